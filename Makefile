@@ -1,0 +1,28 @@
+# Needs only Python >= 3.11 with venv, and make.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: setup run test check clean
+
+setup: .venv/.installed
+
+# Made anew only when what it was made from has changed.
+.venv/.installed: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,check]'
+	touch $@
+
+run: setup
+	$(BIN)/python -m mops_lightning
+
+test: setup
+	$(BIN)/python -m pytest
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/hadolint docker/*.Dockerfile
+
+clean:
+	rm -rf .venv build dist

@@ -1,0 +1,99 @@
+"""Lightning callbacks of a run: stopping cleanly, progress without a terminal."""
+
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import lightning as L
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, RichProgressBar
+
+CHECKPOINT = "last.ckpt"
+
+
+class Stopped(KeyboardInterrupt):
+    """Raised between two steps after a signal, once a checkpoint lies on disk."""
+
+
+class StopBetweenSteps(Callback):
+    """On the first Ctrl-C or SIGTERM, finish the step, write a checkpoint and stop.
+
+    A signal may come in the middle of an optimizer step; only between steps is the state whole, so
+    that resuming gives the result of an unbroken run. A second signal stops at once.
+
+    Args:
+        checkpoint: where to write.
+    """
+
+    def __init__(self, checkpoint: Path) -> None:
+        self.checkpoint = checkpoint
+        self.received: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Listen; not earlier, for Lightning sets its own handlers first."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._note)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.received is not None:
+            raise KeyboardInterrupt("Stopped at once; the checkpoint is the last whole one.")
+        self.received = number
+        print("Stopping after this step (once more: at once) ...", file=sys.stderr, flush=True)
+
+    def on_train_batch_end(self, trainer: L.Trainer, *args: Any) -> None:
+        """Stop here if asked to."""
+        if self.received is not None:
+            trainer.save_checkpoint(self.checkpoint)
+            raise Stopped(f"Go on with ckpt_path={self.checkpoint}")
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Stop after the last step, or stop listening."""
+        self._restore()
+        if self.received is not None:
+            raise Stopped(f"Go on with ckpt_path={self.checkpoint}")
+
+    def on_exception(self, trainer: L.Trainer, *args: Any) -> None:
+        """Stop listening."""
+        self._restore()
+
+    def _restore(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before.clear()
+
+
+class EpochLines(Callback):
+    """One printed line per epoch, for logs and pipes, where a progress bar is noise."""
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Print what the progress bar would show."""
+        numbers = {
+            name: float(value)
+            for name, value in trainer.callback_metrics.items()
+            if name == "train/loss/total" or (name.startswith("val/") and "accuracy" in name)
+        }
+        shown = "  ".join(f"{name} {value:.4f}" for name, value in numbers.items())
+        print(f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}  {shown}", flush=True)
+
+
+def standard(folder: Path) -> list[Callback]:
+    """Return the callbacks of every run.
+
+    Args:
+        folder: the run's folder; checkpoints go to ``checkpoints/last.ckpt`` below it.
+    """
+    checkpoints = folder / "checkpoints"
+    progress: Callback = RichProgressBar(leave=False) if sys.stdout.isatty() else EpochLines()
+    return [
+        ModelCheckpoint(
+            dirpath=checkpoints,
+            filename=Path(CHECKPOINT).stem,
+            save_top_k=1,
+            enable_version_counter=False,
+            save_on_train_epoch_end=True,
+        ),
+        StopBetweenSteps(checkpoints / CHECKPOINT),
+        progress,
+    ]

@@ -1,0 +1,99 @@
+"""The command line. Heavy imports wait until a run starts, so that --help is quick."""
+
+import os
+import sys
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from mops_lightning.config import GROUPS, RUN_KEYS, conf_dir
+from mops_lightning.errors import UserError, did_you_mean
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+USER_ERROR = 2
+INTERRUPTED = 130
+
+
+def main() -> None:
+    """Run one job or a sweep; a user's mistake ends in one line and exit status 2."""
+    import hydra
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    show_traceback = bool(os.environ.get("HYDRA_FULL_ERROR"))
+    # Makes Hydra raise instead of printing its own shortened traceback.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        app = hydra.main(config_path=str(conf_dir()), config_name="config", version_base="1.3")
+        app(_job)()
+    except (UserError, HydraException, OmegaConfBaseException) as error:
+        if show_traceback:
+            raise
+        _end(_explain(error), USER_ERROR)
+
+
+def _job(cfg: "DictConfig") -> float | None:
+    """Run one job; the returned score is what an optimising sweeper looks at."""
+    from pathlib import Path
+
+    from hydra.core.hydra_config import HydraConfig
+
+    from mops_lightning.run import run
+
+    hydra_cfg = HydraConfig.get()
+    folder = Path(os.path.relpath(hydra_cfg.runtime.output_dir))
+    try:
+        return run(cfg, folder, overrides=list(hydra_cfg.overrides.task))["score"]
+    except UserError as error:
+        # Ended here, Hydra does not add lines of its own.
+        _end(str(error), USER_ERROR)
+    except KeyboardInterrupt as stop:
+        _end(f"interrupted. {stop}".rstrip(), INTERRUPTED)
+
+
+def _end(message: str, status: int) -> NoReturn:
+    print(f"mops_lightning: {message}", file=sys.stderr)
+    sys.exit(status)
+
+
+def _explain(error: BaseException) -> str:
+    """Turn an error into one line that names the key and the nearest known one."""
+    texts = []
+    cause: Any = error
+    while cause is not None:
+        texts.append(str(cause).strip())
+        cause = cause.__cause__
+    if isinstance(error, UserError):
+        return texts[0]
+    text = " ".join(dict.fromkeys(line for t in texts for line in t.splitlines() if line.strip()))
+    unknown = getattr(error, "key", None) or _key_in(texts)
+    if unknown:
+        return f"{text}{did_you_mean(unknown, _known_keys())}"
+    return text
+
+
+def _key_in(texts: list[str]) -> str | None:
+    """Find the override that Hydra could not apply."""
+    for text in texts:
+        if "Could not override '" in text:
+            return text.split("Could not override '")[1].split("'")[0]
+    return None
+
+
+def _known_keys() -> list[str]:
+    """List every key of the default configuration, dotted."""
+    from omegaconf import DictConfig
+
+    from mops_lightning.config import compose
+
+    keys = [*RUN_KEYS, *GROUPS]
+
+    def walk(node: DictConfig, prefix: str) -> None:
+        for key in node:
+            keys.append(f"{prefix}{key}")
+            value = node._get_node(key)
+            if isinstance(value, DictConfig) and value._is_none() is False:
+                walk(value, f"{prefix}{key}.")
+
+    walk(compose(), "")
+    return sorted({key for key in keys if not key.split(".")[-1].startswith("_")})

@@ -1,0 +1,162 @@
+"""The parts that procedural shapes are put together from: boxes, cushions, tubes, turned profiles.
+
+Axes are those of the finished shapes: x to the side, y up, z to the front. Lengths have no unit;
+the clouds are normalised afterwards. All parts are ``trimesh.Trimesh``.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import PchipInterpolator
+from trimesh import Trimesh
+
+Array = NDArray[np.float64]
+Span = tuple[float, float]
+"""Lowest and highest coordinate along one axis."""
+
+UPRIGHT = trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0))
+
+
+def around(width: float, centre: float = 0.0) -> Span:
+    """Return the span of the given width about a centre."""
+    return (centre - width / 2, centre + width / 2)
+
+
+def box(x: Span, y: Span, z: Span) -> Trimesh:
+    """Return the axis-aligned box over three spans."""
+    return trimesh.creation.box(bounds=np.array((x, y, z)).T)
+
+
+def cushion(x: Span, y: Span, z: Span, radius: float) -> Trimesh:
+    """Return the box over three spans with edges rounded to ``radius``, at most half its size."""
+    ball, faces = _ball()
+    low, high = np.array((x, y, z)).T
+    half = (high - low) / 2
+    round_off = np.minimum(radius, half)
+    vertices = (low + high) / 2 + np.sign(ball) * (half - round_off) + ball * round_off
+    return Trimesh(vertices, faces, process=False)
+
+
+@cache
+def _ball() -> tuple[Array, NDArray[np.int64]]:
+    """Return vertices and faces of a unit sphere none of whose faces crosses a coordinate plane.
+
+    So moving its octants apart leaves flat panels between them.
+    """
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 9)
+    ball = trimesh.creation.revolve(
+        np.column_stack((np.cos(angles), np.sin(angles))), sections=16, process=False
+    )
+    return np.asarray(ball.vertices).round(12), np.asarray(ball.faces)
+
+
+def loft(rings: ArrayLike) -> Trimesh:
+    """Return the skin over a row of closed cross-sections, each end closed to its middle.
+
+    Args:
+        rings: ``(R, K, 3)``, R cross-sections of K points each.
+    """
+    stack = np.asarray(rings, dtype=np.float64)
+    ends = stack[[0, -1]].mean(1, keepdims=True).repeat(stack.shape[1], axis=1)
+    stack = np.concatenate((ends[:1], stack, ends[1:]))
+    rows, sides = stack.shape[:2]
+    here = np.arange((rows - 1) * sides)
+    beside = here // sides * sides + (here + 1) % sides
+    faces = np.stack((here, beside, here + sides, beside, beside + sides, here + sides), axis=1)
+    return Trimesh(stack.reshape(-1, 3), faces.reshape(-1, 3), process=False)
+
+
+def tube(
+    path: ArrayLike,
+    radii: ArrayLike,
+    sections: int = 12,
+    across: ArrayLike | None = None,
+    flatten: float = 1.0,
+) -> Trimesh:
+    """Return a closed tube along a path that lies in a plane.
+
+    Args:
+        path: ``(R, 3)`` centres of the cross-sections, no two neighbours alike.
+        radii: one for all, or one per centre.
+        sections: corners of a cross-section; 4 makes a square bar.
+        across: normal of the path's plane; None for a straight path.
+        flatten: radius along ``across`` over the radius at right angles to it.
+    """
+    centres = np.asarray(path, dtype=np.float64)
+    along = np.gradient(centres, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    if across is None:
+        across = np.cross(along[0], np.eye(3)[np.abs(along[0]).argmin()])
+    normal = np.asarray(across, dtype=np.float64)
+    normal = np.broadcast_to(normal / np.linalg.norm(normal), centres.shape)
+    turn = 2 * np.pi * (np.arange(sections) + 0.5) / sections
+    # The radius is that of the inscribed circle, so a bar with few corners is no thinner.
+    reach = (np.broadcast_to(radii, len(centres)) / np.cos(np.pi / sections))[:, None, None]
+    first, second = normal[:, None] * flatten, np.cross(along, normal)[:, None]
+    rings = np.cos(turn)[None, :, None] * first + np.sin(turn)[None, :, None] * second
+    return loft(centres[:, None] + reach * rings)
+
+
+def rod(start: ArrayLike, end: ArrayLike, radius: ArrayLike, sections: int = 12) -> Trimesh:
+    """Return a straight bar; ``radius`` is one number, or one at each end."""
+    return tube(np.stack((np.asarray(start), np.asarray(end))), radius, sections)
+
+
+def turned(profile: ArrayLike, sections: int = 32) -> Trimesh:
+    """Return the surface of revolution about the y axis.
+
+    Args:
+        profile: ``(P, 2)`` radius and height, from the bottom up; open where it ends off the axis.
+        sections: steps of a turn.
+    """
+    return trimesh.creation.revolve(
+        np.asarray(profile), sections=sections, transform=UPRIGHT, process=False
+    )
+
+
+def disc(radius: float, y: Span, sections: int = 32) -> Trimesh:
+    """Return a closed upright cylinder about the y axis."""
+    low, high = y
+    return turned(((0, low), (radius, low), (radius, high), (0, high)), sections)
+
+
+def smooth(points: ArrayLike, steps: int = 24) -> Array:
+    """Return a smooth curve through control points, which does not overshoot them.
+
+    Args:
+        points: ``(P, D)``.
+        steps: number of points of the result, ``(steps, D)``.
+    """
+    knots = np.asarray(points, dtype=np.float64)
+    return PchipInterpolator(np.arange(len(knots)), knots)(np.linspace(0, len(knots) - 1, steps))
+
+
+def bow(start: Sequence[float], end: Sequence[float], reach: float, steps: int = 14) -> Array:
+    """Return half an oval in the xy plane, as a handle runs: ``(steps, 3)``.
+
+    Args:
+        start: x and y where it leaves the wall, which it does along x.
+        end: x and y where it comes back.
+        reach: how far it stands off along x; negative to the left.
+        steps: number of points.
+    """
+    turn = np.linspace(0, np.pi, steps)
+    share = ((1 - np.cos(turn)) / 2)[:, None]
+    path = np.asarray(start) * (1 - share) + np.asarray(end) * share
+    path[:, 0] += reach * np.sin(turn) ** 0.8
+    return np.column_stack((path, np.zeros(steps)))
+
+
+def join(*parts: Trimesh | Sequence[Trimesh]) -> Trimesh:
+    """Return one mesh of all parts; lists of parts may stand among them."""
+    flat: list[Trimesh] = []
+    for part in parts:
+        flat += [part] if isinstance(part, Trimesh) else part
+    # trimesh's own concatenate also merges normals and looks, which costs a third of the dataset.
+    starts = np.cumsum([0] + [len(part.vertices) for part in flat[:-1]])
+    vertices = np.concatenate([part.vertices for part in flat])
+    faces = np.concatenate([part.faces + start for part, start in zip(flat, starts, strict=True)])
+    return Trimesh(vertices, faces, process=False)

@@ -1,0 +1,182 @@
+"""Folders of mesh files, sampled into clouds: ModelNet's own form and any other split."""
+
+import csv
+import hashlib
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
+from mops_lightning.data.mesh_io import SUFFIXES, VERSION, BrokenMeshError, cloud_from_file
+from mops_lightning.errors import UserError
+
+SPLITS = ("train", "test")
+
+
+def meshes(
+    root: str | Path,
+    n_points: int = 1024,
+    classes: Sequence[str] | None = None,
+    split_file: str | Path | None = None,
+    skip_broken: bool = False,
+    seed: int = 0,
+    cache: str | Path | None = None,
+    workers: int = 1,
+) -> CloudDataset:
+    """Sample the surfaces of a folder of meshes (off, obj, ply, stl, glb).
+
+    Without ``split_file`` the folder is laid out as ModelNet's archives are,
+    ``CLASS/train/*.off`` and ``CLASS/test/*.off``. With it, the class is the first part of each
+    listed path, and files that are not listed are left alone. The list has one line a mesh::
+
+        path,split
+        chair/chair_0001.off,train
+        chair/old/seat.obj,test
+
+    where paths are relative to ``root`` with forward slashes, the split is ``train`` or ``test``,
+    the first line is optional, and empty lines and lines that start with ``#`` do not count.
+
+    Args:
+        root: the folder.
+        n_points: points to sample from each surface, uniform by area.
+        classes: names to keep; None or empty means all.
+        split_file: the list, as a path from here or from ``root``; None goes by folder names.
+        skip_broken: leave out meshes without a readable surface instead of stopping at them.
+        seed: of the sampling.
+        cache: folder for the sampled clouds, found again by the files' bytes, ``n_points`` and
+            ``seed``; None keeps nothing.
+        workers: processes that read meshes; 1 reads them in this one.
+
+    Returns:
+        Float32 clouds ``(S, n_points, 3)`` in the unit sphere, centroid at the origin; classes in
+        alphabetical order; ``notes["skipped_meshes"]`` counts what was left out. The fingerprint
+        hangs on the files' bytes, relative names and splits, and on the settings.
+
+    Raises:
+        UserError: naming the setting or the file that is wrong.
+    """
+    root = Path(root).expanduser()
+    allowed = {"n_points": (n_points, 1), "seed": (seed, 0), "workers": (workers, 1)}
+    for setting, (value, least) in allowed.items():
+        if value < least:
+            raise UserError(f"dataset.{setting} must be at least {least}, got {value}.")
+    if not root.is_dir():
+        raise UserError(f"dataset.root: {root} is not a folder. Set dataset.root=PATH.")
+    rows = _listed(root, Path(split_file).expanduser()) if split_file else _laid_out(root)
+    chosen = choose_classes(classes, sorted({name.parts[0] for name, _ in rows}))
+    rows = sorted(row for row in rows if row[0].parts[0] in chosen)
+    digest = hashlib.sha256(repr(("meshes", VERSION, n_points, seed, chosen)).encode())
+    clouds: dict[str, list[NDArray[np.float32]]] = {split: [] for split in SPLITS}
+    labels: dict[str, list[int]] = {split: [] for split in SPLITS}
+    skipped = 0
+    kept = Path(cache).expanduser() if cache else None
+    sample = partial(_sample, n_points=n_points, seed=seed, cache=kept)
+    results = _each(sample, [root / name for name, _ in rows], workers)
+    for (name, split), result in zip(rows, results, strict=True):
+        if isinstance(result, BrokenMeshError):
+            if not skip_broken:
+                raise UserError(
+                    f"{result} Mend or remove the file, or set dataset.skip_broken=true."
+                ) from result
+            skipped += 1
+            continue
+        digest.update(repr((split, str(name), result[0])).encode())
+        clouds[split].append(result[1])
+        labels[split].append(chosen.index(name.parts[0]))
+    for split in SPLITS:
+        if not clouds[split]:
+            raise UserError(
+                f"dataset.root: no {split} mesh of {', '.join(chosen)} in {root} "
+                f"({skipped} broken ones skipped)."
+            )
+    train, test = (
+        Clouds(torch.from_numpy(np.stack(clouds[split])), torch.tensor(labels[split]))
+        for split in SPLITS
+    )
+    return CloudDataset(chosen, train, test, digest.hexdigest(), {"skipped_meshes": skipped})
+
+
+def _laid_out(root: Path) -> list[tuple[PurePosixPath, str]]:
+    rows = [
+        (PurePosixPath(path.relative_to(root).as_posix()), split)
+        for split in SPLITS
+        for path in root.glob(f"*/{split}/*")
+        if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
+    ]
+    if not rows:
+        flat = any(path.suffix.lower() in SUFFIXES for path in root.glob("*/*"))
+        hint = " Its meshes lie in CLASS/ itself: say which is which with dataset.split_file=FILE."
+        raise UserError(
+            f"dataset.root: no mesh in {root}. Looked for CLASS/train/* and CLASS/test/* ending "
+            f"in {', '.join(SUFFIXES)}.{hint if flat else ' Set dataset.root=PATH.'}"
+        )
+    return rows
+
+
+def _listed(root: Path, split_file: Path) -> list[tuple[PurePosixPath, str]]:
+    path = split_file if split_file.is_file() else root / split_file
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"dataset.split_file: cannot read {split_file}: {error}.") from error
+    rows: dict[PurePosixPath, str] = {}
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        fields = [field.strip() for field in next(csv.reader([line]))]
+        if fields == ["path", "split"] and not rows:
+            continue
+        where = f"dataset.split_file: {path}, line {number}:"
+        if len(fields) != 2 or fields[1] not in SPLITS:
+            raise UserError(f"{where} must read 'path,train' or 'path,test', got {line!r}.")
+        name = PurePosixPath(fields[0])
+        if name.is_absolute() or ".." in name.parts or len(name.parts) < 2:
+            raise UserError(
+                f"{where} the path must be CLASS/…/FILE, relative to {root}, got {fields[0]!r}."
+            )
+        if name.suffix.lower() not in SUFFIXES:
+            raise UserError(f"{where} {name} must end in {', '.join(SUFFIXES)}.")
+        if name in rows:
+            raise UserError(f"{where} {name} is listed twice.")
+        if not (root / name).is_file():
+            raise UserError(f"{where} {root / name} does not exist.")
+        rows[name] = fields[1]
+    if not rows:
+        raise UserError(f"dataset.split_file: {path} lists no mesh.")
+    return list(rows.items())
+
+
+_Result = tuple[str, NDArray[np.float32]] | BrokenMeshError
+
+
+def _sample(path: Path, n_points: int, seed: int, cache: Path | None) -> _Result:
+    """Return the error instead of raising it, so that it crosses processes and can be skipped."""
+    try:
+        return cloud_from_file(path, n_points, seed, cache)
+    except BrokenMeshError as error:
+        return error
+
+
+def _each(sample: partial[_Result], paths: list[Path], workers: int) -> Iterator[_Result]:
+    console = Console(stderr=True)
+    bar = partial(
+        track,
+        description="Sampling meshes",
+        total=len(paths),
+        console=console,
+        disable=not console.is_terminal,
+    )
+    if workers == 1:
+        yield from bar(map(sample, paths))
+        return
+    # Forking a process in which torch has started threads can hang; a spawned one cannot.
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        yield from bar(pool.map(sample, paths, chunksize=4))

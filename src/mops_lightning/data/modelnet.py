@@ -1,0 +1,185 @@
+"""ModelNet40 in its public HDF5 layout, ``modelnet40_ply_hdf5_2048``."""
+
+import hashlib
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+
+from mops_lightning.data.archive import unpack
+from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, select_classes
+from mops_lightning.data.download import fetch, one_at_a_time
+from mops_lightning.errors import UserError
+
+FOLDER = "modelnet40_ply_hdf5_2048"
+MIRRORS = (
+    f"https://huggingface.co/datasets/Msun/modelnet40/resolve/main/{FOLDER}.zip",
+    f"https://shapenet.cs.stanford.edu/media/{FOLDER}.zip",
+)
+LOOKED_FOR = "shape_names.txt, train_files.txt, test_files.txt and ply_data_{train,test}*.h5"
+
+
+def modelnet40(
+    root: str | Path,
+    n_points: int = 1024,
+    classes: Sequence[str] | None = None,
+    download: bool = False,
+    mirrors: Sequence[str] = MIRRORS,
+    sha256: str | None = None,
+    size: int | None = None,
+) -> CloudDataset:
+    """Read ModelNet40, the shapes of the paper's classification and registration experiments.
+
+    The official split of the public files is kept: all training shapes and all test shapes. Each
+    cloud is its first ``n_points`` points, which are stored in random order, in the unit sphere,
+    y up.
+
+    Args:
+        root: the folder with the files, or the folder above ``modelnet40_ply_hdf5_2048``.
+        n_points: points per shape, at most as many as are stored.
+        classes: names from ``shape_names.txt`` to keep; None or empty means all 40.
+        download: fetch and unpack the archive into ``root`` when the files are not there.
+        mirrors: addresses of the archive, tried in turn.
+        sha256: hexadecimal hash that the archive must have, or None.
+        size: bytes that the archive must have, or None.
+
+    Returns:
+        Float32 clouds ``(S, n_points, 3)`` and int64 labels ``(S,)``. The fingerprint hangs on
+        the files' names, what was read from them, ``n_points`` and the classes, and not on where
+        ``root`` lies.
+
+    Raises:
+        UserError: the files are missing, damaged, or do not hold what was asked for.
+    """
+    if n_points < 1:
+        raise UserError(f"dataset.n_points must be at least 1, got {n_points}.")
+    root = Path(root).expanduser()
+    folder = _find(root)
+    if folder is None and download:
+        folder = _download(root, mirrors, sha256, size)
+    if folder is None:
+        raise UserError(
+            f"dataset.root: no ModelNet40 in {root}. Looked there and in {root / FOLDER} for "
+            f"{LOOKED_FOR}. Try dataset.download=true to fetch them, or dataset.root=PATH."
+        )
+    known = _lines(folder / "shape_names.txt")
+    if not known or len(set(known)) != len(known):
+        raise UserError(f"{folder / 'shape_names.txt'} must list each class once, one a line.")
+    chosen = choose_classes(classes, known)
+    digest = hashlib.sha256(repr(("modelnet40", n_points, chosen)).encode())
+    splits = []
+    for split in ("train", "test"):
+        files = _files(folder, split)
+        parts = [_read(path, n_points, len(known)) for path in files]
+        whole = Clouds(
+            torch.cat([part.points for part in parts]), torch.cat([part.labels for part in parts])
+        )
+        clouds = select_classes(whole, known, chosen) if len(chosen) < len(known) else whole
+        if not len(clouds.labels):
+            raise UserError(
+                f"dataset.classes: {', '.join(chosen)} has no {split} shape in {folder}."
+            )
+        digest.update(repr((split, [f.name for f in files], tuple(clouds.points.shape))).encode())
+        digest.update(clouds.points.numpy().data)
+        digest.update(clouds.labels.numpy().data)
+        splits.append(clouds)
+    return CloudDataset(chosen, splits[0], splits[1], digest.hexdigest())
+
+
+def _find(root: Path) -> Path | None:
+    for folder in (root, root / FOLDER):
+        names = [folder / name for name in ("shape_names.txt", "train_files.txt")]
+        if any(name.is_file() for name in names) or any(folder.glob("ply_data_train*.h5")):
+            return folder
+    return None
+
+
+def _download(root: Path, mirrors: Sequence[str], sha256: str | None, size: int | None) -> Path:
+    folder = root if root.name == FOLDER else root / FOLDER
+    archive = folder.parent / f"{FOLDER}.zip"
+    with one_at_a_time(folder.parent / f".{FOLDER}.lock"):
+        if _find(folder) is None:
+            brought = archive.exists()
+            fetch(mirrors, archive, sha256=sha256, size=size)
+            unpack(archive, folder)
+            if not brought:
+                archive.unlink()
+    if _find(folder) is None:
+        raise UserError(
+            f"dataset.mirrors: the archive unpacked into {folder} is not ModelNet40; it lacks "
+            f"{LOOKED_FOR}. Remove the folder and set dataset.mirrors to another address."
+        )
+    return folder
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(
+            f"dataset.root: cannot read {path}: {error}. ModelNet40 needs {LOOKED_FOR}."
+        ) from error
+    return [line.strip() for line in text.splitlines() if line.strip()]
+
+
+def _files(folder: Path, split: str) -> list[Path]:
+    """List a split's files; the public lists carry a path prefix, so only the name counts."""
+    listing = folder / f"{split}_files.txt"
+    if listing.is_file():
+        files = [folder / re.split(r"[/\\]", line)[-1] for line in _lines(listing)]
+    else:
+        found = folder.glob(f"ply_data_{split}*.h5")
+        files = sorted(found, key=lambda f: (int(re.sub(r"\D", "", f.stem) or 0), f.name))
+    if not files:
+        raise UserError(f"dataset.root: no ply_data_{split}*.h5 in {folder}.")
+    return files
+
+
+def _read(path: Path, n_points: int, n_classes: int) -> Clouds:
+    """Read the first points and the labels of one file, and check all that can be wrong."""
+    if not path.is_file():
+        raise UserError(
+            f"dataset.root: {path} is missing. Complete the folder, or remove it and try "
+            "dataset.download=true."
+        )
+    try:
+        with h5py.File(path, "r") as file:
+            for key in ("data", "label"):
+                if not isinstance(file.get(key), h5py.Dataset):
+                    raise UserError(f"{path} has no dataset {key!r}; it holds {sorted(file)}.")
+            data, label = file["data"], file["label"]
+            shapes, kinds = (data.shape, label.shape), data.dtype.kind + label.dtype.kind
+            if (
+                data.ndim != 3
+                or data.shape[2] != 3
+                or label.shape not in ((len(data),), (len(data), 1))
+                or kinds not in ("fu", "fi")
+            ):
+                raise UserError(
+                    f"{path} must hold data (S, N, 3) of floats and label (S, 1) or (S,) of "
+                    f"integers, got {shapes[0]} {data.dtype} and {shapes[1]} {label.dtype}."
+                )
+            if data.shape[1] < n_points:
+                raise UserError(
+                    f"dataset.n_points is {n_points}, but {path} stores {data.shape[1]} points "
+                    f"a shape. Set dataset.n_points={data.shape[1]} or less."
+                )
+            with np.errstate(over="ignore"):  # what overflows is found below
+                points = np.asarray(data[:, :n_points], dtype=np.float32)
+            labels = np.asarray(label[()], dtype=np.int64).reshape(-1)
+    except (OSError, RuntimeError, KeyError) as error:
+        raise UserError(
+            f"{path} is not a whole HDF5 file ({error}). Remove it and fetch it again, for "
+            "instance by removing its folder and setting dataset.download=true."
+        ) from error
+    if not np.isfinite(points).all():
+        raise UserError(f"{path} holds NaN or infinite coordinates; fetch it again.")
+    if len(labels) and not 0 <= labels.min() <= labels.max() < n_classes:
+        raise UserError(
+            f"{path} holds labels from {labels.min()} to {labels.max()}, but shape_names.txt "
+            f"names {n_classes} classes (0 to {n_classes - 1})."
+        )
+    return Clouds(torch.from_numpy(points), torch.from_numpy(labels))

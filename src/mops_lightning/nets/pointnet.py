@@ -1,0 +1,175 @@
+"""PointNet vanilla and the shared per-point layers that samplers and task nets are made of.
+
+Layers work on ``(B·N, C)`` rows: BatchNorm over rows is 1.6 times faster on a CPU than over
+``(B, C, N)``, and a linear layer is one matrix product.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+def linear_norm_relu(channels: Sequence[int]) -> nn.Sequential:
+    """Stack linear layers, each followed by BatchNorm and ReLU.
+
+    Args:
+        channels: input size, then the output size of every layer.
+
+    Returns:
+        A module from ``(rows, channels[0])`` to ``(rows, channels[-1])``. The linear layers have
+        no bias: BatchNorm would cancel it.
+    """
+    layers: list[nn.Module] = []
+    for before, after in zip(channels[:-1], channels[1:], strict=True):
+        layers += [
+            nn.Linear(before, after, bias=False),
+            nn.BatchNorm1d(after),
+            nn.ReLU(inplace=True),
+        ]
+    return nn.Sequential(*layers)
+
+
+class PointMLP(nn.Module):
+    """One MLP shared by all points.
+
+    Args:
+        channels: input size, then the output size of every layer.
+    """
+
+    def __init__(self, channels: Sequence[int]) -> None:
+        super().__init__()
+        self.layers = linear_norm_relu(channels)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map ``(B, N, channels[0])`` to ``(B, N, channels[-1])``."""
+        return self.layers(features.flatten(0, 1)).unflatten(0, features.shape[:2])
+
+
+class PointMaxPool(nn.Module):
+    """Linear layer, BatchNorm, ReLU and the maximum over points, without the (B, N, C) tensor.
+
+    The maximum commutes with the increasing map x ↦ relu(a·x + b), a ≥ 0 (for a < 0 the minimum
+    takes its place), so the wide product is needed only to find which point wins a channel. What
+    BatchNorm needs beyond that, mean and variance of the product, follows from the mean and the
+    covariance of the narrower input: mean(Wx) = W·mean(x), var(Wx) = diag(W·cov(x)·Wᵀ). Values and
+    gradients are those of the plain layers; gradients flow through the winning points only.
+
+    Args:
+        channels_in: C of the input.
+        channels_out: C of the result.
+    """
+
+    def __init__(self, channels_in: int, channels_out: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(channels_in, channels_out, bias=False)
+        self.norm = nn.BatchNorm1d(channels_out)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map ``(B, N, channels_in)`` to ``(B, channels_out)``."""
+        if features.shape[1] <= features.shape[2]:
+            # Fewer points than channels: the plain product is smaller than the gathered winners.
+            rows = F.linear(features.flatten(0, 1), self.linear.weight)
+            return F.relu(self.norm(rows).unflatten(0, features.shape[:2]).amax(1))
+        mean, scale = self._normalisation(features)
+        peaks = self._peaks(features, (scale < 0).detach())
+        assert self.norm.bias is not None
+        return F.relu((peaks - mean) * scale + self.norm.bias)
+
+    def _normalisation(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and gamma/std of the wide product, and update the running statistics."""
+        norm, weight = self.norm, self.linear.weight
+        assert norm.running_mean is not None
+        assert norm.running_var is not None
+        if not self.training:
+            mean, variance = norm.running_mean, norm.running_var
+        else:
+            rows = features.flatten(0, 1)
+            centre = rows.mean(0)
+            centred = rows - centre
+            covariance = centred.mT @ centred / rows.shape[0]
+            mean = weight @ centre
+            variance = ((weight @ covariance) * weight).sum(1)
+            with torch.no_grad():
+                momentum = 0.1 if norm.momentum is None else norm.momentum
+                unbiased = variance * (rows.shape[0] / max(rows.shape[0] - 1, 1))
+                norm.running_mean.lerp_(mean.to(norm.running_mean.dtype), momentum)
+                norm.running_var.lerp_(unbiased.to(norm.running_var.dtype), momentum)
+                if norm.num_batches_tracked is not None:
+                    norm.num_batches_tracked += 1
+        return mean, norm.weight * torch.rsqrt(variance + norm.eps)
+
+    def _peaks(self, features: Tensor, falling: Tensor) -> Tensor:
+        """Return, per cloud and channel, the extreme value of the product: ``(B, C)``."""
+        weight = self.linear.weight
+        with torch.no_grad():
+            search = torch.where(falling[:, None], -weight, weight).mT.contiguous()
+            if features.is_cuda:
+                winners = (features @ search).argmax(1)
+            else:  # cloud by cloud the product stays in the cache
+                winners = torch.stack([_argmax_rows(cloud @ search) for cloud in features])
+        index = winners[..., None].expand(-1, -1, features.shape[2])
+        return (features.gather(1, index) * weight).sum(-1)
+
+
+def _argmax_rows(values: Tensor, group: int = 32) -> Tensor:
+    """Return ``values.argmax(0)`` for ``(N, C)``, on a CPU several times as fast.
+
+    Maxima alone are vectorised there, maxima with positions are not: so take the maxima of groups
+    of rows, and look for positions only among groups and then inside the winning one.
+    """
+    whole = len(values) // group * group
+    if whole <= group:
+        return values.argmax(0)
+    groups = values[:whole].view(-1, group, values.shape[1])
+    best = groups.amax(1).argmax(0)
+    inside = groups.gather(0, best.expand(1, group, -1))[0]
+    place = inside.argmax(0)
+    winner = best * group + place
+    if whole == len(values):
+        return winner
+    tail = values[whole:].max(0)
+    peak = inside.gather(0, place[None])[0]
+    return torch.where(tail.values > peak, tail.indices + whole, winner)
+
+
+class PointNetVanilla(nn.Module):
+    """PointNet without transform nets, the classifier of the paper's section "Classification".
+
+    Layers 64, 64, 64, 128, 1024 per point, maximum over points, 512, 256, ``num_classes``; dropout
+    after the 256. Takes any number of points.
+
+    Args:
+        num_classes: number of logits.
+        dropout: share of the 256 features that is dropped in training.
+    """
+
+    def __init__(self, num_classes: int, dropout: float = 0.3) -> None:
+        super().__init__()
+        self.features = PointMLP([3, 64, 64, 64, 128])
+        self.pool = PointMaxPool(128, 1024)
+        self.head = nn.Sequential(
+            *linear_norm_relu([1024, 512, 256]), nn.Dropout(dropout), nn.Linear(256, num_classes)
+        )
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Map ``(B, N, 3)`` points to ``(B, num_classes)`` logits."""
+        return self.head(self.pool(self.features(points)))
+
+
+class PointFeatures(nn.Module):
+    """Local and global features of a cloud, paper section "Feature Extraction".
+
+    Args:
+        channels: sizes of the per-point layers after the coordinates.
+    """
+
+    def __init__(self, channels: Sequence[int] = (64, 64, 64, 128, 128)) -> None:
+        super().__init__()
+        self.mlp = PointMLP([3, *channels])
+
+    def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Return local features ``(B, N, C)`` and their maximum over points ``(B, C)``."""
+        local = self.mlp(points)
+        return local, local.amax(1)

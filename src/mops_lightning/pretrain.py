@@ -1,0 +1,77 @@
+"""The task net's weights: given, found in the cache, or trained first."""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+from omegaconf import DictConfig, open_dict
+
+from mops_lightning import resume
+from mops_lightning.callbacks import CHECKPOINT
+from mops_lightning.data.clouds import CloudDataset
+from mops_lightning.io import atomic_write
+
+WEIGHTS = "weights.pt"
+
+
+def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
+    """Return the file that ``weights`` means; ``auto`` trains the net when it is not cached.
+
+    Returns:
+        None for ``weights=null``, which leaves the net as it was initialised, and for a resumed
+        run, whose checkpoint holds the task net as well.
+    """
+    if cfg.weights is None or cfg.ckpt_path is not None:
+        return None
+    if cfg.weights != "auto":
+        return Path(cfg.weights).expanduser()
+    folder = cache_folder(cfg, dataset)
+    if not (folder / WEIGHTS).is_file():
+        print(
+            f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it first, "
+            f"{cfg.pretrain.max_epochs} epochs. It is kept in {folder}",
+            flush=True,
+        )
+        _train(cfg, folder, dataset)
+    return folder / WEIGHTS
+
+
+def task_config(cfg: DictConfig) -> DictConfig:
+    """Return the configuration of the run that trains the task net of ``cfg`` alone."""
+    own = cfg.copy()
+    with open_dict(own):
+        if cfg.learn != "task":
+            own.trainer.max_epochs = cfg.pretrain.max_epochs
+            own.optimizer = cfg.pretrain.optimizer
+        own.learn = "task"
+        own.ckpt_path = None
+    return own
+
+
+def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
+    """Return where the task net of these settings and data is kept, there or not."""
+    own = task_config(cfg)
+    key = {**resume.identity(own, dataset.fingerprint), "epochs": own.trainer.max_epochs}
+    digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:12]
+    name = f"{cfg.names.task}-{cfg.names.net}-{cfg.names.dataset}-{digest}"
+    return Path(cfg.cache).expanduser() / "weights" / name
+
+
+def publish(cfg: DictConfig, weights: Path, dataset: CloudDataset) -> None:
+    """Copy a task net trained with ``learn=task`` into the cache, unless one is there."""
+    target = cache_folder(cfg, dataset) / WEIGHTS
+    if not target.exists():
+        with atomic_write(target) as temporary:
+            shutil.copyfile(weights, temporary)
+
+
+def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
+    from mops_lightning.run import fit_and_test, recorded  # they call this module
+
+    own = task_config(cfg)
+    if (folder / "checkpoints" / CHECKPOINT).is_file():
+        # An earlier pretraining was cut off: go on from there.
+        own.ckpt_path = str(folder)
+    with recorded(own, folder, []) as record:
+        fit_and_test(own, folder, dataset, record)

@@ -1,0 +1,99 @@
+"""Finding the checkpoint to go on from, and making sure that it belongs to this run."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from mops_lightning.callbacks import CHECKPOINT
+from mops_lightning.errors import UserError
+from mops_lightning.experiment import CHECKPOINT_KEY
+
+
+def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
+    """Return what must be equal for a checkpoint to be resumed, as text by setting.
+
+    The length of the run is not part of it: a finished run may be made longer.
+    """
+    parts = {
+        "task": cfg.task,
+        "sampler": cfg.sampler if cfg.learn != "task" else None,
+        "optimizer": cfg.optimizer,
+        "augment": cfg.augment[cfg.learn],
+        "learn": cfg.learn,
+        "seed": cfg.seed,
+        "batch_size": cfg.batch_size,
+        "val_fraction": cfg.val_fraction,
+        "dataset": fingerprint,
+    }
+    return {
+        name: json.dumps(
+            OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value,
+            sort_keys=True,
+        )
+        for name, value in parts.items()
+    }
+
+
+def find(cfg: DictConfig, mine: dict[str, str]) -> Path | None:
+    """Return the checkpoint that ``ckpt_path`` means, or None when it is not set.
+
+    Args:
+        cfg: ``ckpt_path`` may be ``last`` (the newest run below ``out`` with these settings), a
+            run's folder or a file.
+        mine: this run's ``identity``.
+
+    Raises:
+        UserError: there is no such checkpoint, or it belongs to other settings.
+    """
+    if cfg.ckpt_path is None:
+        return None
+    if cfg.ckpt_path == "last":
+        return _newest(Path(cfg.out), mine)
+    path = Path(cfg.ckpt_path).expanduser()
+    if path.is_dir():
+        path = path / "checkpoints" / CHECKPOINT
+    if not path.is_file():
+        raise UserError(
+            f"ckpt_path: no checkpoint {path}. Give a run's folder, a .ckpt file, or last."
+        )
+    theirs = _read(path)
+    different = [name for name in mine if theirs.get(name) != mine[name]]
+    if different:
+        name = different[0]
+        raise UserError(
+            f"ckpt_path: {path} is of a run with other settings ({', '.join(different)}); "
+            f"{name} is {mine[name]} here and {theirs.get(name)} there. "
+            "Give the same settings, or leave ckpt_path out to start anew."
+        )
+    return path
+
+
+def _newest(out: Path, mine: dict[str, str]) -> Path:
+    found = sorted(
+        out.glob(f"**/checkpoints/{CHECKPOINT}"), key=lambda p: p.stat().st_mtime, reverse=True
+    )
+    for path in found:
+        try:
+            theirs = _read(path)
+        except UserError:
+            continue
+        if theirs == mine:
+            return path
+    raise UserError(
+        f"ckpt_path=last: none of the {len(found)} checkpoints below {out} has these settings. "
+        "Leave ckpt_path out to start anew, or name a run's folder."
+    )
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception as error:
+        first = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise UserError(f"ckpt_path: {path} cannot be read as a checkpoint: {first}") from None
+    if CHECKPOINT_KEY not in content:
+        raise UserError(f"ckpt_path: {path} is not a checkpoint of this program.")
+    return content[CHECKPOINT_KEY]

@@ -1,0 +1,133 @@
+"""One run: compose → build → pretrain if needed → fit → test → result.json."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from mops_lightning import pretrain, records, resume, weights
+from mops_lightning.config import build, check
+from mops_lightning.data.clouds import CloudDataset
+from mops_lightning.errors import UserError
+from mops_lightning.fit import device_name, fit, make_experiment, make_trainer, test
+from mops_lightning.summary import closing_lines
+
+WEIGHTS = "weights.pt"
+
+
+def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> dict[str, Any]:
+    """Do all that a configuration asks for and leave ``result.json`` in ``folder``.
+
+    Args:
+        cfg: a composed configuration.
+        folder: the run's folder; must not hold a result yet.
+        overrides: what the user changed, for the record.
+
+    Returns:
+        The record, as written.
+
+    Raises:
+        UserError: a mistake in settings or files.
+    """
+    check(cfg)
+    if (folder / records.FILE).exists():
+        raise UserError(f"{folder} holds a result already; nothing is overwritten. Use another.")
+    with recorded(cfg, folder, overrides or []) as record:
+        with timed(record, "data"):
+            dataset = build(cfg.dataset)
+        points = dataset.train.points.shape[1]
+        if cfg.m > points:
+            raise UserError(f"m must be at most the {points} points of a cloud, got m={cfg.m}.")
+        fit_and_test(cfg, folder, dataset, record)
+    closing_lines(folder, record)
+    return record
+
+
+def fit_and_test(
+    cfg: DictConfig, folder: Path, dataset: CloudDataset, record: dict[str, Any]
+) -> None:
+    """Train and score what ``cfg`` says on loaded data, and fill the record."""
+    identity = resume.identity(cfg, dataset.fingerprint)
+    checkpoint = resume.find(cfg, identity)
+    record["notes"] |= {
+        "dataset_fingerprint": dataset.fingerprint,
+        "train_clouds": len(dataset.train.labels),
+        "test_clouds": len(dataset.test.labels),
+        "resumed_from": None if checkpoint is None else str(checkpoint),
+        **dataset.notes,
+    }
+    task_weights = None
+    if cfg.learn != "task":
+        with timed(record, "pretrain"):
+            task_weights = pretrain.task_weights(cfg, dataset)
+    experiment = make_experiment(cfg, dataset, identity)
+    if task_weights is not None:
+        content = weights.load_into(experiment.task, task_weights)
+        record["notes"]["task_weights_sha256"] = content["sha256"]
+    trainer = make_trainer(cfg, folder)
+    record["device"] = device_name(trainer)
+    if experiment.trainable:
+        with timed(record, "fit"):
+            fit(cfg, trainer, experiment, dataset, checkpoint)
+        record["files"]["checkpoint"] = "checkpoints/last.ckpt"
+    with timed(record, "test"):
+        record["metrics"] = test(cfg, trainer, experiment, dataset)
+    readout = experiment.own_readouts[0]
+    record["score"] = record["metrics"][f"test/{readout}/{experiment.task.score}"]
+    learned = {"task": {WEIGHTS: experiment.task}, "sampler": {WEIGHTS: experiment.sampler}}
+    learned["joint"] = {**learned["sampler"], "task_weights.pt": experiment.task}
+    if experiment.trainable:
+        for name, module in learned[cfg.learn].items():
+            weights.save(folder / name, module, record["config"], record["metrics"])
+            record["files"][Path(name).stem] = name
+    if cfg.learn == "task":
+        pretrain.publish(cfg, folder / WEIGHTS, dataset)
+
+
+@contextmanager
+def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[dict[str, Any]]:
+    """Keep ``result.json`` true while the block runs, and give its record to be filled."""
+    plain = OmegaConf.to_container(cfg, resolve=True)
+    record: dict[str, Any] = {
+        "schema": records.SCHEMA,
+        "status": "running",
+        "config": plain,
+        "overrides": overrides,
+        "metrics": {},
+        "score": None,
+        "seconds": {},
+        "seed": cfg.seed,
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        **records.environment(),
+        "device": None,
+        "files": {},
+        "error": None,
+        "notes": {},
+    }
+    records.write(folder, record)
+    try:
+        with timed(record, "total"):
+            yield record
+        record["status"] = "completed"
+    except KeyboardInterrupt as stop:
+        record["status"], record["error"] = "interrupted", str(stop) or "interrupted"
+        raise
+    except BaseException as error:
+        record["status"], record["error"] = "failed", f"{type(error).__name__}: {error}"
+        raise
+    finally:
+        records.write(folder, record)
+
+
+@contextmanager
+def timed(record: dict[str, Any], name: str) -> Iterator[None]:
+    """Note how many seconds the block took."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        record["seconds"][name] = round(time.perf_counter() - start, 3)

@@ -1,0 +1,91 @@
+"""The contract that every sampler keeps."""
+
+import torch
+from torch import Tensor, nn
+
+from mops_lightning.errors import UserError
+from mops_lightning.types import SampleOutput
+
+
+class Sampler(nn.Module):
+    """Base of all samplers: checks the input, then calls ``sample``.
+
+    Args:
+        m: number of points to return; for a flexible sampler the largest number it can return.
+
+    A subclass implements ``sample(points, m)`` and may override ``anneal``.
+    """
+
+    flexible: bool = False
+    """Whether one instance takes any 1 ≤ m ≤ ``self.m``; others return ``self.m`` points only."""
+
+    def __init__(self, m: int) -> None:
+        super().__init__()
+        if m < 1:
+            raise UserError(f"m must be at least 1, got {m}.")
+        self.m = m
+
+    def forward(self, points: Tensor, m: int | None = None) -> SampleOutput:
+        """Sample every cloud of a batch.
+
+        Args:
+            points: ``(B, N, 3)`` floating point, finite, N ≥ m.
+            m: how many points to return; None means ``self.m``.
+
+        Returns:
+            ``SampleOutput`` with ``(B, m, 3)`` points on the device and in the dtype of the input.
+
+        Raises:
+            UserError: ``points`` or ``m`` is not as described.
+        """
+        m = self.m if m is None else m
+        self._check_m(m)
+        check_points(points, at_least=m, finite=not (self.training and points.is_cuda))
+        return self.sample(points, m)
+
+    def sample(self, points: Tensor, m: int) -> SampleOutput:
+        """Do the work on checked input; see ``forward``."""
+        raise NotImplementedError
+
+    def anneal(self, progress: float) -> None:
+        """Tell the sampler how much of the training is done, from 0 to 1; most do not mind."""
+
+    @property
+    def learned(self) -> bool:
+        """Whether there is anything to train."""
+        return any(True for _ in self.parameters())
+
+    def _check_m(self, m: int) -> None:
+        if self.flexible and not 1 <= m <= self.m:
+            raise UserError(f"m must be between 1 and {self.m}, got {m}.")
+        if not self.flexible and m != self.m:
+            raise UserError(
+                f"m must be {self.m}, the size this {type(self).__name__} was made for, got {m}."
+            )
+
+
+def check_points(points: Tensor, at_least: int = 1, finite: bool = True) -> None:
+    """Refuse what is not a batch of clouds with enough points.
+
+    Args:
+        points: should be ``(B, N, 3)``, floating point and finite.
+        at_least: smallest N allowed.
+        finite: also look for NaN and infinity (on a GPU this waits for the device, so training
+            there leaves it to the data loading).
+
+    Raises:
+        UserError: naming what is allowed and what came.
+    """
+    shape = tuple(points.shape)
+    if points.ndim != 3 or points.shape[-1] != 3:
+        raise UserError(f"points must have shape (B, N, 3), got {shape}.")
+    if not points.is_floating_point():
+        raise UserError(f"points must be floating point, got {points.dtype}.")
+    if points.shape[0] == 0 or points.shape[1] == 0:
+        raise UserError(f"points must hold at least one cloud and one point, got shape {shape}.")
+    if points.shape[1] < at_least:
+        raise UserError(
+            f"m must be at most the number of points N={points.shape[1]}, got m={at_least}."
+        )
+    if finite and not bool(torch.isfinite(points).all()):
+        raise UserError("points must be finite, got NaN or infinity.")

@@ -1,0 +1,98 @@
+"""MOPS-Net: the learned sampler of the paper."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.losses import subset_loss
+from mops_lightning.nets.pointnet import PointFeatures, linear_norm_relu
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.sampling_matrix import SamplingMatrix
+from mops_lightning.types import SampleOutput
+
+ANNEALINGS = ("exponential", "linear")
+
+
+class MOPSNet(Sampler):
+    """MOPS-Net (paper sections "Feature Extraction" to "Joint Training Loss").
+
+    Every point's local feature, joined with the cloud's global one, goes through the MLP ρ; its m
+    outputs, divided by the temperature tau and turned into shares by a softmax over the points,
+    are the columns of the sampling matrix S; the sampled points are SᵀP.
+
+    Args:
+        m: number of points to generate.
+        alpha: weight of the subset loss in the training loss.
+        tau_min: temperature at the end of training and in evaluation; it starts at 1.
+        annealing: how tau falls with the training's progress, ``exponential`` or ``linear``.
+        feature_channels: sizes of the per-point layers; local and global feature have the last.
+        rho_channels: sizes of ρ's hidden layers, before the m outputs.
+
+    Raises:
+        UserError: tau_min is not in (0, 1], alpha is negative or annealing is unknown.
+    """
+
+    def __init__(
+        self,
+        m: int,
+        alpha: float = 30.0,
+        tau_min: float = 0.1,
+        annealing: Literal["exponential", "linear"] = "exponential",
+        feature_channels: Sequence[int] = (64, 64, 64, 128, 128),
+        rho_channels: Sequence[int] = (512, 256, 128),
+    ) -> None:
+        super().__init__(m)
+        if not 0 < tau_min <= 1:
+            raise UserError(f"sampler.tau_min must be above 0 and at most 1, got {tau_min}.")
+        if alpha < 0:
+            raise UserError(f"sampler.alpha must not be negative, got {alpha}.")
+        if annealing not in ANNEALINGS:
+            raise UserError(
+                f"sampler.annealing: unknown {annealing!r}.{did_you_mean(annealing, ANNEALINGS)}"
+            )
+        self.alpha = alpha
+        self.tau_min = tau_min
+        self.annealing = annealing
+        self.training_tau = 1.0
+        local = feature_channels[-1]
+        self.features = PointFeatures(feature_channels)
+        # ρ's first layer acts on [local, global]. The global half is the same for all points of a
+        # cloud, so it is multiplied once per cloud and added, never repeated N times.
+        self.rho_local = nn.Linear(local, rho_channels[0], bias=False)
+        self.rho_global = nn.Linear(local, rho_channels[0], bias=False)
+        self.rho_first = nn.Sequential(nn.BatchNorm1d(rho_channels[0]), nn.ReLU(inplace=True))
+        self.rho = linear_norm_relu(rho_channels)
+        # Without bias: it would be constant down a column of S, where the softmax cancels it.
+        self.queries = nn.Linear(rho_channels[-1], m, bias=False)
+
+    @property
+    def tau(self) -> float:
+        """The temperature in force: annealed in training, tau_min in evaluation."""
+        return self.training_tau if self.training else self.tau_min
+
+    def anneal(self, progress: float) -> None:
+        """Set the training temperature for a progress from 0 (tau = 1) to 1 (tau = tau_min)."""
+        progress = min(max(progress, 0.0), 1.0)
+        if self.annealing == "exponential":
+            self.training_tau = self.tau_min**progress
+        else:
+            self.training_tau = 1 + (self.tau_min - 1) * progress
+
+    def sampling_matrix(self, points: Tensor) -> SamplingMatrix:
+        """Return S for ``(B, N, 3)`` points."""
+        local, global_ = self.features(points)
+        hidden = F.linear(local, self.rho_local.weight) + self.rho_global(global_)[:, None]
+        keys = self.rho(self.rho_first(hidden.flatten(0, 1)))
+        return SamplingMatrix(self.queries.weight, keys.unflatten(0, points.shape[:2]), self.tau)
+
+    def sample(self, points: Tensor, m: int) -> SampleOutput:
+        """Generate points; see ``Sampler.forward``. The subset loss is computed in training."""
+        matrix = self.sampling_matrix(points)
+        generated = matrix.sample(points)
+        losses = {}
+        if self.training:
+            losses["subset"] = self.alpha * subset_loss(points, generated)
+        return SampleOutput(generated, None, losses, matrix)

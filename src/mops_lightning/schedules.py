@@ -1,0 +1,71 @@
+"""Learning rate schedules as factors over a run's steps, so that a resumed run may be longer."""
+
+import math
+
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from mops_lightning.errors import UserError
+
+
+def one_cycle(
+    optimizer: Optimizer,
+    total_steps: int,
+    warmup: float = 0.3,
+    start_factor: float = 0.04,
+    end_factor: float = 1e-4,
+) -> LambdaLR:
+    """Rise by a half cosine to the optimizer's rate, then fall by one (Smith and Topin, 2018).
+
+    Args:
+        optimizer: its learning rate is the peak.
+        total_steps: optimizer steps in the run.
+        warmup: share of the run that rises.
+        start_factor: first rate over peak.
+        end_factor: last rate over peak.
+    """
+
+    def factor(step: int) -> float:
+        progress = min(step / max(total_steps - 1, 1), 1.0)
+        if progress < warmup:
+            low, part = start_factor, 1 - progress / warmup
+        else:
+            low, part = end_factor, (progress - warmup) / max(1 - warmup, 1e-9)
+        return low + (1 - low) * (1 + math.cos(math.pi * part)) / 2
+
+    return LambdaLR(optimizer, factor)
+
+
+def exponential(optimizer: Optimizer, total_steps: int, end_lr: float) -> LambdaLR:
+    """Fall exponentially from the optimizer's rate to ``end_lr``, as the paper does.
+
+    Args:
+        optimizer: its learning rate is the first one.
+        total_steps: optimizer steps in the run.
+        end_lr: rate of the last step.
+
+    Raises:
+        UserError: ``end_lr`` is not positive.
+    """
+    if end_lr <= 0:
+        raise UserError(f"optimizer.schedule.end_lr must be positive, got {end_lr}.")
+    ratio = end_lr / optimizer.param_groups[0]["lr"]
+    return LambdaLR(optimizer, lambda step: ratio ** min(step / max(total_steps - 1, 1), 1.0))
+
+
+def step_decay(
+    optimizer: Optimizer, total_steps: int, every: int, factor: float, floor_lr: float
+) -> LambdaLR:
+    """Multiply the rate by ``factor`` every ``every`` steps, down to ``floor_lr``.
+
+    This is how PointNet, S-Net and SampleNet were trained: ×0.7 per 200,000 or 600,000 samples.
+
+    Args:
+        optimizer: its learning rate is the first one.
+        total_steps: unused; all schedules share this signature.
+        every: steps between two falls.
+        factor: of one fall.
+        floor_lr: smallest rate.
+    """
+    first = optimizer.param_groups[0]["lr"]
+    return LambdaLR(optimizer, lambda step: max(factor ** (step // every), floor_lr / first))

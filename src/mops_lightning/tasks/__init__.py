@@ -1,0 +1,1 @@
+"""Tasks: a net, its loss and its metrics."""

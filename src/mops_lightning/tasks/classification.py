@@ -1,0 +1,49 @@
+"""Classification of sampled clouds (paper section "Classification-oriented Downsampling")."""
+
+from collections.abc import Callable
+
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torchmetrics import Metric, MetricCollection
+from torchmetrics.classification import MulticlassAccuracy
+
+from mops_lightning.types import Batch, SampleOutput, TaskOutput
+
+
+class Classification(nn.Module):
+    """Names the class of a cloud from its sampled points.
+
+    Args:
+        net: maps ``(B, M, 3)`` points to ``(B, num_classes)`` logits.
+        num_classes: number of classes.
+    """
+
+    score = "accuracy"
+    """The metric shown in tables; a higher one is better."""
+
+    def __init__(self, net: nn.Module, num_classes: int) -> None:
+        super().__init__()
+        self.net = net
+        self.num_classes = num_classes
+
+    def step(self, batch: Batch, sample: Callable[[Tensor], SampleOutput]) -> TaskOutput:
+        """Classify one batch.
+
+        Args:
+            batch: points ``(B, N, 3)`` and labels ``(B,)``.
+            sample: turns points into what the net is to see.
+
+        Returns:
+            The cross entropy, logits ``(B, num_classes)`` and labels.
+        """
+        logits = self.net(sample(batch.points).points)
+        loss = F.cross_entropy(logits, batch.labels)
+        return TaskOutput({"cross_entropy": loss}, logits, batch.labels)
+
+    def metrics(self) -> MetricCollection:
+        """Overall accuracy and the mean of the classes' accuracies, both in [0, 1]."""
+        metrics: dict[str, Metric | MetricCollection] = {
+            "accuracy": MulticlassAccuracy(self.num_classes, average="micro"),
+            "mean_class_accuracy": MulticlassAccuracy(self.num_classes, average="macro"),
+        }
+        return MetricCollection(metrics, compute_groups=False)

@@ -1,0 +1,54 @@
+"""What flows between data, sampler, task and metrics, and the letters of its shapes.
+
+``B`` clouds in a batch, ``N`` input points, ``M`` sampled points, ``C`` channels, ``S`` shapes in
+a split. Points are float32 ``(B, N, 3)``, coordinates without unit in the unit sphere.
+"""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from mops_lightning.sampling_matrix import SamplingMatrix
+
+
+class Batch(NamedTuple):
+    """One batch of clouds.
+
+    Attributes:
+        points: ``(B, N, 3)``.
+        labels: ``(B,)`` int64 class numbers.
+    """
+
+    points: Tensor
+    labels: Tensor
+
+
+class SampleOutput(NamedTuple):
+    """What every sampler returns; a NamedTuple, so it survives device transfer and collation.
+
+    Attributes:
+        points: ``(B, M, 3)`` the sampled points.
+        indices: ``(B, M)`` int64 rows of the input, or None when the points are generated.
+        losses: the sampler's own loss terms, already weighted, to be added to the task loss.
+        matrix: the sampling matrix S behind the points, or None.
+    """
+
+    points: Tensor
+    indices: Tensor | None
+    losses: dict[str, Tensor]
+    matrix: "SamplingMatrix | None" = None
+
+
+class TaskOutput(NamedTuple):
+    """What a task's step returns.
+
+    Attributes:
+        losses: the task's loss terms, already weighted.
+        predictions: what the task's metrics compare,
+        targets: and what they compare it with.
+    """
+
+    losses: dict[str, Tensor]
+    predictions: Any
+    targets: Any
