@@ -7,7 +7,12 @@ from types import FrameType
 from typing import Any
 
 import lightning as L
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint, RichProgressBar
+from lightning.pytorch.callbacks import (
+    Callback,
+    LearningRateMonitor,
+    ModelCheckpoint,
+    RichProgressBar,
+)
 
 CHECKPOINT = "last.ckpt"
 
@@ -72,21 +77,24 @@ class EpochLines(Callback):
         numbers = {
             name: float(value)
             for name, value in trainer.callback_metrics.items()
-            if name == "train/loss/total" or (name.startswith("val/") and "accuracy" in name)
+            if name == "train/mean_loss" or (name.startswith("val/") and "accuracy" in name)
         }
         shown = "  ".join(f"{name} {value:.4f}" for name, value in numbers.items())
         print(f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}  {shown}", flush=True)
 
 
-def standard(folder: Path) -> list[Callback]:
+def standard(folder: Path, logged: bool) -> list[Callback]:
     """Return the callbacks of every run.
 
     Args:
         folder: the run's folder; checkpoints go to ``checkpoints/last.ckpt`` below it.
+        logged: whether there is a logger for the learning rate.
     """
     checkpoints = folder / "checkpoints"
     progress: Callback = RichProgressBar(leave=False) if sys.stdout.isatty() else EpochLines()
+    rate = [LearningRateMonitor("step")] if logged else []
     return [
+        *rate,
         ModelCheckpoint(
             dirpath=checkpoints,
             filename=Path(CHECKPOINT).stem,

@@ -90,10 +90,10 @@ def _known_keys() -> list[str]:
 
     def walk(node: DictConfig, prefix: str) -> None:
         for key in node:
-            keys.append(f"{prefix}{key}")
+            keys.append(prefix + str(key))
             value = node._get_node(key)
             if isinstance(value, DictConfig) and value._is_none() is False:
-                walk(value, f"{prefix}{key}.")
+                walk(value, f"{prefix}{key!s}.")
 
     walk(compose(), "")
     return sorted({key for key in keys if not key.split(".")[-1].startswith("_")})

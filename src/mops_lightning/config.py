@@ -148,7 +148,7 @@ def _check_node(node: Any, where: str) -> None:
                 raise UserError(f"{where}.{name} must be set: try {where}.{name}=VALUE.")
     for key in node:
         if not OmegaConf.is_missing(node, key):
-            _check_node(node[key], f"{where}.{key}")
+            _check_node(node[key], f"{where}.{key!s}")
 
 
 def _signature(target: str, where: str) -> dict[str, inspect.Parameter]:
@@ -157,5 +157,7 @@ def _signature(target: str, where: str) -> dict[str, inspect.Parameter]:
     try:
         found = get_object(target)
     except Exception as error:
-        raise UserError(f"{where}._target_: cannot import {target!r}: {str(error).splitlines()[0]}") from None
+        raise UserError(
+            f"{where}._target_: cannot import {target!r}: {str(error).splitlines()[0]}"
+        ) from None
     return dict(inspect.signature(found).parameters)

@@ -84,7 +84,8 @@ class Experiment(L.LightningModule):
             module.requires_grad_(False)
         self.own_readouts = readout_names(self.sampler)
         self.all_readouts = tuple(dict.fromkeys([*self.own_readouts, *self.baselines, FULL]))
-        self.scores = nn.ModuleDict({name: self.task.metrics() for name in self.all_readouts})
+        metrics: Any = task.metrics
+        self.scores = nn.ModuleDict({name: metrics() for name in self.all_readouts})
         self.set_metrics = nn.ModuleDict(
             {name: MeanMetric(nan_strategy="disable") for name in SET_METRICS}
         )
@@ -125,7 +126,7 @@ class Experiment(L.LightningModule):
 
     def on_train_epoch_start(self) -> None:
         """Tell the loader which epoch it is; the run may have been resumed."""
-        loader = self.trainer.train_dataloader
+        loader: Any = self.trainer.train_dataloader
         if hasattr(loader, "set_epoch"):
             loader.set_epoch(self.current_epoch)
 
@@ -153,8 +154,11 @@ class Experiment(L.LightningModule):
         for name, value in {**losses, "total": total}.items():
             self.log(f"train/loss/{name}", value.detach(), batch_size=size)
         self.log("loss", total.detach(), prog_bar=True, logger=False, batch_size=size)
-        if hasattr(self.sampler, "tau"):
-            self.log("train/tau", self.sampler.tau, batch_size=size)
+        mean = {"on_step": False, "on_epoch": True, "batch_size": size}
+        self.log("train/mean_loss", total.detach(), **mean)
+        tau: Any = getattr(self.sampler, "tau", None)
+        if tau is not None:
+            self.log("train/tau", tau, batch_size=size)
         return total
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:

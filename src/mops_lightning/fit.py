@@ -1,20 +1,33 @@
 """Build what a configuration describes, fit it and test it."""
 
 import logging
+import sys
 import warnings
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
-from omegaconf import DictConfig
+from lightning.pytorch.loggers import TensorBoardLogger
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 
 from mops_lightning import callbacks
 from mops_lightning.config import build
 from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
+from mops_lightning.draw import DrawClouds
 from mops_lightning.experiment import Experiment
 from mops_lightning.seeding import derive_seed, generator
+
+HARMLESS = (
+    ".*does not have many workers.*",  # the data lie in memory; workers would only copy them
+    ".*no `val_dataloader`.*",  # val_fraction=0 is a choice
+    ".*smaller than the logging interval.*",  # small data sets log once per epoch
+    ".*isinstance.treespec, LeafSpec.*",  # Lightning 2.6 calls an old name of torch 2.13
+    ".*GPU available but not used.*",  # trainer=cpu is a choice
+)
+"""Warnings about what is meant to be so."""
 
 
 def fit(
@@ -43,12 +56,12 @@ def test(
 ) -> dict[str, float]:
     """Score all test clouds and return the metrics as one flat map."""
     trainer.test(experiment, CloudLoader(dataset.test, cfg.batch_size), verbose=False)
-    return {name: float(value) for name, value in trainer.callback_metrics.items()}
+    metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
+    log_hparams(trainer, cfg, {k: v for k, v in metrics.items() if k.startswith("test/")})
+    return metrics
 
 
-def make_experiment(
-    cfg: DictConfig, dataset: CloudDataset, identity: dict[str, str]
-) -> Experiment:
+def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, str]) -> Experiment:
     """Build task, sampler and baselines, each from a seed of its own."""
     classes = len(dataset.class_names)
     L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
@@ -72,23 +85,61 @@ def make_experiment(
     )
 
 
-def make_trainer(cfg: DictConfig, folder: Path) -> L.Trainer:
+def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> L.Trainer:
     """Build the trainer with this run's callbacks and logger."""
     for name in ("lightning.pytorch", "lightning.fabric", "lightning"):
         # Under Hydra each line would come twice, once from Lightning's own handler.
         logging.getLogger(name).handlers.clear()
         logging.getLogger(name).setLevel(logging.WARNING)
-    # Our loader has no workers on purpose: the data lie in memory.
-    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    for message in HARMLESS:
+        warnings.filterwarnings("ignore", message=message)
     logger = build(cfg.logger, save_dir=str(folder)) if cfg.get("logger") else False
+    shown = choose_shown(dataset, cfg.pictures)
     return build(
         cfg.trainer,
         logger=logger,
-        callbacks=callbacks.standard(folder),
+        callbacks=[
+            *callbacks.standard(folder, logged=bool(logger)),
+            *([DrawClouds(*shown, folder / "pictures")] if shown else []),
+        ],
         default_root_dir=str(folder),
         num_sanity_val_steps=0,
         enable_model_summary=False,
+        enable_progress_bar=sys.stdout.isatty(),
     )
+
+
+def choose_shown(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str]] | None:
+    """Return test clouds of different classes, spread over all classes, and their names."""
+    labels = dataset.test.labels
+    wanted = torch.linspace(0, len(dataset.class_names) - 1, max(number, 1)).round().long()
+    rows = [int((labels == label).nonzero()[0]) for label in wanted.unique() if label in labels]
+    rows = rows[:number]
+    if not rows:
+        return None
+    return dataset.test.points[rows], [dataset.class_names[int(labels[row])] for row in rows]
+
+
+def log_hparams(trainer: L.Trainer, cfg: DictConfig, metrics: dict[str, float]) -> None:
+    """Give the logger the settings that tell runs apart, with the test metrics beside them."""
+    plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    keys = ("names", "sampler", "optimizer", "augment", "m", "learn", "seed", "batch_size")
+    flat = _flatten({key: plain[key] for key in keys})
+    flat["max_epochs"] = plain["trainer"]["max_epochs"]
+    if isinstance(trainer.logger, TensorBoardLogger):
+        trainer.logger.log_hyperparams(flat, {f"hparams/{k}": v for k, v in metrics.items()})
+    elif trainer.logger is not None:
+        trainer.logger.log_hyperparams(flat)
+
+
+def _flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat.update(_flatten(value, f"{prefix}{key}."))
+        elif not key.startswith("_"):
+            flat[f"{prefix}{key}"] = value
+    return flat
 
 
 def device_name(trainer: L.Trainer) -> str:

@@ -15,7 +15,15 @@ from mops_lightning.io import atomic_write
 
 SCHEMA = "mops_lightning/result/1"
 FILE = "result.json"
-PACKAGES = ("mops-lightning", "torch", "lightning", "hydra-core", "torchmetrics", "trimesh", "numpy")
+PACKAGES = (
+    "mops-lightning",
+    "torch",
+    "lightning",
+    "hydra-core",
+    "torchmetrics",
+    "trimesh",
+    "numpy",
+)
 
 
 @cache
@@ -116,5 +124,3 @@ def _finite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-

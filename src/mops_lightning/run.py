@@ -68,7 +68,7 @@ def fit_and_test(
     if task_weights is not None:
         content = weights.load_into(experiment.task, task_weights)
         record["notes"]["task_weights_sha256"] = content["sha256"]
-    trainer = make_trainer(cfg, folder)
+    trainer = make_trainer(cfg, folder, dataset)
     record["device"] = device_name(trainer)
     if experiment.trainable:
         with timed(record, "fit"):
@@ -76,6 +76,10 @@ def fit_and_test(
         record["files"]["checkpoint"] = "checkpoints/last.ckpt"
     with timed(record, "test"):
         record["metrics"] = test(cfg, trainer, experiment, dataset)
+    if (folder / "pictures").is_dir():
+        record["files"]["pictures"] = "pictures"
+    if (folder / "tensorboard").is_dir():
+        record["files"]["tensorboard"] = "tensorboard"
     readout = experiment.own_readouts[0]
     record["score"] = record["metrics"][f"test/{readout}/{experiment.task.score}"]
     learned = {"task": {WEIGHTS: experiment.task}, "sampler": {WEIGHTS: experiment.sampler}}

@@ -71,9 +71,7 @@ class SamplingMatrix(NamedTuple):
                 high, at = block.max(1)
                 better = high > peak[cloud, columns]
                 peak[cloud, columns] = torch.where(better, high, peak[cloud, columns])
-                place[cloud, columns] = torch.where(
-                    better, at + rows.start, place[cloud, columns]
-                )
+                place[cloud, columns] = torch.where(better, at + rows.start, place[cloud, columns])
                 column, row = (block >= threshold).nonzero(as_tuple=True)
                 values.append(block[column, row])
                 batch_index = torch.full_like(row, cloud)
@@ -188,7 +186,9 @@ class _StreamedAttention(torch.autograd.Function):
         for cloud in range(len(keys)):
             for columns in _slices(len(queries), BLOCK_QUERIES):
                 for rows in _slices(keys.shape[1], BLOCK_POINTS):
-                    share = _shares(queries[columns] @ keys[cloud, rows].mT, log_sum[cloud, columns])
+                    share = _shares(
+                        queries[columns] @ keys[cloud, rows].mT, log_sum[cloud, columns]
+                    )
                     change = grad[cloud, columns] @ values[cloud, rows].mT
                     change.sub_(inner[cloud, columns, None]).mul_(share)
                     grad_queries[columns] += change @ keys[cloud, rows]

@@ -24,13 +24,15 @@ def one_cycle(
         start_factor: first rate over peak.
         end_factor: last rate over peak.
     """
+    last = max(total_steps - 1, 1)
+    peak = warmup * total_steps - 1
 
     def factor(step: int) -> float:
-        progress = min(step / max(total_steps - 1, 1), 1.0)
-        if progress < warmup:
-            low, part = start_factor, 1 - progress / warmup
+        step = min(step, last)
+        if step < peak:
+            low, part = start_factor, 1 - step / peak
         else:
-            low, part = end_factor, (progress - warmup) / max(1 - warmup, 1e-9)
+            low, part = end_factor, (step - peak) / max(last - peak, 1)
         return low + (1 - low) * (1 + math.cos(math.pi * part)) / 2
 
     return LambdaLR(optimizer, factor)

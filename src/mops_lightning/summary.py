@@ -53,10 +53,10 @@ def closing_lines(folder: Path, record: dict[str, Any], console: Console | None 
         cells = ["" if row.get(c) is None else _number(c, row[c]) for c in columns]
         table.add_row(label if readout != "full" else f"{names['net']} on full clouds", *cells)
     console.print(table)
-    files = "  ".join(f"{kind} {folder / path}" for kind, path in sorted(record["files"].items()))
+    files = ", ".join([FILE, *sorted(record["files"].values())])
     seconds = record["seconds"]["total"]
     console.print(
-        f"{record['status']} in {seconds:.0f} s: result {folder / FILE}  {files}",
+        f"{record['status']} in {seconds:.0f} s; in {folder}/ lie {files}",
         soft_wrap=True,
         highlight=False,
     )

@@ -51,6 +51,8 @@ def choose_classes(setting: Sequence[str] | None, known: Sequence[str]) -> tuple
     Raises:
         UserError: a class is unknown; the nearest known ones are named.
     """
+    if isinstance(setting, str):
+        raise UserError(f"dataset.classes must be a list, such as [{setting}], got {setting!r}.")
     if not setting:
         return tuple(known)
     for name in setting:

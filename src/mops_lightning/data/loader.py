@@ -49,8 +49,10 @@ class Augmentation:
 
 
 class CloudLoader:
-    """An iterable of ``Batch`` over one split; what batch i of an epoch holds depends on the
-    seed, the epoch and i only, so a resumed run sees what an unbroken one would have seen.
+    """An iterable of ``Batch`` over one split.
+
+    What batch i of an epoch holds depends on the seed, the epoch and i only, so a resumed run sees
+    what an unbroken one would have seen.
 
     Args:
         clouds: the split, in memory.

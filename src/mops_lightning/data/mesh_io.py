@@ -1,4 +1,4 @@
-"""One mesh file to one cloud; light enough to be imported by worker processes."""
+"""One mesh file to one cloud; without torch, so that worker processes start quickly."""
 
 import hashlib
 import re
@@ -23,6 +23,17 @@ FLAT = 1e-12
 
 class BrokenMeshError(UserError):
     """A mesh file without a readable surface; the one error that ``skip_broken`` skips."""
+
+
+Result = tuple[str, NDArray[np.float32]] | BrokenMeshError
+
+
+def cloud_or_error(path: Path, n_points: int, seed: int, cache: Path | None) -> Result:
+    """Do as ``cloud_from_file``, but return a broken mesh's error, so that others can go on."""
+    try:
+        return cloud_from_file(path, n_points, seed, cache)
+    except BrokenMeshError as error:
+        return error
 
 
 def cloud_from_file(

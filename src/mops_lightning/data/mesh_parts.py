@@ -31,7 +31,10 @@ def box(x: Span, y: Span, z: Span) -> Trimesh:
 
 
 def cushion(x: Span, y: Span, z: Span, radius: float) -> Trimesh:
-    """Return the box over three spans with edges rounded to ``radius``, at most half its size."""
+    """Return the box over three spans with slightly domed sides and rounded edges.
+
+    ``radius`` is that of the edges; half a side is the most that has an effect.
+    """
     ball, faces = _ball()
     low, high = np.array((x, y, z)).T
     half = (high - low) / 2
@@ -44,7 +47,7 @@ def cushion(x: Span, y: Span, z: Span, radius: float) -> Trimesh:
 def _ball() -> tuple[Array, NDArray[np.int64]]:
     """Return vertices and faces of a unit sphere none of whose faces crosses a coordinate plane.
 
-    So moving its octants apart leaves flat panels between them.
+    So its octants can be moved apart; the vertices on the planes stay in the middle of a side.
     """
     angles = np.linspace(-np.pi / 2, np.pi / 2, 9)
     ball = trimesh.creation.revolve(

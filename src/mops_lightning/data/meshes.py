@@ -4,6 +4,7 @@ import csv
 import hashlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path, PurePosixPath
@@ -15,7 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
-from mops_lightning.data.mesh_io import SUFFIXES, VERSION, BrokenMeshError, cloud_from_file
+from mops_lightning.data.mesh_io import SUFFIXES, VERSION, BrokenMeshError, Result, cloud_or_error
 from mops_lightning.errors import UserError
 
 SPLITS = ("train", "test")
@@ -78,7 +79,7 @@ def meshes(
     labels: dict[str, list[int]] = {split: [] for split in SPLITS}
     skipped = 0
     kept = Path(cache).expanduser() if cache else None
-    sample = partial(_sample, n_points=n_points, seed=seed, cache=kept)
+    sample = partial(cloud_or_error, n_points=n_points, seed=seed, cache=kept)
     results = _each(sample, [root / name for name, _ in rows], workers)
     for (name, split), result in zip(rows, results, strict=True):
         if isinstance(result, BrokenMeshError):
@@ -154,18 +155,7 @@ def _listed(root: Path, split_file: Path) -> list[tuple[PurePosixPath, str]]:
     return list(rows.items())
 
 
-_Result = tuple[str, NDArray[np.float32]] | BrokenMeshError
-
-
-def _sample(path: Path, n_points: int, seed: int, cache: Path | None) -> _Result:
-    """Return the error instead of raising it, so that it crosses processes and can be skipped."""
-    try:
-        return cloud_from_file(path, n_points, seed, cache)
-    except BrokenMeshError as error:
-        return error
-
-
-def _each(sample: partial[_Result], paths: list[Path], workers: int) -> Iterator[_Result]:
+def _each(sample: partial[Result], paths: list[Path], workers: int) -> Iterator[Result]:
     console = Console(stderr=True)
     bar = partial(
         track,
@@ -177,6 +167,14 @@ def _each(sample: partial[_Result], paths: list[Path], workers: int) -> Iterator
     if workers == 1:
         yield from bar(map(sample, paths))
         return
-    # Forking a process in which torch has started threads can hang; a spawned one cannot.
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield from bar(pool.map(sample, paths, chunksize=4))
+    # Forking a process in which torch has started threads can hang. A spawned one cannot; it
+    # imports the module of its function, which therefore does without torch.
+    try:
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            yield from bar(pool.map(sample, paths, chunksize=4))
+    except BrokenProcessPool as error:
+        raise UserError(
+            "dataset.workers: a process that read meshes died, perhaps for want of memory, or "
+            "because the script that started it has no 'if __name__ == \"__main__\":'. "
+            "Try dataset.workers=1."
+        ) from error

@@ -12,7 +12,7 @@ from mops_lightning.data.shape_seats import rungs, stand
 
 def table(rng: Generator) -> Trimesh:
     """Return a table: round, oval or rectangular top on legs, a pillar or two trestles."""
-    width, height = rng.uniform(0.65, 1.9), rng.uniform(0.5, 1.1)
+    width, height = rng.uniform(0.6, 1.9), rng.uniform(0.5, 1.1)
     depth = width * rng.uniform(0.5, 1.0)
     thick, y = rng.uniform(0.03, 0.1), height
     under = y - thick
@@ -52,19 +52,26 @@ def _apron(width: float, depth: float, y: Span) -> list[Trimesh]:
 
 
 def desk(rng: Generator) -> Trimesh:
-    """Return a desk: a drawer block under one or both ends, a back panel, maybe a hutch."""
+    """Return a desk: drawer blocks or flat drawers, maybe a back panel, maybe a hutch."""
     width, height = rng.uniform(1.2, 1.9), rng.uniform(0.7, 0.95)
     depth = rng.uniform(0.6, 0.9)
     under = height - rng.uniform(0.03, 0.06)
     parts = [box(around(width), (under, height), around(depth))]
     block = width * rng.uniform(0.22, 0.32)
-    with_drawers = (-1, 1) if rng.random() < 0.4 else (rng.choice((-1, 1)),)
+    kind = rng.random()
+    with_drawers = (-1, 1) if kind < 0.35 else (rng.choice((-1, 1)),) if kind < 0.75 else ()
+    if not with_drawers:  # flat drawers under the whole top
+        low = under - rng.uniform(0.1, 0.16)
+        for x in (-width / 4, width / 4):
+            front = around(width * 0.46, x)
+            parts += _drawers(front, (low, under), around(depth * 0.85), 1)
     for side in (-1, 1):
         outer = side * (width / 2 - 0.03)
         inner = outer - side * block
         if side in with_drawers:
             floor, feet = under * rng.choice((0.08, 0.45)), [outer, inner]
-            parts += _drawers(rng, (min(feet), max(feet)), (floor, under), around(depth * 0.9))
+            rows = int(rng.integers(2, 4))
+            parts += _drawers((min(feet), max(feet)), (floor, under), around(depth * 0.9), rows)
         elif rng.random() < 0.5:
             parts.append(box(around(0.04, outer), (0, under), around(depth * 0.9)))
             continue
@@ -80,9 +87,9 @@ def desk(rng: Generator) -> Trimesh:
     return join(parts)
 
 
-def _drawers(rng: Generator, x: Span, y: Span, z: Span) -> list[Trimesh]:
+def _drawers(x: Span, y: Span, z: Span, rows: int) -> list[Trimesh]:
     parts = [box(x, y, z)]
-    levels = np.linspace(y[0], y[1], rng.integers(3, 5))
+    levels = np.linspace(y[0], y[1], rows + 1)
     middle = (x[0] + x[1]) / 2
     for low, high in pairwise(levels):
         parts.append(box((x[0] + 0.02, x[1] - 0.02), (low + 0.02, high - 0.02), around(0.04, z[1])))
@@ -100,7 +107,7 @@ def _hutch(rng: Generator, width: float, y: Span, back: float) -> list[Trimesh]:
 
 def shelf(rng: Generator) -> Trimesh:
     """Return a shelf: two sides, boards, maybe a back, dividers and books."""
-    width, height = rng.uniform(0.6, 1.6), rng.uniform(0.9, 1.9)
+    width, height = rng.uniform(0.6, 1.6), rng.uniform(0.65, 1.9)
     depth, board = rng.uniform(0.25, 0.5), rng.uniform(0.03, 0.05)
     foot = rng.uniform(0.0, 0.12)
     floors = np.linspace(foot, height - board, rng.integers(3, 7))

@@ -51,7 +51,7 @@ def rungs(ends: Array, level: float, radius: float, sides: tuple[int, ...]) -> l
 def chair(rng: Generator) -> Trimesh:
     """Return a chair: seat, back of one of four kinds, legs or a swivel foot, maybe arms."""
     width, depth = rng.uniform(0.75, 1.05), rng.uniform(0.75, 1.0)
-    seat, rise = rng.uniform(0.65, 1.15), rng.uniform(0.45, 1.25)
+    seat, rise = rng.uniform(0.65, 1.15), rng.uniform(0.3, 1.25)
     thick = rng.uniform(0.06, 0.16)
     parts = [_pad(rng, width, depth, (seat - thick, seat))]
     if rng.random() < 0.25:
@@ -65,7 +65,7 @@ def chair(rng: Generator) -> Trimesh:
             parts += rungs(ends, rng.uniform(0.25, 0.5), 0.025, (0, 1, 2, 3))
     parts.append(_chair_back(rng, width, -depth / 2, (seat, seat + rise)))
     if rng.random() < 0.3:
-        y, reach = seat + rng.uniform(0.25, 0.38), depth * rng.uniform(0.25, 0.45)
+        y, reach = seat + rise * rng.uniform(0.3, 0.6), depth * rng.uniform(0.25, 0.45)
         for side in (-1, 1):
             x = side * (width / 2 - 0.03)
             parts.append(box(around(0.09, x), around(0.05, y), (-depth / 2, reach)))
@@ -160,7 +160,7 @@ def sofa(rng: Generator) -> Trimesh:
     arm = rng.uniform(0.1, 0.28)
     width = seats * rng.uniform(0.6, 0.8)
     depth = rng.uniform(0.8, 1.0)
-    foot, seat = rng.uniform(0.05, 0.16), rng.uniform(0.38, 0.5)
+    foot, seat = rng.uniform(0.05, 0.18), rng.uniform(0.4, 0.52)
     back, rest = seat + rng.uniform(0.32, 0.6), seat + rng.uniform(0.1, 0.28)
     thick = rng.uniform(0.18, 0.28)
     whole = width + 2 * arm

@@ -13,10 +13,10 @@ from mops_lightning.data.mesh_parts import Array, bow, disc, join, rod, smooth, 
 def bottle(rng: Generator) -> Trimesh:
     """Return a bottle: straight, waisted or round body, narrow neck, mostly with a cap."""
     radius, height = rng.uniform(0.22, 0.42), 1.0
-    neck = radius * rng.uniform(0.28, 0.48)
+    neck = radius * rng.uniform(0.28, 0.6)
     shoulder = rng.uniform(0.48, 0.68)
     start = shoulder + rng.uniform(0.1, 0.2)
-    kind = rng.integers(3)
+    kind = rng.choice(3, p=(0.5, 0.25, 0.25))
     waist = (1.0, rng.uniform(0.72, 0.88), rng.uniform(1.1, 1.25))[kind]
     body = [
         (radius * 0.9, 0.0),
@@ -40,10 +40,10 @@ def vase(rng: Generator) -> Trimesh:
     """Return a vase: foot, belly, neck and lip, sometimes with two handles; or a mere beaker."""
     belly, height = rng.uniform(0.24, 0.45), 1.0
     foot = belly * rng.uniform(0.4, 0.7)
-    neck = belly * rng.uniform(0.35, 0.85)
-    lip = min(neck * rng.uniform(1.15, 1.9), belly * 1.15)
+    neck = belly * rng.uniform(0.28, 0.85)
+    lip = min(neck * rng.uniform(1.05, 1.9), belly * 1.15)
     low, high = rng.uniform(0.3, 0.55), rng.uniform(0.72, 0.85)
-    if rng.random() < 0.2:  # a beaker: no belly, wider upwards
+    if rng.random() < 0.25:  # a beaker: no belly, wider upwards
         wall = smooth([(foot, 0), (foot * rng.uniform(0.9, 1.3), low), (belly, height)], 24)
         return turned([(0.0, 0.0), *wall])
     wall = smooth([(foot, 0), (foot * 0.85, 0.06), (belly, low), (neck, high), (lip, height)], 32)
@@ -59,7 +59,7 @@ def bowl(rng: Generator) -> Trimesh:
     """Return a bowl: open, wide, on a foot ring; a deep one is near a cup without its handle."""
     radius, depth = 0.5, rng.uniform(0.28, 0.75)
     foot = radius * rng.uniform(0.3, 0.55)
-    ring = rng.uniform(0.02, 0.09)
+    ring = rng.uniform(0.02, 0.14)
     bulge = rng.uniform(1.5, 3.2)
     up = np.linspace(0, 1, 16)
     wall = foot + (radius - foot) * (1 - (1 - up) ** bulge) ** (1 / 1.3)
@@ -116,7 +116,7 @@ def bucket(rng: Generator) -> Trimesh:
 def goblet(rng: Generator) -> Trimesh:
     """Return a stemmed glass: round, tall, conical or tulip bowl over a thin stem and a foot."""
     foot, stem = rng.uniform(0.2, 0.3), rng.uniform(0.025, 0.045)
-    rise = rng.uniform(0.25, 0.55)
+    rise = rng.uniform(0.15, 0.55)
     deep = 1.0 - rise
     wide = rng.uniform(0.18, 0.42)
     start = [(foot, 0.0), (foot * 0.5, 0.03), (stem, 0.08), (stem, rise * 0.95)]

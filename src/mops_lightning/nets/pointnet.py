@@ -5,6 +5,7 @@ Layers work on ``(B·N, C)`` rows: BatchNorm over rows is 1.6 times faster on a 
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +23,7 @@ def linear_norm_relu(channels: Sequence[int]) -> nn.Sequential:
         no bias: BatchNorm would cancel it.
     """
     layers: list[nn.Module] = []
-    for before, after in zip(channels[:-1], channels[1:], strict=True):
+    for before, after in pairwise(channels):
         layers += [
             nn.Linear(before, after, bias=False),
             nn.BatchNorm1d(after),

@@ -1,0 +1,100 @@
+"""The callback that draws the same few test clouds while a sampler learns, and when it is done."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import lightning as L
+import numpy as np
+import torch
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch import Tensor
+
+from mops_lightning.pictures import (
+    COLOURS,
+    INPUT_COLOUR,
+    cloud_grid,
+    matrix_figure,
+    save_figure,
+)
+from mops_lightning.scoring import BatchReadouts, readout_names
+
+DENSE_PIXELS = 2**20
+"""Largest S that is drawn: 1,024 points by 1,024 columns."""
+
+
+class DrawClouds(Callback):
+    """Draws a fixed set of clouds with every readout, and S with SᵀS.
+
+    TensorBoard gets them about ten times in a run and after the test; the run's folder gets PNGs
+    after the test.
+
+    Args:
+        points: ``(K, N, 3)`` clouds to draw.
+        titles: one per cloud.
+        folder: where the PNGs go.
+    """
+
+    def __init__(self, points: Tensor, titles: Sequence[str], folder: Path) -> None:
+        self.points = points
+        self.titles = list(titles)
+        self.folder = folder
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Draw into TensorBoard every tenth of the run."""
+        every = max((trainer.max_epochs or 1) // 10, 1)
+        if trainer.current_epoch % every == 0:
+            self._draw(trainer, pl_module, None)
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Draw into TensorBoard and as PNG."""
+        self._draw(trainer, pl_module, self.folder)
+
+    @torch.no_grad()
+    def _draw(self, trainer: L.Trainer, module: L.LightningModule, folder: Path | None) -> None:
+        sampler = module.sampler
+        board = trainer.logger if isinstance(trainer.logger, TensorBoardLogger) else None
+        if sampler is None or (board is None and folder is None):
+            return
+        training = module.training
+        module.eval()
+        points = self.points.to(module.device)
+        readouts = BatchReadouts(sampler, {})  # type: ignore[arg-type]
+        sampled = {
+            name: readouts.sample_as(name)(points).points
+            for name in readout_names(sampler)  # type: ignore[arg-type]
+        }
+        matrix = readouts.outputs[id(points)][1].matrix
+        module.train(training)
+        figures = {"clouds": cloud_grid(points, sampled, self.titles)}
+        if matrix is not None and points.shape[1] * len(matrix.queries) <= DENSE_PIXELS:
+            first = matrix._replace(keys=matrix.keys[:1])
+            figures["matrix"] = matrix_figure(first.dense()[0], first.gram()[0], self.titles[0])
+        step = trainer.global_step
+        for name, figure in figures.items():
+            if folder is not None:
+                save_figure(figure, folder / f"{name}.png")
+            if board is not None:
+                board.experiment.add_figure(name, figure, step)
+        if board is not None:
+            for name, samples in sampled.items():
+                for number, title in enumerate(self.titles):
+                    vertices, colours = _coloured(points[number], samples[number], name)
+                    board.experiment.add_mesh(
+                        f"{name}/{number}_{title}",
+                        vertices=vertices,
+                        colors=colours,
+                        config_dict={"material": {"cls": "PointsMaterial", "size": 0.03}},
+                        global_step=step,
+                    )
+
+
+def _coloured(points: Tensor, samples: Tensor, readout: str) -> tuple[Tensor, Tensor]:
+    """Join one cloud and its samples, ``(1, N + M, 3)``, with a colour for each point."""
+    colours = np.concatenate(
+        [
+            np.tile(np.array(INPUT_COLOUR, np.uint8), (len(points), 1)),
+            np.tile(np.array(COLOURS[readout], np.uint8), (len(samples), 1)),
+        ]
+    )
+    return torch.cat([points, samples]).cpu()[None], torch.from_numpy(colours)[None]

@@ -1,0 +1,35 @@
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from mops_lightning.data.clouds import CloudDataset, Clouds
+
+torch.set_num_threads(2)
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real data that the user names; tests on it are skipped without one."""
+    folder = os.environ.get("MOPS_DATA")
+    if not folder:
+        pytest.skip("MOPS_DATA is not set: no real data to test on")
+    return Path(folder)
+
+
+@pytest.fixture
+def rng() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def small_dataset(train: int = 24, test: int = 10, points: int = 48) -> CloudDataset:
+    """Three kinds of Gaussian blobs: enough to run every code path, too easy to measure with."""
+    rng = torch.Generator().manual_seed(3)
+
+    def clouds(number: int) -> Clouds:
+        labels = torch.arange(number) % 3
+        scale = torch.tensor([[1.0, 0.1, 0.1], [0.1, 1.0, 0.1], [0.3, 0.3, 0.3]])[labels]
+        return Clouds(torch.randn(number, points, 3, generator=rng) * scale[:, None], labels)
+
+    return CloudDataset(("long", "tall", "round"), clouds(train), clouds(test), "blobs")

@@ -1,0 +1,151 @@
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from mops_lightning.data.mesh_io import BrokenMeshError, cloud_from_file, parse_mesh
+
+BOX = trimesh.creation.box((1.0, 2.0, 3.0))
+BALL = trimesh.creation.icosphere(subdivisions=1)
+SQUARE = "OFF\n4 2 0\n0 0 5\n3 0 5\n3 3 5\n0 3 5\n3 0 1 2\n3 0 2 3\n"
+
+
+def write(path: Path, mesh: Any, **options: Any) -> Path:
+    mesh.export(path, **options)
+    return path
+
+
+def test_points_are_uniform_by_area(tmp_path: Path) -> None:
+    # A big and a small triangle in the plane z = 5: 90 % and 10 % of the area.
+    text = "OFF\n6 2 0\n0 0 5\n3 0 5\n0 3 5\n9 0 5\n10 0 5\n9 1 5\n3 0 1 2\n3 3 4 5\n"
+    (tmp_path / "two.off").write_text(text)
+    _, points = cloud_from_file(tmp_path / "two.off", 10_000, seed=0)
+    assert np.ptp(points[:, 2]) == 0
+    small = points[:, 0] > points[:, 0].min() + 0.6 * np.ptp(points[:, 0])
+    assert abs(small.mean() - 0.1) < 0.012  # four standard deviations
+    assert len(np.unique(points, axis=0)) == 10_000
+
+
+@pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl", "glb", "ascii.ply", "ascii.stl"])
+def test_every_format_holds_the_same_surface(tmp_path: Path, suffix: str) -> None:
+    options: dict[str, Any] = {}
+    if suffix == "ascii.ply":
+        options = {"encoding": "ascii"}
+    elif suffix == "ascii.stl":
+        options = {"file_type": "stl_ascii"}
+    path = write(tmp_path / f"mesh.{suffix}", BOX, **options)
+    mesh = parse_mesh(path.read_bytes(), path)
+    np.testing.assert_allclose(mesh.bounds, BOX.bounds)
+    np.testing.assert_allclose(mesh.area, BOX.area)
+
+
+@pytest.mark.parametrize(
+    "head", ["OFF490 518 0", "OFF 490 518 0", "OFF\r\n490 518 0", "OFF\n# a\n490 518 0"]
+)
+def test_the_counts_may_follow_off_in_any_way(head: str) -> None:
+    ball = trimesh.creation.uv_sphere(count=[16, 32])
+    lines = trimesh.exchange.off.export_off(ball).splitlines()[2:]
+    text = "\n".join(
+        [head.replace("490", str(len(ball.vertices))).replace("518", str(len(ball.faces))), *lines]
+    )
+    mesh = parse_mesh(text.encode(), Path("m.off"))
+    np.testing.assert_allclose(mesh.vertices, ball.vertices, atol=1e-9)
+    np.testing.assert_array_equal(mesh.faces, ball.faces)
+
+
+@pytest.mark.parametrize(
+    "face",
+    ["4 0 1 2 3", "4 0 1 2 3 255 0 0", "3 0 1 2\n3 0 2 3", "3 0 1 2 0.5 0.5 0.5\n3 0 2 3"],
+)
+def test_polygons_and_colours_of_off_files_are_understood(face: str) -> None:
+    text = f"OFF\n4 {1 + face.count(chr(10))} 0\n0 0 5\n3 0 5\n3 3 5\n0 3 5\n{face}\n"
+    assert parse_mesh(text.encode(), Path("m.off")).area == pytest.approx(9)
+
+
+def test_a_scene_s_parts_lie_where_their_transforms_put_them(tmp_path: Path) -> None:
+    scene = trimesh.Scene(BOX)
+    turn = trimesh.transformations.rotation_matrix(np.pi / 2, (0, 0, 1), (5, 0, 0))
+    scene.add_geometry(BOX, transform=turn)
+    path = write(tmp_path / "scene.glb", scene)
+    mesh = parse_mesh(path.read_bytes(), path)
+    np.testing.assert_allclose(mesh.area, 2 * BOX.area)
+    np.testing.assert_allclose(mesh.bounds, scene.bounds)
+    assert mesh.bounds[1, 0] < 7
+
+
+@pytest.mark.parametrize("suffix", ["off", "obj", "stl"])
+def test_comments_may_be_in_an_old_encoding(tmp_path: Path, suffix: str) -> None:
+    comment = "# Körper\n".encode("latin-1")
+    if suffix == "stl":
+        text = trimesh.exchange.stl.export_stl_ascii(BOX).encode()
+        data = text.replace(b"solid", "solid Körper".encode("latin-1"), 1)
+    else:
+        data = comment + write(tmp_path / f"m.{suffix}", BOX).read_bytes()
+    assert parse_mesh(data, Path(f"m.{suffix}")).area == pytest.approx(BOX.area)
+
+
+def test_an_obj_without_its_material_file_is_read() -> None:
+    text = "mtllib gone.mtl\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    assert parse_mesh(text.encode(), Path("m.obj")).area == 0.5
+
+
+def half(mesh: Any, kind: str) -> bytes:
+    data = mesh.export(file_type=kind)
+    data = data.encode() if isinstance(data, str) else data
+    return data[: len(data) // 2]
+
+
+def last_faces_missing(mesh: Any, kind: str) -> bytes:
+    options = {"encoding": "ascii"} if kind == "ply" else {}
+    data = mesh.export(file_type=kind, **options)
+    data = data.encode() if isinstance(data, str) else data
+    return b"\n".join(data.splitlines()[:-5]) + b"\n"
+
+
+TRIANGLE = "v 0 0 0\nv {} 0 0\nv 0 1 0\nf 1 2 {}\n"
+BROKEN = {
+    "empty.off": (b"", "is empty"),
+    "blank.obj": (b" \n\n", "is empty"),
+    "half.off": (half(BALL, "off"), "is broken"),
+    "half.ply": (half(BALL, "ply"), "is broken"),
+    "half.stl": (half(BALL, "stl"), "80 triangles take 4084 bytes, not 2042"),
+    "half.glb": (half(BALL, "glb"), "is broken"),
+    "cut.off": (last_faces_missing(BALL, "off"), "announces 80 faces and holds 75"),
+    "cut.ply": (last_faces_missing(BALL, "ply"), "announces 80 faces and holds 75"),
+    "noise.off": (bytes(range(256)) * 9, "is broken"),
+    "noise.obj": (bytes(range(256)) * 9, r"is broken|holds no faces"),
+    "noise.ply": (bytes(range(256)) * 9, "is broken"),
+    "noise.stl": (bytes(range(256)) * 9, "is broken"),
+    "noise.glb": (bytes(range(256)) * 9, "is broken"),
+    "cloud.off": (b"OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n", "holds no faces"),
+    "cloud.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "holds no faces"),
+    "line.off": (b"OFF\n3 1 0\n0 0 0\n1 1 1\n2 2 2\n3 0 1 2\n", "area zero"),
+    "thin.off": (b"OFF\n3 1 0\n.1 .2 .3\n.2 .4 .6\n.3 .6 .9\n3 0 1 2\n", "area zero"),
+    "point.off": (b"OFF\n3 1 0\n1 1 1\n1 1 1\n1 1 1\n3 0 1 2\n", "area zero"),
+    "nan.obj": (TRIANGLE.format("nan", 3).encode(), "not all finite"),
+    "huge.obj": (TRIANGLE.format("1e308", 3).replace("1 0", "1e308 0").encode(), "not all finite"),
+    "outside.obj": (TRIANGLE.format(1, 9).encode(), "is broken"),
+    "outside.off": (SQUARE.replace("0 2 3", "0 2 4").encode(), "a face names a vertex"),
+    "negative.off": (SQUARE.replace("3 0 2 3", "3 0 2 -1").encode(), "a face names a vertex"),
+    "mesh.dae": (b"<COLLADA/>", "must end in"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_mesh_is_one_error_that_names_it(tmp_path: Path, name: str) -> None:
+    data, message = BROKEN[name]
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(BrokenMeshError, match=rf"{name}.*({message})"):
+        cloud_from_file(tmp_path / name, 8, seed=0)
+
+
+@pytest.mark.skipif("MOPS_DATA" not in os.environ, reason="MOPS_DATA names no folder of real data")
+def test_a_real_obj() -> None:
+    path = Path(os.environ["MOPS_DATA"]) / "scans" / "stanford-bunny.obj"
+    mesh = parse_mesh(path.read_bytes(), path)
+    assert len(mesh.faces) > 10_000
+    _, points = cloud_from_file(path, 1000, seed=0)
+    assert np.linalg.norm(points, axis=1).max() == pytest.approx(1)

@@ -1,0 +1,300 @@
+import os
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning.data.modelnet import FOLDER, modelnet40
+from mops_lightning.errors import UserError
+
+NAMES = ("airplane", "night_stand", "chair")  # not in alphabetical order
+FILES = {"train": (0, 1, 2, 10), "test": (0, 1)}
+STORED = 12
+
+
+def cloud(split: str, file: int, row: int) -> np.ndarray:
+    """Points that tell where they were stored."""
+    random = np.random.default_rng([len(split), file, row])
+    return random.uniform(-1, 1, (STORED, 3)).astype(np.float32)
+
+
+def write_file(path: Path, **datasets: Any) -> None:
+    with h5py.File(path, "w") as file:
+        for key, value in datasets.items():
+            file.create_dataset(key, data=value)
+
+
+def write_layout(folder: Path) -> Path:
+    """The public layout in small: 5 shapes a file, labels 0, 1, 2, 0, 1."""
+    folder.mkdir(parents=True)
+    (folder / "shape_names.txt").write_text("\n".join(NAMES) + "\n\n")
+    for split, numbers in FILES.items():
+        names = [f"ply_data_{split}{number}.h5" for number in numbers]
+        lines = [f"data/{FOLDER}/{name}" for name in names]
+        (folder / f"{split}_files.txt").write_text("\r\n".join(lines))
+        for name, number in zip(names, numbers, strict=True):
+            data = np.stack([cloud(split, number, row) for row in range(5)])
+            label = np.array([[0], [1], [2], [0], [1]], dtype=np.uint8)
+            write_file(folder / name, data=data, label=label)
+    return folder
+
+
+@pytest.fixture
+def layout(tmp_path: Path) -> Path:
+    return write_layout(tmp_path / "data" / FOLDER)
+
+
+def test_all_shapes_of_both_splits_are_read_in_order(layout: Path) -> None:
+    dataset = modelnet40(layout, n_points=STORED)
+    assert dataset.class_names == NAMES
+    for split, clouds in (("train", dataset.train), ("test", dataset.test)):
+        expected = [cloud(split, number, row) for number in FILES[split] for row in range(5)]
+        np.testing.assert_array_equal(clouds.points.numpy(), np.stack(expected))
+        assert clouds.labels.tolist() == [0, 1, 2, 0, 1] * len(FILES[split])
+        assert (clouds.points.dtype, clouds.labels.dtype) == (torch.float32, torch.int64)
+        assert clouds.points.is_contiguous()
+
+
+def test_the_first_points_are_taken(layout: Path) -> None:
+    whole, part = modelnet40(layout, n_points=STORED), modelnet40(layout, n_points=5)
+    assert torch.equal(part.train.points, whole.train.points[:, :5])
+    assert torch.equal(part.test.points, whole.test.points[:, :5])
+
+
+def test_the_folder_above_will_do(layout: Path) -> None:
+    above, itself = modelnet40(layout.parent, n_points=4), modelnet40(str(layout), n_points=4)
+    assert torch.equal(above.train.points, itself.train.points)
+    assert above.fingerprint == itself.fingerprint
+
+
+def test_without_lists_the_files_are_read_in_the_order_of_their_numbers(layout: Path) -> None:
+    listed = modelnet40(layout, n_points=4)
+    for split in FILES:
+        (layout / f"{split}_files.txt").unlink()
+    assert torch.equal(modelnet40(layout, n_points=4).train.points, listed.train.points)
+
+
+def test_classes_are_chosen_and_numbered_anew(layout: Path) -> None:
+    whole = modelnet40(layout, n_points=4)
+    dataset = modelnet40(layout, n_points=4, classes=["chair", "night_stand"])
+    assert dataset.class_names == ("night_stand", "chair")
+    assert dataset.test.labels.tolist() == [0, 1, 0] * 2
+    assert torch.equal(dataset.test.points, whole.test.points[whole.test.labels > 0])
+    with pytest.raises(UserError, match=r"'chiar'.* Did you mean 'chair'"):
+        modelnet40(layout, n_points=4, classes=["chiar"])
+
+
+def test_labels_may_be_flat(layout: Path) -> None:
+    path = layout / "ply_data_test1.h5"
+    write_file(path, data=np.zeros((2, STORED, 3)), label=np.array([2, 0], dtype=np.int32))
+    assert modelnet40(layout, n_points=4).test.labels.tolist()[-2:] == [2, 0]
+
+
+def test_the_fingerprint_follows_the_content_and_not_the_place(
+    layout: Path, tmp_path: Path
+) -> None:
+    elsewhere = shutil.copytree(layout, tmp_path / "elsewhere")
+    first = modelnet40(layout, n_points=4).fingerprint
+    assert modelnet40(elsewhere, n_points=4).fingerprint == first
+    others = {
+        modelnet40(layout, n_points=5).fingerprint,
+        modelnet40(layout, n_points=4, classes=NAMES[:2]).fingerprint,
+        modelnet40(layout, n_points=4, classes=NAMES[1:]).fingerprint,
+    }
+    with h5py.File(elsewhere / "ply_data_test0.h5", "r+") as file:
+        file["data"][3, 2, 1] += 1
+    others.add(modelnet40(elsewhere, n_points=4).fingerprint)
+    with h5py.File(elsewhere / "ply_data_train0.h5", "r+") as file:
+        file["label"][0] = 1
+    others.add(modelnet40(elsewhere, n_points=4).fingerprint)
+    assert len(others | {first}) == 6
+
+
+def test_more_points_than_stored_are_refused(layout: Path) -> None:
+    with pytest.raises(UserError, match=r"n_points is 13, but .*train0\.h5 stores 12 points"):
+        modelnet40(layout, n_points=13)
+    with pytest.raises(UserError, match="at least 1, got 0"):
+        modelnet40(layout, n_points=0)
+
+
+def test_a_missing_folder_says_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(UserError) as caught:
+        modelnet40(tmp_path / "none")
+    for words in (
+        "dataset.root",
+        str(tmp_path / "none"),
+        "shape_names.txt",
+        "dataset.download=true",
+    ):
+        assert words in str(caught.value)
+
+
+def set_item(path: Path, key: str, place: Any, value: float) -> None:
+    with h5py.File(path, "r+") as file:
+        file[key][place] = value
+
+
+shaped = partial(np.zeros, dtype=np.float32)
+label = np.zeros((2, 1), dtype=np.uint8)
+DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "cut off": (lambda p: os.truncate(p, p.stat().st_size // 2), "not a whole HDF5 file"),
+    "empty": (lambda p: os.truncate(p, 0), "not a whole HDF5 file"),
+    "text": (lambda p: p.write_text("<html>Not found</html>"), "not a whole HDF5 file"),
+    "no data": (lambda p: write_file(p, label=label), r"no dataset 'data'; it holds \['label'\]"),
+    "no label": (lambda p: write_file(p, data=shaped((2, 12, 3))), "no dataset 'label'"),
+    "flat": (lambda p: write_file(p, data=shaped((2, 36)), label=label), r"got \(2, 36\)"),
+    "scalar": (lambda p: write_file(p, data=1.0, label=label), r"got \(\)"),
+    "2-D": (lambda p: write_file(p, data=shaped((2, 12, 2)), label=label), r"\(2, 12, 2\)"),
+    "counts": (lambda p: write_file(p, data=shaped((3, 12, 3)), label=label), r"and \(2, 1\)"),
+    "integers": (lambda p: write_file(p, data=np.ones((2, 12, 3), int), label=label), "int64"),
+    "words": (lambda p: write_file(p, data=shaped((2, 12, 3)), label=[b"a", b"b"]), "of integers"),
+    "class 3": (lambda p: set_item(p, "label", 2, 3), "labels from 0 to 3, .* names 3 classes"),
+    "NaN": (lambda p: set_item(p, "data", (1, 2, 0), np.nan), "NaN or infinite"),
+    "overflow": (
+        lambda p: write_file(p, data=np.full((2, 12, 3), 1e300), label=label),
+        "NaN or infinite",
+    ),
+    "missing": (lambda p: p.unlink(), "is missing"),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGES)
+def test_a_damaged_file_is_one_error_that_names_it(layout: Path, kind: str) -> None:
+    damage, message = DAMAGES[kind]
+    damage(layout / "ply_data_train2.h5")
+    with pytest.raises(UserError, match=rf"(?s)ply_data_train2\.h5.*{message}"):
+        modelnet40(layout, n_points=4)
+
+
+def test_a_file_spoiled_in_the_middle_is_one_error(layout: Path) -> None:
+    path = layout / "ply_data_test0.h5"
+    with h5py.File(path, "w") as file:
+        data = np.random.default_rng(0).random((50, STORED, 3))
+        file.create_dataset("data", data=data, compression="gzip", fletcher32=True)
+        file.create_dataset("label", data=np.zeros(50, dtype=np.uint8))
+        offset = file["data"].id.get_chunk_info(0).byte_offset
+    content = bytearray(path.read_bytes())
+    content[offset + 100] ^= 0xFF
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=r"ply_data_test0\.h5 is not a whole HDF5 file"):
+        modelnet40(layout, n_points=4)
+
+
+def test_a_folder_without_its_lists_of_names_or_files_is_one_error(layout: Path) -> None:
+    for path in layout.glob("*test*"):
+        path.unlink()
+    with pytest.raises(UserError, match=r"no ply_data_test\*\.h5"):
+        modelnet40(layout, n_points=4)
+    (layout / "shape_names.txt").write_text("chair\nchair\n")
+    with pytest.raises(UserError, match="each class once"):
+        modelnet40(layout, n_points=4)
+    (layout / "shape_names.txt").unlink()
+    with pytest.raises(UserError, match=r"cannot read .*shape_names\.txt"):
+        modelnet40(layout, n_points=4)
+
+
+def test_a_class_without_test_shapes_is_one_error(layout: Path) -> None:
+    for number in FILES["test"]:
+        path = layout / f"ply_data_test{number}.h5"
+        write_file(path, data=shaped((1, STORED, 3)), label=label[:1])
+    with pytest.raises(UserError, match="chair has no test shape"):
+        modelnet40(layout, n_points=4, classes=["chair"])
+
+
+@pytest.fixture
+def shelf(tmp_path: Path) -> Iterator[tuple[str, list[str], Path]]:
+    """A web server over a folder: its address, what was asked of it, and the folder."""
+    folder = tmp_path / "shelf"
+    folder.mkdir()
+    asked: list[str] = []
+
+    class Handler(SimpleHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append(self.path)
+            super().do_GET()
+
+        def log_message(self, *args: object) -> None: ...
+
+    serve = partial(Handler, directory=str(folder))
+    with ThreadingHTTPServer(("127.0.0.1", 0), serve) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}", asked, folder
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@pytest.mark.parametrize("name", ["data", f"data/{FOLDER}"])
+def test_download_fills_root_once(
+    layout: Path, shelf: tuple[str, list[str], Path], tmp_path: Path, name: str
+) -> None:
+    address, asked, folder = shelf
+    shutil.make_archive(str(folder / "set"), "zip", layout.parent, FOLDER)
+    root = tmp_path / "new" / name
+    mirrors = [f"{address}/gone.zip", f"{address}/set.zip"]
+    found: list[str] = []
+
+    def load() -> None:
+        dataset = modelnet40(root, n_points=4, download=True, mirrors=mirrors)
+        found.append(dataset.fingerprint)
+
+    threads = [threading.Thread(target=load) for _ in range(3)]  # as a sweep would start them
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    load()
+    assert found == [modelnet40(layout, n_points=4).fingerprint] * 4
+    assert asked == ["/gone.zip", "/set.zip"]
+    assert not list((tmp_path / "new").rglob("*.zip*"))
+
+
+def test_what_is_there_is_not_downloaded(layout: Path, shelf: tuple[str, list[str], Path]) -> None:
+    address, asked, _ = shelf
+    modelnet40(layout, n_points=4, download=True, mirrors=[f"{address}/set.zip"])
+    assert asked == []
+
+
+def test_an_archive_of_something_else_is_one_error(
+    shelf: tuple[str, list[str], Path], tmp_path: Path
+) -> None:
+    address, _, folder = shelf
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "readme.txt").write_text("something else")
+    shutil.make_archive(str(folder / "set"), "zip", tmp_path / "other")
+    with pytest.raises(UserError, match=r"dataset\.mirrors: .* is not ModelNet40"):
+        modelnet40(tmp_path / "new", download=True, mirrors=[f"{address}/set.zip"])
+
+
+def test_the_hash_of_the_archive_is_checked(
+    layout: Path, shelf: tuple[str, list[str], Path], tmp_path: Path
+) -> None:
+    address, _, folder = shelf
+    shutil.make_archive(str(folder / "set"), "zip", layout.parent, FOLDER)
+    mirrors = [f"{address}/set.zip"]
+    with pytest.raises(UserError, match=r"sha256 is .*, expected 0000"):
+        modelnet40(tmp_path / "new", download=True, mirrors=mirrors, sha256="0" * 64)
+
+
+@pytest.mark.skipif("MOPS_DATA" not in os.environ, reason="MOPS_DATA names no folder of real data")
+def test_the_real_set() -> None:
+    dataset = modelnet40(Path(os.environ["MOPS_DATA"]) / "modelnet40_hdf5_1024")
+    assert dataset.train.points.shape == (9843, 1024, 3)
+    assert dataset.test.points.shape == (2468, 1024, 3)
+    assert len(dataset.class_names) == 40
+    assert dataset.train.labels.unique().tolist() == list(range(40))
+    airplane = dataset.class_names.index("airplane")
+    assert (dataset.train.labels == airplane).sum() == 626
+    assert (dataset.test.labels == airplane).sum() == 100
+    radius = dataset.test.points.norm(dim=2).amax(1)
+    assert ((radius > 0.9) & (radius < 1.001)).all()

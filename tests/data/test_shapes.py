@@ -1,0 +1,356 @@
+"""The procedural dataset: content, reproducibility, difficulty, cache and errors."""
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from mops_lightning.data.clouds import CloudDataset, Clouds
+from mops_lightning.data.mesh_parts import bow, box, cushion, join, loft, rod, smooth, tube, turned
+from mops_lightning.data.shape_builders import BUILDERS
+from mops_lightning.data.shapes import _sample, shapes
+from mops_lightning.errors import UserError
+
+SMALL: dict[str, Any] = {
+    "n_points": 64,
+    "train_per_class": 2,
+    "test_per_class": 1,
+    "classes": ["cup", "stool"],
+}
+
+
+@pytest.fixture(scope="module")
+def dataset() -> CloudDataset:
+    return shapes(n_points=512, train_per_class=24, test_per_class=8)
+
+
+def same(first: CloudDataset, second: CloudDataset) -> bool:
+    pairs = zip((*first.train, *first.test), (*second.train, *second.test), strict=True)
+    return all(torch.equal(a, b) for a, b in pairs) and first.fingerprint == second.fingerprint
+
+
+# Parts
+
+
+def test_a_box_fills_its_spans() -> None:
+    assert np.allclose(box((0, 1), (2, 4), (-3, 0)).bounds, [[0, 2, -3], [1, 4, 0]])
+
+
+def test_a_cushion_fills_its_spans_up_to_its_rounding() -> None:
+    a, b, c, r = 2.0, 1.0, 1.5, 0.3
+    mesh = cushion((0, a), (0, b), (0, c), r)
+    x, y, z = a - 2 * r, b - 2 * r, c - 2 * r
+    exact = x * y * z + 2 * r * (x * y + y * z + z * x) + np.pi * r**2 * (x + y + z)
+    exact += 4 / 3 * np.pi * r**3
+    assert np.allclose(mesh.bounds, np.array([(0, 0, 0), (a, b, c)]))
+    assert 0.9 * exact < mesh.volume < exact
+
+
+def test_tubes_are_closed_and_as_thick_as_asked() -> None:
+    straight = rod((1, 2, 3), (1, 5, 3), 0.5, sections=64)
+    assert straight.volume == pytest.approx(3 * np.pi * 0.25, rel=0.01)
+    square = rod((0, 0, 0), (0, 2, 0), 0.5, sections=4)
+    assert np.allclose(square.bounds, [[-0.5, 0, -0.5], [0.5, 2, 0.5]])
+    ring = np.linspace(0, 2 * np.pi, 65)
+    circle = np.column_stack((np.cos(ring), np.zeros(65), np.sin(ring)))
+    torus = tube(circle, 0.1, sections=32, across=(0, 1, 0))
+    assert abs(torus.volume) == pytest.approx(2 * np.pi**2 * 0.01, rel=0.02)
+
+
+def test_a_loft_between_squares_is_a_block() -> None:
+    square = np.array([(0, 0, 0), (0, 1, 0), (1, 1, 0), (1, 0, 0)])
+    block = loft((square, square + np.array((0, 0, 3))))
+    assert abs(block.volume) == pytest.approx(3)
+    assert block.area == pytest.approx(14)
+
+
+def test_a_profile_is_turned_about_the_up_axis() -> None:
+    mesh = turned([(1, 0), (1, 3)], sections=64)
+    assert np.allclose(mesh.bounds, [[-1, 0, -1], [1, 3, 1]])
+    assert mesh.area == pytest.approx(6 * np.pi, rel=0.01)
+
+
+def test_smooth_curves_pass_the_ends_and_do_not_overshoot() -> None:
+    curve = smooth([(1, 0), (3, 1), (0.5, 2)], steps=50)
+    assert np.allclose(curve[[0, -1]], [(1, 0), (0.5, 2)])
+    assert curve[:, 0].min() >= 0.5
+    assert curve[:, 0].max() <= 3
+
+
+def test_a_bow_joins_its_ends_and_stands_off_as_asked() -> None:
+    path = bow((1, 2), (1, 0), 0.5, steps=15)
+    assert np.allclose(path[[0, -1]], [(1, 2, 0), (1, 0, 0)])
+    assert path[:, 0].max() == pytest.approx(1.5)
+
+
+def test_joining_keeps_every_face() -> None:
+    parts = [box((0, 1), (0, 1), (0, 1)), rod((5, 0, 0), (5, 1, 0), 0.1)]
+    mesh = join(parts[0], parts[1:])
+    assert mesh.area == pytest.approx(sum(part.area for part in parts))
+    assert mesh.bounds[1, 0] > 5
+
+
+# Content
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_every_builder_gives_sound_meshes(name: str) -> None:
+    for seed in range(12):
+        mesh = BUILDERS[name](np.random.default_rng(seed))
+        assert np.isfinite(mesh.vertices).all()
+        assert mesh.faces.max() < len(mesh.vertices)
+        assert (mesh.extents > 0.1).all()
+        assert mesh.extents.max() < 4
+
+
+def test_clouds_are_labelled_and_in_the_unit_sphere(dataset: CloudDataset) -> None:
+    assert dataset.class_names == tuple(BUILDERS)
+    assert len(dataset.class_names) >= 12
+    for clouds, count in ((dataset.train, 24), (dataset.test, 8)):
+        assert clouds.points.shape == (count * len(BUILDERS), 512, 3)
+        assert clouds.points.dtype == torch.float32
+        assert clouds.labels.dtype == torch.int64
+        assert clouds.labels.bincount().tolist() == [count] * len(BUILDERS)
+        largest = clouds.points.norm(dim=-1).amax(1)
+        assert torch.allclose(largest, torch.ones(()), atol=1e-6)
+        assert clouds.points.mean(1).abs().max() < 1e-6
+
+
+def test_tables_stand_on_their_feet() -> None:
+    points = shapes(n_points=2000, train_per_class=10, test_per_class=1, classes=["table"])
+    for cloud in points.train.points:
+        upper = (cloud[:, 1] > cloud[:, 1].mean()).float().mean()
+        assert upper > 0.5  # the top holds most of the surface
+
+
+def test_points_are_uniform_by_area() -> None:
+    """A thin-walled cylinder of known areas stands for all: floor, wall and their shares."""
+    mesh = join(turned([(0, 0), (1, 0)], 64), turned([(1, 0), (1, 2)], 64))
+    points = _sample(mesh, 40_000, np.random.SeedSequence(0))
+    floor = (points[:, 1] < 1e-9).mean()
+    assert floor == pytest.approx(np.pi / (np.pi + 4 * np.pi), abs=0.01)
+    wall = points[points[:, 1] >= 1e-9]
+    assert np.histogram(wall[:, 1], 4, (0, 2))[0] / len(wall) == pytest.approx([0.25] * 4, abs=0.02)
+
+
+def test_many_points_and_a_single_one() -> None:
+    many = shapes(100_000, 1, 1, ["teapot"])
+    assert many.train.points.shape == (1, 100_000, 3)
+    one = shapes(1, 1, 1, ["teapot"])
+    assert torch.equal(one.train.points, torch.zeros(1, 1, 3))
+
+
+# Reproducibility
+
+
+def test_the_same_settings_give_the_same_clouds_and_another_seed_gives_others() -> None:
+    assert same(shapes(**SMALL), shapes(**SMALL))
+    other = shapes(**SMALL, seed=1)
+    assert not torch.equal(other.train.points, shapes(**SMALL).train.points)
+
+
+def test_a_shape_does_not_hang_on_how_many_there_are() -> None:
+    few, more = shapes(**SMALL), shapes(64, 5, 3, ["bowl", "cup", "stool", "vase"])
+    for split in ("train", "test"):
+        small, large = getattr(few, split), getattr(more, split)
+        for name in few.class_names:
+            expected = small.points[small.labels == few.class_names.index(name)]
+            found = large.points[large.labels == more.class_names.index(name)]
+            assert torch.equal(found[: len(expected)], expected)
+
+
+def test_shapes_differ_within_a_class_and_between_splits(dataset: CloudDataset) -> None:
+    extents = torch.cat([_extents(dataset.train), _extents(dataset.test)])
+    assert len(extents.unique(dim=0)) == len(extents)
+
+
+def test_the_form_does_not_hang_on_the_number_of_points() -> None:
+    forms = [
+        shapes(n, 2, 1, ["airplane", "chair", "lamp"]).train.points.numpy() for n in (1500, 6000)
+    ]
+    far = np.array([[np.median(cKDTree(b).query(a)[0]) for b in forms[1]] for a in forms[0]])
+    assert np.diag(far).max() < 0.03
+    assert (far.argmin(1) == np.arange(len(far))).all()
+
+
+def _numpy_state() -> str:
+    return str(np.random.get_state(legacy=False))  # noqa: NPY002
+
+
+def test_global_random_state_is_left_alone() -> None:
+    before = _numpy_state(), torch.get_rng_state()
+    shapes(**SMALL)
+    assert _numpy_state() == before[0]
+    assert torch.equal(torch.get_rng_state(), before[1])
+
+
+def test_the_fingerprint_tells_settings_apart() -> None:
+    variants: list[dict[str, Any]] = [
+        {},
+        {"n_points": 65},
+        {"train_per_class": 3},
+        {"test_per_class": 2},
+        {"classes": ["cup", "vase"]},
+        {"seed": 1},
+    ]
+    prints = [shapes(**{**SMALL, **variant}).fingerprint for variant in variants]
+    assert len(set(prints)) == len(variants)
+    assert all(len(text) == 64 for text in prints)
+    assert shapes(**{**SMALL, "classes": ["stool", "cup"]}).fingerprint == prints[0]
+
+
+# Difficulty
+
+
+def _extents(clouds: Clouds) -> torch.Tensor:
+    return clouds.points.amax(1) - clouds.points.amin(1)
+
+
+def _nearest(dataset: CloudDataset, describe: Callable[[Clouds], np.ndarray]) -> float:
+    """Accuracy of the nearest training shape under a description of clouds."""
+    nearest = cKDTree(describe(dataset.train)).query(describe(dataset.test))[1]
+    return (dataset.train.labels[nearest] == dataset.test.labels).float().mean().item()
+
+
+def test_bounding_boxes_do_not_tell_the_classes_apart(dataset: CloudDataset) -> None:
+    assert _nearest(dataset, lambda clouds: _extents(clouds).numpy()) < 0.55
+    train, test = _extents(dataset.train).double(), _extents(dataset.test).double()
+    targets = torch.nn.functional.one_hot(dataset.train.labels).double()
+
+    def terms(x: torch.Tensor) -> torch.Tensor:
+        return torch.cat((torch.ones(len(x), 1), x, x**2, x * x.roll(1, 1)), 1)
+
+    weights = torch.linalg.lstsq(terms(train), targets).solution
+    linear = ((terms(test) @ weights).argmax(1) == dataset.test.labels).double().mean()
+    assert linear < 0.55
+
+
+def test_the_classes_can_be_learned(dataset: CloudDataset) -> None:
+    def occupancy(clouds: Clouds, cells: int = 8) -> np.ndarray:
+        at = ((clouds.points + 1) / 2 * cells).long().clamp(0, cells - 1)
+        flat = (at * torch.tensor([cells * cells, cells, 1])).sum(-1)
+        counts = torch.zeros(len(flat), cells**3)
+        return counts.scatter_add_(1, flat, torch.ones(flat.shape)).sqrt().numpy()
+
+    assert _nearest(dataset, occupancy) > 0.85
+
+
+# Cache
+
+
+def test_a_cache_file_is_written_once_and_read(tmp_path: Path) -> None:
+    fresh = shapes(**SMALL)
+    assert same(shapes(**SMALL, cache=tmp_path / "new"), fresh)
+    (path,) = (tmp_path / "new").iterdir()
+    # Other clouds in the file come back: it was read and not made again.
+    np.savez(path, train=fresh.train.points.numpy() / 2, test=fresh.test.points.numpy())
+    again = shapes(**SMALL, cache=str(tmp_path / "new"))
+    assert torch.equal(again.train.points, fresh.train.points / 2)
+    assert torch.equal(again.train.labels, fresh.train.labels)
+
+
+def test_other_settings_use_other_cache_files(tmp_path: Path) -> None:
+    for seed in (0, 1):
+        assert same(shapes(**SMALL, seed=seed, cache=tmp_path), shapes(**SMALL, seed=seed))
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_damaged_cache_file_is_made_anew(tmp_path: Path) -> None:
+    fresh = shapes(**SMALL, cache=tmp_path)
+    (path,) = tmp_path.iterdir()
+    whole = path.read_bytes()
+    damaged = [b"", b"not an archive", whole[: len(whole) // 2], whole[:-1], b"\x93NUMPY" + whole]
+    for position in range(0, len(whole), len(whole) // 20):
+        flipped = bytearray(whole)
+        flipped[position] ^= 0xFF
+        damaged.append(bytes(flipped))
+    for content in damaged:
+        path.write_bytes(content)
+        assert same(shapes(**SMALL, cache=tmp_path), fresh)
+        assert list(tmp_path.iterdir()) == [path]
+    path.write_bytes(damaged[1])
+    shapes(**SMALL, cache=tmp_path)
+    assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"train": np.zeros((4, 64, 3), np.float32)},
+        {"train": np.zeros((4, 64, 3)), "test": np.zeros((2, 64, 3))},
+        {"train": np.zeros((3, 64, 3), np.float32), "test": np.zeros((2, 64, 3), np.float32)},
+        {"train": np.array([{}], object), "test": np.zeros((2, 64, 3), np.float32)},
+    ],
+)
+def test_a_cache_file_of_another_form_is_made_anew(tmp_path: Path, arrays: dict[str, Any]) -> None:
+    fresh = shapes(**SMALL, cache=tmp_path)
+    (path,) = tmp_path.iterdir()
+    np.savez(path, **arrays)
+    assert same(shapes(**SMALL, cache=tmp_path), fresh)
+
+
+# Errors and output
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("n_points", 0),
+        ("n_points", "many"),
+        ("n_points", 10.5),
+        ("train_per_class", 0),
+        ("test_per_class", -1),
+        ("test_per_class", True),
+        ("seed", -1),
+        ("seed", None),
+        ("classes", ["cupp"]),
+        ("classes", "cup"),
+        ("classes", [3]),
+        ("classes", 7),
+    ],
+)
+def test_a_bad_setting_is_named(setting: str, value: object) -> None:
+    with pytest.raises(UserError, match=rf"^dataset\.{setting}\b.*"):
+        shapes(**{**SMALL, setting: value})
+
+
+def test_an_unknown_class_gets_the_nearest_known_one() -> None:
+    with pytest.raises(UserError, match="Did you mean 'stool'"):
+        shapes(classes=["stol"])
+
+
+def test_a_cache_that_is_no_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for cache in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(UserError, match=r"^dataset\.cache\b.*file"):
+            shapes(**SMALL, cache=cache)
+
+
+def test_nothing_is_printed_where_there_is_no_terminal(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    shapes(**SMALL)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are a Unix thing")
+def test_progress_shows_on_a_terminal_and_is_wiped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    ours, theirs = os.openpty()
+    os.set_blocking(ours, False)
+    with open(theirs, "w") as terminal:  # noqa: PTH123
+        monkeypatch.setattr(sys, "stderr", terminal)
+        shapes(**SMALL)
+        terminal.flush()
+        shown = os.read(ours, 65536).decode()
+        monkeypatch.undo()
+    os.close(ours)
+    assert "Making shapes" in shown
+    assert "\x1b[2K" in shown.split("Making shapes")[-1]  # the line is erased at the end

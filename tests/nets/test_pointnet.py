@@ -1,0 +1,97 @@
+import copy
+
+import pytest
+import torch
+from torch.nn import functional as F
+
+from mops_lightning.nets.pointnet import (
+    PointFeatures,
+    PointMaxPool,
+    PointNetVanilla,
+    _argmax_rows,
+)
+
+
+class PlainMaxPool(PointMaxPool):
+    """The same layers, one after the other, with the whole (B, N, C) tensor."""
+
+    def forward(self, features):
+        rows = F.relu(self.norm(self.linear(features.flatten(0, 1))))
+        return rows.unflatten(0, features.shape[:2]).amax(1)
+
+
+def pools(channels_in=6, channels_out=20):
+    torch.manual_seed(1)
+    fast = PointMaxPool(channels_in, channels_out).double()
+    with torch.no_grad():
+        # A negative gamma turns the maximum into a minimum.
+        fast.norm.weight.copy_(torch.randn(channels_out))
+        fast.norm.bias.copy_(torch.randn(channels_out))
+    plain = PlainMaxPool(channels_in, channels_out).double()
+    plain.load_state_dict(fast.state_dict())
+    return fast, plain
+
+
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("points", [4, 6, 7, 50, 100])
+def test_max_pool_equals_its_plain_twin(points, training, rng):
+    fast, plain = pools()
+    outputs, gradients = [], []
+    features = torch.randn(3, points, 6, dtype=torch.float64, generator=rng)
+    weight = torch.randn(3, 20, dtype=torch.float64, generator=rng)
+    for net in (fast, plain):
+        net.train()
+        net(features + 1)  # running statistics that are not the initial ones
+        net.train(training)
+        x = features.clone().requires_grad_()
+        out = net(x)
+        outputs.append(out)
+        gradients.append(torch.autograd.grad((out * weight).sum(), [x, *net.parameters()]))
+    torch.testing.assert_close(outputs[0], outputs[1])
+    for got, want in zip(*gradients, strict=True):
+        torch.testing.assert_close(got, want)
+    for (name, got), want in zip(fast.named_buffers(), plain.buffers(), strict=True):
+        torch.testing.assert_close(got, want, msg=name)
+
+
+def test_max_pool_gradcheck(rng):
+    net = pools(3, 5)[0]
+    features = torch.randn(2, 6, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+    frozen = copy.deepcopy(net)
+    assert torch.autograd.gradcheck(frozen, (features,))
+
+
+@pytest.mark.parametrize("rows", [1, 31, 32, 64, 95, 1000, 1024, 1037])
+def test_grouped_argmax_finds_the_maximum(rows, rng):
+    values = torch.randn(rows, 17, generator=rng)
+    found = _argmax_rows(values)
+    torch.testing.assert_close(values.gather(0, found[None])[0], values.amax(0))
+
+
+def test_classifier_does_not_mind_order_or_batch(rng):
+    torch.manual_seed(0)
+    net = PointNetVanilla(5).eval()
+    points = torch.randn(3, 200, 3, generator=rng)
+    logits = net(points)
+    order = torch.randperm(200, generator=rng)
+    torch.testing.assert_close(net(points[:, order]), logits)
+    torch.testing.assert_close(net(points[1:2]), logits[1:2], atol=1e-5, rtol=1e-5)
+
+
+def test_classifier_has_the_published_layers():
+    sizes = [
+        tuple(module.weight.shape)
+        for module in PointNetVanilla(40).modules()
+        if isinstance(module, torch.nn.Linear)
+    ]
+    channels = [3, 64, 64, 64, 128, 1024, 512, 256, 40]
+    assert sizes == [(b, a) for a, b in zip(channels[:-1], channels[1:], strict=True)]
+
+
+def test_features_are_local_and_their_maximum(rng):
+    torch.manual_seed(0)
+    net = PointFeatures((8, 6)).eval()
+    points = torch.randn(2, 30, 3, generator=rng)
+    local, global_ = net(points)
+    assert local.shape == (2, 30, 6)
+    torch.testing.assert_close(global_, local.max(1).values)

@@ -1,0 +1,121 @@
+import pytest
+import torch
+from torch import nn
+
+from mops_lightning.errors import UserError
+from mops_lightning.losses import subset_loss
+from mops_lightning.nets.pointnet import linear_norm_relu
+from mops_lightning.samplers.mops import MOPSNet
+
+
+def small(m=5, **settings):
+    torch.manual_seed(0)
+    return MOPSNet(m, feature_channels=(8, 6), rho_channels=(12, 10), **settings)
+
+
+class PlainMOPS(nn.Module):
+    """The paper's flow word for word: global feature repeated, one ρ with bias, S in full."""
+
+    def __init__(self, fast: MOPSNet) -> None:
+        super().__init__()
+        self.features = fast.features
+        local = fast.rho_local.weight.shape[1]
+        rho = linear_norm_relu([2 * local, *(m.out_features for m in self._linears(fast))])
+        rho[0].weight.data = torch.cat([fast.rho_local.weight, fast.rho_global.weight], 1).data
+        rho[1].load_state_dict(fast.rho_first[0].state_dict())
+        for number, layer in enumerate(fast.rho):
+            rho[3 + number].load_state_dict(layer.state_dict())
+        self.rho = rho
+        self.last = nn.Linear(fast.queries.in_features, fast.m)
+        self.last.weight.data = fast.queries.weight.data
+        self.tau = fast.tau
+
+    @staticmethod
+    def _linears(fast):
+        return [fast.rho_local, *(m for m in fast.rho if isinstance(m, nn.Linear))]
+
+    def forward(self, points):
+        local, global_ = self.features(points)
+        joined = torch.cat([local, global_[:, None].expand_as(local)], 2)
+        preliminary = self.last(self.rho(joined.flatten(0, 1))).unflatten(0, points.shape[:2])
+        matrix = (preliminary / self.tau).softmax(1)
+        return matrix, matrix.mT @ points
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_equals_the_paper_s_flow(training, rng):
+    fast = small(tau_min=0.3).double().train(training)
+    plain = PlainMOPS(fast).double().train(training)
+    points = torch.randn(3, 20, 3, dtype=torch.float64, generator=rng)
+    matrix, sampled = plain(points)
+    output = fast(points)
+    # The plain twin has a bias in its last layer, which the softmax must cancel.
+    assert plain.last.bias.abs().min() > 0
+    torch.testing.assert_close(output.points, sampled)
+    torch.testing.assert_close(output.matrix.dense(), matrix)
+
+
+def test_published_layers():
+    net = MOPSNet(32)
+    sizes = [tuple(p.shape) for name, p in net.named_parameters() if p.ndim == 2]
+    features = [(64, 3), (64, 64), (64, 64), (128, 64), (128, 128)]
+    assert sizes == [*features, (512, 128), (512, 128), (256, 512), (128, 256), (32, 128)]
+
+
+def test_tau_falls_exponentially_from_one_to_its_end():
+    net = small(tau_min=0.1).train()
+    taus = []
+    for progress in (0.0, 0.5, 1.0):
+        net.anneal(progress)
+        taus.append(net.tau)
+    assert taus == pytest.approx([1.0, 0.1**0.5, 0.1])
+
+
+def test_tau_falls_linearly_on_request():
+    net = small(tau_min=0.2, annealing="linear").train()
+    net.anneal(0.25)
+    assert net.tau == pytest.approx(0.8)
+
+
+def test_tau_is_at_its_end_in_evaluation():
+    net = small(tau_min=0.1).train()
+    net.anneal(0.0)
+    assert net.eval().tau == 0.1
+    assert net.train().tau == 1.0
+
+
+def test_subset_loss_is_weighted_and_only_in_training(rng):
+    net = small(alpha=7.0).train()
+    points = torch.randn(2, 20, 3, generator=rng)
+    output = net(points)
+    torch.testing.assert_close(
+        output.losses["subset"], 7.0 * subset_loss(points, output.points)
+    )
+    assert net.eval()(points).losses == {}
+
+
+def test_points_lie_in_the_convex_hull(rng):
+    points = torch.randn(2, 20, 3, generator=rng)
+    sampled = small().eval()(points).points
+    assert (sampled.amax(1) <= points.amax(1)).all()
+    assert (sampled.amin(1) >= points.amin(1)).all()
+
+
+def test_gradcheck(rng):
+    net = small(m=3, tau_min=0.5).double().eval()
+    points = torch.randn(1, 7, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda p: net(p).points, (points,))
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"tau_min": 0.0}, "sampler.tau_min"),
+        ({"tau_min": 1.5}, "sampler.tau_min"),
+        ({"alpha": -1.0}, "sampler.alpha"),
+        ({"annealing": "exponentail"}, "exponential"),
+    ],
+)
+def test_bad_settings_name_themselves(settings, named):
+    with pytest.raises(UserError, match=named):
+        small(**settings)

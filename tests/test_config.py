@@ -1,0 +1,114 @@
+import inspect
+
+import pytest
+from hydra.utils import get_object
+from omegaconf import DictConfig, OmegaConf
+
+from mops_lightning.config import GROUPS, RUN_KEYS, build, check, compose, conf_dir
+from mops_lightning.errors import UserError
+
+
+def choices():
+    """Every (group, name) that conf/ offers, as an override."""
+    for path in sorted(conf_dir().rglob("*.yaml")):
+        group = path.parent.relative_to(conf_dir()).as_posix()
+        if group != "." and not group.startswith("hydra"):
+            yield f"{group}={path.stem}"
+
+
+EXTRA = {"dataset=meshes": ["dataset.root=somewhere"]}
+CALLER = {
+    # What code, not YAML, gives: see fit.make_experiment and fit.make_trainer.
+    "PointNetVanilla": {"num_classes"},
+    "Classification": {"net", "num_classes"},
+    "Adam": {"params"},
+    "one_cycle": {"optimizer", "total_steps"},
+    "exponential": {"optimizer", "total_steps"},
+    "step_decay": {"optimizer", "total_steps"},
+    "TensorBoardLogger": {"save_dir"},
+    "CSVLogger": {"save_dir"},
+}
+
+
+def nodes(cfg):
+    if isinstance(cfg, DictConfig):
+        if cfg.get("_target_") is not None:
+            yield cfg
+        for key in cfg:
+            if not OmegaConf.is_missing(cfg, key):
+                yield from nodes(cfg[key])
+
+
+@pytest.mark.parametrize("override", choices())
+def test_every_yaml_composes_resolves_and_fits_its_constructors(override):
+    cfg = compose([override, *EXTRA.get(override, [])])
+    OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+    check(cfg)
+    for node in nodes(cfg):
+        target = get_object(node["_target_"])
+        parameters = inspect.signature(target).parameters
+        given = {key for key in node if not str(key).startswith("_")}
+        assert given <= set(parameters), node["_target_"]
+        needed = {
+            name
+            for name, p in parameters.items()
+            if p.default is p.empty and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
+        }
+        missing = needed - given - CALLER.get(target.__name__, set())
+        assert not missing, f"{node['_target_']} would lack {missing}"
+
+
+def test_every_run_level_key_is_known_and_explained_by_help():
+    cfg = compose()
+    own = {str(key) for key in cfg} - set(GROUPS)
+    assert own == set(RUN_KEYS)
+    template = OmegaConf.load(conf_dir() / "hydra" / "help" / "mops.yaml")["template"]
+    section = template.split("== Run-level keys")[1].split("== Every setting")[0]
+    explained = {line.split()[0] for line in section.splitlines()[1:] if line.strip()}
+    assert explained == set(RUN_KEYS)
+
+
+def test_the_main_job_is_what_the_readme_says():
+    cfg = compose()
+    assert dict(cfg.names) == {
+        "task": "classification",
+        "net": "pointnet",
+        "dataset": "shapes",
+        "sampler": "mops",
+    }
+    assert (cfg.m, cfg.learn, cfg.weights) == (32, "sampler", "auto")
+
+
+def test_the_paper_s_settings():
+    cfg = compose(["experiment=classification_paper"])
+    assert (cfg.sampler.tau_min, cfg.sampler.alpha) == (0.1, 30.0)
+    assert cfg.optimizer.optimizer.lr == 5e-4
+    assert cfg.optimizer.schedule.end_lr == 1e-5
+    assert cfg.trainer.max_epochs == 250
+    assert cfg.names.dataset == "modelnet40"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["m=0"], "m must be a whole number of at least 1, got 0"),
+        (["m=2.5"], "m must be a whole number"),
+        (["m=2000"], r"m must be at most dataset.n_points=1024, got m=2000"),
+        (["learn=smapler"], "Did you mean 'sampler'"),
+        (["+sampler.alhpa=3"], "Did you mean 'alpha'"),
+        (["+bacth_size=3"], "Did you mean 'batch_size'"),
+        (["+dataset.clases=[a]"], "Did you mean 'classes'"),
+        (["trainer.max_epochs=0"], "trainer.max_epochs must be a whole number"),
+        (["val_fraction=1.0"], r"val_fraction must be in \[0, 1\)"),
+        (["dataset=meshes"], "dataset.root must be set"),
+        (["sampler._target_=mops_lightning.samplers.mops.MOPSNett"], "cannot import"),
+    ],
+)
+def test_mistakes_are_named_before_any_work(overrides, said):
+    with pytest.raises(UserError, match=said):
+        check(compose(overrides))
+
+
+def test_build_passes_a_user_error_on_unwrapped():
+    with pytest.raises(UserError, match="sampler.tau_min"):
+        build(compose(["sampler.tau_min=0"]).sampler)

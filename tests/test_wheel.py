@@ -1,0 +1,115 @@
+"""The wheel, built, installed and used away from the checkout."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+# .gitignore too: hatchling leaves out of the wheel what git ignores.
+SOURCES = ("pyproject.toml", "README.md", "LICENSE", ".gitignore", "src", "conf")
+TINY_JOB = (
+    "learn=task",
+    "dataset=shapes",
+    "dataset.train_per_class=4",
+    "dataset.test_per_class=2",
+    "dataset.n_points=64",
+    "batch_size=16",
+    "m=8",
+    "trainer=cpu",
+    "trainer.max_epochs=1",
+)
+
+
+def python(*arguments: str, cwd: Path, path: Path | None = None) -> str:
+    """Run this interpreter elsewhere and return what it prints."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    environment.pop("PYTHONPATH", None)
+    if path is not None:
+        # Comes before site-packages and so before the editable install that is found there.
+        environment["PYTHONPATH"] = str(path)
+    done = subprocess.run(
+        [sys.executable, *arguments], cwd=cwd, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from a copy, so that the checkout stays clean."""
+    copy = tmp_path_factory.mktemp("copy")
+    for name in SOURCES:
+        if (ROOT / name).is_dir():
+            compiled = shutil.ignore_patterns("__pycache__", "*.egg-info")
+            shutil.copytree(ROOT / name, copy / name, ignore=compiled)
+        else:
+            shutil.copyfile(ROOT / name, copy / name)
+    python("-m", "build", "--wheel", "--no-isolation", "--outdir", "dist", cwd=copy)
+    (built,) = (copy / "dist").glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("installed")
+    pip = ("-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--no-compile")
+    python(*pip, "--target", str(folder), str(wheel), cwd=folder)
+    return folder
+
+
+def files_below(folder: Path, inside: str) -> set[str]:
+    """Name the files of a folder as they should be named in the wheel."""
+    files = (file.relative_to(folder) for file in folder.rglob("*") if file.is_file())
+    return {f"{inside}/{f.as_posix()}" for f in files if "__pycache__" not in f.parts}
+
+
+def test_the_wheel_holds_the_package_its_configs_and_nothing_else(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if ".dist-info/" not in name}
+    configs = files_below(ROOT / "conf", "mops_lightning/conf")
+    assert "mops_lightning/conf/config.yaml" in configs
+    assert {"mops_lightning/result.schema.json", "mops_lightning/py.typed"} <= names
+    assert names == configs | files_below(ROOT / "src/mops_lightning", "mops_lightning")
+
+
+def test_the_wheel_declares_the_console_script_and_carries_the_licence(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        (info,) = {name.split("/")[0] for name in archive.namelist() if ".dist-info/" in name}
+        scripts = archive.read(f"{info}/entry_points.txt").decode().splitlines()
+        licence = archive.read(f"{info}/licenses/LICENSE")
+    assert scripts[scripts.index("[console_scripts]") + 1] == (
+        "mops-lightning = mops_lightning.cli:main"
+    )
+    assert licence == (ROOT / "LICENSE").read_bytes()
+
+
+def test_the_installed_copy_is_what_these_tests_import(installed: Path, tmp_path: Path) -> None:
+    code = "import mops_lightning, mops_lightning.config as c; print(mops_lightning.__file__)"
+    lines = python("-c", f"{code}; print(c.conf_dir())", cwd=tmp_path, path=installed).split("\n")
+    assert Path(lines[0]) == installed / "mops_lightning" / "__init__.py"
+    assert Path(lines[1]) == installed.resolve() / "mops_lightning" / "conf"
+
+
+def test_help_works_from_the_installed_copy(installed: Path, tmp_path: Path) -> None:
+    text = python("-m", "mops_lightning", "--help", cwd=tmp_path, path=installed)
+    assert "dataset: meshes, modelnet40, shapes" in text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_job_runs_from_the_installed_copy(installed: Path, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "empty"
+    elsewhere.mkdir()
+    folders = (f"out={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}")
+    python("-m", "mops_lightning", *TINY_JOB, *folders, cwd=elsewhere, path=installed)
+    (result,) = (tmp_path / "out").rglob("result.json")
+    record = json.loads(result.read_text())
+    assert record["status"] == "completed"
+    # Only a checkout has a commit: one more sign that it was not the checkout that ran.
+    assert record["git"] == {"commit": None, "dirty": None}
+    assert list(elsewhere.iterdir()) == []
