@@ -228,7 +228,9 @@ def unbroken(tmp_path_factory):
     return folder, final_state(run)
 
 
-@pytest.mark.parametrize(("number", "left"), [(signal.SIGINT, "interrupted"), (signal.SIGKILL, "running")])
+@pytest.mark.parametrize(
+    ("number", "left"), [(signal.SIGINT, "interrupted"), (signal.SIGKILL, "running")]
+)
 def test_a_run_stopped_in_mid_epoch_resumes_to_the_same_weights(unbroken, number, left):
     folder, want = unbroken
     out = f"stopped-{left}"
@@ -247,9 +249,7 @@ def test_a_run_stopped_in_mid_epoch_resumes_to_the_same_weights(unbroken, number
         assert "Traceback" not in err
     status, _, err = call([*LONGER, f"out={out}", "ckpt_path=last"], folder)
     assert status == 0, err
-    (resumed,) = (
-        path.parent for path in (folder / out).rglob("result.json") if path.parent != run
-    )
+    (resumed,) = (path.parent for path in (folder / out).rglob("result.json") if path.parent != run)
     assert records.read(resumed)["notes"]["resumed_from"] == str(
         (run / "checkpoints" / "last.ckpt").relative_to(folder)
     )

@@ -39,7 +39,7 @@ def nodes(cfg):
                 yield from nodes(cfg[key])
 
 
-@pytest.mark.parametrize("override", choices())
+@pytest.mark.parametrize("override", list(choices()))
 def test_every_yaml_composes_resolves_and_fits_its_constructors(override):
     cfg = compose([override, *EXTRA.get(override, [])])
     OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
@@ -110,5 +110,5 @@ def test_mistakes_are_named_before_any_work(overrides, said):
 
 
 def test_build_passes_a_user_error_on_unwrapped():
-    with pytest.raises(UserError, match="sampler.tau_min"):
+    with pytest.raises(UserError, match=r"sampler\.tau_min"):
         build(compose(["sampler.tau_min=0"]).sampler)

@@ -3,14 +3,14 @@ import copy
 import lightning as L
 import pytest
 import torch
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.random import RandomSampler
 
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.experiment import Experiment
 from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.tasks.classification import Classification
 from tests.conftest import small_dataset
 

@@ -30,9 +30,7 @@ def path(request, monkeypatch):
     """Both ways to SᵀP, the streamed one with blocks that divide nothing evenly."""
     monkeypatch.setattr(sampling_matrix, "BLOCK_QUERIES", 4)
     monkeypatch.setattr(sampling_matrix, "BLOCK_POINTS", 10)
-    monkeypatch.setattr(
-        sampling_matrix, "DENSE_LIMIT", 0 if request.param == "streamed" else 2**22
-    )
+    monkeypatch.setattr(sampling_matrix, "DENSE_LIMIT", 0 if request.param == "streamed" else 2**22)
     return request.param
 
 

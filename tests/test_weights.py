@@ -19,7 +19,10 @@ def test_round_trip_is_exact_and_carries_its_facts(saved):
     net, path = saved
     other = PointNetVanilla(4)
     content = weights.load_into(other, path)
-    assert all(torch.equal(a, b) for a, b in zip(net.state_dict().values(), other.state_dict().values(), strict=True))
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(net.state_dict().values(), other.state_dict().values(), strict=True)
+    )
     assert content["config"] == {"seed": 1}
     assert content["metrics"] == {"accuracy": 0.5}
     assert content["sha256"] == weights.digest(net.state_dict())

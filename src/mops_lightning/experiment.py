@@ -154,8 +154,8 @@ class Experiment(L.LightningModule):
         for name, value in {**losses, "total": total}.items():
             self.log(f"train/loss/{name}", value.detach(), batch_size=size)
         self.log("loss", total.detach(), prog_bar=True, logger=False, batch_size=size)
-        mean = {"on_step": False, "on_epoch": True, "batch_size": size}
-        self.log("train/mean_loss", total.detach(), **mean)
+        mean = total.detach()
+        self.log("train/mean_loss", mean, on_step=False, on_epoch=True, batch_size=size)
         tau: Any = getattr(self.sampler, "tau", None)
         if tau is not None:
             self.log("train/tau", tau, batch_size=size)

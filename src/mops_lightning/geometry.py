@@ -5,6 +5,8 @@ distances as differences of coordinates: |a|² + |b|² − 2⟨a, b⟩ would be 
 cancels, and takes wrong neighbours where points lie 1e-3 apart in the unit sphere.
 """
 
+import math
+
 import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
@@ -137,23 +139,23 @@ def farthest_point_fill(points: Tensor, indices: Tensor, given: Tensor) -> Tenso
 
 
 def first_extreme(values: Tensor, largest: bool) -> Tensor:
-    """Return ``values.argmax(-1)`` or ``argmin``, several times as fast on a CPU.
+    """Return ``values.argmax(1, keepdim=True)`` or ``argmin``, several times as fast on a CPU.
 
     Extremes alone are vectorised there, extremes with positions are not: so take those of groups,
     and look for positions only among the groups and inside the winning one.
 
     Args:
-        values: ``(..., L)``, L a multiple of ``GROUP``.
+        values: ``(rows, L)``, L a multiple of ``GROUP``.
         largest: look for the maximum, else for the minimum.
 
     Returns:
-        ``(..., 1)`` int64; the lowest position where several values are equal.
+        ``(rows, 1)`` int64; the lowest position where several values are equal.
     """
-    groups = values.unflatten(-1, (-1, GROUP))
-    peaks = groups.amax(-1) if largest else groups.amin(-1)
-    group = peaks.argmax(-1, keepdim=True) if largest else peaks.argmin(-1, keepdim=True)
-    inside = groups.gather(-2, group[..., None].expand(*group.shape, GROUP)).squeeze(-2)
-    place = inside.argmax(-1, keepdim=True) if largest else inside.argmin(-1, keepdim=True)
+    groups = values.view(len(values), -1, GROUP)
+    peaks = groups.amax(2) if largest else groups.amin(2)
+    group = peaks.argmax(1, keepdim=True) if largest else peaks.argmin(1, keepdim=True)
+    inside = groups.gather(1, group[..., None].expand(-1, 1, GROUP))
+    place = inside.argmax(2) if largest else inside.argmin(2)
     return place.add_(group, alpha=GROUP)
 
 
@@ -162,26 +164,38 @@ def _search_dtype(points: Tensor) -> torch.dtype:
     return torch.promote_types(points.dtype, torch.float32)
 
 
+def _planes(points: Tensor, padding: float | None = None) -> Tensor:
+    """Turn ``(B, N, C)`` into contiguous ``(C, B, N)``, N padded to whole groups if asked."""
+    planes = points.permute(2, 0, 1)
+    if padding is not None:
+        planes = F.pad(planes, (0, -points.shape[1] % GROUP), value=padding)
+    return planes.contiguous()
+
+
 def _nearest_indices(queries: Tensor, points: Tensor) -> Tensor:
     """Search for ``nearest``; coordinates lie in planes, so that every step is vectorised."""
     dtype = _search_dtype(points)
-    rows = queries.to(dtype).permute(2, 0, 1)[..., None].contiguous()  # (C, B, M, 1)
-    columns = points.to(dtype).permute(2, 0, 1)[:, :, None]  # (C, B, 1, N)
-    columns = F.pad(columns, (0, -points.shape[1] % GROUP), value=torch.inf)
+    rows = _planes(queries.to(dtype))[..., None]  # (C, B, M, 1)
+    columns = _planes(points.to(dtype), padding=torch.inf)[:, :, None]  # (C, B, 1, N)
     clouds, m, width = queries.shape[0], queries.shape[1], columns.shape[3]
     limit = BLOCK["cpu" if points.device.type == "cpu" else "other"]
     height = max(1, min(m, limit // width))
     depth = max(1, min(clouds, limit // (height * width)))
-    indices = torch.empty(clouds, m, 1, dtype=torch.int64, device=points.device)
+    indices = torch.empty(clouds, m, dtype=torch.int64, device=points.device)
+    buffers = rows.new_empty(2, depth * height * width)  # allocating per block costs a third more
     for b in range(0, clouds, depth):
         for r in range(0, m, height):
             part = rows[:, b : b + depth, r : r + height]
-            total = (columns[0, b : b + depth] - part[0]).square_()
+            shape = (*part.shape[1:3], width)
+            total, difference = buffers[:, : math.prod(shape)].view(2, *shape)
+            torch.sub(columns[0, b : b + depth], part[0], out=total)
+            total.mul_(total)
             for axis in range(1, len(rows)):
-                difference = columns[axis, b : b + depth] - part[axis]
+                torch.sub(columns[axis, b : b + depth], part[axis], out=difference)
                 total.addcmul_(difference, difference)
-            indices[b : b + depth, r : r + height] = first_extreme(total, largest=False)
-    return indices.squeeze(2)
+            winners = first_extreme(total.view(-1, width), largest=False)
+            indices[b : b + depth, r : r + height] = winners.view(shape[:2])
+    return indices
 
 
 @torch.no_grad()
@@ -198,18 +212,18 @@ def _take_farthest(points: Tensor, distances: Tensor, steps: int) -> Tensor:
         ``(B, steps)`` int64.
     """
     clouds, n, channels = points.shape
-    surplus = -n % GROUP
-    planes = F.pad(points.to(distances.dtype).permute(2, 0, 1), (0, surplus))  # (C, B, N)
-    distances = F.pad(distances, (0, surplus), value=-1.0)
+    planes = _planes(points.to(distances.dtype), padding=0.0)
+    distances = F.pad(distances, (0, planes.shape[2] - n), value=-1.0)
     differences = torch.empty_like(planes)
     total, *others = differences.unbind(0)
-    taken = torch.empty(steps, clouds, 1, dtype=torch.int64, device=points.device)
-    for step in range(steps):
-        index = taken[step].copy_(first_extreme(distances, largest=True))
+    taken = []
+    for _ in range(steps):
+        index = first_extreme(distances, largest=True)
+        taken.append(index)
         distances.scatter_(1, index, -1.0)
         torch.sub(planes, planes.gather(2, index.expand(channels, -1, -1)), out=differences)
-        total.square_()
+        total.mul_(total)
         for other in others:
             total.addcmul_(other, other)
         torch.minimum(distances, total, out=distances)
-    return taken.squeeze(2).T.contiguous()
+    return torch.cat(taken, 1)

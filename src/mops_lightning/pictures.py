@@ -73,8 +73,8 @@ def matrix_figure(dense: Tensor, gram: Tensor, title: str) -> Figure:
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     images = [
-        left.imshow(values[order], aspect="auto", vmin=0, vmax=1, cmap="viridis"),
-        right.imshow(gram.detach().cpu(), vmin=0, vmax=1, cmap="viridis"),
+        left.imshow(values[order].numpy(), aspect="auto", vmin=0, vmax=1, cmap="viridis"),
+        right.imshow(gram.detach().cpu().numpy(), vmin=0, vmax=1, cmap="viridis"),
     ]
     left.set(title="S (points in order of their column)", xlabel="column", ylabel="point")
     right.set(title="SᵀS", xlabel="column", ylabel="column")

@@ -25,7 +25,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
     if cfg.weights is None or cfg.ckpt_path is not None:
         return None
     if cfg.weights != "auto":
-        return Path(cfg.weights).expanduser()
+        return Path(cfg.weights)
     folder = cache_folder(cfg, dataset)
     if not (folder / WEIGHTS).is_file():
         print(

@@ -34,7 +34,7 @@ def save(path: Path, module: nn.Module, config: dict[str, Any], metrics: dict[st
         torch.save(content, temporary)
 
 
-def load(path: Path) -> dict[str, Any]:
+def load(path: str | Path) -> dict[str, Any]:
     """Read a weights file and verify it.
 
     Returns:
@@ -43,6 +43,7 @@ def load(path: Path) -> dict[str, Any]:
     Raises:
         UserError: the file is missing, damaged or no weights file.
     """
+    path = Path(path).expanduser()
     if not path.is_file():
         raise UserError(f"weights: no file {path}. Give a weights.pt, or weights=auto.")
     try:
@@ -60,7 +61,7 @@ def load(path: Path) -> dict[str, Any]:
     return content
 
 
-def load_into(module: nn.Module, path: Path) -> dict[str, Any]:
+def load_into(module: nn.Module, path: str | Path) -> dict[str, Any]:
     """Read a weights file into a module, strictly.
 
     Returns:

@@ -29,7 +29,7 @@ def test_order_hangs_on_seed_and_epoch_only():
     second.set_epoch(2)
     assert labels(second) == epochs[2]
     assert labels(CloudLoader(clouds(), 4, shuffle=True, seed=6)) != epochs[0]
-    assert sorted(sum(epochs[0], [])) == list(range(10))
+    assert sorted(label for batch in epochs[0] for label in batch) == list(range(10))
 
 
 def test_drop_last_keeps_full_batches_only_unless_there_is_none():

@@ -27,7 +27,7 @@ SMALL: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def dataset() -> CloudDataset:
-    return shapes(n_points=512, train_per_class=24, test_per_class=8)
+    return shapes(n_points=512, train_per_class=20, test_per_class=6)
 
 
 def same(first: CloudDataset, second: CloudDataset) -> bool:
@@ -112,7 +112,7 @@ def test_every_builder_gives_sound_meshes(name: str) -> None:
 def test_clouds_are_labelled_and_in_the_unit_sphere(dataset: CloudDataset) -> None:
     assert dataset.class_names == tuple(BUILDERS)
     assert len(dataset.class_names) >= 12
-    for clouds, count in ((dataset.train, 24), (dataset.test, 8)):
+    for clouds, count in ((dataset.train, 20), (dataset.test, 6)):
         assert clouds.points.shape == (count * len(BUILDERS), 512, 3)
         assert clouds.points.dtype == torch.float32
         assert clouds.labels.dtype == torch.int64
@@ -172,7 +172,7 @@ def test_shapes_differ_within_a_class_and_between_splits(dataset: CloudDataset) 
 
 def test_the_form_does_not_hang_on_the_number_of_points() -> None:
     forms = [
-        shapes(n, 2, 1, ["airplane", "chair", "lamp"]).train.points.numpy() for n in (1500, 6000)
+        shapes(n, 2, 1, ["airplane", "chair", "lamp"]).train.points.numpy() for n in (1000, 4000)
     ]
     far = np.array([[np.median(cKDTree(b).query(a)[0]) for b in forms[1]] for a in forms[0]])
     assert np.diag(far).max() < 0.03

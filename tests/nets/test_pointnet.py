@@ -1,4 +1,5 @@
 import copy
+from itertools import pairwise
 
 import pytest
 import torch
@@ -8,7 +9,6 @@ from mops_lightning.nets.pointnet import (
     PointFeatures,
     PointMaxPool,
     PointNetVanilla,
-    _argmax_rows,
 )
 
 
@@ -61,13 +61,6 @@ def test_max_pool_gradcheck(rng):
     assert torch.autograd.gradcheck(frozen, (features,))
 
 
-@pytest.mark.parametrize("rows", [1, 31, 32, 64, 95, 1000, 1024, 1037])
-def test_grouped_argmax_finds_the_maximum(rows, rng):
-    values = torch.randn(rows, 17, generator=rng)
-    found = _argmax_rows(values)
-    torch.testing.assert_close(values.gather(0, found[None])[0], values.amax(0))
-
-
 def test_classifier_does_not_mind_order_or_batch(rng):
     torch.manual_seed(0)
     net = PointNetVanilla(5).eval()
@@ -85,7 +78,7 @@ def test_classifier_has_the_published_layers():
         if isinstance(module, torch.nn.Linear)
     ]
     channels = [3, 64, 64, 64, 128, 1024, 512, 256, 40]
-    assert sizes == [(b, a) for a, b in zip(channels[:-1], channels[1:], strict=True)]
+    assert sizes == [(b, a) for a, b in pairwise(channels)]
 
 
 def test_features_are_local_and_their_maximum(rng):

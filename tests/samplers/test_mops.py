@@ -88,9 +88,7 @@ def test_subset_loss_is_weighted_and_only_in_training(rng):
     net = small(alpha=7.0).train()
     points = torch.randn(2, 20, 3, generator=rng)
     output = net(points)
-    torch.testing.assert_close(
-        output.losses["subset"], 7.0 * subset_loss(points, output.points)
-    )
+    torch.testing.assert_close(output.losses["subset"], 7.0 * subset_loss(points, output.points))
     assert net.eval()(points).losses == {}
 
 

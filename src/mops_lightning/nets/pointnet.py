@@ -11,6 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mops_lightning.geometry import GROUP, first_extreme
+
 
 def linear_norm_relu(channels: Sequence[int]) -> nn.Sequential:
     """Stack linear layers, each followed by BatchNorm and ReLU.
@@ -105,34 +107,17 @@ class PointMaxPool(nn.Module):
         """Return, per cloud and channel, the extreme value of the product: ``(B, C)``."""
         weight = self.linear.weight
         with torch.no_grad():
-            search = torch.where(falling[:, None], -weight, weight).mT.contiguous()
+            search = torch.where(falling[:, None], -weight, weight)
             if features.is_cuda:
-                winners = (features @ search).argmax(1)
+                winners = (search @ features.mT).argmax(2)
             else:  # cloud by cloud the product stays in the cache
-                winners = torch.stack([_argmax_rows(cloud @ search) for cloud in features])
+                surplus = -features.shape[1] % GROUP
+                # Copies of the first point never win: the lowest position does.
+                filled = torch.cat([features, features[:, :1].expand(-1, surplus, -1)], 1)
+                rows = [first_extreme(search @ cloud.mT, largest=True) for cloud in filled]
+                winners = torch.stack(rows).squeeze(2)
         index = winners[..., None].expand(-1, -1, features.shape[2])
         return (features.gather(1, index) * weight).sum(-1)
-
-
-def _argmax_rows(values: Tensor, group: int = 32) -> Tensor:
-    """Return ``values.argmax(0)`` for ``(N, C)``, on a CPU several times as fast.
-
-    Maxima alone are vectorised there, maxima with positions are not: so take the maxima of groups
-    of rows, and look for positions only among groups and then inside the winning one.
-    """
-    whole = len(values) // group * group
-    if whole <= group:
-        return values.argmax(0)
-    groups = values[:whole].view(-1, group, values.shape[1])
-    best = groups.amax(1).argmax(0)
-    inside = groups.gather(0, best.expand(1, group, -1))[0]
-    place = inside.argmax(0)
-    winner = best * group + place
-    if whole == len(values):
-        return winner
-    tail = values[whole:].max(0)
-    peak = inside.gather(0, place[None])[0]
-    return torch.where(tail.values > peak, tail.indices + whole, winner)
 
 
 class PointNetVanilla(nn.Module):

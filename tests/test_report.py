@@ -1,0 +1,81 @@
+import json
+
+import pytest
+
+from mops_lightning import records
+from mops_lightning.errors import UserError
+from mops_lightning.report import main, table
+from tests.test_records import record
+
+
+def put(folder, sampler, m, metrics, **changes):
+    names = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": sampler}
+    config = {"m": m, "learn": "sampler", "names": names, "trainer": {"max_epochs": 3}}
+    notes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **changes.pop("notes", {})}
+    target = folder / f"{sampler}-{m}"
+    target.mkdir()
+    records.write(target, record(config=config, metrics=metrics, notes=notes, **changes))
+
+
+def rows(text):
+    return [
+        [cell.strip() for cell in line.strip()[1:-1].split("|")]
+        for line in text.splitlines()
+        if line.startswith("| ")
+    ]
+
+
+def test_cells_are_the_records_figures_beside_the_paper_s(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3, "test/full/accuracy": 0.9})
+    put(tmp_path, "fps", 8, {"test/sampled/accuracy": 0.1})
+    learned = {"test/generated/accuracy": 0.8, "test/matched/accuracy": 0.77}
+    put(tmp_path, "mops", 32, {**learned, "test/random/accuracy": 0.2, "val/x/accuracy": 1.0})
+    assert rows(table(tmp_path)) == [
+        ["sampled by", "readout", "m=32", "m=8"],
+        ["random", "sampled", "20.00 (15.07)", ""],
+        ["fps", "sampled", "30.00 (34.08)", "10.00 (11.02)"],
+        ["mops", "generated", "80.00 (84.28)", ""],
+        ["mops", "matched", "77.00 (79.01)", ""],
+        ["pointnet", "full", "90.00 (87.10)", ""],
+    ]
+
+
+def test_runs_that_are_not_completed_are_counted_not_shown(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.8}, status="interrupted")
+    text = table(tmp_path)
+    assert "80.00" not in text
+    assert "1 of 2 runs are not completed" in text
+
+
+@pytest.mark.parametrize("note", ["dataset_fingerprint", "task_weights_sha256"])
+def test_runs_of_other_data_or_weights_are_not_mixed(tmp_path, note):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.8}, notes={note: "other"})
+    with pytest.raises(UserError, match="differ in"):
+        table(tmp_path)
+
+
+def test_a_folder_without_records_is_named(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([str(tmp_path)])
+    assert stop.value.code == 2
+    assert str(tmp_path) in capsys.readouterr().err
+
+
+def test_the_command_writes_what_it_prints(tmp_path, capsys):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    main([str(tmp_path)])
+    text = (tmp_path / "table.md").read_text()
+    assert text in capsys.readouterr().out
+
+
+def test_paper_figures_are_complete():
+    from importlib.resources import files
+
+    paper = json.loads(files("mops_lightning").joinpath("paper.json").read_text())
+    rows_ = paper["classification"]["rows"]
+    for sampler, sizes in rows_.items():
+        assert set(sizes) == {"512", "256", "128", "64", "32", "16", "8"}
+        count = 1 if sampler in ("random", "voxel", "fps") else 3
+        assert {len(values) for values in sizes.values()} == {count}
