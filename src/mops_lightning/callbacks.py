@@ -51,13 +51,13 @@ class StopBetweenSteps(Callback):
         """Stop here if asked to."""
         if self.received is not None:
             trainer.save_checkpoint(self.checkpoint)
-            raise Stopped(f"Go on with ckpt_path={self.checkpoint}")
+            raise Stopped(f"Go on with the same command and ckpt_path={self.checkpoint}")
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Stop after the last step, or stop listening."""
         self._restore()
         if self.received is not None:
-            raise Stopped(f"Go on with ckpt_path={self.checkpoint}")
+            raise Stopped(f"Go on with the same command and ckpt_path={self.checkpoint}")
 
     def on_exception(self, trainer: L.Trainer, *args: Any) -> None:
         """Stop listening."""

@@ -80,6 +80,7 @@ class Experiment(L.LightningModule):
         self.make_schedule = make_schedule
         self.seed = seed
         self.identity = identity
+        self.total_steps = 1
         for module in self._frozen():
             module.requires_grad_(False)
         self.own_readouts = readout_names(self.sampler)
@@ -114,10 +115,10 @@ class Experiment(L.LightningModule):
         if self.make_optimizer is None:
             raise UserError("This experiment was built without an optimizer: it can only test.")
         optimizer = self.make_optimizer([p for p in self.parameters() if p.requires_grad])
+        self.total_steps = int(self.trainer.estimated_stepping_batches)
         if self.make_schedule is None:
             return optimizer
-        steps = int(self.trainer.estimated_stepping_batches)
-        schedule = self.make_schedule(optimizer, total_steps=steps)
+        schedule = self.make_schedule(optimizer, total_steps=self.total_steps)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -134,8 +135,7 @@ class Experiment(L.LightningModule):
         """Seed dropout and the like by (seed, epoch, step), and set the temperature."""
         torch.manual_seed(derive_seed(self.seed, self.current_epoch, batch_idx))
         if self.sampler is not None:
-            steps = int(self.trainer.estimated_stepping_batches)
-            self.sampler.anneal(self.global_step / max(steps - 1, 1))
+            self.sampler.anneal(self.global_step / max(self.total_steps - 1, 1))
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the task loss plus the sampler's losses."""

@@ -44,8 +44,8 @@ def normalize_unit_sphere(points: Tensor) -> Tensor:
     centred = points - points.mean(1, keepdim=True)
     radius = torch.linalg.vector_norm(centred, dim=2, keepdim=True).amax(1, keepdim=True)
     # The mean of equal numbers may be off by a rounding error, which must not be blown up.
-    coincide = (points == points[:, :1]).all(2, keepdim=True).all(1, keepdim=True)
-    return torch.where(coincide, 0.0, centred / torch.where(coincide, 1.0, radius))
+    flat = (points == points[:, :1]).all(2, keepdim=True).all(1, keepdim=True) | (radius == 0)
+    return torch.where(flat, 0.0, centred / torch.where(flat, 1.0, radius))
 
 
 def nearest(queries: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -211,7 +211,7 @@ def _take_farthest(points: Tensor, distances: Tensor, steps: int) -> Tensor:
     Returns:
         ``(B, steps)`` int64.
     """
-    clouds, n, channels = points.shape
+    _, n, channels = points.shape
     planes = _planes(points.to(distances.dtype), padding=0.0)
     distances = F.pad(distances, (0, planes.shape[2] - n), value=-1.0)
     differences = torch.empty_like(planes)

@@ -73,5 +73,10 @@ def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
     if (folder / "checkpoints" / CHECKPOINT).is_file():
         # An earlier pretraining was cut off: go on from there.
         own.ckpt_path = str(folder)
-    with recorded(own, folder, []) as record:
-        fit_and_test(own, folder, dataset, record)
+    try:
+        with recorded(own, folder, []) as record:
+            fit_and_test(own, folder, dataset, record)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            "The task net was in training: the same command goes on there."
+        ) from None

@@ -1,0 +1,48 @@
+"""Farthest point sampling (FPS), a baseline of the paper's tables."""
+
+from torch import Tensor
+
+from mops_lightning.errors import UserError
+from mops_lightning.geometry import farthest_point_sample, gather_points
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.ordering import seeded_order
+from mops_lightning.types import SampleOutput
+
+
+class FPSSampler(Sampler):
+    """Choose input points, each as far as possible from those chosen before it.
+
+    Flexible: the choice for a smaller m is the first m points of the choice for a larger one. First
+    point and ties follow the seeded order of the cloud (see ``ordering``), so the choice does not
+    change with batch, call or, unless ``start`` is given, order of the points.
+
+    Args:
+        m: largest number of points to return.
+        seed: another seed starts from another point.
+        start: index of the first point in every cloud; None means that the seed chooses it.
+
+    Raises:
+        UserError: ``start`` is negative or, when called, at least N.
+    """
+
+    flexible = True
+
+    def __init__(self, m: int, seed: int = 0, start: int | None = None) -> None:
+        super().__init__(m)
+        if start is not None and start < 0:
+            raise UserError(f"start must be at least 0, or null for a random one, got {start}.")
+        self.seed = seed
+        self.start = start
+
+    def sample(self, points: Tensor, m: int) -> SampleOutput:
+        """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice."""
+        if self.start is not None and self.start >= points.shape[1]:
+            raise UserError(
+                f"start must be less than the number of points N={points.shape[1]}, "
+                f"got {self.start}."
+            )
+        order = seeded_order(points, self.seed)
+        first = None if self.start is None else (order == self.start).byte().argmax(1)
+        chosen = farthest_point_sample(gather_points(points.detach(), order), m, start=first)
+        indices = order.gather(1, chosen)
+        return SampleOutput(gather_points(points, indices), indices, {})

@@ -1,0 +1,31 @@
+"""Random sampling (RS), the first baseline of the paper's tables."""
+
+from torch import Tensor
+
+from mops_lightning.geometry import gather_points
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.ordering import seeded_order
+from mops_lightning.types import SampleOutput
+
+
+class RandomSampler(Sampler):
+    """Choose input points uniformly and without repetition.
+
+    Flexible: the choice for a smaller m is the first m points of the choice for a larger one. The
+    choice depends on the seed and the cloud alone, see ``ordering``.
+
+    Args:
+        m: largest number of points to return.
+        seed: another seed chooses other points.
+    """
+
+    flexible = True
+
+    def __init__(self, m: int, seed: int = 0) -> None:
+        super().__init__(m)
+        self.seed = seed
+
+    def sample(self, points: Tensor, m: int) -> SampleOutput:
+        """Return m of the points ``(B, N, 3)`` with their indices, in random order."""
+        indices = seeded_order(points, self.seed)[:, :m].contiguous()
+        return SampleOutput(gather_points(points, indices), indices, {})
