@@ -23,6 +23,7 @@ from mops_lightning.seeding import derive_seed, generator
 HARMLESS = (
     ".*does not have many workers.*",  # the data lie in memory; workers would only copy them
     ".*no `val_dataloader`.*",  # val_fraction=0 is a choice
+    ".*module.s. in eval mode at the start.*",  # frozen parts are meant to be
     ".*smaller than the logging interval.*",  # small data sets log once per epoch
     ".*isinstance.treespec, LeafSpec.*",  # Lightning 2.6 calls an old name of torch 2.13
     ".*GPU available but not used.*",  # trainer=cpu is a choice

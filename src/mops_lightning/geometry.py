@@ -51,8 +51,8 @@ def normalize_unit_sphere(points: Tensor) -> Tensor:
 def nearest(queries: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     """Find the nearest point of a cloud for every query by looking at all of them.
 
-    The search runs in blocks, so that memory stays bounded. (A KD-tree is faster on most clouds
-    but ten times slower on queries far from all points, such as those of an untrained sampler.)
+    The search runs in blocks, so that memory stays bounded. (A KD-tree is faster where queries lie
+    on the cloud, but many times slower in its midst, where an untrained sampler puts them.)
 
     Args:
         queries: ``(B, M, C)``.

@@ -42,16 +42,17 @@ def closing_lines(folder: Path, record: dict[str, Any], console: Console | None 
     console = console or Console()
     config = record["config"]
     names, rows = config["names"], readout_rows(record["metrics"])
-    columns = list(dict.fromkeys(name for row in rows.values() for name in row))
-    title = f"{names['task']} on {names['dataset']}, m={config['m']}, test"
+    # What the full clouds are scored by is the task's; figures of the sampled set stay in the record.
+    columns = list(rows.get("full", {}))
+    title = f"{names['task']} by {names['net']}, {names['dataset']}, m={config['m']}, test"
     table = Table(title=title, title_justify="left")
     table.add_column("sampled by")
     for column in columns:
         table.add_column(column.replace("_", " "), justify="right")
     for readout, row in rows.items():
-        label = f"{names['sampler']}: {readout}" if readout in LAST[:4] else readout
+        label = f"{names['sampler']} {readout}" if readout in LAST[:4] else readout
         cells = ["" if row.get(c) is None else _number(c, row[c]) for c in columns]
-        table.add_row(label if readout != "full" else f"{names['net']} on full clouds", *cells)
+        table.add_row("all points" if readout == "full" else label, *cells)
     console.print(table)
     files = ", ".join([FILE, *sorted(record["files"].values())])
     seconds = record["seconds"]["total"]

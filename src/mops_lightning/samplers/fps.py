@@ -30,7 +30,9 @@ class FPSSampler(Sampler):
     def __init__(self, m: int, seed: int = 0, start: int | None = None) -> None:
         super().__init__(m)
         if start is not None and start < 0:
-            raise UserError(f"start must be at least 0, or null for a random one, got {start}.")
+            raise UserError(
+                f"sampler.start must be at least 0, or null for a seeded one, got {start}."
+            )
         self.seed = seed
         self.start = start
 
@@ -38,7 +40,7 @@ class FPSSampler(Sampler):
         """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice."""
         if self.start is not None and self.start >= points.shape[1]:
             raise UserError(
-                f"start must be less than the number of points N={points.shape[1]}, "
+                f"sampler.start must be less than the number of points N={points.shape[1]}, "
                 f"got {self.start}."
             )
         order = seeded_order(points, self.seed)

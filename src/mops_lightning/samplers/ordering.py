@@ -35,9 +35,9 @@ def seeded_order(points: Tensor, seed: int) -> Tensor:
         begin = place.clone()
         begin[:, 1:].masked_fill_(equal, 0)
         copy = place - begin.cummax(1).values
-        # Number 0 leaves a key as it is: clouds without copies must not notice their neighbours.
-        again = (values + copy * _signed(STEP)).argsort(dim=1, stable=True)
-        order = order.gather(1, again)
+        # First ones keep their keys: clouds without copies must not notice their neighbours.
+        values = torch.where(copy > 0, _scramble(values + copy * _signed(STEP)), values)
+        order = order.gather(1, values.argsort(dim=1, stable=True))
     return order
 
 
@@ -59,10 +59,14 @@ def point_hashes(points: Tensor, seed: int) -> Tensor:
     keys = torch.full_like(bits[..., 0], _signed(seed * STEP + 1))
     for axis in range(points.shape[2]):
         keys = _fold(keys.bitwise_xor_(bits[..., axis]).mul_(_signed(FIRST)), 32)
-    keys.add_(_fold(keys, 29).mul_(_signed(SECOND)).sum(1, keepdim=True))
-    for multiplier, shift in ((FIRST, 27), (SECOND, 31)):
-        keys = _fold(_fold(keys, 30).mul_(_signed(multiplier)), shift)
-    return keys
+    return _scramble(keys.add_(_fold(keys, 29).mul_(_signed(SECOND)).sum(1, keepdim=True)))
+
+
+def _scramble(keys: Tensor) -> Tensor:
+    """Let every bit of a key change every bit of the result (the finish of SplitMix64)."""
+    keys = _fold(keys, 30).mul_(_signed(FIRST))
+    keys = _fold(keys, 27).mul_(_signed(SECOND))
+    return _fold(keys, 31)
 
 
 def _fold(keys: Tensor, shift: int) -> Tensor:

@@ -57,7 +57,8 @@ class VoxelSampler(Sampler):
     def __init__(self, m: int, pick: Literal["nearest", "centroid"] = "nearest") -> None:
         super().__init__(m)
         if pick not in ("nearest", "centroid"):
-            raise UserError(f"unknown pick {pick!r}.{did_you_mean(pick, ('nearest', 'centroid'))}")
+            hint = did_you_mean(pick, ("nearest", "centroid"))
+            raise UserError(f"sampler.pick: unknown {pick!r}.{hint}")
         self.pick = pick
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:

@@ -1,0 +1,204 @@
+"""What every sampler promises. A new sampler adds one line to SAMPLERS."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from mops_lightning.errors import UserError
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.random import RandomSampler
+from mops_lightning.samplers.voxel import VoxelSampler
+
+SAMPLERS: dict[str, Callable[..., Sampler]] = {
+    "random": lambda m, **kw: RandomSampler(m, **kw),
+    "fps": lambda m, **kw: FPSSampler(m, **kw),
+    "voxel": lambda m: VoxelSampler(m),
+    "voxel-centroid": lambda m: VoxelSampler(m, pick="centroid"),
+    "mops": lambda m: MOPSNet(m, feature_channels=(8, 6), rho_channels=(12, 10)),
+}
+SEEDED = ["random", "fps"]
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+B, N, M = 3, 60, 8
+
+
+@pytest.fixture(params=SAMPLERS)
+def make(request):
+    """Builds the sampler in eval mode, learned ones with the same weights every time."""
+
+    def build(m=M, dtype=torch.float32):
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            return SAMPLERS[request.param](m).to(dtype).eval()
+
+    return build
+
+
+@pytest.fixture
+def clouds(rng):
+    return torch.randn(B, N, 3, generator=rng)
+
+
+def lattice(rng):
+    """Distinct points with coordinates k/4: equal distances everywhere, to try the ties."""
+    grid = torch.cartesian_prod(*[torch.arange(5) / 4] * 3)
+    return torch.stack([grid[torch.randperm(125, generator=rng)[:N]] for _ in range(B)])
+
+
+def as_sets(points):
+    return [sorted(cloud) for cloud in points.tolist()]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_shape_dtype_and_device(make, clouds, dtype, device):
+    points = clouds.to(device, dtype)
+    output = make(dtype=dtype).to(device)(points)
+    assert output.points.shape == (B, M, 3)
+    assert output.points.dtype == dtype
+    assert output.points.device == points.device
+    assert torch.isfinite(output.points).all()
+    assert all(loss.ndim == 0 for loss in output.losses.values())
+    if output.indices is not None:
+        assert output.indices.shape == (B, M)
+        assert output.indices.dtype == torch.int64
+        assert output.indices.device == points.device
+
+
+@pytest.mark.parametrize("cloud", ["random", "lattice"])
+def test_indices_are_distinct_and_point_at_the_points(make, clouds, cloud, rng):
+    points = clouds if cloud == "random" else lattice(rng)
+    output = make()(points)
+    if output.indices is None:
+        pytest.skip("generates its points")
+    for b in range(B):
+        assert torch.equal(output.points[b], points[b][output.indices[b]])
+        assert len(set(output.indices[b].tolist())) == M
+
+
+@pytest.mark.parametrize("m", [0, -1, M + 1])
+def test_refuses_a_size_out_of_range(make, clouds, m):
+    with pytest.raises(UserError, match=f"m must be .*{M}.* got {m}"):
+        make()(clouds, m)
+
+
+def test_cannot_be_made_for_no_points(make):
+    with pytest.raises(UserError, match="m must be at least 1, got 0"):
+        make(m=0)
+
+
+def test_refuses_more_points_than_there_are(make, clouds):
+    with pytest.raises(UserError, match=f"N={M - 1}, got m={M}"):
+        make()(clouds[:, : M - 1])
+
+
+def test_other_sizes_for_flexible_samplers_only(make, clouds):
+    sampler = make()
+    if not sampler.flexible:
+        with pytest.raises(UserError, match=f"m must be {M}, .* got {M - 3}"):
+            sampler(clouds, M - 3)
+        return
+    for m in (1, M - 3, M):
+        assert sampler(clouds, m).points.shape == (B, m, 3)
+        torch.testing.assert_close(sampler(clouds, m).points, make(m)(clouds).points)
+
+
+@pytest.mark.parametrize(
+    ("points", "named"),
+    [
+        (torch.zeros(N, 3), "shape"),
+        (torch.zeros(B, N, 4), "shape"),
+        (torch.zeros(B, 1, N, 3), "shape"),
+        (torch.zeros(0, N, 3), "at least one"),
+        (torch.zeros(B, 0, 3), "at least one"),
+        (torch.zeros(B, N, 3, dtype=torch.int64), "floating point, got torch.int64"),
+        (torch.full((B, N, 3), torch.nan), "finite"),
+        (torch.full((B, N, 3), -torch.inf), "finite"),
+    ],
+)
+def test_refuses_wrong_input(make, points, named):
+    with pytest.raises(UserError, match=f"points must .*{named}"):
+        make()(points)
+
+
+@pytest.mark.parametrize("cloud", ["random", "lattice"])
+def test_does_not_depend_on_the_order_of_the_points(make, clouds, cloud, rng):
+    points = clouds if cloud == "random" else lattice(rng)
+    sampler = make()
+    permuted = points[:, torch.randperm(N, generator=rng)]
+    first, second = sampler(points).points, sampler(permuted).points
+    if sampler.learned:
+        torch.testing.assert_close(first, second, atol=1e-5, rtol=0)
+    else:
+        assert as_sets(first) == as_sets(second)
+
+
+@pytest.mark.parametrize("cloud", ["random", "lattice"])
+def test_does_not_depend_on_the_batch(make, clouds, cloud, rng):
+    points = clouds if cloud == "random" else lattice(rng)
+    points[1, 5:9] = points[1, 4]  # copies in one cloud must not show in another
+    sampler = make()
+    together = sampler(points)
+    for b in range(B):
+        alone = sampler(points[b : b + 1])
+        if sampler.learned:
+            torch.testing.assert_close(alone.points[0], together.points[b], atol=1e-5, rtol=0)
+        else:
+            assert torch.equal(alone.points[0], together.points[b])
+        if alone.indices is not None:
+            assert torch.equal(alone.indices[0], together.indices[b])
+
+
+def test_repeats_itself_and_leaves_input_and_global_generator_alone(make, clouds):
+    before, state = clouds.clone(), torch.random.get_rng_state()
+    sampler = make()
+    first, second = sampler(clouds), sampler(clouds)
+    assert torch.equal(first.points, second.points)
+    assert torch.equal(first.points, make()(clouds).points)
+    assert torch.equal(clouds, before)
+    assert torch.equal(torch.random.get_rng_state(), state)
+
+
+@pytest.mark.parametrize("name", SEEDED)
+def test_another_seed_gives_another_sample(name, clouds):
+    def sample(seed):
+        return as_sets(SAMPLERS[name](M, seed=seed)(clouds).points)
+
+    assert sample(1) == sample(1)
+    assert all(one != other for one, other in zip(sample(1), sample(2), strict=True))
+
+
+def test_every_point_can_be_asked_for(make, clouds):
+    output = make(m=N)(clouds)
+    assert output.points.shape == (B, N, 3)
+    if output.indices is not None:
+        assert as_sets(output.points) == as_sets(clouds)
+
+
+@pytest.mark.parametrize("distinct", [1, 3])
+def test_coincident_points(make, distinct, rng):
+    place = torch.arange(N) % distinct
+    points = torch.randn(B, distinct, 3, generator=rng)[:, place]
+    output = make()(points)
+    assert torch.isfinite(output.points).all()
+    assert (output.points <= points.amax(1, keepdim=True) + 1e-6).all()
+    assert (output.points >= points.amin(1, keepdim=True) - 1e-6).all()
+    if output.indices is not None:
+        assert all(len(set(row)) == M for row in output.indices.tolist())
+
+
+def test_gradients(make, rng):
+    points = torch.randn(1, 9, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+    sampler = make(m=3, dtype=torch.float64)
+    output = sampler(points)
+    if output.indices is not None:  # the choice is fixed; the chosen points pass gradients on
+        (gradient,) = torch.autograd.grad(output.points.sum(), points)
+        chosen = torch.zeros(1, 9, 1).index_fill(1, output.indices[0], 1.0)
+        assert torch.equal(gradient, chosen.expand_as(gradient).to(gradient))
+    if sampler.learned:
+        assert torch.autograd.gradcheck(lambda p: sampler(p).points, (points,))
+        gradients = torch.autograd.grad(output.points.square().sum(), list(sampler.parameters()))
+        assert all(torch.isfinite(g).all() for g in gradients)
+        assert any((g != 0).any() for g in gradients)
