@@ -14,11 +14,9 @@ from lightning.pytorch.callbacks import (
     RichProgressBar,
 )
 
+from mops_lightning.errors import Interrupted
+
 CHECKPOINT = "last.ckpt"
-
-
-class Stopped(KeyboardInterrupt):
-    """Raised between two steps after a signal, once a checkpoint lies on disk."""
 
 
 class StopBetweenSteps(Callback):
@@ -51,13 +49,13 @@ class StopBetweenSteps(Callback):
         """Stop here if asked to."""
         if self.received is not None:
             trainer.save_checkpoint(self.checkpoint)
-            raise Stopped(f"Go on with the same command and ckpt_path={self.checkpoint}")
+            raise Interrupted(f"Go on with the same command and ckpt_path={self.checkpoint}")
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Stop after the last step, or stop listening."""
         self._restore()
         if self.received is not None:
-            raise Stopped(f"Go on with the same command and ckpt_path={self.checkpoint}")
+            raise Interrupted(f"Go on with the same command and ckpt_path={self.checkpoint}")
 
     def on_exception(self, trainer: L.Trainer, *args: Any) -> None:
         """Stop listening."""

@@ -5,7 +5,7 @@ import sys
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from mops_lightning.config import GROUPS, RUN_KEYS, conf_dir
-from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.errors import Interrupted, UserError, did_you_mean
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -47,7 +47,7 @@ def _job(cfg: "DictConfig") -> float | None:
     except UserError as error:
         # Ended here, Hydra does not add lines of its own.
         _end(str(error), USER_ERROR)
-    except KeyboardInterrupt as stop:
+    except (KeyboardInterrupt, Interrupted) as stop:
         _end(f"interrupted. {stop}".rstrip(), INTERRUPTED)
 
 

@@ -8,6 +8,13 @@ class UserError(ValueError):
     """A mistake in settings, files or arguments; the command line prints it without a traceback."""
 
 
+class Interrupted(Exception):
+    """A run was stopped by a signal.
+
+    Not a KeyboardInterrupt: Lightning turns that into ``SystemExit(1)`` and hides what happened.
+    """
+
+
 def did_you_mean(name: str, allowed: Iterable[str]) -> str:
     """Say which allowed names are nearest to ``name``, and all of them when they are few.
 

@@ -3,6 +3,8 @@
 import logging
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +19,16 @@ from mops_lightning.config import build
 from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.draw import DrawClouds
+from mops_lightning.errors import Interrupted
 from mops_lightning.experiment import Experiment
 from mops_lightning.seeding import derive_seed, generator
 
 HARMLESS = (
     ".*does not have many workers.*",  # the data lie in memory; workers would only copy them
     ".*no `val_dataloader`.*",  # val_fraction=0 is a choice
+    ".*dirpath has changed.*",  # a resumed run has a folder of its own
     ".*module.s. in eval mode at the start.*",  # frozen parts are meant to be
-    ".*smaller than the logging interval.*",  # small data sets log once per epoch
+    ".*smaller than the logging interval.*",  # it is lowered for small data sets
     ".*isinstance.treespec, LeafSpec.*",  # Lightning 2.6 calls an old name of torch 2.13
     ".*GPU available but not used.*",  # trainer=cpu is a choice
 )
@@ -49,17 +53,30 @@ def fit(
         seed=cfg.seed,
     )
     validation = CloudLoader(held_out, cfg.batch_size) if len(held_out.labels) else None
-    trainer.fit(experiment, loader, validation, ckpt_path=checkpoint)
+    # A small data set has fewer batches than lie between two logged ones.
+    trainer.log_every_n_steps = min(trainer.log_every_n_steps, len(loader))
+    with _interruptible():
+        trainer.fit(experiment, loader, validation, ckpt_path=checkpoint)
 
 
 def test(
     cfg: DictConfig, trainer: L.Trainer, experiment: Experiment, dataset: CloudDataset
 ) -> dict[str, float]:
     """Score all test clouds and return the metrics as one flat map."""
-    trainer.test(experiment, CloudLoader(dataset.test, cfg.batch_size), verbose=False)
+    with _interruptible():
+        trainer.test(experiment, CloudLoader(dataset.test, cfg.batch_size), verbose=False)
     metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
     log_hparams(trainer, cfg, {k: v for k, v in metrics.items() if k.startswith("test/")})
     return metrics
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Undo Lightning's translation of Ctrl-C into SystemExit."""
+    try:
+        yield
+    except SystemExit:
+        raise Interrupted("Go on with the same command and ckpt_path=last.") from None
 
 
 def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, str]) -> Experiment:

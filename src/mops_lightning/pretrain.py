@@ -10,6 +10,7 @@ from omegaconf import DictConfig, open_dict
 from mops_lightning import resume
 from mops_lightning.callbacks import CHECKPOINT
 from mops_lightning.data.clouds import CloudDataset
+from mops_lightning.errors import Interrupted
 from mops_lightning.io import atomic_write
 
 WEIGHTS = "weights.pt"
@@ -76,7 +77,5 @@ def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
     try:
         with recorded(own, folder, []) as record:
             fit_and_test(own, folder, dataset, record)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            "The task net was in training: the same command goes on there."
-        ) from None
+    except (KeyboardInterrupt, Interrupted):
+        raise Interrupted("The task net was in training: the same command goes on there.") from None

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from mops_lightning import pretrain, records, resume, weights
 from mops_lightning.config import build, check
 from mops_lightning.data.clouds import CloudDataset
-from mops_lightning.errors import UserError
+from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.fit import device_name, fit, make_experiment, make_trainer, test
 from mops_lightning.summary import closing_lines
 
@@ -117,7 +117,7 @@ def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[di
         with timed(record, "total"):
             yield record
         record["status"] = "completed"
-    except KeyboardInterrupt as stop:
+    except (KeyboardInterrupt, Interrupted) as stop:
         record["status"], record["error"] = "interrupted", str(stop) or "interrupted"
         raise
     except BaseException as error:

@@ -42,7 +42,7 @@ def closing_lines(folder: Path, record: dict[str, Any], console: Console | None 
     console = console or Console()
     config = record["config"]
     names, rows = config["names"], readout_rows(record["metrics"])
-    # What the full clouds are scored by is the task's; figures of the sampled set stay in the record.
+    # The task's own scores; figures of the sampled set stay in the record.
     columns = list(rows.get("full", {}))
     title = f"{names['task']} by {names['net']}, {names['dataset']}, m={config['m']}, test"
     table = Table(title=title, title_justify="left")
