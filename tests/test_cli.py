@@ -99,7 +99,7 @@ def test_weights_pictures_and_curves_are_real_files(main_job):
         assert (run / "pictures" / name).read_bytes().startswith(b"\x89PNG")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    tags = {}
+    tags: dict[str, set[str]] = {}
     for path in (run / "tensorboard").rglob("events*"):
         accumulator = EventAccumulator(str(path))
         accumulator.Reload()
@@ -167,6 +167,7 @@ def test_cfg_job_shows_the_config(tmp_path):
         (["sampler.alhpa=3"], "sampler.alpha"),
         (["sampler=mosp"], "mops"),
         (["m=4096"], "dataset.n_points=4096"),
+        (["trainer=gpu", *TINY[1:]], "Try trainer=auto or trainer=cpu"),
         (["m=abc"], "m must be a whole number"),
         (["dataset=modelnet40", "dataset.root=nowhere"], "dataset.root"),
         (["dataset.classes=[chiar]"], "chair"),

@@ -1,4 +1,5 @@
 import inspect
+from typing import Any
 
 import pytest
 from hydra.utils import get_object
@@ -63,7 +64,8 @@ def test_every_run_level_key_is_known_and_explained_by_help():
     own = {str(key) for key in cfg} - set(GROUPS)
     assert own == set(RUN_KEYS)
     page = OmegaConf.load(conf_dir() / "hydra" / "help" / "mops.yaml")
-    template = OmegaConf.to_container(page, resolve=False)["template"]
+    plain: Any = OmegaConf.to_container(page, resolve=False)
+    template = plain["template"]
     section = template.split("== Run-level keys")[1].split("== Every setting")[0]
     explained = {line.split()[0] for line in section.splitlines()[1:] if line.strip()}
     assert explained == set(RUN_KEYS)

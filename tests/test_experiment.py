@@ -3,14 +3,15 @@ import copy
 import lightning as L
 import pytest
 import torch
-from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.random import RandomSampler
 
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.experiment import Experiment
 from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.random import RandomSampler
+from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.tasks.classification import Classification
 from tests.conftest import small_dataset
 
@@ -113,7 +114,8 @@ def test_scores_are_those_of_a_plain_loop():
     run.test(module, CloudLoader(data.test, 4), verbose=False)
     got = {name: value.item() for name, value in run.callback_metrics.items()}
     module.eval()
-    hits, full, per_class = 0, 0, {0: [], 1: [], 2: []}
+    per_class: list[list[bool]]
+    hits, full, per_class = 0, 0, [[], [], []]
     with torch.no_grad():
         for points, label in zip(data.test.points, data.test.labels, strict=True):
             sampled = module.sampler(points[None]).points
@@ -123,7 +125,7 @@ def test_scores_are_those_of_a_plain_loop():
             full += module.task.net(points[None]).argmax().item() == label.item()
     assert got["test/generated/accuracy"] == pytest.approx(hits / len(data.test.labels))
     assert got["test/full/accuracy"] == pytest.approx(full / len(data.test.labels))
-    means = [sum(v) / len(v) for v in per_class.values()]
+    means = [sum(v) / len(v) for v in per_class]
     assert got["test/generated/mean_class_accuracy"] == pytest.approx(sum(means) / 3)
 
 
@@ -136,6 +138,16 @@ def test_an_index_sampler_has_one_readout():
     assert run.callback_metrics["test/matched/unique_points"] == 8
     assert "test/generated/accuracy" not in run.callback_metrics
     assert "test/sampled/accuracy" in run.callback_metrics
+
+
+def test_an_unlearned_sampler_that_makes_points_has_three_readouts():
+    data = small_dataset()
+    run = trainer()
+    module = experiment(sampler=VoxelSampler(8, "centroid"))
+    run.test(module, CloudLoader(data.test, 4), verbose=False)
+    for readout in ("generated", "matched", "completed"):
+        assert f"test/{readout}/accuracy" in run.callback_metrics
+    assert run.callback_metrics["test/generated/subset_distance"] > 0
 
 
 def test_two_runs_of_one_seed_agree_exactly():

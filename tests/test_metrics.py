@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
@@ -20,7 +21,7 @@ def test_subset_distance_equals_a_kd_tree_s(clouds, rng):
     samples = torch.randn(3, 7, 3, generator=rng)
     got = values("generated/subset_distance", clouds, SampleOutput(samples, None, {}))
     want = [
-        (cKDTree(c.numpy()).query(s.numpy())[0] ** 2).mean()
+        np.square(cKDTree(c.numpy()).query(s.numpy())[0]).mean()
         for c, s in zip(clouds, samples, strict=True)
     ]
     torch.testing.assert_close(got, torch.tensor(want, dtype=torch.float32))

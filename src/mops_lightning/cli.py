@@ -2,7 +2,7 @@
 
 import os
 import sys
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from mops_lightning.config import GROUPS, RUN_KEYS, conf_dir
 from mops_lightning.errors import Interrupted, UserError, did_you_mean
@@ -57,27 +57,27 @@ def _end(message: str, status: int) -> NoReturn:
 
 
 def _explain(error: BaseException) -> str:
-    """Turn an error into one line that names the key and the nearest known one."""
+    """Turn an error into one line that names the setting and the nearest known one."""
+    from hydra.errors import MissingConfigException
+
     texts = []
-    cause: Any = error
+    cause: BaseException | None = error
     while cause is not None:
+        if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
+            group, _, choice = cause.missing_cfg_file.rpartition("/")
+            return f"{group}={choice}: no such choice.{did_you_mean(choice, cause.options or ())}"
         texts.append(str(cause).strip())
         cause = cause.__cause__
     if isinstance(error, UserError):
         return texts[0]
-    text = " ".join(dict.fromkeys(line for t in texts for line in t.splitlines() if line.strip()))
-    unknown = getattr(error, "key", None) or _key_in(texts)
-    if unknown:
-        return f"{text}{did_you_mean(unknown, _known_keys())}"
-    return text
-
-
-def _key_in(texts: list[str]) -> str | None:
-    """Find the override that Hydra could not apply."""
     for text in texts:
         if "Could not override '" in text:
-            return text.split("Could not override '")[1].split("'")[0]
-    return None
+            key = text.split("Could not override '")[1].split("'")[0]
+            hint = did_you_mean(key, _known_keys())
+            return f"{key}: no such setting.{hint} --cfg job shows all of them."
+    # What Hydra and OmegaConf say themselves, without their notes for developers.
+    lines = [line for text in texts for line in text.splitlines() if line.strip()]
+    return " ".join(dict.fromkeys(line.strip() for line in lines if line[0] != " "))
 
 
 def _known_keys() -> list[str]:

@@ -87,6 +87,9 @@ def build(node: Any, **extra: Any) -> Any:
         while cause is not None:
             if isinstance(cause, UserError):
                 raise cause from None
+            if type(cause).__name__ == "MisconfigurationException":
+                # Lightning's word for a trainer that this machine cannot run, such as trainer=gpu.
+                raise UserError(f"trainer: {cause} Try trainer=auto or trainer=cpu.") from None
             cause = cause.__cause__
         raise
 

@@ -54,7 +54,8 @@ def fit(
     )
     validation = CloudLoader(held_out, cfg.batch_size) if len(held_out.labels) else None
     # A small data set has fewer batches than lie between two logged ones.
-    trainer.log_every_n_steps = min(trainer.log_every_n_steps, len(loader))
+    every = min(trainer.log_every_n_steps, len(loader))  # type: ignore[attr-defined]
+    trainer.log_every_n_steps = every  # type: ignore[attr-defined]
     with _interruptible():
         trainer.fit(experiment, loader, validation, ckpt_path=checkpoint)
 

@@ -15,7 +15,7 @@ from typing import Any
 from mops_lightning import records
 from mops_lightning.errors import UserError
 from mops_lightning.io import atomic_write
-from mops_lightning.scoring import FULL, INDEX_READOUT, LEARNED_READOUTS
+from mops_lightning.scoring import FULL, GENERATED_READOUTS, INDEX_READOUT
 
 Cells = dict[tuple[str, str], dict[int, float]]
 """(sampler, readout) → m → value."""
@@ -81,7 +81,7 @@ ORDER = ("random", "voxel", "fps")
 
 def _place(item: tuple[tuple[str, str], dict[int, float]]) -> tuple[bool, int, str, int]:
     (sampler, readout), _ = item
-    readouts = (INDEX_READOUT, *LEARNED_READOUTS, FULL)
+    readouts = (INDEX_READOUT, *GENERATED_READOUTS, FULL)
     rank = ORDER.index(sampler) if sampler in ORDER else len(ORDER)
     return readout == FULL, rank, sampler, readouts.index(readout)
 
@@ -114,7 +114,7 @@ def _add(cells: Cells, record: dict[str, Any], metric: str) -> None:
         readout = parts[1]
         if readout == FULL:
             cells.setdefault((names["net"], FULL), {})[m] = value
-        elif readout in (INDEX_READOUT, *LEARNED_READOUTS):
+        elif readout in (INDEX_READOUT, *GENERATED_READOUTS):
             cells.setdefault((names["sampler"], readout), {})[m] = value
         else:
             cells.setdefault((readout, INDEX_READOUT), {}).setdefault(m, value)
@@ -132,7 +132,7 @@ def _paper_value(paper: dict[str, Any], sampler: str, readout: str, m: int) -> f
     values = paper.get("rows", {}).get(sampler, {}).get(str(m))
     if values is None:
         return None
-    place = 0 if readout == INDEX_READOUT else LEARNED_READOUTS.index(readout)
+    place = 0 if readout == INDEX_READOUT else GENERATED_READOUTS.index(readout)
     return values[place]
 
 

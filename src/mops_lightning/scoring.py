@@ -12,7 +12,7 @@ from mops_lightning.types import SampleOutput
 
 Sample = Callable[[Tensor], SampleOutput]
 
-LEARNED_READOUTS = ("generated", "matched", "completed")
+GENERATED_READOUTS = ("generated", "matched", "completed")
 """Straight out of the sampler; nearest input points; these made unique and filled up by FPS."""
 INDEX_READOUT = "sampled"
 """Index samplers choose input points, so their three readouts are one."""
@@ -29,7 +29,7 @@ def readout_names(sampler: Sampler | None) -> tuple[str, ...]:
     """Name the readouts of a sampler; without one only the full cloud is left."""
     if sampler is None:
         return (FULL,)
-    return LEARNED_READOUTS if sampler.learned else (INDEX_READOUT,)
+    return GENERATED_READOUTS if sampler.generates else (INDEX_READOUT,)
 
 
 class BatchReadouts:

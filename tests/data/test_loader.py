@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from mops_lightning.data.clouds import Clouds
+from mops_lightning.data.clouds import Clouds, choose_classes
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
 
@@ -83,3 +83,8 @@ def test_no_augmentation_changes_nothing(rng):
 def test_negative_jitter_is_refused():
     with pytest.raises(UserError, match="jitter"):
         Augmentation(jitter=-1.0)
+
+
+def test_classes_given_as_one_word_are_asked_for_as_a_list():
+    with pytest.raises(UserError, match=r"must be a list, such as \[chair\]"):
+        choose_classes("chair", ["chair", "table"])

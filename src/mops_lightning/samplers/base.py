@@ -19,6 +19,10 @@ class Sampler(nn.Module):
     flexible: bool = False
     """Whether one instance takes any 1 ≤ m ≤ ``self.m``; others return ``self.m`` points only."""
 
+    generates: bool = False
+    """Whether the points are made, so that matched and completed sets differ from them; the others
+    choose input points and return their indices."""
+
     def __init__(self, m: int) -> None:
         super().__init__()
         if m < 1:

@@ -35,6 +35,8 @@ class MOPSNet(Sampler):
         UserError: tau_min is not in (0, 1], alpha is negative or annealing is unknown.
     """
 
+    generates = True
+
     def __init__(
         self,
         m: int,

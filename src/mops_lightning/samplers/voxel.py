@@ -60,6 +60,7 @@ class VoxelSampler(Sampler):
             hint = did_you_mean(pick, ("nearest", "centroid"))
             raise UserError(f"sampler.pick: unknown {pick!r}.{hint}")
         self.pick = pick
+        self.generates = pick == "centroid"
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return one point for each of m voxels of ``(B, N, 3)`` points."""
