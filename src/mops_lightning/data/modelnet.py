@@ -27,7 +27,7 @@ def modelnet40(
     n_points: int = 1024,
     classes: Sequence[str] | None = None,
     download: bool = False,
-    mirrors: Sequence[str] = MIRRORS,
+    mirrors: Sequence[str] | None = None,
     sha256: str | None = None,
     size: int | None = None,
 ) -> CloudDataset:
@@ -42,7 +42,7 @@ def modelnet40(
         n_points: points per shape, at most as many as are stored.
         classes: names from ``shape_names.txt`` to keep; None or empty means all 40.
         download: fetch and unpack the archive into ``root`` when the files are not there.
-        mirrors: addresses of the archive, tried in turn.
+        mirrors: addresses of the archive, tried in turn; None means ``MIRRORS``.
         sha256: hexadecimal hash that the archive must have, or None.
         size: bytes that the archive must have, or None.
 
@@ -59,7 +59,7 @@ def modelnet40(
     root = Path(root).expanduser()
     folder = _find(root)
     if folder is None and download:
-        folder = _download(root, mirrors, sha256, size)
+        folder = _download(root, mirrors or MIRRORS, sha256, size)
     if folder is None:
         raise UserError(
             f"dataset.root: no ModelNet40 in {root}. Looked there and in {root / FOLDER} for "
