@@ -166,6 +166,7 @@ def test_cfg_job_shows_the_config(tmp_path):
     [
         (["sampler.alhpa=3"], "sampler.alpha"),
         (["sampler=mosp"], "mops"),
+        (["learn=smapler"], "Did you mean 'sampler'"),
         (["m=4096"], "dataset.n_points=4096"),
         (["trainer=gpu", *TINY[1:]], "Try trainer=auto or trainer=cpu"),
         (["m=abc"], "m must be a whole number"),

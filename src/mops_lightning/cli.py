@@ -4,7 +4,7 @@ import os
 import sys
 from typing import TYPE_CHECKING, NoReturn
 
-from mops_lightning.config import GROUPS, RUN_KEYS, conf_dir
+from mops_lightning.config import GROUPS, LEARN, RUN_KEYS, conf_dir
 from mops_lightning.errors import Interrupted, UserError, did_you_mean
 
 if TYPE_CHECKING:
@@ -71,6 +71,10 @@ def _explain(error: BaseException) -> str:
     if isinstance(error, UserError):
         return texts[0]
     for text in texts:
+        if "Interpolation key 'labels." in text:
+            # labels.${learn} names the run's folder, so Hydra meets a wrong learn before we do.
+            value = text.split("'labels.")[1].split("'")[0]
+            return f"learn: unknown value {value!r}.{did_you_mean(value, LEARN)}"
         if "Could not override '" in text:
             key = text.split("Could not override '")[1].split("'")[0]
             hint = did_you_mean(key, _known_keys())

@@ -24,6 +24,7 @@ RUN_KEYS = (
     "pretrain",
     "paper",
     "baselines",
+    "labels",
     "names",
 )
 """Keys of the configuration that are no group; ``--help`` says what each means."""
