@@ -21,6 +21,7 @@ from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.draw import DrawClouds
 from mops_lightning.errors import Interrupted
 from mops_lightning.experiment import Experiment
+from mops_lightning.malloc import keep_freed_memory
 from mops_lightning.seeding import derive_seed, generator
 
 HARMLESS = (
@@ -112,6 +113,7 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> L.Trai
         logging.getLogger(name).setLevel(logging.WARNING)
     for message in HARMLESS:
         warnings.filterwarnings("ignore", message=message)
+    keep_freed_memory()
     logger = build(cfg.logger, save_dir=str(folder)) if cfg.get("logger") else False
     shown = choose_shown(dataset, cfg.pictures)
     return build(
