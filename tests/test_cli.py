@@ -173,6 +173,7 @@ def test_cfg_job_shows_the_config(tmp_path):
         (["dataset=modelnet40", "dataset.root=nowhere"], "dataset.root"),
         (["dataset.classes=[chiar]"], "chair"),
         (["ckpt_path=last"], "ckpt_path=last"),
+        (["dataset.classes=[chair]", *TINY], "at least two classes"),
         (["weights=nowhere.pt", *TINY], "weights: no file nowhere.pt"),
     ],
 )

@@ -16,6 +16,13 @@ INTERRUPTED = 130
 
 def main() -> None:
     """Run one job or a sweep; a user's mistake ends in one line and exit status 2."""
+    try:
+        _main()
+    except (KeyboardInterrupt, Interrupted) as stop:
+        _end(f"interrupted. {stop}".rstrip(), INTERRUPTED)
+
+
+def _main() -> None:
     import hydra
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
@@ -47,8 +54,9 @@ def _job(cfg: "DictConfig") -> float | None:
     except UserError as error:
         # Ended here, Hydra does not add lines of its own.
         _end(str(error), USER_ERROR)
-    except (KeyboardInterrupt, Interrupted) as stop:
-        _end(f"interrupted. {stop}".rstrip(), INTERRUPTED)
+    except Interrupted as stop:
+        # To Hydra, this is an error like any other.
+        raise KeyboardInterrupt(str(stop)) from None
 
 
 def _end(message: str, status: int) -> NoReturn:

@@ -2,7 +2,7 @@
 
 import inspect
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -103,6 +103,9 @@ def check(cfg: DictConfig) -> None:
             ``_target_`` that cannot be imported or does not take one of its arguments.
     """
     known = (*RUN_KEYS, *GROUPS)
+    for name in known:
+        if name not in cfg and name != "logger":
+            raise UserError(f"{name} cannot be removed. Choose another one with {name}=...")
     for key in cfg:
         if str(key) not in known:
             raise UserError(f"Unknown setting {key!r}.{did_you_mean(str(key), known)}")
@@ -110,28 +113,32 @@ def check(cfg: DictConfig) -> None:
         raise UserError(f"learn: unknown value {cfg.learn!r}.{did_you_mean(str(cfg.learn), LEARN)}")
     _whole(cfg, "m", 1)
     _whole(cfg, "seed", 0)
-    _whole(cfg, "batch_size", 1)
+    _whole(cfg, "batch_size", 2)  # BatchNorm cannot learn from one cloud
     _whole(cfg, "pictures", 0)
     if not isinstance(cfg.val_fraction, int | float) or not 0 <= cfg.val_fraction < 1:
         raise UserError(f"val_fraction must be in [0, 1), got {cfg.val_fraction!r}.")
     unused = ("sampler", "baselines") if cfg.learn == "task" else ()
     for group in {*GROUPS, "pretrain", "baselines"} - set(unused):
         _check_node(cfg.get(group), group)
-    epochs = cfg.trainer.get("max_epochs")
-    if not isinstance(epochs, int) or isinstance(epochs, bool) or epochs < 1:
-        raise UserError(f"trainer.max_epochs must be a whole number of at least 1, got {epochs!r}.")
+    for node in ("trainer", "pretrain"):
+        _whole(cfg[node], "max_epochs", 1, f"{node}.max_epochs")
+    if cfg.trainer.get("devices") != 1 or cfg.trainer.get("num_nodes", 1) != 1:
+        raise UserError(
+            f"trainer.devices must be 1, got {cfg.trainer.get('devices')!r}: "
+            "one run uses one device. Start several runs to use several."
+        )
     points = cfg.dataset.get("n_points")
-    if isinstance(points, int) and cfg.m > points:
+    if isinstance(points, int) and 1 <= points < cfg.m:
         raise UserError(
             f"m must be at most dataset.n_points={points}, got m={cfg.m}. "
             f"Try m={points} or dataset.n_points={cfg.m}."
         )
 
 
-def _whole(cfg: DictConfig, key: str, least: int) -> None:
+def _whole(cfg: DictConfig, key: str, least: int, name: str | None = None) -> None:
     value = cfg[key]
     if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise UserError(f"{key} must be a whole number of at least {least}, got {value!r}.")
+        raise UserError(f"{name or key} must be a whole number of at least {least}, got {value!r}.")
 
 
 def _check_node(node: Any, where: str) -> None:
@@ -150,9 +157,29 @@ def _check_node(node: Any, where: str) -> None:
                 )
             if OmegaConf.is_missing(node, key):
                 raise UserError(f"{where}.{name} must be set: try {where}.{name}=VALUE.")
+            if name in parameters and isinstance(node[key], str):
+                wanted = _numbers_only(parameters[name].annotation)
+                if wanted:
+                    raise UserError(f"{where}.{name} must be {wanted}, got {node[key]!r}.")
     for key in node:
         if not OmegaConf.is_missing(node, key):
             _check_node(node[key], f"{where}.{key!s}")
+
+
+def _numbers_only(annotation: Any) -> str | None:
+    """Say what an annotation wants when no text will do; None when text may be right."""
+    names = {int: "a whole number", float: "a number", bool: "true or false"}
+    allowed = get_args(annotation) or (annotation,)
+    wanted = [names[kind] for kind in allowed if kind in names]
+    others = [kind for kind in allowed if kind not in names]
+    harmless = all(kind is type(None) or kind is _tensor() for kind in others)
+    return " or ".join(wanted) if wanted and harmless else None
+
+
+def _tensor() -> type:
+    from torch import Tensor  # late, because --help should not wait for torch
+
+    return Tensor
 
 
 def _signature(target: str, where: str) -> dict[str, inspect.Parameter]:
@@ -164,4 +191,7 @@ def _signature(target: str, where: str) -> dict[str, inspect.Parameter]:
         raise UserError(
             f"{where}._target_: cannot import {target!r}: {str(error).splitlines()[0]}"
         ) from None
-    return dict(inspect.signature(found).parameters)
+    try:
+        return dict(inspect.signature(found, eval_str=True).parameters)
+    except NameError:  # an annotation that exists for type checkers only
+        return dict(inspect.signature(found).parameters)

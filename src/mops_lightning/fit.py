@@ -19,7 +19,7 @@ from mops_lightning.config import build
 from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.draw import DrawClouds
-from mops_lightning.errors import Interrupted
+from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.experiment import Experiment
 from mops_lightning.malloc import keep_freed_memory
 from mops_lightning.seeding import derive_seed, generator
@@ -45,6 +45,11 @@ def fit(
 ) -> None:
     """Train what learns, from ``checkpoint`` on if there is one."""
     train, held_out = split(dataset.train, cfg.val_fraction, cfg.seed)
+    if len(train.labels) < 2:
+        raise UserError(
+            f"val_fraction={cfg.val_fraction} leaves {len(train.labels)} training clouds; "
+            "at least two are needed. Lower it, or give more data."
+        )
     loader = CloudLoader(
         train,
         cfg.batch_size,

@@ -4,8 +4,9 @@ import hashlib
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mops_lightning import resume
 from mops_lightning.callbacks import CHECKPOINT
@@ -53,14 +54,23 @@ def task_config(cfg: DictConfig) -> DictConfig:
 def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
     """Return where the task net of these settings and data is kept, there or not."""
     own = task_config(cfg)
-    key = {**resume.identity(own, dataset.fingerprint), "epochs": own.trainer.max_epochs}
+    # Where it runs and what it logs do not change the net; all else about the trainer may.
+    elsewhere = {"accelerator", "devices", "log_every_n_steps", "_target_"}
+    trainer: dict[str, Any] = OmegaConf.to_container(own.trainer, resolve=True)  # type: ignore[assignment]
+    key = {
+        **resume.identity(own, dataset.fingerprint),
+        "trainer": {name: value for name, value in trainer.items() if name not in elsewhere},
+    }
     digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:12]
     name = f"{cfg.names.task}-{cfg.names.net}-{cfg.names.dataset}-{digest}"
     return Path(cfg.cache).expanduser() / "weights" / name
 
 
 def publish(cfg: DictConfig, weights: Path, dataset: CloudDataset) -> None:
-    """Copy a task net trained with ``learn=task`` into the cache, unless one is there."""
+    """Copy a task net trained with ``learn=task`` into the cache, unless one is there.
+
+    Not for a run that was made longer by resuming it: its learning rate went another way.
+    """
     target = cache_folder(cfg, dataset) / WEIGHTS
     if not target.exists():
         with atomic_write(target) as temporary:

@@ -15,7 +15,7 @@ from mops_lightning.experiment import CHECKPOINT_KEY
 def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
     """Return what must be equal for a checkpoint to be resumed, as text by setting.
 
-    The length of the run is not part of it: a finished run may be made longer.
+    ``epochs`` is noted too, but may differ: a finished run may be made longer.
     """
     parts = {
         "task": cfg.task,
@@ -27,6 +27,7 @@ def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
         "batch_size": cfg.batch_size,
         "val_fraction": cfg.val_fraction,
         "dataset": fingerprint,
+        "epochs": cfg.trainer.max_epochs,
     }
     return {
         name: json.dumps(
@@ -35,6 +36,11 @@ def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
         )
         for name, value in parts.items()
     }
+
+
+def lengthened(cfg: DictConfig, checkpoint: Path) -> bool:
+    """Return whether ``checkpoint`` comes from a run of another planned length."""
+    return _read(checkpoint).get("epochs") != json.dumps(cfg.trainer.max_epochs)
 
 
 def find(cfg: DictConfig, mine: dict[str, str]) -> Path | None:
@@ -60,7 +66,7 @@ def find(cfg: DictConfig, mine: dict[str, str]) -> Path | None:
             f"ckpt_path: no checkpoint {path}. Give a run's folder, a .ckpt file, or last."
         )
     theirs = _read(path)
-    different = [name for name in mine if theirs.get(name) != mine[name]]
+    different = _different(theirs, mine)
     if different:
         name = different[0]
         raise UserError(
@@ -80,12 +86,16 @@ def _newest(out: Path, mine: dict[str, str]) -> Path:
             theirs = _read(path)
         except UserError:
             continue
-        if theirs == mine:
+        if not _different(theirs, mine):
             return path
     raise UserError(
         f"ckpt_path=last: none of the {len(found)} checkpoints below {out} has these settings. "
         "Leave ckpt_path out to start anew, or name a run's folder."
     )
+
+
+def _different(theirs: dict[str, str], mine: dict[str, str]) -> list[str]:
+    return [name for name in mine if name != "epochs" and theirs.get(name) != mine[name]]
 
 
 def _read(path: Path) -> dict[str, Any]:

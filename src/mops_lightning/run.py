@@ -17,6 +17,12 @@ from mops_lightning.fit import device_name, fit, make_experiment, make_trainer, 
 from mops_lightning.summary import closing_lines
 
 WEIGHTS = "weights.pt"
+OUTPUTS = {
+    "checkpoint": "checkpoints/last.ckpt",
+    "pictures": "pictures",
+    "tensorboard": "tensorboard",
+}
+"""What callbacks and loggers may have written."""
 
 
 def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> dict[str, Any]:
@@ -34,8 +40,14 @@ def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> di
         UserError: a mistake in settings or files.
     """
     check(cfg)
-    if (folder / records.FILE).exists():
-        raise UserError(f"{folder} holds a result already; nothing is overwritten. Use another.")
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        # Two runs that start in the same second get the same folder; the second one stops here.
+        (folder / ".started").touch(exist_ok=False)
+    except FileExistsError:
+        raise UserError(
+            f"{folder} holds another run and nothing is overwritten: start again for a new folder."
+        ) from None
     with recorded(cfg, folder, overrides or []) as record:
         with timed(record, "data"):
             dataset = build(cfg.dataset)
@@ -58,6 +70,7 @@ def fit_and_test(
         "train_clouds": len(dataset.train.labels),
         "test_clouds": len(dataset.test.labels),
         "resumed_from": None if checkpoint is None else str(checkpoint),
+        "lengthened": checkpoint is not None and resume.lengthened(cfg, checkpoint),
         **dataset.notes,
     }
     task_weights = None
@@ -73,13 +86,11 @@ def fit_and_test(
     if experiment.trainable:
         with timed(record, "fit"):
             fit(cfg, trainer, experiment, dataset, checkpoint)
-        record["files"]["checkpoint"] = "checkpoints/last.ckpt"
     with timed(record, "test"):
         record["metrics"] = test(cfg, trainer, experiment, dataset)
-    if (folder / "pictures").is_dir():
-        record["files"]["pictures"] = "pictures"
-    if (folder / "tensorboard").is_dir():
-        record["files"]["tensorboard"] = "tensorboard"
+    for kind, name in OUTPUTS.items():
+        if (folder / name).exists():
+            record["files"][kind] = name
     readout = experiment.own_readouts[0]
     record["score"] = record["metrics"][f"test/{readout}/{experiment.task.score}"]
     learned = {"task": {WEIGHTS: experiment.task}, "sampler": {WEIGHTS: experiment.sampler}}
@@ -88,7 +99,7 @@ def fit_and_test(
         for name, module in learned[cfg.learn].items():
             weights.save(folder / name, module, record["config"], record["metrics"])
             record["files"][Path(name).stem] = name
-    if cfg.learn == "task":
+    if cfg.learn == "task" and not record["notes"]["lengthened"]:
         pretrain.publish(cfg, folder / WEIGHTS, dataset)
 
 

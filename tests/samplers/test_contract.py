@@ -51,6 +51,16 @@ def as_sets(points):
     return [sorted(cloud) for cloud in points.tolist()]
 
 
+def test_other_types_are_refused_by_name(make, clouds):
+    with pytest.raises(UserError, match=r"must be a torch\.Tensor, got ndarray"):
+        make()(clouds.numpy())
+    if make().learned:
+        with pytest.raises(UserError, match=r"must be torch\.float32 as the sampler's weights"):
+            make()(clouds.half())
+    with pytest.raises(UserError, match="m must be a whole number"):
+        make(m=8.0)
+
+
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_shape_dtype_and_device(make, clouds, dtype, device):
@@ -85,7 +95,7 @@ def test_refuses_a_size_out_of_range(make, clouds, m):
 
 
 def test_cannot_be_made_for_no_points(make):
-    with pytest.raises(UserError, match="m must be at least 1, got 0"):
+    with pytest.raises(UserError, match="m must be a whole number of at least 1, got 0"):
         make(m=0)
 
 

@@ -25,8 +25,8 @@ class Sampler(nn.Module):
 
     def __init__(self, m: int) -> None:
         super().__init__()
-        if m < 1:
-            raise UserError(f"m must be at least 1, got {m}.")
+        if not isinstance(m, int) or m < 1:
+            raise UserError(f"m must be a whole number of at least 1, got {m!r}.")
         self.m = m
 
     def forward(self, points: Tensor, m: int | None = None) -> SampleOutput:
@@ -45,6 +45,9 @@ class Sampler(nn.Module):
         m = self.m if m is None else m
         self._check_m(m)
         check_points(points, at_least=m, finite=not (self.training and points.is_cuda))
+        own = next((p.dtype for p in self.parameters()), points.dtype)
+        if points.dtype != own and not torch.is_autocast_enabled(points.device.type):
+            raise UserError(f"points must be {own} as the sampler's weights, got {points.dtype}.")
         return self.sample(points, m)
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
@@ -80,6 +83,8 @@ def check_points(points: Tensor, at_least: int = 1, finite: bool = True) -> None
     Raises:
         UserError: naming what is allowed and what came.
     """
+    if not isinstance(points, Tensor):
+        raise UserError(f"points must be a torch.Tensor, got {type(points).__name__}.")
     shape = tuple(points.shape)
     if points.ndim != 3 or points.shape[-1] != 3:
         raise UserError(f"points must have shape (B, N, 3), got {shape}.")

@@ -7,6 +7,7 @@ from torch.nn import functional as F
 from torchmetrics import Metric, MetricCollection
 from torchmetrics.classification import MulticlassAccuracy
 
+from mops_lightning.errors import UserError
 from mops_lightning.types import Batch, SampleOutput, TaskOutput
 
 
@@ -16,6 +17,9 @@ class Classification(nn.Module):
     Args:
         net: maps ``(B, M, 3)`` points to ``(B, num_classes)`` logits.
         num_classes: number of classes.
+
+    Raises:
+        UserError: there are fewer than two classes.
     """
 
     score = "accuracy"
@@ -23,6 +27,10 @@ class Classification(nn.Module):
 
     def __init__(self, net: nn.Module, num_classes: int) -> None:
         super().__init__()
+        if num_classes < 2:
+            raise UserError(
+                f"dataset.classes must leave at least two classes to tell apart, got {num_classes}."
+            )
         self.net = net
         self.num_classes = num_classes
 
