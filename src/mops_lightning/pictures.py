@@ -101,6 +101,6 @@ def _frame(axes: object, cloud: np.ndarray) -> None:
     centre, reach = (cloud.max(0) + cloud.min(0)) / 2, np.ptp(cloud, axis=0).max() / 2 or 1.0
     for name, middle in zip("xyz", centre, strict=True):
         getattr(axes, f"set_{name}lim")(middle - reach, middle + reach)
-    axes.set_box_aspect((1, 1, 1), zoom=1.45)  # type: ignore[attr-defined]
+    axes.set_box_aspect((1, 1, 1), zoom=1.3)  # type: ignore[attr-defined]
     axes.set_axis_off()  # type: ignore[attr-defined]
     axes.view_init(elev=18, azim=-60)  # type: ignore[attr-defined]
