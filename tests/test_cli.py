@@ -206,6 +206,35 @@ def test_a_failed_run_leaves_a_record_that_says_why(tmp_path):
     assert "ply_data_test0.h5" in record["error"]
 
 
+def test_real_modelnet40_runs_from_any_folder(real_data, tmp_path):
+    root = (real_data / "modelnet40_hdf5_1024").resolve()
+    if not root.is_dir():
+        pytest.skip(f"no modelnet40_hdf5_1024 in {real_data}")
+    settings = [s for s in TINY if "per_class" not in s]
+    data = ["dataset=modelnet40", f"dataset.root={root}", "dataset.classes=[cup,bowl]"]
+    status, out, err = call([*settings, *data, "sampler.alpha=10", "sampler.tau_min=0.2"], tmp_path)
+    assert status == 0, err
+    (run,) = runs(tmp_path)
+    notes = records.read(run)["notes"]
+    assert (notes["train_clouds"], notes["test_clouds"]) == (79 + 64, 20 + 20)
+
+
+def test_a_folder_of_meshes_runs(tmp_path):
+    import trimesh
+
+    for name, mesh in (("ball", trimesh.creation.icosphere()), ("box", trimesh.creation.box())):
+        for split, number in (("train", 9), ("test", 2)):
+            folder = tmp_path / "mine" / name / split
+            folder.mkdir(parents=True)
+            for i in range(number):
+                mesh.export(folder / f"{i}.off")
+    settings = [s for s in TINY if "per_class" not in s]
+    status, out, err = call([*settings, "dataset=meshes", "dataset.root=mine"], tmp_path)
+    assert status == 0, err
+    (run,) = runs(tmp_path)
+    assert records.read(run)["notes"]["skipped_meshes"] == 0
+
+
 def test_another_net_s_weights_are_refused(main_job):
     folder, run, *_ = main_job
     other = next((folder / "cache" / "weights").rglob("weights.pt"))
