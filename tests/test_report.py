@@ -56,6 +56,14 @@ def test_runs_of_other_data_or_weights_are_not_mixed(tmp_path, note):
         table(tmp_path)
 
 
+def test_two_runs_for_one_cell_are_refused(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        put(tmp_path / name, "fps", 32, {"test/sampled/accuracy": 0.3})
+    with pytest.raises(UserError, match="Two runs of fps with m=32"):
+        table(tmp_path)
+
+
 def test_a_folder_without_records_is_named(tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         main([str(tmp_path)])

@@ -55,6 +55,7 @@ def table(folder: Path, metric: str = "accuracy") -> str:
     scored = [record for record in done if record["config"]["learn"] != "task"] or done
     names = _common(scored)
     cells: Cells = {}
+    _refuse_doubles(scored)
     for record in scored:
         _add(cells, record, metric)
     sizes = sorted({m for values in cells.values() for m in values}, reverse=True)
@@ -102,6 +103,17 @@ def _common(found: list[dict[str, Any]]) -> dict[str, str]:
                 "Their figures do not belong in one table; give a folder with runs of one kind."
             )
     return {what: next(iter(values)) for what, values in keys.items()}
+
+
+def _refuse_doubles(found: list[dict[str, Any]]) -> None:
+    """Refuse two runs that would stand in the same cells, where one would hide the other."""
+    seen = set()
+    for record in found:
+        config = record["config"]
+        cell = f"{config['names']['sampler']} with m={config['m']}"
+        if config["learn"] != "task" and cell in seen:
+            raise UserError(f"Two runs of {cell} are there; give a folder with one of each.")
+        seen.add(cell)
 
 
 def _add(cells: Cells, record: dict[str, Any], metric: str) -> None:
