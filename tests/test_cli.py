@@ -197,7 +197,8 @@ def test_a_failed_run_leaves_a_record_that_says_why(tmp_path):
             file["label"] = np.zeros((4, 1), np.uint8)
     path = root / "ply_data_test0.h5"
     path.write_bytes(path.read_bytes()[:700])
-    status, out, err = call(["dataset=modelnet40", "dataset.root=broken", "m=4"], tmp_path)
+    settings = ["dataset=modelnet40", "dataset.root=broken", "dataset.n_points=32", "m=4"]
+    status, out, err = call(settings, tmp_path)
     assert status == 2
     assert "ply_data_test0.h5" in err
     (run,) = runs(tmp_path)

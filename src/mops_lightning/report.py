@@ -97,12 +97,13 @@ def _common(found: list[dict[str, Any]]) -> dict[str, str]:
         "task weights (sha256)": {r["notes"].get("task_weights_sha256") for r in found},
     }
     for what, values in keys.items():
-        if len(values) > 1:
+        known = values - {None}  # a resumed run may have its task net from the checkpoint
+        if len(known) > 1:
             raise UserError(
-                f"The runs differ in {what}: {', '.join(sorted(map(str, values)))}. "
+                f"The runs differ in {what}: {', '.join(sorted(map(str, known)))}. "
                 "Their figures do not belong in one table; give a folder with runs of one kind."
             )
-    return {what: next(iter(values)) for what, values in keys.items()}
+    return {what: next(iter(values - {None}), "") for what, values in keys.items()}
 
 
 def _refuse_doubles(found: list[dict[str, Any]]) -> None:

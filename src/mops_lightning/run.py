@@ -79,13 +79,15 @@ def fit_and_test(
             task_weights = pretrain.task_weights(cfg, dataset)
     experiment = make_experiment(cfg, dataset, identity)
     if task_weights is not None:
-        content = weights.load_into(experiment.task, task_weights)
-        record["notes"]["task_weights_sha256"] = content["sha256"]
+        weights.load_into(experiment.task, task_weights)
     trainer = make_trainer(cfg, folder, dataset)
     record["device"] = device_name(trainer)
     if experiment.trainable:
         with timed(record, "fit"):
             fit(cfg, trainer, experiment, dataset, checkpoint)
+    if cfg.learn == "sampler":
+        # A resumed run has its task net from the checkpoint, not from a weights file.
+        record["notes"]["task_weights_sha256"] = weights.digest(experiment.task.state_dict())
     with timed(record, "test"):
         record["metrics"] = test(cfg, trainer, experiment, dataset)
     for kind, name in OUTPUTS.items():
