@@ -125,6 +125,18 @@ class Experiment(L.LightningModule):
         """Keep the run's identity beside its state."""
         checkpoint[CHECKPOINT_KEY] = self.identity or {}
 
+    def on_train_start(self) -> None:
+        """Put the loader where a resumed run goes on, which may be the middle of an epoch.
+
+        Lightning 2.6 hands a loader its state only in some cases, and calls no
+        ``on_train_epoch_start`` for an epoch that had begun.
+        """
+        loader: Any = self.trainer.train_dataloader
+        if hasattr(loader, "load_state_dict"):
+            begun = self.trainer.fit_loop.epoch_loop.batch_progress.current.ready
+            position = begun if begun < len(loader) else 0
+            loader.load_state_dict({"epoch": self.current_epoch, "position": position})
+
     def on_train_epoch_start(self) -> None:
         """Tell the loader which epoch it is; the run may have been resumed."""
         loader: Any = self.trainer.train_dataloader

@@ -73,7 +73,8 @@ def test(
     with _interruptible():
         trainer.test(experiment, CloudLoader(dataset.test, cfg.batch_size), verbose=False)
     metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
-    log_hparams(trainer, cfg, {k: v for k, v in metrics.items() if k.startswith("test/")})
+    score = f"/{experiment.task.score}"
+    log_hparams(trainer, cfg, {k: v for k, v in metrics.items() if k.endswith(score)})
     return metrics
 
 
