@@ -1,6 +1,8 @@
 import os
 from pathlib import Path
+from typing import Any
 
+import lightning as L
 import pytest
 import torch
 
@@ -21,6 +23,20 @@ def real_data() -> Path:
 @pytest.fixture
 def rng() -> torch.Generator:
     return torch.Generator().manual_seed(0)
+
+
+def quiet_trainer(epochs: int, **extra: Any) -> L.Trainer:
+    """A CPU trainer that writes and prints nothing."""
+    return L.Trainer(
+        max_epochs=epochs,
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        **extra,
+    )
 
 
 def small_dataset(train: int = 24, test: int = 10, points: int = 48) -> CloudDataset:

@@ -1,6 +1,5 @@
 import copy
 
-import lightning as L
 import pytest
 import torch
 
@@ -13,7 +12,7 @@ from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.tasks.classification import Classification
-from tests.conftest import small_dataset
+from tests.conftest import quiet_trainer, small_dataset
 
 
 def experiment(learn="sampler", sampler=True, **extra):
@@ -29,22 +28,9 @@ def experiment(learn="sampler", sampler=True, **extra):
     )
 
 
-def trainer(epochs=2, **extra):
-    return L.Trainer(
-        max_epochs=epochs,
-        accelerator="cpu",
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        **extra,
-    )
-
-
 def fit(module, epochs=2):
     data = small_dataset()
-    trainer(epochs).fit(
+    quiet_trainer(epochs).fit(
         module,
         CloudLoader(data.train, 6, shuffle=True, drop_last=True),
         CloudLoader(data.test, 6),
@@ -95,7 +81,7 @@ def test_frozen_parts_stay_in_evaluation_mode_whatever_is_asked():
 
 def test_test_scores_every_readout_and_the_whole_set():
     data = small_dataset()
-    run = trainer()
+    run = quiet_trainer(2)
     run.test(experiment(), CloudLoader(data.test, 4), verbose=False)
     metrics = run.callback_metrics
     for readout in ("generated", "matched", "completed", "random", "fps", "full"):
@@ -110,7 +96,7 @@ def test_test_scores_every_readout_and_the_whole_set():
 def test_scores_are_those_of_a_plain_loop():
     data = small_dataset()
     module = experiment().eval()
-    run = trainer()
+    run = quiet_trainer(2)
     run.test(module, CloudLoader(data.test, 4), verbose=False)
     got = {name: value.item() for name, value in run.callback_metrics.items()}
     module.eval()
@@ -131,7 +117,7 @@ def test_scores_are_those_of_a_plain_loop():
 
 def test_an_index_sampler_has_one_readout():
     data = small_dataset()
-    run = trainer()
+    run = quiet_trainer(2)
     module = experiment(sampler=RandomSampler(8))
     assert not module.trainable
     run.test(module, CloudLoader(data.test, 4), verbose=False)
@@ -142,7 +128,7 @@ def test_an_index_sampler_has_one_readout():
 
 def test_an_unlearned_sampler_that_makes_points_has_three_readouts():
     data = small_dataset()
-    run = trainer()
+    run = quiet_trainer(2)
     module = experiment(sampler=VoxelSampler(8, "centroid"))
     run.test(module, CloudLoader(data.test, 4), verbose=False)
     for readout in ("generated", "matched", "completed"):

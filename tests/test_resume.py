@@ -1,6 +1,5 @@
 """A run that is stopped between any two steps goes on to the weights of an unbroken one."""
 
-import lightning as L
 import pytest
 import torch
 
@@ -12,7 +11,7 @@ from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.schedules import one_cycle
 from mops_lightning.tasks.classification import Classification
-from tests.conftest import small_dataset
+from tests.conftest import quiet_trainer, small_dataset
 
 EPOCHS = 3
 
@@ -41,16 +40,7 @@ def fit(callbacks, checkpoint=None):
     )
     data = small_dataset()
     augment = Augmentation(rotate_up=True, jitter=0.01)
-    trainer = L.Trainer(
-        max_epochs=EPOCHS,
-        accelerator="cpu",
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        callbacks=callbacks,
-    )
+    trainer = quiet_trainer(EPOCHS, callbacks=callbacks)
     trainer.fit(
         module,
         CloudLoader(data.train, 6, shuffle=True, augment=augment, drop_last=True),

@@ -13,8 +13,7 @@ from mops_lightning.callbacks import CHECKPOINT
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted
 from mops_lightning.io import atomic_write
-
-WEIGHTS = "weights.pt"
+from mops_lightning.weights import FILE
 
 
 def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
@@ -29,14 +28,14 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
     if cfg.weights != "auto":
         return Path(cfg.weights)
     folder = cache_folder(cfg, dataset)
-    if not (folder / WEIGHTS).is_file():
+    if not (folder / FILE).is_file():
         print(
             f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it first, "
             f"{cfg.pretrain.max_epochs} epochs. It is kept in {folder}",
             flush=True,
         )
         _train(cfg, folder, dataset)
-    return folder / WEIGHTS
+    return folder / FILE
 
 
 def task_config(cfg: DictConfig) -> DictConfig:
@@ -71,7 +70,7 @@ def publish(cfg: DictConfig, weights: Path, dataset: CloudDataset) -> None:
 
     Not for a run that was made longer by resuming it: its learning rate went another way.
     """
-    target = cache_folder(cfg, dataset) / WEIGHTS
+    target = cache_folder(cfg, dataset) / FILE
     if not target.exists():
         with atomic_write(target) as temporary:
             shutil.copyfile(weights, temporary)

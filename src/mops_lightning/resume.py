@@ -4,12 +4,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.callbacks import CHECKPOINT
 from mops_lightning.errors import UserError
 from mops_lightning.experiment import CHECKPOINT_KEY
+from mops_lightning.weights import read_plain
 
 
 def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
@@ -99,11 +99,7 @@ def _different(theirs: dict[str, str], mine: dict[str, str]) -> list[str]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:
-        first = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise UserError(f"ckpt_path: {path} cannot be read as a checkpoint: {first}") from None
+    content = read_plain(path, "ckpt_path", "a checkpoint")
     if CHECKPOINT_KEY not in content:
         raise UserError(f"ckpt_path: {path} is not a checkpoint of this program.")
     return content[CHECKPOINT_KEY]

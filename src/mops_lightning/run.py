@@ -16,7 +16,6 @@ from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.fit import device_name, fit, make_experiment, make_trainer, test
 from mops_lightning.summary import closing_lines
 
-WEIGHTS = "weights.pt"
 OUTPUTS = {
     "checkpoint": "checkpoints/last.ckpt",
     "pictures": "pictures",
@@ -95,14 +94,17 @@ def fit_and_test(
             record["files"][kind] = name
     readout = experiment.own_readouts[0]
     record["score"] = record["metrics"][f"test/{readout}/{experiment.task.score}"]
-    learned = {"task": {WEIGHTS: experiment.task}, "sampler": {WEIGHTS: experiment.sampler}}
+    learned = {
+        "task": {weights.FILE: experiment.task},
+        "sampler": {weights.FILE: experiment.sampler},
+    }
     learned["joint"] = {**learned["sampler"], "task_weights.pt": experiment.task}
     if experiment.trainable:
         for name, module in learned[cfg.learn].items():
             weights.save(folder / name, module, record["config"], record["metrics"])
             record["files"][Path(name).stem] = name
     if cfg.learn == "task" and not record["notes"]["lengthened"]:
-        pretrain.publish(cfg, folder / WEIGHTS, dataset)
+        pretrain.publish(cfg, folder / weights.FILE, dataset)
 
 
 @contextmanager

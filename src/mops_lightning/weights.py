@@ -11,6 +11,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.io import atomic_write
 
 SCHEMA = "mops_lightning/weights/1"
+FILE = "weights.pt"
 
 
 def save(path: Path, module: nn.Module, config: dict[str, Any], metrics: dict[str, float]) -> None:
@@ -46,11 +47,7 @@ def load(path: str | Path) -> dict[str, Any]:
     path = Path(path).expanduser()
     if not path.is_file():
         raise UserError(f"weights: no file {path}. Give a weights.pt, or weights=auto.")
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        first = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise UserError(f"weights: {path} cannot be read as a weights file: {first}") from None
+    content = read_plain(path, "weights", "a weights file")
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise UserError(
             f"weights: {path} is not a {SCHEMA} file. "
@@ -59,6 +56,19 @@ def load(path: str | Path) -> dict[str, Any]:
     if digest(content["state"]) != content["sha256"]:
         raise UserError(f"weights: {path} is damaged (sha256 differs). Delete it and run again.")
     return content
+
+
+def read_plain(path: Path, setting: str, what: str) -> Any:
+    """Read a file of plain tensors and plain data; ``setting`` and ``what`` name it in the error.
+
+    Raises:
+        UserError: the file is damaged, or holds more than plain data.
+    """
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        first = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise UserError(f"{setting}: {path} cannot be read as {what}: {first}") from None
 
 
 def load_into(module: nn.Module, path: str | Path) -> dict[str, Any]:
