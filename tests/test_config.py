@@ -1,11 +1,10 @@
-import inspect
 from typing import Any
 
 import pytest
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
-from mops_lightning.config import GROUPS, RUN_KEYS, build, check, compose, conf_dir
+from mops_lightning.config import GROUPS, RUN_KEYS, build, check, compose, conf_dir, signature
 from mops_lightning.errors import UserError
 
 
@@ -47,7 +46,7 @@ def test_every_yaml_composes_resolves_and_fits_its_constructors(override):
     check(cfg)
     for node in nodes(cfg):
         target = get_object(node["_target_"])
-        parameters = inspect.signature(target).parameters
+        parameters = signature(node["_target_"], override)
         given = {key for key in node if not str(key).startswith("_")}
         assert given <= set(parameters), node["_target_"]
         needed = {

@@ -10,6 +10,7 @@ from mops_lightning.errors import UserError, did_you_mean
 
 RUN_KEYS = (
     "m",
+    "sizes",
     "learn",
     "seed",
     "weights",
@@ -23,6 +24,7 @@ RUN_KEYS = (
     "augment",
     "pretrain",
     "paper",
+    "rivals",
     "baselines",
     "labels",
     "names",
@@ -112,6 +114,7 @@ def check(cfg: DictConfig) -> None:
     if cfg.learn not in LEARN:
         raise UserError(f"learn: unknown value {cfg.learn!r}.{did_you_mean(str(cfg.learn), LEARN)}")
     _whole(cfg, "m", 1)
+    _check_sizes(cfg.sizes)
     _whole(cfg, "seed", 0)
     _whole(cfg, "batch_size", 2)  # BatchNorm cannot learn from one cloud
     _whole(cfg, "pictures", 0)
@@ -135,6 +138,15 @@ def check(cfg: DictConfig) -> None:
         )
 
 
+def _check_sizes(sizes: Any) -> None:
+    whole = OmegaConf.is_list(sizes) and all(type(size) is int for size in sizes)
+    if sizes != "auto" and not (whole and len(sizes) and min(sizes) >= 1):
+        raise UserError(
+            f"sizes must be auto or a list of whole numbers of at least 1, got {sizes!r}. "
+            "Try sizes=[8,16,32]."
+        )
+
+
 def _whole(cfg: DictConfig, key: str, least: int, name: str | None = None) -> None:
     value = cfg[key]
     if not isinstance(value, int) or isinstance(value, bool) or value < least:
@@ -146,7 +158,7 @@ def _check_node(node: Any, where: str) -> None:
     if not isinstance(node, DictConfig):
         return
     if node.get("_target_") is not None:
-        parameters = _signature(str(node["_target_"]), where)
+        parameters = signature(str(node["_target_"]), where)
         takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
         for key in node:
             name = str(key)
@@ -182,7 +194,8 @@ def _tensor() -> type:
     return Tensor
 
 
-def _signature(target: str, where: str) -> dict[str, inspect.Parameter]:
+def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
+    """Return the parameters of a target; what a class hands on to its bases belongs to them."""
     from hydra.utils import get_object
 
     try:
@@ -191,7 +204,26 @@ def _signature(target: str, where: str) -> dict[str, inspect.Parameter]:
         raise UserError(
             f"{where}._target_: cannot import {target!r}: {str(error).splitlines()[0]}"
         ) from None
+    if not inspect.isclass(found):
+        return _own_signature(found)
+    parameters: dict[str, inspect.Parameter] = {}
+    for cls in found.__mro__:
+        if "__init__" not in vars(cls):
+            continue
+        own = _own_signature(vars(cls)["__init__"])
+        own.pop("self", None)
+        rest = [name for name, p in own.items() if p.kind is p.VAR_KEYWORD]
+        named = {name: p for name, p in own.items() if name not in rest}
+        if parameters:  # what a base must be given, the class above gives it
+            named = {name: p for name, p in named.items() if p.default is not p.empty}
+        parameters = {**named, **parameters}
+        if not rest:
+            return parameters
+    return {**parameters, **own}  # nobody says what else is allowed
+
+
+def _own_signature(function: Any) -> dict[str, inspect.Parameter]:
     try:
-        return dict(inspect.signature(found, eval_str=True).parameters)
+        return dict(inspect.signature(function, eval_str=True).parameters)
     except NameError:  # an annotation that exists for type checkers only
-        return dict(inspect.signature(found).parameters)
+        return dict(inspect.signature(function).parameters)

@@ -59,12 +59,13 @@ class DrawClouds(Callback):
         training = module.training
         module.eval()
         points = self.points.to(module.device)
-        readouts = BatchReadouts(sampler, {})  # type: ignore[arg-type]
+        m: int = module.m  # type: ignore[assignment]
+        readouts = BatchReadouts(sampler, {}, (m,))  # type: ignore[arg-type]
         sampled = {
-            name: readouts.sample_as(name)(points).points
+            name: readouts.sample_as(name, m)(points).points
             for name in readout_names(sampler)  # type: ignore[arg-type]
         }
-        matrix = readouts.outputs[id(points)][1].matrix
+        matrix = readouts.outputs(m)[0][1].matrix
         module.train(training)
         figures = {"clouds": cloud_grid(points, sampled, self.titles)}
         if matrix is not None and points.shape[1] * len(matrix.queries) <= DENSE_PIXELS:

@@ -1,6 +1,7 @@
 """The only LightningModule: a sampler and a task net, of which one or both learn."""
 
-from collections.abc import Callable, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, Protocol, get_args
 
 import lightning as L
@@ -12,10 +13,11 @@ from torchmetrics import MeanMetric, MetricCollection
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics import SET_METRICS
+from mops_lightning.readout_names import FULL, SOFT_PROJECTED, size_prefix
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.scoring import FULL, BatchReadouts, Sample, full_cloud, readout_names
+from mops_lightning.scoring import BatchReadouts, Sample, full_cloud, readout_names
 from mops_lightning.seeding import derive_seed
-from mops_lightning.types import Batch, SampleOutput, TaskOutput
+from mops_lightning.types import Batch, TaskOutput
 
 CHECKPOINT_KEY = "mops_lightning"
 """Where a checkpoint keeps the identity of its run."""
@@ -50,6 +52,9 @@ class Experiment(L.LightningModule):
         baselines: index samplers that are tested beside the sampler, by name.
         seed: what happens in step i of epoch e depends on (seed, e, i) only.
         identity: kept in checkpoints, so that none is resumed under other settings.
+        sizes: how many points are tested, from one pass over the data; None: ``m`` alone. With
+            several, the metrics are named ``test/m32/generated/accuracy`` and so on.
+        m: the size that is validated and whose score stands for the run; None: the sampler's.
 
     Raises:
         UserError: ``learn`` is unknown, or the sampler that it needs is missing.
@@ -65,6 +70,8 @@ class Experiment(L.LightningModule):
         baselines: Mapping[str, Sampler] | None = None,
         seed: int = 0,
         identity: dict[str, str] | None = None,
+        sizes: Sequence[int] | None = None,
+        m: int | None = None,
     ) -> None:
         super().__init__()
         allowed = get_args(Learn)
@@ -83,12 +90,23 @@ class Experiment(L.LightningModule):
         self.total_steps = 1
         for module in self._frozen():
             module.requires_grad_(False)
+        self.m: int = m or (self.sampler.m if self.sampler is not None else 0)
+        self.sizes = tuple(sizes or (self.m,))
         self.own_readouts = readout_names(self.sampler)
-        self.all_readouts = tuple(dict.fromkeys([*self.own_readouts, *self.baselines, FULL]))
-        metrics: Any = task.metrics
-        self.scores = nn.ModuleDict({name: metrics() for name in self.all_readouts})
+        self.score_name = f"test/{self._prefix(self.m)}{self.own_readouts[0]}/{self.task.score}"
+        if self.sampler is None:
+            self.score_name = f"test/{FULL}/{self.task.score}"
+        readouts = dict.fromkeys([*self.own_readouts, *self.baselines])
+        keys = [f"{self._prefix(size)}{name}" for size in self.sizes for name in readouts]
+        make_metrics: Any = task.metrics
+        self.scores = nn.ModuleDict({key: make_metrics() for key in (*keys, *readouts, FULL)})
+        self.train_scores = make_metrics()
         self.set_metrics = nn.ModuleDict(
-            {name: MeanMetric(nan_strategy="disable") for name in SET_METRICS}
+            {
+                f"{prefix}{name}": MeanMetric(nan_strategy="disable")
+                for name in SET_METRICS
+                for prefix in {"", *map(self._prefix, self.sizes)}
+            }
         )
         self.train()
 
@@ -150,19 +168,31 @@ class Experiment(L.LightningModule):
             self.sampler.anneal(self.global_step / max(self.total_steps - 1, 1))
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Return the task loss plus the sampler's losses."""
-        sampled: list[SampleOutput] = []
-
-        def sample(points: Tensor) -> SampleOutput:
-            sampled.append(full_cloud(points) if self.sampler is None else self.sampler(points))
-            return sampled[-1]
-
-        losses = dict(self.task.step(batch, sample).losses)
-        for output in sampled:
-            for name, value in output.losses.items():
-                losses[name] = losses.get(name, 0) + value / len(sampled)
+        """Return the task loss plus the sampler's losses, over all sizes of this step."""
+        sizes = (0,) if self.sampler is None else self.sampler.training_sizes()
+        readouts = BatchReadouts(self.sampler, {}, sizes)
+        terms: dict[str, list[Tensor]] = defaultdict(list)
+        for m in sizes:
+            sample = full_cloud if self.sampler is None else readouts.as_trained_on(m)
+            result = self.task.step(batch, sample)
+            self.train_scores.update(result.predictions, result.targets)
+            for name, value in result.losses.items():
+                terms[name].append(value)
+            outputs = [output for _, output in readouts.outputs(m)]
+            for output in outputs:
+                for name, value in output.losses.items():
+                    terms[name].append(value / len(outputs))
+        share = 1.0
+        if self.sampler is not None and self.sampler.over_sizes == "mean":
+            share = 1 / len(sizes)
+        losses = {name: torch.stack(values).sum() * share for name, values in terms.items()}
         total = torch.stack(list(losses.values())).sum()
-        size = len(batch.points)
+        self._log_training(losses, total, readouts, len(batch.points))
+        return total
+
+    def _log_training(
+        self, losses: dict[str, Tensor], total: Tensor, readouts: BatchReadouts, size: int
+    ) -> None:
         for name, value in {**losses, "total": total}.items():
             self.log(f"train/loss/{name}", value.detach(), batch_size=size)
         self.log("loss", total.detach(), prog_bar=True, logger=False, batch_size=size)
@@ -171,33 +201,51 @@ class Experiment(L.LightningModule):
         tau: Any = getattr(self.sampler, "tau", None)
         if tau is not None:
             self.log("train/tau", tau, batch_size=size)
-        return total
+        soft = any(
+            output.soft_projected is not None for _, output in readouts.outputs(max(readouts.sizes))
+        )
+        seen = SOFT_PROJECTED if soft else self.own_readouts[0]
+        for name, metric in self.train_scores.items(keep_base=True, copy_state=False):
+            self.log(f"train/{seen}/{name}", metric, on_step=False, on_epoch=True, batch_size=size)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Score the learned readouts on held-out training clouds."""
-        self._score(batch, "val", self.own_readouts)
+        """Score the learned readouts on held-out training clouds, at one size."""
+        readouts = BatchReadouts(self.sampler, {}, (self.m,))
+        self._score(batch, "val/", readouts, self.m, self.own_readouts)
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
-        """Score the learned readouts, the baselines and the full clouds."""
-        self._score(batch, "test", self.all_readouts)
-
-    def _score(self, batch: Batch, stage: str, readouts: tuple[str, ...]) -> None:
-        size = len(batch.points)
+        """Score the learned readouts and the baselines at every size, and the full clouds."""
         baselines: Any = dict(self.baselines.items())
-        batch_readouts = BatchReadouts(self.sampler, baselines)
-        for readout in readouts:
-            result = self.task.step(batch, batch_readouts.sample_as(readout))
-            metrics: Any = self.scores[readout]
+        readouts = BatchReadouts(self.sampler, baselines, self.sizes)
+        names = [name for name in (*self.own_readouts, *baselines) if name != FULL]
+        for m in self.sizes:
+            self._score(batch, f"test/{self._prefix(m)}", readouts, m, names)
+        self._score(batch, "test/", readouts, self.m, [FULL])
+
+    def _prefix(self, m: int) -> str:
+        return size_prefix(m) if len(self.sizes) > 1 else ""
+
+    def _score(
+        self, batch: Batch, prefix: str, readouts: BatchReadouts, m: int, names: Sequence[str]
+    ) -> None:
+        """Update and log the metrics of some readouts at one size; ``prefix`` names both."""
+        size = len(batch.points)
+        within = prefix.split("/", 1)[1]
+        for readout in names:
+            result = self.task.step(batch, readouts.sample_as(readout, m))
+            metrics: Any = self.scores[f"{within}{readout}"]
             metrics.update(result.predictions, result.targets)
             for name, metric in metrics.items(keep_base=True, copy_state=False):
-                self.log(f"{stage}/{readout}/{name}", metric, batch_size=size)
+                self.log(f"{prefix}{readout}/{name}", metric, batch_size=size)
             if readout == self.own_readouts[0]:
                 for name, value in result.losses.items():
-                    self.log(f"{stage}/loss/{name}", value, batch_size=size)
-        for points, output in batch_readouts.outputs.values():
+                    self.log(f"{prefix}loss/{name}", value, batch_size=size)
+        if list(names) == [FULL]:
+            return
+        for points, output in readouts.outputs(m):
             for name, per_cloud in SET_METRICS.items():
                 values = per_cloud(points, output)
                 if values is not None:
-                    mean: Any = self.set_metrics[name]
+                    mean: Any = self.set_metrics[f"{within}{name}"]
                     mean.update(values)
-                    self.log(f"{stage}/{name}", mean, batch_size=size)
+                    self.log(f"{prefix}{name}", mean, batch_size=size)

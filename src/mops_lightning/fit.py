@@ -22,7 +22,9 @@ from mops_lightning.draw import DrawClouds
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.experiment import Experiment
 from mops_lightning.malloc import keep_freed_memory
+from mops_lightning.readout_names import parse
 from mops_lightning.seeding import derive_seed, generator
+from mops_lightning.sizes import tested_sizes
 
 HARMLESS = (
     ".*does not have many workers.*",  # the data lie in memory; workers would only copy them
@@ -73,9 +75,18 @@ def test(
     with _interruptible():
         trainer.test(experiment, CloudLoader(dataset.test, cfg.batch_size), verbose=False)
     metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
-    score = f"/{experiment.task.score}"
-    log_hparams(trainer, cfg, {k: v for k, v in metrics.items() if k.endswith(score)})
+    log_hparams(trainer, cfg, _headline(metrics, experiment))
     return metrics
+
+
+def _headline(metrics: dict[str, float], experiment: Experiment) -> dict[str, float]:
+    """Pick the task's score at every readout, of several sizes at the run's own."""
+    chosen = {}
+    for name, value in metrics.items():
+        parts = parse(name)
+        if parts and parts.metric == experiment.task.score and parts.m in (None, experiment.m):
+            chosen[name] = value
+    return chosen
 
 
 @contextmanager
@@ -96,9 +107,13 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     # A seed of its own: the sampler's first weights must not hang on the size of the task net.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
     sampler = build(cfg.sampler) if cfg.learn != "task" else None
+    sizes = tested_sizes(cfg.sizes, cfg.m, sampler, dataset.test.points.shape[1])
     baselines = {}
     if sampler is not None and sampler.learned:
-        baselines = {str(name): build(node) for name, node in cfg.baselines.items() if node}
+        nodes = {str(name): node for name, node in cfg.baselines.items() if node}
+        baselines = {name: build(node, m=max(sizes)) for name, node in nodes.items()}
+    elif sampler is not None and sampler.flexible:
+        sampler = build(cfg.sampler, m=max(sizes))
     return Experiment(
         task,
         sampler,
@@ -108,6 +123,8 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         baselines=baselines,
         seed=cfg.seed,
         identity=identity,
+        sizes=sizes,
+        m=cfg.m,
     )
 
 

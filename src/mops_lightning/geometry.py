@@ -65,6 +65,38 @@ def nearest(queries: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     Raises:
         UserError: the shapes do not fit.
     """
+    _check_search(queries, points)
+    with torch.no_grad():
+        indices = _search(queries, points, 1)[..., 0]
+    return (queries - gather_points(points, indices)).square().sum(2), indices
+
+
+def k_nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Find the k nearest points of a cloud for every query by looking at all of them.
+
+    Args:
+        queries: ``(B, M, C)``.
+        points: ``(B, N, C)``.
+        k: how many, 1 ≤ k ≤ N.
+
+    Returns:
+        Squared distances ``(B, M, k)``, ascending, through which gradients flow to queries and
+        points, and the indices ``(B, M, k)`` int64. Which of equally near points are taken is not
+        defined for k > 1.
+
+    Raises:
+        UserError: the shapes do not fit, or k is out of its range.
+    """
+    _check_search(queries, points)
+    if not 1 <= k <= points.shape[1]:
+        raise UserError(f"k must be from 1 to the number of points N={points.shape[1]}, got {k}.")
+    with torch.no_grad():
+        indices = _search(queries, points, k)
+    neighbours = gather_points(points, indices.flatten(1)).unflatten(1, indices.shape[1:])
+    return (queries[:, :, None] - neighbours).square().sum(3), indices
+
+
+def _check_search(queries: Tensor, points: Tensor) -> None:
     if queries.ndim != 3 or points.ndim != 3 or queries.shape[::2] != points.shape[::2]:
         raise UserError(
             "queries (B, M, C) and points (B, N, C) must agree in B and C, "
@@ -72,9 +104,6 @@ def nearest(queries: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
         )
     if points.shape[1] == 0:
         raise UserError("points must hold at least one point per cloud, got N=0.")
-    with torch.no_grad():
-        indices = _nearest_indices(queries, points)
-    return (queries - gather_points(points, indices)).square().sum(2), indices
 
 
 def farthest_point_sample(
@@ -172,8 +201,8 @@ def _planes(points: Tensor, padding: float | None = None) -> Tensor:
     return planes.contiguous()
 
 
-def _nearest_indices(queries: Tensor, points: Tensor) -> Tensor:
-    """Search for ``nearest``; coordinates lie in planes, so that every step is vectorised."""
+def _search(queries: Tensor, points: Tensor, k: int) -> Tensor:
+    """Return ``(B, M, k)`` nearest; coordinates lie in planes, so that every step is vectorised."""
     dtype = _search_dtype(points)
     rows = _planes(queries.to(dtype))[..., None]  # (C, B, M, 1)
     columns = _planes(points.to(dtype), padding=torch.inf)[:, :, None]  # (C, B, 1, N)
@@ -181,7 +210,7 @@ def _nearest_indices(queries: Tensor, points: Tensor) -> Tensor:
     limit = BLOCK["cpu" if points.device.type == "cpu" else "other"]
     height = max(1, min(m, limit // width))
     depth = max(1, min(clouds, limit // (height * width)))
-    indices = torch.empty(clouds, m, dtype=torch.int64, device=points.device)
+    indices = torch.empty(clouds, m, k, dtype=torch.int64, device=points.device)
     buffers = rows.new_empty(2, depth * height * width)  # allocating per block costs a third more
     for b in range(0, clouds, depth):
         for r in range(0, m, height):
@@ -193,8 +222,11 @@ def _nearest_indices(queries: Tensor, points: Tensor) -> Tensor:
             for axis in range(1, len(rows)):
                 torch.sub(columns[axis, b : b + depth], part[axis], out=difference)
                 total.addcmul_(difference, difference)
-            winners = first_extreme(total.view(-1, width), largest=False)
-            indices[b : b + depth, r : r + height] = winners.view(shape[:2])
+            flat = total.view(-1, width)
+            winners = (
+                first_extreme(flat, largest=False) if k == 1 else flat.topk(k, largest=False)[1]
+            )
+            indices[b : b + depth, r : r + height] = winners.view(*shape[:2], k)
     return indices
 
 

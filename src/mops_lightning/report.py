@@ -15,7 +15,7 @@ from typing import Any
 from mops_lightning import records
 from mops_lightning.errors import UserError
 from mops_lightning.io import atomic_write
-from mops_lightning.scoring import FULL, GENERATED_READOUTS, INDEX_READOUT
+from mops_lightning.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT
 
 Cells = dict[tuple[str, str], dict[int, float]]
 """(sampler, readout) → m → value."""

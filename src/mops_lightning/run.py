@@ -92,8 +92,8 @@ def fit_and_test(
     for kind, name in OUTPUTS.items():
         if (folder / name).exists():
             record["files"][kind] = name
-    readout = experiment.own_readouts[0]
-    record["score"] = record["metrics"][f"test/{readout}/{experiment.task.score}"]
+    record["score"] = record["metrics"][experiment.score_name]
+    record["notes"]["score"] = experiment.score_name
     learned = {
         "task": {weights.FILE: experiment.task},
         "sampler": {weights.FILE: experiment.sampler},

@@ -6,28 +6,33 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from mops_lightning.readout_names import FULL, ROWS, parse
 from mops_lightning.records import FILE
 
-LAST = ("generated", "matched", "completed", "sampled", "full")
-"""Readouts in the order of the table, after the baselines."""
+Rows = dict[str, dict[str, float | None]]
+"""Readout → metric, or m=SIZE where several are tested → value."""
 
 
-def readout_rows(metrics: dict[str, float | None], prefix: str = "test/") -> dict[str, dict]:
+def readout_rows(metrics: dict[str, float | None], score: str | None = None) -> Rows:
     """Group a record's flat test metrics by readout.
 
     Args:
         metrics: such as ``{"test/generated/accuracy": 0.8}``.
-        prefix: what the names start with.
+        score: the metric to show where several sizes are tested; None: the only one.
 
     Returns:
-        ``{"generated": {"accuracy": 0.8}}``: baselines first, full clouds last.
+        ``{"generated": {"accuracy": 0.8}}``, or ``{"generated": {"m=32": 0.8}}`` where several
+        sizes are tested: baselines first, full clouds last, which count for every size.
     """
-    rows: dict[str, dict] = {}
-    for name, value in metrics.items():
-        parts = name.removeprefix(prefix).split("/")
-        if name.startswith(prefix) and len(parts) == 2 and parts[0] not in ("loss", "matrix"):
-            rows.setdefault(parts[0], {})[parts[1]] = value
-    order = {name: position for position, name in enumerate(LAST)}
+    parts = {name: parse(name) for name in metrics}
+    several = any(part and part.m for part in parts.values())
+    rows: Rows = {}
+    for name, part in parts.items():
+        if part is None or (several and score not in (None, part.metric)):
+            continue
+        column = part.metric if not several else f"m={part.m}" if part.m else FULL
+        rows.setdefault(part.readout, {})[column] = metrics[name]
+    order = {name: position for position, name in enumerate(ROWS)}
     return dict(sorted(rows.items(), key=lambda item: order.get(item[0], -1)))
 
 
@@ -41,18 +46,29 @@ def closing_lines(folder: Path, record: dict[str, Any], console: Console | None 
     """
     console = console or Console()
     config = record["config"]
-    names, rows = config["names"], readout_rows(record["metrics"])
+    names, score = config["names"], parse(record["notes"].get("score", ""))
+    rows = readout_rows(record["metrics"], score.metric if score else None)
     # The task's own scores; figures of the sampled set stay in the record.
-    columns = list(rows.get("full", {}))
-    title = f"{names['task']} by {names['net']}, {names['dataset']}, m={config['m']}, test"
+    columns = list(rows.get(FULL, {}))
+    what = f"m={config['m']}"
+    if score and score.m:
+        columns = list(next(iter(rows.values())))
+        rows[FULL] = dict.fromkeys(columns, next(iter(rows[FULL].values())))
+        what = score.metric.replace("_", " ")
+    title = f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test"
     table = Table(title=title, title_justify="left")
     table.add_column("sampled by")
     for column in columns:
         table.add_column(column.replace("_", " "), justify="right")
     for readout, row in rows.items():
-        label = f"{names['sampler']} {readout}" if readout in LAST[:4] else readout
-        cells = ["" if row.get(c) is None else _number(c, row[c]) for c in columns]
-        table.add_row("all points" if readout == "full" else label, *cells)
+        label = f"{names['sampler']} {readout}" if readout in ROWS[:-1] else readout
+        values = [row.get(column) for column in columns]
+        kinds = [score.metric if score and score.m else column for column in columns]
+        cells = [
+            "" if value is None else _number(kind, value)
+            for kind, value in zip(kinds, values, strict=True)
+        ]
+        table.add_row("all points" if readout == FULL else label, *cells)
     console.print(table)
     files = ", ".join([FILE, *sorted(record["files"].values())])
     seconds = record["seconds"]["total"]

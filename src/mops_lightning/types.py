@@ -32,12 +32,25 @@ class SampleOutput(NamedTuple):
         indices: ``(B, M)`` int64 rows of the input, or None when the points are generated.
         losses: the sampler's own loss terms, already weighted, to be added to the task loss.
         matrix: the sampling matrix S behind the points, or None.
+        soft_projected: ``(B, M, 3)`` what the task net is trained on in place of ``points``, or
+            None; exists in training only and is never a test result.
     """
 
     points: Tensor
     indices: Tensor | None
     losses: dict[str, Tensor]
     matrix: "SamplingMatrix | None" = None
+    soft_projected: Tensor | None = None
+
+    def first(self, m: int) -> "SampleOutput":
+        """Return the output of the first ``m`` points; losses, being of all of them, stay out."""
+        return SampleOutput(
+            self.points[:, :m],
+            None if self.indices is None else self.indices[:, :m],
+            {},
+            None if self.matrix is None else self.matrix.leftmost(m),
+            None if self.soft_projected is None else self.soft_projected[:, :m],
+        )
 
 
 class TaskOutput(NamedTuple):

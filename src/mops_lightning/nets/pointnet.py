@@ -112,10 +112,11 @@ class PointMaxPool(nn.Module):
                 winners = (search @ features.mT).argmax(2)
             else:  # cloud by cloud the product stays in the cache
                 surplus = -features.shape[1] % GROUP
-                # Copies of the first point never win: the lowest position does.
                 filled = torch.cat([features, features[:, :1].expand(-1, surplus, -1)], 1)
                 rows = [first_extreme(search @ cloud.mT, largest=True) for cloud in filled]
                 winners = torch.stack(rows).squeeze(2)
+                # A copy may beat the first point itself by a rounding error of the product.
+                winners.masked_fill_(winners >= features.shape[1], 0)
         index = winners[..., None].expand(-1, -1, features.shape[2])
         return (features.gather(1, index) * weight).sum(-1)
 

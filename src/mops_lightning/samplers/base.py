@@ -1,5 +1,8 @@
 """The contract that every sampler keeps."""
 
+from collections.abc import Sequence
+from typing import Literal
+
 import torch
 from torch import Tensor, nn
 
@@ -13,7 +16,8 @@ class Sampler(nn.Module):
     Args:
         m: number of points to return; for a flexible sampler the largest number it can return.
 
-    A subclass implements ``sample(points, m)`` and may override ``anneal``.
+    A subclass implements ``sample(points, m)``; a learned one also ``losses``, and one for many
+    sizes ``training_sizes``. ``anneal`` is there for what changes in the course of the training.
     """
 
     flexible: bool = False
@@ -22,6 +26,12 @@ class Sampler(nn.Module):
     generates: bool = False
     """Whether the points are made, so that matched and completed sets differ from them; the others
     choose input points and return their indices."""
+
+    nested: bool = False
+    """Whether the answer for a smaller m is the first m points of the answer for a larger one."""
+
+    over_sizes: Literal["mean", "sum"] = "mean"
+    """How the losses at several ``training_sizes`` become one."""
 
     def __init__(self, m: int) -> None:
         super().__init__()
@@ -48,11 +58,40 @@ class Sampler(nn.Module):
         own = next((p.dtype for p in self.parameters()), points.dtype)
         if points.dtype != own and not torch.is_autocast_enabled(points.device.type):
             raise UserError(f"points must be {own} as the sampler's weights, got {points.dtype}.")
-        return self.sample(points, m)
+        output = self.sample(points, m)
+        return output._replace(losses=self.losses(points, output)) if self.training else output
+
+    def sample_sizes(self, points: Tensor, sizes: Sequence[int]) -> dict[int, SampleOutput]:
+        """Sample at several sizes; a nested sampler works once, at the largest.
+
+        Args:
+            points: as for ``forward``.
+            sizes: each as ``m`` for ``forward``.
+
+        Returns:
+            By size, what ``forward`` returns for it.
+        """
+        if not self.nested:
+            return {m: self(points, m) for m in sizes}
+        whole = self(points, max(sizes))
+        outputs = {max(sizes): whole}
+        for m in set(sizes) - set(outputs):
+            part = whole.first(m)
+            losses = self.losses(points, part) if self.training else {}
+            outputs[m] = part._replace(losses=losses)
+        return {m: outputs[m] for m in sizes}
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Do the work on checked input; see ``forward``."""
         raise NotImplementedError
+
+    def losses(self, points: Tensor, output: SampleOutput) -> dict[str, Tensor]:
+        """Return the sampler's own weighted loss terms for points and an output, in training."""
+        return {}
+
+    def training_sizes(self) -> tuple[int, ...]:
+        """Return the sizes that the next training step learns from; torch's seed draws them."""
+        return (self.m,)
 
     def anneal(self, progress: float) -> None:
         """Tell the sampler how much of the training is done, from 0 to 1; most do not mind."""

@@ -26,6 +26,7 @@ class FPSSampler(Sampler):
     """
 
     flexible = True
+    nested = True
 
     def __init__(self, m: int, seed: int = 0, start: int | None = None) -> None:
         super().__init__(m)

@@ -91,10 +91,10 @@ class MOPSNet(Sampler):
         return SamplingMatrix(self.queries.weight, keys.unflatten(0, points.shape[:2]), self.tau)
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
-        """Generate points; see ``Sampler.forward``. The subset loss is computed in training."""
-        matrix = self.sampling_matrix(points)
-        generated = matrix.sample(points)
-        losses = {}
-        if self.training:
-            losses["subset"] = self.alpha * subset_loss(points, generated)
-        return SampleOutput(generated, None, losses, matrix)
+        """Generate points; see ``Sampler.forward``."""
+        matrix = self.sampling_matrix(points).leftmost(m)
+        return SampleOutput(matrix.sample(points), None, {}, matrix)
+
+    def losses(self, points: Tensor, output: SampleOutput) -> dict[str, Tensor]:
+        """Return α times the subset loss (paper section "Joint Training Loss")."""
+        return {"subset": self.alpha * subset_loss(points, output.points)}

@@ -20,6 +20,7 @@ class RandomSampler(Sampler):
     """
 
     flexible = True
+    nested = True
 
     def __init__(self, m: int, seed: int = 0) -> None:
         super().__init__(m)

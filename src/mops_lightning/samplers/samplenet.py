@@ -1,0 +1,102 @@
+"""SampleNet and its progressive form: S-Net with a soft projection onto the cloud.
+
+Lang, Manor and Avidan, "SampleNet: Differentiable Point Cloud Sampling", CVPR 2020; a rival in the
+paper's tables.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mops_lightning.errors import UserError
+from mops_lightning.geometry import gather_points, k_nearest
+from mops_lightning.samplers.snet import Progressive, SNet
+from mops_lightning.types import SampleOutput
+
+
+def soft_projection(queries: Tensor, points: Tensor, k: int, sigma: Tensor | float) -> Tensor:
+    """Replace every query by a weighted mean of its k nearest points.
+
+    Σ_i w_i·p_i with w = softmax(−d²(q, p_i)/σ) over the k nearest (SampleNet, section "Soft
+    projection"). For σ → 0 it is the nearest point.
+
+    Args:
+        queries: ``(B, M, 3)``.
+        points: ``(B, N, 3)``, N ≥ k.
+        k: how many neighbours.
+        sigma: σ > 0, in squared units of the coordinates.
+
+    Returns:
+        ``(B, M, 3)``; gradients flow to queries, points and σ.
+
+    Raises:
+        UserError: k is out of its range.
+    """
+    distances, indices = k_nearest(queries, points, k)
+    # The softmax does not mind the shift, and a tiny σ makes no infinity of the nearest one.
+    shares = ((distances[..., :1] - distances) / sigma).softmax(2)
+    neighbours = gather_points(points, indices.flatten(1)).unflatten(1, indices.shape[1:])
+    return (shares[..., None] * neighbours).sum(2)
+
+
+class SampleNet(SNet):
+    """S-Net whose points are softly projected onto the cloud for the task net in training.
+
+    In evaluation nothing is projected: the readouts *matched* and *completed* take the nearest
+    input points of the simplified ones, which are the readout *generated*.
+
+    Args:
+        m: number of points to generate.
+        k: how many neighbours the projection takes.
+        beta: weight of the projection loss, which is σ (β in the MOPS-Net paper).
+        gamma: weight of the simplification loss (γ in the MOPS-Net paper); None takes ``alpha``,
+            the name it has in SampleNet's own publication.
+        sigma_min: floor of σ = t², where t is learned and starts at 1.
+        **settings: as for ``SNet``; ``alpha`` is the weight of the simplification loss.
+
+    Raises:
+        UserError: a setting is out of its range.
+    """
+
+    def __init__(
+        self,
+        m: int,
+        k: int = 7,
+        beta: float = 1.0,
+        gamma: float | None = None,
+        sigma_min: float = 0.0,
+        **settings: Any,
+    ) -> None:
+        super().__init__(m, **settings)
+        for name, value in {"beta": beta, "gamma": gamma or 0, "sigma_min": sigma_min}.items():
+            if value < 0:
+                raise UserError(f"sampler.{name} must not be negative, got {value}.")
+        if k < 1:
+            raise UserError(f"sampler.k must be at least 1, got {k}.")
+        self.k = k
+        self.beta = beta
+        self.alpha = self.alpha if gamma is None else gamma
+        self.sigma_min = sigma_min
+        self.temperature = nn.Parameter(torch.ones(()))
+
+    @property
+    def sigma(self) -> Tensor:
+        """The projection's temperature σ = t², at least ``sigma_min``."""
+        return self.temperature.square().clamp(min=self.sigma_min)
+
+    def sample(self, points: Tensor, m: int) -> SampleOutput:
+        """Generate points; in training their soft projection stands beside them."""
+        output = super().sample(points, m)
+        if not self.training:
+            return output
+        projected = soft_projection(output.points, points, self.k, self.sigma)
+        return output._replace(soft_projected=projected)
+
+    def losses(self, points: Tensor, output: SampleOutput) -> dict[str, Tensor]:
+        """Return the weighted simplification loss and β·σ."""
+        return {**super().losses(points, output), "projection": self.beta * self.sigma}
+
+
+class ProgressiveSampleNet(Progressive, SampleNet):
+    """SampleNet with nested samples; settings as for ``Progressive`` and ``SampleNet``."""

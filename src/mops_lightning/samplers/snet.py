@@ -1,0 +1,130 @@
+"""S-Net and its progressive form: points made from the global feature alone.
+
+Dovrat, Lang and Avidan, "Learning to Sample", CVPR 2019; a rival in the paper's tables.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, Literal
+
+from torch import Tensor, nn
+
+from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.losses import simplification_loss
+from mops_lightning.nets.pointnet import PointMaxPool, PointMLP
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.types import SampleOutput
+
+
+class SNet(Sampler):
+    """Per-point layers, maximum over points, and a head that emits all 3m coordinates.
+
+    Args:
+        m: number of points to generate.
+        alpha: weight of the simplification loss in the training loss.
+        coverage: γ of the simplification loss.
+        coverage_per_point: δ of the simplification loss.
+        feature_channels: sizes of the per-point layers, each with BatchNorm and ReLU.
+        head_channels: sizes of the head's hidden layers, each with ReLU.
+        head_norm: whether these have BatchNorm.
+        output_norm: whether the coordinates pass a BatchNorm too.
+
+    Raises:
+        UserError: a weight is negative or there are less than two per-point layers.
+    """
+
+    generates = True
+
+    def __init__(
+        self,
+        m: int,
+        alpha: float = 30.0,
+        coverage: float = 1.0,
+        coverage_per_point: float = 0.0,
+        feature_channels: Sequence[int] = (64, 64, 64, 128, 128),
+        head_channels: Sequence[int] = (256, 256, 256),
+        head_norm: bool = True,
+        output_norm: bool = True,
+    ) -> None:
+        super().__init__(m)
+        weights = {"alpha": alpha, "coverage": coverage, "coverage_per_point": coverage_per_point}
+        for name, value in weights.items():
+            if value < 0:
+                raise UserError(f"sampler.{name} must not be negative, got {value}.")
+        if len(feature_channels) < 2:
+            raise UserError(
+                f"sampler.feature_channels must name at least two layers, got {feature_channels}."
+            )
+        self.alpha = alpha
+        self.coverage = coverage
+        self.coverage_per_point = coverage_per_point
+        self.features = PointMLP([3, *feature_channels[:-1]])
+        self.pool = PointMaxPool(*feature_channels[-2:])
+        layers: list[nn.Module] = []
+        for before, after in pairwise([feature_channels[-1], *head_channels]):
+            layers += [nn.Linear(before, after, bias=not head_norm)]
+            layers += [nn.BatchNorm1d(after)] if head_norm else []
+            layers += [nn.ReLU(inplace=True)]
+        layers += [nn.Linear(head_channels[-1], 3 * m, bias=not output_norm)]
+        layers += [nn.BatchNorm1d(3 * m)] if output_norm else []
+        self.head = nn.Sequential(*layers)
+
+    def sample(self, points: Tensor, m: int) -> SampleOutput:
+        """Generate points; see ``Sampler.forward``."""
+        coordinates = self.head(self.pool(self.features(points)))
+        return SampleOutput(coordinates.unflatten(1, (self.m, 3))[:, :m], None, {})
+
+    def losses(self, points: Tensor, output: SampleOutput) -> dict[str, Tensor]:
+        """Return α times the simplification loss."""
+        loss = simplification_loss(points, output.points, self.coverage, self.coverage_per_point)
+        return {"simplification": self.alpha * loss}
+
+
+class Progressive(Sampler):
+    """What makes a net progressive: every power of two of its points is trained as a sample.
+
+    The ProgressiveNet of the S-Net paper. Any m up to the largest can be asked for; the first m
+    points are returned. Stands before the net in a class's bases, whose settings it passes on.
+
+    Args:
+        m_max: largest number of points, 1,024 in the publication.
+        least: smallest size that is trained: 2 for classification, 16 for reconstruction.
+        over_sizes: whether the losses at all sizes are summed (classification) or averaged
+            (reconstruction).
+        **settings: as for the net.
+
+    Raises:
+        UserError: a setting is out of its range.
+    """
+
+    flexible = True
+    nested = True
+
+    def __init__(
+        self,
+        m_max: int = 1024,
+        least: int = 2,
+        over_sizes: Literal["sum", "mean"] = "sum",
+        **settings: Any,
+    ) -> None:
+        super().__init__(m_max, **settings)
+        if least < 1:
+            raise UserError(f"sampler.least must be at least 1, got {least}.")
+        if over_sizes not in ("sum", "mean"):
+            hint = did_you_mean(over_sizes, ("sum", "mean"))
+            raise UserError(f"sampler.over_sizes: unknown {over_sizes!r}.{hint}")
+        self.least = least
+        self.over_sizes = over_sizes
+
+    def training_sizes(self) -> tuple[int, ...]:
+        """Return ``least``, twice of it and so on below the largest size, and this one."""
+        sizes = {self.m}
+        size = self.least
+        while size < self.m:
+            sizes.add(size)
+            size *= 2
+        return tuple(sorted(sizes))
+
+
+class ProgressiveSNet(Progressive, SNet):
+    """S-Net with nested samples; settings as for ``Progressive`` and ``SNet``."""

@@ -1,0 +1,92 @@
+import pytest
+import torch
+
+from mops_lightning.errors import UserError
+from mops_lightning.losses import subset_loss
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.samplers.mops import MOPSNet
+
+
+def small(m_max=16, **settings):
+    torch.manual_seed(0)
+    return FMOPSNet(m_max, feature_channels=(8, 6), rho_channels=(12, 10), **settings)
+
+
+def test_a_smaller_sample_is_the_head_of_a_larger_one(rng):
+    points = torch.randn(3, 40, 3, generator=rng)
+    net = small().eval()
+    whole = net(points)
+    for m in (1, 5, 16):
+        part = net(points, m)
+        torch.testing.assert_close(part.points, whole.points[:, :m])
+        torch.testing.assert_close(part.matrix.dense(), whole.matrix.dense()[..., :m])
+
+
+def test_it_is_mops_net_s_network(rng):
+    points = torch.randn(3, 40, 3, generator=rng)
+    flexible = small()
+    fixed = MOPSNet(5, feature_channels=(8, 6), rho_channels=(12, 10))
+    state = flexible.state_dict()
+    state["queries.weight"] = state["queries.weight"][:5]
+    fixed.load_state_dict(state, strict=True)
+    torch.testing.assert_close(fixed.eval()(points).points, flexible.eval()(points, 5).points)
+
+
+def test_one_forward_pass_gives_every_size_with_its_loss(rng):
+    points = torch.randn(3, 40, 3, generator=rng)
+    net = small(alpha=2.0).train()
+    calls = []
+    net.features.register_forward_hook(lambda *_: calls.append(1))
+    outputs = net.sample_sizes(points, (2, 16, 7))
+    assert len(calls) == 1
+    assert list(outputs) == [2, 16, 7]
+    for m, output in outputs.items():
+        assert output.points.shape[1] == len(output.matrix.queries) == m
+        expected = 2 * subset_loss(points, output.points)
+        torch.testing.assert_close(output.losses["subset"], expected)
+
+
+def drawn(number, **settings):
+    net = small(512, **settings)
+    torch.manual_seed(1)
+    return [net.training_sizes() for _ in range(number)]
+
+
+def test_sizes_are_drawn_as_described():
+    uniform = torch.tensor(drawn(4000, sizes_per_step="uniform")).flatten().double()
+    assert (uniform.min(), uniform.max()) == (1, 512)
+    assert uniform.mean() == pytest.approx(256.5, rel=0.03)
+    log = torch.tensor(drawn(4000, sizes_per_step="log_uniform")).flatten()
+    assert log.min() == 1
+    assert 500 <= log.max() <= 512
+    # floor(513^u) is m with the probability log((m + 1) / m) / log 513.
+    assert (log == 1).double().mean() == pytest.approx(0.1111, abs=0.02)
+    assert (log <= 22).double().mean() == pytest.approx(0.5025, abs=0.03)
+    nested = drawn(300, prefixes=4)
+    assert all(list(sizes) == sorted(set(sizes)) for sizes in nested)
+    assert all(1 <= sizes[0] <= 4 and 107 <= sizes[-1] <= 512 for sizes in nested)
+    # Two parts share the size at which one ends and the next begins.
+    assert {len(sizes) for sizes in nested} <= {3, 4}
+
+
+def test_sizes_follow_the_seed():
+    assert drawn(20) == drawn(20)
+    assert len(set(drawn(20))) > 15
+
+
+def test_all_sizes_of_tiny_nets_can_be_drawn():
+    assert set(small(1).training_sizes()) == {1}
+    assert {size for _ in range(99) for size in small(3, prefixes=1).training_sizes()} <= {1, 2, 3}
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"sizes_per_step": "nestd"}, "sampler.sizes_per_step: unknown 'nestd'.*nested"),
+        ({"prefixes": 0}, "sampler.prefixes must be at least 1, got 0"),
+        ({"tau_min": 0.0}, "sampler.tau_min must"),
+    ],
+)
+def test_wrong_settings_are_refused(settings, named):
+    with pytest.raises(UserError, match=named):
+        small(**settings)
