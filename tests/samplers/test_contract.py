@@ -11,6 +11,7 @@ from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.poisson import PoissonSampler
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
@@ -22,6 +23,7 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "fps": lambda m, **kw: FPSSampler(m, **kw),
     "voxel": lambda m: VoxelSampler(m),
     "voxel-centroid": lambda m: VoxelSampler(m, pick="centroid"),
+    "poisson": lambda m, **kw: PoissonSampler(m, **kw),
     "mops": lambda m: MOPSNet(m, feature_channels=(8, 6), rho_channels=(12, 10)),
     "fmops": lambda m: FMOPSNet(m, feature_channels=(8, 6), rho_channels=(12, 10)),
     "snet": lambda m: SNet(m, **SMALL),

@@ -1,0 +1,50 @@
+import pytest
+import torch
+
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.poisson import PoissonSampler, eliminate, spacing_bound
+from mops_lightning.samplers.random import RandomSampler
+
+
+def plain(cloud, m, reach):
+    """Sample elimination in two loops: sum all weights anew before each point that is dropped."""
+    kept = list(range(len(cloud)))
+    while len(kept) > m:
+        sums = []
+        for i in kept:
+            distances = [float((cloud[i] - cloud[j]).norm()) for j in kept if j != i]
+            sums.append(sum(max(0.0, 1 - d / reach) ** 8 for d in distances))
+        kept.pop(max(range(len(kept)), key=lambda place: sums[place]))
+    return kept
+
+
+@pytest.mark.parametrize("m", [2, 9, 23, 24])  # of the last two, both are equally crowded
+def test_equals_the_plain_form(m, rng):
+    points = torch.randn(3, 24, 3, generator=rng, dtype=torch.float64)
+    reach = spacing_bound(points, m)
+    expected = [plain(cloud, m, float(bound)) for cloud, bound in zip(points, reach, strict=True)]
+    assert eliminate(points, m).tolist() == expected
+
+
+@pytest.mark.parametrize("m", [2, 5, 12])
+def test_no_sample_is_spaced_wider_than_the_bound(m, rng):
+    points = torch.randn(20, 30, 3, generator=rng, dtype=torch.float64)
+    bound = spacing_bound(points, m)
+    for _ in range(30):
+        rows = torch.randperm(30, generator=rng)[:m]
+        spacing = torch.cdist(points[:, rows], points[:, rows])
+        spacing.diagonal(dim1=1, dim2=2).fill_(torch.inf)
+        assert (spacing.amin((1, 2)) <= bound[:, 0]).all()
+
+
+def spacing(points):
+    distances = torch.cdist(points, points)
+    distances.diagonal(dim1=1, dim2=2).fill_(torch.inf)
+    return distances.amin((1, 2)).mean()
+
+
+def test_points_are_spread_far_more_evenly_than_at_random(rng):
+    flat = torch.rand(8, 600, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.0])
+    poisson = spacing(PoissonSampler(60)(flat).points)
+    assert poisson > 4 * spacing(RandomSampler(60)(flat).points)
+    assert poisson > 0.8 * spacing(FPSSampler(60)(flat).points)
