@@ -31,6 +31,10 @@ def _main() -> None:
     # Makes Hydra raise instead of printing its own shortened traceback.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
+        if any(argument.startswith("evaluate=") for argument in sys.argv):
+            from mops_lightning.evaluate import command_line
+
+            sys.argv[1:] = command_line(sys.argv[1:])
         app = hydra.main(config_path=str(conf_dir()), config_name="config", version_base="1.3")
         app(_job)()
     except (UserError, HydraException, OmegaConfBaseException) as error:
@@ -85,7 +89,7 @@ def _explain(error: BaseException) -> str:
             return f"learn: unknown value {value!r}.{did_you_mean(value, LEARN)}"
         if "Could not override '" in text:
             key = text.split("Could not override '")[1].split("'")[0]
-            hint = did_you_mean(key, _known_keys())
+            hint = did_you_mean(key, [known for known in _known_keys() if known != key])
             return f"{key}: no such setting.{hint} --cfg job shows all of them."
     # What Hydra and OmegaConf say themselves, without their notes for developers.
     lines = [line for text in texts for line in text.splitlines() if line.strip()]

@@ -15,6 +15,7 @@ RUN_KEYS = (
     "seed",
     "weights",
     "ckpt_path",
+    "evaluate",
     "batch_size",
     "val_fraction",
     "pictures",
@@ -32,7 +33,7 @@ RUN_KEYS = (
 """Keys of the configuration that are no group; ``--help`` says what each means."""
 
 GROUPS = ("task", "dataset", "sampler", "optimizer", "trainer", "logger")
-LEARN = ("task", "sampler", "joint")
+LEARN = ("task", "sampler", "joint", "nothing")
 
 
 def conf_dir() -> Path:
@@ -113,6 +114,7 @@ def check(cfg: DictConfig) -> None:
             raise UserError(f"Unknown setting {key!r}.{did_you_mean(str(key), known)}")
     if cfg.learn not in LEARN:
         raise UserError(f"learn: unknown value {cfg.learn!r}.{did_you_mean(str(cfg.learn), LEARN)}")
+    _check_evaluation(cfg)
     _whole(cfg, "m", 1)
     _check_sizes(cfg.sizes)
     _whole(cfg, "seed", 0)
@@ -136,6 +138,18 @@ def check(cfg: DictConfig) -> None:
             f"m must be at most dataset.n_points={points}, got m={cfg.m}. "
             f"Try m={points} or dataset.n_points={cfg.m}."
         )
+
+
+def _check_evaluation(cfg: DictConfig) -> None:
+    if cfg.evaluate is not None and cfg.learn != "nothing":
+        raise UserError(
+            f"evaluate: trains nothing, got learn={cfg.learn}. Leave learn out, or train anew "
+            "without evaluate."
+        )
+    if cfg.evaluate is None and cfg.weights == "run":
+        raise UserError("weights=run means the run named by evaluate=RUN, which is not given.")
+    if cfg.learn == "nothing" and cfg.ckpt_path is not None:
+        raise UserError("ckpt_path resumes a training; to test a trained run give evaluate=RUN.")
 
 
 def _check_sizes(sizes: Any) -> None:

@@ -22,7 +22,7 @@ from mops_lightning.types import Batch, TaskOutput
 CHECKPOINT_KEY = "mops_lightning"
 """Where a checkpoint keeps the identity of its run."""
 
-Learn = Literal["task", "sampler", "joint"]
+Learn = Literal["task", "sampler", "joint", "nothing"]
 
 
 class Task(Protocol):
@@ -119,8 +119,10 @@ class Experiment(L.LightningModule):
 
     def _frozen(self) -> list[nn.Module]:
         frozen: list[nn.Module] = list(self.baselines.values())
-        if self.learn == "sampler":
+        if self.learn in ("sampler", "nothing"):
             frozen.append(self.task)
+        if self.learn == "nothing" and self.sampler is not None:
+            frozen.append(self.sampler)
         return frozen
 
     @property

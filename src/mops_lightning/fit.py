@@ -24,7 +24,7 @@ from mops_lightning.experiment import Experiment
 from mops_lightning.malloc import keep_freed_memory
 from mops_lightning.readout_names import parse
 from mops_lightning.seeding import derive_seed, generator
-from mops_lightning.sizes import tested_sizes
+from mops_lightning.sizes import sizes_to_test
 
 HARMLESS = (
     ".*does not have many workers.*",  # the data lie in memory; workers would only copy them
@@ -107,7 +107,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     # A seed of its own: the sampler's first weights must not hang on the size of the task net.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
     sampler = build(cfg.sampler) if cfg.learn != "task" else None
-    sizes = tested_sizes(cfg.sizes, cfg.m, sampler, dataset.test.points.shape[1])
+    sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, dataset.test.points.shape[1])
     baselines = {}
     if sampler is not None and sampler.learned:
         nodes = {str(name): node for name, node in cfg.baselines.items() if node}

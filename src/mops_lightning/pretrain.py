@@ -12,6 +12,7 @@ from mops_lightning import resume
 from mops_lightning.callbacks import CHECKPOINT
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted
+from mops_lightning.evaluate import OF_RUN
 from mops_lightning.io import atomic_write
 from mops_lightning.weights import FILE
 
@@ -20,10 +21,10 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
     """Return the file that ``weights`` means; ``auto`` trains the net when it is not cached.
 
     Returns:
-        None for ``weights=null``, which leaves the net as it was initialised, and for a resumed
-        run, whose checkpoint holds the task net as well.
+        None for ``weights=null``, which leaves the net as it was initialised, for a resumed run,
+        whose checkpoint holds the task net as well, and for the net of an evaluated run.
     """
-    if cfg.weights is None or cfg.ckpt_path is not None:
+    if cfg.weights in (None, OF_RUN) or cfg.ckpt_path is not None:
         return None
     if cfg.weights != "auto":
         return Path(cfg.weights)
@@ -47,6 +48,7 @@ def task_config(cfg: DictConfig) -> DictConfig:
             own.optimizer = cfg.pretrain.optimizer
         own.learn = "task"
         own.ckpt_path = None
+        own.evaluate = None
     return own
 
 

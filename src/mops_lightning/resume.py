@@ -21,7 +21,7 @@ def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
         "task": cfg.task,
         "sampler": cfg.sampler if cfg.learn != "task" else None,
         "optimizer": cfg.optimizer,
-        "augment": cfg.augment[cfg.learn],
+        "augment": cfg.augment.get(cfg.learn),
         "learn": cfg.learn,
         "seed": cfg.seed,
         "batch_size": cfg.batch_size,

@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mops_lightning import pretrain, records, resume, weights
+from mops_lightning import evaluate, pretrain, records, resume, weights
 from mops_lightning.config import build, check
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
@@ -68,6 +68,7 @@ def fit_and_test(
         "dataset_fingerprint": dataset.fingerprint,
         "train_clouds": len(dataset.train.labels),
         "test_clouds": len(dataset.test.labels),
+        "class_names": list(dataset.class_names),
         "resumed_from": None if checkpoint is None else str(checkpoint),
         "lengthened": checkpoint is not None and resume.lengthened(cfg, checkpoint),
         **dataset.notes,
@@ -78,13 +79,19 @@ def fit_and_test(
             task_weights = pretrain.task_weights(cfg, dataset)
     experiment = make_experiment(cfg, dataset, identity)
     if task_weights is not None:
-        weights.load_into(experiment.task, task_weights)
+        content = weights.load_into(experiment.task, task_weights)
+        if content.get("classes"):
+            evaluate.same_classes(content["classes"], dataset, f"weights: {task_weights}")
+    if cfg.evaluate is not None:
+        record["notes"]["evaluated"] = evaluate.load(cfg, experiment, dataset)
+    elif cfg.learn == "nothing" and experiment.sampler is not None and experiment.sampler.learned:
+        raise UserError("learn=nothing needs a trained sampler: give its run with evaluate=RUN.")
     trainer = make_trainer(cfg, folder, dataset)
     record["device"] = device_name(trainer)
     if experiment.trainable:
         with timed(record, "fit"):
             fit(cfg, trainer, experiment, dataset, checkpoint)
-    if cfg.learn == "sampler":
+    if cfg.learn in ("sampler", "nothing"):
         # A resumed run has its task net from the checkpoint, not from a weights file.
         record["notes"]["task_weights_sha256"] = weights.digest(experiment.task.state_dict())
     with timed(record, "test"):
@@ -101,7 +108,8 @@ def fit_and_test(
     learned["joint"] = {**learned["sampler"], "task_weights.pt": experiment.task}
     if experiment.trainable:
         for name, module in learned[cfg.learn].items():
-            weights.save(folder / name, module, record["config"], record["metrics"])
+            classes = dataset.class_names if module is experiment.task else ()
+            weights.save(folder / name, module, record["config"], record["metrics"], classes)
             record["files"][Path(name).stem] = name
     if cfg.learn == "task" and not record["notes"]["lengthened"]:
         pretrain.publish(cfg, folder / weights.FILE, dataset)

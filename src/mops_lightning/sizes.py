@@ -10,7 +10,7 @@ STANDARD = (8, 16, 32, 64, 128, 256, 512)
 AUTO = "auto"
 
 
-def tested_sizes(
+def sizes_to_test(
     sizes: str | Sequence[int], m: int, sampler: Sampler | None, n_points: int
 ) -> tuple[int, ...]:
     """Return how many points the test asks the sampler for, in ascending order.

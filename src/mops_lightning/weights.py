@@ -1,6 +1,7 @@
 """Weights files: plain tensors and plain data, checked when read."""
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,13 @@ SCHEMA = "mops_lightning/weights/1"
 FILE = "weights.pt"
 
 
-def save(path: Path, module: nn.Module, config: dict[str, Any], metrics: dict[str, float]) -> None:
+def save(
+    path: Path,
+    module: nn.Module,
+    config: dict[str, Any],
+    metrics: dict[str, float],
+    classes: Sequence[str] = (),
+) -> None:
     """Write a module's tensors with what made them.
 
     Args:
@@ -22,12 +29,14 @@ def save(path: Path, module: nn.Module, config: dict[str, Any], metrics: dict[st
         module: whose state is kept.
         config: plain data that says how the weights came about.
         metrics: what they scored.
+        classes: names of the classes that were told apart, in order.
     """
     state = {name: value.detach().cpu().contiguous() for name, value in module.state_dict().items()}
     content = {
         "schema": SCHEMA,
         "config": config,
         "metrics": metrics,
+        "classes": list(classes),
         "sha256": digest(state),
         "state": state,
     }
@@ -81,7 +90,17 @@ def load_into(module: nn.Module, path: str | Path) -> dict[str, Any]:
         UserError: the file is unusable, or holds the weights of another net.
     """
     content = load(path)
-    have, want = content["state"], module.state_dict()
+    fit_state(module, content["state"], path)
+    return content
+
+
+def fit_state(module: nn.Module, have: dict[str, Tensor], path: str | Path) -> None:
+    """Load tensors into a module, strictly; ``path`` names them in the error.
+
+    Raises:
+        UserError: they are those of another net.
+    """
+    want = module.state_dict()
     wrong = [f"{name} is missing" for name in want if name not in have]
     wrong += [f"{name} is unknown" for name in have if name not in want]
     wrong += [
@@ -96,7 +115,6 @@ def load_into(module: nn.Module, path: str | Path) -> dict[str, Any]:
             "Check task, task/net and dataset.classes, or use weights=auto."
         )
     module.load_state_dict(have, strict=True)
-    return content
 
 
 def digest(state: dict[str, Tensor]) -> str:

@@ -1,0 +1,185 @@
+"""Testing a trained run anew: on other sizes, other data or under another task net.
+
+``python -m mops_lightning evaluate=RUN sizes=[8,100]`` repeats what RUN was told, then what stands
+on the command line, trains nothing, and leaves a record of its own.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from mops_lightning import records, weights
+from mops_lightning.callbacks import CHECKPOINT
+from mops_lightning.data.clouds import CloudDataset
+from mops_lightning.errors import UserError
+from mops_lightning.experiment import Experiment
+
+KEY = "evaluate"
+OF_RUN = "run"
+"""``weights=run``: the task net that the evaluated run was trained with."""
+NOT_REPEATED = ("ckpt_path", "weights", "learn", "trainer", "optimizer", "out", "pictures", KEY)
+"""What a run was told about its training and its folders does not matter to its evaluation."""
+
+
+def command_line(arguments: list[str]) -> list[str]:
+    """Put a run's own overrides before the user's where ``evaluate=RUN`` is among these.
+
+    Args:
+        arguments: as typed, without the program's name.
+
+    Returns:
+        The arguments to go on with; the same ones without ``evaluate=RUN``.
+
+    Raises:
+        UserError: RUN is no run with a trained sampler.
+    """
+    chosen = [a.split("=", 1)[1] for a in arguments if a.startswith(f"{KEY}=")]
+    if not chosen or chosen[-1] in ("", "null"):
+        return arguments
+    record = trained_run(Path(chosen[-1].strip("'\"")))
+    mine = [_key(a) for a in arguments if "=" in a and not a.startswith("-")]
+    names = record["config"]["names"]
+    groups = {"task": names["task"], "dataset": names["dataset"], "sampler": names["sampler"]}
+    repeated = [f"{group}={name}" for group, name in groups.items()]
+    repeated += [a for a in record["overrides"] if _key(a) not in (*groups, *NOT_REPEATED)]
+    kept = [a for a in repeated if not any(_covers(key, _key(a)) for key in (*mine, *NOT_REPEATED))]
+    return [*kept, "learn=nothing", f"weights={OF_RUN}", *arguments]
+
+
+def trained_run(folder: Path) -> dict[str, Any]:
+    """Return the record of a completed run that trained a sampler.
+
+    Raises:
+        UserError: it is none.
+    """
+    folder = folder.expanduser()
+    if not folder.is_dir():
+        raise UserError(f"{KEY}: no folder {folder}. Give the folder of a run, with result.json.")
+    record = records.read(folder)
+    learn = record["config"]["learn"]
+    if record["status"] != "completed":
+        raise UserError(
+            f"{KEY}: {folder} is {record['status']}, not completed. "
+            f"Finish it with its own command and ckpt_path={folder}."
+        )
+    if learn == "task":
+        raise UserError(
+            f"{KEY}: {folder} trained a task net alone. "
+            f"Test samplers under it with weights={folder}/{weights.FILE}."
+        )
+    if weights.FILE not in record["files"].values():
+        raise UserError(
+            f"{KEY}: {folder} trained nothing; run its own command with other settings."
+        )
+    return record
+
+
+def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict[str, Any]:
+    """Fill an experiment with the nets of the run that ``cfg.evaluate`` names.
+
+    Returns:
+        Notes for the record: which run, and what made it.
+
+    Raises:
+        UserError: settings, classes or files do not fit the run.
+    """
+    folder = Path(cfg.evaluate).expanduser()
+    record = trained_run(folder)
+    _same_settings(cfg, record, folder)
+    notes = record["notes"]
+    if notes.get("dataset_fingerprint") != dataset.fingerprint:
+        same_classes(notes.get("class_names"), dataset, f"{KEY}: {folder}")
+    assert experiment.sampler is not None  # learn=nothing builds one
+    content = weights.load_into(experiment.sampler, folder / weights.FILE)
+    if cfg.weights == OF_RUN:
+        _load_task(experiment.task, folder, record)
+    return {
+        "run": str(folder),
+        "commit": record["git"]["commit"],
+        "max_epochs": record["config"]["trainer"]["max_epochs"],
+        "learn": record["config"]["learn"],
+        "dataset": record["config"]["names"]["dataset"],
+        "sampler_weights_sha256": content["sha256"],
+    }
+
+
+def same_classes(names: list[str] | None, dataset: CloudDataset, what: str) -> None:
+    """Refuse a net that numbers its classes in another way than the data do.
+
+    Args:
+        names: the classes that the net was trained on; None where nobody noted them.
+        dataset: the data.
+        what: the file or folder of the net.
+
+    Raises:
+        UserError: they differ, or are not known.
+    """
+    here = list(dataset.class_names)
+    if names is None:
+        raise UserError(
+            f"{what} does not say which classes its net tells apart, so it can be used on its own "
+            "data only."
+        )
+    if list(names) != here:
+        missing = [name for name in names if name not in here] or list(names)
+        raise UserError(
+            f"{what}: its net tells apart {len(names)} classes that are not those of the data "
+            f"({len(here)}): {', '.join(missing[:3])} ... against {', '.join(here[:3])} .... "
+            "Give a task net of these classes with weights=auto, or data of its classes with "
+            "dataset.classes."
+        )
+
+
+def _load_task(task: torch.nn.Module, folder: Path, record: dict[str, Any]) -> None:
+    """Take the task net from a jointly trained run's file, or from the run's checkpoint."""
+    name = record["files"].get("task_weights")
+    if name is not None:
+        weights.load_into(task, folder / name)
+        return
+    path = folder / "checkpoints" / CHECKPOINT
+    if not path.is_file():
+        raise UserError(
+            f"{KEY}: {path}, which holds the run's task net, is gone. Give one with weights=."
+        )
+    state = weights.read_plain(path, KEY, "a checkpoint")["state_dict"]
+    own = {key.removeprefix("task."): value for key, value in state.items() if key[:5] == "task."}
+    if weights.digest(own) != record["notes"].get("task_weights_sha256"):
+        raise UserError(f"{KEY}: {path} is not of the run in its folder. Give weights=.")
+    weights.fit_state(task, own, path)
+
+
+def _same_settings(cfg: DictConfig, record: dict[str, Any], folder: Path) -> None:
+    there = record["config"]
+    here: Any = OmegaConf.to_container(cfg, resolve=True)
+    for group in ("task", "sampler"):
+        old, new = there["names"][group], here["names"][group]
+        if old != new:
+            raise UserError(
+                f"{KEY}: {folder} was trained with {group}={old}, got {group}={new}. "
+                f"Leave {group} out, or name a run with {group}={new}."
+            )
+    if here["names"]["net"] != there["names"]["net"] and cfg.weights == OF_RUN:
+        raise UserError(
+            f"{KEY}: the task net of {folder} is {there['names']['net']}; for "
+            f"task/net={here['names']['net']} give its weights too: weights=auto or a file."
+        )
+    for key in sorted({*there["sampler"], *here["sampler"]}):
+        old, new = there["sampler"].get(key), here["sampler"].get(key)
+        if old != new:
+            hint = "" if key != "m" else " Sizes of a net for many are chosen with sizes=[...]."
+            raise UserError(
+                f"{KEY}: sampler.{key} is {new} here and was {old} when {folder} was trained; "
+                f"leave it out, or train a sampler with it.{hint}"
+            )
+
+
+def _key(override: str) -> str:
+    """Return the key of ``++key=value`` or ``key@package=value``."""
+    return override.split("=", 1)[0].lstrip("+~")
+
+
+def _covers(key: str, other: str) -> bool:
+    """Return whether overriding ``key`` makes an earlier override of ``other`` void."""
+    return other == key or other.startswith((f"{key}.", f"{key}/"))

@@ -1,0 +1,118 @@
+import json
+
+import pytest
+
+from mops_lightning.config import compose
+from mops_lightning.errors import UserError
+from mops_lightning.evaluate import command_line
+from mops_lightning.run import run
+
+TINY = [
+    "trainer=cpu",
+    "trainer.max_epochs=1",
+    "epochs.task=1",
+    "dataset.train_per_class=4",
+    "dataset.test_per_class=3",
+    "dataset.n_points=64",
+    "dataset.classes=[chair,vase,lamp]",
+    "batch_size=4",
+    "m=8",
+    "pictures=0",
+    "logger=none",
+]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A small FMOPS-Net run: its folder, its record and its cache."""
+    folder = tmp_path_factory.mktemp("evaluate")
+    overrides = [*TINY, "sampler=fmops", "sampler.m_max=32", f"cache={folder}/cache"]
+    return folder / "run", run(compose(overrides), folder / "run", overrides)
+
+
+def evaluated(trained, tmp_path, *arguments):
+    chosen = command_line([f"evaluate={trained[0]}", "pictures=0", "logger=none", *arguments])
+    return run(compose(chosen), tmp_path / "new", chosen)
+
+
+def test_the_run_s_own_figures_come_again(trained, tmp_path):
+    folder, record = trained
+    again = evaluated(trained, tmp_path)
+    assert again["metrics"] == record["metrics"]
+    assert again["notes"]["evaluated"]["run"] == str(folder)
+    assert again["notes"]["task_weights_sha256"] == record["notes"]["task_weights_sha256"]
+    assert "fit" not in again["seconds"]
+    assert again["config"]["learn"] == "nothing"
+    assert not (tmp_path / "new" / "weights.pt").exists()
+
+
+def test_other_sizes_and_other_data(trained, tmp_path):
+    record = evaluated(trained, tmp_path, "sizes=[5,20]", "dataset.n_points=100")
+    sizes = {name.split("/")[1] for name in record["metrics"] if name.endswith("matched/accuracy")}
+    assert sizes == {"m5", "m8", "m20"}
+    assert record["config"]["dataset"]["n_points"] == 100
+    assert record["config"]["dataset"]["classes"] == ["chair", "vase", "lamp"]
+
+
+def test_another_task_net(trained, tmp_path):
+    overrides = [*TINY, "learn=task", "seed=5", "dataset.seed=0"]
+    run(compose(overrides), tmp_path / "task", overrides)
+    record = evaluated(trained, tmp_path, f"weights={tmp_path}/task/weights.pt")
+    ours = trained[1]["notes"]["task_weights_sha256"]
+    assert record["notes"]["task_weights_sha256"] not in (None, ours)
+
+
+def test_joint_runs_bring_their_task_net(tmp_path):
+    overrides = [*TINY, "learn=joint", f"cache={tmp_path}/cache"]
+    record = run(compose(overrides), tmp_path / "run", overrides)
+    again = evaluated((tmp_path / "run", record), tmp_path)
+    assert again["metrics"] == record["metrics"]
+
+
+@pytest.mark.parametrize(
+    ("argument", "named"),
+    [
+        ("sampler.tau_min=0.2", "sampler.tau_min is 0.2 here and was 0.1 when"),
+        ("sampler=mops", "trained with sampler=fmops, got sampler=mops"),
+        ("dataset.classes=[chair,vase]", "tells apart 3 classes .* those of the data .2."),
+        ("dataset.classes=[vase,chair,bed]", "classes that are not those of the data"),
+        ("learn=sampler", "trains nothing, got learn=sampler"),
+        ("sizes=[33]", "at most sampler.m_max=32"),
+        ("ckpt_path=last", "give evaluate=RUN"),
+    ],
+)
+def test_mismatches_are_refused(trained, tmp_path, argument, named):
+    with pytest.raises(UserError, match=named):
+        evaluated(trained, tmp_path, argument)
+
+
+def test_a_task_net_of_other_classes_is_refused_wherever_it_is_given(tmp_path):
+    overrides = [*TINY, "learn=task"]
+    run(compose(overrides), tmp_path / "task", overrides)
+    swapped = [*TINY, "sampler=fps", f"weights={tmp_path}/task/weights.pt"]
+    swapped.append("dataset.classes=[vase,chair,bed]")
+    with pytest.raises(UserError, match="classes that are not those of the data"):
+        run(compose(swapped), tmp_path / "new", swapped)
+
+
+def test_what_cannot_be_evaluated_is_refused(trained, tmp_path):
+    with pytest.raises(UserError, match="no folder"):
+        command_line([f"evaluate={tmp_path}/none"])
+    record = dict(trained[1])
+    path = tmp_path / "result.json"
+    for change, named in (
+        ({"status": "interrupted"}, "is interrupted, not completed"),
+        ({"config": {**record["config"], "learn": "task"}}, "trained a task net alone"),
+        ({"files": {}}, "trained nothing"),
+    ):
+        path.write_text(json.dumps({**record, **change}))
+        with pytest.raises(UserError, match=named):
+            command_line([f"evaluate={tmp_path}"])
+    untrained = [*TINY, "learn=nothing", f"cache={trained[0].parent}/cache"]
+    with pytest.raises(UserError, match="give its run with evaluate=RUN"):
+        run(compose(untrained), tmp_path / "new", untrained)
+
+
+def test_other_command_lines_are_left_alone():
+    assert command_line(["m=8", "evaluate=null"]) == ["m=8", "evaluate=null"]
+    assert command_line(["--help"]) == ["--help"]
