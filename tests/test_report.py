@@ -31,13 +31,33 @@ def test_cells_are_the_records_figures_beside_the_paper_s(tmp_path):
     learned = {"test/generated/accuracy": 0.8, "test/matched/accuracy": 0.77}
     put(tmp_path, "mops", 32, {**learned, "test/random/accuracy": 0.2, "val/x/accuracy": 1.0})
     assert rows(table(tmp_path)) == [
-        ["sampled by", "readout", "m=32", "m=8"],
-        ["random", "sampled", "20.00 (15.07)", ""],
-        ["fps", "sampled", "30.00 (34.08)", "10.00 (11.02)"],
-        ["mops", "generated", "80.00 (84.28)", ""],
-        ["mops", "matched", "77.00 (79.01)", ""],
-        ["pointnet", "full", "90.00 (87.10)", ""],
+        ["sampled by", "m=32", "m=8"],
+        ["random", "20.00", ""],
+        ["*the paper's*", "15.07", "4.70"],
+        ["fps", "30.00", "10.00"],
+        ["*the paper's*", "34.08", "11.02"],
+        ["mops", "80.00 / 77.00", ""],
+        ["*the paper's*", "84.28 / 79.01 / 79.74", "52.39 / 32.62 / 32.62"],
     ]
+    assert "pointnet on all points: 90.00 (the paper: 87.10)." in table(tmp_path)
+
+
+def test_runs_of_many_sizes_fill_many_cells(tmp_path):
+    metrics = {"test/full/accuracy": 0.9}
+    for m in (8, 32):
+        metrics |= {f"test/m{m}/{name}/accuracy": m / 100 for name in ("generated", "matched")}
+        metrics |= {f"test/m{m}/fps/accuracy": m / 200, f"test/m{m}/matrix/nonzero_percent": 3.0}
+    put(tmp_path, "fmops", 32, metrics)
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    ours = [row for row in rows(table(tmp_path)) if "paper" not in row[0]]
+    assert ours == [
+        ["sampled by", "m=32", "m=8"],
+        ["fps", "30.00", "4.00"],  # a run of its own goes before a baseline's row
+        ["fmops", "32.00 / 32.00", "8.00 / 8.00"],
+    ]
+    put(tmp_path, "fmops", 8, {"test/generated/accuracy": 0.8})
+    with pytest.raises(UserError, match="Two runs of fmops with m=8"):
+        table(tmp_path)
 
 
 def test_runs_that_are_not_completed_are_counted_not_shown(tmp_path):

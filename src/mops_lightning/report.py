@@ -1,7 +1,8 @@
 """``python -m mops_lightning.report FOLDER``: one table of all run records below a folder.
 
-Reads ``result.json`` files only. Rows are what sampled the points, columns are sizes; where the
-paper has the figure it stands behind ours in brackets.
+Reads ``result.json`` files only. As in the paper's tables, columns are sizes and a cell holds the
+figures of generated / matched / completed sets, or one figure for samplers that choose input
+points. Where the paper has them too, its figures stand in a row below ours.
 """
 
 import argparse
@@ -15,10 +16,10 @@ from typing import Any
 from mops_lightning import records
 from mops_lightning.errors import UserError
 from mops_lightning.io import atomic_write
-from mops_lightning.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT
+from mops_lightning.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT, parse
 
-Cells = dict[tuple[str, str], dict[int, float]]
-"""(sampler, readout) → m → value."""
+Cells = dict[str, dict[int, dict[str, float]]]
+"""sampler → m → readout → value."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -55,36 +56,57 @@ def table(folder: Path, metric: str = "accuracy") -> str:
     scored = [record for record in done if record["config"]["learn"] != "task"] or done
     names = _common(scored)
     cells: Cells = {}
-    _refuse_doubles(scored)
+    own: set[tuple[str, int]] = set()
     for record in scored:
-        _add(cells, record, metric)
+        _add(cells, own, record, metric)
     sizes = sorted({m for values in cells.values() for m in values}, reverse=True)
     paper = _paper(names["task"], metric)
     lines = [
         f"Test {metric.replace('_', ' ')} in %, {names['task']} on {names['dataset']} under "
-        f"{names['net']}; in brackets the paper's figure.",
+        f"{names['net']}: generated / matched / completed sets, or one figure for samplers that "
+        "choose input points.",
         "",
-        "| sampled by | readout | " + " | ".join(f"m={m}" for m in sizes) + " |",
-        "|---|---|" + "--:|" * len(sizes),
+        "| sampled by | " + " | ".join(f"m={m}" for m in sizes) + " |",
+        "|---|" + "--:|" * len(sizes),
     ]
-    for (sampler, readout), values in sorted(cells.items(), key=_place):
-        shown = [_cell(values.get(m), _paper_value(paper, sampler, readout, m)) for m in sizes]
-        lines.append(f"| {sampler} | {readout} | " + " | ".join(shown) + " |")
+    for sampler in sorted(cells, key=_place):
+        lines.append(_row(sampler, [_figures(cells[sampler].get(m)) for m in sizes]))
+        if any(str(m) in paper.get("rows", {}).get(sampler, {}) for m in sizes):
+            lines.append(_row("*the paper's*", [_paper_figures(paper, sampler, m) for m in sizes]))
+    lines += ["", *_full(scored, names["net"], metric, paper)]
     lines += ["", *_how(done)]
     if len(done) < len(found):
         lines += ["", f"{len(found) - len(done)} of {len(found)} runs are not completed."]
     return "\n".join(lines) + "\n"
 
 
-ORDER = ("random", "voxel", "fps")
-"""Unlearned samplers first; others by name, then the full clouds."""
+ORDER = (
+    "random",
+    "voxel",
+    "fps",
+    "poisson",
+    "snet",
+    "snet_progressive",
+    "samplenet",
+    "samplenet_progressive",
+    "mops",
+    "fmops",
+)
+"""Samplers as in the paper's tables; others by name behind them."""
 
 
-def _place(item: tuple[tuple[str, str], dict[int, float]]) -> tuple[bool, int, str, int]:
-    (sampler, readout), _ = item
-    readouts = (INDEX_READOUT, *GENERATED_READOUTS, FULL)
-    rank = ORDER.index(sampler) if sampler in ORDER else len(ORDER)
-    return readout == FULL, rank, sampler, readouts.index(readout)
+def _place(sampler: str) -> tuple[int, str]:
+    return (ORDER.index(sampler) if sampler in ORDER else len(ORDER)), sampler
+
+
+def _row(label: str, figures: list[str]) -> str:
+    return f"| {label} | " + " | ".join(figures) + " |"
+
+
+def _full(found: list[dict[str, Any]], net: str, metric: str, paper: dict[str, Any]) -> list[str]:
+    values = {record["metrics"].get(f"test/{FULL}/{metric}") for record in found} - {None}
+    published = f" (the paper: {paper['full']:.2f})" if "full" in paper else ""
+    return [f"{net} on all points: {_number(value)}{published}." for value in sorted(values)]
 
 
 def _common(found: list[dict[str, Any]]) -> dict[str, str]:
@@ -106,31 +128,33 @@ def _common(found: list[dict[str, Any]]) -> dict[str, str]:
     return {what: next(iter(values - {None}), "") for what, values in keys.items()}
 
 
-def _refuse_doubles(found: list[dict[str, Any]]) -> None:
-    """Refuse two runs that would stand in the same cells, where one would hide the other."""
-    seen = set()
-    for record in found:
-        config = record["config"]
-        cell = f"{config['names']['sampler']} with m={config['m']}"
-        if config["learn"] != "task" and cell in seen:
-            raise UserError(f"Two runs of {cell} are there; give a folder with one of each.")
-        seen.add(cell)
+def _add(cells: Cells, own: set[tuple[str, int]], record: dict[str, Any], metric: str) -> None:
+    """Put a record's figures into the cells; a run of the sampler itself beats a baseline row.
 
-
-def _add(cells: Cells, record: dict[str, Any], metric: str) -> None:
-    """Put a record's figures into the cells; a run of the sampler itself beats a baseline row."""
-    names, m = record["config"]["names"], record["config"]["m"]
+    Raises:
+        UserError: two runs would stand in one cell, where one would hide the other.
+    """
+    config = record["config"]
+    sampler = config["names"]["sampler"]
+    taken = set()
     for name, value in record["metrics"].items():
-        parts = name.split("/")
-        if len(parts) != 3 or parts[0] != "test" or parts[2] != metric or value is None:
+        parts = parse(name)
+        if parts is None or parts.metric != metric or value is None or parts.readout == FULL:
             continue
-        readout = parts[1]
-        if readout == FULL:
-            cells.setdefault((names["net"], FULL), {})[m] = value
-        elif readout in (INDEX_READOUT, *GENERATED_READOUTS):
-            cells.setdefault((names["sampler"], readout), {})[m] = value
-        else:
-            cells.setdefault((readout, INDEX_READOUT), {}).setdefault(m, value)
+        m = parts.m or config["m"]
+        if parts.readout not in (INDEX_READOUT, *GENERATED_READOUTS):
+            if (parts.readout, m) not in own:
+                cells.setdefault(parts.readout, {})[m] = {INDEX_READOUT: value}
+            continue
+        if (sampler, m) in own:
+            raise UserError(
+                f"Two runs of {sampler} with m={m} are there; give a folder with one of each."
+            )
+        if (sampler, m) not in taken:
+            cells.setdefault(sampler, {})[m] = {}
+        taken.add((sampler, m))
+        cells[sampler][m][parts.readout] = value
+    own |= taken
 
 
 def _paper(task: str, metric: str) -> dict[str, Any]:
@@ -139,20 +163,19 @@ def _paper(task: str, metric: str) -> dict[str, Any]:
     return entry if entry.get("metric") == metric else {}
 
 
-def _paper_value(paper: dict[str, Any], sampler: str, readout: str, m: int) -> float | None:
-    if readout == FULL:
-        return paper.get("full")
-    values = paper.get("rows", {}).get(sampler, {}).get(str(m))
-    if values is None:
-        return None
-    place = 0 if readout == INDEX_READOUT else GENERATED_READOUTS.index(readout)
-    return values[place]
+def _paper_figures(paper: dict[str, Any], sampler: str, m: int) -> str:
+    values = paper["rows"][sampler].get(str(m), [])
+    return " / ".join(f"{value:.2f}" for value in values)
 
 
-def _cell(value: float | None, paper: float | None) -> str:
-    if value is None:
-        return ""
-    return f"{100 * value:.2f}" + ("" if paper is None else f" ({paper:.2f})")
+def _figures(values: dict[str, float] | None) -> str:
+    values = values or {}
+    shown = [values[name] for name in (INDEX_READOUT, *GENERATED_READOUTS) if name in values]
+    return " / ".join(map(_number, shown))
+
+
+def _number(value: float) -> str:
+    return f"{100 * value:.2f}"
 
 
 def _how(found: Iterable[dict[str, Any]]) -> list[str]:
@@ -162,10 +185,13 @@ def _how(found: Iterable[dict[str, Any]]) -> list[str]:
         config, names = record["config"], record["config"]["names"]
         what = names["net"] if config["learn"] == "task" else names["sampler"]
         trained = "fit" in record["seconds"]
+        earlier = record["notes"].get("evaluated") or {}
         commit = (record["git"]["commit"] or "a wheel")[:10]
         lines[
             f"- {what}: "
-            + (f"{config['trainer']['max_epochs']} epochs, " if trained else "nothing to train, ")
+            + (f"{config['trainer']['max_epochs']} epochs, " if trained else "")
+            + (f"evaluated after {earlier['max_epochs']} epochs, " if earlier else "")
+            + ("nothing to train, " if not trained and not earlier else "")
             + f"seed {record['seed']}, {record['device']}, {record['threads']} threads, commit "
             + commit
             + (" with changes" if record["git"]["dirty"] else "")
