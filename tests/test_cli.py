@@ -299,3 +299,24 @@ def test_a_checkpoint_of_other_settings_is_refused(main_job):
     status, out, err = call([*settings, f"ckpt_path={path}", "out=wrong"], folder)
     assert status == 2
     assert "other settings (sampler" in err
+
+
+def test_one_net_for_many_sizes_is_tested_at_once_and_evaluated_anew(main_job):
+    folder, *_ = main_job
+    status, out, err = call([*TINY, "sampler=fmops", "sampler.m_max=32"], folder)
+    assert status == 0, err
+    for word in ("m=8", "m=16", "m=32", "fmops completed", "all points"):
+        assert word in out
+    run = next(path for path in runs(folder) if path.parent.name == "fmops-m32")
+    before = records.read(run)
+    status, out, err = call([f"evaluate={run}", "sizes=[3,16]", "pictures=0"], folder)
+    assert status == 0, err
+    again = next(path for path in runs(folder) if path.parent.name == "fmops-m32-evaluated")
+    after = records.read(again)
+    name = "test/m16/completed/accuracy"
+    assert after["metrics"][name] == before["metrics"][name]
+    assert "test/m3/matched/accuracy" in after["metrics"]
+    status, _, err = call([f"evaluate={run}", "sampler.tau_min=0.5"], folder)
+    assert status == 2
+    assert err.count("\n") == 1
+    assert "sampler.tau_min is 0.5 here and was 0.1" in err
