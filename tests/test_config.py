@@ -88,6 +88,24 @@ def test_the_paper_s_settings():
     assert cfg.optimizer.schedule.end_lr == 1e-5
     assert cfg.trainer.max_epochs == 250
     assert cfg.names.dataset == "modelnet40"
+    assert cfg.val_fraction == 0
+
+
+def test_the_rivals_settings():
+    cfg = compose(["experiment=classification_snet", "sampler=samplenet"])
+    assert (cfg.sampler.k, cfg.sampler.beta, cfg.sampler.alpha, cfg.sampler.sigma_min) == (
+        7,
+        1,
+        30,
+        0,
+    )
+    assert (cfg.sampler.coverage, cfg.sampler.coverage_per_point) == (1, 0)
+    assert cfg.optimizer.optimizer.lr == 0.01
+    assert cfg.optimizer.schedule.every * cfg.batch_size == 600_000
+    assert (cfg.trainer.max_epochs, cfg.val_fraction) == (500, 0)
+    cfg = compose(["sampler=snet_progressive"])
+    assert (cfg.sampler.m_max, cfg.sampler.least, cfg.sampler.over_sizes) == (1024, 2, "sum")
+    assert (cfg.sampler.coverage, cfg.sampler.coverage_per_point) == (0.5, pytest.approx(1 / 30))
 
 
 @pytest.mark.parametrize(
@@ -96,6 +114,18 @@ def test_the_paper_s_settings():
         (["m=0"], "m must be a whole number of at least 1, got 0"),
         (["m=2.5"], "m must be a whole number"),
         (["m=2000"], r"m must be at most dataset.n_points=1024, got m=2000"),
+        (
+            ["sampler=fmops", "sampler.prefixes=1.5"],
+            "sampler.prefixes must be a whole number, got 1.5",
+        ),
+        (
+            ["sampler=fmops", "sampler.m_max=0"],
+            "sampler.m_max must be a whole number of at least 1",
+        ),
+        (["sampler=samplenet", "sampler.k=null"], "sampler.k must be a whole number, got None"),
+        (["sampler=snet", "sampler.head_channels=[a]"], "must be a list of whole numbers, got"),
+        (["sizes=[8,x]"], "sizes must be auto or a list of whole numbers"),
+        (["weights=run"], "weights=run means the run named by evaluate"),
         (["learn=smapler"], "Did you mean 'sampler'"),
         (["+sampler.alhpa=3"], "Did you mean 'alpha'"),
         (["+bacth_size=3"], "Did you mean 'batch_size'"),

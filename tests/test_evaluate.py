@@ -113,6 +113,64 @@ def test_what_cannot_be_evaluated_is_refused(trained, tmp_path):
         run(compose(untrained), tmp_path / "new", untrained)
 
 
+def overrides_after(trained, *arguments):
+    return [a for a in command_line(list(arguments)) if not a.startswith("evaluate=")]
+
+
+def test_flags_may_stand_before_or_behind(trained):
+    folder, _ = trained
+    assert overrides_after(trained, "-m", "m=4,8", f"evaluate={folder}")[:2] == ["-m", "m=4,8"]
+    assert overrides_after(trained, "--cfg", "job", f"evaluate={folder}")[:2] == ["--cfg", "job"]
+    assert overrides_after(trained, f"evaluate={folder}", "m=4", "-m")[-2:] == ["m=4", "-m"]
+
+
+def test_naming_what_the_run_has_changes_nothing(trained):
+    folder, _ = trained
+    plain = set(overrides_after(trained, f"evaluate={folder}"))
+    named = overrides_after(trained, f"evaluate={folder}", "dataset=shapes", "sampler=fmops")
+    assert set(named) == plain
+    assert len(named) == len(plain)
+    other = overrides_after(trained, f"evaluate={folder}", "dataset=meshes")
+    assert "dataset=meshes" in other
+    assert not any(a.startswith(("dataset.", "dataset=shapes")) for a in other)
+
+
+def test_the_run_may_be_named_in_several_ways(trained, tmp_path):
+    folder, _ = trained
+    first = command_line([f"evaluate={folder}"])
+    for name in (f"evaluate='{folder}'", f"+evaluate={folder}", f"evaluate={folder}/"):
+        assert command_line([name]) == first
+    strange = tmp_path / "it's (1), a run"
+    strange.symlink_to(folder)
+    assert compose(command_line([f"evaluate={strange}"])).evaluate == str(strange)
+    with pytest.raises(UserError, match="takes one run"):
+        command_line([f"evaluate={folder},{folder}"])
+
+
+def test_data_that_are_not_here_are_asked_for(trained, tmp_path):
+    record = {**trained[1], "overrides": ["dataset=meshes", "dataset.root=meshes"]}
+    (tmp_path / "result.json").write_text(json.dumps(record))
+    with pytest.raises(
+        UserError, match=r"had its data in dataset\.root=meshes, which is not there"
+    ):
+        command_line([f"evaluate={tmp_path}"])
+    assert "dataset.root=." in command_line([f"evaluate={tmp_path}", "dataset.root=."])
+
+
+def test_a_task_net_of_other_classes_and_their_data(trained, tmp_path):
+    folder, _ = trained
+    classes = "dataset.classes=[bed,vase]"
+    record = evaluated(trained, tmp_path, classes, "weights=auto", f"cache={folder.parent}/cache")
+    assert record["notes"]["class_names"] == ["bed", "vase"]
+
+
+def test_a_lost_sampler_is_named(trained, tmp_path):
+    record = trained[1]
+    (tmp_path / "result.json").write_text(json.dumps(record))
+    with pytest.raises(UserError, match=r"evaluate: the sampler of .* cannot be had"):
+        evaluated((tmp_path, record), tmp_path, "weights=null")
+
+
 def test_other_command_lines_are_left_alone():
     assert command_line(["m=8", "evaluate=null"]) == ["m=8", "evaluate=null"]
     assert command_line(["--help"]) == ["--help"]

@@ -9,7 +9,12 @@ from tests.test_records import record
 
 
 def put(folder, sampler, m, metrics, **changes):
-    names = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": sampler}
+    names = {
+        "task": "classification",
+        "net": "pointnet",
+        "dataset": "modelnet40",
+        "sampler": sampler,
+    }
     config = {"m": m, "learn": "sampler", "names": names, "trainer": {"max_epochs": 3}}
     notes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **changes.pop("notes", {})}
     target = folder / f"{sampler}-{m}"
@@ -82,6 +87,35 @@ def test_two_runs_for_one_cell_are_refused(tmp_path):
         put(tmp_path / name, "fps", 32, {"test/sampled/accuracy": 0.3})
     with pytest.raises(UserError, match="Two runs of fps with m=32"):
         table(tmp_path)
+
+
+def test_joint_runs_stand_apart_each_with_its_own_task_net(tmp_path):
+    for name in ("snet", "mops"):
+        metrics = {"test/generated/accuracy": 0.5, "test/fps/accuracy": 0.2}
+        notes = {"task_weights_sha256": None, "evaluated": {"learn": "joint", "max_epochs": 9}}
+        put(tmp_path, name, 32, {**metrics, "test/full/accuracy": 0.9}, notes=notes)
+    text = table(tmp_path)
+    assert [row[0] for row in rows(text) if "paper" not in row[0]] == ["sampled by", "snet", "mops"]
+    assert "pointnet on all points after joint training with snet: 90.00" in text
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    with pytest.raises(UserError, match="differ in what learned"):
+        table(tmp_path)
+
+
+def test_an_unknown_metric_and_unreadable_records_are_named(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    with pytest.raises(UserError, match=r"--metric: no run .* has 'acuracy'.*accuracy"):
+        table(tmp_path, "acuracy")
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "result.json").write_text("")
+    assert f"Not readable: {tmp_path}/bad/result.json." in table(tmp_path)
+
+
+def test_the_paper_s_figures_stand_by_its_own_data_only(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    path = tmp_path / "fps-32" / "result.json"
+    path.write_text(path.read_text().replace("modelnet40", "shapes"))
+    assert "paper" not in table(tmp_path)
 
 
 def test_a_folder_without_records_is_named(tmp_path, capsys):

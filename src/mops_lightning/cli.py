@@ -31,7 +31,7 @@ def _main() -> None:
     # Makes Hydra raise instead of printing its own shortened traceback.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
-        if any(argument.startswith("evaluate=") for argument in sys.argv):
+        if any(argument.lstrip("+").startswith("evaluate=") for argument in sys.argv):
             from mops_lightning.evaluate import command_line
 
             sys.argv[1:] = command_line(sys.argv[1:])
@@ -111,5 +111,9 @@ def _known_keys() -> list[str]:
             if isinstance(value, DictConfig) and value._is_none() is False:
                 walk(value, f"{prefix}{key!s}.")
 
-    walk(compose(), "")
+    chosen = [argument for argument in sys.argv[1:] if argument.split("=")[0] in GROUPS]
+    try:
+        walk(compose(chosen), "")
+    except Exception:  # the mistake may be among them
+        walk(compose(), "")
     return sorted({key for key in keys if not key.split(".")[-1].startswith("_")})

@@ -2,10 +2,11 @@
 
 import inspect
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from mops_lightning.annotations import misfit
 from mops_lightning.errors import UserError, did_you_mean
 
 RUN_KEYS = (
@@ -122,11 +123,13 @@ def check(cfg: DictConfig) -> None:
     _whole(cfg, "pictures", 0)
     if not isinstance(cfg.val_fraction, int | float) or not 0 <= cfg.val_fraction < 1:
         raise UserError(f"val_fraction must be in [0, 1), got {cfg.val_fraction!r}.")
+    if "m_max" in cfg.sampler and cfg.learn != "task":
+        _whole(cfg.sampler, "m_max", 1, "sampler.m_max")
     unused = ("sampler", "baselines") if cfg.learn == "task" else ()
     for group in {*GROUPS, "pretrain", "baselines"} - set(unused):
         _check_node(cfg.get(group), group)
-    for node in ("trainer", "pretrain"):
-        _whole(cfg[node], "max_epochs", 1, f"{node}.max_epochs")
+    _whole(cfg.trainer, "max_epochs", int(cfg.learn != "nothing"), "trainer.max_epochs")
+    _whole(cfg.pretrain, "max_epochs", 1, "pretrain.max_epochs")
     if cfg.trainer.get("devices") != 1 or cfg.trainer.get("num_nodes", 1) != 1:
         raise UserError(
             f"trainer.devices must be 1, got {cfg.trainer.get('devices')!r}: "
@@ -141,12 +144,12 @@ def check(cfg: DictConfig) -> None:
 
 
 def _check_evaluation(cfg: DictConfig) -> None:
-    if cfg.evaluate is not None and cfg.learn != "nothing":
+    if cfg.evaluate and cfg.learn != "nothing":
         raise UserError(
             f"evaluate: trains nothing, got learn={cfg.learn}. Leave learn out, or train anew "
             "without evaluate."
         )
-    if cfg.evaluate is None and cfg.weights == "run":
+    if not cfg.evaluate and cfg.weights == "run":
         raise UserError("weights=run means the run named by evaluate=RUN, which is not given.")
     if cfg.learn == "nothing" and cfg.ckpt_path is not None:
         raise UserError("ckpt_path resumes a training; to test a trained run give evaluate=RUN.")
@@ -183,29 +186,15 @@ def _check_node(node: Any, where: str) -> None:
                 )
             if OmegaConf.is_missing(node, key):
                 raise UserError(f"{where}.{name} must be set: try {where}.{name}=VALUE.")
-            if name in parameters and isinstance(node[key], str):
-                wanted = _numbers_only(parameters[name].annotation)
+            if name in parameters and not isinstance(node[key], DictConfig):
+                value = node[key]
+                value = OmegaConf.to_container(value) if OmegaConf.is_list(value) else value
+                wanted = misfit(value, parameters[name].annotation)
                 if wanted:
-                    raise UserError(f"{where}.{name} must be {wanted}, got {node[key]!r}.")
+                    raise UserError(f"{where}.{name} must be {wanted}, got {value!r}.")
     for key in node:
         if not OmegaConf.is_missing(node, key):
             _check_node(node[key], f"{where}.{key!s}")
-
-
-def _numbers_only(annotation: Any) -> str | None:
-    """Say what an annotation wants when no text will do; None when text may be right."""
-    names = {int: "a whole number", float: "a number", bool: "true or false"}
-    allowed = get_args(annotation) or (annotation,)
-    wanted = [names[kind] for kind in allowed if kind in names]
-    others = [kind for kind in allowed if kind not in names]
-    harmless = all(kind is type(None) or kind is _tensor() for kind in others)
-    return " or ".join(wanted) if wanted and harmless else None
-
-
-def _tensor() -> type:
-    from torch import Tensor  # late, because --help should not wait for torch
-
-    return Tensor
 
 
 def signature(target: str, where: str) -> dict[str, inspect.Parameter]:

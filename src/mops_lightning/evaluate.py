@@ -30,22 +30,51 @@ def command_line(arguments: list[str]) -> list[str]:
         arguments: as typed, without the program's name.
 
     Returns:
-        The arguments to go on with; the same ones without ``evaluate=RUN``.
+        The arguments to go on with.
 
     Raises:
         UserError: RUN is no run with a trained sampler.
     """
-    chosen = [a.split("=", 1)[1] for a in arguments if a.startswith(f"{KEY}=")]
-    if not chosen or chosen[-1] in ("", "null"):
+    places = [i for i, a in enumerate(arguments) if a.lstrip("+").startswith(f"{KEY}=")]
+    chosen = arguments[places[-1]].split("=", 1)[1].strip("'\"") if places else ""
+    if chosen in ("", "null"):
         return arguments
-    record = trained_run(Path(chosen[-1].strip("'\"")))
-    mine = [_key(a) for a in arguments if "=" in a and not a.startswith("-")]
+    folder = Path(chosen).expanduser()
+    record = trained_run(folder)
     names = record["config"]["names"]
     groups = {"task": names["task"], "dataset": names["dataset"], "sampler": names["sampler"]}
-    repeated = [f"{group}={name}" for group, name in groups.items()]
-    repeated += [a for a in record["overrides"] if _key(a) not in (*groups, *NOT_REPEATED)]
-    kept = [a for a in repeated if not any(_covers(key, _key(a)) for key in (*mine, *NOT_REPEATED))]
-    return [*kept, "learn=nothing", f"weights={OF_RUN}", *arguments]
+    typed = [a for i, a in enumerate(arguments) if i not in places and not a.startswith("-")]
+    # Naming what the run has anyway changes nothing, its settings below it stay too.
+    typed_keys = [_key(a) for a in typed if a not in [f"{k}={v}" for k, v in groups.items()]]
+    repeated = [a for a in record["overrides"] if _key(a) not in groups]
+    repeated = [f"{group}={name}" for group, name in groups.items()] + repeated
+    given = {_key(a) for a in typed}
+    kept = [
+        a
+        for a in repeated
+        if _key(a) not in given
+        and not any(_covers(key, _key(a)) for key in (*typed_keys, *NOT_REPEATED))
+    ]
+    _data_are_here(kept, folder)
+    quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
+    own = [*kept, "learn=nothing", f"weights={OF_RUN}", f"{KEY}='{quoted}'"]
+    # In one place: flags may stand before or behind all overrides, not between them.
+    before = [a for i, a in enumerate(arguments[: places[0]]) if i not in places]
+    behind = [a for i, a in enumerate(arguments) if i > places[0] and i not in places]
+    defaults = [a for a in own if _key(a) not in given]
+    return [*before, *defaults, *behind]
+
+
+def _data_are_here(overrides: list[str], folder: Path) -> None:
+    """Refuse a folder of data that is named from where the run was started, which is elsewhere."""
+    for override in overrides:
+        key, _, value = override.partition("=")
+        path = Path(value.strip("'\"")).expanduser()
+        if key == "dataset.root" and value not in ("", "null") and not path.exists():
+            raise UserError(
+                f"{KEY}: {folder} had its data in dataset.root={value}, which is not there, seen "
+                "from this folder. Say where they are: dataset.root=PATH."
+            )
 
 
 def trained_run(folder: Path) -> dict[str, Any]:
@@ -54,16 +83,19 @@ def trained_run(folder: Path) -> dict[str, Any]:
     Raises:
         UserError: it is none.
     """
-    folder = folder.expanduser()
+    if folder.name == records.FILE:
+        folder = folder.parent
+    if not folder.is_dir() and "," in str(folder):
+        raise UserError(f"{KEY} takes one run, got {folder}. Start one evaluation for each.")
     if not folder.is_dir():
         raise UserError(f"{KEY}: no folder {folder}. Give the folder of a run, with result.json.")
     record = records.read(folder)
     learn = record["config"]["learn"]
     if record["status"] != "completed":
-        raise UserError(
-            f"{KEY}: {folder} is {record['status']}, not completed. "
-            f"Finish it with its own command and ckpt_path={folder}."
-        )
+        hint = "Name a completed run."
+        if (folder / "checkpoints" / CHECKPOINT).is_file():
+            hint = f"Finish it with its own command and ckpt_path={folder}."
+        raise UserError(f"{KEY}: {folder} is {record['status']}, not completed. {hint}")
     if learn == "task":
         raise UserError(
             f"{KEY}: {folder} trained a task net alone. "
@@ -85,14 +117,17 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
     Raises:
         UserError: settings, classes or files do not fit the run.
     """
-    folder = Path(cfg.evaluate).expanduser()
-    record = trained_run(folder)
+    record = trained_run(Path(cfg.evaluate))
+    folder = Path(cfg.evaluate.removesuffix(records.FILE))
     _same_settings(cfg, record, folder)
     notes = record["notes"]
-    if notes.get("dataset_fingerprint") != dataset.fingerprint:
+    if cfg.weights == OF_RUN and notes.get("dataset_fingerprint") != dataset.fingerprint:
         same_classes(notes.get("class_names"), dataset, f"{KEY}: {folder}")
     assert experiment.sampler is not None  # learn=nothing builds one
-    content = weights.load_into(experiment.sampler, folder / weights.FILE)
+    try:
+        content = weights.load_into(experiment.sampler, folder / weights.FILE)
+    except UserError as error:
+        raise UserError(f"{KEY}: the sampler of {folder} cannot be had: {error}") from None
     if cfg.weights == OF_RUN:
         _load_task(experiment.task, folder, record)
     return {
@@ -100,6 +135,7 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
         "commit": record["git"]["commit"],
         "max_epochs": record["config"]["trainer"]["max_epochs"],
         "learn": record["config"]["learn"],
+        "seed": record["seed"],
         "dataset": record["config"]["names"]["dataset"],
         "sampler_weights_sha256": content["sha256"],
     }
@@ -176,7 +212,7 @@ def _same_settings(cfg: DictConfig, record: dict[str, Any], folder: Path) -> Non
 
 
 def _key(override: str) -> str:
-    """Return the key of ``++key=value`` or ``key@package=value``."""
+    """Return the key of ``++key=value`` or ``~key``."""
     return override.split("=", 1)[0].lstrip("+~")
 
 

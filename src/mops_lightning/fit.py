@@ -107,7 +107,8 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     # A seed of its own: the sampler's first weights must not hang on the size of the task net.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
     sampler = build(cfg.sampler) if cfg.learn != "task" else None
-    sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, dataset.test.points.shape[1])
+    points = dataset.test.points.shape[1]
+    sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, points, training=cfg.learn != "nothing")
     baselines = {}
     if sampler is not None and sampler.learned:
         nodes = {str(name): node for name, node in cfg.baselines.items() if node}

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mops_lightning import records
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.io import atomic_write
 from mops_lightning.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT, parse
 
@@ -47,9 +47,16 @@ def table(folder: Path, metric: str = "accuracy") -> str:
         UserError: there is no record, or records of different tasks, data or task weights, whose
             figures must not stand in one table.
     """
-    found = [records.read(path.parent) for path in sorted(folder.rglob(records.FILE))]
-    if not found:
+    found, broken = [], []
+    for path in sorted(folder.rglob(records.FILE)):
+        try:
+            found.append({**records.read(path.parent), "folder": str(path.parent)})
+        except UserError:
+            broken.append(str(path))
+    if not found and not broken:
         raise UserError(f"{folder}: no {records.FILE} below it.")
+    if not found:
+        raise UserError(f"{folder}: none of its run records can be read: {', '.join(broken[:3])}.")
     done = [record for record in found if record["status"] == "completed"]
     if not done:
         raise UserError(f"{folder}: none of its {len(found)} runs is completed.")
@@ -59,8 +66,13 @@ def table(folder: Path, metric: str = "accuracy") -> str:
     own: set[tuple[str, int]] = set()
     for record in scored:
         _add(cells, own, record, metric)
+    if not cells:
+        known = {parts.metric for r in scored for parts in map(parse, r["metrics"]) if parts}
+        raise UserError(
+            f"--metric: no run below {folder} has {metric!r}.{did_you_mean(metric, known)}"
+        )
     sizes = sorted({m for values in cells.values() for m in values}, reverse=True)
-    paper = _paper(names["task"], metric)
+    paper = _paper(names["task"], names["dataset"], metric)
     lines = [
         f"Test {metric.replace('_', ' ')} in %, {names['task']} on {names['dataset']} under "
         f"{names['net']}: generated / matched / completed sets, or one figure for samplers that "
@@ -77,6 +89,8 @@ def table(folder: Path, metric: str = "accuracy") -> str:
     lines += ["", *_how(done)]
     if len(done) < len(found):
         lines += ["", f"{len(found) - len(done)} of {len(found)} runs are not completed."]
+    if broken:
+        lines += ["", f"Not readable: {', '.join(broken)}."]
     return "\n".join(lines) + "\n"
 
 
@@ -104,9 +118,17 @@ def _row(label: str, figures: list[str]) -> str:
 
 
 def _full(found: list[dict[str, Any]], net: str, metric: str, paper: dict[str, Any]) -> list[str]:
-    values = {record["metrics"].get(f"test/{FULL}/{metric}") for record in found} - {None}
     published = f" (the paper: {paper['full']:.2f})" if "full" in paper else ""
-    return [f"{net} on all points: {_number(value)}{published}." for value in sorted(values)]
+    lines: dict[str, None] = {}
+    for record in found:
+        value = record["metrics"].get(f"test/{FULL}/{metric}")
+        joint = _learned(record) == "joint"
+        with_ = (
+            f" after joint training with {record['config']['names']['sampler']}" if joint else ""
+        )
+        if value is not None:
+            lines[f"{net} on all points{with_}: {_number(value)}{published}."] = None
+    return list(lines)
 
 
 def _common(found: list[dict[str, Any]]) -> dict[str, str]:
@@ -116,6 +138,7 @@ def _common(found: list[dict[str, Any]]) -> dict[str, str]:
         "net": {r["config"]["names"]["net"] for r in found},
         "dataset": {r["config"]["names"]["dataset"] for r in found},
         "data (dataset_fingerprint)": {r["notes"].get("dataset_fingerprint") for r in found},
+        "what learned (learn)": {_learned(r) for r in found},
         "task weights (sha256)": {r["notes"].get("task_weights_sha256") for r in found},
     }
     for what, values in keys.items():
@@ -126,6 +149,12 @@ def _common(found: list[dict[str, Any]]) -> dict[str, str]:
                 "Their figures do not belong in one table; give a folder with runs of one kind."
             )
     return {what: next(iter(values - {None}), "") for what, values in keys.items()}
+
+
+def _learned(record: dict[str, Any]) -> str:
+    """Return whether the task net learned with the sampler, in the run that was evaluated too."""
+    learn = (record["notes"].get("evaluated") or {}).get("learn", record["config"]["learn"])
+    return "joint" if learn == "joint" else "sampler alone"
 
 
 def _add(cells: Cells, own: set[tuple[str, int]], record: dict[str, Any], metric: str) -> None:
@@ -143,12 +172,14 @@ def _add(cells: Cells, own: set[tuple[str, int]], record: dict[str, Any], metric
             continue
         m = parts.m or config["m"]
         if parts.readout not in (INDEX_READOUT, *GENERATED_READOUTS):
-            if (parts.readout, m) not in own:
+            # After joint training each run has a task net, and baselines under it, of its own.
+            if (parts.readout, m) not in own and _learned(record) != "joint":
                 cells.setdefault(parts.readout, {})[m] = {INDEX_READOUT: value}
             continue
         if (sampler, m) in own:
             raise UserError(
-                f"Two runs of {sampler} with m={m} are there; give a folder with one of each."
+                f"Two runs of {sampler} with m={m} are there, the second one in "
+                f"{record['folder']}; give a folder with one of each."
             )
         if (sampler, m) not in taken:
             cells.setdefault(sampler, {})[m] = {}
@@ -157,10 +188,11 @@ def _add(cells: Cells, own: set[tuple[str, int]], record: dict[str, Any], metric
     own |= taken
 
 
-def _paper(task: str, metric: str) -> dict[str, Any]:
+def _paper(task: str, dataset: str, metric: str) -> dict[str, Any]:
+    """Return the paper's figures for a table, if it has any for this task, data and metric."""
     text = files("mops_lightning").joinpath("paper.json").read_text()
     entry = json.loads(text).get(task, {})
-    return entry if entry.get("metric") == metric else {}
+    return entry if (entry.get("dataset"), entry.get("metric")) == (dataset, metric) else {}
 
 
 def _paper_figures(paper: dict[str, Any], sampler: str, m: int) -> str:
@@ -186,13 +218,15 @@ def _how(found: Iterable[dict[str, Any]]) -> list[str]:
         what = names["net"] if config["learn"] == "task" else names["sampler"]
         trained = "fit" in record["seconds"]
         earlier = record["notes"].get("evaluated") or {}
+        seed = earlier.get("seed", record["seed"])
+        joint = ", jointly trained" if _learned(record) == "joint" and trained else ""
         commit = (record["git"]["commit"] or "a wheel")[:10]
         lines[
-            f"- {what}: "
+            f"- {what}{joint}: "
             + (f"{config['trainer']['max_epochs']} epochs, " if trained else "")
             + (f"evaluated after {earlier['max_epochs']} epochs, " if earlier else "")
             + ("nothing to train, " if not trained and not earlier else "")
-            + f"seed {record['seed']}, {record['device']}, {record['threads']} threads, commit "
+            + f"seed {seed}, {record['device']}, {record['threads']} threads, commit "
             + commit
             + (" with changes" if record["git"]["dirty"] else "")
         ] = None

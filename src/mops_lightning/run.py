@@ -82,7 +82,7 @@ def fit_and_test(
         content = weights.load_into(experiment.task, task_weights)
         if content.get("classes"):
             evaluate.same_classes(content["classes"], dataset, f"weights: {task_weights}")
-    if cfg.evaluate is not None:
+    if cfg.evaluate:
         record["notes"]["evaluated"] = evaluate.load(cfg, experiment, dataset)
     elif cfg.learn == "nothing" and experiment.sampler is not None and experiment.sampler.learned:
         raise UserError("learn=nothing needs a trained sampler: give its run with evaluate=RUN.")

@@ -11,7 +11,11 @@ AUTO = "auto"
 
 
 def sizes_to_test(
-    sizes: str | Sequence[int], m: int, sampler: Sampler | None, n_points: int
+    sizes: str | Sequence[int],
+    m: int,
+    sampler: Sampler | None,
+    n_points: int,
+    training: bool = True,
 ) -> tuple[int, ...]:
     """Return how many points the test asks the sampler for, in ascending order.
 
@@ -21,6 +25,7 @@ def sizes_to_test(
         m: the size that the run is about; it is always tested.
         sampler: None where only the task net learns.
         n_points: N of the test clouds.
+        training: whether the sampler learns, which it does at its largest size too.
 
     Raises:
         UserError: a size that the sampler or the clouds do not allow.
@@ -28,8 +33,10 @@ def sizes_to_test(
     if sampler is None:
         return ()
     if sampler.learned:
-        _check_largest(sampler, m, n_points)
+        _check_largest(sampler, m, n_points, training)
     if sizes == AUTO:
+        if m > n_points:
+            raise UserError(f"m must be at most the {n_points} points of a cloud, got m={m}.")
         most = min(sampler.m, n_points)
         more = STANDARD if sampler.flexible and sampler.learned else ()
         return tuple(sorted({m, *(size for size in more if size <= most)}))
@@ -51,14 +58,15 @@ def sizes_to_test(
     return tuple(wanted)
 
 
-def _check_largest(sampler: Sampler, m: int, n_points: int) -> None:
+def _check_largest(sampler: Sampler, m: int, n_points: int, training: bool) -> None:
     if m > sampler.m:
         raise UserError(
-            f"m must be at most sampler.m_max={sampler.m}, got m={m}. Try sampler.m_max={m}."
+            f"m must be at most sampler.m_max={sampler.m}, got m={m}. "
+            f"Lower m, or train with sampler.m_max={m}."
         )
-    if sampler.m > n_points:
+    if training and sampler.m > n_points:
         name = "sampler.m_max" if sampler.flexible else "m"
         raise UserError(
             f"{name} must be at most the {n_points} points of a cloud, got {sampler.m}. "
-            f"Try {name}={n_points}."
+            f"Train with {name}={n_points} or more points."
         )

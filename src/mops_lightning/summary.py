@@ -55,12 +55,16 @@ def closing_lines(folder: Path, record: dict[str, Any], console: Console | None 
         columns = list(next(iter(rows.values())))
         rows[FULL] = dict.fromkeys(columns, next(iter(rows[FULL].values())))
         what = score.metric.replace("_", " ")
+    if config.get("learn") == "task":
+        what = "all points"
     title = f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test"
     table = Table(title=title, title_justify="left")
     table.add_column("sampled by")
     for column in columns:
         table.add_column(column.replace("_", " "), justify="right")
     for readout, row in rows.items():
+        if not any(row.get(column) is not None for column in columns):
+            continue  # figures of the set alone
         label = f"{names['sampler']} {readout}" if readout in ROWS[:-1] else readout
         values = [row.get(column) for column in columns]
         kinds = [score.metric if score and score.m else column for column in columns]

@@ -93,7 +93,8 @@ def test_progressive_samples_are_nested_each_with_the_loss_of_its_size(rng):
     [
         ({"alpha": -1.0}, "sampler.alpha must not be negative, got -1.0"),
         ({"coverage": -1.0}, "sampler.coverage must not"),
-        ({"feature_channels": (8,)}, "sampler.feature_channels must name at least two"),
+        ({"feature_channels": (8,)}, "feature_channels must be sizes of at least 2 layers"),
+        ({"head_channels": (0,)}, "head_channels must be .* each at least 1, got .0."),
         ({"least": 0}, "sampler.least must be at least 1, got 0"),
         ({"over_sizes": "summ"}, "sampler.over_sizes: unknown 'summ'.*sum"),
     ],

@@ -87,6 +87,10 @@ class SampleNet(SNet):
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Generate points; in training their soft projection stands beside them."""
+        if self.k > points.shape[1]:
+            raise UserError(
+                f"sampler.k must be at most the number of points N={points.shape[1]}, got {self.k}."
+            )
         output = super().sample(points, m)
         if not self.training:
             return output

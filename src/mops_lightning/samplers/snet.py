@@ -30,7 +30,7 @@ class SNet(Sampler):
         output_norm: whether the coordinates pass a BatchNorm too.
 
     Raises:
-        UserError: a weight is negative or there are less than two per-point layers.
+        UserError: a weight is negative, a layer has no channels or layers are missing.
     """
 
     generates = True
@@ -51,10 +51,16 @@ class SNet(Sampler):
         for name, value in weights.items():
             if value < 0:
                 raise UserError(f"sampler.{name} must not be negative, got {value}.")
-        if len(feature_channels) < 2:
-            raise UserError(
-                f"sampler.feature_channels must name at least two layers, got {feature_channels}."
-            )
+        layers_wanted = {
+            "feature_channels": (feature_channels, 2),
+            "head_channels": (head_channels, 1),
+        }
+        for name, (channels, least) in layers_wanted.items():
+            if len(channels) < least or min(channels) < 1:
+                raise UserError(
+                    f"sampler.{name} must be sizes of at least {least} layers, each at least 1, "
+                    f"got {list(channels)}."
+                )
         self.alpha = alpha
         self.coverage = coverage
         self.coverage_per_point = coverage_per_point
@@ -88,7 +94,8 @@ class Progressive(Sampler):
 
     Args:
         m_max: largest number of points, 1,024 in the publication.
-        least: smallest size that is trained: 2 for classification, 16 for reconstruction.
+        least: smallest size that is trained (m_max where that is smaller): 2 for classification,
+            16 for reconstruction.
         over_sizes: whether the losses at all sizes are summed (classification) or averaged
             (reconstruction).
         **settings: as for the net.

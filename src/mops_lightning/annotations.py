@@ -1,0 +1,65 @@
+"""Whether a value from a configuration fits the annotation of the argument that takes it."""
+
+import collections.abc
+import types
+from typing import Any, Literal, Union, get_args, get_origin
+
+PLAIN: dict[Any, str] = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "a text",
+    type(None): "null",
+}
+LISTS = (list, tuple, collections.abc.Sequence)
+
+
+def misfit(value: Any, annotation: Any) -> str | None:
+    """Say what an annotation wants when a value does not fit it.
+
+    Args:
+        value: plain data: a number, a text, a truth value, None, a list or a dict.
+        annotation: as written in the signature. What is neither plain, a list of plain nor a choice
+            of these cannot be judged, and any value fits.
+
+    Returns:
+        Such as "a whole number or null"; None where the value fits.
+    """
+    return None if _fits(value, annotation) else _describe(annotation)
+
+
+def _fits(value: Any, annotation: Any) -> bool:
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin in (Union, types.UnionType):
+        return any(_fits(value, part) for part in inner)
+    if origin is Literal:
+        # A wrong text is left to the constructor, which names the nearest right one.
+        return isinstance(value, str) or any(value is part for part in inner)
+    if origin in LISTS or annotation in LISTS:
+        kinds = [part for part in inner if part is not Ellipsis]
+        return isinstance(value, list) and (
+            not kinds or all(any(_fits(item, kind) for kind in kinds) for item in value)
+        )
+    if annotation is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if annotation is type(None) or annotation is None:
+        return value is None
+    if annotation in PLAIN:
+        return type(value) is annotation
+    # A tensor, a callable, Any ...: a number or nothing may be right, a text is not a tensor.
+    return not (
+        getattr(annotation, "__name__", "") == "Tensor" and not isinstance(value, int | float)
+    )
+
+
+def _describe(annotation: Any) -> str:
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin in (Union, types.UnionType):
+        wanted = [_describe(part) for part in inner if getattr(part, "__name__", "") != "Tensor"]
+        return " or ".join(dict.fromkeys(wanted))
+    if origin is Literal:
+        return " or ".join(map(str, inner))
+    if origin in LISTS or annotation in LISTS:
+        kinds = {int: "whole numbers", float: "numbers", str: "texts"}
+        return "a list" + (f" of {kinds[inner[0]]}" if inner and inner[0] in kinds else "")
+    return PLAIN.get(annotation, str(annotation))
