@@ -52,6 +52,15 @@ def test_the_folders_of_modelnet_are_read(layout: Path, capsys: pytest.CaptureFi
     assert capsys.readouterr() == ("", "")  # no progress bar where nobody looks
 
 
+def test_a_class_of_one_split_only_is_said(
+    layout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (layout / "ball" / "test" / "ball_3.OFF").unlink()
+    dataset = meshes(layout, n_points=20)
+    assert dataset.notes["classes_without_test_meshes"] == ["ball"]
+    assert "no test mesh of ball: never scored" in capsys.readouterr().err
+
+
 def test_broken_meshes_stop_the_reading_or_are_counted(layout: Path) -> None:
     whole = meshes(layout, n_points=20)
     (layout / "ball" / "train" / "a.off").write_bytes(b"OFF\n")

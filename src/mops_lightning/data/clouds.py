@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,14 +31,14 @@ class CloudDataset:
         train: the clouds to learn from.
         test: the clouds to score; all of them are scored.
         fingerprint: sha256 of all that fixes the content; part of the name of cached weights.
-        notes: numbers worth recording with a run, such as how many meshes were skipped.
+        notes: plain facts worth recording with a run, such as how many meshes were skipped.
     """
 
     class_names: tuple[str, ...]
     train: Clouds
     test: Clouds
     fingerprint: str
-    notes: dict[str, int] = field(default_factory=dict)
+    notes: dict[str, Any] = field(default_factory=dict)
 
 
 def choose_classes(setting: Sequence[str] | None, known: Sequence[str]) -> tuple[str, ...]:

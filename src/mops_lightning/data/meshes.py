@@ -2,12 +2,14 @@
 
 import csv
 import hashlib
+import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
@@ -102,7 +104,15 @@ def meshes(
         Clouds(torch.from_numpy(np.stack(clouds[split])), torch.tensor(labels[split]))
         for split in SPLITS
     )
-    return CloudDataset(chosen, train, test, digest.hexdigest(), {"skipped_meshes": skipped})
+    notes: dict[str, Any] = {"skipped_meshes": skipped}
+    for split, consequence in (("train", "never learned"), ("test", "never scored")):
+        lacking = [name for i, name in enumerate(chosen) if i not in labels[split]]
+        if lacking:
+            notes[f"classes_without_{split}_meshes"] = lacking
+            print(
+                f"{root}: no {split} mesh of {', '.join(lacking)}: {consequence}.", file=sys.stderr
+            )
+    return CloudDataset(chosen, train, test, digest.hexdigest(), notes)
 
 
 def _laid_out(root: Path) -> list[tuple[PurePosixPath, str]]:
