@@ -45,34 +45,8 @@ def closing_lines(folder: Path, record: dict[str, Any], console: Console | None 
         console: where to print; the standard output by default.
     """
     console = console or Console()
-    config = record["config"]
-    names, score = config["names"], parse(record["notes"].get("score", ""))
-    rows = readout_rows(record["metrics"], score.metric if score else None)
-    # The task's own scores; figures of the sampled set stay in the record.
-    columns = list(rows.get(FULL, {}))
-    what = f"m={config['m']}"
-    if score and score.m:
-        columns = list(next(iter(rows.values())))
-        rows[FULL] = dict.fromkeys(columns, next(iter(rows[FULL].values())))
-        what = score.metric.replace("_", " ")
-    if config.get("learn") == "task":
-        what = "all points"
-    title = f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test"
-    table = Table(title=title, title_justify="left")
-    table.add_column("sampled by")
-    for column in columns:
-        table.add_column(column.replace("_", " "), justify="right")
-    for readout, row in rows.items():
-        if not any(row.get(column) is not None for column in columns):
-            continue  # figures of the set alone
-        label = f"{names['sampler']} {readout}" if readout in ROWS[:-1] else readout
-        values = [row.get(column) for column in columns]
-        kinds = [score.metric if score and score.m else column for column in columns]
-        cells = [
-            "" if value is None else _number(kind, value)
-            for kind, value in zip(kinds, values, strict=True)
-        ]
-        table.add_row("all points" if readout == FULL else label, *cells)
+    title, table = results_table(record)
+    console.print(title, soft_wrap=True, highlight=False, style="italic")
     console.print(table)
     files = ", ".join([FILE, *sorted(record["files"].values())])
     seconds = record["seconds"]["total"]
@@ -83,5 +57,41 @@ def closing_lines(folder: Path, record: dict[str, Any], console: Console | None 
     )
 
 
-def _number(name: str, value: float) -> str:
-    return f"{100 * value:.2f} %" if "accuracy" in name else f"{value:.4g}"
+def results_table(record: dict[str, Any]) -> tuple[str, Table]:
+    """Return a title, and what every readout scored: by metric, or by size where several are tested."""
+    config = record["config"]
+    names, score = config["names"], parse(record["notes"].get("score", ""))
+    several = score.metric if score and score.m else None
+    rows = readout_rows(record["metrics"], several)
+    # The task's own scores; figures of the sampled set stay in the record.
+    columns = list(rows.get(FULL, {}))
+    what = "all points" if config.get("learn") == "task" else f"m={config['m']}"
+    if several:
+        columns = list(next(iter(rows.values())))
+        rows[FULL] = dict.fromkeys(columns, next(iter(rows[FULL].values())))
+        what = several.replace("_", " ") + (" in %" if _is_share(several) else "")
+    table = Table()
+    table.add_column("sampled by")
+    for column in columns:
+        table.add_column(column.replace("_", " "), justify="right")
+    for readout, row in rows.items():
+        values = [row.get(column) for column in columns]
+        if all(value is None for value in values):
+            continue  # figures of the set alone
+        label = f"{names['sampler']} {readout}" if readout in ROWS[:-1] else readout
+        cells = [
+            "" if value is None else _number(several or column, value, unit=not several)
+            for column, value in zip(columns, values, strict=True)
+        ]
+        table.add_row("all points" if readout == FULL else label, *cells)
+    return f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test", table
+
+
+def _is_share(metric: str) -> bool:
+    return "accuracy" in metric
+
+
+def _number(metric: str, value: float, unit: bool) -> str:
+    if _is_share(metric):
+        return f"{100 * value:.2f}" + (" %" if unit else "")
+    return f"{value:.4g}"
