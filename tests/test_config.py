@@ -103,6 +103,11 @@ def test_the_rivals_settings():
     assert cfg.optimizer.optimizer.lr == 0.01
     assert cfg.optimizer.schedule.every * cfg.batch_size == 600_000
     assert (cfg.trainer.max_epochs, cfg.val_fraction) == (500, 0)
+    cfg = compose(["sampler=snet"])
+    assert (cfg.optimizer.optimizer.lr, cfg.pretrain.optimizer.optimizer.lr) == (0.01, 0.001)
+    assert compose(["sampler=snet", "learn=joint"]).optimizer.optimizer.lr == 0.001
+    assert compose(["sampler=snet", "optimizer=exponential"]).optimizer.optimizer.lr == 5e-4
+    assert compose(["sampler=fmops"]).optimizer.optimizer.lr == 0.001
     cfg = compose(["sampler=snet_progressive"])
     assert (cfg.sampler.m_max, cfg.sampler.least, cfg.sampler.over_sizes) == (1024, 2, "sum")
     assert (cfg.sampler.coverage, cfg.sampler.coverage_per_point) == (0.5, pytest.approx(1 / 30))
