@@ -58,7 +58,7 @@ def closing_lines(folder: Path, record: dict[str, Any], console: Console | None 
 
 
 def results_table(record: dict[str, Any]) -> tuple[str, Table]:
-    """Return a title and what every readout scored, by metric or by size where several are tested."""
+    """Return a title and what every readout scored: by metric, or by size if there are several."""
     config = record["config"]
     names, score = config["names"], parse(record["notes"].get("score", ""))
     several = score.metric if score and score.m else None
