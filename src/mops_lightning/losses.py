@@ -1,5 +1,12 @@
-"""Losses that are no part of a task: pure functions."""
+"""Losses that are no part of a task: pure functions.
 
+Nested samplers are trained at several sizes of one sample, whose first m points count for size m.
+The functions in the plural give the losses of all sizes for little more than the largest costs.
+"""
+
+from collections.abc import Sequence
+
+import torch
 from torch import Tensor
 
 from mops_lightning.geometry import nearest
@@ -18,7 +25,13 @@ def subset_loss(points: Tensor, samples: Tensor) -> Tensor:
     Returns:
         A scalar in squared units of the coordinates; 0 where every sample is an input point.
     """
-    return nearest(samples, points)[0].mean()
+    return subset_losses(points, samples, (samples.shape[1],))[samples.shape[1]]
+
+
+def subset_losses(points: Tensor, samples: Tensor, sizes: Sequence[int]) -> dict[int, Tensor]:
+    """Return, by size m, the ``subset_loss`` of the first m samples."""
+    distances = nearest(samples, points)[0]
+    return {m: distances[:, :m].mean() for m in sizes}
 
 
 def simplification_loss(
@@ -39,7 +52,26 @@ def simplification_loss(
     Returns:
         A scalar in squared units of the coordinates.
     """
+    size = samples.shape[1]
+    return simplification_losses(points, samples, (size,), coverage, coverage_per_point)[size]
+
+
+def simplification_losses(
+    points: Tensor,
+    samples: Tensor,
+    sizes: Sequence[int],
+    coverage: float = 1.0,
+    coverage_per_point: float = 0.0,
+) -> dict[int, Tensor]:
+    """Return, by size m, the ``simplification_loss`` of the first m samples."""
     to_cloud = nearest(samples, points)[0]
-    from_cloud = nearest(points, samples)[0]
-    weight = coverage + coverage_per_point * samples.shape[1]
-    return (to_cloud.mean(1) + to_cloud.amax(1) + weight * from_cloud.mean(1)).mean()
+    losses, begin, from_cloud = {}, 0, None
+    for m in sorted(set(sizes)):
+        # Nearest among the first m: nearest among the smaller size, or among what is added to it.
+        added = nearest(points, samples[:, begin:m])[0]
+        from_cloud = added if from_cloud is None else torch.minimum(from_cloud, added)
+        begin = m
+        there = to_cloud[:, :m].mean(1) + to_cloud[:, :m].amax(1)
+        weight = coverage + coverage_per_point * m
+        losses[m] = (there + weight * from_cloud.mean(1)).mean()
+    return losses

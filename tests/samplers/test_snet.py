@@ -2,6 +2,7 @@ import pytest
 import torch
 from torch import nn
 
+from mops_lightning import losses
 from mops_lightning.errors import UserError
 from mops_lightning.losses import simplification_loss
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
@@ -31,6 +32,23 @@ def test_simplification_loss_has_right_gradients(rng):
     samples = torch.randn(2, 4, 3, generator=rng, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda q: simplification_loss(points, q, 0.5, 0.1), (samples,))
     assert simplification_loss(points, points) == 0
+
+
+@pytest.mark.parametrize("name", ["subset", "simplification"])
+def test_losses_of_many_sizes_are_those_of_each(name, rng):
+    points = torch.randn(3, 30, 3, generator=rng, dtype=torch.float64)
+    samples = torch.randn(3, 12, 3, generator=rng, dtype=torch.float64, requires_grad=True)
+    extra = (0.5, 0.1) if name == "simplification" else ()
+    many, one = getattr(losses, f"{name}_losses"), getattr(losses, f"{name}_loss")
+    sizes = (12, 1, 5)
+    together = many(points, samples, sizes, *extra)
+    assert set(together) == set(sizes)
+    for m in sizes:
+        alone = one(points, samples[:, :m].clone(), *extra)
+        torch.testing.assert_close(together[m], alone)
+        (got,) = torch.autograd.grad(together[m], samples, retain_graph=True)
+        (want,) = torch.autograd.grad(alone, samples)
+        torch.testing.assert_close(got, want)
 
 
 def layers(net):

@@ -53,13 +53,15 @@ class Sampler(nn.Module):
             UserError: ``points`` or ``m`` is not as described.
         """
         m = self.m if m is None else m
-        self._check_m(m)
+        return self.sample_sizes(points, (m,))[m]
+
+    def _checked(self, points: Tensor, m: int) -> SampleOutput:
+        """Check the points, then sample, without losses."""
         check_points(points, at_least=m, finite=not (self.training and points.is_cuda))
         own = next((p.dtype for p in self.parameters()), points.dtype)
         if points.dtype != own and not torch.is_autocast_enabled(points.device.type):
             raise UserError(f"points must be {own} as the sampler's weights, got {points.dtype}.")
-        output = self.sample(points, m)
-        return output._replace(losses=self.losses(points, output)) if self.training else output
+        return self.sample(points, m)
 
     def sample_sizes(self, points: Tensor, sizes: Sequence[int]) -> dict[int, SampleOutput]:
         """Sample at several sizes; a nested sampler works once, at the largest.
@@ -71,22 +73,22 @@ class Sampler(nn.Module):
         Returns:
             By size, what ``forward`` returns for it.
         """
-        if not self.nested:
+        if not self.nested and len(sizes) > 1:
             return {m: self(points, m) for m in sizes}
-        whole = self(points, max(sizes))
-        outputs = {max(sizes): whole}
-        for m in set(sizes) - set(outputs):
-            part = whole.first(m)
-            losses = self.losses(points, part) if self.training else {}
-            outputs[m] = part._replace(losses=losses)
-        return {m: outputs[m] for m in sizes}
+        for m in sizes:
+            self._check_m(m)
+        whole = self._checked(points, max(sizes))
+        losses = self.losses(points, whole, sizes) if self.training else {}
+        return {m: whole.first(m)._replace(losses=losses.get(m, {})) for m in sizes}
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Do the work on checked input; see ``forward``."""
         raise NotImplementedError
 
-    def losses(self, points: Tensor, output: SampleOutput) -> dict[str, Tensor]:
-        """Return the sampler's own weighted loss terms for points and an output, in training."""
+    def losses(
+        self, points: Tensor, output: SampleOutput, sizes: Sequence[int]
+    ) -> dict[int, dict[str, Tensor]]:
+        """Return, by size, the weighted loss terms of a training output's first points."""
         return {}
 
     def training_sizes(self) -> tuple[int, ...]:

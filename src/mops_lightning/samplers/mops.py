@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.losses import subset_loss
+from mops_lightning.losses import subset_losses
 from mops_lightning.nets.pointnet import PointFeatures, linear_norm_relu
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.sampling_matrix import SamplingMatrix
@@ -95,6 +95,9 @@ class MOPSNet(Sampler):
         matrix = self.sampling_matrix(points).leftmost(m)
         return SampleOutput(matrix.sample(points), None, {}, matrix)
 
-    def losses(self, points: Tensor, output: SampleOutput) -> dict[str, Tensor]:
-        """Return α times the subset loss (paper section "Joint Training Loss")."""
-        return {"subset": self.alpha * subset_loss(points, output.points)}
+    def losses(
+        self, points: Tensor, output: SampleOutput, sizes: Sequence[int]
+    ) -> dict[int, dict[str, Tensor]]:
+        """Return α times the subset loss (paper section "Joint Training Loss") at every size."""
+        losses = subset_losses(points, output.points, sizes)
+        return {m: {"subset": self.alpha * loss} for m, loss in losses.items()}

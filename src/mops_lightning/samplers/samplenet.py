@@ -4,6 +4,7 @@ Lang, Manor and Avidan, "SampleNet: Differentiable Point Cloud Sampling", CVPR 2
 paper's tables.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -97,9 +98,13 @@ class SampleNet(SNet):
         projected = soft_projection(output.points, points, self.k, self.sigma)
         return output._replace(soft_projected=projected)
 
-    def losses(self, points: Tensor, output: SampleOutput) -> dict[str, Tensor]:
-        """Return the weighted simplification loss and β·σ."""
-        return {**super().losses(points, output), "projection": self.beta * self.sigma}
+    def losses(
+        self, points: Tensor, output: SampleOutput, sizes: Sequence[int]
+    ) -> dict[int, dict[str, Tensor]]:
+        """Return, at every size, the weighted simplification loss and β·σ."""
+        projection = {"projection": self.beta * self.sigma}
+        losses = super().losses(points, output, sizes)
+        return {m: {**terms, **projection} for m, terms in losses.items()}
 
 
 class ProgressiveSampleNet(Progressive, SampleNet):

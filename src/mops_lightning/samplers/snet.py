@@ -10,7 +10,7 @@ from typing import Any, Literal
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.losses import simplification_loss
+from mops_lightning.losses import simplification_losses
 from mops_lightning.nets.pointnet import PointMaxPool, PointMLP
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.types import SampleOutput
@@ -80,10 +80,13 @@ class SNet(Sampler):
         coordinates = self.head(self.pool(self.features(points)))
         return SampleOutput(coordinates.unflatten(1, (self.m, 3))[:, :m], None, {})
 
-    def losses(self, points: Tensor, output: SampleOutput) -> dict[str, Tensor]:
-        """Return α times the simplification loss."""
-        loss = simplification_loss(points, output.points, self.coverage, self.coverage_per_point)
-        return {"simplification": self.alpha * loss}
+    def losses(
+        self, points: Tensor, output: SampleOutput, sizes: Sequence[int]
+    ) -> dict[int, dict[str, Tensor]]:
+        """Return α times the simplification loss at every size."""
+        weights = (self.coverage, self.coverage_per_point)
+        losses = simplification_losses(points, output.points, sizes, *weights)
+        return {m: {"simplification": self.alpha * loss} for m, loss in losses.items()}
 
 
 class Progressive(Sampler):
