@@ -117,8 +117,11 @@ class PointMaxPool(nn.Module):
                 winners = torch.stack(rows).squeeze(2)
                 # A copy may beat the first point itself by a rounding error of the product.
                 winners.masked_fill_(winners >= features.shape[1], 0)
-        index = winners[..., None].expand(-1, -1, features.shape[2])
-        return (features.gather(1, index) * weight).sum(-1)
+        # Whole rows of the flat tensor: an index for every number takes three times as long.
+        clouds = torch.arange(len(features), device=features.device)
+        rows = (winners + clouds[:, None] * features.shape[1]).flatten()
+        winning = features.flatten(0, 1).index_select(0, rows).unflatten(0, winners.shape)
+        return (winning * weight).sum(-1)
 
 
 class PointNetVanilla(nn.Module):
