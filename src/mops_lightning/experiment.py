@@ -214,15 +214,18 @@ class Experiment(L.LightningModule):
         """Score the learned readouts on held-out training clouds, at one size."""
         readouts = BatchReadouts(self.sampler, {}, (self.m,))
         self._score(batch, "val/", readouts, self.m, self.own_readouts)
+        self._score_sets(readouts, {self.m: "val/"}, len(batch.points))
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         """Score the learned readouts and the baselines at every size, and the full clouds."""
         baselines: Any = dict(self.baselines.items())
         readouts = BatchReadouts(self.sampler, baselines, self.sizes)
         names = [name for name in (*self.own_readouts, *baselines) if name != FULL]
-        for m in self.sizes:
-            self._score(batch, f"test/{self._prefix(m)}", readouts, m, names)
+        prefixes = {m: f"test/{self._prefix(m)}" for m in self.sizes}
+        for m, prefix in prefixes.items():
+            self._score(batch, prefix, readouts, m, names)
         self._score(batch, "test/", readouts, self.m, [FULL])
+        self._score_sets(readouts, prefixes, len(batch.points))
 
     def _prefix(self, m: int) -> str:
         return size_prefix(m) if len(self.sizes) > 1 else ""
@@ -242,12 +245,12 @@ class Experiment(L.LightningModule):
             if readout == self.own_readouts[0]:
                 for name, value in result.losses.items():
                     self.log(f"{prefix}loss/{name}", value, batch_size=size)
-        if list(names) == [FULL]:
-            return
-        for points, output in readouts.outputs(m):
-            for name, per_cloud in SET_METRICS.items():
-                values = per_cloud(points, output)
-                if values is not None:
-                    mean: Any = self.set_metrics[f"{within}{name}"]
+
+    def _score_sets(self, readouts: BatchReadouts, prefixes: dict[int, str], size: int) -> None:
+        """Update and log what is measured of the sampled sets themselves, at every size."""
+        for points, output, sizes in readouts.wholes():
+            for name, measure in SET_METRICS.items():
+                for m, values in (measure(points, output, sizes) or {}).items():
+                    mean: Any = self.set_metrics[f"{prefixes[m].split('/', 1)[1]}{name}"]
                     mean.update(values)
-                    self.log(f"{prefix}{name}", mean, batch_size=size)
+                    self.log(f"{prefixes[m]}{name}", mean, batch_size=size)

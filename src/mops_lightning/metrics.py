@@ -1,6 +1,10 @@
-"""Metrics of the sampled set itself, whatever the task: one number per cloud, to be averaged."""
+"""Metrics of the sampled set itself, whatever the task: one number per cloud, to be averaged.
 
-from collections.abc import Callable
+Each takes the points ``(B, N, 3)``, what a sampler made of them, and the sizes of interest: for size
+m the first m samples count. It returns ``(B,)`` numbers by size, None where it has no meaning.
+"""
+
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -12,42 +16,44 @@ from mops_lightning.types import SampleOutput
 NONZERO_THRESHOLD = 0.01
 """Entries of S below this count as zero (paper, table of the non-zero elements)."""
 
+BySize = dict[int, Tensor]
 
-def subset_distance(points: Tensor, output: SampleOutput) -> Tensor:
-    """Return (1/M) Σ_j min_i ‖q_j − p_i‖² per cloud: the paper's L_subset without its weight.
 
-    Args:
-        points: ``(B, N, 3)`` input.
-        output: what the sampler made of it.
+def subset_distance(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize:
+    """Return (1/m) Σ_j min_i ‖q_j − p_i‖²: the paper's L_subset without its weight.
 
-    Returns:
-        ``(B,)``, in squared units of the input.
+    In squared units of the input.
     """
-    return nearest(output.points, points)[0].mean(1)
+    distances = nearest(output.points, points)[0]
+    return {m: distances[:, :m].mean(1) for m in sizes}
 
 
-def unique_points(points: Tensor, output: SampleOutput) -> Tensor:
-    """Return how many different input points are matched, at most M, per cloud: ``(B,)``."""
+def unique_points(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize:
+    """Return how many different input points are matched, at most m."""
     indices = match(output.points, points) if output.indices is None else output.indices
-    return unique_count(indices).to(points.dtype)
+    return {m: unique_count(indices[:, :m]).to(points.dtype) for m in sizes}
 
 
-def nonzero_percent(points: Tensor, output: SampleOutput) -> Tensor | None:
-    """Return the entries of S that reach 0.01, in percent, per cloud; None without S."""
+def nonzero_percent(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize | None:
+    """Return the entries of S that reach 0.01, in percent; None without S."""
     if output.matrix is None:
         return None
-    return 100 * output.matrix.nonzero_share(NONZERO_THRESHOLD)
+    counts = output.matrix.nonzero_counts(NONZERO_THRESHOLD)
+    return {m: 100 * counts[:, :m].mean(1) / points.shape[1] for m in sizes}
 
 
-def orthogonality_error(points: Tensor, output: SampleOutput) -> Tensor | None:
-    """Return ‖SᵀS − I‖_F per cloud, which the paper's Eq. (3) wants small; None without S."""
+def orthogonality_error(
+    points: Tensor, output: SampleOutput, sizes: Sequence[int]
+) -> BySize | None:
+    """Return ‖SᵀS − I‖_F, which the paper's Eq. (3) wants small; None without S."""
     if output.matrix is None:
         return None
     gram = output.matrix.gram()
-    return torch.linalg.matrix_norm(gram - torch.eye(gram.shape[-1]).to(gram))
+    error = gram - torch.eye(gram.shape[-1]).to(gram)
+    return {m: torch.linalg.matrix_norm(error[:, :m, :m]) for m in sizes}
 
 
-SET_METRICS: dict[str, Callable[[Tensor, SampleOutput], Tensor | None]] = {
+SET_METRICS: dict[str, Callable[[Tensor, SampleOutput, Sequence[int]], BySize | None]] = {
     "generated/subset_distance": subset_distance,
     "matched/unique_points": unique_points,
     "matrix/nonzero_percent": nonzero_percent,

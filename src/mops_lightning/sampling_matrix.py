@@ -94,13 +94,13 @@ class SamplingMatrix(NamedTuple):
         """Return the matrix of the first ``m`` columns (paper section "Flexible MOPS-Net")."""
         return self._replace(queries=self.queries[:m])
 
-    def nonzero_share(self, threshold: float = 0.01) -> Tensor:
-        """Return, per cloud, the share of entries that reach ``threshold``: ``(B,)`` in [0, 1]."""
+    def nonzero_counts(self, threshold: float = 0.01) -> Tensor:
+        """Return how many entries of every column reach ``threshold``: ``(B, M)``, no gradients."""
         with torch.no_grad():
-            count = self.keys.new_zeros(self.keys.shape[0])
-            for cloud, _, _, block in self._blocks():
-                count[cloud] += (block >= threshold).sum()
-            return count / (self.keys.shape[1] * len(self.queries))
+            counts = self.keys.new_zeros(self.keys.shape[0], len(self.queries))
+            for cloud, _, columns, block in self._blocks():
+                counts[cloud, columns] += (block >= threshold).sum(1)
+            return counts
 
     def gram(self) -> Tensor:
         """Return SᵀS, ``(B, M, M)``, the identity for an ideal sampling matrix; no gradients."""

@@ -78,6 +78,18 @@ class BatchReadouts:
             if name == "own"
         ]
 
+    def wholes(self) -> list[tuple[Tensor, SampleOutput, Sequence[int]]]:
+        """Return what the sampler has made so far: points, output, the sizes that it stands for."""
+        found: list[tuple[Tensor, SampleOutput, Sequence[int]]] = []
+        for (name, _), (points, outputs) in self._outputs.items():
+            if name != "own":
+                continue
+            if self.samplers[name].nested:
+                found.append((points, outputs[max(self.sizes)], self.sizes))
+            else:
+                found += [(points, outputs[m], (m,)) for m in self.sizes]
+        return found
+
     def _once(self, name: str, points: Tensor) -> dict[int, SampleOutput]:
         key = (name, id(points))
         if key not in self._outputs:

@@ -119,8 +119,8 @@ class PointMaxPool(nn.Module):
                 winners.masked_fill_(winners >= features.shape[1], 0)
         # Whole rows of the flat tensor: an index for every number takes three times as long.
         clouds = torch.arange(len(features), device=features.device)
-        rows = (winners + clouds[:, None] * features.shape[1]).flatten()
-        winning = features.flatten(0, 1).index_select(0, rows).unflatten(0, winners.shape)
+        places = (winners + clouds[:, None] * features.shape[1]).flatten()
+        winning = features.flatten(0, 1).index_select(0, places).unflatten(0, winners.shape)
         return (winning * weight).sum(-1)
 
 
