@@ -1,7 +1,7 @@
 """Metrics of the sampled set itself, whatever the task: one number per cloud, to be averaged.
 
-Each takes the points ``(B, N, 3)``, what a sampler made of them, and the sizes of interest: for size
-m the first m samples count. It returns ``(B,)`` numbers by size, None where it has no meaning.
+Each takes the points ``(B, N, 3)``, what a sampler made of them, and the sizes of interest: for
+size m the first m samples count. It returns ``(B,)`` numbers by size, None where it has no meaning.
 """
 
 from collections.abc import Callable, Sequence
