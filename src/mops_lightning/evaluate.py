@@ -52,8 +52,7 @@ def command_line(arguments: list[str]) -> list[str]:
     kept = [
         a
         for a in repeated
-        if _key(a) not in given
-        and not any(_covers(key, _key(a)) for key in (*typed_keys, *NOT_REPEATED))
+        if not any(_covers(key, _key(a)) for key in (*typed_keys, *NOT_REPEATED))
     ]
     _data_are_here(kept, folder)
     quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")

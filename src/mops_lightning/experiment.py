@@ -94,8 +94,6 @@ class Experiment(L.LightningModule):
         self.sizes = tuple(sizes or (self.m,))
         self.own_readouts = readout_names(self.sampler)
         self.score_name = f"test/{self._prefix(self.m)}{self.own_readouts[0]}/{self.task.score}"
-        if self.sampler is None:
-            self.score_name = f"test/{FULL}/{self.task.score}"
         readouts = dict.fromkeys([*self.own_readouts, *self.baselines])
         keys = [f"{self._prefix(size)}{name}" for size in self.sizes for name in readouts]
         make_metrics: Any = task.metrics

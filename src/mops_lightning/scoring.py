@@ -40,7 +40,7 @@ class BatchReadouts:
     def __init__(
         self, sampler: Sampler | None, baselines: Mapping[str, Sampler], sizes: Sequence[int]
     ) -> None:
-        self.samplers = {name: baselines[name] for name in baselines}
+        self.samplers = dict(baselines)
         if sampler is not None:
             self.samplers["own"] = sampler
         self.sizes = sizes
