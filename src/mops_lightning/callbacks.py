@@ -68,28 +68,37 @@ class StopBetweenSteps(Callback):
 
 
 class EpochLines(Callback):
-    """One printed line per epoch, for logs and pipes, where a progress bar is noise."""
+    """One printed line per epoch, for logs and pipes, where a progress bar is noise.
+
+    Args:
+        score: the task's metric, which is shown as validated.
+    """
+
+    def __init__(self, score: str) -> None:
+        self.score = score
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Print what the progress bar would show."""
         numbers = {
             name: float(value)
             for name, value in trainer.callback_metrics.items()
-            if name == "train/mean_loss" or (name.startswith("val/") and "accuracy" in name)
+            if name == "train/mean_loss"
+            or (name.startswith("val/") and name.endswith(f"/{self.score}"))
         }
         shown = "  ".join(f"{name} {value:.4f}" for name, value in numbers.items())
         print(f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}  {shown}", flush=True)
 
 
-def standard(folder: Path, logged: bool) -> list[Callback]:
+def standard(folder: Path, logged: bool, score: str) -> list[Callback]:
     """Return the callbacks of every run.
 
     Args:
         folder: the run's folder; checkpoints go to ``checkpoints/last.ckpt`` below it.
         logged: whether there is a logger for the learning rate.
+        score: the task's metric.
     """
     checkpoints = folder / "checkpoints"
-    progress: Callback = RichProgressBar(leave=False) if sys.stdout.isatty() else EpochLines()
+    progress: Callback = RichProgressBar(leave=False) if sys.stdout.isatty() else EpochLines(score)
     rate = [LearningRateMonitor("step")] if logged else []
     return [
         *rate,

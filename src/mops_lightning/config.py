@@ -23,6 +23,7 @@ RUN_KEYS = (
     "out",
     "cache",
     "epochs",
+    "schedules",
     "augment",
     "pretrain",
     "paper",
@@ -97,6 +98,12 @@ def build(node: Any, **extra: Any) -> Any:
                 raise UserError(f"trainer: {cause} Try trainer=auto or trainer=cpu.") from None
             cause = cause.__cause__
         raise
+
+
+def accepted(node: DictConfig, offered: dict[str, Any]) -> dict[str, Any]:
+    """Return those of the offered arguments that a node's constructor takes."""
+    parameters = signature(str(node["_target_"]), "")
+    return {name: value for name, value in offered.items() if name in parameters}
 
 
 def check(cfg: DictConfig) -> None:

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import numpy as np
 import torch
+from lightning.fabric.utilities import move_data_to_device
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
@@ -24,19 +26,19 @@ DENSE_PIXELS = 2**20
 
 
 class DrawClouds(Callback):
-    """Draws a fixed set of clouds with every readout, and S with SᵀS.
+    """Draws a fixed set of clouds with every readout, S with SᵀS, and what the task draws.
 
     TensorBoard gets them about ten times in a run and after the test; the run's folder gets PNGs
     after the test.
 
     Args:
-        points: ``(K, N, 3)`` clouds to draw.
-        titles: one per cloud.
+        batch: the test clouds to draw, as the task takes them.
+        titles: one per cloud of the dataset.
         folder: where the PNGs go.
     """
 
-    def __init__(self, points: Tensor, titles: Sequence[str], folder: Path) -> None:
-        self.points = points
+    def __init__(self, batch: Any, titles: Sequence[str], folder: Path) -> None:
+        self.batch = batch
         self.titles = list(titles)
         self.folder = folder
 
@@ -52,25 +54,28 @@ class DrawClouds(Callback):
 
     @torch.no_grad()
     def _draw(self, trainer: L.Trainer, module: L.LightningModule, folder: Path | None) -> None:
-        sampler = module.sampler
         board = trainer.logger if isinstance(trainer.logger, TensorBoardLogger) else None
-        if sampler is None or (board is None and folder is None):
+        if board is None and folder is None:
             return
+        sampler: Any = module.sampler
+        task: Any = module.task
+        m: Any = module.m
         training = module.training
         module.eval()
-        points = self.points.to(module.device)
-        m: int = module.m  # type: ignore[assignment]
-        readouts = BatchReadouts(sampler, {}, (m,))  # type: ignore[arg-type]
-        sampled = {
-            name: readouts.sample_as(name, m)(points).points
-            for name in readout_names(sampler)  # type: ignore[arg-type]
-        }
-        matrix = readouts.outputs(m)[0][1].matrix
+        batch = move_data_to_device(self.batch, module.device)
+        readouts = BatchReadouts(sampler, {}, (m,))
+        samples = {name: readouts.sample_as(name, m) for name in readout_names(sampler)}
+        figures = task.figures(batch, samples, self.titles)
+        titles = task.cloud_titles(self.titles)
+        sampled = {}
+        if sampler is not None:
+            sampled = {name: sample(batch.points).points for name, sample in samples.items()}
+            figures["clouds"] = cloud_grid(batch.points, sampled, titles)
+            matrix = readouts.outputs(m)[0][1].matrix
+            if matrix is not None and batch.points.shape[1] * len(matrix.queries) <= DENSE_PIXELS:
+                first = matrix._replace(keys=matrix.keys[:1])
+                figures["matrix"] = matrix_figure(first.dense()[0], first.gram()[0], titles[0])
         module.train(training)
-        figures = {"clouds": cloud_grid(points, sampled, self.titles)}
-        if matrix is not None and points.shape[1] * len(matrix.queries) <= DENSE_PIXELS:
-            first = matrix._replace(keys=matrix.keys[:1])
-            figures["matrix"] = matrix_figure(first.dense()[0], first.gram()[0], self.titles[0])
         step = trainer.global_step
         for name, figure in figures.items():
             if folder is not None:
@@ -78,9 +83,9 @@ class DrawClouds(Callback):
             if board is not None:
                 board.experiment.add_figure(name, figure, step)
         if board is not None:
-            for name, samples in sampled.items():
-                for number, title in enumerate(self.titles):
-                    vertices, colours = _coloured(points[number], samples[number], name)
+            for name, chosen in sampled.items():
+                for number, title in enumerate(titles):
+                    vertices, colours = _coloured(batch.points[number], chosen[number], name)
                     board.experiment.add_mesh(
                         f"{name}/{number}_{title}",
                         vertices=vertices,

@@ -118,16 +118,17 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
     """
     record = trained_run(Path(cfg.evaluate))
     folder = Path(cfg.evaluate.removesuffix(records.FILE))
-    _same_settings(cfg, record, folder)
+    _same_settings(cfg, record, folder, experiment.task)
     notes = record["notes"]
-    if cfg.weights == OF_RUN and notes.get("dataset_fingerprint") != dataset.fingerprint:
+    told = experiment.task.tells_classes
+    if told and cfg.weights == OF_RUN and notes.get("dataset_fingerprint") != dataset.fingerprint:
         same_classes(notes.get("class_names"), dataset, f"{KEY}: {folder}")
     assert experiment.sampler is not None  # learn=nothing builds one
     try:
         content = weights.load_into(experiment.sampler, folder / weights.FILE)
     except UserError as error:
         raise UserError(f"{KEY}: the sampler of {folder} cannot be had: {error}") from None
-    if cfg.weights == OF_RUN:
+    if cfg.weights == OF_RUN and any(True for _ in experiment.task.parameters()):
         _load_task(experiment.task, folder, record)
     return {
         "run": str(folder),
@@ -185,7 +186,9 @@ def _load_task(task: torch.nn.Module, folder: Path, record: dict[str, Any]) -> N
     weights.fit_state(task, own, path)
 
 
-def _same_settings(cfg: DictConfig, record: dict[str, Any], folder: Path) -> None:
+def _same_settings(
+    cfg: DictConfig, record: dict[str, Any], folder: Path, task: torch.nn.Module
+) -> None:
     there = record["config"]
     here: Any = OmegaConf.to_container(cfg, resolve=True)
     for group in ("task", "sampler"):
@@ -195,7 +198,8 @@ def _same_settings(cfg: DictConfig, record: dict[str, Any], folder: Path) -> Non
                 f"{KEY}: {folder} was trained with {group}={old}, got {group}={new}. "
                 f"Leave {group} out, or name a run with {group}={new}."
             )
-    if here["names"]["net"] != there["names"]["net"] and cfg.weights == OF_RUN:
+    weightless = not any(True for _ in task.parameters())
+    if here["names"]["net"] != there["names"]["net"] and cfg.weights == OF_RUN and not weightless:
         raise UserError(
             f"{KEY}: the task net of {folder} is {there['names']['net']}; for "
             f"task/net={here['names']['net']} give its weights too: weights=auto or a file."

@@ -2,22 +2,23 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 import lightning as L
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
-from torchmetrics import MeanMetric, MetricCollection
+from torchmetrics import MeanMetric
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics import SET_METRICS
 from mops_lightning.readout_names import FULL, SOFT_PROJECTED, size_prefix
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.scoring import BatchReadouts, Sample, full_cloud, readout_names
+from mops_lightning.scoring import BatchReadouts, full_cloud, readout_names
 from mops_lightning.seeding import derive_seed
-from mops_lightning.types import Batch, TaskOutput
+from mops_lightning.tasks.base import Task
+from mops_lightning.types import Batch
 
 CHECKPOINT_KEY = "mops_lightning"
 """Where a checkpoint keeps the identity of its run."""
@@ -25,26 +26,11 @@ CHECKPOINT_KEY = "mops_lightning"
 Learn = Literal["task", "sampler", "joint", "nothing"]
 
 
-class Task(Protocol):
-    """What a task module offers; see ``tasks``."""
-
-    score: str
-    net: nn.Module
-
-    def step(self, batch: Any, sample: Sample) -> TaskOutput:
-        """Return losses, predictions and targets of one batch."""
-        ...
-
-    def metrics(self) -> MetricCollection:
-        """Return new metrics that take predictions and targets."""
-        ...
-
-
 class Experiment(L.LightningModule):
     """Trains the sampler, the task net or both, and scores every readout.
 
     Args:
-        task: an ``nn.Module`` that is a ``Task``.
+        task: see ``tasks``.
         sampler: None only for ``learn="task"``, which does not use it.
         learn: what is trained. The rest is frozen: no gradients, evaluation mode.
         make_optimizer: from parameters to optimizer; not needed for testing only.
@@ -57,12 +43,13 @@ class Experiment(L.LightningModule):
         m: the size that is validated and whose score stands for the run; None: the sampler's.
 
     Raises:
-        UserError: ``learn`` is unknown, or the sampler that it needs is missing.
+        UserError: ``learn`` is unknown, the sampler that it needs is missing, or the task net lets
+            no gradient through.
     """
 
     def __init__(
         self,
-        task: nn.Module,
+        task: Task,
         sampler: Sampler | None = None,
         learn: Learn = "sampler",
         make_optimizer: Callable[..., Optimizer] | None = None,
@@ -79,7 +66,14 @@ class Experiment(L.LightningModule):
             raise UserError(f"learn: unknown value {learn!r}.{did_you_mean(learn, allowed)}")
         if sampler is None and learn != "task":
             raise UserError(f"learn={learn} needs a sampler; without one only learn=task works.")
-        self.task: Any = task
+        learns = learn == "task" or (sampler.learned and learn != "nothing")  # type: ignore[union-attr]
+        if learns and not getattr(task.net, "differentiable", True):
+            raise UserError(
+                f"learn={learn}: {type(task.net).__name__} has no weights and lets no gradient "
+                "through. Train under another task/net and test with evaluate=RUN, or choose a "
+                "sampler that needs no training, such as sampler=fps."
+            )
+        self.task: Task = task
         self.sampler = None if learn == "task" else sampler
         self.baselines = nn.ModuleDict({} if learn == "task" else dict(baselines or {}))
         self.learn = learn
@@ -96,7 +90,7 @@ class Experiment(L.LightningModule):
         self.score_name = f"test/{self._prefix(self.m)}{self.own_readouts[0]}/{self.task.score}"
         readouts = dict.fromkeys([*self.own_readouts, *self.baselines])
         keys = [f"{self._prefix(size)}{name}" for size in self.sizes for name in readouts]
-        make_metrics: Any = task.metrics
+        make_metrics = task.metrics
         self.scores = nn.ModuleDict({key: make_metrics() for key in (*keys, *readouts, FULL)})
         self.train_scores = make_metrics()
         self.set_metrics = nn.ModuleDict(

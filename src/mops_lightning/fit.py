@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from mops_lightning import callbacks
-from mops_lightning.config import build
+from mops_lightning.config import accepted, build
 from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.draw import DrawClouds
@@ -25,6 +25,7 @@ from mops_lightning.malloc import keep_freed_memory
 from mops_lightning.readout_names import parse
 from mops_lightning.seeding import derive_seed, generator
 from mops_lightning.sizes import sizes_to_test
+from mops_lightning.tasks.base import Task
 
 HARMLESS = (
     ".*does not have many workers.*",  # the data lie in memory; workers would only copy them
@@ -57,10 +58,13 @@ def fit(
         cfg.batch_size,
         shuffle=True,
         augment=Augmentation(**cfg.augment[cfg.learn]),
+        make_batch=experiment.task.make_batch,
         drop_last=True,
         seed=cfg.seed,
     )
-    validation = CloudLoader(held_out, cfg.batch_size) if len(held_out.labels) else None
+    validation = None
+    if len(held_out.labels):
+        validation = _scored(held_out, cfg.batch_size, experiment.task)
     # A small data set has fewer batches than lie between two logged ones.
     every = min(trainer.log_every_n_steps, len(loader))  # type: ignore[attr-defined]
     trainer.log_every_n_steps = every  # type: ignore[attr-defined]
@@ -73,10 +77,16 @@ def test(
 ) -> dict[str, float]:
     """Score all test clouds and return the metrics as one flat map."""
     with _interruptible():
-        trainer.test(experiment, CloudLoader(dataset.test, cfg.batch_size), verbose=False)
+        loader = _scored(dataset.test, cfg.batch_size, experiment.task)
+        trainer.test(experiment, loader, verbose=False)
     metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
     log_hparams(trainer, cfg, _headline(metrics, experiment))
     return metrics
+
+
+def _scored(clouds: Clouds, batch_size: int, task: Task) -> CloudLoader:
+    """Return a loader whose batches are the same in every epoch and for every method."""
+    return CloudLoader(clouds, batch_size, make_batch=task.make_batch, seed=task.test_seed)
 
 
 def _headline(metrics: dict[str, float], experiment: Experiment) -> dict[str, float]:
@@ -102,12 +112,13 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     """Build task, sampler and baselines, each from a seed of its own."""
     classes = len(dataset.class_names)
     L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
-    net = build(cfg.task.net, num_classes=classes)
-    task = build(cfg.task, net=net, num_classes=classes)
+    offered = {"num_classes": classes}
+    net = build(cfg.task.net, **accepted(cfg.task.net, offered))
+    task: Task = build(cfg.task, net=net, **accepted(cfg.task, offered))
     # A seed of its own: the sampler's first weights must not hang on the size of the task net.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
     sampler = build(cfg.sampler) if cfg.learn != "task" else None
-    points = dataset.test.points.shape[1]
+    points = task.points_of(dataset.test.points.shape[1])
     sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, points, training=cfg.learn != "nothing")
     baselines = {}
     if sampler is not None and sampler.learned:
@@ -129,7 +140,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     )
 
 
-def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> L.Trainer:
+def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset, task: Task) -> L.Trainer:
     """Build the trainer with this run's callbacks and logger."""
     for name in ("lightning.pytorch", "lightning.fabric", "lightning"):
         # Under Hydra each line would come twice, once from Lightning's own handler.
@@ -139,13 +150,17 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> L.Trai
         warnings.filterwarnings("ignore", message=message)
     keep_freed_memory()
     logger = build(cfg.logger, save_dir=str(folder)) if cfg.get("logger") else False
-    shown = choose_shown(dataset, cfg.pictures)
+    rows, titles = choose_shown(dataset, cfg.pictures)
+    drawing = []
+    if titles:
+        batch = _scored(dataset.test, cfg.batch_size, task).batch_of(rows)
+        drawing = [DrawClouds(batch, titles, folder / "pictures")]
     return build(
         cfg.trainer,
         logger=logger,
         callbacks=[
-            *callbacks.standard(folder, logged=bool(logger)),
-            *([DrawClouds(*shown, folder / "pictures")] if shown else []),
+            *callbacks.standard(folder, logged=bool(logger), score=task.score),
+            *drawing,
         ],
         default_root_dir=str(folder),
         num_sanity_val_steps=0,
@@ -154,15 +169,14 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> L.Trai
     )
 
 
-def choose_shown(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str]] | None:
-    """Return test clouds of different classes, spread over all classes, and their names."""
+def choose_shown(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str]]:
+    """Return rows of test clouds of different classes, spread over all classes, and their names."""
     labels = dataset.test.labels
     wanted = torch.linspace(0, len(dataset.class_names) - 1, max(number, 1)).round().long()
     rows = [int((labels == label).nonzero()[0]) for label in wanted.unique() if label in labels]
     rows = rows[:number]
-    if not rows:
-        return None
-    return dataset.test.points[rows], [dataset.class_names[int(labels[row])] for row in rows]
+    names = [dataset.class_names[int(labels[row])] for row in rows]
+    return torch.tensor(rows, dtype=torch.int64), names
 
 
 def log_hparams(trainer: L.Trainer, cfg: DictConfig, metrics: dict[str, float]) -> None:

@@ -1,4 +1,4 @@
-"""Losses that are no part of a task: pure functions.
+"""Losses that are no part of a task, and distances of clouds: pure functions.
 
 Nested samplers are trained at several sizes of one sample, whose first m points count for size m.
 The functions in the plural give the losses of all sizes for little more than the largest costs.
@@ -75,3 +75,19 @@ def simplification_losses(
         weight = coverage + coverage_per_point * m
         losses[m] = (there + weight * from_cloud.mean(1)).mean()
     return losses
+
+
+def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
+    """Return the squared chamfer distance of two clouds, both directions, each a mean over points.
+
+    CD(P, Q) = 1/|P| Σ_p min_q ‖p − q‖² + 1/|Q| Σ_q min_p ‖q − p‖². The search runs in blocks, so
+    memory does not grow with |P|·|Q|; gradients flow to both clouds through the nearest points.
+
+    Args:
+        points: ``(B, N, 3)`` the clouds P.
+        others: ``(B, M, 3)`` the clouds Q.
+
+    Returns:
+        ``(B,)`` in squared units of the coordinates.
+    """
+    return nearest(points, others)[0].mean(1) + nearest(others, points)[0].mean(1)

@@ -34,7 +34,7 @@ def cloud_grid(points: Tensor, readouts: Mapping[str, Tensor], titles: Sequence[
     columns = {"input": None, **readouts}
     figure = Figure(figsize=(2.6 * len(columns), 2.6 * len(points)), layout="tight")
     FigureCanvasAgg(figure)
-    for row, cloud in enumerate(_upright(points)):
+    for row, cloud in enumerate(upright(points)):
         for column, (name, samples) in enumerate(columns.items()):
             axes = figure.add_subplot(
                 len(points), len(columns), row * len(columns) + column + 1, projection="3d"
@@ -49,8 +49,8 @@ def cloud_grid(points: Tensor, readouts: Mapping[str, Tensor], titles: Sequence[
             )
             if samples is not None:
                 colour = np.array(COLOURS.get(name, COLOURS["sampled"])) / 255
-                axes.scatter(*_upright(samples)[row].T, s=22, color=colour, depthshade=False)
-            _frame(axes, cloud)
+                axes.scatter(*upright(samples)[row].T, s=22, color=colour, depthshade=False)
+            frame_cloud(axes, cloud)
             if row == 0:
                 axes.set_title(name, fontsize=11)
             if column == 0:
@@ -90,13 +90,13 @@ def save_figure(figure: Figure, path: Path) -> Path:
     return path
 
 
-def _upright(points: Tensor) -> np.ndarray:
+def upright(points: Tensor) -> np.ndarray:
     """Turn y-up clouds into matplotlib's z-up ones."""
     array = points.detach().cpu().float().numpy()
     return np.stack([array[..., 0], -array[..., 2], array[..., 1]], -1)
 
 
-def _frame(axes: object, cloud: np.ndarray) -> None:
+def frame_cloud(axes: object, cloud: np.ndarray) -> None:
     """Show equal scales and nothing but the points."""
     centre, reach = (cloud.max(0) + cloud.min(0)) / 2, np.ptp(cloud, axis=0).max() / 2 or 1.0
     for name, middle in zip("xyz", centre, strict=True):

@@ -20,11 +20,15 @@ from mops_lightning.weights import FILE
 def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
     """Return the file that ``weights`` means; ``auto`` trains the net when it is not cached.
 
+    With ``learn=task`` a file is where the training starts from; ``auto`` starts anew.
+
     Returns:
         None for ``weights=null``, which leaves the net as it was initialised, for a resumed run,
         whose checkpoint holds the task net as well, and for the net of an evaluated run.
     """
     if cfg.weights in (None, OF_RUN) or cfg.ckpt_path is not None:
+        return None
+    if cfg.weights == "auto" and cfg.learn == "task":
         return None
     if cfg.weights != "auto":
         return Path(cfg.weights)
@@ -46,6 +50,7 @@ def task_config(cfg: DictConfig) -> DictConfig:
         if cfg.learn != "task":
             own.trainer.max_epochs = cfg.pretrain.max_epochs
             own.optimizer = cfg.pretrain.optimizer
+            own.weights = "auto"
         own.learn = "task"
         own.ckpt_path = None
         own.evaluate = None
@@ -70,7 +75,8 @@ def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
 def publish(cfg: DictConfig, weights: Path, dataset: CloudDataset) -> None:
     """Copy a task net trained with ``learn=task`` into the cache, unless one is there.
 
-    Not for a run that was made longer by resuming it: its learning rate went another way.
+    Not for a run that was made longer by resuming it, for its learning rate went another way, and
+    not for one that began with given weights.
     """
     target = cache_folder(cfg, dataset) / FILE
     if not target.exists():

@@ -13,7 +13,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from mops_lightning import records
+from mops_lightning import records, units
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.io import atomic_write
 from mops_lightning.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT, parse
@@ -26,7 +26,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Write ``table.md`` into the folder and print it."""
     parser = argparse.ArgumentParser(prog="python -m mops_lightning.report", description=__doc__)
     parser.add_argument("folder", type=Path, help="a run, a sweep, or any folder above records")
-    parser.add_argument("--metric", default="accuracy", help="name behind the readout")
+    parser.add_argument("--metric", help="name behind the readout; by default the task's score")
     chosen = parser.parse_args(arguments)
     try:
         text = table(chosen.folder, chosen.metric)
@@ -40,8 +40,12 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"written to {path}")
 
 
-def table(folder: Path, metric: str = "accuracy") -> str:
+def table(folder: Path, metric: str | None = None) -> str:
     """Return a Markdown table of all completed records below ``folder``.
+
+    Args:
+        folder: the records' folder.
+        metric: what is shown; None: the score of the records' task.
 
     Raises:
         UserError: there is no record, or records of different tasks, data or task weights, whose
@@ -62,19 +66,20 @@ def table(folder: Path, metric: str = "accuracy") -> str:
         raise UserError(f"{folder}: none of its {len(found)} runs is completed.")
     scored = [record for record in done if record["config"]["learn"] != "task"] or done
     names = _common(scored)
+    metric = metric or _score(scored)
     cells: Cells = {}
     own: set[tuple[str, int]] = set()
     for record in scored:
-        _add(cells, own, record, metric)
+        _add(cells, own, record, metric, names["net"])
     if not cells:
         known = {parts.metric for r in scored for parts in map(parse, r["metrics"]) if parts}
         raise UserError(
             f"--metric: no run below {folder} has {metric!r}.{did_you_mean(metric, known)}"
         )
     sizes = sorted({m for values in cells.values() for m in values}, reverse=True)
-    paper = _paper(names["task"], names["dataset"], metric)
+    paper = _paper(names, metric)
     lines = [
-        f"Test {metric.replace('_', ' ')} in %, {names['task']} on {names['dataset']} under "
+        f"Test {units.title(metric)}, {names['task']} on {names['dataset']} under "
         f"{names['net']}: generated / matched / completed sets, or one figure for samplers that "
         "choose input points.",
         "",
@@ -82,7 +87,8 @@ def table(folder: Path, metric: str = "accuracy") -> str:
         "|---|" + "--:|" * len(sizes),
     ]
     for sampler in sorted(cells, key=_place):
-        lines.append(_row(sampler, [_figures(cells[sampler].get(m)) for m in sizes]))
+        figures = [_figures(metric, cells[sampler].get(m)) for m in sizes]
+        lines.append(_row(sampler, figures))
         if any(str(m) in paper.get("rows", {}).get(sampler, {}) for m in sizes):
             lines.append(_row("*the paper's*", [_paper_figures(paper, sampler, m) for m in sizes]))
     lines += ["", *_full(scored, names["net"], metric, paper)]
@@ -110,7 +116,9 @@ ORDER = (
 
 
 def _place(sampler: str) -> tuple[int, str]:
-    return (ORDER.index(sampler) if sampler in ORDER else len(ORDER)), sampler
+    name = sampler.rsplit(" ", 1)[-1]  # behind "icp on"
+    place = ORDER.index(name) if name in ORDER else len(ORDER)
+    return place + len(ORDER) * (name != sampler) * 2, sampler
 
 
 def _row(label: str, figures: list[str]) -> str:
@@ -127,18 +135,25 @@ def _full(found: list[dict[str, Any]], net: str, metric: str, paper: dict[str, A
             f" after joint training with {record['config']['names']['sampler']}" if joint else ""
         )
         if value is not None:
-            lines[f"{net} on all points{with_}: {_number(value)}{published}."] = None
+            here = record["config"]["names"]["net"]
+            shown = f"{units.figure(metric, value)}{published if here == net else ''}"
+            lines[f"{here} on all points{with_}: {shown}."] = None
     return list(lines)
 
 
 def _common(found: list[dict[str, Any]]) -> dict[str, str]:
-    """Return the names of task, net and data, which all records must share."""
+    """Return the names of task, net and data, which all records must share.
+
+    A net without weights, such as ICP, may stand beside the trained one.
+    """
+    trained = [r for r in found if not _weightless(r)] or found
     keys = {
         "task": {r["config"]["names"]["task"] for r in found},
-        "net": {r["config"]["names"]["net"] for r in found},
+        "net": {r["config"]["names"]["net"] for r in trained},
         "dataset": {r["config"]["names"]["dataset"] for r in found},
         "data (dataset_fingerprint)": {r["notes"].get("dataset_fingerprint") for r in found},
-        "what learned (learn)": {_learned(r) for r in found},
+        "pairs (task.pairs)": {_pairs(r) for r in found},
+        "what learned (learn)": {_learned(r) for r in trained},
         "task weights (sha256)": {r["notes"].get("task_weights_sha256") for r in found},
     }
     for what, values in keys.items():
@@ -151,20 +166,42 @@ def _common(found: list[dict[str, Any]]) -> dict[str, str]:
     return {what: next(iter(values - {None}), "") for what, values in keys.items()}
 
 
+def _weightless(record: dict[str, Any]) -> bool:
+    """Return whether the task net has no weights: none were noted, and none were trained."""
+    learns = record["config"]["learn"] in ("task", "joint")
+    return not learns and "task_weights_sha256" not in record["notes"]
+
+
+def _pairs(record: dict[str, Any]) -> str | None:
+    pairs = record["config"]["task"].get("pairs")
+    return None if pairs is None else json.dumps(pairs, sort_keys=True)
+
+
+def _score(found: list[dict[str, Any]]) -> str:
+    """Return the metric that the records' tasks are scored by."""
+    scores = [parse(record["notes"].get("score", "")) for record in found]
+    return next((parts.metric for parts in scores if parts), "accuracy")
+
+
 def _learned(record: dict[str, Any]) -> str:
     """Return whether the task net learned with the sampler, in the run that was evaluated too."""
     learn = (record["notes"].get("evaluated") or {}).get("learn", record["config"]["learn"])
     return "joint" if learn == "joint" else "sampler alone"
 
 
-def _add(cells: Cells, own: set[tuple[str, int]], record: dict[str, Any], metric: str) -> None:
+def _add(
+    cells: Cells, own: set[tuple[str, int]], record: dict[str, Any], metric: str, net: str
+) -> None:
     """Put a record's figures into the cells; a run of the sampler itself beats a baseline row.
+
+    What another net than ``net`` made of a sampler's points is a row of its own.
 
     Raises:
         UserError: two runs would stand in one cell, where one would hide the other.
     """
     config = record["config"]
-    sampler = config["names"]["sampler"]
+    other = "" if config["names"]["net"] == net else f"{config['names']['net']} on "
+    sampler = other + config["names"]["sampler"]
     taken = set()
     for name, value in record["metrics"].items():
         parts = parse(name)
@@ -173,8 +210,9 @@ def _add(cells: Cells, own: set[tuple[str, int]], record: dict[str, Any], metric
         m = parts.m or config["m"]
         if parts.readout not in (INDEX_READOUT, *GENERATED_READOUTS):
             # After joint training each run has a task net, and baselines under it, of its own.
-            if (parts.readout, m) not in own and _learned(record) != "joint":
-                cells.setdefault(parts.readout, {})[m] = {INDEX_READOUT: value}
+            row = other + parts.readout
+            if (row, m) not in own and _learned(record) != "joint":
+                cells.setdefault(row, {})[m] = {INDEX_READOUT: value}
             continue
         if (sampler, m) in own:
             raise UserError(
@@ -188,11 +226,13 @@ def _add(cells: Cells, own: set[tuple[str, int]], record: dict[str, Any], metric
     own |= taken
 
 
-def _paper(task: str, dataset: str, metric: str) -> dict[str, Any]:
+def _paper(names: dict[str, str], metric: str) -> dict[str, Any]:
     """Return the paper's figures for a table, if it has any for this task, data and metric."""
     text = files("mops_lightning").joinpath("paper.json").read_text()
-    entry = json.loads(text).get(task, {})
-    return entry if (entry.get("dataset"), entry.get("metric")) == (dataset, metric) else {}
+    joint = names["what learned (learn)"] == "joint"
+    entry = json.loads(text).get(names["task"] + ("_joint" if joint else ""), {})
+    fits = (entry.get("dataset"), entry.get("metric")) == (names["dataset"], metric)
+    return entry if fits else {}
 
 
 def _paper_figures(paper: dict[str, Any], sampler: str, m: int) -> str:
@@ -200,14 +240,10 @@ def _paper_figures(paper: dict[str, Any], sampler: str, m: int) -> str:
     return " / ".join(f"{value:.2f}" for value in values)
 
 
-def _figures(values: dict[str, float] | None) -> str:
+def _figures(metric: str, values: dict[str, float] | None) -> str:
     values = values or {}
     shown = [values[name] for name in (INDEX_READOUT, *GENERATED_READOUTS) if name in values]
-    return " / ".join(map(_number, shown))
-
-
-def _number(value: float) -> str:
-    return f"{100 * value:.2f}"
+    return " / ".join(units.figure(metric, value) for value in shown)
 
 
 def _how(found: Iterable[dict[str, Any]]) -> list[str]:

@@ -73,27 +73,30 @@ def fit_and_test(
         "lengthened": checkpoint is not None and resume.lengthened(cfg, checkpoint),
         **dataset.notes,
     }
+    experiment = make_experiment(cfg, dataset, identity)
+    task = experiment.task
+    has_weights = any(True for _ in task.parameters())
     task_weights = None
-    if cfg.learn != "task":
+    if has_weights:
         with timed(record, "pretrain"):
             task_weights = pretrain.task_weights(cfg, dataset)
-    experiment = make_experiment(cfg, dataset, identity)
     if task_weights is not None:
-        content = weights.load_into(experiment.task, task_weights)
-        if content.get("classes"):
+        content = weights.load_into(task, task_weights)
+        record["notes"]["weights_loaded"] = content["sha256"]
+        if task.tells_classes and content.get("classes"):
             evaluate.same_classes(content["classes"], dataset, f"weights: {task_weights}")
     if cfg.evaluate:
         record["notes"]["evaluated"] = evaluate.load(cfg, experiment, dataset)
     elif cfg.learn == "nothing" and experiment.sampler is not None and experiment.sampler.learned:
         raise UserError("learn=nothing needs a trained sampler: give its run with evaluate=RUN.")
-    trainer = make_trainer(cfg, folder, dataset)
+    trainer = make_trainer(cfg, folder, dataset, task)
     record["device"] = device_name(trainer)
     if experiment.trainable:
         with timed(record, "fit"):
             fit(cfg, trainer, experiment, dataset, checkpoint)
-    if cfg.learn in ("sampler", "nothing"):
+    if cfg.learn in ("sampler", "nothing") and has_weights:
         # A resumed run has its task net from the checkpoint, not from a weights file.
-        record["notes"]["task_weights_sha256"] = weights.digest(experiment.task.state_dict())
+        record["notes"]["task_weights_sha256"] = weights.digest(task.state_dict())
     with timed(record, "test"):
         record["metrics"] = test(cfg, trainer, experiment, dataset)
     for kind, name in OUTPUTS.items():
@@ -101,17 +104,18 @@ def fit_and_test(
             record["files"][kind] = name
     record["score"] = record["metrics"][experiment.score_name]
     record["notes"]["score"] = experiment.score_name
-    learned = {
-        "task": {weights.FILE: experiment.task},
+    learned: dict[str, dict[str, Any]] = {
+        "task": {weights.FILE: task},
         "sampler": {weights.FILE: experiment.sampler},
     }
-    learned["joint"] = {**learned["sampler"], "task_weights.pt": experiment.task}
+    learned["joint"] = {**learned["sampler"], "task_weights.pt": task}
     if experiment.trainable:
         for name, module in learned[cfg.learn].items():
-            classes = dataset.class_names if module is experiment.task else ()
+            classes = dataset.class_names if module is task and task.tells_classes else ()
             weights.save(folder / name, module, record["config"], record["metrics"], classes)
             record["files"][Path(name).stem] = name
-    if cfg.learn == "task" and not record["notes"]["lengthened"]:
+    anew = not record["notes"]["lengthened"] and task_weights is None
+    if cfg.learn == "task" and anew:
         pretrain.publish(cfg, folder / weights.FILE, dataset)
 
 

@@ -1,6 +1,6 @@
 """The readouts of a batch: what a user may take as the sampled set."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -9,9 +9,8 @@ from mops_lightning.geometry import gather_points
 from mops_lightning.readout import complete, match
 from mops_lightning.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.tasks.base import Sample
 from mops_lightning.types import SampleOutput
-
-Sample = Callable[[Tensor], SampleOutput]
 
 
 def full_cloud(points: Tensor) -> SampleOutput:

@@ -6,6 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from mops_lightning import units
 from mops_lightning.readout_names import FULL, ROWS, parse
 from mops_lightning.records import FILE
 
@@ -69,29 +70,19 @@ def results_table(record: dict[str, Any]) -> tuple[str, Table]:
     if several:
         columns = list(next(iter(rows.values())))
         rows[FULL] = dict.fromkeys(columns, next(iter(rows[FULL].values())))
-        what = several.replace("_", " ") + (" in %" if _is_share(several) else "")
+        what = units.title(several)
     table = Table()
     table.add_column("sampled by")
     for column in columns:
-        table.add_column(column.replace("_", " "), justify="right")
+        table.add_column(column if several else units.title(column), justify="right")
     for readout, row in rows.items():
         values = [row.get(column) for column in columns]
         if all(value is None for value in values):
             continue  # figures of the set alone
         label = f"{names['sampler']} {readout}" if readout in ROWS[:-1] else readout
         cells = [
-            "" if value is None else _number(several or column, value, unit=not several)
+            "" if value is None else units.figure(several or column, value)
             for column, value in zip(columns, values, strict=True)
         ]
         table.add_row("all points" if readout == FULL else label, *cells)
     return f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test", table
-
-
-def _is_share(metric: str) -> bool:
-    return "accuracy" in metric
-
-
-def _number(metric: str, value: float, unit: bool) -> str:
-    if _is_share(metric):
-        return f"{100 * value:.2f}" + (" %" if unit else "")
-    return f"{value:.4g}"

@@ -24,6 +24,23 @@ class Batch(NamedTuple):
     labels: Tensor
 
 
+class PairBatch(NamedTuple):
+    """One batch of pairs for registration.
+
+    Attributes:
+        points: ``(2B, N, 3)`` the sources, then the targets, each with its centroid at the origin;
+            one tensor, so that a sampler sees all clouds in one pass.
+        centroids: ``(2B, 3)`` what was subtracted.
+        quaternion: ``(B, 4)`` rotation of the true motion from source to target, scalar first,
+        translation: ``(B, 3)`` and its translation; both are of the clouds before centring.
+    """
+
+    points: Tensor
+    centroids: Tensor
+    quaternion: Tensor
+    translation: Tensor
+
+
 class SampleOutput(NamedTuple):
     """What every sampler returns; a NamedTuple, so it survives device transfer and collation.
 

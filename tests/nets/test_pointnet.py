@@ -6,6 +6,7 @@ import torch
 from torch.nn import functional as F
 
 from mops_lightning.nets.pointnet import (
+    FEW_POINTS,
     PointFeatures,
     PointMaxPool,
     PointNetVanilla,
@@ -16,26 +17,29 @@ class PlainMaxPool(PointMaxPool):
     """The same layers, one after the other, with the whole (B, N, C) tensor."""
 
     def forward(self, features):
-        rows = F.relu(self.norm(self.linear(features.flatten(0, 1))))
+        rows = self.linear(features.flatten(0, 1))
+        rows = F.relu(rows if self.norm is None else self.norm(rows))
         return rows.unflatten(0, features.shape[:2]).amax(1)
 
 
-def pools(channels_in=6, channels_out=20):
+def pools(channels_in=6, channels_out=20, norm=True):
     torch.manual_seed(1)
-    fast = PointMaxPool(channels_in, channels_out).double()
-    with torch.no_grad():
-        # A negative gamma turns the maximum into a minimum.
-        fast.norm.weight.copy_(torch.randn(channels_out))
-        fast.norm.bias.copy_(torch.randn(channels_out))
-    plain = PlainMaxPool(channels_in, channels_out).double()
+    fast = PointMaxPool(channels_in, channels_out, norm).double()
+    if fast.norm is not None:
+        with torch.no_grad():
+            # A negative gamma turns the maximum into a minimum.
+            fast.norm.weight.copy_(torch.randn(channels_out))
+            fast.norm.bias.copy_(torch.randn(channels_out))
+    plain = PlainMaxPool(channels_in, channels_out, norm).double()
     plain.load_state_dict(fast.state_dict())
     return fast, plain
 
 
+@pytest.mark.parametrize("norm", [True, False])
 @pytest.mark.parametrize("training", [True, False])
-@pytest.mark.parametrize("points", [4, 6, 7, 50, 100])
-def test_max_pool_equals_its_plain_twin(points, training, rng):
-    fast, plain = pools()
+@pytest.mark.parametrize("points", [4, FEW_POINTS, FEW_POINTS + 1, 50, 100])
+def test_max_pool_equals_its_plain_twin(points, training, norm, rng):
+    fast, plain = pools(norm=norm)
     outputs, gradients = [], []
     features = torch.randn(3, points, 6, dtype=torch.float64, generator=rng)
     weight = torch.randn(3, 20, dtype=torch.float64, generator=rng)
@@ -47,18 +51,31 @@ def test_max_pool_equals_its_plain_twin(points, training, rng):
         out = net(x)
         outputs.append(out)
         gradients.append(torch.autograd.grad((out * weight).sum(), [x, *net.parameters()]))
-    torch.testing.assert_close(outputs[0], outputs[1])
+        with torch.no_grad():  # nothing has to be kept for gradients here
+            net.eval()
+            outputs.append(net(features))
+    torch.testing.assert_close(outputs[:2], outputs[2:])
     for got, want in zip(*gradients, strict=True):
         torch.testing.assert_close(got, want)
     for (name, got), want in zip(fast.named_buffers(), plain.buffers(), strict=True):
         torch.testing.assert_close(got, want, msg=name)
 
 
-def test_max_pool_gradcheck(rng):
-    net = pools(3, 5)[0]
-    features = torch.randn(2, 6, 3, dtype=torch.float64, generator=rng, requires_grad=True)
-    frozen = copy.deepcopy(net)
-    assert torch.autograd.gradcheck(frozen, (features,))
+@pytest.mark.parametrize("norm", [True, False])
+def test_max_pool_gradcheck(norm, rng):
+    net = copy.deepcopy(pools(3, 5, norm)[0])
+    size = (2, FEW_POINTS + 3, 3)
+    features = torch.randn(size, dtype=torch.float64, generator=rng, requires_grad=True)
+    assert torch.autograd.gradcheck(net, (features,))
+
+
+def test_max_pool_gives_a_frozen_layer_no_gradient_and_its_input_all(rng):
+    fast, plain = pools()
+    for net in (fast, plain):
+        net.requires_grad_(False).eval()
+    features = torch.randn(2, 60, 6, dtype=torch.float64, generator=rng, requires_grad=True)
+    got, want = (torch.autograd.grad(net(features).sum(), features)[0] for net in (fast, plain))
+    torch.testing.assert_close(got, want)
 
 
 def test_classifier_does_not_mind_order_or_batch(rng):
@@ -92,10 +109,11 @@ def test_features_are_local_and_their_maximum(rng):
 
 def test_pooling_never_takes_a_copy_that_only_fills_up(rng):
     # Copies of the first point may differ from it by a rounding error: many tries hit such a case.
-    for number in range(7, 40):
-        pool = PointMaxPool(6, 40).double().eval()
+    for number in range(FEW_POINTS + 1, FEW_POINTS + 40):
+        pool = PlainMaxPool(6, 40).double().eval()
         features = torch.randn(2, number, 6, dtype=torch.float64, generator=rng)
         features[:, 0] *= 5
-        plain = F.relu(pool.norm((features @ pool.linear.weight.mT).flatten(0, 1)))
-        expected = plain.unflatten(0, (2, number)).amax(1)
-        torch.testing.assert_close(pool(features), expected)
+        fast = PointMaxPool(6, 40).double().eval()
+        fast.load_state_dict(pool.state_dict())
+        features.requires_grad_()
+        torch.testing.assert_close(fast(features), pool(features))

@@ -1,11 +1,11 @@
 """Batches straight from memory: no worker processes, and an order that can be resumed."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.errors import UserError
@@ -35,7 +35,7 @@ class Augmentation:
                 f"got {self.jitter} and {self.jitter_clip}."
             )
 
-    def __call__(self, points: Tensor, rng: torch.Generator) -> Tensor:
+    def __call__(self, points: Tensor, rng: Generator) -> Tensor:
         """Return ``(B, N, 3)`` points, changed as the attributes say."""
         if self.rotate_up:
             angle = torch.rand(len(points), generator=rng) * (2 * torch.pi)
@@ -48,8 +48,15 @@ class Augmentation:
         return points
 
 
+FIXED, DRAWN = 11, 12
+"""Streams of random numbers for what tasks draw: the same in every epoch, or new ones."""
+
+MakeBatch = Callable[[Batch, Callable[[], list[Generator]]], Any]
+"""What a task makes of a batch, given one source of random numbers for each cloud."""
+
+
 class CloudLoader:
-    """An iterable of ``Batch`` over one split.
+    """An iterable over one split, of ``Batch`` or of what the task makes of it.
 
     What batch i of an epoch holds depends on the seed, the epoch and i only, so a resumed run sees
     what an unbroken one would have seen.
@@ -59,9 +66,11 @@ class CloudLoader:
         batch_size: clouds per batch.
         shuffle: new order every epoch; otherwise the order of the split.
         augment: None leaves the points alone.
+        make_batch: what the task makes of a batch; see ``tasks.base.Task.make_batch``. Without
+            ``shuffle`` it draws the same in every epoch.
         drop_last: leave out a last batch that is not full (BatchNorm cannot train on one cloud);
             never when there is no full one.
-        seed: of order and augmentation.
+        seed: of order, augmentation and what ``make_batch`` draws.
     """
 
     def __init__(
@@ -70,6 +79,7 @@ class CloudLoader:
         batch_size: int,
         shuffle: bool = False,
         augment: Augmentation | None = None,
+        make_batch: MakeBatch | None = None,
         drop_last: bool = False,
         seed: int = 0,
     ) -> None:
@@ -77,6 +87,7 @@ class CloudLoader:
         self.batch_size = batch_size
         self.shuffle = shuffle
         self.augment = augment
+        self.make_batch = make_batch
         self.seed = seed
         number = len(clouds.points)
         full = number // batch_size
@@ -102,7 +113,7 @@ class CloudLoader:
         self.epoch = state["epoch"]
         self.position = self.resume_at = state["position"]
 
-    def __iter__(self) -> Iterator[Batch]:
+    def __iter__(self) -> Iterator[Any]:
         # The body runs at the first batch, after set_epoch and load_state_dict have been called.
         epoch, number = self.epoch, len(self.clouds.points)
         start, self.resume_at = self.resume_at, 0
@@ -117,4 +128,15 @@ class CloudLoader:
                 points = self.augment(points, generator(self.seed, epoch, batch))
             last = batch + 1 == self.batches
             self.epoch, self.position = (epoch + 1, 0) if last else (epoch, batch + 1)
-            yield Batch(points, self.clouds.labels[chosen])
+            yield self._made(points, chosen, epoch)
+
+    def batch_of(self, rows: Tensor) -> Any:
+        """Return the given clouds ``(B,)`` as one batch, for a loader that does not shuffle."""
+        return self._made(self.clouds.points[rows], rows, 0)
+
+    def _made(self, points: Tensor, rows: Tensor, epoch: int) -> Any:
+        batch = Batch(points, self.clouds.labels[rows])
+        if self.make_batch is None:
+            return batch
+        stream = (DRAWN, self.seed, epoch) if self.shuffle else (FIXED, self.seed)
+        return self.make_batch(batch, lambda: [generator(*stream, row) for row in rows.tolist()])

@@ -6,31 +6,36 @@ Layers work on ``(B·N, C)`` rows: BatchNorm over rows is 1.6 times faster on a 
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from mops_lightning.geometry import GROUP, first_extreme
 
+FEW_POINTS = 32
+"""Up to here ``PointMaxPool`` computes the plain layers; on a CPU both ways are equal around it."""
 
-def linear_norm_relu(channels: Sequence[int]) -> nn.Sequential:
+
+def linear_norm_relu(channels: Sequence[int], norm: bool = True) -> nn.Sequential:
     """Stack linear layers, each followed by BatchNorm and ReLU.
 
     Args:
         channels: input size, then the output size of every layer.
+        norm: False leaves BatchNorm out.
 
     Returns:
-        A module from ``(rows, channels[0])`` to ``(rows, channels[-1])``. The linear layers have
-        no bias: BatchNorm would cancel it.
+        A module from ``(rows, channels[0])`` to ``(rows, channels[-1])``. Before BatchNorm the
+        linear layers have no bias: it would be cancelled.
     """
     layers: list[nn.Module] = []
     for before, after in pairwise(channels):
-        layers += [
-            nn.Linear(before, after, bias=False),
-            nn.BatchNorm1d(after),
-            nn.ReLU(inplace=True),
-        ]
+        layers += [nn.Linear(before, after, bias=not norm)]
+        layers += [nn.BatchNorm1d(after)] if norm else []
+        layers += [nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)
 
 
@@ -39,11 +44,12 @@ class PointMLP(nn.Module):
 
     Args:
         channels: input size, then the output size of every layer.
+        norm: False leaves BatchNorm out.
     """
 
-    def __init__(self, channels: Sequence[int]) -> None:
+    def __init__(self, channels: Sequence[int], norm: bool = True) -> None:
         super().__init__()
-        self.layers = linear_norm_relu(channels)
+        self.layers = linear_norm_relu(channels, norm)
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, N, channels[0])`` to ``(B, N, channels[-1])``."""
@@ -62,27 +68,32 @@ class PointMaxPool(nn.Module):
     Args:
         channels_in: C of the input.
         channels_out: C of the result.
+        norm: False leaves BatchNorm out; the linear layer then has a bias.
     """
 
-    def __init__(self, channels_in: int, channels_out: int) -> None:
+    def __init__(self, channels_in: int, channels_out: int, norm: bool = True) -> None:
         super().__init__()
-        self.linear = nn.Linear(channels_in, channels_out, bias=False)
-        self.norm = nn.BatchNorm1d(channels_out)
+        self.linear = nn.Linear(channels_in, channels_out, bias=not norm)
+        self.norm = nn.BatchNorm1d(channels_out) if norm else None
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, N, channels_in)`` to ``(B, channels_out)``."""
-        if features.shape[1] <= features.shape[2]:
-            # Fewer points than channels: the plain product is smaller than the gathered winners.
-            rows = F.linear(features.flatten(0, 1), self.linear.weight)
-            return F.relu(self.norm(rows).unflatten(0, features.shape[:2]).amax(1))
-        mean, scale = self._normalisation(features)
+        if features.shape[1] <= FEW_POINTS:
+            # For few points the plain product costs less than what finding winners adds to it.
+            rows = self.linear(features.flatten(0, 1))
+            rows = rows if self.norm is None else self.norm(rows)
+            return F.relu(rows.unflatten(0, features.shape[:2]).amax(1))
+        if self.norm is None:
+            rising = torch.zeros_like(self.linear.bias, dtype=torch.bool)
+            return F.relu(self._peaks(features, rising) + self.linear.bias)
+        mean, scale = self._normalisation(self.norm, features)
         peaks = self._peaks(features, (scale < 0).detach())
         assert self.norm.bias is not None
         return F.relu((peaks - mean) * scale + self.norm.bias)
 
-    def _normalisation(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def _normalisation(self, norm: nn.BatchNorm1d, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and gamma/std of the wide product, and update the running statistics."""
-        norm, weight = self.norm, self.linear.weight
+        weight = self.linear.weight
         assert norm.running_mean is not None
         assert norm.running_var is not None
         if not self.training:
@@ -105,23 +116,68 @@ class PointMaxPool(nn.Module):
 
     def _peaks(self, features: Tensor, falling: Tensor) -> Tensor:
         """Return, per cloud and channel, the extreme value of the product: ``(B, C)``."""
-        weight = self.linear.weight
-        with torch.no_grad():
-            search = torch.where(falling[:, None], -weight, weight)
-            if features.is_cuda:
-                winners = (search @ features.mT).argmax(2)
-            else:  # cloud by cloud the product stays in the cache
-                surplus = -features.shape[1] % GROUP
-                filled = torch.cat([features, features[:, :1].expand(-1, surplus, -1)], 1)
-                rows = [first_extreme(search @ cloud.mT, largest=True) for cloud in filled]
-                winners = torch.stack(rows).squeeze(2)
-                # A copy may beat the first point itself by a rounding error of the product.
-                winners.masked_fill_(winners >= features.shape[1], 0)
-        # Whole rows of the flat tensor: an index for every number takes three times as long.
-        clouds = torch.arange(len(features), device=features.device)
-        places = (winners + clouds[:, None] * features.shape[1]).flatten()
-        winning = features.flatten(0, 1).index_select(0, places).unflatten(0, winners.shape)
-        return (winning * weight).sum(-1)
+        sign = torch.where(falling, -1.0, 1.0).to(features)
+        return sign * _MaxOverPoints.apply(features, sign[:, None] * self.linear.weight)
+
+
+class _MaxOverPoints(Function):
+    """The maximum over points of a linear map: ``(B, N, D)`` and ``(C, D)`` to ``(B, C)``.
+
+    One point per cloud and channel wins, so both gradients are sums of few weighted rows: those of
+    the weight over the winners of a channel, those of the features over the channels that a point
+    has won. ``embedding_bag`` adds them up without the (B, C, D) tensor between.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, weight: Tensor) -> Tensor:
+        clouds, n, _ = features.shape
+        if not any(ctx.needs_input_grad):
+            return torch.stack([(weight @ cloud.mT).amax(1) for cloud in features])
+        if features.is_cuda:
+            peaks, winners = (weight @ features.mT).max(2)
+        else:  # cloud by cloud the product stays in the cache
+            filled = torch.cat([features, features[:, :1].expand(-1, -n % GROUP, -1)], 1)
+            peaks = features.new_empty(clouds, len(weight))
+            winners = torch.empty(clouds, len(weight), dtype=torch.int64)
+            for cloud, values, rows in zip(filled, peaks, winners, strict=True):
+                product = weight @ cloud.mT
+                place = first_extreme(product, largest=True)
+                values.copy_(product.gather(1, place)[:, 0])
+                rows.copy_(place[:, 0])
+            # A copy may beat the first point itself by a rounding error of the product.
+            winners.masked_fill_(winners >= n, 0)
+        ctx.save_for_backward(features, weight, winners)
+        return peaks
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        features, weight, winners = ctx.saved_tensors
+        (gradient,) = gradients
+        clouds, n, _ = features.shape
+        channels = len(weight)
+        to_features = to_weight = None
+        places = winners + torch.arange(clouds, device=winners.device)[:, None] * n
+        if ctx.needs_input_grad[0]:
+            places_sorted, order = places.flatten().sort()
+            starts = torch.searchsorted(
+                places_sorted, torch.arange(clouds * n, device=places.device)
+            )
+            to_features = F.embedding_bag(
+                order % channels,
+                weight,
+                starts,
+                mode="sum",
+                per_sample_weights=gradient.flatten()[order],
+            ).view_as(features)
+        if ctx.needs_input_grad[1]:
+            to_weight = F.embedding_bag(
+                places.T.contiguous(),
+                features.flatten(0, 1),
+                mode="sum",
+                per_sample_weights=gradient.T.contiguous(),
+            )
+        return to_features, to_weight
 
 
 class PointNetVanilla(nn.Module):

@@ -4,14 +4,13 @@ Dovrat, Lang and Avidan, "Learning to Sample", CVPR 2019; a rival in the paper's
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any, Literal
 
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.losses import simplification_losses
-from mops_lightning.nets.pointnet import PointMaxPool, PointMLP
+from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, linear_norm_relu
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.types import SampleOutput
 
@@ -65,12 +64,10 @@ class SNet(Sampler):
         self.coverage = coverage
         self.coverage_per_point = coverage_per_point
         self.features = PointMLP([3, *feature_channels[:-1]])
-        self.pool = PointMaxPool(*feature_channels[-2:])
-        layers: list[nn.Module] = []
-        for before, after in pairwise([feature_channels[-1], *head_channels]):
-            layers += [nn.Linear(before, after, bias=not head_norm)]
-            layers += [nn.BatchNorm1d(after)] if head_norm else []
-            layers += [nn.ReLU(inplace=True)]
+        self.pool = PointMaxPool(feature_channels[-2], feature_channels[-1])
+        layers: list[nn.Module] = list(
+            linear_norm_relu([feature_channels[-1], *head_channels], head_norm)
+        )
         layers += [nn.Linear(head_channels[-1], 3 * m, bias=not output_norm)]
         layers += [nn.BatchNorm1d(3 * m)] if output_norm else []
         self.head = nn.Sequential(*layers)

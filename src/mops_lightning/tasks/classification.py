@@ -1,17 +1,16 @@
 """Classification of sampled clouds (paper section "Classification-oriented Downsampling")."""
 
-from collections.abc import Callable
-
-from torch import Tensor, nn
+from torch import nn
 from torch.nn import functional as F
 from torchmetrics import Metric, MetricCollection
 from torchmetrics.classification import MulticlassAccuracy
 
 from mops_lightning.errors import UserError
-from mops_lightning.types import Batch, SampleOutput, TaskOutput
+from mops_lightning.tasks.base import Sample, Task
+from mops_lightning.types import Batch, TaskOutput
 
 
-class Classification(nn.Module):
+class Classification(Task):
     """Names the class of a cloud from its sampled points.
 
     Args:
@@ -24,17 +23,17 @@ class Classification(nn.Module):
 
     score = "accuracy"
     """The metric shown in tables; a higher one is better."""
+    tells_classes = True
 
     def __init__(self, net: nn.Module, num_classes: int) -> None:
-        super().__init__()
+        super().__init__(net)
         if num_classes < 2:
             raise UserError(
                 f"dataset.classes must leave at least two classes to tell apart, got {num_classes}."
             )
-        self.net = net
         self.num_classes = num_classes
 
-    def step(self, batch: Batch, sample: Callable[[Tensor], SampleOutput]) -> TaskOutput:
+    def step(self, batch: Batch, sample: Sample) -> TaskOutput:
         """Classify one batch.
 
         Args:

@@ -1,0 +1,122 @@
+"""Pairs for registration: a cloud and its copy under a random rigid motion."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Generator, Tensor
+
+from mops_lightning.errors import UserError
+from mops_lightning.geometry import gather_points
+from mops_lightning.rigid import Motion, random_motion
+from mops_lightning.types import PairBatch
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """How a cloud becomes a pair of source and target.
+
+    The target is the source under a motion with a uniform turn about each of the fixed axes x, y
+    and z and a uniform shift (paper section "Registration-oriented Downsampling"; the sizes are
+    those of PCRNet's authors).
+
+    Attributes:
+        rotation: largest turn about each axis, in degrees, 0 to 180.
+        translation: largest shift along each axis, in units of the coordinates.
+        resample: how many points source and target have, drawn from the shape independently, so
+            that they are different points of one surface; None: all points, the same in both.
+        jitter: standard deviation of the noise added to every coordinate of both clouds.
+        jitter_clip: largest noise in either direction.
+        overlap: share of the points that lie in both clouds, above 0 up to 1. Source and target
+            lose opposite ends of the shape, along a random direction; each keeps (1 + overlap)/2.
+        test_seed: fixes the pairs that are scored, whatever the run's own seed is.
+
+    Raises:
+        UserError: a number is out of range.
+    """
+
+    rotation: float = 45.0
+    translation: float = 1.0
+    resample: int | None = None
+    jitter: float = 0.0
+    jitter_clip: float = 0.05
+    overlap: float = 1.0
+    test_seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse numbers out of range."""
+        ranges = {
+            "rotation": (0 <= self.rotation <= 180, "from 0 to 180 degrees"),
+            "translation": (self.translation >= 0, "not negative"),
+            "resample": (self.resample is None or self.resample >= 1, "null or at least 1"),
+            "jitter": (self.jitter >= 0, "not negative"),
+            "jitter_clip": (self.jitter_clip >= 0, "not negative"),
+            "overlap": (0 < self.overlap <= 1, "above 0 and at most 1"),
+            "test_seed": (self.test_seed >= 0, "a whole number of at least 0"),
+        }
+        for name, (fits, allowed) in ranges.items():
+            if not fits:
+                raise UserError(f"task.pairs.{name} must be {allowed}, got {getattr(self, name)}.")
+
+    def points_of(self, n_points: int) -> int:
+        """Return how many points source and target have when the shape has ``n_points``.
+
+        Raises:
+            UserError: ``resample`` asks for more than there are.
+        """
+        if self.resample is not None and self.resample > n_points:
+            raise UserError(
+                f"task.pairs.resample must be at most the {n_points} points of a shape, got "
+                f"{self.resample}. Try dataset.n_points={self.resample}."
+            )
+        drawn = self.resample or n_points
+        return max(round(drawn * (1 + self.overlap) / 2), 1)
+
+    def __call__(self, points: Tensor, generators: Sequence[Generator]) -> PairBatch:
+        """Make a pair of every cloud.
+
+        Args:
+            points: ``(B, N, 3)``.
+            generators: one for each cloud, which fixes its pair whatever stands beside it.
+        """
+        kept = self.points_of(points.shape[1])
+        motion = random_motion(self.rotation, self.translation, generators)
+        source, target = points, points
+        if self.resample is not None:
+            source, target = (self._drawn(points, generators) for _ in range(2))
+        if kept < source.shape[1]:
+            direction = torch.stack([torch.randn(3, 1, generator=g) for g in generators])
+            source = _cut(source, direction, kept)
+            target = _cut(target, -direction, kept)
+        target = motion.apply(target)
+        if self.jitter:
+            source = source + self._noise(source, generators)
+            target = target + self._noise(target, generators)
+        return pair_batch(source, target, motion)
+
+    def _drawn(self, points: Tensor, generators: Sequence[Generator]) -> Tensor:
+        rows = [torch.randperm(points.shape[1], generator=g)[: self.resample] for g in generators]
+        return gather_points(points, torch.stack(rows))
+
+    def _noise(self, cloud: Tensor, generators: Sequence[Generator]) -> Tensor:
+        noise = torch.stack([torch.randn(cloud.shape[1:], generator=g) for g in generators])
+        return noise.mul_(self.jitter).clamp_(-self.jitter_clip, self.jitter_clip)
+
+
+def pair_batch(source: Tensor, target: Tensor, motion: Motion) -> PairBatch:
+    """Join sources and targets, both ``(B, N, 3)``, each with its centroid at the origin.
+
+    Args:
+        source: the clouds to be moved.
+        target: where they are to come to lie.
+        motion: the true motion from source to target.
+    """
+    both = torch.cat([source, target])
+    centroids = both.mean(1)
+    return PairBatch(both - centroids[:, None], centroids, motion.quaternion, motion.translation)
+
+
+def _cut(points: Tensor, direction: Tensor, kept: int) -> Tensor:
+    """Keep the points that lie farthest along a direction ``(B, 3, 1)``, in their order."""
+    rows = (points @ direction)[..., 0].topk(kept, dim=1)[1].sort(1).values
+    return gather_points(points, rows)

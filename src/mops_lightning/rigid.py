@@ -1,0 +1,148 @@
+"""Rigid motions as quaternion and translation: pure functions on batches.
+
+Quaternions are ``(w, x, y, z)``, scalar first, of norm 1; q and −q are one rotation. A motion takes
+a point p to R·p + t. Angles are radians unless a name says degrees.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Generator, Tensor
+
+
+class Motion(NamedTuple):
+    """One rigid motion per cloud.
+
+    Attributes:
+        quaternion: ``(B, 4)``, scalar first, norm 1.
+        translation: ``(B, 3)``, in units of the coordinates.
+    """
+
+    quaternion: Tensor
+    translation: Tensor
+
+    def apply(self, points: Tensor) -> Tensor:
+        """Move ``(B, N, 3)`` points."""
+        rotation = quaternion_to_matrix(self.quaternion).to(points.dtype)
+        return points @ rotation.mT + self.translation[:, None]
+
+    def after(self, first: "Motion") -> "Motion":
+        """Return the motion that does ``first``, then this one."""
+        moved = self.apply(first.translation[:, None])[:, 0]
+        return Motion(quaternion_multiply(self.quaternion, first.quaternion), moved)
+
+    def inverse(self) -> "Motion":
+        """Return the motion that undoes this one."""
+        back = quaternion_conjugate(self.quaternion)
+        turned = Motion(back, torch.zeros_like(self.translation)).apply(self.translation[:, None])
+        return Motion(back, -turned[:, 0])
+
+
+def identity_motion(points: Tensor) -> Motion:
+    """Return the motion that leaves ``(B, N, 3)`` points where they are."""
+    zero = torch.zeros_like(points[:, 0])
+    return Motion(torch.cat([torch.ones_like(zero[:, :1]), zero], 1), zero)
+
+
+def quaternion_conjugate(quaternion: Tensor) -> Tensor:
+    """Return the inverse rotations of ``(..., 4)`` unit quaternions."""
+    return torch.cat([quaternion[..., :1], -quaternion[..., 1:]], -1)
+
+
+def quaternion_multiply(left: Tensor, right: Tensor) -> Tensor:
+    """Return Hamilton's product ``(..., 4)``: the rotation ``right``, then ``left``."""
+    a, u = left[..., :1], left[..., 1:]
+    b, v = right[..., :1], right[..., 1:]
+    scalar = a * b - (u * v).sum(-1, keepdim=True)
+    return torch.cat([scalar, a * v + b * u + torch.linalg.cross(u, v)], -1)
+
+
+def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
+    """Turn ``(..., 4)`` unit quaternions into ``(..., 3, 3)`` rotation matrices."""
+    w, x, y, z = quaternion.unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def quaternion_from_matrix(matrix: Tensor) -> Tensor:
+    """Turn ``(..., 3, 3)`` rotation matrices into ``(..., 4)`` unit quaternions with w ≥ 0.
+
+    Of the four ways to get them, the one that divides by the largest number.
+    """
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    x, y, z = diagonal.unbind(-1)
+    # Four times the square of each component.
+    squares = torch.stack([1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z], -1)
+    minus, plus = matrix - matrix.mT, matrix + matrix.mT
+    wx, wy, wz = minus[..., 2, 1], minus[..., 0, 2], minus[..., 1, 0]
+    xy, xz, yz = plus[..., 0, 1], plus[..., 0, 2], plus[..., 1, 2]
+    s = squares.unbind(-1)
+    # Row i is 4·q_i·(w, x, y, z).
+    candidates = torch.stack(
+        [
+            torch.stack([s[0], wx, wy, wz], -1),
+            torch.stack([wx, s[1], xy, xz], -1),
+            torch.stack([wy, xy, s[2], yz], -1),
+            torch.stack([wz, xz, yz, s[3]], -1),
+        ],
+        -2,
+    )
+    best = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
+    chosen = torch.nn.functional.normalize(candidates.gather(-2, best)[..., 0, :], dim=-1)
+    return torch.where(chosen[..., :1] < 0, -chosen, chosen)
+
+
+def quaternion_from_euler(angles: Tensor) -> Tensor:
+    """Turn ``(..., 3)`` angles about the fixed axes x, then y, then z into quaternions."""
+    half = angles / 2
+    result = None
+    for axis in range(3):
+        turn = torch.zeros(*angles.shape[:-1], 4, dtype=angles.dtype, device=angles.device)
+        turn[..., 0] = half[..., axis].cos()
+        turn[..., 1 + axis] = half[..., axis].sin()
+        result = turn if result is None else quaternion_multiply(turn, result)
+    assert result is not None
+    return result
+
+
+def rotation_angle(first: Tensor, second: Tensor) -> Tensor:
+    """Return the geodesic angle between two rotations, in radians from 0 to π.
+
+    2·atan2(‖v‖, |w|) of the relative rotation (w, v) is accurate at 0 and at π, where the acos of
+    a rounded cosine loses half its digits or answers NaN.
+
+    Args:
+        first: ``(..., 4)`` quaternions; their length and sign do not matter.
+        second: the same.
+
+    Returns:
+        ``(...)``.
+    """
+    between = quaternion_multiply(quaternion_conjugate(first), second)
+    vector = torch.linalg.vector_norm(between[..., 1:], dim=-1)
+    return 2 * torch.atan2(vector, between[..., 0].abs())
+
+
+def random_motion(rotation: float, translation: float, generators: Sequence[Generator]) -> Motion:
+    """Draw one motion from each generator.
+
+    Args:
+        rotation: largest turn about each fixed axis in degrees; angles are uniform up to it.
+        translation: largest shift along each axis; uniform too.
+        generators: one for each motion, ``(B,)``.
+    """
+    drawn = torch.stack([torch.rand(2, 3, generator=g, dtype=torch.float64) for g in generators])
+    drawn = 2 * drawn - 1
+    angles = torch.deg2rad(drawn[:, 0] * rotation)
+    return Motion(quaternion_from_euler(angles).float(), (drawn[:, 1] * translation).float())

@@ -1,0 +1,74 @@
+"""What every task offers to the experiment."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from torch import Generator, Tensor, nn
+from torchmetrics import MetricCollection
+
+from mops_lightning.types import Batch, SampleOutput, TaskOutput
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Sample = Callable[[Tensor], SampleOutput]
+"""From ``(B, N, 3)`` points to what is sampled of them."""
+
+
+class Task(nn.Module):
+    """Base of all tasks: owns the task net, its losses and its metrics.
+
+    Args:
+        net: the task net; how it is called is the task's own affair.
+    """
+
+    score: str
+    """The metric shown in tables."""
+
+    tells_classes: bool = False
+    """Whether the net's outputs are the data's classes, so that it fits no others."""
+
+    test_seed: int = 0
+    """Fixes what ``make_batch`` draws for the clouds that are scored."""
+
+    def __init__(self, net: nn.Module) -> None:
+        super().__init__()
+        self.net = net
+
+    def make_batch(self, batch: Batch, generators: Callable[[], list[Generator]]) -> Any:
+        """Turn a batch of clouds into what ``step`` takes; the same by default.
+
+        Args:
+            batch: of the loader.
+            generators: makes one for each cloud, which fixes what is drawn for it, whatever stands
+                beside it in the batch.
+        """
+        return batch
+
+    def points_of(self, n_points: int) -> int:
+        """Return how many points the clouds have that are sampled, from the dataset's number."""
+        return n_points
+
+    def step(self, batch: Any, sample: Sample) -> TaskOutput:
+        """Return losses, predictions and targets of one batch."""
+        raise NotImplementedError
+
+    def metrics(self) -> MetricCollection:
+        """Return new metrics that take predictions and targets."""
+        raise NotImplementedError
+
+    def cloud_titles(self, titles: Sequence[str]) -> list[str]:
+        """Return a title for each of a batch's points, from those of the dataset's clouds."""
+        return list(titles)
+
+    def figures(
+        self, batch: Any, samples: Mapping[str, Sample], titles: Sequence[str]
+    ) -> "dict[str, Figure]":
+        """Draw what the task makes of a few clouds, by name; nothing by default.
+
+        Args:
+            batch: as for ``step``.
+            samples: what the net is to see, by readout.
+            titles: one per cloud of the dataset.
+        """
+        return {}

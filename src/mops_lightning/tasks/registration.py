@@ -1,0 +1,113 @@
+"""Registration of sampled clouds (paper section "Registration-oriented Downsampling")."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from torch import Generator, Tensor, nn
+from torchmetrics import Metric, MetricCollection
+
+from mops_lightning.data.pairs import Pairs
+from mops_lightning.motion_metrics import RotationError, RotationRecall, TranslationError
+from mops_lightning.rigid import Motion
+from mops_lightning.tasks.base import Sample, Task
+from mops_lightning.types import Batch, PairBatch, TaskOutput
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Loss = Callable[[Motion, Motion, Tensor, Tensor], dict[str, Tensor]]
+
+
+class Registration(Task):
+    """Finds the rigid motion between two clouds from sampled points of both.
+
+    Each cloud's centroid is subtracted before sampling; the translation that is answered and scored
+    is that of the clouds as they came.
+
+    Args:
+        net: maps sources ``(B, M, 3)`` and targets ``(B, M, 3)`` to a ``Motion``.
+        pairs: how training and test pairs are made.
+        loss: takes the predicted and the true motion and the two centred clouds ``(B, N, 3)``;
+            returns its terms by name.
+    """
+
+    score = "rotation_error_deg"
+    """The metric shown in tables; a lower one is better."""
+
+    def __init__(self, net: nn.Module, pairs: Pairs, loss: Loss) -> None:
+        super().__init__(net)
+        self.pairs = pairs
+        self.test_seed = pairs.test_seed
+        self.loss = loss
+
+    def make_batch(self, batch: Batch, generators: Callable[[], list[Generator]]) -> PairBatch:
+        """Make a pair of every cloud; see ``Pairs``."""
+        return self.pairs(batch.points, generators())
+
+    def points_of(self, n_points: int) -> int:
+        """Return how many points the clouds have that are sampled."""
+        return self.pairs.points_of(n_points)
+
+    def step(self, batch: PairBatch, sample: Sample) -> TaskOutput:
+        """Register one batch.
+
+        Args:
+            batch: pairs.
+            sample: turns points into what the net is to see.
+
+        Returns:
+            The loss terms, the predicted motions and the true ones.
+        """
+        found = self._centred(batch, sample)
+        true = Motion(batch.quaternion, batch.translation)
+        from_source, from_target = batch.centroids.chunk(2)
+        # The true motion seen between the centred clouds: R·(p + c) + t = R·p + (R·c + t).
+        shift = true.apply(from_source[:, None])[:, 0] - from_target
+        losses = self.loss(found, true._replace(translation=shift), *batch.points.chunk(2))
+        turned = found._replace(translation=from_target).apply(-from_source[:, None])[:, 0]
+        predicted = Motion(found.quaternion, found.translation + turned)
+        return TaskOutput(losses, predicted, true)
+
+    def _centred(self, batch: PairBatch, sample: Sample) -> Motion:
+        source, target = sample(batch.points).points.chunk(2)
+        return self.net(source, target)
+
+    def metrics(self) -> MetricCollection:
+        """Rotation errors in degrees, recalls in [0, 1], translation error in coordinate units."""
+        metrics: dict[str, Metric | MetricCollection] = {
+            "rotation_error_deg": RotationError(),
+            "rotation_error_p90_deg": RotationError(quantile=0.9),
+            "rotation_error_doubled_deg": RotationError(factor=2.0),
+            "rotation_recall_5deg": RotationRecall(5.0),
+            "rotation_recall_10deg": RotationRecall(10.0),
+            "translation_error": TranslationError(),
+        }
+        return MetricCollection(metrics, compute_groups=False)
+
+    def cloud_titles(self, titles: Sequence[str]) -> list[str]:
+        """Tell sources and targets apart."""
+        return [f"{title}_{side}" for side in ("source", "target") for title in titles]
+
+    def figures(
+        self, batch: PairBatch, samples: Mapping[str, Sample], titles: Sequence[str]
+    ) -> "dict[str, Figure]":
+        """Draw the pairs before and after alignment, one column for each readout.
+
+        Args:
+            batch: the pairs to draw.
+            samples: what the net is to see, by readout.
+            titles: one per pair.
+        """
+        from mops_lightning.pictures_pairs import Aligned, pair_grid
+
+        source, target = batch.points.chunk(2)
+        columns = {}
+        for name, sample in samples.items():
+            result = self.step(batch, sample)
+            motion = self._centred(batch, sample)
+            chosen = sample(batch.points).points.chunk(2)
+            errors = RotationError.of(result.predictions, result.targets)
+            columns[name] = Aligned(
+                motion.apply(source), motion.apply(chosen[0]), chosen[1], errors.tolist()
+            )
+        return {"pairs": pair_grid(source, target, columns, titles)}

@@ -1,0 +1,147 @@
+import pytest
+import torch
+
+from mops_lightning.data.loader import CloudLoader
+from mops_lightning.data.pairs import Pairs, pair_batch
+from mops_lightning.errors import UserError
+from mops_lightning.rigid import Motion
+from mops_lightning.seeding import generator
+from mops_lightning.types import Batch
+from tests.conftest import small_dataset
+
+
+def generators(number, key=0):
+    return [generator(key, i) for i in range(number)]
+
+
+def clouds(rng, number=6, points=50):
+    return torch.randn(number, points, 3, generator=rng)
+
+
+def restored(batch):
+    return (batch.points + batch.centroids[:, None]).chunk(2)
+
+
+def moved(batch, points):
+    return Motion(batch.quaternion, batch.translation).apply(points)
+
+
+def test_the_target_is_the_source_under_the_true_motion(rng):
+    points = clouds(rng)
+    batch = Pairs()(points, generators(6))
+    source, target = restored(batch)
+    torch.testing.assert_close(source, points)
+    torch.testing.assert_close(target, moved(batch, source), atol=1e-5, rtol=0)
+    torch.testing.assert_close(batch.points.mean(1), torch.zeros(12, 3), atol=1e-6, rtol=0)
+    assert not torch.allclose(target, source, atol=0.1)
+
+
+def test_a_pair_hangs_on_its_generator_not_on_its_neighbours(rng):
+    points = clouds(rng)
+    pairs = Pairs(resample=20, jitter=0.02, overlap=0.6)
+    together = pairs(points, generators(6))
+    for i in range(6):
+        alone = pairs(points[i : i + 1], generators(6)[i : i + 1])
+        for name in ("quaternion", "translation"):
+            assert torch.equal(getattr(alone, name)[0], getattr(together, name)[i])
+        torch.testing.assert_close(alone.points[0], together.points[i])
+        torch.testing.assert_close(alone.points[1], together.points[6 + i])
+
+
+def rows_of(cloud, points):
+    distance, row = torch.cdist(cloud, points).min(1)
+    assert distance.max() < 1e-4
+    return set(row.tolist())
+
+
+def test_resampled_clouds_hold_different_points_of_the_same_shape(rng):
+    points = clouds(rng, points=60)
+    batch = Pairs(resample=20)(points, generators(6))
+    source, target = restored(batch)
+    assert source.shape == target.shape == (6, 20, 3)
+    for i in range(6):
+        mine = rows_of(source[i], points[i])
+        theirs = rows_of(target[i], moved(batch, points)[i])
+        assert len(mine) == len(theirs) == 20
+        assert mine != theirs
+
+
+@pytest.mark.parametrize("overlap", [0.2, 0.5, 0.9])
+def test_overlap_is_the_share_of_points_that_both_hold(overlap, rng):
+    points = clouds(rng, points=100)
+    pairs = Pairs(overlap=overlap)
+    batch = pairs(points, generators(6))
+    source, target = restored(batch)
+    assert source.shape[1] == pairs.points_of(100) == round(50 * (1 + overlap))
+    for i in range(6):
+        shared = rows_of(source[i], points[i]) & rows_of(target[i], moved(batch, points)[i])
+        assert len(shared) == round(100 * overlap)
+
+
+def test_jitter_is_independent_in_both_clouds_and_clipped(rng):
+    points = clouds(rng, points=400)
+    batch = Pairs(jitter=0.02, jitter_clip=0.03)(points, generators(6))
+    plain = Pairs()(points, generators(6))
+    noise = [a - b for a, b in zip(restored(batch), restored(plain), strict=True)]
+    for one in noise:
+        assert one.abs().max() <= 0.03 + 1e-5
+        assert 0.014 < one.std() < 0.02
+    assert not torch.allclose(noise[0], noise[1], atol=1e-3)
+
+
+def test_training_pairs_are_new_in_every_epoch_and_scored_ones_are_not():
+    data = small_dataset().train
+    pairs = Pairs()
+
+    def make(batch, generators):
+        assert isinstance(batch, Batch)
+        return pairs(batch.points, generators())
+
+    training = CloudLoader(data, 5, shuffle=True, make_batch=make, seed=1)
+    epochs = []
+    for epoch in range(2):
+        training.set_epoch(epoch)
+        epochs.append(torch.cat([batch.quaternion for batch in training]))
+    assert len({tuple(row.tolist()) for row in torch.cat(epochs)}) == 2 * len(data.labels)
+    again = CloudLoader(data, 5, shuffle=True, make_batch=make, seed=1)
+    assert torch.equal(torch.cat([batch.quaternion for batch in again]), epochs[0])
+
+    scored = CloudLoader(data, 5, make_batch=make)
+    first = torch.cat([batch.quaternion for batch in scored])
+    scored.set_epoch(7)
+    assert torch.equal(torch.cat([batch.quaternion for batch in scored]), first)
+    # However the batches are cut:
+    other = CloudLoader(data, 7, make_batch=make)
+    assert torch.equal(torch.cat([batch.quaternion for batch in other]), first)
+    assert torch.equal(scored.batch_of(torch.tensor([3, 9])).quaternion, first[[3, 9]])
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("rotation", 181.0),
+        ("rotation", -1.0),
+        ("translation", -0.1),
+        ("resample", 0),
+        ("jitter", -0.1),
+        ("jitter_clip", -0.1),
+        ("overlap", 0.0),
+        ("overlap", 1.1),
+        ("test_seed", -1),
+    ],
+)
+def test_numbers_out_of_range_are_refused_by_name(setting, value):
+    with pytest.raises(UserError, match=rf"task.pairs.{setting} must be .*{value}"):
+        Pairs(**{setting: value})
+
+
+def test_more_points_than_there_are_cannot_be_drawn(rng):
+    with pytest.raises(UserError, match=r"task.pairs.resample must be at most the 50 .*got 51"):
+        Pairs(resample=51)(clouds(rng), generators(6))
+
+
+def test_a_pair_batch_centres_both_clouds(rng):
+    source, target = clouds(rng), clouds(rng) + 3
+    batch = pair_batch(source, target, Motion(torch.ones(6, 4), torch.ones(6, 3)))
+    torch.testing.assert_close(batch.centroids[6:], target.mean(1))
+    torch.testing.assert_close(torch.cat(restored(batch)), torch.cat([source, target]))
