@@ -23,7 +23,7 @@ class PCRNet(nn.Module):
 
     Weights start as He et al. (ICCV 2015) draw them: without BatchNorm the usual smaller ones let
     the signal fade on its way through eleven layers, and training does not get off the ground. The
-    first answers are near the identity, so that no quaternion near zero has to be normalised.
+    last bias starts at the identity.
 
     Args:
         iterations: passes; each moves the source by what the ones before it found, and the motions

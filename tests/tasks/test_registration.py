@@ -1,0 +1,215 @@
+from typing import Any
+
+import pytest
+import torch
+
+from mops_lightning.data.loader import CloudLoader
+from mops_lightning.data.pairs import Pairs, pair_batch
+from mops_lightning.errors import UserError
+from mops_lightning.experiment import Experiment
+from mops_lightning.motion_metrics import RotationError
+from mops_lightning.nets.icp import ICP
+from mops_lightning.nets.pcrnet import PCRNet
+from mops_lightning.rigid import Motion, quaternion_from_matrix
+from mops_lightning.rigid_losses import frobenius_chamfer_loss, quaternion_loss
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.samplenet import SampleNet
+from mops_lightning.samplers.snet import ProgressiveSNet, SNet
+from mops_lightning.scoring import full_cloud
+from mops_lightning.tasks.registration import Registration
+from tests.conftest import quiet_trainer, small_dataset
+from tests.test_experiment import changed, state
+from tests.test_rigid import motion
+
+
+class Kabsch(torch.nn.Module):
+    """The exact answer where point i of the source is point i of the target."""
+
+    def forward(self, source, target):
+        a, b = source.mean(1, keepdim=True), target.mean(1, keepdim=True)
+        u, _, vh = torch.linalg.svd((source - a).mT @ (target - b))
+        flip = torch.eye(3).repeat(len(u), 1, 1)
+        flip[:, 2, 2] = torch.linalg.det(vh.mT @ u.mT).sign()
+        rotation = vh.mT @ flip @ u.mT
+        shift = b - a @ rotation.mT
+        return Motion(quaternion_from_matrix(rotation), shift[:, 0])
+
+
+def small_net():
+    torch.manual_seed(0)
+    return PCRNet(feature_channels=(16, 32), head_channels=(32, 16))
+
+
+def task(net=None, loss=quaternion_loss, **pairs):
+    return Registration(net or small_net(), Pairs(**pairs), loss)
+
+
+def test_an_exact_net_recovers_hand_made_motions_exactly(rng):
+    source = torch.randn(5, 40, 3, generator=rng) + 3  # far from its centroid
+    true = motion(1)
+    batch = pair_batch(source, true.apply(source), true)
+    for loss in (quaternion_loss, frobenius_chamfer_loss):
+        result = task(Kabsch(), loss).step(batch, full_cloud)
+        assert RotationError.of(result.predictions, true).max() < 1e-2
+        torch.testing.assert_close(
+            result.predictions.translation, true.translation, atol=1e-4, rtol=0
+        )
+        assert sum(result.losses.values()) < 1e-3
+
+
+def test_shifting_a_cloud_changes_the_answer_by_just_that(rng):
+    source, target = torch.randn(2, 5, 40, 3, generator=rng)
+    module = task().eval()
+    true = motion(1)
+    shift = torch.tensor([1.0, -2.0, 3.0])
+
+    def answer(a, b):
+        return module.step(pair_batch(a, b, true), full_cloud).predictions
+
+    plain = answer(source, target)
+    by_target = answer(source, target + shift)
+    torch.testing.assert_close(by_target.quaternion, plain.quaternion, atol=1e-5, rtol=0)
+    torch.testing.assert_close(by_target.translation, plain.translation + shift, atol=1e-4, rtol=0)
+    # q = R·p + t = R·(p + s) + (t − R·s)
+    by_source = answer(source + shift, target)
+    still = plain.apply(source)
+    torch.testing.assert_close(by_source.apply(source + shift), still, atol=1e-4, rtol=0)
+
+
+def test_moving_both_clouds_changes_an_exact_answer_accordingly(rng):
+    source = torch.randn(5, 40, 3, generator=rng)
+    true, both = motion(1), motion(2)
+    target = true.apply(source)
+    module = task(Kabsch())
+    batch = pair_batch(both.apply(source), both.apply(target), true)
+    found = module.step(batch, full_cloud).predictions
+    expected = both.after(true).after(both.inverse())
+    assert RotationError.of(found, expected).max() < 1e-2
+    torch.testing.assert_close(found.translation, expected.translation, atol=1e-4, rtol=0)
+
+
+def test_the_order_of_points_does_not_matter(rng):
+    source, target = torch.randn(2, 5, 40, 3, generator=rng)
+    module = task().eval()
+    order = torch.randperm(40, generator=rng)
+    answers = [
+        module.step(pair_batch(a, b, motion(1)), full_cloud).predictions
+        for a, b in ((source, target), (source[:, order], target[:, order.flip(0)]))
+    ]
+    torch.testing.assert_close(*answers, atol=1e-5, rtol=1e-5)
+
+
+def test_the_scored_translation_is_that_of_the_clouds_as_they_came(rng):
+    source = torch.randn(5, 40, 3, generator=rng)
+    true = motion(1)
+    batch = pair_batch(source, true.apply(source), true)
+    result = task(Kabsch()).step(batch, full_cloud)
+    torch.testing.assert_close(result.targets.translation, true.translation)
+
+
+def test_both_clouds_are_sampled_by_one_call_of_the_sampler(rng):
+    batch = Pairs()(torch.randn(5, 40, 3, generator=rng), [torch.Generator() for _ in range(5)])
+    seen = []
+
+    def sample(points):
+        seen.append(points)
+        return FPSSampler(8)(points)
+
+    task().eval().step(batch, sample)
+    assert len(seen) == 1
+    assert seen[0] is batch.points
+
+
+MOPS: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
+RIVAL: dict[str, Any] = {"feature_channels": (8, 16), "head_channels": (16,)}
+LEARNED = {
+    "mops": lambda: MOPSNet(8, **MOPS),
+    "fmops": lambda: FMOPSNet(16, **MOPS),
+    "snet": lambda: SNet(8, **RIVAL),
+    "samplenet": lambda: SampleNet(8, k=4, **RIVAL),
+    "snet_progressive": lambda: ProgressiveSNet(16, least=4, **RIVAL),
+}
+
+
+def trained(learn, sampler, **extra):
+    torch.manual_seed(1)
+    module = Experiment(
+        task(resample=40),
+        sampler,
+        learn=learn,
+        make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
+        **extra,
+    )
+    before = state(module)
+    data = small_dataset()
+    make = module.task.make_batch
+    quiet_trainer(1).fit(
+        module,
+        CloudLoader(data.train, 6, shuffle=True, make_batch=make, drop_last=True),
+        CloudLoader(data.test, 6, make_batch=make),
+    )
+    return module, changed(before, module)
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_frozen_and_joint_training_change_exactly_what_they_should(name):
+    _, frozen = trained("sampler", LEARNED[name]())
+    assert frozen
+    assert all(key.startswith("sampler.") for key in frozen)
+    module, joint = trained("joint", LEARNED[name]())
+    assert {key for key in module.state_dict() if key.startswith("task.")} <= joint
+    assert {key.split(".")[0] for key in joint} == {"sampler", "task"}
+
+
+def test_training_the_task_uses_full_clouds_and_changes_it_alone():
+    module, names = trained("task", None)
+    assert module.sampler is None
+    assert names
+    assert all(name.startswith("task.") for name in names)
+
+
+def test_a_test_scores_every_readout_by_every_metric():
+    module, _ = trained("sampler", MOPSNet(8, **MOPS), baselines={"fps": FPSSampler(8)})
+    run = quiet_trainer(1)
+    loader = CloudLoader(small_dataset().test, 4, make_batch=module.task.make_batch)
+    run.test(module, loader, verbose=False)
+    for readout in ("generated", "matched", "completed", "fps", "full"):
+        values = {
+            name: run.callback_metrics[f"test/{readout}/{name}"] for name in module.task.metrics()
+        }
+        assert 0 <= values["rotation_error_deg"] <= 180
+        assert values["rotation_error_doubled_deg"] == 2 * values["rotation_error_deg"]
+        assert values["rotation_error_p90_deg"] >= 0
+        assert values["rotation_recall_5deg"] <= values["rotation_recall_10deg"] <= 1
+        assert values["translation_error"] >= 0
+    assert module.score_name == "test/generated/rotation_error_deg"
+
+
+def test_nothing_can_be_trained_under_icp_but_anything_tested():
+    icp = task(ICP())
+    with pytest.raises(UserError, match=r"learn=sampler: ICP has no weights .*evaluate=RUN"):
+        Experiment(icp, MOPSNet(8, **MOPS))
+    with pytest.raises(UserError, match="learn=task: ICP has no weights"):
+        Experiment(icp, learn="task")
+    module = Experiment(icp, FPSSampler(8))
+    assert not module.trainable
+    run = quiet_trainer(1)
+    data = CloudLoader(small_dataset().test, 4, make_batch=icp.make_batch)
+    run.test(module, data, verbose=False)
+    assert run.callback_metrics["test/full/rotation_error_deg"] < 60
+
+
+def test_figures_show_every_readout_and_its_error(rng):
+    data = CloudLoader(small_dataset().test, 4, make_batch=(module := task()).make_batch)
+    batch = data.batch_of(torch.tensor([0, 1]))
+    sampler = FPSSampler(8)
+    figures = module.figures(batch, {"sampled": sampler, "full": full_cloud}, ["long", "tall"])
+    axes = figures["pairs"].axes
+    assert len(axes) == 6
+    assert [one.get_title() for one in axes[:3]] == ["before", "by sampled", "by full"]
+    result = module.step(batch, full_cloud)
+    error = RotationError.of(result.predictions, result.targets)[1]
+    assert axes[5].texts[0].get_text() == f"{error:.1f}°"
+    assert module.cloud_titles(["long"]) == ["long_source", "long_target"]

@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from mops_lightning.losses import chamfer_distance
+from mops_lightning.rigid import Motion, rotation_angle
+from mops_lightning.rigid_losses import (
+    frobenius_chamfer_loss,
+    frobenius_distance,
+    quaternion_distance,
+    quaternion_loss,
+)
+
+
+def quaternions(seed, number=50):
+    drawn = Rotation.random(number, random_state=seed).as_quat()
+    return torch.from_numpy(np.roll(drawn, 1, axis=1).copy())
+
+
+def test_quaternion_distance_is_the_smaller_of_both_signs():
+    a, b = quaternions(1), quaternions(2)
+    plain = torch.minimum((a - b).norm(dim=1), (a + b).norm(dim=1)).mean()
+    torch.testing.assert_close(quaternion_distance(a, b), plain)
+    torch.testing.assert_close(quaternion_distance(-a, b), plain)
+    angle = rotation_angle(a, b)
+    torch.testing.assert_close(quaternion_distance(a, b), (2 * (angle / 4).sin()).mean())
+
+
+def test_quaternion_distance_has_gradients_towards_the_nearer_sign():
+    true = quaternions(3)
+    predicted = (-true + 1e-2).requires_grad_()
+    (gradient,) = torch.autograd.grad(quaternion_distance(predicted, true), predicted)
+    assert ((predicted - gradient + true).norm(dim=1) < (predicted + true).norm(dim=1)).all()
+    same = true.clone().requires_grad_()
+    assert torch.isfinite(torch.autograd.grad(quaternion_distance(same, true), same)[0]).all()
+
+
+def test_frobenius_distance_is_the_matrix_norm():
+    a, b = quaternions(1), quaternions(2)
+    relative = [
+        np.square(one.as_matrix() - np.eye(3)).sum()
+        for one in Rotation.from_quat(np.roll(a.numpy(), -1, 1))
+        * Rotation.from_quat(np.roll(b.numpy(), -1, 1)).inv()
+    ]
+    torch.testing.assert_close(frobenius_distance(a, b).item(), float(np.mean(relative)))
+
+
+@pytest.mark.parametrize("loss", [quaternion_loss, frobenius_chamfer_loss])
+def test_losses_vanish_at_the_true_motion_only(loss, rng):
+    source = torch.randn(50, 30, 3, dtype=torch.float64, generator=rng)
+    true = Motion(quaternions(1), torch.randn(50, 3, dtype=torch.float64, generator=rng))
+    target = Motion(true.quaternion, true.translation).apply(source)
+    assert sum(loss(true, true, source, target).values()) < 1e-12
+    other = Motion(quaternions(2), true.translation)
+    assert sum(loss(other, true, source, target).values()) > 0.1
+    shifted = Motion(true.quaternion, true.translation + 1)
+    assert sum(loss(shifted, true, source, target).values()) > 0.1
+
+
+def test_weights_of_the_terms():
+    true, other = (
+        Motion(quaternions(1), torch.zeros(50, 3)),
+        Motion(quaternions(1), torch.ones(50, 3)),
+    )
+    cloud = torch.zeros(50, 4, 3).double()
+    one, two = (
+        quaternion_loss(other, true, cloud, cloud, translation_weight=w)["translation"]
+        for w in (1.0, 2.0)
+    )
+    torch.testing.assert_close(one, torch.tensor(3.0).sqrt())
+    torch.testing.assert_close(two, 2 * one)
+    one, two = (
+        frobenius_chamfer_loss(
+            other._replace(translation=other.translation.double()), true, cloud, cloud, w
+        )["chamfer"]
+        for w in (1.0, 2.0)
+    )
+    torch.testing.assert_close(one, torch.tensor(6.0).double())
+    torch.testing.assert_close(two, 2 * one)
+
+
+def plain_chamfer(points, others):
+    squares = (points[:, :, None] - others[:, None]).square().sum(-1)
+    return squares.min(2).values.mean(1) + squares.min(1).values.mean(1)
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 7), (40, 25), (300, 900)])
+def test_chamfer_distance_equals_its_plain_twin(n, m, rng):
+    points = torch.randn(3, n, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+    others = torch.randn(3, m, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+    got, want = chamfer_distance(points, others), plain_chamfer(points, others)
+    torch.testing.assert_close(got, want)
+    gradients = [torch.autograd.grad(value.sum(), [points, others]) for value in (got, want)]
+    torch.testing.assert_close(*gradients)
+
+
+def test_chamfer_distance_is_zero_for_the_same_points_in_any_order(rng):
+    points = torch.randn(2, 20, 3, generator=rng)
+    order = torch.randperm(20, generator=rng)
+    assert not chamfer_distance(points, points[:, order]).any()
