@@ -145,6 +145,32 @@ def test_joint_training_starts_from_the_pretrained_task(main_job):
     assert after["sha256"] != weights.load(before)["sha256"]
 
 
+def test_registration_pretrains_trains_jointly_tests_and_is_evaluated_under_icp(tmp_path):
+    settings = [*TINY, "task=registration", "sampler=fmops", "sampler.m_max=16", "pictures=1"]
+    status, out, err = call([*settings, "learn=joint"], tmp_path)
+    assert status == 0, err
+    assert "training it first" in out
+    assert "registration by pcrnet, shapes, rotation error (°), test" in out
+    (run,) = runs(tmp_path)
+    record = records.read(run)
+    assert 0 < record["metrics"]["test/m16/matched/rotation_error_p90_deg"] < 180
+    assert record["score"] == record["metrics"]["test/m8/generated/rotation_error_deg"]
+    assert {path.name for path in (run / "pictures").iterdir()} == {
+        "clouds.png",
+        "matrix.png",
+        "pairs.png",
+    }
+    assert (run / "task_weights.pt").is_file()
+    status, out, err = call(
+        [f"evaluate={run}", "task/net=icp", "task.pairs.overlap=0.8", "pictures=0"], tmp_path
+    )
+    assert status == 0, err
+    assert "registration by icp" in out
+    status, _, err = call(["task=registration", "task/net=icp", *TINY], tmp_path)
+    assert status == 2
+    assert "learn=sampler: ICP has no weights" in err
+
+
 def test_help_shows_groups_and_keys_without_heavy_imports(tmp_path):
     status, out, err = call(["--help"], tmp_path)
     assert (status, err) == (0, "")

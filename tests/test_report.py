@@ -8,16 +8,17 @@ from mops_lightning.report import main, table
 from tests.test_records import record
 
 
-def put(folder, sampler, m, metrics, **changes):
-    names = {
-        "task": "classification",
-        "net": "pointnet",
-        "dataset": "modelnet40",
-        "sampler": sampler,
+def put(folder, sampler, m, metrics, task="classification", net="pointnet", **changes):
+    names = {"task": task, "net": net, "dataset": "modelnet40", "sampler": sampler}
+    config = {
+        "m": m,
+        "learn": "sampler",
+        "names": names,
+        "trainer": {"max_epochs": 3},
+        "task": changes.pop("settings", {}),
     }
-    config = {"m": m, "learn": "sampler", "names": names, "trainer": {"max_epochs": 3}}
     notes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **changes.pop("notes", {})}
-    target = folder / f"{sampler}-{m}"
+    target = folder / f"{sampler}-{m}-{net}"
     target.mkdir()
     records.write(target, record(config=config, metrics=metrics, notes=notes, **changes))
 
@@ -113,7 +114,7 @@ def test_an_unknown_metric_and_unreadable_records_are_named(tmp_path):
 
 def test_the_paper_s_figures_stand_by_its_own_data_only(tmp_path):
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
-    path = tmp_path / "fps-32" / "result.json"
+    path = tmp_path / "fps-32-pointnet" / "result.json"
     path.write_text(path.read_text().replace("modelnet40", "shapes"))
     assert "paper" not in table(tmp_path)
 
@@ -132,12 +133,66 @@ def test_the_command_writes_what_it_prints(tmp_path, capsys):
     assert text in capsys.readouterr().out
 
 
-def test_paper_figures_are_complete():
+DEGREES = "rotation_error_deg"
+
+
+def put_pairs(folder, sampler, m, value, net="pcrnet", rotation=45, **changes):
+    changes["notes"] = {"score": f"test/sampled/{DEGREES}", **changes.get("notes", {})}
+    metrics = {f"test/sampled/{DEGREES}": value, f"test/full/{DEGREES}": 7.5}
+    pairs = {"pairs": {"rotation": rotation}}
+    put(folder, sampler, m, metrics, "registration", net, settings=pairs, **changes)
+    if net == "icp":  # there are no weights to note
+        path = folder / f"{sampler}-{m}-icp" / "result.json"
+        content = json.loads(path.read_text())
+        del content["notes"]["task_weights_sha256"]
+        path.write_text(json.dumps(content))
+
+
+def test_registration_is_shown_in_degrees_with_icp_below(tmp_path):
+    put_pairs(tmp_path, "fps", 32, 12.345)
+    put_pairs(tmp_path, "fps", 32, 20.0, net="icp")
+    put_pairs(tmp_path, "mops", 8, 9.0)
+    text = table(tmp_path)
+    assert text.startswith("Test rotation error (°): registration on modelnet40 under pcrnet;")
+    assert rows(text) == [
+        ["sampled by", "m=32", "m=8"],
+        ["fps", "12.35", ""],
+        ["*the paper's*", "13.12", "33.28"],
+        ["mops", "", "9.00"],
+        ["*the paper's*", "7.97 / 8.53 / 8.54", "12.64 / 12.68 / 12.68"],
+        ["icp on fps", "20.00", ""],
+    ]
+    assert "pcrnet on all points: 7.50 (the paper: 7.21)." in text
+    assert "icp on all points: 7.50." in text
+
+
+def test_pairs_made_in_different_ways_are_not_mixed(tmp_path):
+    put_pairs(tmp_path, "fps", 32, 12.0)
+    put_pairs(tmp_path, "mops", 32, 9.0, rotation=30)
+    with pytest.raises(UserError, match=r"differ in pairs"):
+        table(tmp_path)
+
+
+def test_joint_registration_stands_by_the_paper_s_joint_table(tmp_path):
+    notes = {"task_weights_sha256": None, "evaluated": {"learn": "joint", "max_epochs": 9}}
+    put_pairs(tmp_path, "mops", 32, 6.0, notes=notes)
+    assert ["*the paper's*", "6.74 / 9.18 / 9.65"] in rows(table(tmp_path))
+
+
+SIZES = {
+    "classification": {"512", "256", "128", "64", "32", "16", "8"},
+    "registration": {"64", "32", "8"},
+    "registration_joint": {"64", "32", "8"},
+}
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_paper_figures_are_complete(name):
     from importlib.resources import files
 
     paper = json.loads(files("mops_lightning").joinpath("paper.json").read_text())
-    rows_ = paper["classification"]["rows"]
-    for sampler, sizes in rows_.items():
-        assert set(sizes) == {"512", "256", "128", "64", "32", "16", "8"}
+    assert set(paper) == set(SIZES)
+    for sampler, sizes in paper[name]["rows"].items():
+        assert set(sizes) == SIZES[name]
         count = 1 if sampler in ("random", "voxel", "fps") else 3
         assert {len(values) for values in sizes.values()} == {count}

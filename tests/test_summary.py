@@ -35,10 +35,10 @@ def test_one_size_is_shown_by_metric():
     text = printed(metrics, "test/generated/accuracy")
     assert "m=32" in text
     assert cells(text) == [
-        ["sampled by", "accuracy"],
-        ["fps", "25.00 %"],
-        ["mops generated", "50.00 %"],
-        ["all points", "87.50 %"],
+        ["sampled by", "accuracy (%)"],
+        ["fps", "25.00"],
+        ["mops generated", "50.00"],
+        ["all points", "87.50"],
     ]
 
 
@@ -63,7 +63,7 @@ def test_seven_sizes_fit_into_eighty_columns():
         metrics[f"test/m{m}/completed/accuracy"] = m / 1000
         metrics[f"test/m{m}/completed/mean_class_accuracy"] = m / 2000
     text = printed(metrics, "test/m32/generated/accuracy")
-    assert "accuracy in %" in text
+    assert "accuracy (%)" in text
     assert cells(text) == [
         ["sampled by", *(f"m={m}" for m in sizes)],
         ["mops completed", *(f"{m / 10:.2f}" for m in sizes)],

@@ -79,8 +79,8 @@ def table(folder: Path, metric: str | None = None) -> str:
     sizes = sorted({m for values in cells.values() for m in values}, reverse=True)
     paper = _paper(names, metric)
     lines = [
-        f"Test {units.title(metric)}, {names['task']} on {names['dataset']} under "
-        f"{names['net']}: generated / matched / completed sets, or one figure for samplers that "
+        f"Test {units.title(metric)}: {names['task']} on {names['dataset']} under "
+        f"{names['net']}; generated / matched / completed sets, or one figure for samplers that "
         "choose input points.",
         "",
         "| sampled by | " + " | ".join(f"m={m}" for m in sizes) + " |",

@@ -77,6 +77,10 @@ def fit_and_test(
     task = experiment.task
     has_weights = any(True for _ in task.parameters())
     task_weights = None
+    if not has_weights and cfg.weights not in (None, "auto", evaluate.OF_RUN):
+        raise UserError(
+            f"weights: {cfg.names.net} has none to load, got {cfg.weights}. Leave weights out."
+        )
     if has_weights:
         with timed(record, "pretrain"):
             task_weights = pretrain.task_weights(cfg, dataset)

@@ -9,9 +9,9 @@ def unit(metric: str) -> str:
 
 
 def title(metric: str) -> str:
-    """Return a metric's name in words, with its unit where several figures share it."""
-    words = {"%": " in %", "°": " in degrees", "": ""}[unit(metric)]
-    return metric.removesuffix("_deg").replace("_", " ") + words
+    """Return a metric's name in words, with its unit in brackets."""
+    sign = f" ({unit(metric)})" if unit(metric) else ""
+    return metric.removesuffix("_deg").replace("_", " ") + sign
 
 
 def figure(metric: str, value: float) -> str:
