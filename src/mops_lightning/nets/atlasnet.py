@@ -1,0 +1,89 @@
+"""AtlasNet: many independent decoders, one surface patch each.
+
+Groueix et al., "A Papier-Mâché Approach to Learning 3D Surface Generation", CVPR 2018; compared
+with in the paper's section "Reconstruction of large-scale point clouds".
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from mops_lightning.errors import UserError
+from mops_lightning.nets.autoencoder import PointEncoder
+from mops_lightning.nets.foldingnet import REACH, square_grid
+from mops_lightning.nets.pointnet import linear_norm_relu
+
+
+class Patch(nn.Module):
+    """One decoder: lifts 2-D points, adds the codeword, and maps the sum to 3-D.
+
+    Args:
+        codeword: size d of the codeword.
+        channels: sizes of the layers behind the lifting, with BatchNorm and ReLU.
+    """
+
+    def __init__(self, codeword: int, channels: Sequence[int]) -> None:
+        super().__init__()
+        self.lift = nn.Linear(2, codeword)
+        self.layers = nn.Sequential(
+            *linear_norm_relu([codeword, *channels]), nn.Linear(channels[-1], 3)
+        )
+
+    def forward(self, codeword: Tensor, square: Tensor) -> Tensor:
+        """Map ``(B, d)`` codewords and ``(B or 1, g, 2)`` points of a square to ``(B, g, 3)``."""
+        hidden = self.lift(square) + codeword[:, None]
+        return self.layers(hidden.flatten(0, 1)).unflatten(0, hidden.shape[:2])
+
+
+class AtlasNet(nn.Module):
+    """The paper's encoder, and M patches that share nothing.
+
+    Training draws random points of the square, tests take a regular grid.
+
+    Args:
+        n_points: how many points are emitted when the call does not say; may change at any time.
+        pieces: M, the number of patches.
+        codeword: size d of the codeword.
+        patch_channels: sizes of the layers of every patch.
+
+    Raises:
+        UserError: a number is out of range.
+    """
+
+    def __init__(
+        self,
+        n_points: int = 1024,
+        pieces: int = 4,
+        codeword: int = 128,
+        patch_channels: Sequence[int] = (1024, 512, 512),
+    ) -> None:
+        super().__init__()
+        if pieces < 1 or n_points < pieces:
+            raise UserError(
+                "task.net.pieces must be at least 1, and task.net.n_points at least as many, got "
+                f"{pieces} and {n_points}."
+            )
+        if not patch_channels or min(patch_channels) < 1:
+            raise UserError(
+                "task.net.patch_channels must be sizes of at least 1 layer, each at least 1, "
+                f"got {list(patch_channels)}."
+            )
+        self.n_points = n_points
+        self.encoder = PointEncoder(codeword)
+        self.patches = nn.ModuleList(Patch(codeword, patch_channels) for _ in range(pieces))
+
+    def forward(self, points: Tensor, n_points: int | None = None) -> Tensor:
+        """Map ``(B, N, 3)`` points, any N, to ``(B, n, 3)``; see ``n_points`` above."""
+        n = n_points or self.n_points
+        size = -(-n // len(self.patches))
+        codeword = self.encoder(points)
+        patches = []
+        for patch in self.patches:
+            if self.training:
+                square = torch.rand(len(points), size, 2, device=points.device, dtype=points.dtype)
+                square = (square - 0.5) * 2 * REACH
+            else:
+                square = square_grid(size).to(points)[None]
+            patches.append(patch(codeword, square))
+        return torch.stack(patches, 2).flatten(1, 2)[:, :n]

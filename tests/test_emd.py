@@ -1,0 +1,127 @@
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import wasserstein_distance
+
+from mops_lightning.emd import earth_mover_distance, matching
+from mops_lightning.errors import UserError
+
+
+def plain(points, others):
+    """Try all bijections."""
+    best = []
+    for p, q in zip(points, others, strict=True):
+        orders = itertools.permutations(range(len(p)))
+        best.append(min((p - q[list(order)]).norm(dim=1).mean().item() for order in orders))
+    return torch.tensor(best, dtype=points.dtype)
+
+
+def clouds(rng, *shape):
+    return torch.randn(2, *shape, 3, dtype=torch.float64, generator=rng)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 6])
+def test_exact_distance_is_the_best_of_all_bijections(n, rng):
+    points, others = clouds(rng, 3, n)
+    torch.testing.assert_close(earth_mover_distance(points, others), plain(points, others))
+
+
+def test_on_a_line_it_is_the_wasserstein_distance_of_scipy(rng):
+    points, others = clouds(rng, 2, 200)
+    points[..., 1:] = others[..., 1:] = 0
+    want = [
+        wasserstein_distance(p[:, 0].numpy(), q[:, 0].numpy())
+        for p, q in zip(points, others, strict=True)
+    ]
+    torch.testing.assert_close(
+        earth_mover_distance(points, others), torch.tensor(want, dtype=torch.float64)
+    )
+
+
+def kinds(n, rng):
+    """Pairs of clouds as reconstruction meets them: surfaces, a start from a heap, a copy."""
+    sphere, again = clouds(rng, 1, n)
+    sphere, again = (cloud / cloud.norm(dim=2, keepdim=True) for cloud in (sphere, again))
+    noise, flat = clouds(rng, 1, n)
+    order = torch.randperm(n, generator=rng)
+    return {
+        "surface": (sphere, again),
+        "heap": (sphere, 0.1 * noise),
+        "copy": (sphere, sphere[:, order] + 0.05 * noise[:, order]),
+        "plane": (sphere, flat * torch.tensor([1.0, 0.3, 0.02])),
+    }
+
+
+@pytest.mark.parametrize("kind", ["surface", "heap", "copy", "plane"])
+@pytest.mark.parametrize(("block", "rounds", "bound"), [(64, 2, 1.17), (128, 8, 1.08)])
+def test_distance_by_blocks_is_an_upper_bound_near_the_exact_one(kind, block, rounds, bound, rng):
+    points, others = kinds(512, rng)[kind]
+    exact = earth_mover_distance(points, others).item()
+    near = earth_mover_distance(points, others, block, rounds).item()
+    assert exact * (1 - 1e-9) <= near < bound * exact
+
+
+def test_more_rounds_are_never_worse_and_one_block_is_exact(rng):
+    points, others = kinds(300, rng)["surface"]
+    values = [earth_mover_distance(points, others, 32, rounds).item() for rounds in range(6)]
+    assert values == sorted(values, reverse=True)
+    assert values[5] < values[0]
+    one = earth_mover_distance(points, others, block=300)
+    torch.testing.assert_close(one, earth_mover_distance(points, others))
+
+
+@pytest.mark.parametrize("block", [None, 7])
+def test_matchings_are_bijections_of_odd_and_coincident_clouds_too(block, rng):
+    points, others = clouds(rng, 3, 61)
+    points[1] = 0.5
+    others[2] = points[2]
+    match = matching(points, others, block)
+    assert torch.equal(match.sort(1).values, torch.arange(61).expand(3, -1))
+    assert torch.equal(matching(points, others, block), match)
+    if block is None:
+        assert earth_mover_distance(points, others)[2] == 0
+
+
+@pytest.mark.parametrize("block", [None, 4])
+def test_gradients(block, rng):
+    points, others = (cloud.requires_grad_() for cloud in clouds(rng, 2, 9))
+    assert torch.autograd.gradcheck(
+        lambda a, b: earth_mover_distance(a, b, block), (points, others), eps=1e-7
+    )
+    same = points.detach().clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(earth_mover_distance(same, points).sum(), same)
+    assert torch.isfinite(gradient).all()
+
+
+def test_half_precision_and_float32_are_taken(rng):
+    points, others = clouds(rng, 2, 20)
+    exact = earth_mover_distance(points, others)
+    torch.testing.assert_close(earth_mover_distance(points.float(), others.float()), exact.float())
+    assert earth_mover_distance(points.half(), others.half()).dtype == torch.float16
+
+
+def test_ten_thousand_points_take_little_memory_and_time(rng):
+    points, others = kinds(10_000, rng)["surface"]
+    value = earth_mover_distance(points, others, block=64, rounds=2).item()
+    # What no bijection can beat: every point to the nearest one.
+    from scipy.spatial import cKDTree
+
+    lower = np.mean(cKDTree(others[0].numpy()).query(points[0].numpy())[0])
+    assert lower < value < 4 * lower
+    assert np.isfinite(value)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"others": torch.zeros(2, 6, 3)}, r"same N, got \(2, 5, 3\) and \(2, 6, 3\)"),
+        ({"block": 1}, "block must be at least 2 points, got 1"),
+        ({"rounds": -1}, "rounds must not be negative, got -1"),
+    ],
+)
+def test_bad_input_is_named(change, said):
+    given = {"points": torch.zeros(2, 5, 3), "others": torch.zeros(2, 5, 3), **change}
+    with pytest.raises(UserError, match=said):
+        earth_mover_distance(**given)
