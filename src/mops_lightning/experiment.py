@@ -87,12 +87,13 @@ class Experiment(L.LightningModule):
         self.m: int = m or (self.sampler.m if self.sampler is not None else 0)
         self.sizes = tuple(sizes or (self.m,))
         self.own_readouts = readout_names(self.sampler)
-        self.score_name = f"test/{self._prefix(self.m)}{self.own_readouts[0]}/{self.task.score}"
+        score = task.full_score or task.score if self.sampler is None else task.score
+        self.score_name = f"test/{self._prefix(self.m)}{self.own_readouts[0]}/{score}"
         readouts = dict.fromkeys([*self.own_readouts, *self.baselines])
         keys = [f"{self._prefix(size)}{name}" for size in self.sizes for name in readouts]
         make_metrics = task.metrics
         self.scores = nn.ModuleDict({key: make_metrics() for key in (*keys, *readouts, FULL)})
-        self.train_scores = make_metrics()
+        self.train_scores = make_metrics(training=True)
         self.set_metrics = nn.ModuleDict(
             {
                 f"{prefix}{name}": MeanMetric(nan_strategy="disable")
@@ -229,7 +230,7 @@ class Experiment(L.LightningModule):
         size = len(batch.points)
         within = prefix.split("/", 1)[1]
         for readout in names:
-            result = self.task.step(batch, readouts.sample_as(readout, m))
+            result = self.task.scored(batch, readouts.sample_as(readout, m))
             metrics: Any = self.scores[f"{within}{readout}"]
             metrics.update(result.predictions, result.targets)
             for name, metric in metrics.items(keep_base=True, copy_state=False):

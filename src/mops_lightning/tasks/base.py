@@ -25,6 +25,9 @@ class Task(nn.Module):
     score: str
     """The metric shown in tables."""
 
+    full_score: str | None = None
+    """The metric that tells how good the net is by itself; None: the same."""
+
     tells_classes: bool = False
     """Whether the net's outputs are the data's classes, so that it fits no others."""
 
@@ -53,8 +56,16 @@ class Task(nn.Module):
         """Return losses, predictions and targets of one batch."""
         raise NotImplementedError
 
-    def metrics(self) -> MetricCollection:
-        """Return new metrics that take predictions and targets."""
+    def scored(self, batch: Any, sample: Sample) -> TaskOutput:
+        """Return what ``step`` does, for scores instead of training; the same by default."""
+        return self.step(batch, sample)
+
+    def metrics(self, training: bool = False) -> MetricCollection:
+        """Return new metrics that take predictions and targets of ``scored``.
+
+        Args:
+            training: take those of ``step`` instead.
+        """
         raise NotImplementedError
 
     def cloud_titles(self, titles: Sequence[str]) -> list[str]:

@@ -47,7 +47,7 @@ class Classification(Task):
         loss = F.cross_entropy(logits, batch.labels)
         return TaskOutput({"cross_entropy": loss}, logits, batch.labels)
 
-    def metrics(self) -> MetricCollection:
+    def metrics(self, training: bool = False) -> MetricCollection:
         """Overall accuracy and the mean of the classes' accuracies, both in [0, 1]."""
         metrics: dict[str, Metric | MetricCollection] = {
             "accuracy": MulticlassAccuracy(self.num_classes, average="micro"),

@@ -72,7 +72,7 @@ class Registration(Task):
         source, target = sample(batch.points).points.chunk(2)
         return self.net(source, target)
 
-    def metrics(self) -> MetricCollection:
+    def metrics(self, training: bool = False) -> MetricCollection:
         """Rotation errors in degrees, recalls in [0, 1], translation error in coordinate units."""
         metrics: dict[str, Metric | MetricCollection] = {
             "rotation_error_deg": RotationError(),

@@ -1,0 +1,107 @@
+"""Reconstruction of dense clouds from sampled points (paper section "Reconstruction")."""
+
+import torch
+from torch import Tensor, nn
+from torchmetrics import Metric, MetricCollection
+
+from mops_lightning.emd import earth_mover_distance
+from mops_lightning.errors import UserError
+from mops_lightning.losses import chamfer_distance
+from mops_lightning.reconstruction_metrics import Distances, MeanDistance, NormalizedError
+from mops_lightning.tasks.base import Sample, Task
+from mops_lightning.types import Batch, TaskOutput
+
+SCORED_BLOCK, SCORED_ROUNDS = 256, 8
+"""How earth mover's distances are scored that are too large for the exact one."""
+
+
+class Reconstruction(Task):
+    """Rebuilds a cloud from its sampled points with an auto-encoder.
+
+    The loss is the chamfer distance plus ``emd_weight`` times the earth mover's distance. The
+    latter goes by blocks (see ``emd.block_matching``), for exact matching would take most of the
+    training's time.
+    Scores take it exactly up to ``exact_up_to`` points, and by larger blocks above.
+
+    Args:
+        net: maps ``(B, M, 3)`` points and a number n to ``(B, n, 3)``.
+        emd_weight: of the earth mover's distance in the loss; 0 leaves it out.
+        emd_block: points in a block, in training.
+        emd_rounds: rounds of blocks, in training.
+        exact_up_to: largest clouds whose distance is scored exactly.
+
+    Raises:
+        UserError: the weight is negative.
+    """
+
+    score = "nre_cd"
+    """The metric shown in tables; 1 is as good as all points, a lower one is better."""
+    full_score = "chamfer"
+
+    def __init__(
+        self,
+        net: nn.Module,
+        emd_weight: float = 1.0,
+        emd_block: int = 64,
+        emd_rounds: int = 2,
+        exact_up_to: int = 2048,
+    ) -> None:
+        super().__init__(net)
+        if emd_weight < 0:
+            raise UserError(f"task.emd_weight must not be negative, got {emd_weight}.")
+        self.emd_weight = emd_weight
+        self.emd_block = emd_block
+        self.emd_rounds = emd_rounds
+        self.exact_up_to = exact_up_to
+        self._reference: tuple[Tensor, Distances] | None = None
+
+    def step(self, batch: Batch, sample: Sample) -> TaskOutput:
+        """Reconstruct one batch for training.
+
+        Args:
+            batch: clouds.
+            sample: turns points into what the net is to see.
+
+        Returns:
+            The loss terms, and the distances of the reconstructions without a reference.
+        """
+        built = self._rebuilt(batch.points, sample)
+        chamfer = chamfer_distance(built, batch.points)
+        losses = {"chamfer": chamfer.mean()}
+        emd = torch.zeros_like(chamfer)
+        if self.emd_weight:
+            emd = earth_mover_distance(built, batch.points, self.emd_block, self.emd_rounds)
+            losses["emd"] = self.emd_weight * emd.mean()
+        return TaskOutput(losses, Distances(chamfer, emd), None)
+
+    def scored(self, batch: Batch, sample: Sample) -> TaskOutput:
+        """Reconstruct one batch for scores, from sampled and, once for all readouts, all points."""
+        if self._reference is None or self._reference[0] is not batch.points:
+            self._reference = (batch.points, self._distances(batch.points, batch.points))
+        found = self._distances(batch.points, sample(batch.points).points)
+        losses = {"chamfer": found.chamfer.mean(), "emd": self.emd_weight * found.emd.mean()}
+        return TaskOutput(losses, found, self._reference[1])
+
+    def _rebuilt(self, points: Tensor, sample: Sample) -> Tensor:
+        return self.net(sample(points).points, points.shape[1])
+
+    def _distances(self, points: Tensor, seen: Tensor) -> Distances:
+        built = self.net(seen, points.shape[1])
+        exact = points.shape[1] <= self.exact_up_to
+        emd = earth_mover_distance(built, points, None if exact else SCORED_BLOCK, SCORED_ROUNDS)
+        return Distances(chamfer_distance(built, points), emd)
+
+    def metrics(self, training: bool = False) -> MetricCollection:
+        """Distances in (squared) units of the coordinates, and NRE; training has no reference."""
+        metrics: dict[str, Metric | MetricCollection] = {
+            "chamfer": MeanDistance("chamfer"),
+            "emd": MeanDistance("emd"),
+        }
+        if not training:
+            metrics |= {
+                "nre_cd": NormalizedError("chamfer"),
+                "nre_emd": NormalizedError("emd"),
+                "nre_cd_of_means": NormalizedError("chamfer", of_means=True),
+                "nre_emd_of_means": NormalizedError("emd", of_means=True),
+            }
+        return MetricCollection(metrics, compute_groups=False)

@@ -1,0 +1,134 @@
+import pytest
+import torch
+
+from mops_lightning.data.loader import CloudLoader
+from mops_lightning.emd import earth_mover_distance
+from mops_lightning.errors import UserError
+from mops_lightning.experiment import Experiment
+from mops_lightning.losses import chamfer_distance
+from mops_lightning.nets.autoencoder import AutoEncoder
+from mops_lightning.nets.foldingnet import MFoldingNet
+from mops_lightning.reconstruction_metrics import Distances, MeanDistance, NormalizedError
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.scoring import full_cloud
+from mops_lightning.tasks.reconstruction import Reconstruction
+from mops_lightning.types import Batch
+from tests.conftest import quiet_trainer, small_dataset
+from tests.test_experiment import changed, state
+
+
+def task(**extra):
+    torch.manual_seed(0)
+    return Reconstruction(AutoEncoder(48, 8, (8, 8), (16,)), **extra)
+
+
+def batch(rng, number=4, points=48):
+    return Batch(torch.randn(number, points, 3, generator=rng), torch.zeros(number))
+
+
+def test_the_loss_is_chamfer_plus_weighted_emd(rng):
+    given = batch(rng)
+    for weight in (0.0, 1.0, 2.5):
+        module = task(emd_weight=weight, emd_block=48).eval()
+        losses = module.step(given, full_cloud).losses
+        built = module.net(given.points)
+        torch.testing.assert_close(losses["chamfer"], chamfer_distance(built, given.points).mean())
+        assert set(losses) == {"chamfer", *(["emd"] if weight else [])}
+        if weight:
+            emd = earth_mover_distance(built, given.points).mean()
+            torch.testing.assert_close(losses["emd"], weight * emd)
+
+
+def test_all_points_have_an_error_of_one_and_a_sample_of_the_same_codeword_too(rng):
+    module = task().eval()
+    given = batch(rng)
+    metrics = module.metrics()
+    result = module.scored(given, full_cloud)
+    metrics.update(result.predictions, result.targets)
+    values = metrics.compute()
+    for name in ("nre_cd", "nre_emd", "nre_cd_of_means", "nre_emd_of_means"):
+        assert values[name] == 1
+    result = module.scored(given, FPSSampler(4))
+    metrics = module.metrics()
+    metrics.update(result.predictions, result.targets)
+    values = metrics.compute()
+    built = module.net(FPSSampler(4)(given.points).points)
+    ratio = chamfer_distance(built, given.points) / chamfer_distance(
+        module.net(given.points), given.points
+    )
+    torch.testing.assert_close(values["nre_cd"], ratio.mean())
+    torch.testing.assert_close(values["chamfer"], chamfer_distance(built, given.points).mean())
+    exact = earth_mover_distance(built, given.points).mean()
+    torch.testing.assert_close(values["emd"], exact)
+
+
+def test_references_are_those_of_the_batch_at_hand(rng):
+    module = task().eval()
+    for _ in range(3):
+        given = batch(rng)
+        result = module.scored(given, full_cloud)
+        assert torch.equal(result.predictions.chamfer, result.targets.chamfer)
+        assert torch.equal(result.predictions.emd, result.targets.emd)
+
+
+def test_ratios_are_averaged_over_clouds_or_taken_of_means():
+    found = Distances(torch.tensor([2.0, 3.0, 0.0]), torch.tensor([1.0, 1.0, 0.0]))
+    full = Distances(torch.tensor([1.0, 6.0, 0.0]), torch.tensor([0.5, 1.0, 0.0]))
+    assert NormalizedError("chamfer")(found, full).item() == pytest.approx((2 + 0.5 + 1) / 3)
+    assert NormalizedError("chamfer", of_means=True)(found, full).item() == pytest.approx(5 / 7)
+    assert NormalizedError("emd")(found, full).item() == pytest.approx((2 + 1 + 1) / 3)
+    assert MeanDistance("emd")(found, None).item() == pytest.approx(2 / 3)
+
+
+def trained(learn, sampler, **extra):
+    torch.manual_seed(1)
+    module = Experiment(
+        task(),
+        sampler,
+        learn=learn,
+        make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
+        **extra,
+    )
+    before = state(module)
+    data = small_dataset()
+    quiet_trainer(1).fit(
+        module, CloudLoader(data.train, 6, shuffle=True, drop_last=True), CloudLoader(data.test, 6)
+    )
+    return module, changed(before, module)
+
+
+def sampler():
+    return MOPSNet(8, feature_channels=(8, 8), rho_channels=(16, 8))
+
+
+def test_frozen_joint_and_alone():
+    assert {name.split(".")[0] for name in trained("sampler", sampler())[1]} == {"sampler"}
+    assert {name.split(".")[0] for name in trained("joint", sampler())[1]} == {"sampler", "task"}
+    module, names = trained("task", None)
+    assert {name.split(".")[0] for name in names} == {"task"}
+    assert module.score_name == "test/full/chamfer"
+
+
+def test_every_readout_is_scored():
+    module, _ = trained("sampler", sampler(), baselines={"fps": FPSSampler(8)})
+    run = quiet_trainer(1)
+    run.test(module, CloudLoader(small_dataset().test, 4), verbose=False)
+    for readout in ("generated", "matched", "completed", "fps", "full"):
+        for name in module.task.metrics():
+            assert run.callback_metrics[f"test/{readout}/{name}"] > 0
+    assert run.callback_metrics["test/full/nre_cd"] == 1
+    assert module.score_name == "test/generated/nre_cd"
+
+
+def test_a_net_whose_points_can_change_serves_other_clouds(rng):
+    torch.manual_seed(0)
+    module = Reconstruction(MFoldingNet(48, 2, 8, fold_channels=(8, 8))).eval()
+    assert module.scored(batch(rng, points=60), full_cloud).predictions.emd.shape == (4,)
+    with pytest.raises(UserError, match="emits the 48 points"):
+        task().scored(batch(rng, points=60), full_cloud)
+
+
+def test_a_negative_weight_is_refused():
+    with pytest.raises(UserError, match=r"task.emd_weight must not be negative, got -1"):
+        task(emd_weight=-1)
