@@ -18,6 +18,8 @@ def choices():
 
 EXTRA = {
     "dataset=meshes": ["dataset.root=somewhere"],
+    "dataset=hdf5": ["dataset.root=somewhere"],
+    "dataset=mesh_sequence": ["dataset.root=somewhere"],
     "task/loss=quaternion": ["task=registration"],
     "task/loss=frobenius_chamfer": ["task=registration"],
 }

@@ -66,14 +66,61 @@ def meshes(
     Raises:
         UserError: naming the setting or the file that is wrong.
     """
-    root = Path(root).expanduser()
-    allowed = {"n_points": (n_points, 1), "seed": (seed, 0), "workers": (workers, 1)}
-    for setting, (value, least) in allowed.items():
+    root = mesh_root(root, {"n_points": (n_points, 1), "seed": (seed, 0), "workers": (workers, 1)})
+    rows = _listed(root, Path(split_file).expanduser()) if split_file else _laid_out(root)
+    return sample_rows(
+        root,
+        rows,
+        classes,
+        n_points,
+        skip_broken=skip_broken,
+        seed=seed,
+        cache=cache,
+        workers=workers,
+    )
+
+
+def mesh_root(root: str | Path, settings: dict[str, tuple[int, int]]) -> Path:
+    """Return the folder, once it is known to be one and the settings are large enough.
+
+    Args:
+        root: the folder's path.
+        settings: by name, what was given and the least that is allowed.
+
+    Raises:
+        UserError: naming the setting.
+    """
+    for setting, (value, least) in settings.items():
         if value < least:
             raise UserError(f"dataset.{setting} must be at least {least}, got {value}.")
-    if not root.is_dir():
-        raise UserError(f"dataset.root: {root} is not a folder. Set dataset.root=PATH.")
-    rows = _listed(root, Path(split_file).expanduser()) if split_file else _laid_out(root)
+    folder = Path(root).expanduser()
+    if not folder.is_dir():
+        raise UserError(f"dataset.root: {folder} is not a folder. Set dataset.root=PATH.")
+    return folder
+
+
+def sample_rows(
+    root: Path,
+    rows: Sequence[tuple[PurePosixPath, str]],
+    classes: Sequence[str] | None,
+    n_points: int,
+    skip_broken: bool = False,
+    seed: int = 0,
+    cache: str | Path | None = None,
+    workers: int = 1,
+) -> CloudDataset:
+    """Sample the listed meshes; see ``meshes`` for the arguments and what comes back.
+
+    Args:
+        root: the folder.
+        rows: paths below it, whose first part is the class, each with ``train`` or ``test``.
+        classes: names to keep.
+        n_points: points of each surface.
+        skip_broken: leave out what cannot be read.
+        seed: of the sampling.
+        cache: folder for the sampled clouds.
+        workers: processes that read meshes.
+    """
     chosen = choose_classes(classes, sorted({name.parts[0] for name, _ in rows}))
     rows = sorted(row for row in rows if row[0].parts[0] in chosen)
     digest = hashlib.sha256(repr(("meshes", VERSION, n_points, seed, chosen)).encode())

@@ -5,13 +5,12 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import h5py
-import numpy as np
 import torch
 
 from mops_lightning.data.archive import unpack
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, select_classes
 from mops_lightning.data.download import fetch, one_at_a_time
+from mops_lightning.data.hdf5 import read_clouds
 from mops_lightning.errors import UserError
 
 FOLDER = "modelnet40_ply_hdf5_2048"
@@ -73,7 +72,7 @@ def modelnet40(
     splits = []
     for split in ("train", "test"):
         files = _files(folder, split)
-        parts = [_read(path, n_points, len(known)) for path in files]
+        parts = [read_clouds(path, n_points, len(known)) for path in files]
         whole = Clouds(
             torch.cat([part.points for part in parts]), torch.cat([part.labels for part in parts])
         )
@@ -136,50 +135,3 @@ def _files(folder: Path, split: str) -> list[Path]:
     if not files:
         raise UserError(f"dataset.root: no ply_data_{split}*.h5 in {folder}.")
     return files
-
-
-def _read(path: Path, n_points: int, n_classes: int) -> Clouds:
-    """Read the first points and the labels of one file, and check all that can be wrong."""
-    if not path.is_file():
-        raise UserError(
-            f"dataset.root: {path} is missing. Complete the folder, or remove it and try "
-            "dataset.download=true."
-        )
-    try:
-        with h5py.File(path, "r") as file:
-            for key in ("data", "label"):
-                if not isinstance(file.get(key), h5py.Dataset):
-                    raise UserError(f"{path} has no dataset {key!r}; it holds {sorted(file)}.")
-            data, label = file["data"], file["label"]
-            shapes, kinds = (data.shape, label.shape), data.dtype.kind + label.dtype.kind
-            if (
-                data.ndim != 3
-                or data.shape[2] != 3
-                or label.shape not in ((len(data),), (len(data), 1))
-                or kinds not in ("fu", "fi")
-            ):
-                raise UserError(
-                    f"{path} must hold data (S, N, 3) of floats and label (S, 1) or (S,) of "
-                    f"integers, got {shapes[0]} {data.dtype} and {shapes[1]} {label.dtype}."
-                )
-            if data.shape[1] < n_points:
-                raise UserError(
-                    f"dataset.n_points is {n_points}, but {path} stores {data.shape[1]} points "
-                    f"a shape. Set dataset.n_points={data.shape[1]} or less."
-                )
-            with np.errstate(over="ignore"):  # what overflows is found below
-                points = np.asarray(data[:, :n_points], dtype=np.float32)
-            labels = np.asarray(label[()], dtype=np.int64).reshape(-1)
-    except (OSError, RuntimeError, KeyError) as error:
-        raise UserError(
-            f"{path} is not a whole HDF5 file ({error}). Remove it and fetch it again, for "
-            "instance by removing its folder and setting dataset.download=true."
-        ) from error
-    if not np.isfinite(points).all():
-        raise UserError(f"{path} holds NaN or infinite coordinates; fetch it again.")
-    if len(labels) and not 0 <= labels.min() <= labels.max() < n_classes:
-        raise UserError(
-            f"{path} holds labels from {labels.min()} to {labels.max()}, but shape_names.txt "
-            f"names {n_classes} classes (0 to {n_classes - 1})."
-        )
-    return Clouds(torch.from_numpy(points), torch.from_numpy(labels))

@@ -1,0 +1,60 @@
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning.data.hdf5 import hdf5
+from mops_lightning.errors import UserError
+
+
+@pytest.fixture
+def folder(tmp_path):
+    rng = np.random.default_rng(0)
+    for split, number in (("train", 6), ("test", 4)):
+        with h5py.File(tmp_path / f"{split}.h5", "w") as file:
+            file["data"] = rng.normal(size=(number, 50, 3)).astype(np.float32)
+            file["label"] = (np.arange(number) % 2).astype(np.uint8)[:, None]
+            file["name"] = np.array([b"x"] * number)
+    return tmp_path
+
+
+def test_first_points_of_both_files_are_read_as_they_are(folder):
+    data = hdf5(folder, n_points=20)
+    assert data.class_names == ("class_0", "class_1")
+    assert data.train.points.shape == (6, 20, 3)
+    with h5py.File(folder / "test.h5") as file:
+        assert torch.equal(data.test.points, torch.from_numpy(file["data"][:, :20]))
+    assert data.fingerprint == hdf5(folder, n_points=20).fingerprint
+    assert data.fingerprint != hdf5(folder, n_points=21).fingerprint
+
+
+def test_names_are_used_and_can_be_chosen(folder):
+    (folder / "shape_names.txt").write_text("airplane\nbowl\n")
+    data = hdf5(folder, 20, ["bowl"])
+    assert data.class_names == ("bowl",)
+    assert data.test.labels.tolist() == [0, 0]
+    (folder / "shape_names.txt").write_text("airplane\n")
+    with pytest.raises(UserError, match=r"labels from 0 to 1, but shape_names.txt names 1 classes"):
+        hdf5(folder, 20)
+
+
+def test_mistakes_are_named(folder, tmp_path):
+    with pytest.raises(UserError, match=r"dataset.n_points must be at least 1, got 0"):
+        hdf5(folder, 0)
+    with pytest.raises(UserError, match=r"dataset.root: .*/nowhere is not a folder"):
+        hdf5(tmp_path / "nowhere")
+    with pytest.raises(UserError, match=r"n_points is 51, but .*h5 stores 50 points"):
+        hdf5(folder, 51)
+    (folder / "test.h5").unlink()
+    with pytest.raises(UserError, match=r"test.h5 is missing"):
+        hdf5(folder, 20)
+
+
+def test_real_airplanes_of_ten_thousand_points(real_data):
+    root = real_data / "modelnet40_airplane_10000"
+    if not root.is_dir():
+        pytest.skip(f"{root} is not there")
+    data = hdf5(root, n_points=10_000)
+    assert data.train.points.shape == (626, 10_000, 3)
+    assert data.test.points.shape == (100, 10_000, 3)
+    assert data.test.points.norm(dim=2).max() < 1.001

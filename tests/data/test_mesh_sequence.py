@@ -1,0 +1,77 @@
+import pytest
+import torch
+import trimesh
+
+from mops_lightning.data.mesh_sequence import mesh_sequence
+from mops_lightning.errors import UserError
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two sequences of boxes that grow longer with time; names are not padded."""
+    for name, frames in (("crane", 12), ("samba", 10)):
+        (tmp_path / name).mkdir()
+        for frame in range(frames):
+            box = trimesh.creation.box((1, 1, 1 + frame))
+            box.export(tmp_path / name / f"mesh_{frame}.ply")
+        (tmp_path / name / "notes.txt").write_text("no mesh")
+    return tmp_path
+
+
+def lengths(points):
+    """Frame numbers, from the boxes' proportions."""
+    size = points.amax(1) - points.amin(1)
+    return (size[:, 2] / size[:, 0] - 1).round().int().tolist()
+
+
+def test_the_last_frames_are_tested_and_their_neighbours_belong_to_neither(folder):
+    data = mesh_sequence(folder, n_points=3000, test_share=0.25, gap=2)
+    assert data.class_names == ("crane", "samba")
+    train, test = data.train, data.test
+    crane, samba = (sorted(lengths(test.points[test.labels == label])) for label in (0, 1))
+    assert crane == [9, 10, 11]
+    assert samba == [8, 9]
+    assert sorted(lengths(train.points[train.labels == 0])) == list(range(7))
+    assert sorted(lengths(train.points[train.labels == 1])) == list(range(6))
+    assert train.points.shape[1:] == (3000, 3)
+    assert train.points.norm(dim=2).amax(1).allclose(torch.ones(13))
+
+
+def test_one_sequence_and_a_cache(folder, tmp_path):
+    cache = tmp_path / "cache"
+    first = mesh_sequence(folder, 100, ["samba"], cache=cache)
+    assert first.class_names == ("samba",)
+    again = mesh_sequence(folder, 100, ["samba"], cache=cache)
+    assert torch.equal(first.train.points, again.train.points)
+    assert first.fingerprint == again.fingerprint
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"test_share": 0.0}, r"dataset.test_share must lie between 0 and 1, got 0.0"),
+        ({"gap": -1}, r"dataset.gap must be at least 0, got -1"),
+        ({"gap": 10}, r"dataset.gap: .*crane has 12 frames, of which 2 are tested and 10 left"),
+        ({"n_points": 0}, r"dataset.n_points must be at least 1, got 0"),
+        ({"classes": ["samb"]}, r"unknown class 'samb'.*samba"),
+    ],
+)
+def test_mistakes_are_named(folder, settings, said):
+    with pytest.raises(UserError, match=said):
+        mesh_sequence(folder, **{"n_points": 50, **settings})
+
+
+def test_a_folder_without_sequences_is_named(tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match=r"no mesh in .* Looked for SEQUENCE"):
+        mesh_sequence(tmp_path)
+
+
+def test_real_captures(real_data):
+    root = real_data / "vlasic2008"
+    if not root.is_dir():
+        pytest.skip(f"{root} is not there")
+    data = mesh_sequence(root, n_points=64)
+    assert data.class_names == ("crane", "samba")
+    assert len(data.test.labels) == 24
+    assert len(data.train.labels) == 2 * (59 - 12 - 2)
