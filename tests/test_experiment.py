@@ -57,6 +57,16 @@ def test_learning_the_sampler_leaves_the_task_bit_identical():
     assert {"sampler.queries.weight", "sampler.rho_first.0.running_mean"} <= names
 
 
+@pytest.mark.parametrize(("learn", "rates"), [("joint", [1e-2, 1e-3]), ("sampler", [1e-2])])
+def test_a_jointly_trained_task_net_may_learn_more_slowly(learn, rates):
+    module = fit(experiment(learn, task_rate=0.1), epochs=1)
+    groups = module.optimizers().param_groups
+    assert [group["lr"] for group in groups] == pytest.approx(rates)
+    parts = (module.sampler, module.task)[: len(rates)]
+    for group, part in zip(groups, parts, strict=True):
+        assert {id(p) for p in group["params"]} == {id(p) for p in part.parameters()}
+
+
 def test_learning_jointly_changes_both():
     module = experiment("joint")
     before = state(module)

@@ -17,6 +17,7 @@ RUN_KEYS = (
     "weights",
     "ckpt_path",
     "evaluate",
+    "task_rate",
     "batch_size",
     "val_fraction",
     "pictures",
@@ -128,6 +129,8 @@ def check(cfg: DictConfig) -> None:
     _whole(cfg, "seed", 0)
     _whole(cfg, "batch_size", 2)  # BatchNorm cannot learn from one cloud
     _whole(cfg, "pictures", 0)
+    if not isinstance(cfg.task_rate, int | float) or cfg.task_rate <= 0:
+        raise UserError(f"task_rate must be a number above 0, got {cfg.task_rate!r}.")
     if not isinstance(cfg.val_fraction, int | float) or not 0 <= cfg.val_fraction < 1:
         raise UserError(f"val_fraction must be in [0, 1), got {cfg.val_fraction!r}.")
     if "m_max" in cfg.sampler and cfg.learn != "task":

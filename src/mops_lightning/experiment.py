@@ -40,6 +40,7 @@ class Experiment(L.LightningModule):
         identity: kept in checkpoints, so that none is resumed under other settings.
         sizes: how many points are tested, from one pass over the data; None: ``m`` alone. With
             several, the metrics are named ``test/m32/generated/accuracy`` and so on.
+        task_rate: with ``learn="joint"`` the task net's learning rate over that of the sampler.
         m: the size that is validated and whose score stands for the run; None: the sampler's.
 
     Raises:
@@ -59,6 +60,7 @@ class Experiment(L.LightningModule):
         identity: dict[str, str] | None = None,
         sizes: Sequence[int] | None = None,
         m: int | None = None,
+        task_rate: float = 1.0,
     ) -> None:
         super().__init__()
         allowed = get_args(Learn)
@@ -81,6 +83,7 @@ class Experiment(L.LightningModule):
         self.make_schedule = make_schedule
         self.seed = seed
         self.identity = identity
+        self.task_rate = task_rate
         self.total_steps = 1
         for module in self._frozen():
             module.requires_grad_(False)
@@ -127,7 +130,11 @@ class Experiment(L.LightningModule):
         """Build the optimizer of what learns, and its schedule over all steps of the run."""
         if self.make_optimizer is None:
             raise UserError("This experiment was built without an optimizer: it can only test.")
-        optimizer = self.make_optimizer([p for p in self.parameters() if p.requires_grad])
+        modules = [module for module in (self.sampler, self.task) if module is not None]
+        groups = [[p for p in module.parameters() if p.requires_grad] for module in modules]
+        optimizer = self.make_optimizer([{"params": group} for group in groups if group])
+        if self.learn == "joint":
+            optimizer.param_groups[-1]["lr"] *= self.task_rate
         self.total_steps = int(self.trainer.estimated_stepping_batches)
         if self.make_schedule is None:
             return optimizer

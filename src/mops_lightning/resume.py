@@ -25,6 +25,7 @@ def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
         "learn": cfg.learn,
         "seed": cfg.seed,
         "batch_size": cfg.batch_size,
+        **({"task_rate": cfg.task_rate} if cfg.learn == "joint" else {}),
         "val_fraction": cfg.val_fraction,
         "dataset": fingerprint,
         "epochs": cfg.trainer.max_epochs,

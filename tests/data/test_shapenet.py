@@ -47,7 +47,7 @@ def test_core_clouds_can_stay_as_they_are_and_classes_be_chosen(core):
     data = shapenet_core(core, n_points=60, classes=[CHAIR], normalize=False)
     assert data.class_names == (CHAIR,)
     stored: list[Any] = [trimesh.load(path) for path in (core / CHAIR).glob("*.ply")]
-    first = {tuple(np.float32(cloud.vertices[0]).tolist()) for cloud in stored}
+    first = {tuple(np.asarray(cloud.vertices, np.float32)[0].tolist()) for cloud in stored}
     read = torch.cat([data.train.points, data.test.points])[:, 0]
     assert {tuple(row) for row in read.tolist()} == first
 
