@@ -174,3 +174,14 @@ def test_a_lost_sampler_is_named(trained, tmp_path):
 def test_other_command_lines_are_left_alone():
     assert command_line(["m=8", "evaluate=null"]) == ["m=8", "evaluate=null"]
     assert command_line(["--help"]) == ["--help"]
+
+
+def test_another_net_or_loss_takes_the_place_of_all_its_settings(tmp_path):
+    overrides = [*TINY, "task=registration", "task.net.iterations=2", f"cache={tmp_path}/cache"]
+    overrides += ["sampler=mops", "task/loss=frobenius_chamfer", "task.loss.chamfer_weight=0.5"]
+    run(compose(overrides), tmp_path / "run", overrides)
+    for other in (["task/net=icp"], ["task/loss=quaternion"]):
+        chosen = command_line([f"evaluate={tmp_path}/run", "pictures=0", "logger=none", *other])
+        cfg = compose(chosen)
+        record = run(cfg, tmp_path / other[0].replace("/", "-"), chosen)
+        assert record["status"] == "completed"

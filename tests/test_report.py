@@ -173,6 +173,42 @@ def test_pairs_made_in_different_ways_are_not_mixed(tmp_path):
         table(tmp_path)
 
 
+def test_nets_of_other_settings_are_not_mixed(tmp_path):
+    for name, passes in (("fps", 1), ("mops", 3)):
+        put(
+            tmp_path,
+            name,
+            32,
+            {"test/sampled/accuracy": 0.5},
+            settings={"net": {"iterations": passes}},
+        )
+    with pytest.raises(UserError, match=r"differ in settings of pointnet"):
+        table(tmp_path)
+
+
+def test_a_folder_of_task_nets_alone_says_what_they_score(tmp_path):
+    metrics = {f"test/full/{DEGREES}": 7.5}
+    notes = {"score": f"test/full/{DEGREES}"}
+    put(tmp_path, "mops", 32, metrics, "registration", "pcrnet", notes=notes)
+    path = tmp_path / "mops-32-pcrnet" / "result.json"
+    path.write_text(path.read_text().replace('"learn": "sampler"', '"learn": "task"'))
+    text = table(tmp_path)
+    assert text.startswith("No sampler was tested; registration on modelnet40.")
+    assert "pcrnet on all points: 7.50 (the paper: 7.21)." in text
+
+
+def test_runs_of_another_task_are_not_listed_and_other_nets_are_named(tmp_path):
+    put_pairs(tmp_path, "fps", 32, 12.0)
+    put_pairs(tmp_path, "fps", 32, 20.0, net="icp")
+    put(tmp_path, "snet", 32, {"test/full/accuracy": 0.9})
+    path = tmp_path / "snet-32-pointnet" / "result.json"
+    path.write_text(path.read_text().replace('"learn": "sampler"', '"learn": "task"'))
+    text = table(tmp_path)
+    assert "pointnet" not in text
+    assert "- fps under icp: nothing to train" in text
+    assert "- fps: nothing to train" in text
+
+
 def test_joint_registration_stands_by_the_paper_s_joint_table(tmp_path):
     notes = {"task_weights_sha256": None, "evaluated": {"learn": "joint", "max_epochs": 9}}
     put_pairs(tmp_path, "mops", 32, 6.0, notes=notes)

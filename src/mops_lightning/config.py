@@ -118,6 +118,8 @@ def check(cfg: DictConfig) -> None:
     for name in known:
         if name not in cfg and name != "logger":
             raise UserError(f"{name} cannot be removed. Choose another one with {name}=...")
+    if not isinstance(cfg.task.get("net"), DictConfig):
+        raise UserError("task.net cannot be removed. Choose another one with task/net=NAME.")
     for key in cfg:
         if str(key) not in known:
             raise UserError(f"Unknown setting {key!r}.{did_you_mean(str(key), known)}")

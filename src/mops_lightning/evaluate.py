@@ -221,4 +221,4 @@ def _key(override: str) -> str:
 
 def _covers(key: str, other: str) -> bool:
     """Return whether overriding ``key`` makes an earlier override of ``other`` void."""
-    return other == key or other.startswith((f"{key}.", f"{key}/"))
+    return other == key or other.startswith((f"{key}.", f"{key}/", f"{key.replace('/', '.')}."))

@@ -68,7 +68,7 @@ class Experiment(L.LightningModule):
             raise UserError(f"learn: unknown value {learn!r}.{did_you_mean(learn, allowed)}")
         if sampler is None and learn != "task":
             raise UserError(f"learn={learn} needs a sampler; without one only learn=task works.")
-        learns = learn == "task" or (sampler.learned and learn != "nothing")  # type: ignore[union-attr]
+        learns = learn in ("task", "joint") or (sampler.learned and learn != "nothing")  # type: ignore[union-attr]
         if learns and not getattr(task.net, "differentiable", True):
             raise UserError(
                 f"learn={learn}: {type(task.net).__name__} has no weights and lets no gradient "

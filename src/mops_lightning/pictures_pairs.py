@@ -31,13 +31,18 @@ class Aligned(NamedTuple):
 
 
 def pair_grid(
-    source: Tensor, target: Tensor, aligned: Mapping[str, Aligned], titles: Sequence[str]
+    source: Tensor,
+    target: Tensor,
+    before: Sequence[float],
+    aligned: Mapping[str, Aligned],
+    titles: Sequence[str],
 ) -> Figure:
-    """Draw pairs as rows: as they came, then aligned by every readout, sampled points marked.
+    """Draw pairs as rows: as they came, then aligned by every readout, sampled points ringed.
 
     Args:
         source: ``(K, N, 3)``, y up, drawn blue.
         target: ``(K, N, 3)``, drawn orange.
+        before: the angles of the true rotations in degrees, one per pair.
         aligned: by readout.
         titles: one per pair.
     """
@@ -67,9 +72,12 @@ def pair_grid(
                         linewidths=0.4,
                         depthshade=False,
                     )
-            frame_cloud(axes, np.concatenate([upright(source[row]), upright(target[row])]))
+            frame_cloud(axes, np.concatenate([upright(moved[row]), upright(target[row])]))
             if row == 0:
-                axes.set_title(name if result is None else f"by {name}", fontsize=11)
-            below = titles[row] if result is None else f"{result.errors[row]:.1f}°"
+                axes.set_title("before (centred)" if result is None else f"by {name}", fontsize=11)
+            below = f"{titles[row]}, {before[row]:.1f}° apart"
+            if result is not None:
+                below = f"rotation error {result.errors[row]:.1f}°"
             axes.text2D(0.02, 0.04, below, transform=axes.transAxes, fontsize=9)
+    figure.supxlabel("source blue, target orange, sampled points ringed", fontsize=9)
     return figure

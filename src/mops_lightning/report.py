@@ -71,6 +71,11 @@ def table(folder: Path, metric: str | None = None) -> str:
     own: set[tuple[str, int]] = set()
     for record in scored:
         _add(cells, own, record, metric, names["net"])
+    if not cells and all(record["config"]["learn"] == "task" for record in scored):
+        lines = [f"No sampler was tested; {names['task']} on {names['dataset']}.", ""]
+        score = _score(scored)
+        lines += [*_full(scored, names["net"], score, _paper(names, score)), "", *_how(scored, "")]
+        return "\n".join(lines) + "\n"
     if not cells:
         known = {parts.metric for r in scored for parts in map(parse, r["metrics"]) if parts}
         raise UserError(
@@ -92,7 +97,7 @@ def table(folder: Path, metric: str | None = None) -> str:
         if any(str(m) in paper.get("rows", {}).get(sampler, {}) for m in sizes):
             lines.append(_row("*the paper's*", [_paper_figures(paper, sampler, m) for m in sizes]))
     lines += ["", *_full(scored, names["net"], metric, paper)]
-    lines += ["", *_how(done)]
+    lines += ["", *_how([r for r in done if _task(r) == names["task"]], names["net"])]
     if len(done) < len(found):
         lines += ["", f"{len(found) - len(done)} of {len(found)} runs are not completed."]
     if broken:
@@ -152,10 +157,15 @@ def _common(found: list[dict[str, Any]]) -> dict[str, str]:
         "net": {r["config"]["names"]["net"] for r in trained},
         "dataset": {r["config"]["names"]["dataset"] for r in found},
         "data (dataset_fingerprint)": {r["notes"].get("dataset_fingerprint") for r in found},
-        "pairs (task.pairs)": {_pairs(r) for r in found},
+        "pairs (task.pairs)": {_plain(r["config"]["task"].get("pairs")) for r in found},
         "what learned (learn)": {_learned(r) for r in trained},
         "task weights (sha256)": {r["notes"].get("task_weights_sha256") for r in found},
     }
+    for net in sorted({r["config"]["names"]["net"] for r in found}):
+        same = [r["config"]["task"] for r in found if r["config"]["names"]["net"] == net]
+        keys[f"settings of {net} (task.net)"] = {_plain(task.get("net")) for task in same}
+    if any(_learned(r) == "joint" for r in trained):
+        keys["loss (task.loss)"] = {_plain(r["config"]["task"].get("loss")) for r in trained}
     for what, values in keys.items():
         known = values - {None}  # a resumed run may have its task net from the checkpoint
         if len(known) > 1:
@@ -172,9 +182,12 @@ def _weightless(record: dict[str, Any]) -> bool:
     return not learns and "task_weights_sha256" not in record["notes"]
 
 
-def _pairs(record: dict[str, Any]) -> str | None:
-    pairs = record["config"]["task"].get("pairs")
-    return None if pairs is None else json.dumps(pairs, sort_keys=True)
+def _plain(node: Any) -> str | None:
+    return None if node is None else json.dumps(node, sort_keys=True)
+
+
+def _task(record: dict[str, Any]) -> str:
+    return record["config"]["names"]["task"]
 
 
 def _score(found: list[dict[str, Any]]) -> str:
@@ -246,8 +259,8 @@ def _figures(metric: str, values: dict[str, float] | None) -> str:
     return " / ".join(units.figure(metric, value) for value in shown)
 
 
-def _how(found: Iterable[dict[str, Any]]) -> list[str]:
-    """Say how each kind of run was made: epochs, seeds, device, commit."""
+def _how(found: Iterable[dict[str, Any]], net: str) -> list[str]:
+    """Say how each kind of run was made: epochs, seeds, device, commit; other nets are named."""
     lines: dict[str, None] = {}
     for record in found:
         config, names = record["config"], record["config"]["names"]
@@ -255,6 +268,8 @@ def _how(found: Iterable[dict[str, Any]]) -> list[str]:
         trained = "fit" in record["seconds"]
         earlier = record["notes"].get("evaluated") or {}
         seed = earlier.get("seed", record["seed"])
+        if names["net"] not in (net, what):
+            what += f" under {names['net']}"
         joint = ", jointly trained" if _learned(record) == "joint" and trained else ""
         commit = (record["git"]["commit"] or "a wheel")[:10]
         lines[

@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from mops_lightning.callbacks import CHECKPOINT
 from mops_lightning.errors import UserError
 from mops_lightning.experiment import CHECKPOINT_KEY
-from mops_lightning.weights import read_plain
+from mops_lightning.weights import load, read_plain
 
 
 def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
@@ -17,8 +17,11 @@ def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
 
     ``epochs`` is noted too, but may differ: a finished run may be made longer.
     """
+    task: Any = OmegaConf.to_container(cfg.task, resolve=True)
+    if isinstance(task.get("pairs"), dict):
+        task["pairs"].pop("test_seed", None)  # of what is scored, not of what is learned
     parts = {
-        "task": cfg.task,
+        "task": task,
         "sampler": cfg.sampler if cfg.learn != "task" else None,
         "optimizer": cfg.optimizer,
         "augment": cfg.augment.get(cfg.learn),
@@ -29,6 +32,7 @@ def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
         "val_fraction": cfg.val_fraction,
         "dataset": fingerprint,
         "epochs": cfg.trainer.max_epochs,
+        **_given_weights(cfg),
     }
     return {
         name: json.dumps(
@@ -37,6 +41,13 @@ def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
         )
         for name, value in parts.items()
     }
+
+
+def _given_weights(cfg: DictConfig) -> dict[str, str]:
+    """Return the hash of the weights file that the run begins with, if it is one of the user's."""
+    if cfg.weights in (None, "auto", "run") or not Path(cfg.weights).expanduser().is_file():
+        return {}
+    return {"weights": str(load(cfg.weights)["sha256"])}
 
 
 def lengthened(cfg: DictConfig, checkpoint: Path) -> bool:
@@ -72,7 +83,7 @@ def find(cfg: DictConfig, mine: dict[str, str]) -> Path | None:
         name = different[0]
         raise UserError(
             f"ckpt_path: {path} is of a run with other settings ({', '.join(different)}); "
-            f"{name} is {mine[name]} here and {theirs.get(name)} there. "
+            f"{name} is {mine.get(name)} here and {theirs.get(name)} there. "
             "Give the same settings, or leave ckpt_path out to start anew."
         )
     return path
@@ -96,7 +107,8 @@ def _newest(out: Path, mine: dict[str, str]) -> Path:
 
 
 def _different(theirs: dict[str, str], mine: dict[str, str]) -> list[str]:
-    return [name for name in mine if name != "epochs" and theirs.get(name) != mine[name]]
+    names = [name for name in {**mine, **theirs} if name != "epochs"]
+    return [name for name in names if theirs.get(name) != mine.get(name)]
 
 
 def _read(path: Path) -> dict[str, Any]:

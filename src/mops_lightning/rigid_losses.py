@@ -1,8 +1,11 @@
 """Losses between rigid motions; each returns its weighted terms by name."""
 
+import math
+
 import torch
 from torch import Tensor
 
+from mops_lightning.errors import UserError
 from mops_lightning.losses import chamfer_distance
 from mops_lightning.rigid import Motion, quaternion_to_matrix
 
@@ -40,6 +43,7 @@ def quaternion_loss(
         translation_weight: weight of the L2 distance of the translations, which the paper leaves
             out; without it nothing would train that part of the answer.
     """
+    _check_weight("translation_weight", translation_weight)
     shift = torch.linalg.vector_norm(predicted.translation - true.translation, dim=1).mean()
     return {
         "quaternion": quaternion_distance(predicted.quaternion, true.quaternion),
@@ -63,8 +67,14 @@ def frobenius_chamfer_loss(
         target: ``(B, N, 3)`` the centred target, all points.
         chamfer_weight: weight of the chamfer distance.
     """
+    _check_weight("chamfer_weight", chamfer_weight)
     chamfer = chamfer_distance(predicted.apply(source), target).mean()
     return {
         "frobenius": frobenius_distance(predicted.quaternion, true.quaternion),
         "chamfer": chamfer_weight * chamfer,
     }
+
+
+def _check_weight(name: str, value: float) -> None:
+    if not 0 <= value < math.inf:
+        raise UserError(f"task.loss.{name} must be a number of at least 0, got {value}.")

@@ -1,5 +1,6 @@
 """One run: compose → build → pretrain if needed → fit → test → result.json."""
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -108,6 +109,11 @@ def fit_and_test(
             record["files"][kind] = name
     record["score"] = record["metrics"][experiment.score_name]
     record["notes"]["score"] = experiment.score_name
+    if not math.isfinite(record["score"]):
+        raise UserError(
+            f"{experiment.score_name} is {record['score']}: the training went astray, and nothing "
+            "of it is kept. Try a lower rate (optimizer.optimizer.lr) or other weights of losses."
+        )
     learned: dict[str, dict[str, Any]] = {
         "task": {weights.FILE: task},
         "sampler": {weights.FILE: experiment.sampler},
@@ -118,7 +124,7 @@ def fit_and_test(
             classes = dataset.class_names if module is task and task.tells_classes else ()
             weights.save(folder / name, module, record["config"], record["metrics"], classes)
             record["files"][Path(name).stem] = name
-    anew = not record["notes"]["lengthened"] and task_weights is None
+    anew = not record["notes"]["lengthened"] and cfg.weights in (None, "auto")
     if cfg.learn == "task" and anew:
         pretrain.publish(cfg, folder / weights.FILE, dataset)
 

@@ -68,5 +68,6 @@ def _check_largest(sampler: Sampler, m: int, n_points: int, training: bool) -> N
         name = "sampler.m_max" if sampler.flexible else "m"
         raise UserError(
             f"{name} must be at most the {n_points} points of a cloud, got {sampler.m}. "
-            f"Train with {name}={n_points} or more points."
+            f"Try {name}={n_points}, or clouds of more points (dataset.n_points; for pairs also "
+            "task.pairs.resample and task.pairs.overlap)."
         )

@@ -132,3 +132,21 @@ def test_a_net_whose_points_can_change_serves_other_clouds(rng):
 def test_a_negative_weight_is_refused():
     with pytest.raises(UserError, match=r"task.emd_weight must not be negative, got -1"):
         task(emd_weight=-1)
+
+
+def test_figures_show_samples_and_reconstructions(rng):
+    module = task().eval()
+    given = batch(rng, number=2)
+    samples = {"sampled": FPSSampler(8), "full": full_cloud}
+    axes = module.figures(given, samples, ["long", "tall"])["reconstructions"].axes
+    assert [one.get_title() for one in axes[:4]] == [
+        "input",
+        "all points",
+        "sampled",
+        "from sampled",
+    ]
+    assert len(axes) == 8
+    assert axes[4].texts[0].get_text() == "tall"
+    result = module.scored(given, FPSSampler(8))
+    ratio = (result.predictions.chamfer / result.targets.chamfer)[1]
+    assert axes[7].texts[0].get_text() == f"NRE {ratio:.2f}"

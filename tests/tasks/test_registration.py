@@ -10,7 +10,7 @@ from mops_lightning.experiment import Experiment
 from mops_lightning.motion_metrics import RotationError
 from mops_lightning.nets.icp import ICP
 from mops_lightning.nets.pcrnet import PCRNet
-from mops_lightning.rigid import Motion, quaternion_from_matrix
+from mops_lightning.rigid import Motion, identity_motion, quaternion_from_matrix
 from mops_lightning.rigid_losses import frobenius_chamfer_loss, quaternion_loss
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
@@ -193,6 +193,8 @@ def test_nothing_can_be_trained_under_icp_but_anything_tested():
         Experiment(icp, MOPSNet(8, **MOPS))
     with pytest.raises(UserError, match="learn=task: ICP has no weights"):
         Experiment(icp, learn="task")
+    with pytest.raises(UserError, match="learn=joint: ICP has no weights"):
+        Experiment(icp, FPSSampler(8), learn="joint")
     module = Experiment(icp, FPSSampler(8))
     assert not module.trainable
     run = quiet_trainer(1)
@@ -208,8 +210,10 @@ def test_figures_show_every_readout_and_its_error(rng):
     figures = module.figures(batch, {"sampled": sampler, "full": full_cloud}, ["long", "tall"])
     axes = figures["pairs"].axes
     assert len(axes) == 6
-    assert [one.get_title() for one in axes[:3]] == ["before", "by sampled", "by full"]
+    assert [one.get_title() for one in axes[:3]] == ["before (centred)", "by sampled", "by full"]
     result = module.step(batch, full_cloud)
     error = RotationError.of(result.predictions, result.targets)[1]
-    assert axes[5].texts[0].get_text() == f"{error:.1f}°"
+    assert axes[5].texts[0].get_text() == f"rotation error {error:.1f}°"
+    angle = RotationError.of(result.targets, identity_motion(batch.points[:2]))[1]
+    assert axes[3].texts[0].get_text() == f"tall, {angle:.1f}° apart"
     assert module.cloud_titles(["long"]) == ["long_source", "long_target"]

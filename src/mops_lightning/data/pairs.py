@@ -1,5 +1,6 @@
 """Pairs for registration: a cloud and its copy under a random rigid motion."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -47,12 +48,12 @@ class Pairs:
         """Refuse numbers out of range."""
         ranges = {
             "rotation": (0 <= self.rotation <= 180, "from 0 to 180 degrees"),
-            "translation": (self.translation >= 0, "not negative"),
+            "translation": (0 <= self.translation < math.inf, "a number of at least 0"),
             "resample": (self.resample is None or self.resample >= 1, "null or at least 1"),
-            "jitter": (self.jitter >= 0, "not negative"),
-            "jitter_clip": (self.jitter_clip >= 0, "not negative"),
+            "jitter": (0 <= self.jitter < math.inf, "a number of at least 0"),
+            "jitter_clip": (0 <= self.jitter_clip < math.inf, "a number of at least 0"),
             "overlap": (0 < self.overlap <= 1, "above 0 and at most 1"),
-            "test_seed": (self.test_seed >= 0, "a whole number of at least 0"),
+            "test_seed": (0 <= self.test_seed < 2**63, "a whole number from 0 to 2^63 - 1"),
         }
         for name, (fits, allowed) in ranges.items():
             if not fits:

@@ -28,7 +28,7 @@ class ICP(nn.Module):
         super().__init__()
         if max_iterations < 1:
             raise UserError(f"task.net.max_iterations must be at least 1, got {max_iterations}.")
-        if threshold < 0:
+        if not 0 <= threshold < np.inf:
             raise UserError(f"task.net.threshold must not be negative, got {threshold}.")
         self.max_iterations = max_iterations
         self.threshold = threshold

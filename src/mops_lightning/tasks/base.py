@@ -1,11 +1,13 @@
 """What every task offers to the experiment."""
 
 from collections.abc import Callable, Mapping, Sequence
+from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 from torch import Generator, Tensor, nn
 from torchmetrics import MetricCollection
 
+from mops_lightning.errors import UserError
 from mops_lightning.types import Batch, SampleOutput, TaskOutput
 
 if TYPE_CHECKING:
@@ -20,6 +22,9 @@ class Task(nn.Module):
 
     Args:
         net: the task net; how it is called is the task's own affair.
+
+    Raises:
+        UserError: it is no net, or one of another task.
     """
 
     score: str
@@ -31,11 +36,23 @@ class Task(nn.Module):
     tells_classes: bool = False
     """Whether the net's outputs are the data's classes, so that it fits no others."""
 
+    net_takes: tuple[str, ...] = ("points",)
+    """What the net's ``forward`` takes, by name."""
+
     test_seed: int = 0
     """Fixes what ``make_batch`` draws for the clouds that are scored."""
 
     def __init__(self, net: nn.Module) -> None:
         super().__init__()
+        if not isinstance(net, nn.Module):
+            raise UserError(f"task.net must be a net, got {net!r}. Choose one with task/net=NAME.")
+        takes = tuple(signature(net.forward).parameters)
+        if takes != self.net_takes:
+            raise UserError(
+                f"task/net: {type(net).__name__} takes ({', '.join(takes)}) and "
+                f"{type(self).__name__.lower()} needs a net that takes "
+                f"({', '.join(self.net_takes)}). Leave task/net out for the task's own."
+            )
         self.net = net
 
     def make_batch(self, batch: Batch, generators: Callable[[], list[Generator]]) -> Any:

@@ -1,5 +1,9 @@
 """Reconstruction of dense clouds from sampled points (paper section "Reconstruction")."""
 
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor, nn
 from torchmetrics import Metric, MetricCollection
@@ -10,6 +14,9 @@ from mops_lightning.losses import chamfer_distance
 from mops_lightning.reconstruction_metrics import Distances, MeanDistance, NormalizedError
 from mops_lightning.tasks.base import Sample, Task
 from mops_lightning.types import Batch, TaskOutput
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SCORED_BLOCK, SCORED_ROUNDS = 256, 8
 """How earth mover's distances are scored that are too large for the exact one."""
@@ -37,6 +44,7 @@ class Reconstruction(Task):
     score = "nre_cd"
     """The metric shown in tables; 1 is as good as all points, a lower one is better."""
     full_score = "chamfer"
+    net_takes = ("points", "n_points")
 
     def __init__(
         self,
@@ -47,7 +55,7 @@ class Reconstruction(Task):
         exact_up_to: int = 2048,
     ) -> None:
         super().__init__(net)
-        if emd_weight < 0:
+        if not 0 <= emd_weight < math.inf:
             raise UserError(f"task.emd_weight must not be negative, got {emd_weight}.")
         self.emd_weight = emd_weight
         self.emd_block = emd_block
@@ -65,7 +73,7 @@ class Reconstruction(Task):
         Returns:
             The loss terms, and the distances of the reconstructions without a reference.
         """
-        built = self._rebuilt(batch.points, sample)
+        built = self.net(sample(batch.points).points, batch.points.shape[1])
         chamfer = chamfer_distance(built, batch.points)
         losses = {"chamfer": chamfer.mean()}
         emd = torch.zeros_like(chamfer)
@@ -82,14 +90,36 @@ class Reconstruction(Task):
         losses = {"chamfer": found.chamfer.mean(), "emd": self.emd_weight * found.emd.mean()}
         return TaskOutput(losses, found, self._reference[1])
 
-    def _rebuilt(self, points: Tensor, sample: Sample) -> Tensor:
-        return self.net(sample(points).points, points.shape[1])
-
     def _distances(self, points: Tensor, seen: Tensor) -> Distances:
         built = self.net(seen, points.shape[1])
         exact = points.shape[1] <= self.exact_up_to
         emd = earth_mover_distance(built, points, None if exact else SCORED_BLOCK, SCORED_ROUNDS)
         return Distances(chamfer_distance(built, points), emd)
+
+    def figures(
+        self, batch: Batch, samples: Mapping[str, Sample], titles: Sequence[str]
+    ) -> "dict[str, Figure]":
+        """Draw input, sampled points and reconstructions side by side.
+
+        Args:
+            batch: the clouds to draw.
+            samples: what the net is to see, by readout.
+            titles: one per cloud.
+        """
+        from mops_lightning.pictures_rebuilt import Rebuilt, rebuilt_grid
+
+        n = batch.points.shape[1]
+        full = self.net(batch.points, n)
+        reference = chamfer_distance(full, batch.points)
+        columns = {}
+        for name, sample in samples.items():
+            chosen = sample(batch.points).points
+            if chosen.shape == batch.points.shape:
+                continue  # all points have a column of their own
+            built = self.net(chosen, n)
+            ratios = chamfer_distance(built, batch.points) / reference
+            columns[name] = Rebuilt(chosen, built, ratios.tolist())
+        return {"reconstructions": rebuilt_grid(batch.points, full, columns, titles)}
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Distances in (squared) units of the coordinates, and NRE; training has no reference."""

@@ -7,8 +7,9 @@ from torch import Generator, Tensor, nn
 from torchmetrics import Metric, MetricCollection
 
 from mops_lightning.data.pairs import Pairs
+from mops_lightning.errors import UserError
 from mops_lightning.motion_metrics import RotationError, RotationRecall, TranslationError
-from mops_lightning.rigid import Motion
+from mops_lightning.rigid import Motion, identity_motion
 from mops_lightning.tasks.base import Sample, Task
 from mops_lightning.types import Batch, PairBatch, TaskOutput
 
@@ -33,9 +34,17 @@ class Registration(Task):
 
     score = "rotation_error_deg"
     """The metric shown in tables; a lower one is better."""
+    net_takes = ("source", "target")
 
-    def __init__(self, net: nn.Module, pairs: Pairs, loss: Loss) -> None:
+    def __init__(
+        self, net: nn.Module, pairs: Pairs | None = None, loss: Loss | None = None
+    ) -> None:
         super().__init__(net)
+        for name, part in (("pairs", pairs), ("loss", loss)):
+            if part is None:
+                raise UserError(f"task.{name} cannot be removed; leave task.{name} out.")
+        assert pairs is not None
+        assert loss is not None
         self.pairs = pairs
         self.test_seed = pairs.test_seed
         self.loss = loss
@@ -110,4 +119,6 @@ class Registration(Task):
             columns[name] = Aligned(
                 motion.apply(source), motion.apply(chosen[0]), chosen[1], errors.tolist()
             )
-        return {"pairs": pair_grid(source, target, columns, titles)}
+        true = Motion(batch.quaternion, batch.translation)
+        before = RotationError.of(identity_motion(source), true).tolist()
+        return {"pairs": pair_grid(source, target, before, columns, titles)}
