@@ -93,7 +93,7 @@ def test_two_runs_for_one_cell_are_refused(tmp_path):
 def test_joint_runs_stand_apart_each_with_its_own_task_net(tmp_path):
     for name in ("snet", "mops"):
         metrics = {"test/generated/accuracy": 0.5, "test/fps/accuracy": 0.2}
-        notes = {"task_weights_sha256": None, "evaluated": {"learn": "joint", "max_epochs": 9}}
+        notes = {"task_weights_sha256": name, "evaluated": {"learn": "joint", "max_epochs": 9}}
         put(tmp_path, name, 32, {**metrics, "test/full/accuracy": 0.9}, notes=notes)
     text = table(tmp_path)
     assert [row[0] for row in rows(text) if "paper" not in row[0]] == ["sampled by", "snet", "mops"]

@@ -159,7 +159,10 @@ def _common(found: list[dict[str, Any]]) -> dict[str, str]:
         "data (dataset_fingerprint)": {r["notes"].get("dataset_fingerprint") for r in found},
         "pairs (task.pairs)": {_plain(r["config"]["task"].get("pairs")) for r in found},
         "what learned (learn)": {_learned(r) for r in trained},
-        "task weights (sha256)": {r["notes"].get("task_weights_sha256") for r in found},
+        # After joint training each run has a task net of its own.
+        "task weights (sha256)": {
+            r["notes"].get("task_weights_sha256") for r in found if _learned(r) != "joint"
+        },
     }
     for net in sorted({r["config"]["names"]["net"] for r in found}):
         same = [r["config"]["task"] for r in found if r["config"]["names"]["net"] == net]
