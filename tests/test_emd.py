@@ -1,4 +1,9 @@
 import itertools
+import subprocess
+import sys
+import time
+from pathlib import Path
+from subprocess import PIPE
 
 import numpy as np
 import pytest
@@ -119,9 +124,56 @@ def test_ten_thousand_points_take_little_memory_and_time(rng):
         ({"others": torch.zeros(2, 6, 3)}, r"same N, got \(2, 5, 3\) and \(2, 6, 3\)"),
         ({"block": 1}, "block must be at least 2 points, got 1"),
         ({"rounds": -1}, "rounds must not be negative, got -1"),
+        ({"workers": 0}, "workers must be at least 1, or null for all cores, got 0"),
     ],
 )
 def test_bad_input_is_named(change, said):
     given = {"points": torch.zeros(2, 5, 3), "others": torch.zeros(2, 5, 3), **change}
     with pytest.raises(UserError, match=said):
         earth_mover_distance(**given)
+
+
+def test_workers_give_the_same_matching_and_end_with_the_process_that_asked(tmp_path, rng):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import sys\n"
+        "if __name__ == '__main__':\n"
+        "    import torch\n"
+        "    from mops_lightning import workers\n"
+        "    from mops_lightning.emd import matching\n"
+        "    points, others = torch.load(sys.argv[1])\n"
+        "    for block in (None, 64):\n"
+        "        shared = matching(points, others, block, 1, workers=2)\n"
+        "        assert torch.equal(shared, matching(points, others, block, 1))\n"
+        "    print(*workers.pool(2)._processes, flush=True)\n"
+        "    input()\n"
+    )
+    torch.save(tuple(clouds(rng, 24, 350)), tmp_path / "clouds.pt")
+    command = [sys.executable, script, tmp_path / "clouds.pt"]
+    with subprocess.Popen(command, stdin=PIPE, stdout=PIPE, text=True) as process:
+        assert process.stdout is not None
+        pids = [int(pid) for pid in process.stdout.readline().split()]
+        assert len(pids) == 2
+        assert all(Path(f"/proc/{pid}").exists() for pid in pids)
+        process.kill()
+    deadline = time.monotonic() + 20
+    while any(alive(pid) for pid in pids) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(alive(pid) for pid in pids)
+
+
+def alive(pid):
+    """Whether a process runs; one that has ended may wait for its new parent to take note."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")")[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.parametrize("n", [30, 200])
+def test_the_exact_distance_is_that_of_pot(n, rng):
+    ot = pytest.importorskip("ot", reason="POT is not installed (pip install pot)")
+    points, others = kinds(n, rng)["surface"]
+    cost = torch.cdist(points, others)[0].numpy()
+    want = ot.emd2(np.full(n, 1 / n), np.full(n, 1 / n), cost)
+    assert earth_mover_distance(points, others).item() == pytest.approx(want, rel=1e-9)

@@ -1,6 +1,7 @@
 """``python -m mops_lightning``."""
 
-from mops_lightning.cli import main
-
 if __name__ == "__main__":
+    # Worker processes import this module too and need nothing of what follows.
+    from mops_lightning.cli import main
+
     main()

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from mops_lightning.errors import UserError
 from mops_lightning.geometry import gather_points, k_nearest
 from mops_lightning.nets.autoencoder import PointEncoder
+from mops_lightning.nets.folding import Fold
 from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, linear_norm_relu
 
 REACH = 0.3
@@ -34,33 +35,6 @@ def square_grid(n: int) -> Tensor:
     columns = -(-n // rows)
     ticks = [torch.linspace(-REACH, REACH, k) if k > 1 else torch.zeros(1) for k in (rows, columns)]
     return torch.cartesian_prod(*ticks)[:n]
-
-
-class Fold(nn.Module):
-    """One folding: linear layers on [codeword piece, coordinates], the last one to 3-D.
-
-    The piece is multiplied once, not once per grid point.
-
-    Args:
-        piece: size of the codeword piece.
-        coordinates: 2 for a grid, 3 for points.
-        channels: sizes of the hidden layers, with ReLU.
-    """
-
-    def __init__(self, piece: int, coordinates: int, channels: Sequence[int]) -> None:
-        super().__init__()
-        self.from_piece = nn.Linear(piece, channels[0])
-        self.from_coordinates = nn.Linear(coordinates, channels[0], bias=False)
-        self.rest = nn.Sequential(
-            nn.ReLU(inplace=True),
-            *linear_norm_relu(channels, norm=False),
-            nn.Linear(channels[-1], 3),
-        )
-
-    def forward(self, pieces: Tensor, coordinates: Tensor) -> Tensor:
-        """Fold ``(P, piece)`` and ``(P or 1, g, coordinates)`` to ``(P, g, 3)``."""
-        hidden = self.from_piece(pieces)[:, None] + self.from_coordinates(coordinates)
-        return self.rest(hidden.flatten(0, 1)).unflatten(0, hidden.shape[:2])
 
 
 class FoldingDecoder(nn.Module):

@@ -36,6 +36,8 @@ class Reconstruction(Task):
         emd_block: points in a block, in training.
         emd_rounds: rounds of blocks, in training.
         exact_up_to: largest clouds whose distance is scored exactly.
+        emd_workers: processes that search for bijections; None: as many as torch has threads. No
+            result depends on it.
 
     Raises:
         UserError: the weight is negative.
@@ -53,6 +55,7 @@ class Reconstruction(Task):
         emd_block: int = 64,
         emd_rounds: int = 2,
         exact_up_to: int = 2048,
+        emd_workers: int | None = 1,
     ) -> None:
         super().__init__(net)
         if not 0 <= emd_weight < math.inf:
@@ -61,6 +64,7 @@ class Reconstruction(Task):
         self.emd_block = emd_block
         self.emd_rounds = emd_rounds
         self.exact_up_to = exact_up_to
+        self.emd_workers = emd_workers
         self._reference: tuple[Tensor, Distances] | None = None
 
     def step(self, batch: Batch, sample: Sample) -> TaskOutput:
@@ -78,7 +82,7 @@ class Reconstruction(Task):
         losses = {"chamfer": chamfer.mean()}
         emd = torch.zeros_like(chamfer)
         if self.emd_weight:
-            emd = earth_mover_distance(built, batch.points, self.emd_block, self.emd_rounds)
+            emd = self._emd(built, batch.points, self.emd_block, self.emd_rounds)
             losses["emd"] = self.emd_weight * emd.mean()
         return TaskOutput(losses, Distances(chamfer, emd), None)
 
@@ -93,8 +97,11 @@ class Reconstruction(Task):
     def _distances(self, points: Tensor, seen: Tensor) -> Distances:
         built = self.net(seen, points.shape[1])
         exact = points.shape[1] <= self.exact_up_to
-        emd = earth_mover_distance(built, points, None if exact else SCORED_BLOCK, SCORED_ROUNDS)
+        emd = self._emd(built, points, None if exact else SCORED_BLOCK, SCORED_ROUNDS)
         return Distances(chamfer_distance(built, points), emd)
+
+    def _emd(self, built: Tensor, points: Tensor, block: int | None, rounds: int) -> Tensor:
+        return earth_mover_distance(built, points, block, rounds, self.emd_workers)
 
     def figures(
         self, batch: Batch, samples: Mapping[str, Sample], titles: Sequence[str]
