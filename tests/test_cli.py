@@ -192,6 +192,9 @@ def test_cfg_job_shows_the_config(tmp_path):
     [
         (["sampler.alhpa=3"], "sampler.alpha"),
         (["sampler=mosp"], "mops"),
+        (["task=registration", "task/lss=quaternion"], "Did you mean 'task/loss'"),
+        (["sampler.log=2"], "sampler.log: no such setting"),
+        (["sampler.feature_channels=[8]"], "write +sampler.feature_channels=..."),
         (["learn=smapler"], "Did you mean 'sampler'"),
         (["m=4096"], "dataset.n_points=4096"),
         (["trainer=gpu", *TINY[1:]], "Try trainer=auto or trainer=cpu"),

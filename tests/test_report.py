@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from mops_lightning import records
+from mops_lightning import paper, records
 from mops_lightning.errors import UserError
 from mops_lightning.report import main, table
 from tests.test_records import record
@@ -186,15 +186,70 @@ def test_nets_of_other_settings_are_not_mixed(tmp_path):
         table(tmp_path)
 
 
-def test_a_folder_of_task_nets_alone_says_what_they_score(tmp_path):
-    metrics = {f"test/full/{DEGREES}": 7.5}
-    notes = {"score": f"test/full/{DEGREES}"}
-    put(tmp_path, "mops", 32, metrics, "registration", "pcrnet", notes=notes)
-    path = tmp_path / "mops-32-pcrnet" / "result.json"
-    path.write_text(path.read_text().replace('"learn": "sampler"', '"learn": "task"'))
+def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):
+    target = folder / f"{name}-{points}"
+    target.mkdir()
+    shown = list(metrics)
+    metrics = {f"test/full/{metric}": value for metric, value in metrics.items()}
+    config = {
+        "learn": "task",
+        "names": {"task": task, "net": net, "dataset": "modelnet40"},
+        "trainer": {"max_epochs": 3},
+        "task": {"net": {"_target_": net, "n_points": points, **settings}},
+        "dataset": {"n_points": points},
+    }
+    notes = {"score": next(iter(metrics)), "shown": shown, "parameters": {"task": 1_025_000}}
+    records.write(target, record(config=config, metrics=metrics, notes=notes))
+
+
+def test_a_folder_of_task_nets_alone_is_a_table_of_nets(tmp_path):
+    put_net(tmp_path, "first", {DEGREES: 7.5}, "registration", iterations=1)
+    put_net(tmp_path, "second", {DEGREES: 6.5}, "registration", iterations=8)
     text = table(tmp_path)
-    assert text.startswith("No sampler was tested; registration on modelnet40.")
-    assert "pcrnet on all points: 7.50 (the paper: 7.21)." in text
+    assert text.startswith("No sampler was tested; registration on modelnet40 from all points.")
+    assert rows(text) == [
+        ["net", "iterations", "points", "rotation error (°)", "MB", "*the paper's*"],
+        ["pcrnet", "1", "1024", "7.50", "4.1", "7.21"],
+        ["pcrnet", "8", "1024", "6.50", "4.1", "7.21"],
+    ]
+    put_net(tmp_path, "third", {DEGREES: 6.5}, "registration", iterations=8)
+    with pytest.raises(UserError, match="Two runs of registration by the same net"):
+        table(tmp_path)
+    put_net(tmp_path, "fourth", {"accuracy": 0.5}, "classification", "pointnet")
+    with pytest.raises(UserError, match="differ in task: classification, registration"):
+        table(tmp_path)
+
+
+def test_nets_that_reconstruct_stand_beside_the_paper_s(tmp_path):
+    distances = {"nre_cd": 1.0, "chamfer": 0.00123, "emd": 0.05}
+    for points in (10000, 1024):
+        for pieces in (16, 1, 8):
+            net = "mfoldingnet" if pieces > 1 else "foldingnet"
+            given = ("reconstruction", net, points)
+            put_net(tmp_path, f"m{pieces}", distances, *given, pieces=pieces, encoder="mlp")
+    put_net(tmp_path, "mlp", distances, "reconstruction", "autoencoder")
+    found = rows(table(tmp_path))
+    assert found[0] == ["net", "pieces", "points", "chamfer", "emd", "MB", "*the paper's*"]
+    assert [row[:3] for row in found[1:]] == [
+        ["autoencoder", "", "1024"],
+        ["foldingnet", "1", "1024"],
+        ["mfoldingnet", "8", "1024"],
+        ["mfoldingnet", "16", "1024"],
+        ["foldingnet", "1", "10000"],
+        ["mfoldingnet", "8", "10000"],
+        ["mfoldingnet", "16", "10000"],
+    ]
+    assert found[3][3:] == ["0.00123", "0.05", "4.1", "12.69 / 209.13 / 2.9"]
+    assert found[5][-1] == "1.25 / 18.8 / 12"
+
+
+def test_several_metrics_make_several_tables(tmp_path):
+    metrics = {"test/sampled/nre_cd": 1.5, "test/sampled/nre_emd": 2.5}
+    put(tmp_path, "fps", 32, metrics, task="reconstruction")
+    text = table(tmp_path, "nre_cd", "nre_emd")
+    assert text.count("| sampled by |") == 2
+    assert text.index("Test nre cd") < text.index("| fps | 1.5 |") < text.index("Test nre emd")
+    assert text.count("seed 0") == 1
 
 
 def test_runs_of_another_task_are_not_listed_and_other_nets_are_named(tmp_path):
@@ -219,16 +274,15 @@ SIZES = {
     "classification": {"512", "256", "128", "64", "32", "16", "8"},
     "registration": {"64", "32", "8"},
     "registration_joint": {"64", "32", "8"},
+    "large_nre_cd": {"4096", "1024", "256"},
+    "large_nre_emd": {"4096", "1024", "256"},
 }
 
 
 @pytest.mark.parametrize("name", SIZES)
 def test_paper_figures_are_complete(name):
-    from importlib.resources import files
-
-    paper = json.loads(files("mops_lightning").joinpath("paper.json").read_text())
-    assert set(paper) == set(SIZES)
-    for sampler, sizes in paper[name]["rows"].items():
+    assert set(paper.tables()) == {*SIZES, "frameworks"}
+    for sampler, sizes in paper.tables()[name]["rows"].items():
         assert set(sizes) == SIZES[name]
-        count = 1 if sampler in ("random", "voxel", "fps") else 3
+        count = 1 if sampler in ("random", "voxel", "fps") or "large" in name else 3
         assert {len(values) for values in sizes.values()} == {count}

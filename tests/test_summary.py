@@ -9,12 +9,11 @@ from tests.test_records import record
 NAMES = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": "mops"}
 
 
-def printed(metrics, score, **config):
+def printed(metrics, score, shown=(), **config):
     console = Console(width=80, record=True, file=StringIO())
     config = {"m": 32, "learn": "sampler", "names": NAMES, **config}
-    closing_lines(
-        Path("run"), record(config=config, metrics=metrics, notes={"score": score}), console
-    )
+    notes = {"score": score, "shown": list(shown)}
+    closing_lines(Path("run"), record(config=config, metrics=metrics, notes=notes), console)
     return console.export_text()
 
 
@@ -40,6 +39,12 @@ def test_one_size_is_shown_by_metric():
         ["mops generated", "50.00"],
         ["all points", "87.50"],
     ]
+
+
+def test_a_task_says_which_metrics_are_shown_and_in_which_order():
+    metrics = {f"test/{readout}/{name}": 1.5 for readout in ("generated", "full") for name in "abc"}
+    text = printed(metrics, "test/generated/c", ["c", "a"])
+    assert cells(text)[0] == ["sampled by", "c", "a"]
 
 
 def test_index_samplers_have_no_empty_rows():

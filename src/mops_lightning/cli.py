@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
 from mops_lightning.config import GROUPS, LEARN, RUN_KEYS, conf_dir
@@ -89,18 +90,45 @@ def _explain(error: BaseException) -> str:
             return f"learn: unknown value {value!r}.{did_you_mean(value, LEARN)}"
         if "Could not override '" in text:
             key = text.split("Could not override '")[1].split("'")[0]
-            hint = did_you_mean(key, [known for known in _known_keys() if known != key])
-            return f"{key}: no such setting.{hint} --cfg job shows all of them."
+            return _no_such_setting(key)
     # What Hydra and OmegaConf say themselves, without their notes for developers.
     lines = [line for text in texts for line in text.splitlines() if line.strip()]
     return " ".join(dict.fromkeys(line.strip() for line in lines if line[0] != " "))
 
 
-def _known_keys() -> list[str]:
-    """List every key of the default configuration, dotted."""
-    from omegaconf import DictConfig
+def _no_such_setting(key: str) -> str:
+    """Say what was meant by a key: a group, a setting, or one that YAML leaves at its default."""
+    from omegaconf import OmegaConf
 
+    from mops_lightning.config import signature
+
+    root = conf_dir()
+    paths = [str(path.relative_to(root)) for path in root.rglob("*") if path.is_dir()]
+    groups = [path for path in paths if not path.startswith("hydra")]
+    if "/" in key:
+        return f"{key}: no such group of choices.{did_you_mean(key, groups)}"
+    cfg = _composed(groups)
+    node, _, name = key.rpartition(".")
+    target = OmegaConf.select(cfg, f"{node}._target_")
+    if target and name in signature(target, node):
+        return f"{key}: {target} takes it, but no file sets it: write +{key}=..."
+    hint = did_you_mean(key, [known for known in _known_keys(cfg) if known != key])
+    return f"{key}: no such setting.{hint} --cfg job shows all of them."
+
+
+def _composed(groups: Sequence[str]) -> "DictConfig":
+    """Compose what the command line chooses from groups, without what else it sets."""
     from mops_lightning.config import compose
+
+    try:
+        return compose([part for part in sys.argv[1:] if part.split("=")[0] in groups])
+    except Exception:  # the mistake may be among them
+        return compose()
+
+
+def _known_keys(cfg: "DictConfig") -> list[str]:
+    """List every key of a configuration, dotted."""
+    from omegaconf import DictConfig
 
     keys = [*RUN_KEYS, *GROUPS]
 
@@ -111,9 +139,5 @@ def _known_keys() -> list[str]:
             if isinstance(value, DictConfig) and value._is_none() is False:
                 walk(value, f"{prefix}{key!s}.")
 
-    chosen = [argument for argument in sys.argv[1:] if argument.split("=")[0] in GROUPS]
-    try:
-        walk(compose(chosen), "")
-    except Exception:  # the mistake may be among them
-        walk(compose(), "")
+    walk(cfg, "")
     return sorted({key for key in keys if not key.split(".")[-1].startswith("_")})

@@ -2,21 +2,22 @@
 
 Reads ``result.json`` files only. As in the paper's tables, columns are sizes and a cell holds the
 figures of generated / matched / completed sets, or one figure for samplers that choose input
-points. Where the paper has them too, its figures stand in a row below ours.
+points. Where the paper has them too, its figures stand in a row below ours. A folder of task nets
+alone gives a table of nets.
 """
 
 import argparse
 import json
 import sys
 from collections.abc import Iterable
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from mops_lightning import records, units
+from mops_lightning import paper, records, units
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.io import atomic_write
 from mops_lightning.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT, parse
+from mops_lightning.report_nets import nets_table
 
 Cells = dict[str, dict[int, dict[str, float]]]
 """sampler → m → readout → value."""
@@ -26,10 +27,12 @@ def main(arguments: list[str] | None = None) -> None:
     """Write ``table.md`` into the folder and print it."""
     parser = argparse.ArgumentParser(prog="python -m mops_lightning.report", description=__doc__)
     parser.add_argument("folder", type=Path, help="a run, a sweep, or any folder above records")
-    parser.add_argument("--metric", help="name behind the readout; by default the task's score")
+    parser.add_argument(
+        "--metric", nargs="+", default=[], help="names behind the readout; default: the score"
+    )
     chosen = parser.parse_args(arguments)
     try:
-        text = table(chosen.folder, chosen.metric)
+        text = table(chosen.folder, *chosen.metric)
     except UserError as error:
         print(f"mops_lightning.report: {error}", file=sys.stderr)
         sys.exit(2)
@@ -40,12 +43,12 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"written to {path}")
 
 
-def table(folder: Path, metric: str | None = None) -> str:
-    """Return a Markdown table of all completed records below ``folder``.
+def table(folder: Path, *metrics: str) -> str:
+    """Return Markdown tables of all completed records below ``folder``, one for each metric.
 
     Args:
         folder: the records' folder.
-        metric: what is shown; None: the score of the records' task.
+        metrics: what is shown; none: the score of the records' task.
 
     Raises:
         UserError: there is no record, or records of different tasks, data or task weights, whose
@@ -64,25 +67,37 @@ def table(folder: Path, metric: str | None = None) -> str:
     done = [record for record in found if record["status"] == "completed"]
     if not done:
         raise UserError(f"{folder}: none of its {len(found)} runs is completed.")
-    scored = [record for record in done if record["config"]["learn"] != "task"] or done
-    names = _common(scored)
-    metric = metric or _score(scored)
+    scored = [record for record in done if record["config"]["learn"] != "task"]
+    if scored:
+        names = _common(scored)
+        lines = []
+        for metric in metrics or [_score(scored)]:
+            lines += [*_table(folder, scored, metric, names), ""]
+        lines += _how([r for r in done if _task(r) == names["task"]], names["net"])
+    else:
+        lines = [*nets_table(done), "", *_how(done, "")]
+    if len(done) < len(found):
+        lines += ["", f"{len(found) - len(done)} of {len(found)} runs are not completed."]
+    if broken:
+        lines += ["", f"Not readable: {', '.join(broken)}."]
+    return "\n".join(lines) + "\n"
+
+
+def _table(
+    folder: Path, scored: list[dict[str, Any]], metric: str, names: dict[str, str]
+) -> list[str]:
     cells: Cells = {}
     own: set[tuple[str, int]] = set()
     for record in scored:
         _add(cells, own, record, metric, names["net"])
-    if not cells and all(record["config"]["learn"] == "task" for record in scored):
-        lines = [f"No sampler was tested; {names['task']} on {names['dataset']}.", ""]
-        score = _score(scored)
-        lines += [*_full(scored, names["net"], score, _paper(names, score)), "", *_how(scored, "")]
-        return "\n".join(lines) + "\n"
     if not cells:
         known = {parts.metric for r in scored for parts in map(parse, r["metrics"]) if parts}
         raise UserError(
             f"--metric: no run below {folder} has {metric!r}.{did_you_mean(metric, known)}"
         )
     sizes = sorted({m for values in cells.values() for m in values}, reverse=True)
-    paper = _paper(names, metric)
+    joint = names["what learned (learn)"] == "joint"
+    published = paper.table(names["task"], names["dataset"], metric, joint)
     lines = [
         f"Test {units.title(metric)}: {names['task']} on {names['dataset']} under "
         f"{names['net']}; generated / matched / completed sets, or one figure for samplers that "
@@ -94,15 +109,10 @@ def table(folder: Path, metric: str | None = None) -> str:
     for sampler in sorted(cells, key=_place):
         figures = [_figures(metric, cells[sampler].get(m)) for m in sizes]
         lines.append(_row(sampler, figures))
-        if any(str(m) in paper.get("rows", {}).get(sampler, {}) for m in sizes):
-            lines.append(_row("*the paper's*", [_paper_figures(paper, sampler, m) for m in sizes]))
-    lines += ["", *_full(scored, names["net"], metric, paper)]
-    lines += ["", *_how([r for r in done if _task(r) == names["task"]], names["net"])]
-    if len(done) < len(found):
-        lines += ["", f"{len(found) - len(done)} of {len(found)} runs are not completed."]
-    if broken:
-        lines += ["", f"Not readable: {', '.join(broken)}."]
-    return "\n".join(lines) + "\n"
+        if any(str(m) in published.get("rows", {}).get(sampler, {}) for m in sizes):
+            theirs = [_paper_figures(published, sampler, m) for m in sizes]
+            lines.append(_row("*the paper's*", theirs))
+    return [*lines, "", *_full(scored, names["net"], metric, published)]
 
 
 ORDER = (
@@ -130,8 +140,8 @@ def _row(label: str, figures: list[str]) -> str:
     return f"| {label} | " + " | ".join(figures) + " |"
 
 
-def _full(found: list[dict[str, Any]], net: str, metric: str, paper: dict[str, Any]) -> list[str]:
-    published = f" (the paper: {paper['full']:.2f})" if "full" in paper else ""
+def _full(found: list[dict[str, Any]], net: str, metric: str, theirs: dict[str, Any]) -> list[str]:
+    published = f" (the paper: {theirs['full']:.2f})" if "full" in theirs else ""
     lines: dict[str, None] = {}
     for record in found:
         value = record["metrics"].get(f"test/{FULL}/{metric}")
@@ -242,17 +252,8 @@ def _add(
     own |= taken
 
 
-def _paper(names: dict[str, str], metric: str) -> dict[str, Any]:
-    """Return the paper's figures for a table, if it has any for this task, data and metric."""
-    text = files("mops_lightning").joinpath("paper.json").read_text()
-    joint = names["what learned (learn)"] == "joint"
-    entry = json.loads(text).get(names["task"] + ("_joint" if joint else ""), {})
-    fits = (entry.get("dataset"), entry.get("metric")) == (names["dataset"], metric)
-    return entry if fits else {}
-
-
-def _paper_figures(paper: dict[str, Any], sampler: str, m: int) -> str:
-    values = paper["rows"][sampler].get(str(m), [])
+def _paper_figures(published: dict[str, Any], sampler: str, m: int) -> str:
+    values = published["rows"][sampler].get(str(m), [])
     return " / ".join(f"{value:.2f}" for value in values)
 
 

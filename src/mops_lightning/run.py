@@ -108,7 +108,15 @@ def fit_and_test(
         if (folder / name).exists():
             record["files"][kind] = name
     record["score"] = record["metrics"][experiment.score_name]
-    record["notes"]["score"] = experiment.score_name
+    record["notes"] |= {
+        "score": experiment.score_name,
+        "shown": list(task.shown),
+        "parameters": {
+            name: sum(parameter.numel() for parameter in module.parameters())
+            for name, module in (("task", task), ("sampler", experiment.sampler))
+            if module is not None
+        },
+    }
     if not math.isfinite(record["score"]):
         raise UserError(
             f"{experiment.score_name} is {record['score']}: the training went astray, and nothing "

@@ -66,6 +66,7 @@ def results_table(record: dict[str, Any]) -> tuple[str, Table]:
     rows = readout_rows(record["metrics"], several)
     # The task's own scores; figures of the sampled set stay in the record.
     columns = list(rows.get(FULL, {}))
+    columns = [name for name in record["notes"].get("shown", ()) if name in columns] or columns
     what = "all points" if config.get("learn") == "task" else f"m={config['m']}"
     if several:
         columns = list(next(iter(rows.values())))

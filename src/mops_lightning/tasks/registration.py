@@ -34,6 +34,13 @@ class Registration(Task):
 
     score = "rotation_error_deg"
     """The metric shown in tables; a lower one is better."""
+    shown = (
+        "rotation_error_deg",
+        "rotation_error_p90_deg",
+        "rotation_recall_5deg",
+        "rotation_recall_10deg",
+        "translation_error",
+    )
     net_takes = ("source", "target")
 
     def __init__(
