@@ -1,4 +1,4 @@
-"""Clouds of 40,960 points, from which 4,096 are taken, fit into 1 GB (paper section "Complexity Analysis")."""
+"""4,096 of 40,960 points fit into 1 GB (paper section "Complexity Analysis")."""
 
 import subprocess
 import sys

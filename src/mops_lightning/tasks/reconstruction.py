@@ -18,7 +18,7 @@ from mops_lightning.types import Batch, TaskOutput
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SCORED_BLOCK, SCORED_ROUNDS = 256, 8
+SCORED_BLOCK, SCORED_ROUNDS = 128, 8
 """How earth mover's distances are scored that are too large for the exact one."""
 
 
