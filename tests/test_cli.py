@@ -126,10 +126,14 @@ def test_the_cached_task_net_serves_the_next_run(main_job):
     assert "weights" not in record["files"]
 
 
-def test_a_sweep_leaves_one_record_per_job(main_job):
+def test_a_sweep_leaves_one_record_per_job_and_goes_on_after_a_failure(main_job):
     folder, *_ = main_job
-    status, out, err = call(["-m", *TINY, "sampler=random", "m=4,8", "out=sweep"], folder)
-    assert status == 0, err
+    fixed = ["out=sweep", "hydra.sweep.dir=sweep/cells"]
+    status, out, err = call(["-m", *TINY, "sampler=random", "m=4,65,8", *fixed], folder)
+    assert status == 1
+    assert "sweep/cells/1 failed: m must be at most dataset.n_points=64, got m=65" in out
+    assert "3 cells: 2 completed, 1 failed; in sweep/cells" in out
+    assert "Traceback" not in out + err
     found = sorted((folder / "sweep").rglob("result.json"))
     assert [json.loads(p.read_text())["config"]["m"] for p in found] == [4, 8]
 

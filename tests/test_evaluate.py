@@ -54,6 +54,15 @@ def test_other_sizes_and_other_data(trained, tmp_path):
     assert record["config"]["dataset"]["classes"] == ["chair", "vase", "lamp"]
 
 
+def test_noise_is_added_to_test_clouds_alone(trained, tmp_path):
+    _, record = trained
+    noisy = evaluated(trained, tmp_path, "noise=0.5")
+    key = "test/m8/generated/subset_distance"
+    assert noisy["metrics"][key] != record["metrics"][key]
+    for note in ("dataset_fingerprint", "task_weights_sha256"):
+        assert noisy["notes"][note] == record["notes"][note]
+
+
 def test_another_task_net(trained, tmp_path):
     overrides = [*TINY, "learn=task", "seed=5", "dataset.seed=0"]
     run(compose(overrides), tmp_path / "task", overrides)

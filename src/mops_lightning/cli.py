@@ -49,19 +49,27 @@ def _job(cfg: "DictConfig") -> float | None:
     from pathlib import Path
 
     from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
 
     from mops_lightning.run import run
+    from mops_lightning.sweep import run_cell
 
     hydra_cfg = HydraConfig.get()
     folder = Path(os.path.relpath(hydra_cfg.runtime.output_dir))
+    overrides = list(hydra_cfg.overrides.task)
     try:
-        return run(cfg, folder, overrides=list(hydra_cfg.overrides.task))["score"]
+        if hydra_cfg.mode == RunMode.MULTIRUN:
+            return run_cell(cfg, folder, overrides)
+        return run(cfg, folder, overrides)["score"]
     except UserError as error:
         # Ended here, Hydra does not add lines of its own.
         _end(str(error), USER_ERROR)
     except Interrupted as stop:
         # To Hydra, this is an error like any other.
-        raise KeyboardInterrupt(str(stop)) from None
+        again = "The same command with hydra.sweep.dir={} goes on with the sweep."
+        swept = hydra_cfg.mode == RunMode.MULTIRUN
+        text = again.format(os.path.relpath(hydra_cfg.sweep.dir)) if swept else str(stop)
+        raise KeyboardInterrupt(text) from None
 
 
 def _end(message: str, status: int) -> NoReturn:

@@ -1,6 +1,7 @@
 """Where conf/ is, what the run-level keys mean, and how nodes become objects."""
 
 import inspect
+import math
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ RUN_KEYS = (
     "task_rate",
     "batch_size",
     "val_fraction",
+    "noise",
     "pictures",
     "out",
     "cache",
@@ -135,6 +137,8 @@ def check(cfg: DictConfig) -> None:
         raise UserError(f"task_rate must be a number above 0, got {cfg.task_rate!r}.")
     if not isinstance(cfg.val_fraction, int | float) or not 0 <= cfg.val_fraction < 1:
         raise UserError(f"val_fraction must be in [0, 1), got {cfg.val_fraction!r}.")
+    if not isinstance(cfg.noise, int | float) or not 0 <= cfg.noise < math.inf:
+        raise UserError(f"noise must be a number of at least 0, got {cfg.noise!r}.")
     if "m_max" in cfg.sampler and cfg.learn != "task":
         _whole(cfg.sampler, "m_max", 1, "sampler.m_max")
     unused = ("sampler", "baselines") if cfg.learn == "task" else ()

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,13 @@ from omegaconf import DictConfig, OmegaConf
 from mops_lightning import evaluate, pretrain, records, resume, weights
 from mops_lightning.config import build, check
 from mops_lightning.data.clouds import CloudDataset
+from mops_lightning.data.noise import noisy
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.fit import device_name, fit, make_experiment, make_trainer, test
 from mops_lightning.summary import closing_lines
+
+STARTED = ".started"
+"""Empty file in the folder of a run that has begun."""
 
 OUTPUTS = {
     "checkpoint": "checkpoints/last.ckpt",
@@ -43,7 +48,7 @@ def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> di
     folder.mkdir(parents=True, exist_ok=True)
     try:
         # Two runs that start in the same second get the same folder; the second one stops here.
-        (folder / ".started").touch(exist_ok=False)
+        (folder / STARTED).touch(exist_ok=False)
     except FileExistsError:
         raise UserError(
             f"{folder} holds another run and nothing is overwritten: start again for a new folder."
@@ -51,6 +56,8 @@ def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> di
     with recorded(cfg, folder, overrides or []) as record:
         with timed(record, "data"):
             dataset = build(cfg.dataset)
+            test_points = noisy(dataset.test.points, cfg.noise)
+            dataset = replace(dataset, test=dataset.test._replace(points=test_points))
         points = dataset.train.points.shape[1]
         if cfg.m > points:
             raise UserError(f"m must be at most the {points} points of a cloud, got m={cfg.m}.")
