@@ -8,7 +8,8 @@ import pytest
 
 from mops_lightning import records
 from mops_lightning.config import compose
-from mops_lightning.sweep import ASIDE, FAILED, run_cell
+from mops_lightning.sweep import run_cell
+from mops_lightning.sweep_names import ASIDE, FAILED
 from tests.test_evaluate import TINY
 
 

@@ -19,12 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning import records
 from mops_lightning.errors import Interrupted, UserError
-
-ASIDE = ".attempts"
-"""Folder in a cell's where earlier attempts are kept."""
-
-FAILED = ".failed"
-"""File in a cell's folder that says why its last start failed, be it before there was a record."""
+from mops_lightning.sweep_names import ASIDE, FAILED
 
 STAYS = (ASIDE, ".hydra", ".lock", "cli.log")
 """What belongs to the cell and not to an attempt."""

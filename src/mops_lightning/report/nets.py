@@ -5,13 +5,14 @@ from typing import Any
 from mops_lightning import paper, units
 from mops_lightning.errors import UserError
 from mops_lightning.readout_names import FULL
+from mops_lightning.report.text import Grid
 
 HIDDEN = ("_target_", "n_points")
 """Settings of a net that its table does not list; the number of points has a column of its own."""
 
 
-def nets_table(found: list[dict[str, Any]]) -> list[str]:
-    """Return Markdown lines with a row for each net, by number of points and settings.
+def nets_grid(found: list[dict[str, Any]]) -> Grid:
+    """Return a table with a row for each net, by number of points and settings.
 
     Sizes are of float32 parameters, in MB of a million bytes. Where the paper compares the same
     nets, its figures stand in the last column.
@@ -37,7 +38,7 @@ def nets_table(found: list[dict[str, Any]]) -> list[str]:
     theirs = [_paper(record) for record in found]
     columns = ["net", *keys, "points", *map(units.title, metrics), "MB"]
     columns += ["*the paper's*"] if any(theirs) else []
-    rows: dict[tuple[Any, ...], str] = {}
+    rows: dict[tuple[Any, ...], list[str]] = {}
     for record, net, published in zip(found, nets, theirs, strict=True):
         points = record["config"].get("dataset", {}).get("n_points")
         label = (record["config"]["names"]["net"], *(net.get(key) for key in keys), points)
@@ -56,14 +57,9 @@ def nets_table(found: list[dict[str, Any]]) -> list[str]:
                 f"Two runs of {names['task']} by the same net are there, the second one in "
                 f"{record['folder']}; give a folder with one of each."
             )
-        rows[place] = "| " + " | ".join(cells) + " |"
-    return [
-        f"No sampler was tested; {names['task']} on {names['dataset']} from all points.",
-        "",
-        "| " + " | ".join(columns) + " |",
-        "|---|" + "--:|" * (len(columns) - 1),
-        *(rows[place] for place in sorted(rows)),
-    ]
+        rows[place] = cells
+    title = f"No sampler was tested; {names['task']} on {names['dataset']} from all points."
+    return Grid(title, columns, [rows[place] for place in sorted(rows)])
 
 
 def _metrics(found: list[dict[str, Any]]) -> list[str]:

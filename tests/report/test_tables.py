@@ -4,8 +4,15 @@ import pytest
 
 from mops_lightning import paper, records
 from mops_lightning.errors import UserError
-from mops_lightning.report import main, table
+from mops_lightning.report.build import build
+from mops_lightning.report.cli import main
+from mops_lightning.report.text import markdown
 from tests.test_records import record
+
+
+def table(folder, *metrics, mixed=False):
+    report = build(folder, metrics, mixed)
+    return markdown(report.grids, report.remarks)
 
 
 def put(folder, sampler, m, metrics, task="classification", net="pointnet", **changes):
@@ -62,7 +69,7 @@ def test_runs_of_many_sizes_fill_many_cells(tmp_path):
         ["fmops", "32.00 / 32.00", "8.00 / 8.00"],
     ]
     put(tmp_path, "fmops", 8, {"test/generated/accuracy": 0.8})
-    with pytest.raises(UserError, match="Two runs of fmops with m=8"):
+    with pytest.raises(UserError, match="Two runs of fmops with m=8 and seed=0"):
         table(tmp_path)
 
 
@@ -105,11 +112,11 @@ def test_joint_runs_stand_apart_each_with_its_own_task_net(tmp_path):
 
 def test_an_unknown_metric_and_unreadable_records_are_named(tmp_path):
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
-    with pytest.raises(UserError, match=r"--metric: no run .* has 'acuracy'.*accuracy"):
+    with pytest.raises(UserError, match=r"--metric: no run has 'acuracy'.*accuracy"):
         table(tmp_path, "acuracy")
     (tmp_path / "bad").mkdir()
     (tmp_path / "bad" / "result.json").write_text("")
-    assert f"Not readable: {tmp_path}/bad/result.json." in table(tmp_path)
+    assert f"- {tmp_path}/bad: not readable" in table(tmp_path)
 
 
 def test_the_paper_s_figures_stand_by_its_own_data_only(tmp_path):

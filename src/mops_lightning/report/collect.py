@@ -1,0 +1,142 @@
+"""Which runs lie below a folder, and whether their figures may stand in one table."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mops_lightning import records
+from mops_lightning.errors import UserError
+from mops_lightning.readout_names import parse
+from mops_lightning.sweep_names import ASIDE, FAILED
+
+Record = dict[str, Any]
+"""A run record, and ``folder``, where it lies."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What lies below a folder.
+
+    Attributes:
+        done: records of completed runs, in the order of their folders.
+        undone: folder → why it has no result.
+        count: runs and cells altogether.
+    """
+
+    done: list[Record]
+    undone: dict[str, str]
+    count: int
+
+
+def collect(folder: Path) -> Found:
+    """Read all records below ``folder``; earlier attempts of a sweep's cells do not count.
+
+    Raises:
+        UserError: there is none, or none is of a completed run.
+    """
+    done: list[Record] = []
+    undone: dict[str, str] = {}
+    paths = [*folder.rglob(records.FILE), *folder.rglob(FAILED)]
+    runs = sorted({path.parent for path in paths if ASIDE not in path.parts})
+    if not runs:
+        raise UserError(f"{folder}: no {records.FILE} below it.")
+    for run in runs:
+        try:
+            record = records.read(run)
+        except UserError:
+            text = (run / FAILED).read_text() if (run / FAILED).exists() else "not readable"
+            undone[str(run)] = text.strip()
+            continue
+        if record["status"] == "completed":
+            done.append({**record, "folder": str(run)})
+        else:
+            why = f": {record['error']}" if record["error"] else ""
+            undone[str(run)] = record["status"] + why
+    if not done:
+        listed = "; ".join(f"{run} ({why})" for run, why in list(undone.items())[:3])
+        raise UserError(f"{folder}: none of its {len(runs)} runs is completed: {listed}.")
+    return Found(done, undone, len(runs))
+
+
+def common(found: list[Record], mixed: bool = False) -> dict[str, str]:
+    """Return the names of task, net, data and ``learned``, which all records must share.
+
+    A net without weights, such as ICP, may stand beside the trained one.
+
+    Args:
+        found: completed records.
+        mixed: whether different commits are allowed.
+
+    Raises:
+        UserError: they differ in what must be equal; it says in what.
+    """
+    trained = [r for r in found if not _weightless(r)] or found
+    keys = {
+        "task": {r["config"]["names"]["task"] for r in found},
+        "net": {r["config"]["names"]["net"] for r in trained},
+        "dataset": {r["config"]["names"]["dataset"] for r in found},
+        "data (dataset_fingerprint)": {r["notes"].get("dataset_fingerprint") for r in found},
+        "pairs (task.pairs)": {_plain(r["config"]["task"].get("pairs")) for r in found},
+        "what learned (learn)": {learned(r) for r in trained},
+        # After joint training each run has a task net of its own.
+        "task weights (sha256)": {
+            r["notes"].get("task_weights_sha256") for r in found if learned(r) != "joint"
+        },
+    }
+    for net in sorted({r["config"]["names"]["net"] for r in found}):
+        same = [r["config"]["task"] for r in found if r["config"]["names"]["net"] == net]
+        keys[f"settings of {net} (task.net)"] = {_plain(task.get("net")) for task in same}
+    if any(learned(r) == "joint" for r in trained):
+        keys["loss (task.loss)"] = {_plain(r["config"]["task"].get("loss")) for r in trained}
+    for what, values in keys.items():
+        known = values - {None}  # a resumed run may have its task net from the checkpoint
+        if len(known) > 1:
+            raise UserError(
+                f"The runs differ in {what}: {', '.join(sorted(map(str, known)))}. "
+                "Their figures do not belong in one table; give a folder with runs of one kind."
+            )
+    commits = sorted({(r["git"]["commit"] or "a wheel")[:10] for r in found})
+    if len(commits) > 1 and not mixed:
+        raise UserError(
+            f"The runs differ in the commit of the code: {', '.join(commits)}. If their figures "
+            "may stand in one table all the same, add --mixed."
+        )
+    names = {what: next(iter(values - {None}), "") for what, values in keys.items()}
+    return {**names, "learned": names["what learned (learn)"]}
+
+
+def learned(record: Record) -> str:
+    """Return whether the task net learned with the sampler, in the run that was evaluated too."""
+    learn = (record["notes"].get("evaluated") or {}).get("learn", record["config"]["learn"])
+    return "joint" if learn == "joint" else "sampler alone"
+
+
+def epochs(record: Record) -> int | None:
+    """Return how long a run, or the one that it evaluates, was trained; None: not at all."""
+    earlier = record["notes"].get("evaluated") or {}
+    if "fit" in record["seconds"]:
+        return record["config"]["trainer"]["max_epochs"]
+    return earlier.get("max_epochs")
+
+
+def score(found: list[Record]) -> str:
+    """Return the metric that the records' tasks are scored by."""
+    scores = [parse(record["notes"].get("score", "")) for record in found]
+    return next((parts.metric for parts in scores if parts), "accuracy")
+
+
+def seed(record: Record) -> int:
+    """Return the seed of a run, or of the one that it evaluates."""
+    earlier: Record = record["notes"].get("evaluated") or {}
+    return earlier["seed"] if "seed" in earlier else record["seed"]
+
+
+def _weightless(record: Record) -> bool:
+    """Return whether the task net has no weights: none were noted, and none were trained."""
+    learns = record["config"]["learn"] in ("task", "joint")
+    return not learns and "task_weights_sha256" not in record["notes"]
+
+
+def _plain(node: Any) -> str | None:
+    return None if node is None else json.dumps(node, sort_keys=True)

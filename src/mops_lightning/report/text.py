@@ -1,0 +1,99 @@
+"""Tables as Markdown, LaTeX and CSV."""
+
+import csv
+import io
+from dataclasses import dataclass, field
+
+from mops_lightning.readout_names import parse
+from mops_lightning.report.axes import row, value
+from mops_lightning.report.collect import Record, epochs, learned, seed
+
+
+@dataclass
+class Grid:
+    """A table of texts.
+
+    Attributes:
+        title: what it shows.
+        head: the columns' names, that of the rows first.
+        rows: their cells.
+        below: lines under the table.
+    """
+
+    title: str
+    head: list[str]
+    rows: list[list[str]]
+    below: list[str] = field(default_factory=list)
+
+
+def markdown(grids: list[Grid], remarks: list[str]) -> str:
+    """Return all tables, one below the other, and the remarks."""
+    lines: list[str] = []
+    for grid in grids:
+        lines += [grid.title, "", _line(grid.head), "|---|" + "--:|" * (len(grid.head) - 1)]
+        lines += [*map(_line, grid.rows), "", *grid.below, *([""] if grid.below else [])]
+    return "\n".join([*lines, *remarks]) + "\n"
+
+
+def _line(cells: list[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+TEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "°": r"$^\circ$", "±": r"$\pm$"}
+
+
+def latex(grids: list[Grid], remarks: list[str]) -> str:
+    """Return all tables as ``tabular`` environments (package booktabs); remarks as comments."""
+    parts = []
+    for grid in grids:
+        body = "\n".join(f"{' & '.join(map(_tex, cells))} \\\\" for cells in grid.rows)
+        parts.append(
+            "\\begin{table}\n\\centering\n"
+            f"\\caption{{{_tex(grid.title)}}}\n"
+            f"\\begin{{tabular}}{{l{'r' * (len(grid.head) - 1)}}}\n\\toprule\n"
+            f"{' & '.join(map(_tex, grid.head))} \\\\\n\\midrule\n{body}\n\\bottomrule\n"
+            "\\end{tabular}\n\\end{table}\n" + "".join(f"% {line}\n" for line in grid.below)
+        )
+    return "\n".join(parts) + "".join(f"% {line}\n" for line in remarks)
+
+
+def _tex(text: str) -> str:
+    if text.startswith("*") and text.endswith("*"):
+        return f"\\emph{{{_tex(text[1:-1])}}}"
+    return "".join(TEX.get(letter, letter) for letter in text)
+
+
+def long_csv(found: list[Record], net: str, keys: list[str]) -> str:
+    """Return every test figure of every record as a line of its own.
+
+    Args:
+        found: completed records.
+        net: the table's task net.
+        keys: dotted settings that get a column.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    fixed = ["folder", "sampler", "learn", "seed", "epochs", "m", "readout", "metric", "value"]
+    writer.writerow([*fixed, *keys, "commit", "device"])
+    for record in found:
+        for name, figure in record["metrics"].items():
+            parts = parse(name)
+            if parts is None or figure is None:
+                continue
+            writer.writerow(
+                [
+                    record["folder"],
+                    row(record, net),
+                    learned(record),
+                    seed(record),
+                    epochs(record) or 0,
+                    parts.m or record["config"].get("m"),
+                    parts.readout,
+                    parts.metric,
+                    repr(figure),
+                    *(value(record, key) for key in keys),
+                    record["git"]["commit"],
+                    record["device"],
+                ]
+            )
+    return out.getvalue()

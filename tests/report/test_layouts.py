@@ -1,0 +1,164 @@
+"""Seeds, other settings than the size, heat maps, and the files that a report consists of."""
+
+import csv
+import json
+from typing import Any
+
+import pytest
+
+from mops_lightning import records
+from mops_lightning.errors import UserError
+from mops_lightning.report.build import build
+from mops_lightning.report.cli import main
+from mops_lightning.report.plots import plots
+from tests.report.test_tables import put, rows, table
+from tests.test_records import record
+
+
+def put_cell(folder, name, sampler, values, seed=0, **settings):
+    """A run of a sweep, whose settings beside the size are given dotted."""
+    config = {
+        "m": settings.pop("m", 32),
+        "learn": "sampler",
+        "names": {
+            "task": "reconstruction",
+            "net": "autoencoder",
+            "dataset": "shapes",
+            "sampler": sampler,
+        },
+        "trainer": {"max_epochs": 3},
+        "task": {"emd_weight": 1.0},
+        "sampler": {"m": 32, **settings.pop("of", {})},
+        **settings,
+    }
+    metrics = {f"test/{readout}/nre_cd": value for readout, value in values.items()}
+    notes = {"dataset_fingerprint": "d", "score": "test/generated/nre_cd"}
+    (folder / name).mkdir(parents=True)
+    seconds = {"total": 1.0, "fit": 0.5}
+    content = record(config=config, metrics=metrics, notes=notes, seed=seed, seconds=seconds)
+    records.write(folder / name, content)
+    return folder / name / records.FILE
+
+
+def test_seeds_are_summed_up_with_their_count(tmp_path):
+    for seed, value in enumerate((1.0, 2.0, 3.0)):
+        put_cell(tmp_path, f"{seed}", "mops", {"generated": value, "matched": 1.5}, seed=seed)
+    assert rows(table(tmp_path))[1] == ["mops", "2 ± 1 / 1.5 ± 0 (n=3)"]
+    put_cell(tmp_path, "again", "mops", {"generated": 1.0}, seed=2)
+    with pytest.raises(UserError, match="Two runs of mops with m=32 and seed=2"):
+        table(tmp_path)
+
+
+def test_runs_of_other_commits_or_settings_stand_together_only_when_asked(tmp_path):
+    path = put_cell(tmp_path, "a", "mops", {"generated": 1.0})
+    put_cell(tmp_path, "b", "snet", {"generated": 2.0}, batch_size=7)  # its own business
+    assert len(rows(table(tmp_path))) == 3
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, "git": {"commit": "f" * 40, "dirty": False}}))
+    with pytest.raises(UserError, match=r"differ in the commit of the code: .*ffffffffff.*--mixed"):
+        table(tmp_path)
+    assert len(rows(table(tmp_path, mixed=True))) == 3
+    settings = {"learn": "sampler", "optimizer": {"name": "other"}}
+    put_cell(tmp_path, "c", "mops", {"generated": 1.0}, m=8, **settings)
+    assert rows(table(tmp_path, mixed=True))[0] == ["sampled by", "m=32", "m=8"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=r"\(mops: optimizer.name\).*--mixed"):
+        table(tmp_path)
+
+
+def test_one_more_setting_makes_columns(tmp_path):
+    for noise in (0.0, 0.1, 0.02):
+        put_cell(tmp_path, f"a{noise}", "mops", {"generated": 1 + noise}, noise=noise)
+        put_cell(tmp_path, f"b{noise}", "fps", {"sampled": 2 + noise}, noise=noise)
+    assert rows(table(tmp_path)) == [
+        ["sampled by", "noise=0.0", "noise=0.02", "noise=0.1"],
+        ["fps", "2", "2.02", "2.1"],
+        ["mops", "1", "1.02", "1.1"],
+    ]
+    put_cell(tmp_path, "c", "mops", {"generated": 1.0}, noise=0.0, m=8)
+    with pytest.raises(UserError, match=r"differ in size \(m=8, m=32\) and in noise"):
+        table(tmp_path)
+
+
+def put_planes(folder):
+    for number, alpha in enumerate((0.1, 1.0)):
+        for tau in (0.5, 0.9):
+            values = {"generated": 1 + number * tau, "matched": 2.0}
+            put_cell(folder, f"a{alpha}{tau}", "mops", values, of={"alpha": alpha, "tau": tau})
+        for gamma in (1e-5, 1e-3, 0.1):
+            beta = 10.0**-number
+            values = {"generated": gamma + beta, "matched": 3.0}
+            put_cell(
+                folder,
+                f"b{beta}{gamma}",
+                "samplenet",
+                values,
+                of={"beta": beta, "gamma": gamma},
+            )
+
+
+def test_two_settings_make_a_plane_for_each_sampler(tmp_path):
+    put_planes(tmp_path)
+    text = table(tmp_path)
+    assert "Test nre cd of samplenet" in text
+    assert rows(text) == [
+        ["beta \\ gamma", "1e-05", "0.001", "0.1"],
+        ["0.1", "0.1 / 3", "0.101 / 3", "0.2 / 3"],
+        ["1.0", "1 / 3", "1.001 / 3", "1.1 / 3"],
+        ["alpha \\ tau", "0.5", "0.9"],
+        ["0.1", "1 / 2", "1 / 2"],
+        ["1.0", "1.5 / 2", "1.9 / 2"],
+    ]
+    assert "plane of mops: generated 1 to 1.9 (factor 1.9), matched 2 to 2 (factor 1)." in text
+
+
+def test_cells_without_a_result_are_listed_with_the_reason(tmp_path):
+    put_cell(tmp_path, "done", "mops", {"generated": 1.0})
+    (tmp_path / "failed").mkdir()
+    (tmp_path / "failed" / ".failed").write_text("m must be at most 64\n")
+    put_cell(tmp_path / "done", ".attempts/1", "mops", {"generated": 9.0})
+    text = table(tmp_path)
+    assert "1 of 2 runs are not completed:" in text
+    assert f"- {tmp_path}/failed: m must be at most 64" in text
+    assert "9" not in rows(text)[1][1]
+
+
+def test_all_files_are_written_and_say_the_same(tmp_path, capsys):
+    put_planes(tmp_path)
+    main([str(tmp_path)])
+    assert "nre_cd_planes.png" in capsys.readouterr().out
+    assert (tmp_path / "nre_cd_planes.png").read_bytes()[:4] == b"\x89PNG"
+    svg = (tmp_path / "nre_cd_planes.svg").read_text()
+    assert "samplenet" in svg or "<path" in svg
+    tex = (tmp_path / "table.tex").read_text()
+    assert r"1.0 & 1.5 / 2 & 1.9 / 2 \\" in tex
+    assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 2
+    with (tmp_path / "table.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 20
+    (one,) = [
+        line
+        for line in lines
+        if (line["sampler.alpha"], line["sampler.tau"], line["readout"])
+        == ("1.0", "0.9", "generated")
+    ]
+    assert (one["sampler"], one["metric"], one["value"], one["m"]) == (
+        "mops",
+        "nre_cd",
+        "1.9",
+        "32",
+    )
+
+
+def test_sizes_are_drawn_as_curves(tmp_path):
+    for m in (8, 32):
+        put(tmp_path, "fps", m, {"test/sampled/accuracy": m / 100})
+        put(tmp_path, "mops", m, {"test/generated/accuracy": m / 50, "test/matched/accuracy": 0.5})
+    (figure,) = plots(build(tmp_path)).values()
+    panels: list[list[Any]] = [list(axes.containers) for axes in figure.axes]
+    first, second, third = panels
+    fps, mops = first
+    assert fps.lines[0].get_ydata().tolist() == [8, 32]
+    assert mops.lines[0].get_ydata().tolist() == [16, 64]
+    assert second[1].lines[0].get_ydata().tolist() == [50, 50]
+    assert len(third) == 1  # there are no completed figures of MOPS-Net
