@@ -1,4 +1,6 @@
 import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -49,3 +51,43 @@ def small_dataset(train: int = 24, test: int = 10, points: int = 48) -> CloudDat
         return Clouds(torch.randn(number, points, 3, generator=rng) * scale[:, None], labels)
 
     return CloudDataset(("long", "tall", "round"), clouds(train), clouds(test), "blobs")
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """An installed Chromium, without a window."""
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if program is None:
+        pytest.skip(f"no browser to look with: none of {', '.join(BROWSERS)} is installed")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        # WebGL without a graphics card.
+        flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        yield playwright.chromium.launch(executable_path=program, args=flags)
+
+
+@pytest.fixture
+def opened(browser: Any) -> Iterator[Any]:
+    """A function that opens an address: the page, its errors, and all addresses it asked for."""
+    page = browser.new_page()
+    errors: list[str] = []
+    requests: list[str] = []
+
+    def note(message: Any) -> None:
+        if message.type == "error":
+            errors.append(message.text)
+
+    page.on("console", note)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("request", lambda request: requests.append(request.url))
+
+    def open_(address: str) -> tuple[Any, list[str], list[str]]:
+        page.goto(address)
+        return page, errors, requests
+
+    yield open_
+    page.close()

@@ -160,6 +160,7 @@ def test_registration_pretrains_trains_jointly_tests_and_is_evaluated_under_icp(
     assert 0 < record["metrics"]["test/m16/matched/rotation_error_p90_deg"] < 180
     assert record["score"] == record["metrics"]["test/m8/generated/rotation_error_deg"]
     assert {path.name for path in (run / "pictures").iterdir()} == {
+        "clouds.npz",
         "clouds.png",
         "matrix.png",
         "pairs.png",

@@ -12,6 +12,7 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
+from mops_lightning.cloud_files import CLOUDS, save_clouds
 from mops_lightning.pictures import (
     COLOURS,
     INPUT_COLOUR,
@@ -75,6 +76,8 @@ class DrawClouds(Callback):
             if matrix is not None and batch.points.shape[1] * len(matrix.queries) <= DENSE_PIXELS:
                 first = matrix._replace(keys=matrix.keys[:1])
                 figures["matrix"] = matrix_figure(first.dense()[0], first.gram()[0], titles[0])
+        if folder is not None and sampled:
+            save_clouds(folder / CLOUDS, batch.points, sampled, titles)
         module.train(training)
         step = trainer.global_step
         for name, figure in figures.items():

@@ -12,6 +12,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning import evaluate, pretrain, records, resume, weights
+from mops_lightning.cloud_files import CLOUDS
 from mops_lightning.config import build, check
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.noise import noisy
@@ -25,6 +26,7 @@ STARTED = ".started"
 OUTPUTS = {
     "checkpoint": "checkpoints/last.ckpt",
     "pictures": "pictures",
+    "clouds": f"pictures/{CLOUDS}",
     "tensorboard": "tensorboard",
 }
 """What callbacks and loggers may have written."""

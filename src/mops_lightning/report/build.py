@@ -20,7 +20,7 @@ from mops_lightning.report.collect import (
     seed,
 )
 from mops_lightning.report.nets import nets_grid
-from mops_lightning.report.text import Grid
+from mops_lightning.report.text import PAPER, Grid
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def _by_column(table: Cells, names: dict[str, str], layout: Axes) -> Grid:
         if any(str(column) in theirs for column in columns):
             figures = [theirs.get(str(column), []) for column in columns]
             texts = [" / ".join(f"{one:.2f}" for one in values) for values in figures]
-            rows.append(["*the paper's*", *texts])
+            rows.append([PAPER, *texts])
     title = (
         f"Test {units.title(table.metric)}: {names['task']} on {names['dataset']} under "
         f"{names['net']}; generated / matched / completed sets, or one figure for samplers that "

@@ -9,6 +9,8 @@ from mops_lightning.io import atomic_write
 from mops_lightning.report.build import Report, build
 from mops_lightning.report.text import latex, long_csv, markdown
 
+PAGE = "report.html"
+
 DESCRIPTION = """Tables, plots and a page of all run records below a folder.
 
 Reads result.json files only. As in the paper's tables, columns are sizes, and a cell holds the
@@ -20,7 +22,7 @@ nets."""
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Write ``table.md``, ``table.tex``, ``table.csv`` and the plots into the folder."""
+    """Write the tables, the plots and the page into the folder."""
     parser = argparse.ArgumentParser(
         prog="python -m mops_lightning.report",
         description=DESCRIPTION,
@@ -48,6 +50,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def write(report: Report, folder: Path) -> list[str]:
     """Write all files of a report into its folder; return their names."""
+    from mops_lightning.report.page import page
     from mops_lightning.report.plots import plots
 
     layout = report.axes
@@ -63,7 +66,11 @@ def write(report: Report, folder: Path) -> list[str]:
         with atomic_write(folder / name) as temporary:
             temporary.write_text(text)
     written = list(texts)
-    for name, figure in plots(report).items():
+    figures = plots(report)
+    with atomic_write(folder / PAGE) as temporary:
+        temporary.write_text(page(report, folder, figures))
+    written.append(PAGE)
+    for name, figure in figures.items():
         for suffix in (".png", ".svg"):
             with atomic_write(folder / (name + suffix)) as temporary:
                 figure.savefig(

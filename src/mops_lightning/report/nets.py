@@ -5,7 +5,7 @@ from typing import Any
 from mops_lightning import paper, units
 from mops_lightning.errors import UserError
 from mops_lightning.readout_names import FULL
-from mops_lightning.report.text import Grid
+from mops_lightning.report.text import PAPER, Grid
 
 HIDDEN = ("_target_", "n_points")
 """Settings of a net that its table does not list; the number of points has a column of its own."""
@@ -37,7 +37,7 @@ def nets_grid(found: list[dict[str, Any]]) -> Grid:
     metrics = _metrics(found)
     theirs = [_paper(record) for record in found]
     columns = ["net", *keys, "points", *map(units.title, metrics), "MB"]
-    columns += ["*the paper's*"] if any(theirs) else []
+    columns += [PAPER] if any(theirs) else []
     rows: dict[tuple[Any, ...], list[str]] = {}
     for record, net, published in zip(found, nets, theirs, strict=True):
         points = record["config"].get("dataset", {}).get("n_points")

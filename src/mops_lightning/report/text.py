@@ -8,6 +8,9 @@ from mops_lightning.readout_names import parse
 from mops_lightning.report.axes import row, value
 from mops_lightning.report.collect import Record, epochs, learned, seed
 
+PAPER = "*the paper's*"
+"""Label of a row with the paper's figures, which belong to the row above."""
+
 
 @dataclass
 class Grid:

@@ -1,0 +1,103 @@
+"""A report as one HTML page that needs nothing else: tables to sort, plots, clouds to turn."""
+
+import base64
+import html
+import io
+import json
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from mops_lightning.cloud_files import INPUT, load_clouds
+from mops_lightning.pictures import COLOURS, INPUT_COLOUR
+from mops_lightning.report.build import Report
+from mops_lightning.report.text import PAPER, Grid
+
+SHOWN = 24
+"""Most runs whose clouds are put into a page; more make it too large to open."""
+
+
+PLOTLY = "package_data/plotly.min.js"
+
+
+def page(report: Report, folder: Path, figures: Mapping[str, Figure]) -> str:
+    """Return the page.
+
+    Args:
+        report: what to show.
+        folder: what it is of; it gives the title.
+        figures: the plots by name.
+    """
+    clouds = _clouds(report, folder)
+    template = Template(files("mops_lightning.report").joinpath("page.html").read_text())
+    return template.substitute(
+        title=html.escape(folder.resolve().name),
+        tables="\n".join(map(_table, report.grids)),
+        plots="\n".join(_image(name, figure) for name, figure in figures.items()),
+        clouds=VIEW if clouds else "",
+        remarks="".join(
+            f"<li>{html.escape(line[2:])}</li>" for line in report.remarks if line[:2] == "- "
+        ),
+        plotly=files("plotly").joinpath(PLOTLY).read_text() if clouds else "",
+        # "</script>" in a title must not end the script.
+        data=json.dumps(clouds).replace("<", "\\u003c"),
+    )
+
+
+VIEW = """<h2>Sampled clouds</h2>
+<p><label>Run <select id="run"></select></label><label>Cloud <select id="shape"></select></label>
+Turn with the mouse; a click on a name in the legend hides it.</p>
+<div id="view"></div>"""
+
+
+def _table(grid: Grid) -> str:
+    rows: list[list[str]] = []
+    for cells in grid.rows:
+        texts = [html.escape(cell) for cell in cells]
+        if cells[0] == PAPER:
+            # Below our figures in the same row, so that sorting keeps them together.
+            rows[-1] = [
+                f"{ours}<small>{theirs.strip('*')}</small>" if theirs else ours
+                for ours, theirs in zip(rows[-1], texts, strict=True)
+            ]
+        else:
+            rows.append(texts)
+    head = "".join(f"<th>{html.escape(name.strip('*'))}</th>" for name in grid.head)
+    body = "\n".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>" for cells in rows)
+    below = "".join(f"<p>{html.escape(line)}</p>" for line in grid.below)
+    return (
+        f"<p>{html.escape(grid.title)}</p>\n"
+        f'<div class="wide"><table><thead><tr>{head}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div>\n{below}"
+    )
+
+
+def _image(name: str, figure: Figure) -> str:
+    out = io.BytesIO()
+    figure.savefig(out, format="svg", metadata={"Date": None})
+    data = base64.b64encode(out.getvalue()).decode()
+    return f'<img alt="{html.escape(name)}" src="data:image/svg+xml;base64,{data}">'
+
+
+def _clouds(report: Report, folder: Path) -> list[dict[str, Any]]:
+    """Return the clouds that the runs have kept, as plain data."""
+    shown: list[dict[str, Any]] = []
+    for record in report.found.done:
+        path = Path(record["folder"]) / record["files"].get("clouds", "")
+        if not path.is_file() or len(shown) == SHOWN:
+            continue
+        titles, arrays = load_clouds(path)
+        colours = {INPUT: INPUT_COLOUR, **COLOURS}
+        shown.append(
+            {
+                "name": str(Path(record["folder"]).relative_to(folder)),
+                "titles": titles,
+                "points": {name: a.astype(float).round(3).tolist() for name, a in arrays.items()},
+                "colours": {name: f"rgb{colours.get(name, COLOURS['sampled'])}" for name in arrays},
+            }
+        )
+    return shown
