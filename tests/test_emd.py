@@ -6,8 +6,10 @@ from pathlib import Path
 from subprocess import PIPE
 
 import numpy as np
+import ot
 import pytest
 import torch
+from scipy.optimize import linear_sum_assignment
 from scipy.stats import wasserstein_distance
 
 from mops_lightning.emd import earth_mover_distance, matching
@@ -170,9 +172,15 @@ def alive(pid):
         return False
 
 
+def test_many_points_are_matched_as_well_by_pot_as_by_scipy(rng):
+    for points, others in kinds(1024, rng).values():
+        cost = torch.cdist(points, others)[0].numpy()
+        want = cost[linear_sum_assignment(cost)].mean()
+        assert earth_mover_distance(points, others).item() == pytest.approx(want, rel=1e-9)
+
+
 @pytest.mark.parametrize("n", [30, 200])
 def test_the_exact_distance_is_that_of_pot(n, rng):
-    ot = pytest.importorskip("ot", reason="POT is not installed (pip install pot)")
     points, others = kinds(n, rng)["surface"]
     cost = torch.cdist(points, others)[0].numpy()
     want = ot.emd2(np.full(n, 1 / n), np.full(n, 1 / n), cost)

@@ -20,6 +20,7 @@ def pool(workers: int) -> ProcessPoolExecutor:
 
 def _start() -> None:
     """Leave Ctrl-C to the process that asks, and end when it ends, however it does."""
+    os.environ["POT_BACKEND_DISABLE_PYTORCH"] = "1"  # POT would import torch into every worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
