@@ -1,0 +1,28 @@
+"""Sweeps by other launchers than Hydra's own: the same cells, records and summary."""
+
+import json
+import os
+
+import pytest
+
+from tests.test_cli import TINY, call
+
+LAUNCHERS = {
+    "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
+    "submitit": ["hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=1"],
+}
+
+
+@pytest.mark.parametrize("name", LAUNCHERS)
+def test_cells_run_side_by_side(name, tmp_path):
+    fixed = [*TINY, "sampler=random", "weights=null", "pictures=0", "hydra.sweep.dir=cells"]
+    command = ["-m", *LAUNCHERS[name], *fixed, "m=4,8"]
+    status, out, err = call(command, tmp_path)
+    assert status == 0, out + err
+    assert "2 cells: 2 completed; in cells" in out
+    found = [json.loads((tmp_path / "cells" / cell / "result.json").read_text()) for cell in "01"]
+    assert [record["config"]["m"] for record in found] == [4, 8]
+    if name == "joblib":  # it shares the cores out
+        assert {record["threads"] for record in found} == {
+            max(len(os.sched_getaffinity(0)) // 2, 1)
+        }
