@@ -96,6 +96,9 @@ def build(node: Any, **extra: Any) -> Any:
         while cause is not None:
             if isinstance(cause, UserError):
                 raise cause from None
+            if isinstance(cause, ModuleNotFoundError):
+                target = node.get("_target_", node)
+                raise UserError(f"{target} needs a package that is not here: {cause}") from None
             if type(cause).__name__ == "MisconfigurationException":
                 # Lightning's word for a trainer that this machine cannot run, such as trainer=gpu.
                 raise UserError(f"trainer: {cause} Try trainer=auto or trainer=cpu.") from None
