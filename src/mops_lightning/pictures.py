@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
 from mops_lightning.io import atomic_write
@@ -39,23 +40,28 @@ def cloud_grid(points: Tensor, readouts: Mapping[str, Tensor], titles: Sequence[
             axes = figure.add_subplot(
                 len(points), len(columns), row * len(columns) + column + 1, projection="3d"
             )
-            faint = samples is not None
-            axes.scatter(
-                *cloud.T,
-                s=1 if faint else 3,
-                color=np.array(INPUT_COLOUR) / 255 if faint else "0.35",
-                alpha=0.35 if faint else 1.0,
-                depthshade=False,
-            )
-            if samples is not None:
-                colour = np.array(COLOURS.get(name, COLOURS["sampled"])) / 255
-                axes.scatter(*upright(samples)[row].T, s=22, color=colour, depthshade=False)
-            frame_cloud(axes, cloud)
+            draw_cloud(axes, cloud, None if samples is None else upright(samples)[row], name)
             if row == 0:
                 axes.set_title(name, fontsize=11)
             if column == 0:
                 axes.text2D(0.02, 0.04, titles[row], transform=axes.transAxes, fontsize=9)
     return figure
+
+
+def draw_cloud(axes: Axes3D, cloud: np.ndarray, samples: np.ndarray | None, readout: str) -> None:
+    """Draw one cloud ``(N, 3)``, z up, faint where there are samples ``(M, 3)`` to be seen."""
+    faint = samples is not None
+    axes.scatter(
+        *cloud.T,
+        s=1 if faint else 3,
+        color=np.array(INPUT_COLOUR) / 255 if faint else "0.35",
+        alpha=0.35 if faint else 1.0,
+        depthshade=False,
+    )
+    if samples is not None:
+        colour = np.array(COLOURS.get(readout, COLOURS["sampled"])) / 255
+        axes.scatter(*samples.T, s=22, color=colour, depthshade=False)
+    frame_cloud(axes, cloud)
 
 
 def matrix_figure(dense: Tensor, gram: Tensor, title: str) -> Figure:
@@ -90,9 +96,9 @@ def save_figure(figure: Figure, path: Path) -> Path:
     return path
 
 
-def upright(points: Tensor) -> np.ndarray:
+def upright(points: Tensor | np.ndarray) -> np.ndarray:
     """Turn y-up clouds into matplotlib's z-up ones."""
-    array = points.detach().cpu().float().numpy()
+    array = points if isinstance(points, np.ndarray) else points.detach().cpu().float().numpy()
     return np.stack([array[..., 0], -array[..., 2], array[..., 1]], -1)
 
 

@@ -5,8 +5,10 @@ import json
 from typing import Any
 
 import pytest
+import torch
 
 from mops_lightning import records
+from mops_lightning.cloud_files import save_clouds
 from mops_lightning.errors import UserError
 from mops_lightning.report.build import build
 from mops_lightning.report.cli import main
@@ -162,3 +164,16 @@ def test_sizes_are_drawn_as_curves(tmp_path):
     assert mops.lines[0].get_ydata().tolist() == [16, 64]
     assert second[1].lines[0].get_ydata().tolist() == [50, 50]
     assert len(third) == 1  # there are no completed figures of MOPS-Net
+
+
+def test_a_cloud_is_drawn_at_every_noise_level(tmp_path, rng):
+    for noise in (0.0, 0.1):
+        for name, readout in (("mops", "generated"), ("fps", "sampled")):
+            path = put_cell(tmp_path, f"{name}{noise}", name, {readout: 1.0}, noise=noise)
+            content = json.loads(path.read_text())
+            path.write_text(json.dumps({**content, "files": {"clouds": "clouds.npz"}}))
+            points = torch.rand(1, 40, 3, generator=rng)
+            save_clouds(path.parent / "clouds.npz", points, {readout: points[:, :4]}, ["chair"])
+    figure = plots(build(tmp_path))["clouds"]
+    assert [axes.get_title() for axes in figure.axes[:2]] == ["noise=0", "noise=0.1"]
+    assert len(figure.axes) == 4

@@ -1,12 +1,17 @@
 """Curves and heat maps of a report's tables."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from mops_lightning import units
+from mops_lightning.cloud_files import INPUT, load_clouds
+from mops_lightning.pictures import draw_cloud, upright
 from mops_lightning.readout_names import GENERATED_READOUTS, INDEX_READOUT
-from mops_lightning.report.axes import Axes
+from mops_lightning.report.axes import Axes, row, value
 from mops_lightning.report.build import Report, plane
 from mops_lightning.report.cells import Cells, place
 
@@ -19,7 +24,39 @@ def plots(report: Report) -> dict[str, Figure]:
             figures[f"{table.metric}_planes"] = heat_maps(table, report.axes)
         elif len(table.columns()) > 1:
             figures[f"{table.metric}_curves"] = curves(table, report.axes)
+    if report.axes.column != "m" and (figure := clouds_by_column(report)):
+        figures["clouds"] = figure
     return figures
+
+
+def clouds_by_column(report: Report) -> Figure | None:
+    """Draw one test cloud as every sampler saw it at every value of the setting, such as noise."""
+    found: dict[str, dict[Any, Path]] = {}
+    for record in report.scored:
+        path = Path(record["folder"]) / record["files"].get("clouds", "")
+        if path.is_file():
+            name = row(record, report.names["net"])
+            found.setdefault(name, {}).setdefault(value(record, report.axes.column), path)
+    columns = sorted({column for paths in found.values() for column in paths})
+    if not columns:
+        return None
+    figure = Figure(figsize=(2.6 * len(columns), 2.6 * len(found)), layout="tight")
+    FigureCanvasAgg(figure)
+    for i, name in enumerate(sorted(found, key=place)):
+        for j, column in enumerate(columns):
+            if column not in found[name]:
+                continue
+            _, arrays = load_clouds(found[name][column])
+            cloud = upright(arrays.pop(INPUT)[0])
+            readout, samples = next(iter(arrays.items()))
+            axes = figure.add_subplot(
+                len(found), len(columns), i * len(columns) + j + 1, projection="3d"
+            )
+            draw_cloud(axes, cloud, upright(samples[0]), readout)
+            if i == 0:
+                axes.set_title(f"{report.axes.column}={column:g}", fontsize=11)
+            axes.text2D(0.02, 0.04, f"{name}, {readout}", transform=axes.transAxes, fontsize=9)
+    return figure
 
 
 def curves(table: Cells, axes: Axes) -> Figure:
