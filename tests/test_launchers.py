@@ -26,3 +26,21 @@ def test_cells_run_side_by_side(name, tmp_path):
         assert {record["threads"] for record in found} == {
             max(len(os.sched_getaffinity(0)) // 2, 1)
         }
+
+
+def test_optuna_searches_and_keeps_every_trial(tmp_path):
+    pytest.importorskip("optuna", reason="the extra 'optuna' is not installed")
+    search = [
+        "hydra/sweeper=optuna",
+        "hydra.sweeper.n_trials=2",
+        "hydra.sweeper.direction=maximize",
+    ]
+    settings = [*TINY, "weights=null", "pictures=0", "logger=none", "hydra.sweep.dir=trials"]
+    command = ["-m", *search, *settings, "sampler.alpha=interval(0.1,30)"]
+    status, out, err = call(command, tmp_path)
+    assert status == 0, out + err
+    assert "Best parameters: {'sampler.alpha': " in out
+    found = [json.loads((tmp_path / "trials" / cell / "result.json").read_text()) for cell in "01"]
+    alphas = {record["config"]["sampler"]["alpha"] for record in found}
+    assert len(alphas) == 2
+    assert all(0.1 <= alpha <= 30 for alpha in alphas)
