@@ -252,11 +252,14 @@ def test_nets_that_reconstruct_stand_beside_the_paper_s(tmp_path):
 
 def test_several_metrics_make_several_tables(tmp_path):
     metrics = {"test/sampled/nre_cd": 1.5, "test/sampled/nre_emd": 2.5}
+    metrics |= {"test/full/nre_cd": 1.0, "test/full/chamfer": 0.0025, "test/full/emd": 0.06}
     put(tmp_path, "fps", 32, metrics, task="reconstruction")
     text = table(tmp_path, "nre_cd", "nre_emd")
     assert text.count("| sampled by |") == 2
     assert text.index("Test nre cd") < text.index("| fps | 1.5 |") < text.index("Test nre emd")
     assert text.count("seed 0") == 1
+    assert "pointnet on all points: chamfer 0.0025." in text
+    assert "pointnet on all points: emd 0.06." in text
 
 
 def test_runs_of_another_task_are_not_listed_and_other_nets_are_named(tmp_path):

@@ -23,6 +23,10 @@ from mops_lightning.report.nets import nets_grid
 from mops_lightning.report.text import PAPER, Grid
 
 
+NORMALIZED = {"nre_cd": "chamfer", "nre_emd": "emd"}
+"""Errors that are 1 on all points, and what they are normalized by, which is shown instead."""
+
+
 @dataclass(frozen=True)
 class Report:
     """All that is shown of a folder.
@@ -147,6 +151,7 @@ def _full(found: list[Record], names: dict[str, str], metric: str) -> list[str]:
     theirs = paper.table(names["task"], names["dataset"], metric, joint)
     published = f" (the paper: {theirs['full']:.2f})" if "full" in theirs else ""
     lines: dict[str, None] = {}
+    metric = NORMALIZED.get(metric, metric)
     for record in found:
         figure = record["metrics"].get(f"test/{FULL}/{metric}")
         config = record["config"]["names"]
@@ -155,6 +160,7 @@ def _full(found: list[Record], names: dict[str, str], metric: str) -> list[str]:
         )
         if figure is not None:
             shown = units.figure(metric, figure)
+            shown = f"{units.title(metric)} {shown}" if metric in NORMALIZED.values() else shown
             shown += published if config["net"] == names["net"] else ""
             lines[f"{config['net']} on all points{with_}: {shown}."] = None
     return list(lines)
