@@ -111,7 +111,6 @@ def test_what_cannot_be_evaluated_is_refused(trained, tmp_path):
     path = tmp_path / "result.json"
     for change, named in (
         ({"status": "interrupted"}, "is interrupted, not completed"),
-        ({"config": {**record["config"], "learn": "task"}}, "trained a task net alone"),
         ({"files": {}}, "trained nothing"),
     ):
         path.write_text(json.dumps({**record, **change}))
@@ -120,6 +119,24 @@ def test_what_cannot_be_evaluated_is_refused(trained, tmp_path):
     untrained = [*TINY, "learn=nothing", f"cache={trained[0].parent}/cache"]
     with pytest.raises(UserError, match="give its run with evaluate=RUN"):
         run(compose(untrained), tmp_path / "new", untrained)
+
+
+def test_a_task_net_alone_is_tested_on_other_data(tmp_path):
+    overrides = [*TINY, "task=reconstruction", "task/net=mfoldingnet", "learn=task"]
+    overrides += ["+task.net.fold_channels=[16,8]"]
+    made = run(compose(overrides), tmp_path / "made", overrides)
+    folder = (tmp_path / "made", made)
+    again = evaluated(folder, tmp_path / "same")
+    assert again["metrics"] == made["metrics"]
+    assert "fit" not in again["seconds"]
+    assert not (tmp_path / "same" / "new" / "weights.pt").exists()
+    more = evaluated(folder, tmp_path / "more", "dataset.n_points=90", "noise=0.01")
+    assert more["config"]["task"]["net"]["n_points"] == 90
+    assert more["score"] != made["score"]
+    with pytest.raises(UserError, match="is a task net itself; leave weights out"):
+        evaluated(folder, tmp_path / "a", "weights=null")
+    with pytest.raises(UserError, match=r"made with learn=task.*weights=.*/weights.pt"):
+        evaluated(folder, tmp_path / "b", "learn=nothing")
 
 
 def overrides_after(trained, *arguments):

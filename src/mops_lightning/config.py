@@ -163,7 +163,7 @@ def check(cfg: DictConfig) -> None:
 
 
 def _check_evaluation(cfg: DictConfig) -> None:
-    if cfg.evaluate and cfg.learn != "nothing":
+    if cfg.evaluate and cfg.learn not in ("nothing", "task"):
         raise UserError(
             f"evaluate: trains nothing, got learn={cfg.learn}. Leave learn out, or train anew "
             "without evaluate."

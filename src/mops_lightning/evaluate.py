@@ -1,5 +1,7 @@
 """Testing a trained run anew: on other sizes, other data or under another task net.
 
+A run that trained a task net alone is tested on all points of its data or of others.
+
 ``python -m mops_lightning evaluate=RUN sizes=[8,100]`` repeats what RUN was told, then what stands
 on the command line, trains nothing, and leaves a record of its own.
 """
@@ -56,7 +58,8 @@ def command_line(arguments: list[str]) -> list[str]:
     ]
     _data_are_here(kept, folder)
     quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
-    own = [*kept, "learn=nothing", f"weights={OF_RUN}", f"{KEY}='{quoted}'"]
+    learn = "task" if record["config"]["learn"] == "task" else "nothing"
+    own = [*kept, f"learn={learn}", f"weights={OF_RUN}", f"{KEY}='{quoted}'"]
     # In one place: flags may stand before or behind all overrides, not between them.
     before = [a for i, a in enumerate(arguments[: places[0]]) if i not in places]
     behind = [a for i, a in enumerate(arguments) if i > places[0] and i not in places]
@@ -77,7 +80,7 @@ def _data_are_here(overrides: list[str], folder: Path) -> None:
 
 
 def trained_run(folder: Path) -> dict[str, Any]:
-    """Return the record of a completed run that trained a sampler.
+    """Return the record of a completed run that trained something.
 
     Raises:
         UserError: it is none.
@@ -89,17 +92,11 @@ def trained_run(folder: Path) -> dict[str, Any]:
     if not folder.is_dir():
         raise UserError(f"{KEY}: no folder {folder}. Give the folder of a run, with result.json.")
     record = records.read(folder)
-    learn = record["config"]["learn"]
     if record["status"] != "completed":
         hint = "Name a completed run."
         if (folder / "checkpoints" / CHECKPOINT).is_file():
             hint = f"Finish it with its own command and ckpt_path={folder}."
         raise UserError(f"{KEY}: {folder} is {record['status']}, not completed. {hint}")
-    if learn == "task":
-        raise UserError(
-            f"{KEY}: {folder} trained a task net alone. "
-            f"Test samplers under it with weights={folder}/{weights.FILE}."
-        )
     if weights.FILE not in record["files"].values():
         raise UserError(
             f"{KEY}: {folder} trained nothing; run its own command with other settings."
@@ -123,12 +120,15 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
     told = experiment.task.tells_classes
     if told and cfg.weights == OF_RUN and notes.get("dataset_fingerprint") != dataset.fingerprint:
         same_classes(notes.get("class_names"), dataset, f"{KEY}: {folder}")
-    assert experiment.sampler is not None  # learn=nothing builds one
+    learned = experiment.task if cfg.learn == "task" else experiment.sampler
+    what = "task net" if cfg.learn == "task" else "sampler"
+    assert learned is not None  # learn=nothing builds a sampler
     try:
-        content = weights.load_into(experiment.sampler, folder / weights.FILE)
+        content = weights.load_into(learned, folder / weights.FILE)
     except UserError as error:
-        raise UserError(f"{KEY}: the sampler of {folder} cannot be had: {error}") from None
-    if cfg.weights == OF_RUN and any(True for _ in experiment.task.parameters()):
+        raise UserError(f"{KEY}: the {what} of {folder} cannot be had: {error}") from None
+    has_weights = any(True for _ in experiment.task.parameters())
+    if cfg.learn != "task" and cfg.weights == OF_RUN and has_weights:
         _load_task(experiment.task, folder, record)
     return {
         "run": str(folder),
@@ -137,7 +137,7 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
         "learn": record["config"]["learn"],
         "seed": record["seed"],
         "dataset": record["config"]["names"]["dataset"],
-        "sampler_weights_sha256": content["sha256"],
+        f"{what.split()[0]}_weights_sha256": content["sha256"],
     }
 
 
@@ -191,7 +191,14 @@ def _same_settings(
 ) -> None:
     there = record["config"]
     here: Any = OmegaConf.to_container(cfg, resolve=True)
-    for group in ("task", "sampler"):
+    if (cfg.learn == "task") != (there["learn"] == "task"):
+        raise UserError(
+            f"{KEY}: {folder} was made with learn={there['learn']}; leave learn out. Samplers are "
+            f"tested under a task net of your own with weights={folder}/{weights.FILE}."
+        )
+    if cfg.learn == "task" and cfg.weights != OF_RUN:
+        raise UserError(f"{KEY}: {folder} is a task net itself; leave weights out.")
+    for group in ("task",) if cfg.learn == "task" else ("task", "sampler"):
         old, new = there["names"][group], here["names"][group]
         if old != new:
             raise UserError(
@@ -204,7 +211,7 @@ def _same_settings(
             f"{KEY}: the task net of {folder} is {there['names']['net']}; for "
             f"task/net={here['names']['net']} give its weights too: weights=auto or a file."
         )
-    for key in sorted({*there["sampler"], *here["sampler"]}):
+    for key in sorted({*there["sampler"], *here["sampler"]}) if cfg.learn != "task" else ():
         old, new = there["sampler"].get(key), here["sampler"].get(key)
         if old != new:
             hint = "" if key != "m" else " Sizes of a net for many are chosen with sizes=[...]."

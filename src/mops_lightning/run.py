@@ -105,7 +105,8 @@ def fit_and_test(
         raise UserError("learn=nothing needs a trained sampler: give its run with evaluate=RUN.")
     trainer = make_trainer(cfg, folder, dataset, task)
     record["device"] = device_name(trainer)
-    if experiment.trainable:
+    trains = experiment.trainable and not cfg.evaluate
+    if trains:
         with timed(record, "fit"):
             fit(cfg, trainer, experiment, dataset, checkpoint)
     if cfg.learn in ("sampler", "nothing") and has_weights:
@@ -136,13 +137,13 @@ def fit_and_test(
         "sampler": {weights.FILE: experiment.sampler},
     }
     learned["joint"] = {**learned["sampler"], "task_weights.pt": task}
-    if experiment.trainable:
+    if trains:
         for name, module in learned[cfg.learn].items():
             classes = dataset.class_names if module is task and task.tells_classes else ()
             weights.save(folder / name, module, record["config"], record["metrics"], classes)
             record["files"][Path(name).stem] = name
     anew = not record["notes"]["lengthened"] and cfg.weights in (None, "auto")
-    if cfg.learn == "task" and anew:
+    if cfg.learn == "task" and trains and anew:
         pretrain.publish(cfg, folder / weights.FILE, dataset)
 
 

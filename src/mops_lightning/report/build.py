@@ -22,7 +22,6 @@ from mops_lightning.report.collect import (
 from mops_lightning.report.nets import nets_grid
 from mops_lightning.report.text import PAPER, Grid
 
-
 NORMALIZED = {"nre_cd": "chamfer", "nre_emd": "emd"}
 """Errors that are 1 on all points, and what they are normalized by, which is shown instead."""
 
