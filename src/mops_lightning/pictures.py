@@ -57,6 +57,7 @@ def draw_cloud(axes: Axes3D, cloud: np.ndarray, samples: np.ndarray | None, read
         color=np.array(INPUT_COLOUR) / 255 if faint else "0.35",
         alpha=0.35 if faint else 1.0,
         depthshade=False,
+        rasterized=True,  # thousands of points make an SVG of megabytes
     )
     if samples is not None:
         colour = np.array(COLOURS.get(readout, COLOURS["sampled"])) / 255

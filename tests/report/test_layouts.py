@@ -70,12 +70,14 @@ def test_runs_of_other_commits_or_settings_stand_together_only_when_asked(tmp_pa
 
 def test_one_more_setting_makes_columns(tmp_path):
     for noise in (0.0, 0.1, 0.02):
-        put_cell(tmp_path, f"a{noise}", "mops", {"generated": 1 + noise}, noise=noise)
+        figures = {"generated": 1 + noise, "full": 0.5 + noise}
+        put_cell(tmp_path, f"a{noise}", "mops", figures, noise=noise)
         put_cell(tmp_path, f"b{noise}", "fps", {"sampled": 2 + noise}, noise=noise)
     assert rows(table(tmp_path)) == [
         ["sampled by", "noise=0.0", "noise=0.02", "noise=0.1"],
         ["fps", "2", "2.02", "2.1"],
         ["mops", "1", "1.02", "1.1"],
+        ["all points", "0.5", "0.52", "0.6"],
     ]
     put_cell(tmp_path, "c", "mops", {"generated": 1.0}, noise=0.0, m=8)
     with pytest.raises(UserError, match=r"differ in size \(m=8, m=32\) and in noise"):

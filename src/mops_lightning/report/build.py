@@ -7,7 +7,7 @@ from typing import Any
 
 from mops_lightning import paper, units
 from mops_lightning.readout_names import FULL, GENERATED_READOUTS
-from mops_lightning.report.axes import Axes, axes
+from mops_lightning.report.axes import Axes, axes, value
 from mops_lightning.report.cells import Cells, cells, place
 from mops_lightning.report.collect import (
     Found,
@@ -74,7 +74,10 @@ def build(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Rep
         grids += (
             _planes(table, names, layout) if layout.planes else [_by_column(table, names, layout)]
         )
-        grids[-1].below += _full(scored, names, table.metric)
+        if layout.column == "m":
+            grids[-1].below += _full(scored, names, table.metric)
+        else:
+            grids[-1].rows.append(_full_row(scored, table, layout))
     same = [r for r in found.done if r["config"]["names"]["task"] == names["task"]]
     return Report(
         found, scored, names, layout, tables, grids, [*how(same, names["net"]), *_undone(found)]
@@ -142,6 +145,16 @@ def plane(table: Cells, name: str) -> dict[str, dict[Any, float]]:
         for readout, by_seed in readouts.items():
             found.setdefault(readout, {})[column] = sum(by_seed.values()) / len(by_seed)
     return {name: found[name] for name in (*GENERATED_READOUTS, *found) if name in found}
+
+
+def _full_row(found: list[Record], table: Cells, layout: Axes) -> list[str]:
+    """Return what the task net scores on all points at every value of the setting."""
+    shown = {}
+    for record in found:
+        figure = record["metrics"].get(f"test/{FULL}/{table.metric}")
+        if figure is not None:
+            shown[value(record, layout.column)] = units.figure(table.metric, figure)
+    return ["all points", *(shown.get(column, "") for column in table.columns()[::-1])]
 
 
 def _full(found: list[Record], names: dict[str, str], metric: str) -> list[str]:
