@@ -136,6 +136,10 @@ def test_a_sweep_leaves_one_record_per_job_and_goes_on_after_a_failure(main_job)
     assert "Traceback" not in out + err
     found = sorted((folder / "sweep").rglob("result.json"))
     assert [json.loads(p.read_text())["config"]["m"] for p in found] == [4, 8]
+    # Only the cells of this start count, not what an earlier one has left.
+    status, out, err = call(["-m", *TINY, "sampler=random", "m=4", *fixed], folder)
+    assert status == 0, out + err
+    assert "1 cells: 1 completed; in sweep/cells" in out
 
 
 def test_joint_training_starts_from_the_pretrained_task(main_job):

@@ -139,6 +139,13 @@ def test_a_task_net_alone_is_tested_on_other_data(tmp_path):
         evaluated(folder, tmp_path / "b", "learn=nothing")
 
 
+def test_an_auto_encoder_says_why_it_does_not_fit_more_points(tmp_path):
+    overrides = [*TINY, "task=reconstruction", "sampler=mops", f"cache={tmp_path}/cache"]
+    made = run(compose(overrides), tmp_path / "made", overrides)
+    with pytest.raises(UserError, match=r"task.net.n_points is 90 here and was 64"):
+        evaluated((tmp_path / "made", made), tmp_path, "dataset.n_points=90")
+
+
 def overrides_after(trained, *arguments):
     return [a for a in command_line(list(arguments)) if not a.startswith("evaluate=")]
 

@@ -28,7 +28,10 @@ def test_a_finished_cell_is_not_run_again(start, tmp_path):
     score = start("sampler=fps", "weights=null")
     path = tmp_path / "cell" / records.FILE
     before = path.stat().st_mtime_ns
-    assert start("sampler=fps", "weights=null", "pictures=1", "out=elsewhere") == score
+    assert (
+        start("sampler=fps", "weights=null", "pictures=1", "out=elsewhere", "dataset.cache=there")
+        == score
+    )
     assert path.stat().st_mtime_ns == before
     assert not (tmp_path / "cell" / ASIDE).exists()
 
@@ -36,7 +39,7 @@ def test_a_finished_cell_is_not_run_again(start, tmp_path):
 def test_a_cell_of_other_settings_is_left_alone(start, tmp_path, caplog):
     score = start("sampler=fps", "weights=null")
     assert math.isnan(start("sampler=fps", "weights=null", "seed=3"))
-    assert "seed is 3 now and was 0" in caplog.text
+    assert "other settings: seed is 3 now and was 0" in caplog.text
     assert "hydra.sweep.dir" in (tmp_path / "cell" / FAILED).read_text()
     assert start("sampler=fps", "weights=null") == score
     assert not (tmp_path / "cell" / FAILED).exists()
@@ -67,6 +70,16 @@ def test_an_interrupted_cell_goes_on_to_the_same_result(start, tmp_path):
     assert again["metrics"] == whole["metrics"]
     assert again["notes"]["resumed_from"].endswith(f"{ASIDE}/1/checkpoints/last.ckpt")
     assert start(*longer) == score
+    # Cut off again before it has a checkpoint of its own, or a record: the first one still counts.
+    (tmp_path / "cell" / "checkpoints" / "last.ckpt").unlink(missing_ok=True)
+    path.write_text(json.dumps({**again, "status": "interrupted", "metrics": {}, "score": None}))
+    assert start(*longer) == score
+    for name in (records.FILE, "weights.pt"):
+        (tmp_path / "cell" / name).unlink()
+    (tmp_path / "cell" / "checkpoints" / "last.ckpt").unlink(missing_ok=True)
+    assert start(*longer) == score
+    resumed = records.read(tmp_path / "cell")["notes"]["resumed_from"]
+    assert resumed.endswith(f"{ASIDE}/1/checkpoints/last.ckpt")
 
 
 def test_a_cell_that_another_process_runs_is_left_to_it(start, tmp_path, caplog):
@@ -76,6 +89,7 @@ def test_a_cell_that_another_process_runs_is_left_to_it(start, tmp_path, caplog)
         fcntl.flock(file, fcntl.LOCK_EX)
         assert math.isnan(start("sampler=fps", "weights=null"))
     assert "another process runs this cell" in caplog.text
+    assert not (folder / FAILED).exists()
     assert math.isfinite(start("sampler=fps", "weights=null"))
 
 

@@ -3,7 +3,7 @@
 import os
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from mops_lightning.config import GROUPS, LEARN, RUN_KEYS, conf_dir
 from mops_lightning.errors import Interrupted, UserError, did_you_mean
@@ -85,6 +85,8 @@ def _explain(error: BaseException) -> str:
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
+            if not cause.options:
+                return f"no file {cause.missing_cfg_file} in --config-dir.{_names_there(cause)}"
             group, _, choice = cause.missing_cfg_file.rpartition("/")
             return f"{group}={choice}: no such choice.{did_you_mean(choice, cause.options or ())}"
         texts.append(str(cause).strip())
@@ -102,6 +104,16 @@ def _explain(error: BaseException) -> str:
     # What Hydra and OmegaConf say themselves, without their notes for developers.
     lines = [line for text in texts for line in text.splitlines() if line.strip()]
     return " ".join(dict.fromkeys(line.strip() for line in lines if line[0] != " "))
+
+
+def _names_there(cause: Any) -> str:
+    """Say which configurations the folder behind --config-dir has."""
+    from pathlib import Path
+
+    places = [i for i, a in enumerate(sys.argv) if a in ("--config-dir", "-cd")]
+    root = Path(sys.argv[places[-1] + 1]) if places else conf_dir()
+    names = [str(path.relative_to(root).with_suffix("")) for path in root.rglob("*.yaml")]
+    return did_you_mean(cause.missing_cfg_file, names)
 
 
 def _no_such_setting(key: str) -> str:

@@ -129,7 +129,10 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
         raise UserError(f"{KEY}: the {what} of {folder} cannot be had: {error}") from None
     has_weights = any(True for _ in experiment.task.parameters())
     if cfg.learn != "task" and cfg.weights == OF_RUN and has_weights:
-        _load_task(experiment.task, folder, record)
+        try:
+            _load_task(experiment.task, folder, record)
+        except UserError as error:
+            raise UserError(f"{error}{_other_net(cfg, record)}") from None
     return {
         "run": str(folder),
         "commit": record["git"]["commit"],
@@ -184,6 +187,18 @@ def _load_task(task: torch.nn.Module, folder: Path, record: dict[str, Any]) -> N
     if weights.digest(own) != record["notes"].get("task_weights_sha256"):
         raise UserError(f"{KEY}: {path} is not of the run in its folder. Give weights=.")
     weights.fit_state(task, own, path)
+
+
+def _other_net(cfg: DictConfig, record: dict[str, Any]) -> str:
+    """Say in which settings of the task net an evaluation differs from its run."""
+    here: Any = OmegaConf.to_container(cfg.task.net, resolve=True)
+    there = record["config"]["task"].get("net") or {}
+    changed = [
+        f"task.net.{key} is {here.get(key)} here and was {there.get(key)}"
+        for key in {**there, **here}
+        if here.get(key) != there.get(key)
+    ]
+    return f" Cause: {', '.join(changed)}." if changed else ""
 
 
 def _same_settings(

@@ -151,6 +151,7 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset, task: Tas
         warnings.filterwarnings("ignore", message=message)
     keep_freed_memory()
     logger = build(cfg.logger, save_dir=str(folder)) if cfg.get("logger") else False
+    score = task.score if cfg.learn != "task" else task.full_score or task.score
     rows, titles = choose_shown(dataset, cfg.pictures)
     drawing = []
     if titles:
@@ -160,7 +161,7 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset, task: Tas
         cfg.trainer,
         logger=logger,
         callbacks=[
-            *callbacks.standard(folder, logged=bool(logger), score=task.score),
+            *callbacks.standard(folder, logged=bool(logger), score=score),
             *drawing,
         ],
         default_root_dir=str(folder),

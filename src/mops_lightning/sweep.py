@@ -21,11 +21,23 @@ from mops_lightning import records
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.sweep_names import ASIDE, FAILED
 
+BEGUN = ".begun"
+"""File in a sweep's folder that is as old as its last start."""
+
 STAYS = (ASIDE, ".hydra", ".lock", "cli.log")
 """What belongs to the cell and not to an attempt."""
 
-MAY_DIFFER = ("ckpt_path", "out", "cache", "logger", "pictures")
-"""Settings that change where things lie, and no result."""
+MAY_DIFFER = (
+    "ckpt_path",
+    "out",
+    "cache",
+    "dataset.cache",
+    "dataset.workers",
+    "logger",
+    "pictures",
+    "task.emd_workers",
+)
+"""Settings that change where things lie or how many processes there are, and no result."""
 
 log = logging.getLogger(__name__)
 
@@ -55,12 +67,14 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
                 log.info(f"{folder}: done before, score {earlier['score']:.6g}")
                 return float(earlier["score"])
             if earlier:
-                checkpoint = _move_aside(folder)
-                if checkpoint and earlier["status"] != "failed" and cfg.ckpt_path is None:
+                _move_aside(folder)
+            if (folder / ASIDE).is_dir():
+                checkpoint = _checkpoint(cfg, folder)
+                if checkpoint and cfg.ckpt_path is None:
                     cfg.ckpt_path = str(checkpoint)
+                goes_on = f"goes on from {cfg.ckpt_path}" if cfg.ckpt_path else "tried again"
                 log.info(
-                    f"{folder}: {earlier['status']} before, "
-                    + (f"goes on from {cfg.ckpt_path}" if cfg.ckpt_path else "tried again")
+                    f"{folder}: {earlier['status'] if earlier else 'cut off'} before, {goes_on}"
                 )
             # A process that was killed at its very start left this, and no record.
             (folder / STARTED).unlink(missing_ok=True)
@@ -68,6 +82,8 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
             return math.nan if score is None else float(score)
     except Interrupted:
         raise
+    except Busy:
+        log.warning(f"{folder}: another process runs this cell, and it is left to it")
     except UserError as error:
         (folder / FAILED).write_text(f"{error}\n")
         log.error(f"{folder} failed: {error}")
@@ -82,14 +98,14 @@ def _claimed(folder: Path) -> Iterator[None]:
     """Hold the cell's lock, which goes with the process that has it.
 
     Raises:
-        UserError: another process runs this cell.
+        Busy: another process runs this cell.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / ".lock").open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise UserError("another process runs this cell; let it end, or stop it.") from None
+            raise Busy from None
         yield
 
 
@@ -102,52 +118,88 @@ def _earlier(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
     if not (folder / records.FILE).exists():
         return None
     record = records.read(folder)
-    mine, theirs = OmegaConf.to_container(cfg, resolve=True), record["config"]
-    assert isinstance(mine, dict)
-    for node in (mine, theirs):
-        for key in MAY_DIFFER:
-            node.pop(key, None)
-    for key, ours, other in _differences(mine, theirs):
+    different = sorted(_differences(OmegaConf.to_container(cfg, resolve=True), record["config"]))
+    if different:
+        # The setting itself, not one of those that are derived from it.
+        key, ours, other = min(different, key=lambda one: one[0].count("."))
         raise UserError(
             f"its result is of other settings: {key} is {ours} now and was {other}. Give the sweep "
-            "another folder with hydra.sweep.dir=FOLDER, or move the cell's folder away."
+            f"another folder with hydra.sweep.dir=FOLDER; where {key} is swept, name the cells by "
+            "it too, with hydra.sweep.subdir; or move the cell's folder away."
         )
     return record
 
 
-def _differences(mine: Any, theirs: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+def _differences(mine: Any, theirs: Any, prefix: str = "") -> Iterator[tuple[str, str, str]]:
+    if prefix.rstrip(".") in MAY_DIFFER:
+        return
     if isinstance(mine, dict) and isinstance(theirs, dict):
         for key in {**mine, **theirs}:
             yield from _differences(mine.get(key), theirs.get(key), f"{prefix}{key}.")
     elif mine != theirs:
-        yield prefix.rstrip("."), mine, theirs
+        yield prefix.rstrip("."), str(mine), str(theirs)
 
 
-def _move_aside(folder: Path) -> Path | None:
-    """Move an attempt into a numbered folder; return its checkpoint if it has one."""
+def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
+    """Return the checkpoint of the newest attempt with one: the last may have been cut off early.
+
+    An attempt that failed by itself is no place to go on from, nor what lies before it.
+    """
     from mops_lightning.callbacks import CHECKPOINT
 
+    plain = OmegaConf.to_container(cfg, resolve=True)
+    attempts = (folder / ASIDE).iterdir()
+    for attempt in sorted(attempts, key=lambda path: int(path.name), reverse=True):
+        record = records.read(attempt)
+        if record["status"] == "failed" or any(_differences(plain, record["config"])):
+            return None
+        if (attempt / "checkpoints" / CHECKPOINT).is_file():
+            return attempt / "checkpoints" / CHECKPOINT
+    return None
+
+
+def _move_aside(folder: Path) -> None:
+    """Move an attempt into a numbered folder."""
     aside = folder / ASIDE
     target = aside / str(1 + len(list(aside.glob("*"))))
     target.mkdir(parents=True)
     for path in folder.iterdir():
         if path.name not in STAYS:
             path.rename(target / path.name)
-    checkpoint = target / "checkpoints" / CHECKPOINT
-    return checkpoint if checkpoint.is_file() else None
+
+
+class Busy(Exception):
+    """Another process runs a cell."""
+
+
+def _state(cell: Path) -> str:
+    if (cell / FAILED).exists():
+        return "failed"
+    try:
+        return str(records.read(cell)["status"])
+    except UserError:
+        return "not begun"
 
 
 class SweepSummary(Callback):
     """Says at the end of a sweep what became of its cells; failed ones make the exit status 1."""
 
+    def on_multirun_start(self, config: DictConfig, **extra: Any) -> None:
+        """Mark the beginning, on the clock of the folder's own disk."""
+        folder = Path(config.hydra.sweep.dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / BEGUN).touch()
+
     def on_multirun_end(self, config: DictConfig, **extra: Any) -> None:
-        """Count the cells below the sweep's folder and print what became of them."""
+        """Count the cells of this start and print what became of them."""
         folder = Path(os.path.relpath(config.hydra.sweep.dir))
+        begun = (folder / BEGUN).stat().st_mtime_ns
         states: Counter[str] = Counter()
-        cells = [*folder.rglob(records.FILE), *folder.rglob(FAILED)]
-        for cell in {path.parent for path in cells if ASIDE not in path.parts}:
-            failed = (cell / FAILED).exists()
-            states["failed" if failed else records.read(cell)["status"]] += 1
+        # Hydra writes this into every cell that it starts.
+        for path in folder.rglob(".hydra/overrides.yaml"):
+            cell = path.parents[1]
+            if path.stat().st_mtime_ns >= begun:
+                states[_state(cell)] += 1
         counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
         print(f"{sum(states.values())} cells: {counts}; in {folder}")
         print(f"A table of them: python -m mops_lightning.report {folder}")

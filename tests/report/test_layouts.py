@@ -45,7 +45,7 @@ def put_cell(folder, name, sampler, values, seed=0, **settings):
 def test_seeds_are_summed_up_with_their_count(tmp_path):
     for seed, value in enumerate((1.0, 2.0, 3.0)):
         put_cell(tmp_path, f"{seed}", "mops", {"generated": value, "matched": 1.5}, seed=seed)
-    assert rows(table(tmp_path))[1] == ["mops", "2 ± 1 / 1.5 ± 0 (n=3)"]
+    assert rows(table(tmp_path))[1] == ["mops", "2 ± 1.00 / 1.5 ± 0.00 (n=3)"]
     put_cell(tmp_path, "again", "mops", {"generated": 1.0}, seed=2)
     with pytest.raises(UserError, match="Two runs of mops with m=32 and seed=2"):
         table(tmp_path)
@@ -113,7 +113,32 @@ def test_two_settings_make_a_plane_for_each_sampler(tmp_path):
         ["0.1", "1 / 2", "1 / 2"],
         ["1.0", "1.5 / 2", "1.9 / 2"],
     ]
+    assert "of mops: reconstruction on shapes, m=32, under autoencoder" in text
     assert "plane of mops: generated 1 to 1.9 (factor 1.9), matched 2 to 2 (factor 1)." in text
+
+
+def test_planes_of_several_sizes_are_refused(tmp_path):
+    put_planes(tmp_path)
+    put_cell(tmp_path, "other", "mops", {"generated": 1.0}, m=8, of={"alpha": 0.1, "tau": 0.7})
+    with pytest.raises(UserError, match=r"differ in size \(m=8, m=32\) and in sampler.alpha"):
+        table(tmp_path)
+
+
+def test_each_seed_may_have_data_of_its_own_if_every_sampler_has_every_seed(tmp_path):
+    for seed in (0, 1):
+        for name in ("mops", "fps"):
+            values = {"generated": 1.0 + seed}
+            path = put_cell(tmp_path, f"{name}{seed}", name, values, seed=seed)
+            content = json.loads(path.read_text())
+            content["notes"] |= {
+                "dataset_fingerprint": f"d{seed}",
+                "task_weights_sha256": f"w{seed}",
+            }
+            path.write_text(json.dumps(content))
+    assert rows(table(tmp_path))[1] == ["fps", "1.5 ± 0.71 (n=2)"]
+    path.parent.joinpath(records.FILE).unlink()
+    with pytest.raises(UserError, match="every sampler must have every seed"):
+        table(tmp_path)
 
 
 def test_cells_without_a_result_are_listed_with_the_reason(tmp_path):

@@ -206,7 +206,7 @@ def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):
         "dataset": {"n_points": points},
     }
     notes = {"score": next(iter(metrics)), "shown": shown, "parameters": {"task": 1_025_000}}
-    records.write(target, record(config=config, metrics=metrics, notes=notes))
+    return records.write(target, record(config=config, metrics=metrics, notes=notes))
 
 
 def test_a_folder_of_task_nets_alone_is_a_table_of_nets(tmp_path):
@@ -219,9 +219,19 @@ def test_a_folder_of_task_nets_alone_is_a_table_of_nets(tmp_path):
         ["pcrnet", "1", "1024", "7.50", "4.1", "7.21"],
         ["pcrnet", "8", "1024", "6.50", "4.1", "7.21"],
     ]
-    put_net(tmp_path, "third", {DEGREES: 6.5}, "registration", iterations=8)
-    with pytest.raises(UserError, match="Two runs of registration by the same net"):
+    with pytest.raises(UserError, match=r"--metric: no run has 'chamfr'"):
+        table(tmp_path, "chamfr")
+    path = put_net(tmp_path, "third", {DEGREES: 6.0}, "registration", iterations=8)
+    with pytest.raises(UserError, match="Two runs of registration by the same net and seed"):
         table(tmp_path)
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, "seed": 1}))
+    assert rows(table(tmp_path))[2][3] == "6.25 ± 0.35 (n=2)"
+    content["config"]["batch_size"] = 7
+    path.write_text(json.dumps({**content, "seed": 1}))
+    with pytest.raises(UserError, match=r"differ in their settings \(batch_size\).*--mixed"):
+        table(tmp_path)
+    assert rows(table(tmp_path, mixed=True))[2][3] == "6.25 ± 0.35 (n=2)"
     put_net(tmp_path, "fourth", {"accuracy": 0.5}, "classification", "pointnet")
     with pytest.raises(UserError, match="differ in task: classification, registration"):
         table(tmp_path)

@@ -114,8 +114,8 @@ def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:
     """
     if not path.is_file():
         raise UserError(
-            f"dataset.root: {path} is missing. Complete the folder, or remove it and try "
-            "dataset.download=true."
+            f"dataset.root: {path} is missing. Complete the folder, or give another with "
+            "dataset.root=PATH."
         )
     try:
         with h5py.File(path, "r") as file:
@@ -144,11 +144,10 @@ def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:
             labels = np.asarray(label[()], dtype=np.int64).reshape(-1)
     except (OSError, RuntimeError, KeyError) as error:
         raise UserError(
-            f"{path} is not a whole HDF5 file ({error}). Remove it and fetch it again, for "
-            "instance by removing its folder and setting dataset.download=true."
+            f"{path} is not a whole HDF5 file ({error}). Replace it by a whole one."
         ) from error
     if not np.isfinite(points).all():
-        raise UserError(f"{path} holds NaN or infinite coordinates; fetch it again.")
+        raise UserError(f"{path} holds NaN or infinite coordinates. Replace it by a whole one.")
     least, most = (labels.min(), labels.max()) if len(labels) else (0, 0)
     if least < 0 or (n_classes is not None and most >= n_classes):
         named = "" if n_classes is None else f" names {n_classes} classes (0 to {n_classes - 1})"

@@ -47,15 +47,17 @@ def axes(found: list[Record], net: str, mixed: bool = False) -> Axes:
     if not keys:
         return Axes()
     numbers = {key for key in keys if _numeric(found, key)}
-    if len(keys) == 1 and numbers == keys:
-        sizes = sorted({record["config"]["m"] for record in found})
-        if len(sizes) > 1:
-            raise UserError(
-                f"The runs differ in size (m={', m='.join(map(str, sizes))}) and in {min(keys)}. "
-                "Give a folder with runs of one size."
-            )
+    line = len(keys) == 1 and numbers == keys
+    plane = all(len(one) == 2 and set(one) <= numbers for one in different.values())
+    sizes = sorted({record["config"]["m"] for record in found})
+    if (line or plane) and len(sizes) > 1:
+        raise UserError(
+            f"The runs differ in size (m={', m='.join(map(str, sizes))}) and in "
+            f"{', '.join(sorted(keys))}. Give a folder with runs of one size."
+        )
+    if line:
         return Axes(column=min(keys))
-    if all(len(one) == 2 and set(one) <= numbers for one in different.values()):
+    if plane:
         return Axes(planes={name: (one[0], one[1]) for name, one in different.items()})
     if mixed:
         return Axes()

@@ -64,7 +64,9 @@ def build(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Rep
     scored = [record for record in found.done if record["config"]["learn"] != "task"]
     if not scored:
         remarks = [*how(found.done, ""), *_undone(found)]
-        return Report(found, [], {}, Axes(), [], [nets_grid(found.done)], remarks)
+        return Report(
+            found, [], {}, Axes(), [], [nets_grid(found.done, list(metrics), mixed)], remarks
+        )
     names = common(scored, mixed)
     layout = axes(scored, names["net"], mixed)
     shown = list(metrics) or [score(scored)]
@@ -99,8 +101,9 @@ def _by_column(table: Cells, names: dict[str, str], layout: Axes) -> Grid:
             figures = [theirs.get(str(column), []) for column in columns]
             texts = [" / ".join(f"{one:.2f}" for one in values) for values in figures]
             rows.append([PAPER, *texts])
+    size = "" if layout == Axes() else f", m={names['m']},"
     title = (
-        f"Test {units.title(table.metric)}: {names['task']} on {names['dataset']} under "
+        f"Test {units.title(table.metric)}: {names['task']} on {names['dataset']}{size} under "
         f"{names['net']}; generated / matched / completed sets, or one figure for samplers that "
         "choose input points."
     )
@@ -119,8 +122,8 @@ def _planes(table: Cells, names: dict[str, str], layout: Axes) -> list[Grid]:
             for left in sorted({column[0] for column in table.figures[name]})
         ]
         title = (
-            f"Test {units.title(table.metric)} of {name}: {names['task']} on {names['dataset']} "
-            f"under {names['net']}; generated / matched / completed sets."
+            f"Test {units.title(table.metric)} of {name}: {names['task']} on {names['dataset']}, "
+            f"m={names['m']}, under {names['net']}; generated / matched / completed sets."
         )
         head = [f"{down.split('.')[-1]} \\ {across.split('.')[-1]}", *map(str, columns)]
         grids.append(Grid(title, head, rows, [spread(table, name)]))

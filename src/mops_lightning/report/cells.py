@@ -41,7 +41,7 @@ class Cells:
         """Return generated / matched / completed figures, or one; over seeds mean ± deviation."""
         cell = self.figures[row].get(column, {})
         names = [name for name in (INDEX_READOUT, *GENERATED_READOUTS) if name in cell]
-        texts = [_over_seeds(self.metric, list(cell[name].values())) for name in names]
+        texts = [over_seeds(self.metric, list(cell[name].values())) for name in names]
         count = max((len(cell[name]) for name in names), default=0)
         return " / ".join(texts) + (f" (n={count})" if count > 1 else "")
 
@@ -102,11 +102,15 @@ def _add(table: Cells, record: Record, net: str, axes: Axes) -> None:
         values[seed(record)] = figure
 
 
-def _over_seeds(metric: str, values: list[float]) -> str:
+def over_seeds(metric: str, values: list[float]) -> str:
+    """Return a value, or mean ± standard deviation of several, in the metric's unit."""
     mean = units.figure(metric, statistics.fmean(values))
     if len(values) == 1:
         return mean
-    return f"{mean} ± {units.figure(metric, statistics.stdev(values))}"
+    # To the mean's last place: more would be noise.
+    places = len(mean.partition(".")[2]) if "e" not in mean else 0
+    scale = 100 if units.unit(metric) == "%" else 1
+    return f"{mean} ± {scale * statistics.stdev(values):.{max(places, 2)}f}"
 
 
 ORDER = (

@@ -35,6 +35,8 @@ def collect(folder: Path) -> Found:
     Raises:
         UserError: there is none, or none is of a completed run.
     """
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such folder. Give a run's, a sweep's or any above records.")
     done: list[Record] = []
     undone: dict[str, str] = {}
     paths = [*folder.rglob(records.FILE), *folder.rglob(FAILED)]
@@ -76,13 +78,8 @@ def common(found: list[Record], mixed: bool = False) -> dict[str, str]:
         "task": {r["config"]["names"]["task"] for r in found},
         "net": {r["config"]["names"]["net"] for r in trained},
         "dataset": {r["config"]["names"]["dataset"] for r in found},
-        "data (dataset_fingerprint)": {r["notes"].get("dataset_fingerprint") for r in found},
         "pairs (task.pairs)": {_plain(r["config"]["task"].get("pairs")) for r in found},
         "what learned (learn)": {learned(r) for r in trained},
-        # After joint training each run has a task net of its own.
-        "task weights (sha256)": {
-            r["notes"].get("task_weights_sha256") for r in found if learned(r) != "joint"
-        },
     }
     for net in sorted({r["config"]["names"]["net"] for r in found}):
         same = [r["config"]["task"] for r in found if r["config"]["names"]["net"] == net]
@@ -90,20 +87,54 @@ def common(found: list[Record], mixed: bool = False) -> dict[str, str]:
     if any(learned(r) == "joint" for r in trained):
         keys["loss (task.loss)"] = {_plain(r["config"]["task"].get("loss")) for r in trained}
     for what, values in keys.items():
-        known = values - {None}  # a resumed run may have its task net from the checkpoint
+        known = values - {None}
         if len(known) > 1:
             raise UserError(
                 f"The runs differ in {what}: {', '.join(sorted(map(str, known)))}. "
                 "Their figures do not belong in one table; give a folder with runs of one kind."
             )
+    same_for_every_seed("data (dataset_fingerprint)", "dataset_fingerprint", found)
+    # After joint training each run has a task net of its own.
+    alone = [r for r in found if learned(r) != "joint"]
+    same_for_every_seed("task weights (sha256)", "task_weights_sha256", alone)
+    one_commit(found, mixed)
+    names = {what: next(iter(values - {None}), "") for what, values in keys.items()}
+    sizes = "/".join(str(m) for m in sorted({record["config"]["m"] for record in found}))
+    return {**names, "learned": names["what learned (learn)"], "m": sizes}
+
+
+def one_commit(found: list[Record], mixed: bool) -> None:
+    """Refuse runs of different commits unless asked for."""
     commits = sorted({(r["git"]["commit"] or "a wheel")[:10] for r in found})
     if len(commits) > 1 and not mixed:
         raise UserError(
             f"The runs differ in the commit of the code: {', '.join(commits)}. If their figures "
             "may stand in one table all the same, add --mixed."
         )
-    names = {what: next(iter(values - {None}), "") for what, values in keys.items()}
-    return {**names, "learned": names["what learned (learn)"]}
+
+
+def same_for_every_seed(what: str, note: str, found: list[Record]) -> None:
+    """Refuse runs of one seed with different data or nets.
+
+    Each seed may have its own, as procedural data and nets that are trained first have; then every
+    sampler must have been run with every seed.
+    """
+    by_seed: dict[int, set[str]] = {}
+    seeds: dict[str, set[int]] = {}
+    for record in found:
+        if known := record["notes"].get(note):  # a resumed run may have its net from a checkpoint
+            by_seed.setdefault(seed(record), set()).add(known)
+            seeds.setdefault(record["config"]["names"]["sampler"], set()).add(seed(record))
+    everything = sorted({one for values in by_seed.values() for one in values})
+    mixed = any(len(values) > 1 for values in by_seed.values())
+    uneven = len(everything) > 1 and len({frozenset(values) for values in seeds.values()}) > 1
+    if mixed or uneven:
+        listed = ", ".join(one[:12] for one in everything)
+        hint = " (with one for each seed, every sampler must have every seed)" if uneven else ""
+        raise UserError(
+            f"The runs differ in {what}: {listed}{hint}. Their figures do not belong in one table; "
+            "give a folder with runs of one kind."
+        )
 
 
 def learned(record: Record) -> str:

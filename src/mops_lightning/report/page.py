@@ -39,13 +39,16 @@ def page(report: Report, folder: Path, figures: Mapping[str, Figure]) -> str:
         tables="\n".join(map(_table, report.grids)),
         plots="\n".join(_image(name, figure) for name, figure in figures.items()),
         clouds=VIEW if clouds else "",
-        remarks="".join(
-            f"<li>{html.escape(line[2:])}</li>" for line in report.remarks if line[:2] == "- "
-        ),
+        remarks="".join(map(_remark, filter(None, report.remarks))),
         plotly=files("plotly").joinpath(PLOTLY).read_text() if clouds else "",
         # "</script>" in a title must not end the script.
         data=json.dumps(clouds).replace("<", "\\u003c"),
     )
+
+
+def _remark(line: str) -> str:
+    text = html.escape(line.removeprefix("- "))
+    return f"<li>{text}</li>" if line.startswith("- ") else f"</ul><p>{text}</p><ul>"
 
 
 VIEW = """<h2>Sampled clouds</h2>

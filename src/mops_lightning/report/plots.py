@@ -126,7 +126,7 @@ def heat_maps(table: Cells, axes: Axes) -> Figure:
                     light = one < (low + high) / 2
                     colour = "white" if light else "black"
                     axis.text(
-                        j, i, f"{one:.3g}", ha="center", va="center", color=colour, fontsize=7
+                        j, i, f"{one:.4g}", ha="center", va="center", color=colour, fontsize=7
                     )
             axis.set_xticks(range(len(xs)), [f"{x:g}" for x in xs])
             axis.set_yticks(range(len(ys)), [f"{y:g}" for y in ys])
