@@ -11,8 +11,10 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from hydra.core.global_hydra import GlobalHydra
 
 from mops_lightning import records, weights
+from mops_lightning.cli import main
 
 TINY = [
     "trainer=cpu",
@@ -215,8 +217,16 @@ def test_cfg_job_shows_the_config(tmp_path):
         (["weights=nowhere.pt", *TINY], "weights: no file nowhere.pt"),
     ],
 )
-def test_mistakes_end_in_one_clear_error(arguments, said, tmp_path):
-    status, out, err = call(arguments, tmp_path)
+def test_mistakes_end_in_one_clear_error(arguments, said, tmp_path, monkeypatch, capsys):
+    # In this process, for a new one spends most of its time on importing torch and lightning.
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MOPS_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "")
+    monkeypatch.setattr(sys, "argv", ["mops_lightning", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    GlobalHydra.instance().clear()
+    status, err = stop.value.code, capsys.readouterr().err
     assert status == 2
     assert said in err
     assert "Traceback" not in err

@@ -9,7 +9,6 @@ SCRIPT = """
 import resource
 import sys
 
-import lightning
 import torch
 
 from mops_lightning.nets.foldingnet import MFoldingNet
