@@ -1,6 +1,7 @@
 """The files below sweeps/: each composes, and names every cell apart."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -29,7 +30,7 @@ def composed(name, overrides=()):
 def test_cells_are_valid_and_named_by_all_that_is_swept(name):
     quick = name.startswith("quick/")
     cfg = composed(name)
-    raw = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)
+    raw: Any = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)
     for key in cfg.hydra.sweeper.params:
         known_as = "names.sampler" if key == "sampler" else key
         assert f"${{{known_as}}}" in raw["subdir"], "two cells would share a folder"
