@@ -23,6 +23,7 @@ from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.experiment import Experiment
 from mops_lightning.malloc import keep_freed_memory
 from mops_lightning.readout_names import parse
+from mops_lightning.records import dotted
 from mops_lightning.seeding import derive_seed, generator
 from mops_lightning.sizes import sizes_to_test
 from mops_lightning.tasks.base import Task
@@ -185,22 +186,13 @@ def log_hparams(trainer: L.Trainer, cfg: DictConfig, metrics: dict[str, float]) 
     """Give the logger the settings that tell runs apart, with the test metrics beside them."""
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     keys = ("names", "sampler", "optimizer", "augment", "m", "learn", "seed", "batch_size")
-    flat = _flatten({key: plain[key] for key in keys})
+    leaves = dotted({key: plain[key] for key in keys})
+    flat = {key: value for key, value in leaves.items() if key.rsplit(".", 1)[-1][:1] != "_"}
     flat["max_epochs"] = plain["trainer"]["max_epochs"]
     if isinstance(trainer.logger, TensorBoardLogger):
         trainer.logger.log_hyperparams(flat, {f"hparams/{k}": v for k, v in metrics.items()})
     elif trainer.logger is not None:
         trainer.logger.log_hyperparams(flat)
-
-
-def _flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            flat.update(_flatten(value, f"{prefix}{key}."))
-        elif not key.startswith("_"):
-            flat[f"{prefix}{key}"] = value
-    return flat
 
 
 def device_name(trainer: L.Trainer) -> str:

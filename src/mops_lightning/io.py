@@ -5,6 +5,12 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
+
+try:
+    import fcntl
+except ImportError:  # not a POSIX system: nobody waits, whoever is last wins
+    fcntl = None  # type: ignore[assignment]
 
 
 @contextmanager
@@ -33,3 +39,13 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def lock(file: IO[str], wait: bool = True) -> None:
+    """Lock an open file until it is closed; the system does so even when a process is killed.
+
+    Raises:
+        BlockingIOError: another process has it, and ``wait`` is False.
+    """
+    if fcntl is not None:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))

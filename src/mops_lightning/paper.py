@@ -26,7 +26,7 @@ def table(task: str, dataset: str, metric: str, joint: bool = False) -> dict[str
     return {}
 
 
-def net(name: str, pieces: int | None, n_points: int) -> list[float] | None:
+def net(name: str, pieces: int | None, n_points: int | None) -> list[float] | None:
     """Return chamfer and earth mover's distance and size in MB of a net that reconstructs.
 
     Args:

@@ -48,7 +48,9 @@ def cloud_grid(points: Tensor, readouts: Mapping[str, Tensor], titles: Sequence[
     return figure
 
 
-def draw_cloud(axes: Axes3D, cloud: np.ndarray, samples: np.ndarray | None, readout: str) -> None:
+def draw_cloud(
+    axes: Axes3D, cloud: np.ndarray, samples: np.ndarray | None, readout: str, size: float = 22
+) -> None:
     """Draw one cloud ``(N, 3)``, z up, faint where there are samples ``(M, 3)`` to be seen."""
     faint = samples is not None
     axes.scatter(
@@ -61,7 +63,7 @@ def draw_cloud(axes: Axes3D, cloud: np.ndarray, samples: np.ndarray | None, read
     )
     if samples is not None:
         colour = np.array(COLOURS.get(readout, COLOURS["sampled"])) / 255
-        axes.scatter(*samples.T, s=22, color=colour, depthshade=False)
+        axes.scatter(*samples.T, s=size, color=colour, depthshade=False)
     frame_cloud(axes, cloud)
 
 

@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from mops_lightning.pictures import COLOURS, INPUT_COLOUR, frame_cloud, upright
+from mops_lightning.pictures import draw_cloud, frame_cloud, upright
 
 DRAWN = 8192
 """Most points drawn of a cloud: more cannot be told apart, and take minutes."""
@@ -59,12 +59,9 @@ def rebuilt_grid(
             )
             if samples is None:
                 axes.scatter(*drawn.T, s=2, c=drawn[:, 1], cmap="viridis", depthshade=False)
+                frame_cloud(axes, cloud)
             else:
-                faint = np.array(INPUT_COLOUR) / 255
-                colour = np.array(COLOURS.get(title, COLOURS["sampled"])) / 255
-                axes.scatter(*drawn.T, s=1, color=faint, alpha=0.35, depthshade=False)
-                axes.scatter(*samples.T, s=16, color=colour, depthshade=False)
-            frame_cloud(axes, cloud)
+                draw_cloud(axes, cloud, samples, title, size=16)
             if row == 0:
                 axes.set_title(title, fontsize=10)
             axes.text2D(0.02, 0.02, below, transform=axes.transAxes, fontsize=8)

@@ -72,6 +72,16 @@ def read(folder: Path) -> dict[str, Any]:
     return record
 
 
+def dotted(tree: Any, prefix: str = "") -> dict[str, Any]:
+    """Return the leaves of nested settings under dotted keys; lists are leaves."""
+    if not isinstance(tree, dict):
+        return {prefix: tree}
+    leaves: dict[str, Any] = {}
+    for key, below in tree.items():
+        leaves |= dotted(below, f"{prefix}.{key}" if prefix else str(key))
+    return leaves
+
+
 def environment() -> dict[str, Any]:
     """Return versions, machine and the commit of the code, as plain data."""
     import torch

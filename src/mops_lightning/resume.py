@@ -18,6 +18,7 @@ def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
     ``epochs`` is noted too, but may differ: a finished run may be made longer.
     """
     task: Any = OmegaConf.to_container(cfg.task, resolve=True)
+    task.pop("emd_workers", None)  # how many processes there are changes no result
     if isinstance(task.get("pairs"), dict):
         task["pairs"].pop("test_seed", None)  # of what is scored, not of what is learned
     parts = {

@@ -4,7 +4,6 @@ A sweep whose folder and cells have fixed names (``hydra.sweep.dir``, ``hydra.sw
 started again with the same command at any time.
 """
 
-import fcntl
 import logging
 import math
 import os
@@ -19,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning import records
 from mops_lightning.errors import Interrupted, UserError
+from mops_lightning.io import lock
 from mops_lightning.sweep_names import ASIDE, FAILED
 
 BEGUN = ".begun"
@@ -103,7 +103,7 @@ def _claimed(folder: Path) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / ".lock").open("w") as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(file, wait=False)
         except BlockingIOError:
             raise Busy from None
         yield
@@ -118,10 +118,11 @@ def _earlier(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
     if not (folder / records.FILE).exists():
         return None
     record = records.read(folder)
-    different = sorted(_differences(OmegaConf.to_container(cfg, resolve=True), record["config"]))
+    different = _differences(cfg, record)
     if different:
         # The setting itself, not one of those that are derived from it.
-        key, ours, other = min(different, key=lambda one: one[0].count("."))
+        key = min(different, key=lambda one: (one.count("."), one))
+        ours, other = different[key]
         raise UserError(
             f"its result is of other settings: {key} is {ours} now and was {other}. Give the sweep "
             f"another folder with hydra.sweep.dir=FOLDER; where {key} is swept, name the cells by "
@@ -130,14 +131,16 @@ def _earlier(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
     return record
 
 
-def _differences(mine: Any, theirs: Any, prefix: str = "") -> Iterator[tuple[str, str, str]]:
-    if prefix.rstrip(".") in MAY_DIFFER:
-        return
-    if isinstance(mine, dict) and isinstance(theirs, dict):
-        for key in {**mine, **theirs}:
-            yield from _differences(mine.get(key), theirs.get(key), f"{prefix}{key}.")
-    elif mine != theirs:
-        yield prefix.rstrip("."), str(mine), str(theirs)
+def _differences(cfg: DictConfig, record: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Return the dotted settings that differ and may not: what they are now, and were."""
+    mine = records.dotted(OmegaConf.to_container(cfg, resolve=True))
+    theirs = records.dotted(record["config"])
+    return {
+        key: (mine.get(key), theirs.get(key))
+        for key in {**mine, **theirs}
+        if mine.get(key) != theirs.get(key)
+        and not any(key == name or key.startswith(f"{name}.") for name in MAY_DIFFER)
+    }
 
 
 def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
@@ -147,11 +150,10 @@ def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
     """
     from mops_lightning.callbacks import CHECKPOINT
 
-    plain = OmegaConf.to_container(cfg, resolve=True)
     attempts = (folder / ASIDE).iterdir()
     for attempt in sorted(attempts, key=lambda path: int(path.name), reverse=True):
         record = records.read(attempt)
-        if record["status"] == "failed" or any(_differences(plain, record["config"])):
+        if record["status"] == "failed" or _differences(cfg, record):
             return None
         if (attempt / "checkpoints" / CHECKPOINT).is_file():
             return attempt / "checkpoints" / CHECKPOINT

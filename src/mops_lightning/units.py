@@ -14,9 +14,12 @@ def title(metric: str) -> str:
     return metric.removesuffix("_deg").replace("_", " ") + sign
 
 
+def scale(metric: str) -> float:
+    """Return what a value is multiplied by to be in the unit of its metric."""
+    return 100.0 if unit(metric) == "%" else 1.0
+
+
 def figure(metric: str, value: float) -> str:
     """Return a value in the unit of its metric, without it."""
-    sign = unit(metric)
-    if sign == "%":
-        return f"{100 * value:.2f}"
-    return f"{value:.2f}" if sign else f"{value:.4g}"
+    value *= scale(metric)
+    return f"{value:.2f}" if unit(metric) else f"{value:.4g}"

@@ -23,12 +23,7 @@ from rich.progress import (
 )
 
 from mops_lightning.errors import UserError
-from mops_lightning.io import atomic_write
-
-try:
-    import fcntl
-except ImportError:  # Windows has none
-    fcntl = None  # type: ignore[assignment]
+from mops_lightning.io import atomic_write, lock
 
 TIMEOUT = 60.0  # seconds without a byte
 CHUNK = 1 << 16
@@ -122,8 +117,7 @@ def one_at_a_time(path: Path) -> Iterator[None]:
     except OSError as error:
         raise UserError(f"Cannot download into {path.parent}: {error}.") from error
     with file:
-        if fcntl is not None:  # released by the system, even when a process is killed
-            fcntl.flock(file, fcntl.LOCK_EX)
+        lock(file)
         yield
 
 

@@ -1,10 +1,10 @@
 """In which settings the runs of one table differ, and what its columns therefore are."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from mops_lightning.errors import UserError
+from mops_lightning.records import dotted
 from mops_lightning.report.collect import Record, epochs
 
 CONSIDERED = ("sampler", "optimizer", "task", "augment", "batch_size", "noise", "task_rate")
@@ -83,9 +83,8 @@ def considered(record: Record) -> dict[str, Any]:
     if isinstance(nodes.get("augment"), dict):
         nodes["augment"] = nodes["augment"].get(learn)
     nodes.setdefault("noise", 0.0)  # records from before there was noise
-    flat = dict(_flat(nodes))
     return {
-        **{key: value for key, value in flat.items() if key not in SIZES},
+        **{key: value for key, value in dotted(nodes).items() if key not in SIZES},
         "trainer.max_epochs": epochs(record),
     }
 
@@ -104,11 +103,3 @@ def row(record: Record, net: str) -> str:
 def _numeric(found: list[Record], key: str) -> bool:
     values = [considered(record).get(key) for record in found if key in considered(record)]
     return all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
-
-
-def _flat(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(node, dict):
-        for key, below in node.items():
-            yield from _flat(below, f"{prefix}.{key}" if prefix else str(key))
-    else:
-        yield prefix, node

@@ -109,8 +109,8 @@ def over_seeds(metric: str, values: list[float]) -> str:
         return mean
     # To the mean's last place: more would be noise.
     places = len(mean.partition(".")[2]) if "e" not in mean else 0
-    scale = 100 if units.unit(metric) == "%" else 1
-    return f"{mean} ± {scale * statistics.stdev(values):.{max(places, 2)}f}"
+    deviation = units.scale(metric) * statistics.stdev(values)
+    return f"{mean} ± {deviation:.{max(places, 2)}f}"
 
 
 ORDER = (

@@ -66,15 +66,13 @@ def write(report: Report, folder: Path) -> list[str]:
         with atomic_write(folder / name) as temporary:
             temporary.write_text(text)
     written = list(texts)
-    figures = plots(report)
-    with atomic_write(folder / PAGE) as temporary:
-        temporary.write_text(page(report, folder, figures))
-    written.append(PAGE)
-    for name, figure in figures.items():
-        for suffix in (".png", ".svg"):
+    drawn = []
+    for name, figure in plots(report).items():
+        for suffix, metadata in ((".png", {}), (".svg", {"Date": None})):
             with atomic_write(folder / (name + suffix)) as temporary:
-                figure.savefig(
-                    temporary, dpi=150, metadata={"Date": None} if suffix == ".svg" else {}
-                )
-            written.append(name + suffix)
-    return written
+                figure.savefig(temporary, dpi=150, metadata=metadata)
+            drawn.append(name + suffix)
+    vectors = [folder / name for name in drawn if name.endswith(".svg")]
+    with atomic_write(folder / PAGE) as temporary:
+        temporary.write_text(page(report, folder, vectors))
+    return [*written, PAGE, *drawn]

@@ -8,7 +8,7 @@ from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.readout_names import FULL
 from mops_lightning.report.axes import varying
 from mops_lightning.report.cells import over_seeds
-from mops_lightning.report.collect import Record, one_commit, same_for_every_seed, seed
+from mops_lightning.report.collect import Record, one_commit, same_for_every_seed, score, seed
 from mops_lightning.report.text import PAPER, Grid
 
 HIDDEN = ("_target_", "n_points")
@@ -110,14 +110,12 @@ def _metrics(found: list[Record], asked: Sequence[str]) -> list[str]:
 def _paper(record: Record) -> str:
     config = record["config"]
     task, net = config["names"]["task"], config["names"]["net"]
-    pieces = (config["task"].get("net") or {}).get("pieces")
-    points = config.get("dataset", {}).get("n_points", 0)
-    figures = paper.net(net, pieces, points) if task == "reconstruction" else None
+    figures = (
+        paper.net(net, _net(record).get("pieces"), _points(record))
+        if task == "reconstruction"
+        else None
+    )
     if figures:
         return " / ".join(f"{value:g}" for value in figures)
-    published = paper.table(task, config["names"]["dataset"], _score(record)).get("full")
+    published = paper.table(task, config["names"]["dataset"], score([record])).get("full")
     return "" if published is None else f"{published:.2f}"
-
-
-def _score(record: Record) -> str:
-    return record["notes"].get("score", "").rsplit("/", 1)[-1]

@@ -2,15 +2,12 @@
 
 import base64
 import html
-import io
 import json
-from collections.abc import Mapping
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import Any
-
-from matplotlib.figure import Figure
 
 from mops_lightning.cloud_files import INPUT, load_clouds
 from mops_lightning.pictures import COLOURS, INPUT_COLOUR
@@ -20,24 +17,23 @@ from mops_lightning.report.text import PAPER, Grid
 SHOWN = 24
 """Most runs whose clouds are put into a page; more make it too large to open."""
 
-
 PLOTLY = "package_data/plotly.min.js"
 
 
-def page(report: Report, folder: Path, figures: Mapping[str, Figure]) -> str:
+def page(report: Report, folder: Path, plots: Sequence[Path]) -> str:
     """Return the page.
 
     Args:
         report: what to show.
         folder: what it is of; it gives the title.
-        figures: the plots by name.
+        plots: SVG files.
     """
     clouds = _clouds(report, folder)
     template = Template(files("mops_lightning.report").joinpath("page.html").read_text())
     return template.substitute(
         title=html.escape(folder.resolve().name),
         tables="\n".join(map(_table, report.grids)),
-        plots="\n".join(_image(name, figure) for name, figure in figures.items()),
+        plots="\n".join(map(_image, plots)),
         clouds=VIEW if clouds else "",
         remarks="".join(map(_remark, filter(None, report.remarks))),
         plotly=files("plotly").joinpath(PLOTLY).read_text() if clouds else "",
@@ -79,11 +75,9 @@ def _table(grid: Grid) -> str:
     )
 
 
-def _image(name: str, figure: Figure) -> str:
-    out = io.BytesIO()
-    figure.savefig(out, format="svg", metadata={"Date": None})
-    data = base64.b64encode(out.getvalue()).decode()
-    return f'<img alt="{html.escape(name)}" src="data:image/svg+xml;base64,{data}">'
+def _image(path: Path) -> str:
+    data = base64.b64encode(path.read_bytes()).decode()
+    return f'<img alt="{html.escape(path.stem)}" src="data:image/svg+xml;base64,{data}">'
 
 
 def _clouds(report: Report, folder: Path) -> list[dict[str, Any]]:

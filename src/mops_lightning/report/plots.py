@@ -69,7 +69,7 @@ def curves(table: Cells, axes: Axes) -> Figure:
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(GENERATED_READOUTS), sharey=True)
     columns = table.columns()[::-1]
-    scale = 100.0 if units.unit(table.metric) == "%" else 1.0
+    scale = units.scale(table.metric)
     for axis, readout in zip(panels, GENERATED_READOUTS, strict=True):
         for number, name in enumerate(table.rows()):
             cells = table.figures[name]
@@ -106,7 +106,7 @@ def heat_maps(table: Cells, axes: Axes) -> Figure:
     names = sorted(axes.planes, key=place)
     found = {name: plane(table, name) for name in names}
     everything = [one for by in found.values() for values in by.values() for one in values.values()]
-    scale = 100.0 if units.unit(table.metric) == "%" else 1.0
+    scale = units.scale(table.metric)
     low, high = scale * min(everything), scale * max(everything)
     width = max(len(by) for by in found.values())
     figure = Figure(figsize=(3.6 * width + 1, 3.2 * len(names)), layout="constrained")
