@@ -10,7 +10,8 @@ import torch
 
 from mops_lightning.data.clouds import CloudDataset, Clouds
 
-torch.set_num_threads(2)
+if "OMP_NUM_THREADS" not in os.environ:
+    torch.set_num_threads(2)
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
-"""The real command line in a subprocess, as a user types it."""
+"""The real command line, as a user types it."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -11,52 +10,16 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from hydra.core.global_hydra import GlobalHydra
 
 from mops_lightning import records, weights
-from mops_lightning.cli import main
-
-TINY = [
-    "trainer=cpu",
-    "trainer.max_epochs=1",
-    "epochs.task=1",
-    "dataset.train_per_class=4",
-    "dataset.test_per_class=2",
-    "dataset.n_points=64",
-    "batch_size=16",
-    "m=8",
-    "pictures=2",
-]
-
-
-def start(arguments, folder, **extra):
-    environment = {**os.environ, "MOPS_CACHE": str(folder / "cache"), "COLUMNS": "160", **extra}
-    environment.pop("HYDRA_FULL_ERROR", None)
-    return subprocess.Popen(
-        [sys.executable, "-m", "mops_lightning", *arguments],
-        cwd=folder,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def call(arguments, folder):
-    process = start(arguments, folder)
-    out, err = process.communicate(timeout=240)
-    return process.returncode, out, err
-
-
-def runs(folder):
-    return sorted(path.parent for path in (folder / "outputs").rglob("result.json"))
+from tests.command_line import TINY, call, call_anew, runs, start
 
 
 @pytest.fixture(scope="module")
 def main_job(tmp_path_factory):
     """The main job, small, once: its folder, its run's folder and what it printed."""
     folder = tmp_path_factory.mktemp("main")
-    status, out, err = call(TINY, folder)
+    status, out, err = call_anew(TINY, folder)
     assert status == 0, err
     (run,) = runs(folder)
     return folder, run, out, err
@@ -183,7 +146,7 @@ def test_registration_pretrains_trains_jointly_tests_and_is_evaluated_under_icp(
 
 
 def test_help_shows_groups_and_keys_without_heavy_imports(tmp_path):
-    status, out, err = call(["--help"], tmp_path)
+    status, out, err = call_anew(["--help"], tmp_path)
     assert (status, err) == (0, "")
     for word in ("sampler:", "mops", "val_fraction", "ckpt_path", "python -m mops_lightning -m"):
         assert word in out
@@ -212,21 +175,13 @@ def test_cfg_job_shows_the_config(tmp_path):
         (["m=abc"], "m must be a whole number"),
         (["dataset=modelnet40", "dataset.root=nowhere"], "dataset.root"),
         (["dataset.classes=[chiar]"], "chair"),
-        (["ckpt_path=last"], "ckpt_path=last"),
+        (["ckpt_path=last", *TINY], "ckpt_path=last"),
         (["dataset.classes=[chair]", *TINY], "at least two classes"),
         (["weights=nowhere.pt", *TINY], "weights: no file nowhere.pt"),
     ],
 )
-def test_mistakes_end_in_one_clear_error(arguments, said, tmp_path, monkeypatch, capsys):
-    # In this process, for a new one spends most of its time on importing torch and lightning.
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("MOPS_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "")
-    monkeypatch.setattr(sys, "argv", ["mops_lightning", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    GlobalHydra.instance().clear()
-    status, err = stop.value.code, capsys.readouterr().err
+def test_mistakes_end_in_one_clear_error(arguments, said, tmp_path):
+    status, _, err = call(arguments, tmp_path)
     assert status == 2
     assert said in err
     assert "Traceback" not in err

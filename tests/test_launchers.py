@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from tests.test_cli import TINY, call
+from tests.command_line import TINY, call, call_anew
 
 LAUNCHERS = {
     "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
@@ -17,7 +17,7 @@ LAUNCHERS = {
 def test_cells_run_side_by_side(name, tmp_path):
     fixed = [*TINY, "sampler=random", "weights=null", "pictures=0", "hydra.sweep.dir=cells"]
     command = ["-m", *LAUNCHERS[name], *fixed, "m=4,8"]
-    status, out, err = call(command, tmp_path)
+    status, out, err = call_anew(command, tmp_path)
     assert status == 0, out + err
     assert "2 cells: 2 completed; in cells" in out
     found = [json.loads((tmp_path / "cells" / cell / "result.json").read_text()) for cell in "01"]

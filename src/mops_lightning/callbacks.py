@@ -32,10 +32,12 @@ class StopBetweenSteps(Callback):
     def __init__(self, checkpoint: Path) -> None:
         self.checkpoint = checkpoint
         self.received: int | None = None
+        self.leads = True
         self._before: dict[int, Any] = {}
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Listen; not earlier, for Lightning sets its own handlers first."""
+        self.leads = trainer.is_global_zero
         for number in (signal.SIGINT, signal.SIGTERM):
             self._before[number] = signal.signal(number, self._note)
 
@@ -43,18 +45,19 @@ class StopBetweenSteps(Callback):
         if self.received is not None:
             raise KeyboardInterrupt("Stopped at once; the checkpoint is the last whole one.")
         self.received = number
-        print("Stopping after this step (once more: at once) ...", file=sys.stderr, flush=True)
+        if self.leads:
+            print("Stopping after this step (once more: at once) ...", file=sys.stderr, flush=True)
 
     def on_train_batch_end(self, trainer: L.Trainer, *args: Any) -> None:
-        """Stop here if asked to."""
-        if self.received is not None:
+        """Stop here if asked to, all processes of a run after the same step."""
+        if trainer.strategy.reduce_boolean_decision(self.received is not None, all=False):
             trainer.save_checkpoint(self.checkpoint)
             raise Interrupted(f"Go on with the same command and ckpt_path={self.checkpoint}")
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Stop after the last step, or stop listening."""
         self._restore()
-        if self.received is not None:
+        if trainer.strategy.reduce_boolean_decision(self.received is not None, all=False):
             raise Interrupted(f"Go on with the same command and ckpt_path={self.checkpoint}")
 
     def on_exception(self, trainer: L.Trainer, *args: Any) -> None:
@@ -86,6 +89,8 @@ class EpochLines(Callback):
             or (name.startswith("val/") and name.endswith(f"/{self.score}"))
         }
         shown = "  ".join(f"{name} {value:.4f}" for name, value in numbers.items())
+        if not trainer.is_global_zero:
+            return
         print(f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}  {shown}", flush=True)
 
 

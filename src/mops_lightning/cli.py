@@ -51,6 +51,7 @@ def _job(cfg: "DictConfig") -> float | None:
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
+    from mops_lightning import several
     from mops_lightning.run import run
     from mops_lightning.sweep import run_cell
 
@@ -59,12 +60,15 @@ def _job(cfg: "DictConfig") -> float | None:
     overrides = list(hydra_cfg.overrides.task)
     try:
         if hydra_cfg.mode == RunMode.MULTIRUN:
+            several.check_multirun(cfg)
             return run_cell(cfg, folder, overrides)
         return run(cfg, folder, overrides)["score"]
     except UserError as error:
         # Ended here, Hydra does not add lines of its own.
         _end(str(error), USER_ERROR)
     except Interrupted as stop:
+        if several.follows(cfg):
+            sys.exit(INTERRUPTED)  # the first process says it for all
         # To Hydra, this is an error like any other.
         again = "The same command with hydra.sweep.dir={} goes on with the sweep."
         swept = hydra_cfg.mode == RunMode.MULTIRUN

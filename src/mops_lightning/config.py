@@ -7,6 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from mops_lightning import several
 from mops_lightning.annotations import misfit
 from mops_lightning.errors import UserError, did_you_mean
 
@@ -149,11 +150,7 @@ def check(cfg: DictConfig) -> None:
         _check_node(cfg.get(group), group)
     _whole(cfg.trainer, "max_epochs", int(cfg.learn != "nothing"), "trainer.max_epochs")
     _whole(cfg.pretrain, "max_epochs", 1, "pretrain.max_epochs")
-    if cfg.trainer.get("devices") != 1 or cfg.trainer.get("num_nodes", 1) != 1:
-        raise UserError(
-            f"trainer.devices must be 1, got {cfg.trainer.get('devices')!r}: "
-            "one run uses one device. Start several runs to use several."
-        )
+    several.check(cfg)
     points = cfg.dataset.get("n_points")
     if isinstance(points, int) and 1 <= points < cfg.m:
         raise UserError(

@@ -55,6 +55,8 @@ class DrawClouds(Callback):
 
     @torch.no_grad()
     def _draw(self, trainer: L.Trainer, module: L.LightningModule, folder: Path | None) -> None:
+        if not trainer.is_global_zero:
+            return
         board = trainer.logger if isinstance(trainer.logger, TensorBoardLogger) else None
         if board is None and folder is None:
             return

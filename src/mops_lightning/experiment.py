@@ -172,6 +172,10 @@ class Experiment(L.LightningModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the task loss plus the sampler's losses, over all sizes of this step."""
         sizes = (0,) if self.sampler is None else self.sampler.training_sizes()
+        if self.global_rank:  # sizes are everyone's, what is drawn for clouds each process's own
+            torch.manual_seed(
+                derive_seed(self.seed, self.current_epoch, batch_idx, self.global_rank)
+            )
         readouts = BatchReadouts(self.sampler, {}, sizes)
         terms: dict[str, list[Tensor]] = defaultdict(list)
         for m in sizes:
@@ -196,10 +200,12 @@ class Experiment(L.LightningModule):
         self, losses: dict[str, Tensor], total: Tensor, readouts: BatchReadouts, size: int
     ) -> None:
         for name, value in {**losses, "total": total}.items():
-            self.log(f"train/loss/{name}", value.detach(), batch_size=size)
+            self.log(f"train/loss/{name}", value.detach(), batch_size=size, sync_dist=True)
         self.log("loss", total.detach(), prog_bar=True, logger=False, batch_size=size)
         mean = total.detach()
-        self.log("train/mean_loss", mean, on_step=False, on_epoch=True, batch_size=size)
+        self.log(
+            "train/mean_loss", mean, on_step=False, on_epoch=True, batch_size=size, sync_dist=True
+        )
         tau: Any = getattr(self.sampler, "tau", None)
         if tau is not None:
             self.log("train/tau", tau, batch_size=size)
@@ -244,7 +250,7 @@ class Experiment(L.LightningModule):
                 self.log(f"{prefix}{readout}/{name}", metric, batch_size=size)
             if readout == self.own_readouts[0]:
                 for name, value in result.losses.items():
-                    self.log(f"{prefix}loss/{name}", value, batch_size=size)
+                    self.log(f"{prefix}loss/{name}", value, batch_size=size, sync_dist=True)
 
     def _score_sets(self, readouts: BatchReadouts, prefixes: dict[int, str], size: int) -> None:
         """Update and log what is measured of the sampled sets themselves, at every size."""

@@ -48,11 +48,12 @@ def fit(
     checkpoint: Path | None,
 ) -> None:
     """Train what learns, from ``checkpoint`` on if there is one."""
+    part = trainer.global_rank, trainer.world_size
     train, held_out = split(dataset.train, cfg.val_fraction, cfg.seed)
-    if len(train.labels) < 2:
+    if len(train.labels) < 2 * trainer.world_size:
         raise UserError(
             f"val_fraction={cfg.val_fraction} leaves {len(train.labels)} training clouds; "
-            "at least two are needed. Lower it, or give more data."
+            "at least two are needed for each device. Lower it, or give more data."
         )
     loader = CloudLoader(
         train,
@@ -62,10 +63,11 @@ def fit(
         make_batch=experiment.task.make_batch,
         drop_last=True,
         seed=cfg.seed,
+        part=part,
     )
     validation = None
     if len(held_out.labels):
-        validation = _scored(held_out, cfg.batch_size, experiment.task)
+        validation = _scored(held_out, cfg.batch_size, experiment.task, part)
     # A small data set has fewer batches than lie between two logged ones.
     every = min(trainer.log_every_n_steps, len(loader))  # type: ignore[attr-defined]
     trainer.log_every_n_steps = every  # type: ignore[attr-defined]
@@ -78,16 +80,21 @@ def test(
 ) -> dict[str, float]:
     """Score all test clouds and return the metrics as one flat map."""
     with _interruptible():
-        loader = _scored(dataset.test, cfg.batch_size, experiment.task)
+        part = trainer.global_rank, trainer.world_size
+        loader = _scored(dataset.test, cfg.batch_size, experiment.task, part)
         trainer.test(experiment, loader, verbose=False)
     metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
     log_hparams(trainer, cfg, _headline(metrics, experiment))
     return metrics
 
 
-def _scored(clouds: Clouds, batch_size: int, task: Task) -> CloudLoader:
+def _scored(
+    clouds: Clouds, batch_size: int, task: Task, part: tuple[int, int] = (0, 1)
+) -> CloudLoader:
     """Return a loader whose batches are the same in every epoch and for every method."""
-    return CloudLoader(clouds, batch_size, make_batch=task.make_batch, seed=task.test_seed)
+    return CloudLoader(
+        clouds, batch_size, make_batch=task.make_batch, seed=task.test_seed, part=part
+    )
 
 
 def _headline(metrics: dict[str, float], experiment: Experiment) -> dict[str, float]:

@@ -8,10 +8,10 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from mops_lightning import resume
+from mops_lightning import resume, several
 from mops_lightning.callbacks import CHECKPOINT
 from mops_lightning.data.clouds import CloudDataset
-from mops_lightning.errors import Interrupted
+from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.evaluate import OF_RUN
 from mops_lightning.io import atomic_write
 from mops_lightning.weights import FILE
@@ -34,6 +34,12 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
         return Path(cfg.weights)
     folder = cache_folder(cfg, dataset)
     if not (folder / FILE).is_file():
+        if several.started_together(cfg):
+            raise UserError(
+                f"weights: {cfg.names.net} must be trained before a launcher starts several "
+                "processes. Run the same command once with learn=task trainer=auto and without "
+                "the launcher, or give weights=FILE."
+            )
         print(
             f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it first, "
             f"{cfg.pretrain.max_epochs} epochs. It is kept in {folder}",
@@ -52,6 +58,7 @@ def task_config(cfg: DictConfig) -> DictConfig:
             own.optimizer = cfg.pretrain.optimizer
             own.weights = "auto"
         own.learn = "task"
+        own.trainer.devices, own.trainer.num_nodes, own.trainer.strategy = 1, 1, "auto"
         own.ckpt_path = None
         own.evaluate = None
     return own
@@ -61,7 +68,14 @@ def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
     """Return where the task net of these settings and data is kept, there or not."""
     own = task_config(cfg)
     # Where it runs and what it logs do not change the net; all else about the trainer may.
-    elsewhere = {"accelerator", "devices", "log_every_n_steps", "_target_"}
+    elsewhere = {
+        "accelerator",
+        "devices",
+        "num_nodes",
+        "strategy",
+        "log_every_n_steps",
+        "_target_",
+    }
     trainer: dict[str, Any] = OmegaConf.to_container(own.trainer, resolve=True)  # type: ignore[assignment]
     key = {
         **resume.identity(own, dataset.fingerprint),

@@ -11,7 +11,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mops_lightning import evaluate, pretrain, records, resume, weights
+from mops_lightning import evaluate, pretrain, records, resume, several, weights
 from mops_lightning.cloud_files import CLOUDS
 from mops_lightning.config import build, check
 from mops_lightning.data.clouds import CloudDataset
@@ -47,14 +47,9 @@ def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> di
         UserError: a mistake in settings or files.
     """
     check(cfg)
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        # Two runs that start in the same second get the same folder; the second one stops here.
-        (folder / STARTED).touch(exist_ok=False)
-    except FileExistsError:
-        raise UserError(
-            f"{folder} holds another run and nothing is overwritten: start again for a new folder."
-        ) from None
+    follows = several.follows(cfg)
+    if not follows:
+        _begin(folder)
     with recorded(cfg, folder, overrides or []) as record:
         with timed(record, "data"):
             dataset = build(cfg.dataset)
@@ -64,8 +59,20 @@ def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> di
         if cfg.m > points:
             raise UserError(f"m must be at most the {points} points of a cloud, got m={cfg.m}.")
         fit_and_test(cfg, folder, dataset, record)
-    closing_lines(folder, record)
+    if not follows:
+        closing_lines(folder, record)
     return record
+
+
+def _begin(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        # Two runs that start in the same second get the same folder; the second one stops here.
+        (folder / STARTED).touch(exist_ok=False)
+    except FileExistsError:
+        raise UserError(
+            f"{folder} holds another run and nothing is overwritten: start again for a new folder."
+        ) from None
 
 
 def fit_and_test(
@@ -104,6 +111,7 @@ def fit_and_test(
     elif cfg.learn == "nothing" and experiment.sampler is not None and experiment.sampler.learned:
         raise UserError("learn=nothing needs a trained sampler: give its run with evaluate=RUN.")
     trainer = make_trainer(cfg, folder, dataset, task)
+    several.check_shares(cfg.batch_size, len(dataset.test.labels), trainer.world_size)
     record["device"] = device_name(trainer)
     trains = experiment.trainable and not cfg.evaluate
     if trains:
@@ -114,6 +122,8 @@ def fit_and_test(
         record["notes"]["task_weights_sha256"] = weights.digest(task.state_dict())
     with timed(record, "test"):
         record["metrics"] = test(cfg, trainer, experiment, dataset)
+    if not trainer.is_global_zero:
+        return  # all that follows is written, and once is enough
     for kind, name in OUTPUTS.items():
         if (folder / name).exists():
             record["files"][kind] = name
@@ -121,6 +131,7 @@ def fit_and_test(
     record["notes"] |= {
         "score": experiment.score_name,
         "shown": list(task.shown),
+        "processes": trainer.world_size,
         "parameters": {
             name: sum(parameter.numel() for parameter in module.parameters())
             for name, module in (("task", task), ("sampler", experiment.sampler))
@@ -142,14 +153,19 @@ def fit_and_test(
             classes = dataset.class_names if module is task and task.tells_classes else ()
             weights.save(folder / name, module, record["config"], record["metrics"], classes)
             record["files"][Path(name).stem] = name
+    # Each of several devices has BatchNorm's statistics of its own share.
     anew = not record["notes"]["lengthened"] and cfg.weights in (None, "auto")
+    anew = anew and trainer.world_size == 1
     if cfg.learn == "task" and trains and anew:
         pretrain.publish(cfg, folder / weights.FILE, dataset)
 
 
 @contextmanager
 def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[dict[str, Any]]:
-    """Keep ``result.json`` true while the block runs, and give its record to be filled."""
+    """Keep ``result.json`` true while the block runs, and give its record to be filled.
+
+    A process that follows another one fills its record for nobody.
+    """
     plain = OmegaConf.to_container(cfg, resolve=True)
     record: dict[str, Any] = {
         "schema": records.SCHEMA,
@@ -167,7 +183,8 @@ def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[di
         "error": None,
         "notes": {},
     }
-    records.write(folder, record)
+    write = (lambda *_: None) if several.follows(cfg) else records.write
+    write(folder, record)
     try:
         with timed(record, "total"):
             yield record
@@ -179,7 +196,7 @@ def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[di
         record["status"], record["error"] = "failed", f"{type(error).__name__}: {error}"
         raise
     finally:
-        records.write(folder, record)
+        write(folder, record)
 
 
 @contextmanager

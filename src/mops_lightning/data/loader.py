@@ -68,6 +68,8 @@ class CloudLoader:
         augment: None leaves the points alone.
         make_batch: what the task makes of a batch; see ``tasks.base.Task.make_batch``. Without
             ``shuffle`` it draws the same in every epoch.
+        part: which share of every batch this process takes, and how many processes there are. In
+            training (``shuffle``) all shares are equal, in tests none is empty.
         drop_last: leave out a last batch that is not full (BatchNorm cannot train on one cloud);
             never when there is no full one.
         seed: of order, augmentation and what ``make_batch`` draws.
@@ -82,6 +84,7 @@ class CloudLoader:
         make_batch: MakeBatch | None = None,
         drop_last: bool = False,
         seed: int = 0,
+        part: tuple[int, int] = (0, 1),
     ) -> None:
         self.clouds = clouds
         self.batch_size = batch_size
@@ -89,6 +92,7 @@ class CloudLoader:
         self.augment = augment
         self.make_batch = make_batch
         self.seed = seed
+        self.part = part
         number = len(clouds.points)
         full = number // batch_size
         self.batches = full if drop_last and full else -(-number // batch_size)
@@ -121,14 +125,28 @@ class CloudLoader:
             order = torch.randperm(number, generator=generator(self.seed, epoch))
         else:
             order = torch.arange(number)
-        for batch in range(start, self.batches):
-            chosen = order[batch * self.batch_size : (batch + 1) * self.batch_size]
+        for batch, (chosen, mine) in enumerate(self._cut(order)[start:], start):
             points = self.clouds.points[chosen]
-            if self.augment is not None:
+            if self.augment is not None:  # all clouds of the batch: they draw from one source
                 points = self.augment(points, generator(self.seed, epoch, batch))
             last = batch + 1 == self.batches
             self.epoch, self.position = (epoch + 1, 0) if last else (epoch, batch + 1)
-            yield self._made(points, chosen, epoch)
+            yield self._made(points[mine], chosen[mine], epoch)
+
+    def _cut(self, order: Tensor) -> list[tuple[Tensor, slice]]:
+        """Return the rows of every batch, and which of them are this process's."""
+        rank, processes = self.part
+        if processes > 1 and not self.shuffle:
+            # Shares may differ by a cloud, but everyone has as many batches and none is empty.
+            own = order.tensor_split(processes)[rank]
+            return [(rows, slice(None)) for rows in own.tensor_split(self.batches)]
+        size = self.batch_size
+        cut = [order[batch * size : (batch + 1) * size] for batch in range(self.batches)]
+        shares = [len(rows) // processes for rows in cut]
+        return [
+            (rows, slice(rank * share, (rank + 1) * share))
+            for rows, share in zip(cut, shares, strict=True)
+        ]
 
     def batch_of(self, rows: Tensor) -> Any:
         """Return the given clouds ``(B,)`` as one batch, for a loader that does not shuffle."""

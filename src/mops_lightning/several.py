@@ -1,0 +1,106 @@
+"""One run over several processes (Lightning's DDP): who leads, and what each may do.
+
+Rank 0 leads: it alone writes files and prints. The others follow, and load, train and score.
+"""
+
+import os
+
+from omegaconf import DictConfig, OmegaConf
+
+from mops_lightning.errors import UserError
+
+RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "SLURM_PROCID")
+"""Where launchers tell a process which one it is; Lightning's own, torchrun and SLURM."""
+
+STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true")
+"""Those of Lightning's that start each process as this program."""
+
+
+def asked_for(cfg: DictConfig) -> bool:
+    """Return whether the settings ask for more than one device or host."""
+    devices = cfg.trainer.get("devices")
+    one = len(devices) == 1 if OmegaConf.is_list(devices) else devices == 1
+    return not (one and cfg.trainer.get("num_nodes", 1) == 1)
+
+
+def follows(cfg: DictConfig) -> bool:
+    """Return whether this process is one of several and not the first of them."""
+    return asked_for(cfg) and any(_number(name) for name in RANKS)
+
+
+def started_together(cfg: DictConfig) -> bool:
+    """Return whether a launcher such as torchrun started all processes, not this program."""
+    return asked_for(cfg) and _number("WORLD_SIZE") + _number("SLURM_NTASKS") > 1
+
+
+def check(cfg: DictConfig) -> None:
+    """Find mistakes in the number of devices and hosts.
+
+    Raises:
+        UserError: a value out of range, or a strategy that does not go with this program.
+    """
+    devices = cfg.trainer.get("devices")
+    if OmegaConf.is_list(devices):
+        good = bool(devices) and all(type(device) is int and device >= 0 for device in devices)
+    else:
+        good = devices in ("auto", -1) or (type(devices) is int and devices >= 1)
+    if not good:
+        raise UserError(
+            f"trainer.devices must be a number of devices, a list of GPUs, auto or -1 (all), got "
+            f"{devices!r}. Try trainer.devices=1."
+        )
+    nodes = cfg.trainer.get("num_nodes", 1)
+    if type(nodes) is not int or nodes < 1:
+        raise UserError(f"trainer.num_nodes must be a number of hosts, got {nodes!r}.")
+    if cfg.trainer.get("sync_batchnorm"):
+        raise UserError(
+            "trainer.sync_batchnorm: cannot be true, for the nets here pool and normalise in one "
+            "step, each process over its share of the batch. Leave it out."
+        )
+    strategy = cfg.trainer.get("strategy", "auto")
+    if asked_for(cfg) and strategy not in STRATEGIES:
+        raise UserError(
+            f"trainer.strategy: several devices work with {', '.join(STRATEGIES)}, got "
+            f"{strategy!r}. Try trainer=ddp."
+        )
+
+
+def check_multirun(cfg: DictConfig) -> None:
+    """Refuse a sweep whose cells ask for several devices each.
+
+    Raises:
+        UserError: they do; the processes of one cell would run the whole sweep.
+    """
+    if asked_for(cfg):
+        raise UserError(
+            f"trainer.devices={cfg.trainer.get('devices')}, trainer.num_nodes="
+            f"{cfg.trainer.get('num_nodes', 1)}: a sweep (-m) gives each cell one device. Run "
+            "cells beside each other with trainer.devices=1 hydra/launcher=joblib (or "
+            "submitit_slurm), or start each big run by itself, without -m."
+        )
+
+
+def check_shares(batch_size: int, test_clouds: int, processes: int) -> None:
+    """Refuse data that do not go round.
+
+    Raises:
+        UserError: ``batch_size`` is no multiple of the number of processes, or leaves fewer than
+            two clouds to one of them, or there are fewer test clouds than processes.
+    """
+    if test_clouds < processes:
+        raise UserError(
+            f"trainer.devices: {processes} devices are too many for {test_clouds} test clouds. "
+            f"Try trainer.devices={test_clouds}."
+        )
+    if processes > 1 and (batch_size % processes or batch_size < 2 * processes):
+        least = 2 * processes
+        near = max(round(batch_size / processes) * processes, least)
+        raise UserError(
+            f"batch_size={batch_size} is the batch of all {processes} devices together: it must "
+            f"be a multiple of {processes} and at least {least}. Try batch_size={near}."
+        )
+
+
+def _number(name: str) -> int:
+    value = os.environ.get(name, "")
+    return int(value) if value.isdigit() else 0

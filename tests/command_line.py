@@ -1,0 +1,80 @@
+"""The command line as a user types it, in a process of its own or, quicker, in this one."""
+
+import contextlib
+import io
+import os
+import subprocess
+import sys
+import warnings
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from hydra.core.global_hydra import GlobalHydra
+
+from mops_lightning.cli import main
+
+TINY = [
+    "trainer=cpu",
+    "trainer.max_epochs=1",
+    "epochs.task=1",
+    "dataset.train_per_class=4",
+    "dataset.test_per_class=2",
+    "dataset.n_points=64",
+    "batch_size=16",
+    "m=8",
+    "pictures=2",
+]
+
+
+def start(arguments, folder, **extra):
+    """Begin in a new process."""
+    environment = {**os.environ, **_variables(folder), **extra}
+    environment.pop("HYDRA_FULL_ERROR", None)
+    return subprocess.Popen(
+        [sys.executable, "-m", "mops_lightning", *arguments],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def call_anew(arguments, folder, **extra):
+    """Run in a new process to its end: exit status and what it printed."""
+    process = start(arguments, folder, **extra)
+    out, err = process.communicate(timeout=240)
+    return process.returncode, out, err
+
+
+def call(arguments, folder):
+    """Run in this process: a new one spends most of its time on importing torch and lightning."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        contextlib.chdir(folder),
+        patch.dict(os.environ, {**_variables(folder), "HYDRA_FULL_ERROR": ""}),
+        patch.object(sys, "argv", ["mops_lightning", *arguments]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        warnings.catch_warnings(),
+    ):
+        status: Any = 0
+        try:
+            main()
+        except SystemExit as stop:
+            status = stop.code
+        finally:
+            GlobalHydra.instance().clear()
+    return status, out.getvalue(), err.getvalue()
+
+
+def runs(folder):
+    """Return the folders of all runs below ``outputs``."""
+    return sorted(path.parent for path in (folder / "outputs").rglob("result.json"))
+
+
+def _variables(folder):
+    # As many threads there as here, for sums depend on it.
+    threads = str(torch.get_num_threads())
+    return {"MOPS_CACHE": str(folder / "cache"), "COLUMNS": "160", "OMP_NUM_THREADS": threads}
