@@ -138,31 +138,63 @@ def _shares(logits: Tensor, log_sum: Tensor) -> Tensor:
     return logits.sub_(log_sum[:, None]).exp_()
 
 
+class Partial(NamedTuple):
+    """The softmax-weighted sum over some of a cloud's points; such sums merge to that over all.
+
+    Attributes:
+        peak: ``(M,)``, the largest logit of every column.
+        total: ``(M,)``, the sum of exp(logit - peak).
+        weighted: ``(M, V)``, the sum of exp(logit - peak) times the point's values.
+    """
+
+    peak: Tensor
+    total: Tensor
+    weighted: Tensor
+
+    def merge(self, other: "Partial") -> "Partial":
+        """Return the sum over the points of both, in whatever order they are merged."""
+        peak = torch.maximum(self.peak, other.peak)
+        mine, theirs = (self.peak - peak).exp(), (other.peak - peak).exp()
+        return Partial(
+            peak,
+            self.total * mine + other.total * theirs,
+            self.weighted * mine[:, None] + other.weighted * theirs[:, None],
+        )
+
+    def result(self) -> Tensor:
+        """Return the weighted mean ``(M, V)``."""
+        return self.weighted / self.total[:, None]
+
+
+def attend(queries: Tensor, keys: Tensor, values: Tensor) -> Partial:
+    """Sum values over points with the weights exp⟨query, key⟩, without the M·N logits at once.
+
+    Args:
+        queries: ``(M, C)``, already divided by the temperature.
+        keys: ``(N, C)``.
+        values: ``(N, V)``.
+    """
+    m = len(queries)
+    whole = Partial(keys.new_empty(m), keys.new_empty(m), values.new_empty(m, values.shape[1]))
+    for columns in _slices(m, BLOCK_QUERIES):
+        parts: Partial | None = None
+        for rows in _slices(len(keys), BLOCK_POINTS):
+            logits = queries[columns] @ keys[rows].mT
+            peak = logits.amax(1)
+            share = _shares(logits, peak)
+            part = Partial(peak, share.sum(1), share @ values[rows])
+            parts = part if parts is None else parts.merge(part)
+        assert parts is not None
+        for kept, found in zip(whole, parts, strict=True):
+            kept[columns] = found
+    return whole
+
+
 def _attend(queries: Tensor, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
     """Return softmax-weighted values ``(B, M, V)`` and the log of the softmax sums ``(B, M)``."""
-    batch, m = len(keys), len(queries)
-    result = values.new_empty(batch, m, values.shape[2])
-    log_sum = keys.new_empty(batch, m)
-    for cloud in range(batch):
-        for columns in _slices(m, BLOCK_QUERIES):
-            peak = total = weighted = None
-            for rows in _slices(keys.shape[1], BLOCK_POINTS):
-                logits = queries[columns] @ keys[cloud, rows].mT
-                high = logits.amax(1)
-                new_peak = high if peak is None else torch.maximum(peak, high)
-                share = _shares(logits, new_peak)
-                part_total, part = share.sum(1), share @ values[cloud, rows]
-                if peak is not None and total is not None and weighted is not None:
-                    shrink = (peak - new_peak).exp()
-                    part_total = part_total.addcmul_(total, shrink)
-                    part = part.addcmul_(weighted, shrink[:, None])
-                peak, total, weighted = new_peak, part_total, part
-            assert peak is not None
-            assert total is not None
-            assert weighted is not None
-            result[cloud, columns] = weighted / total[:, None]
-            log_sum[cloud, columns] = peak + total.log()
-    return result, log_sum
+    wholes = [attend(queries, *cloud) for cloud in zip(keys, values, strict=True)]
+    results = torch.stack([whole.result() for whole in wholes])
+    return results, torch.stack([whole.peak + whole.total.log() for whole in wholes])
 
 
 class _StreamedAttention(torch.autograd.Function):

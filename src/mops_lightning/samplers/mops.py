@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Literal
 
+import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -10,6 +11,7 @@ from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.losses import subset_losses
 from mops_lightning.nets.pointnet import PointFeatures, linear_norm_relu
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.folded import fold
 from mops_lightning.sampling_matrix import SamplingMatrix
 from mops_lightning.types import SampleOutput
 
@@ -85,10 +87,20 @@ class MOPSNet(Sampler):
 
     def sampling_matrix(self, points: Tensor) -> SamplingMatrix:
         """Return S for ``(B, N, 3)`` points."""
+        plain = self.training or torch.is_grad_enabled()
+        if not plain and not torch.is_autocast_enabled(points.device.type):
+            return self._evaluated(points)
         local, global_ = self.features(points)
         hidden = F.linear(local, self.rho_local.weight) + self.rho_global(global_)[:, None]
         keys = self.rho(self.rho_first(hidden.flatten(0, 1)))
         return SamplingMatrix(self.queries.weight, keys.unflatten(0, points.shape[:2]), self.tau)
+
+    def _evaluated(self, points: Tensor) -> SamplingMatrix:
+        """Return S without gradients, by folded layers."""
+        net = fold(self)
+        local = net.local_features(points.flatten(0, 1)).unflatten(0, points.shape[:2])
+        keys = [net.keys(cloud, peak) for cloud, peak in zip(local, local.amax(1), strict=True)]
+        return SamplingMatrix(self.queries.weight, torch.stack(keys), self.tau)
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Generate points; see ``Sampler.forward``."""

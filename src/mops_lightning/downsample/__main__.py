@@ -1,0 +1,7 @@
+"""``python -m mops_lightning.downsample IN OUT``."""
+
+if __name__ == "__main__":
+    # Worker processes import this module too and need nothing of what follows.
+    from mops_lightning.downsample.cli import main
+
+    main()

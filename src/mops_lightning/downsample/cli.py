@@ -1,0 +1,166 @@
+"""The command behind ``python -m mops_lightning.downsample``."""
+
+import argparse
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import as_completed
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.progress import track
+
+from mops_lightning.errors import UserError
+from mops_lightning.workers import pool
+
+DESCRIPTION = """Downsample clouds and meshes from files.
+
+IN is a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt .off .obj .stl .glb) or a folder of such,
+OUT a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt .obj) or a folder. Points are put into the
+unit sphere, as in training, sampled by a trained sampler (--weights) or an untrained method
+(--method), and mapped back. From meshes, points are sampled on the surface first."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Do all files; a bad one is named at the end and makes the exit status 1."""
+    parser = _parser()
+    chosen = parser.parse_args(arguments)
+    try:
+        sys.exit(_run(chosen))
+    except UserError as error:
+        print(f"mops_lightning.downsample: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print(
+            "mops_lightning.downsample: interrupted. The same command goes on with the rest.",
+            file=sys.stderr,
+        )
+        sys.exit(130)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m mops_lightning.downsample",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("source", metavar="IN", type=Path, help="a file or a folder")
+    add("target", metavar="OUT", type=Path, help="a file or a folder")
+    add("--m", type=int, help="points to keep; default: as many as the weights were trained for")
+    add("--weights", type=Path, help="weights.pt of a trained sampler, or the folder of its run")
+    add("--method", choices=("fps", "random", "voxel", "poisson"), help="instead of --weights")
+    add(
+        "--readout",
+        choices=("generated", "matched", "completed"),
+        default="completed",
+        help="of a trained sampler: its new points, the input points nearest to them, or these "
+        "without doubles, filled up to m by farthest point sampling (the default)",
+    )
+    add("--keep-attributes", action="store_true", help="keep colours, normals, intensities, ...")
+    add("--surface", type=int, help="points to sample from a mesh first; default: 10000 or 8m")
+    add("--format", help="suffix of the files in a folder OUT, such as ply; default: as IN")
+    add("--workers", type=int, default=1, help="processes that share a folder's files")
+    add("--seed", type=int, default=0, help="of what is random")
+    add("--overwrite", action="store_true", help="replace files that are there")
+    return parser
+
+
+def _run(chosen: argparse.Namespace) -> int:
+    from mops_lightning.downsample.job import Settings, run, sampler_of
+
+    if chosen.workers < 1:
+        raise UserError(f"--workers must be at least 1, got {chosen.workers}.")
+    settings = Settings(
+        chosen.m, chosen.weights, chosen.method, chosen.readout, chosen.keep_attributes,
+        chosen.surface, chosen.seed,
+    )  # fmt: skip
+    sampler_of(settings)  # its mistakes come before any file
+    jobs = _jobs(chosen)
+    if not chosen.source.is_dir():
+        ((source, target),) = jobs
+        if target.exists() and not chosen.overwrite:
+            raise UserError(f"{target} is there already. Give another OUT, or --overwrite.")
+        start = time.perf_counter()
+        number, whole, dropped = run(source, target, settings)
+        print(f"{target}: {_said(number, whole, dropped)}, {time.perf_counter() - start:.1f} s")
+        return 0
+    done: Counter[str] = Counter()
+    todo = [job for job in jobs if chosen.overwrite or not job[1].exists()]
+    failures = {}
+    with _mapped(todo, settings, chosen.workers) as results:
+        for (source, _), result in track(
+            results, "downsampling", total=len(todo), disable=not sys.stdout.isatty()
+        ):
+            done["failed" if isinstance(result, UserError) else "done"] += 1
+            if isinstance(result, UserError):
+                failures[source] = result
+    if len(jobs) > len(todo):
+        done["there already"] = len(jobs) - len(todo)
+    for _, error in sorted(failures.items()):
+        print(f"failed: {error}", file=sys.stderr)
+    counts = ", ".join(f"{number} {state}" for state, number in done.items())
+    print(f"{len(jobs)} files: {counts}; in {chosen.target}")
+    return 1 if failures else 0
+
+
+def _said(number: int, whole: int, dropped: int) -> str:
+    left = f" ({dropped:,} more without finite coordinates left out)" if dropped else ""
+    return f"{number:,} of {whole:,} points{left}"
+
+
+def _jobs(chosen: argparse.Namespace) -> list[tuple[Path, Path]]:
+    from mops_lightning.downsample.formats import READABLE, WRITERS
+
+    source, target = chosen.source, chosen.target
+    wanted = f".{chosen.format.lstrip('.').lower()}" if chosen.format else None
+    writable = ", ".join(WRITERS)
+    if wanted and wanted not in WRITERS:
+        raise UserError(f"--format must be one of {writable}, got {chosen.format}.")
+    if not source.exists():
+        raise UserError(f"{source}: no such file or folder.")
+
+    def suffix(path: Path) -> str:
+        own = path.suffix.lower()
+        return wanted or (own if own in WRITERS else ".ply")
+
+    if not source.is_dir():
+        if target.is_dir():
+            target = target / f"{source.stem}{suffix(source)}"
+        if target.suffix.lower() not in WRITERS:
+            raise UserError(f"OUT must end in one of {writable}, got {target}.")
+        if target.resolve() == source.resolve():
+            raise UserError(f"OUT is IN, {source}: give another file.")
+        return [(source, target)]
+    if target.is_file():
+        raise UserError(f"OUT must be a folder, as IN is one, got the file {target}.")
+    files = sorted(p for p in source.rglob("*") if p.is_file() and p.suffix.lower() in READABLE)
+    inside = target.resolve()
+    files = [p for p in files if inside not in p.resolve().parents]
+    if not files:
+        raise UserError(f"{source} holds no file that ends in {', '.join(READABLE)}.")
+    jobs = [(p, target / p.relative_to(source).with_suffix(suffix(p))) for p in files]
+    twice = [path for path, number in Counter(path for _, path in jobs).items() if number > 1]
+    if twice:
+        both = ", ".join(str(p) for p, goal in jobs if goal == twice[0])
+        raise UserError(f"{both} would both become {twice[0]}. Leave --format out, or rename one.")
+    return jobs
+
+
+@contextmanager
+def _mapped(jobs: list[tuple[Path, Path]], settings: Any, workers: int) -> Iterator[Iterator[Any]]:
+    """Give pairs of job and result, in the order in which they come."""
+    from mops_lightning.downsample.files import attempt
+
+    if workers == 1 or len(jobs) < 2:
+        yield ((job, attempt(*job, settings, None)) for job in jobs)
+        return
+    workers = min(workers, len(jobs))
+    futures = {pool(workers).submit(attempt, *job, settings, workers): job for job in jobs}
+    try:
+        yield ((futures[future], future.result()) for future in as_completed(futures))
+    finally:
+        for future in futures:
+            future.cancel()

@@ -1,0 +1,60 @@
+"""LAS and LAZ files by laspy, an extra."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mops_lightning.downsample.table import BadCloudError, Table
+from mops_lightning.errors import UserError
+
+
+def read(path: Path) -> Table:
+    """Read all points with all their dimensions; coordinates are scaled and shifted."""
+    laspy = _laspy(path)
+    try:
+        cloud = laspy.read(path)
+        points = np.stack([np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"], 1)
+        names = [name for name in cloud.point_format.dimension_names if name not in "XYZ"]
+        columns = {name: np.asarray(cloud[name]) for name in names}
+    except Exception as error:  # the parsers raise whatever a broken file makes them stumble over
+        raise BadCloudError(f"{path} is broken: {type(error).__name__}: {error}.") from None
+    return Table(points, {n: c for n, c in columns.items() if c.ndim == 1}, cloud.header)
+
+
+def write(path: Path, table: Table) -> None:
+    """Write a LAS or LAZ file like the one that was read, or one of plain coordinates."""
+    laspy = _laspy(path)
+    header: Any
+    if table.head is None:
+        header = laspy.LasHeader(point_format=3, version="1.2")
+        spread = float(np.ptp(table.points, axis=0).max())
+        header.offsets = table.points.min(0)
+        header.scales = np.full(3, max(spread, 1e-9) / 2**30)
+    else:
+        header = laspy.LasHeader(
+            point_format=table.head.point_format, version=str(table.head.version)
+        )
+        header.offsets, header.scales = table.head.offsets, table.head.scales
+        header.vlrs = table.head.vlrs
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = table.points.T
+    known = set(cloud.point_format.dimension_names)
+    for name, column in table.columns.items():
+        if name in known:
+            cloud[name] = column
+        elif name.isidentifier():
+            cloud.add_extra_dim(laspy.ExtraBytesParams(name=name[:32], type=column.dtype))
+            cloud[name[:32]] = column
+    cloud.write(path)
+
+
+def _laspy(path: Path) -> Any:
+    try:
+        import laspy
+    except ModuleNotFoundError:
+        raise UserError(
+            f"{path}: LAS and LAZ need a package that is not here: "
+            "pip install 'mops-lightning[las]'."
+        ) from None
+    return laspy

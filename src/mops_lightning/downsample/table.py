@@ -1,0 +1,66 @@
+"""A cloud as its file has it: coordinates, and columns of whatever else."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mops_lightning.errors import UserError
+
+Column = NDArray[Any]
+
+
+class BadCloudError(UserError):
+    """A file that holds no cloud; others of its folder are done all the same."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Points and their attributes.
+
+    Attributes:
+        points: ``(N, 3)`` float64 coordinates in the file's own unit.
+        columns: further numbers per point, ``(N,)`` each, under the file's names.
+        head: what a format needs to write the like again (LAS: its header).
+    """
+
+    points: NDArray[np.float64]
+    columns: Mapping[str, Column] = field(default_factory=dict)
+    head: Any = None
+
+    def take(self, rows: NDArray[np.int64]) -> "Table":
+        """Return some of the points with all that belongs to them."""
+        columns = {name: column[rows] for name, column in self.columns.items()}
+        return Table(self.points[rows], columns, self.head)
+
+    def bare(self) -> "Table":
+        """Return the points alone."""
+        return Table(self.points, {}, self.head)
+
+
+def from_array(array: NDArray[Any], names: list[str], path: Path, head: Any = None) -> Table:
+    """Make a table of the columns of a plain or structured array.
+
+    Args:
+        array: ``(N, K)``, K ≥ 3, or ``(N,)`` with named fields.
+        names: of the columns; x, y and z must be among them.
+        path: for errors.
+        head: see ``Table``.
+
+    Raises:
+        BadCloudError: there are no coordinates.
+    """
+    lower = {name.lower(): name for name in reversed(names)}
+    if not {"x", "y", "z"} <= set(lower):
+        raise BadCloudError(f"{path} has no x, y and z; its columns are {', '.join(names)}.")
+
+    def column(name: str) -> Column:
+        return array[name] if array.dtype.names else array[:, names.index(name)]
+
+    axes = [lower[axis] for axis in "xyz"]
+    points = np.stack([np.asarray(column(axis), np.float64) for axis in axes], 1)
+    rest = {name: column(name) for name in names if name not in axes}
+    return Table(points, {name: c for name, c in rest.items() if c.ndim == 1}, head)

@@ -1,0 +1,154 @@
+"""The command as a user types it."""
+
+import contextlib
+import io
+
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning import weights
+from mops_lightning.downsample.cli import main
+from mops_lightning.downsample.formats import WRITERS
+from mops_lightning.downsample.job import read
+from mops_lightning.downsample.table import Table
+from mops_lightning.samplers.fmops import FMOPSNet
+
+
+def call(*arguments):
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            return stop.code, out.getvalue(), err.getvalue()
+    raise AssertionError("it ends by an exit status")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two clouds far from the origin, one with a hole in its numbers, and trained weights."""
+    folder = tmp_path_factory.mktemp("clouds")
+    random = np.random.default_rng(0)
+    (folder / "in" / "deep").mkdir(parents=True)
+    for name, number in (("a.ply", 300), ("deep/b.npz", 200)):
+        points = random.normal(size=(number, 3)) * [5, 1, 1] + [1000, 0, 0]
+        points[7] = np.nan
+        table = Table(points, {"label": np.arange(number)})
+        WRITERS[f".{name.split('.')[1]}"](folder / "in" / name, table)
+    torch.manual_seed(0)
+    node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 40}
+    config = {"learn": "sampler", "sampler": node}
+    weights.save(folder / "weights.pt", FMOPSNet(40), config, {})
+    weights.save(folder / "task.pt", FMOPSNet(40), {**config, "learn": "task"}, {})
+    return folder
+
+
+@pytest.mark.parametrize("method", ["fps", "random", "voxel", "poisson"])
+def test_an_untrained_method_keeps_rows_of_the_file(method, folder, tmp_path):
+    source, target = folder / "in" / "a.ply", tmp_path / "out.npz"
+    status, out, err = call(source, target, "--method", method, "--m", 20, "--keep-attributes")
+    assert (status, err) == (0, "")
+    assert "20 of 299 points (1 more without finite coordinates left out)" in out
+    kept, whole = read(target, 9, 0), read(source, 9, 0)
+    rows = kept.columns["label"].astype(int)
+    assert len(set(rows)) == 20
+    np.testing.assert_array_equal(kept.points, whole.points[rows])
+
+
+def test_readouts_of_a_trained_sampler(folder, tmp_path):
+    source = folder / "in" / "a.ply"
+    whole = read(source, 9, 0).points
+    found = {}
+    for readout in ("generated", "matched", "completed"):
+        target = tmp_path / f"{readout}.npy"
+        settings = ["--weights", folder, "--readout", readout, "--m", 30]
+        assert call(source, target, *settings)[0] == 0
+        found[readout] = np.load(target)
+        assert found[readout].shape == (30, 3)
+    inside = {readout: {tuple(p) for p in points} for readout, points in found.items()}
+    all_points = {tuple(p) for p in whole}
+    assert not inside["generated"] & all_points
+    assert inside["matched"] <= inside["completed"] <= all_points
+    assert len(inside["completed"]) == 30
+    # Mapped back: among the points, not in the unit sphere.
+    finite = whole[np.isfinite(whole).all(1)]
+    assert (found["generated"] > finite.min(0)).all()
+    assert (found["generated"] < finite.max(0)).all()
+
+
+def test_a_folder_is_done_again_only_where_something_is_missing_or_bad(folder, tmp_path):
+    target = tmp_path / "out"
+    bad = folder / "in" / "bad.xyz"
+    bad.write_text("not a cloud\n")
+    try:
+        settings = ["--weights", folder / "weights.pt", "--m", 8, "--format", "ply"]
+        status, out, err = call(folder / "in", target, *settings, "--workers", 2)
+        assert status == 1
+        assert "3 files: " in out
+        assert "2 done" in out
+        assert "1 failed" in out
+        assert err.startswith(f"failed: {bad}")
+        first = {path.name: path.read_bytes() for path in target.rglob("*.ply")}
+        assert set(first) == {"a.ply", "b.ply"}
+        assert (target / "deep" / "b.ply").is_file()
+        (target / "a.ply").unlink()
+    finally:
+        bad.unlink()
+    status, out, err = call(folder / "in", target, *settings)
+    assert (status, err) == (0, "")
+    assert "2 files: 1 done, 1 there already" in out
+    again = {path.name: path.read_bytes() for path in target.rglob("*.ply")}
+    assert again == first, "one process gives what two gave"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--m", 5], "give --weights FILE"),
+        (["--m", 5, "--method", "fps", "--weights", "w.pt"], "and not both"),
+        (["--method", "fps"], "--m must be"),
+        (["--m", 0, "--method", "fps"], "--m must be"),
+        (["--m", 41, "--weights", "weights.pt"], "trained for up to 40 points, got 41"),
+        (["--weights", "task.pt"], "holds a task net"),
+        (["--weights", "nowhere.pt"], "no file nowhere.pt"),
+        (["--weights", "weights.pt", "--keep-attributes", "--readout", "generated"], "are new"),
+        (["--m", 500, "--method", "fps"], "holds 299 points, fewer than --m 500"),
+        (["--m", 5, "--method", "fps", "--workers", 0], "--workers must be"),
+        (["--m", 5, "--method", "fps", "--format", "stl"], "--format must be one of"),
+    ],
+)
+def test_mistakes_end_in_one_clear_error(arguments, said, folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(folder)
+    status, out, err = call("in/a.ply", tmp_path / "out.ply", *arguments)
+    assert (status, out) == (2, "")
+    assert said in err
+    assert len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "out.ply").exists()
+
+
+def test_nothing_is_overwritten_unasked(folder, tmp_path):
+    source, target = folder / "in" / "a.ply", tmp_path / "out.ply"
+    target.write_text("mine")
+    settings = ["--method", "random", "--m", 5]
+    status, _, err = call(source, target, *settings)
+    assert status == 2
+    assert "is there already" in err
+    assert target.read_text() == "mine"
+    assert call(source, target, *settings, "--overwrite")[0] == 0
+    assert len(read(target, 9, 0).points) == 5
+    assert "OUT is IN" in call(source, source, *settings)[2]
+    assert "OUT must end in" in call(source, tmp_path / "out.stl", *settings)[2]
+    assert "no such file or folder" in call(tmp_path / "no", target, *settings)[2]
+
+
+def test_real_scans(real_data, tmp_path):
+    scans = real_data / "scans"
+    if not scans.is_dir():
+        pytest.skip(f"no scans in {real_data}")
+    status, out, err = call(scans, tmp_path, "--method", "random", "--m", 100, "--keep-attributes")
+    assert (status, err) == (0, "")
+    fragment = read(tmp_path / "fragment.pcd", 9, 0)
+    assert len(fragment.points) == 100
+    assert "normal_x" in fragment.columns
+    assert len(read(tmp_path / "kitti_000000.bin", 9, 0).columns["intensity"]) == 100
