@@ -1,0 +1,210 @@
+"""The measurements: each function returns rows, plain dictionaries of names and numbers."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from measure import Timing, flops, interleaved, peak_memory
+from torch import Tensor, nn
+from twins import PlainMOPS, plain_farthest_point_sample
+
+from mops_lightning.geometry import farthest_point_sample
+from mops_lightning.samplers.folded import fold
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.random import RandomSampler
+from mops_lightning.samplers.samplenet import SampleNet
+from mops_lightning.samplers.snet import SNet
+from mops_lightning.samplers.voxel import VoxelSampler
+from mops_lightning.sampling_matrix import attend
+from mops_lightning.streaming import stream_sample
+
+Row = dict[str, Any]
+Calls = dict[str, Callable[[], Any]]
+SIZES = (512, 256, 128, 64, 32, 16, 8)
+LARGE = (4096, 1024, 256)
+CHUNK = 8192
+
+
+def cloud(number: int, clouds: int = 1) -> Tensor:
+    """Return the same points on spheres each time: surfaces, as clouds are."""
+    rng = torch.Generator().manual_seed(number)
+    return nn.functional.normalize(torch.randn(clouds, number, 3, generator=rng), dim=2)
+
+
+def frozen(net: nn.Module, points: Tensor) -> Tensor:
+    """Return the points that a sampler, or a plain twin, gives in evaluation."""
+    with torch.no_grad():
+        made = net.eval()(points)
+    return made if isinstance(made, Tensor) else made.points
+
+
+def chunked(sampler: MOPSNet, points: Tensor, size: int = CHUNK) -> Tensor:
+    """Return the same by chunks of the cloud."""
+    return stream_sample(sampler, partial(points[0].split, size))
+
+
+def inference(peak: dict[str, float], rounds: int) -> list[Row]:
+    """Seconds per cloud of 1,024 points, 32 in a batch, all samplers (the paper's run times)."""
+    points = cloud(1024, 32)
+    rows: list[Row] = []
+    for m in SIZES:
+        mops = MOPSNet(m)
+        samplers: dict[str, nn.Module] = {
+            "random": RandomSampler(m),
+            "voxel": VoxelSampler(m),
+            "fps": FPSSampler(m),
+            "snet": SNet(m),
+            "samplenet": SampleNet(m),
+            "mops": mops,
+            "mops, plain twin": PlainMOPS(mops),
+        }
+        _equal(frozen(mops, points), frozen(samplers["mops, plain twin"], points))
+        calls: Calls = {name: partial(frozen, net, points) for name, net in samplers.items()}
+        names = {"N": 1024, "m": m}
+        rows += _rows("sampler", calls, names, rounds, peak, clouds=32)
+    return rows
+
+
+def large(peak: dict[str, float], rounds: int) -> list[Row]:
+    """One cloud of 40,960 points (the paper's table of run time and memory)."""
+    points = cloud(40960)
+    rows: list[Row] = []
+    for m in LARGE:
+        sampler = MOPSNet(m)
+        plain = PlainMOPS(sampler)
+        _equal(frozen(sampler, points), frozen(plain, points))
+        calls: Calls = {
+            "mops": partial(frozen, sampler, points),
+            "mops, in chunks": partial(chunked, sampler, points),
+            "mops, plain twin": partial(frozen, plain, points),
+            "fps": partial(farthest_point_sample, points, m),
+        }
+        bodies = {
+            "mops": "frozen(s, points)",
+            "mops, in chunks": "chunked(s, points)",
+            "mops, plain twin": "frozen(PlainMOPS(s), points)",
+            "fps": f"farthest_point_sample(points, {m})",
+        }
+        for row in _rows("sampler", calls, {"N": 40960, "m": m}, rounds, peak):
+            memory = peak_memory(_SETUP.format(number=40960, m=m), bodies[row["sampler"]])
+            rows.append({**row, "peak_bytes": memory})
+    return rows
+
+
+_SETUP = """
+from cases import *
+points, s = cloud({number}), MOPSNet({m})
+torch.randn(512, 512) @ torch.randn(512, 512)
+"""
+
+
+def modules(peak: dict[str, float], rounds: int) -> list[Row]:
+    """Where the time of one cloud of 40,960 points goes: features, sampling matrix, regression."""
+    points = cloud(40960)[0]
+    rows: list[Row] = []
+    for m in LARGE:
+        net = fold(MOPSNet(m).eval())
+        local = net.local_features(points)
+        calls: Calls = {
+            "features": partial(net.local_features, points),
+            "matrix": partial(net.keys, local, local.amax(0)),
+            "regression": partial(attend, net.queries, net.keys(local, local.amax(0)), points),
+        }
+        with torch.no_grad():
+            rows += _rows("module", calls, {"N": 40960, "m": m}, rounds, peak)
+    return rows
+
+
+def training(peak: dict[str, float], rounds: int) -> list[Row]:
+    """One cloud's share of a training step of the sampler alone, 32 clouds in a batch."""
+    points = cloud(1024, 32)
+
+    def step(net: nn.Module) -> None:
+        net.zero_grad()
+        made = net(points)
+        (made if isinstance(made, Tensor) else made.points).square().sum().backward()
+
+    nets = {"mops": MOPSNet(32).train(), "mops, plain twin": PlainMOPS(MOPSNet(32)).train()}
+    calls: Calls = {name: partial(step, net) for name, net in nets.items()}
+    return _rows("training", calls, {"N": 1024, "m": 32}, rounds, peak, clouds=32)
+
+
+def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
+    """Farthest point sampling beside the plain form, and beside fpsample where it is installed."""
+    rows: list[Row] = []
+    for number, m in ((1024, 32), (10_000, 1024), (100_000, 1024)):
+        points = cloud(number)
+        calls: Calls = {
+            "fps": partial(farthest_point_sample, points, m),
+            "fps, plain twin": partial(plain_farthest_point_sample, points[0], m),
+        }
+        try:
+            import fpsample  # type: ignore[import-not-found]
+
+            array = points[0].numpy()
+            calls["fpsample, plain"] = partial(fpsample.fps_sampling, array, m, 0)
+            calls["fpsample, buckets"] = partial(
+                fpsample.bucket_fps_kdline_sampling, array, m, 5, 0
+            )
+        except ModuleNotFoundError:
+            pass
+        rows += _rows("sampler", calls, {"N": number, "m": m}, rounds, peak)
+    return rows
+
+
+def growth(peak: dict[str, float], rounds: int) -> list[Row]:
+    """Time and memory as N grows to 10,000,000, in chunks of 65,536, m=4,096."""
+    sampler = MOPSNet(4096).eval()
+    rows: list[Row] = []
+    for number in (100_000, 1_000_000, 10_000_000):
+        calls: Calls = {"mops, in chunks": partial(chunked, sampler, cloud(number), 65536)}
+        few = min(rounds, 3 if number < 1_000_000 else 2)
+        names = {"N": number, "m": 4096}
+        (row,) = _rows("sampler", calls, names, few, peak, warm_up=int(number < 1_000_000))
+        setup = _SETUP.format(number=number, m=4096)
+        rows.append({**row, "peak_bytes": peak_memory(setup, "chunked(s.eval(), points, 65536)")})
+    return rows
+
+
+def _equal(fast: Tensor, plain: Tensor) -> None:
+    """Refuse to time what does not compute the same."""
+    torch.testing.assert_close(fast, plain, rtol=1e-3, atol=1e-4)
+
+
+def _rows(
+    kind: str,
+    calls: Calls,
+    names: Row,
+    rounds: int,
+    peak: dict[str, float],
+    clouds: int = 1,
+    warm_up: int = 2,
+) -> list[Row]:
+    """Time the calls in turns; one row for each, per cloud."""
+    rows = []
+    for name, timing in interleaved(calls, rounds, warm_up).items():
+        row = {kind: name, **names, **_seconds(timing, clouds)}
+        # Counting walks through the call once more: not for those that take many seconds.
+        operations = flops(calls[name]) if timing.median < 10 else 0
+        if operations:
+            reached = operations / timing.median / peak["flops"]
+            row |= {"flop": operations / clouds, "share_of_ceiling": reached}
+        rows.append(row)
+    return rows
+
+
+def _seconds(timing: Timing, clouds: int) -> Row:
+    spread = (timing.high - timing.low) / clouds
+    return {"seconds": timing.median / clouds, "spread": spread, "rounds": timing.rounds}
+
+
+ALL: dict[str, Callable[[dict[str, float], int], list[Row]]] = {
+    "inference": inference,
+    "large": large,
+    "modules": modules,
+    "training": training,
+    "farthest": farthest,
+    "growth": growth,
+}
