@@ -114,6 +114,8 @@ def test_a_folder_is_done_again_only_where_something_is_missing_or_bad(folder, t
         (["--weights", "nowhere.pt"], "no file nowhere.pt"),
         (["--weights", "weights.pt", "--keep-attributes", "--readout", "generated"], "are new"),
         (["--m", 500, "--method", "fps"], "holds 299 points, fewer than --m 500"),
+        (["--m", 5, "--method", "fps", "--chunk", 9], "--chunk must be at least 1"),
+        (["--weights", "weights.pt", "--chunk", 9], "--readout generated or matched"),
         (["--m", 5, "--method", "fps", "--workers", 0], "--workers must be"),
         (["--m", 5, "--method", "fps", "--format", "stl"], "--format must be one of"),
     ],
@@ -152,3 +154,49 @@ def test_real_scans(real_data, tmp_path):
     assert len(fragment.points) == 100
     assert "normal_x" in fragment.columns
     assert len(read(tmp_path / "kitti_000000.bin", 9, 0).columns["intensity"]) == 100
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".npy", ".bin", ".laz"])
+@pytest.mark.parametrize("readout", ["generated", "matched"])
+def test_chunks_of_a_file_give_what_the_whole_file_gives(suffix, readout, folder, tmp_path):
+    points = np.random.default_rng(1).normal(size=(500, 3)).astype(np.float32).astype(float)
+    if suffix != ".laz":  # it holds whole numbers, NaN is none
+        points[100:160] = np.nan
+    source = tmp_path / f"in{suffix}"
+    WRITERS[suffix](source, Table(points, {"intensity": np.arange(500, dtype=np.uint16)}))
+    settings = ["--weights", folder, "--readout", readout]
+    settings += ["--keep-attributes"] if readout == "matched" else []
+    assert call(source, tmp_path / "whole.npz", *settings)[0] == 0
+    status, out, err = call(source, tmp_path / "parts.npz", *settings, "--chunk", 60)
+    assert (status, err) == (0, "")
+    assert f"40 of {500 if suffix == '.laz' else 440} points" in out
+    whole, parts = (read(tmp_path / f"{name}.npz", 9, 0) for name in ("whole", "parts"))
+    np.testing.assert_allclose(parts.points, whole.points, atol=1e-5)
+    assert list(parts.columns) == list(whole.columns)
+    for name, column in whole.columns.items():
+        np.testing.assert_array_equal(parts.columns[name], column)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.xyz", b"1 2 3", "--chunk works with .npy"),
+        ("a.bin", b"123", "no KITTI scan"),
+        ("a.npy", b"123", "a.npy is broken"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n", "needs binary PLY"),
+    ],
+)
+def test_files_that_cannot_be_read_in_chunks_are_named(name, content, said, folder, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    settings = ["--weights", folder, "--readout", "matched", "--chunk", 60]
+    status, _, err = call(tmp_path / name, tmp_path / "out.ply", *settings)
+    assert status == 2
+    assert said in err
+
+
+def test_a_truncated_file_is_named_by_its_chunks(folder, tmp_path):
+    path = tmp_path / "a.ply"
+    WRITERS[".ply"](path, Table(np.ones((90, 3)) * np.arange(90)[:, None]))
+    path.write_bytes(path.read_bytes()[:-5])
+    settings = ["--weights", folder, "--readout", "matched", "--chunk", 60]
+    assert "ends after 89 points" in call(path, tmp_path / "out.ply", *settings)[2]

@@ -63,6 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--surface", type=int, help="points to sample from a mesh first; default: 10000 or 8m")
     add("--format", help="suffix of the files in a folder OUT, such as ply; default: as IN")
     add("--workers", type=int, default=1, help="processes that share a folder's files")
+    add("--chunk", type=int, help="read so many points at a time, for clouds larger than memory")
     add("--seed", type=int, default=0, help="of what is random")
     add("--overwrite", action="store_true", help="replace files that are there")
     return parser
@@ -74,9 +75,15 @@ def _run(chosen: argparse.Namespace) -> int:
     if chosen.workers < 1:
         raise UserError(f"--workers must be at least 1, got {chosen.workers}.")
     settings = Settings(
-        chosen.m, chosen.weights, chosen.method, chosen.readout, chosen.keep_attributes,
-        chosen.surface, chosen.seed,
-    )  # fmt: skip
+        chosen.m,
+        chosen.weights,
+        chosen.method,
+        chosen.readout,
+        chosen.keep_attributes,
+        chosen.surface,
+        chosen.seed,
+        chosen.chunk,
+    )
     sampler_of(settings)  # its mistakes come before any file
     jobs = _jobs(chosen)
     if not chosen.source.is_dir():

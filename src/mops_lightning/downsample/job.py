@@ -14,6 +14,7 @@ from torch import Tensor
 from mops_lightning import weights
 from mops_lightning.data.mesh_io import parse_mesh
 from mops_lightning.downsample.formats import READABLE, READERS, WRITERS
+from mops_lightning.downsample.large import by_chunks
 from mops_lightning.downsample.table import BadCloudError, Table
 from mops_lightning.errors import UserError
 from mops_lightning.io import atomic_write
@@ -45,6 +46,7 @@ class Settings:
         keep_attributes: keep colours, normals and the like of the kept points.
         surface: points to sample from a mesh's surface first.
         seed: of what is random.
+        chunk: read so many points at a time; None: the whole file.
     """
 
     m: int | None
@@ -54,6 +56,7 @@ class Settings:
     keep_attributes: bool = False
     surface: int | None = None
     seed: int = 0
+    chunk: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
@@ -64,6 +67,12 @@ class Settings:
             )
         if (self.m is not None and self.m < 1) or (self.m is None and self.method):
             raise UserError(f"--m must be a whole number of at least 1, got {self.m}.")
+        whole = self.method or self.readout == "completed"
+        if self.chunk is not None and (self.chunk < 1 or whole):
+            raise UserError(
+                "--chunk must be at least 1 and goes with --weights of MOPS-Net and --readout "
+                "generated or matched: everything else needs the whole cloud at once."
+            )
         if self.readout not in GENERATED_READOUTS:
             raise UserError(f"--readout must be one of {', '.join(GENERATED_READOUTS)}.")
         if self.keep_attributes and self.weights and self.readout == "generated":
@@ -124,6 +133,12 @@ def run(source: Path, target: Path, settings: Settings) -> tuple[int, int, int]:
     """
     sampler = sampler_of(settings)
     m = settings.m or sampler.m
+    if settings.chunk:
+        kept, number = by_chunks(
+            source, sampler, m, settings.chunk, settings.readout, settings.keep_attributes
+        )
+        _write(target, kept)
+        return len(kept.points), number, 0
     table = read(source, settings.surface or max(10_000, 8 * m), settings.seed)
     finite = np.flatnonzero(np.isfinite(table.points).all(axis=1))
     dropped = len(table.points) - len(finite)
@@ -131,9 +146,13 @@ def run(source: Path, target: Path, settings: Settings) -> tuple[int, int, int]:
     if len(table.points) < m:
         raise BadCloudError(f"{source} holds {len(table.points)} points, fewer than --m {m}.")
     kept = sampled(table, sampler, m, settings)
-    with atomic_write(target) as temporary:
-        WRITERS[target.suffix.lower()](temporary, kept)
+    _write(target, kept)
     return len(kept.points), len(table.points), dropped
+
+
+def _write(target: Path, table: Table) -> None:
+    with atomic_write(target) as temporary:
+        WRITERS[target.suffix.lower()](temporary, table)
 
 
 def read(path: Path, surface: int, seed: int) -> Table:

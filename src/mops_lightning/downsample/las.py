@@ -11,20 +11,25 @@ from mops_lightning.errors import UserError
 
 def read(path: Path) -> Table:
     """Read all points with all their dimensions; coordinates are scaled and shifted."""
-    laspy = _laspy(path)
+    laspy = laspy_for(path)
     try:
         cloud = laspy.read(path)
-        points = np.stack([np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"], 1)
-        names = [name for name in cloud.point_format.dimension_names if name not in "XYZ"]
-        columns = {name: np.asarray(cloud[name]) for name in names}
+        return table_of(cloud, cloud.header)
     except Exception as error:  # the parsers raise whatever a broken file makes them stumble over
         raise BadCloudError(f"{path} is broken: {type(error).__name__}: {error}.") from None
-    return Table(points, {n: c for n, c in columns.items() if c.ndim == 1}, cloud.header)
+
+
+def table_of(cloud: Any, header: Any) -> Table:
+    """Make a table of laspy's points, with all dimensions of one number each."""
+    points = np.stack([np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"], 1)
+    names = [name for name in cloud.point_format.dimension_names if name not in "XYZ"]
+    columns = {name: np.asarray(cloud[name]) for name in names}
+    return Table(points, {n: c for n, c in columns.items() if c.ndim == 1}, header)
 
 
 def write(path: Path, table: Table) -> None:
     """Write a LAS or LAZ file like the one that was read, or one of plain coordinates."""
-    laspy = _laspy(path)
+    laspy = laspy_for(path)
     header: Any
     if table.head is None:
         header = laspy.LasHeader(point_format=3, version="1.2")
@@ -49,7 +54,12 @@ def write(path: Path, table: Table) -> None:
     cloud.write(path)
 
 
-def _laspy(path: Path) -> Any:
+def laspy_for(path: Path) -> Any:
+    """Return laspy, which need not be installed.
+
+    Raises:
+        UserError: it is not.
+    """
     try:
         import laspy
     except ModuleNotFoundError:
