@@ -149,6 +149,7 @@ def test_the_rivals_settings():
         (["batch_size=1"], "batch_size must be a whole number of at least 2"),
         (["trainer.devices=0"], "trainer.devices must be a number of devices"),
         (["trainer.devices=[]"], "trainer.devices must be a number of devices"),
+        (["trainer=cpu", "trainer.devices=-1"], "trainer.devices=-1 means all GPUs"),
         (["trainer=ddp", "trainer.num_nodes=0"], "trainer.num_nodes must be a number of hosts"),
         (["trainer=ddp", "trainer.strategy=fsdp"], "trainer.strategy: several devices work with"),
         (["trainer=ddp", "+trainer.sync_batchnorm=true"], "trainer.sync_batchnorm: cannot be"),

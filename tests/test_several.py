@@ -5,10 +5,11 @@ import json
 import pytest
 import torch
 
+from mops_lightning.config import compose
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
-from mops_lightning.several import check_shares
+from mops_lightning.several import check_shares, check_start
 from tests.command_line import TINY, call, call_anew
 
 
@@ -51,12 +52,36 @@ def test_every_cloud_is_scored_once_in_equally_many_batches_none_of_them_empty(p
 
 
 @pytest.mark.parametrize(
-    ("batch_size", "test_clouds", "processes", "said"),
-    [(15, 99, 2, "Try batch_size=16"), (4, 99, 4, "Try batch_size=8"), (8, 3, 4, "devices=3")],
+    ("numbers", "said"),
+    [
+        ((15, 99, 0, 2), "Try batch_size=16"),
+        ((4, 99, 0, 4), "Try batch_size=8"),
+        ((8, 3, 0, 4), "devices=3"),
+        ((8, 9, 1, 2), "val_fraction holds out 1 training clouds, fewer than the 2 devices"),
+    ],
 )
-def test_data_that_do_not_go_round_are_refused(batch_size, test_clouds, processes, said):
+def test_data_that_do_not_go_round_are_refused(numbers, said):
     with pytest.raises(UserError, match=said):
-        check_shares(batch_size, test_clouds, processes)
+        check_shares(*numbers)
+
+
+def test_processes_of_a_launcher_must_be_meant_and_share_a_folder(monkeypatch):
+    several = compose(["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"])
+    check_start(several, [])
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(UserError, match=r"hydra\.run\.dir=FOLDER"):
+        check_start(several, [])
+    check_start(several, ["hydra.run.dir=here"])
+    with pytest.raises(UserError, match="2 processes were started"):
+        check_start(compose(["trainer=cpu"]), ["hydra.run.dir=here"])
+
+
+def test_a_wrong_batch_is_refused_before_the_task_net_is_trained(tmp_path):
+    devices = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "batch_size=15"]
+    status, out, err = call([*TINY[1:], *devices], tmp_path)
+    assert status == 2
+    assert "Try batch_size=16" in err
+    assert "training it first" not in out
 
 
 REGISTRATION = [*TINY, "task=registration", "learn=task", "trainer.max_epochs=2", "batch_size=8"]

@@ -62,6 +62,7 @@ def _job(cfg: "DictConfig") -> float | None:
         if hydra_cfg.mode == RunMode.MULTIRUN:
             several.check_multirun(cfg)
             return run_cell(cfg, folder, overrides)
+        several.check_start(cfg, hydra_cfg.overrides.hydra)
         return run(cfg, folder, overrides)["score"]
     except UserError as error:
         # Ended here, Hydra does not add lines of its own.

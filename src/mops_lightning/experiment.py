@@ -97,6 +97,7 @@ class Experiment(L.LightningModule):
         make_metrics = task.metrics
         self.scores = nn.ModuleDict({key: make_metrics() for key in (*keys, *readouts, FULL)})
         self.train_scores = make_metrics(training=True)
+        self.loss_means = nn.ModuleDict()  # the task says their names with its first result
         self.set_metrics = nn.ModuleDict(
             {
                 f"{prefix}{name}": MeanMetric(nan_strategy="disable")
@@ -250,7 +251,15 @@ class Experiment(L.LightningModule):
                 self.log(f"{prefix}{readout}/{name}", metric, batch_size=size)
             if readout == self.own_readouts[0]:
                 for name, value in result.losses.items():
-                    self.log(f"{prefix}loss/{name}", value, batch_size=size, sync_dist=True)
+                    self._log_loss(f"{prefix}loss/{name}", value, size)
+
+    def _log_loss(self, key: str, value: Tensor, size: int) -> None:
+        """Log a mean over clouds that may be spread unevenly over processes."""
+        if key not in self.loss_means:
+            self.loss_means[key] = MeanMetric().to(self.device)
+        mean: Any = self.loss_means[key]
+        mean.update(value, size)
+        self.log(key, mean, batch_size=size, metric_attribute=f"loss_means.{key}")
 
     def _score_sets(self, readouts: BatchReadouts, prefixes: dict[int, str], size: int) -> None:
         """Update and log what is measured of the sampled sets themselves, at every size."""

@@ -208,9 +208,14 @@ def device_name(trainer: L.Trainer) -> str:
     return torch.cuda.get_device_name(root) if root.type == "cuda" else root.type
 
 
+def held_out_clouds(clouds: Clouds, fraction: float) -> int:
+    """Return how many training clouds ``split`` holds out."""
+    return round(len(clouds.labels) * fraction)
+
+
 def split(clouds: Clouds, fraction: float, seed: int) -> tuple[Clouds, Clouds]:
     """Hold out a random share of the training clouds for the curves under ``val/``."""
-    held_out = round(len(clouds.labels) * fraction)
+    held_out = held_out_clouds(clouds, fraction)
     order = torch.randperm(len(clouds.labels), generator=generator(seed, 2))
     rest, chosen = order[held_out:].sort().values, order[:held_out].sort().values
     return (

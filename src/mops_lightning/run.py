@@ -17,7 +17,14 @@ from mops_lightning.config import build, check
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.noise import noisy
 from mops_lightning.errors import Interrupted, UserError
-from mops_lightning.fit import device_name, fit, make_experiment, make_trainer, test
+from mops_lightning.fit import (
+    device_name,
+    fit,
+    held_out_clouds,
+    make_experiment,
+    make_trainer,
+    test,
+)
 from mops_lightning.summary import closing_lines
 
 STARTED = ".started"
@@ -71,7 +78,8 @@ def _begin(folder: Path) -> None:
         (folder / STARTED).touch(exist_ok=False)
     except FileExistsError:
         raise UserError(
-            f"{folder} holds another run and nothing is overwritten: start again for a new folder."
+            f"{folder} holds another run and nothing is overwritten: start again for a new folder, "
+            "and leave hydra.run.dir out or give another one."
         ) from None
 
 
@@ -92,6 +100,13 @@ def fit_and_test(
     }
     experiment = make_experiment(cfg, dataset, identity)
     task = experiment.task
+    trainer = make_trainer(cfg, folder, dataset, task)
+    several.check_shares(
+        cfg.batch_size,
+        len(dataset.test.labels),
+        held_out_clouds(dataset.train, cfg.val_fraction),
+        trainer.world_size,
+    )
     has_weights = any(True for _ in task.parameters())
     task_weights = None
     if not has_weights and cfg.weights not in (None, "auto", evaluate.OF_RUN):
@@ -110,8 +125,6 @@ def fit_and_test(
         record["notes"]["evaluated"] = evaluate.load(cfg, experiment, dataset)
     elif cfg.learn == "nothing" and experiment.sampler is not None and experiment.sampler.learned:
         raise UserError("learn=nothing needs a trained sampler: give its run with evaluate=RUN.")
-    trainer = make_trainer(cfg, folder, dataset, task)
-    several.check_shares(cfg.batch_size, len(dataset.test.labels), trainer.world_size)
     record["device"] = device_name(trainer)
     trains = experiment.trainable and not cfg.evaluate
     if trains:

@@ -4,6 +4,7 @@ Rank 0 leads: it alone writes files and prints. The others follow, and load, tra
 """
 
 import os
+from collections.abc import Sequence
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -28,6 +29,30 @@ def follows(cfg: DictConfig) -> bool:
     return asked_for(cfg) and any(_number(name) for name in RANKS)
 
 
+def check_start(cfg: DictConfig, hydra_overrides: Sequence[str]) -> None:
+    """Find mistakes of a run whose processes were started by torchrun or the like.
+
+    Args:
+        cfg: the run's settings.
+        hydra_overrides: what was typed for Hydra itself.
+
+    Raises:
+        UserError: the settings ask for one process, or every process would have its own folder.
+    """
+    number = _number("WORLD_SIZE")
+    if number > 1 and not asked_for(cfg):
+        raise UserError(
+            f"{number} processes were started (WORLD_SIZE), but trainer.devices=1. Give "
+            "trainer=ddp trainer.devices=N, as many as on this host, or start one process."
+        )
+    named = any(override.startswith("hydra.run.dir=") for override in hydra_overrides)
+    if started_together(cfg) and not named:
+        raise UserError(
+            "hydra.run.dir: processes that were started together need one folder. Give "
+            "hydra.run.dir=FOLDER, which all of them see."
+        )
+
+
 def started_together(cfg: DictConfig) -> bool:
     """Return whether a launcher such as torchrun started all processes, not this program."""
     return asked_for(cfg) and _number("WORLD_SIZE") + _number("SLURM_NTASKS") > 1
@@ -49,6 +74,8 @@ def check(cfg: DictConfig) -> None:
             f"trainer.devices must be a number of devices, a list of GPUs, auto or -1 (all), got "
             f"{devices!r}. Try trainer.devices=1."
         )
+    if devices == -1 and cfg.trainer.get("accelerator") == "cpu":
+        raise UserError("trainer.devices=-1 means all GPUs; on the CPU give a number of processes.")
     nodes = cfg.trainer.get("num_nodes", 1)
     if type(nodes) is not int or nodes < 1:
         raise UserError(f"trainer.num_nodes must be a number of hosts, got {nodes!r}.")
@@ -80,17 +107,28 @@ def check_multirun(cfg: DictConfig) -> None:
         )
 
 
-def check_shares(batch_size: int, test_clouds: int, processes: int) -> None:
+def check_shares(batch_size: int, test_clouds: int, held_out: int, processes: int) -> None:
     """Refuse data that do not go round.
+
+    Args:
+        batch_size: of all processes together.
+        test_clouds: how many there are.
+        held_out: how many training clouds are kept for ``val/``; 0 for none.
+        processes: how many share them.
 
     Raises:
         UserError: ``batch_size`` is no multiple of the number of processes, or leaves fewer than
-            two clouds to one of them, or there are fewer test clouds than processes.
+            two clouds to one of them, or there are fewer clouds than processes.
     """
     if test_clouds < processes:
         raise UserError(
             f"trainer.devices: {processes} devices are too many for {test_clouds} test clouds. "
             f"Try trainer.devices={test_clouds}."
+        )
+    if 0 < held_out < processes:
+        raise UserError(
+            f"val_fraction holds out {held_out} training clouds, fewer than the {processes} "
+            "devices. Try val_fraction=0, or a larger one."
         )
     if processes > 1 and (batch_size % processes or batch_size < 2 * processes):
         least = 2 * processes

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 
 import numpy as np
 import pytest
@@ -111,12 +112,14 @@ def test_a_folder_is_done_again_only_where_something_is_missing_or_bad(folder, t
         (["--m", 0, "--method", "fps"], "--m must be"),
         (["--m", 41, "--weights", "weights.pt"], "trained for up to 40 points, got 41"),
         (["--weights", "task.pt"], "holds a task net"),
-        (["--weights", "nowhere.pt"], "no file nowhere.pt"),
+        (["--weights", "nowhere.pt"], "--weights: no file nowhere.pt"),
         (["--weights", "weights.pt", "--keep-attributes", "--readout", "generated"], "are new"),
         (["--m", 500, "--method", "fps"], "holds 299 points, fewer than --m 500"),
         (["--m", 5, "--method", "fps", "--chunk", 9], "--chunk must be at least 1"),
         (["--weights", "weights.pt", "--chunk", 9], "--readout generated or matched"),
         (["--m", 5, "--method", "fps", "--workers", 0], "--workers must be"),
+        (["--m", 5, "--method", "fps", "--readout", "matched"], "--readout is for --weights"),
+        (["--m", 5, "--method", "fps", "--surface", -5], "--surface must be"),
         (["--m", 5, "--method", "fps", "--format", "stl"], "--format must be one of"),
     ],
 )
@@ -140,6 +143,11 @@ def test_nothing_is_overwritten_unasked(folder, tmp_path):
     assert call(source, target, *settings, "--overwrite")[0] == 0
     assert len(read(target, 9, 0).points) == 5
     assert "OUT is IN" in call(source, source, *settings)[2]
+    assert (
+        "holds coordinates alone"
+        in call(source, tmp_path / "out.obj", *settings, "--keep-attributes")[2]
+    )
+    assert "FileExistsError" in call(source, target / "below.ply", *settings)[2]
     assert "OUT must end in" in call(source, tmp_path / "out.stl", *settings)[2]
     assert "no such file or folder" in call(tmp_path / "no", target, *settings)[2]
 
@@ -200,3 +208,27 @@ def test_a_truncated_file_is_named_by_its_chunks(folder, tmp_path):
     path.write_bytes(path.read_bytes()[:-5])
     settings = ["--weights", folder, "--readout", "matched", "--chunk", 60]
     assert "ends after 89 points" in call(path, tmp_path / "out.ply", *settings)[2]
+
+
+def test_a_dead_worker_is_named_and_the_same_command_does_the_rest(folder, tmp_path, monkeypatch):
+    from mops_lightning.downsample import files
+
+    monkeypatch.setattr(files, "attempt", die)
+    settings = ["--method", "random", "--m", 5]
+    status, out, err = call(folder / "in", tmp_path, *settings, "--workers", 2)
+    assert status == 1
+    assert err.count("a worker process died") == 2
+    assert "2 files: 2 failed" in out
+    monkeypatch.undo()
+    assert call(folder / "in", tmp_path, *settings, "--workers", 2)[0] == 0
+
+
+def die(*_):
+    os._exit(9)
+
+
+def test_coordinates_beyond_measure_are_refused(folder, tmp_path):
+    np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(size=(9, 3)) * 1e200)
+    status, _, err = call(tmp_path / "a.npy", tmp_path / "b.npy", "--method", "fps", "--m", 4)
+    assert status == 2
+    assert "too large" in err

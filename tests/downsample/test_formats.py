@@ -64,6 +64,57 @@ def test_other_programs_read_what_is_written(table, tmp_path):
     np.testing.assert_array_equal(las["label"], table.columns["label"])
 
 
+AWKWARD = {
+    "x": np.arange(4),
+    "my col": np.arange(4) + 0.5,
+    "my_col": np.arange(4) * 3,
+    "id": np.arange(4) + 2**40,
+    "swapped": np.arange(4).astype(">u2") + 300,
+    "flag": np.array([True, False, True, True]),
+    "classification": np.array([-1, 1000, 2, 3]),
+    "intensity": np.linspace(0, 1, 4),
+    "time": 3e8 + np.arange(4) * 1e-4,
+}
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npz", ".txt", ".las"])
+def test_awkward_columns_keep_their_numbers(suffix, tmp_path):
+    points = np.random.default_rng(0).random((4, 3)) + np.array([1e6, 0, 0])
+    again = read(written(Table(points, AWKWARD), suffix, tmp_path), 9, 0)
+    np.testing.assert_allclose(again.points, points, rtol=0, atol=1e-6)
+    columns = [c for c in again.columns.values() if c.any()]
+    for name, column in AWKWARD.items():
+        assert any(np.array_equal(found, column) for found in columns), name
+
+
+def test_what_float32_would_move_is_not_written_as_float32(tmp_path):
+    points = np.random.default_rng(0).random((20, 3)) + 1e9
+    for suffix in (".pcd", ".obj", ".xyz"):
+        again = read(written(Table(points), suffix, tmp_path), 9, 0)
+        np.testing.assert_allclose(again.points, points, rtol=0, atol=1e-6)
+    with pytest.raises(UserError, match="holds float32"):
+        written(Table(points), ".bin", tmp_path)
+
+
+def test_texts_dates_and_lists_are_left_out(tmp_path):
+    rows = np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("n", "U3"), ("d", "M8[s]")])
+    np.save(tmp_path / "a.npy", rows)
+    assert not read(tmp_path / "a.npy", 9, 0).columns
+    np.savez(tmp_path / "a.npz", points=np.ones((3, 3)), names=np.array(["a", "b", "c"]))
+    assert not read(tmp_path / "a.npz", 9, 0).columns
+    head = "property float x\nproperty float y\nproperty float z\nproperty list uchar int l\n"
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex 2\n{head}end_header\n"
+    row = np.array([1, 2, 3], "<f4").tobytes() + b"\x01\x05\0\0\0"
+    (tmp_path / "a.ply").write_bytes(head.encode() + row * 2)
+    table = read(tmp_path / "a.ply", 9, 0)
+    np.testing.assert_array_equal(table.take(np.array([0])).points, [[1, 2, 3]])
+
+
+def test_faces_behind_a_tab_make_a_mesh(tmp_path):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf\t1 2 3\n")
+    assert len(read(tmp_path / "a.obj", 70, 0).points) == 70
+
+
 def test_a_las_file_keeps_its_kind_scale_and_dimensions(tmp_path):
     cloud = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
     cloud.header.offsets, cloud.header.scales = [1000] * 3, [0.01] * 3
@@ -147,14 +198,24 @@ def test_pcd_in_all_its_three_forms(tmp_path):
         "1,2,3\n4,5,6\n",
         "x;y;z\n1;2;3\n4;5;6\n",
         "# a\n// b\n1\t2\t3\n4 5 6",
+        "\ufeff1 2 3\n4 5 6\n",
+        "1 2 3 # first\n4 5 6 # second\n",
+        "I X Y Z\n9 1 2 3\n9 4 5 6\n",
+        "//Z;X;Y\n3;1;2\n6;4;5\n",
         "2\n1 2 3\n4 5 6\n",
         "a b c\n1 2 3\n4 5 6\n",
     ],
 )
 def test_text_in_the_usual_dialects(text, tmp_path):
     path = tmp_path / "a.xyz"
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     np.testing.assert_array_equal(read(path, 9, 0).points, [[1, 2, 3], [4, 5, 6]])
+
+
+ASCII = (
+    "ply\nformat ascii 1.0\nelement vertex 2\n"
+    "property float x\nproperty float y\nproperty float z\nend_header\n"
+)
 
 
 def test_ascii_ply_and_a_mesh(tmp_path):
@@ -180,7 +241,9 @@ def test_ascii_ply_and_a_mesh(tmp_path):
         ("a.xyz", b"1 2 3\n4 5\n", "a.xyz is broken"),
         ("a.txt", b"1 2\n3 4\n", "rows of x, y, z"),
         ("a.npy", b"no", "a.npy is broken"),
-        ("a.bin", b"12345678", "no KITTI scan"),
+        ("a.bin", b"12345678" * 3, "no KITTI scan"),
+        ("a.txt", b"1 2 abc\n3 4 5\n", "a.txt is broken"),
+        ("a.ply", ASCII.encode() + b"1 2 3\n", "announces 2 points, not 1"),
         ("a.pcd", b"VERSION 7", "no DATA line"),
         ("a.pcd", HEAD.encode() + b"DATA binary\n123", "a.pcd is broken"),
         ("a.pcd", HEAD.encode() + b"DATA binary_compressed\n\x03\0\0\0\x80\x02\0\0123", "broken"),

@@ -144,6 +144,7 @@ def _load(data: bytes, kind: str) -> trimesh.Trimesh:
     if text:
         # Comments may be in any old encoding, and trimesh guesses it with a package of its own.
         data = data.decode("utf-8" if _is_utf8(data) else "latin-1").encode()
+        data = data.replace(b"\t", b" ")  # it knows an OBJ's faces by "f " only
     # Materials have no say in the surface, and their files may be missing.
     extra: dict[str, Any] = {"skip_materials": True} if kind in (".obj", ".glb") else {}
     scene: Any = trimesh.load(

@@ -5,7 +5,8 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import as_completed
+from concurrent.futures import Future, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -55,7 +56,6 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--readout",
         choices=("generated", "matched", "completed"),
-        default="completed",
         help="of a trained sampler: its new points, the input points nearest to them, or these "
         "without doubles, filled up to m by farthest point sampling (the default)",
     )
@@ -70,15 +70,18 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(chosen: argparse.Namespace) -> int:
-    from mops_lightning.downsample.job import Settings, run, sampler_of
+    from mops_lightning.downsample.files import attempt
+    from mops_lightning.downsample.job import Settings, sampler_of
 
+    if chosen.readout and chosen.method:
+        raise UserError(f"--readout is for --weights: --method {chosen.method} keeps input points.")
     if chosen.workers < 1:
         raise UserError(f"--workers must be at least 1, got {chosen.workers}.")
     settings = Settings(
         chosen.m,
         chosen.weights,
         chosen.method,
-        chosen.readout,
+        chosen.readout or "completed",
         chosen.keep_attributes,
         chosen.surface,
         chosen.seed,
@@ -91,12 +94,15 @@ def _run(chosen: argparse.Namespace) -> int:
         if target.exists() and not chosen.overwrite:
             raise UserError(f"{target} is there already. Give another OUT, or --overwrite.")
         start = time.perf_counter()
-        number, whole, dropped = run(source, target, settings)
+        result = attempt(source, target, settings, None)
+        if isinstance(result, UserError):
+            raise result
+        number, whole, dropped = result
         print(f"{target}: {_said(number, whole, dropped)}, {time.perf_counter() - start:.1f} s")
         return 0
     done: Counter[str] = Counter()
     todo = [job for job in jobs if chosen.overwrite or not job[1].exists()]
-    failures = {}
+    failures, dropped = {}, 0
     with _mapped(todo, settings, chosen.workers) as results:
         for (source, _), result in track(
             results, "downsampling", total=len(todo), disable=not sys.stdout.isatty()
@@ -104,12 +110,16 @@ def _run(chosen: argparse.Namespace) -> int:
             done["failed" if isinstance(result, UserError) else "done"] += 1
             if isinstance(result, UserError):
                 failures[source] = result
+            else:
+                dropped += result[2]
     if len(jobs) > len(todo):
         done["there already"] = len(jobs) - len(todo)
-    for _, error in sorted(failures.items()):
-        print(f"failed: {error}", file=sys.stderr)
+    for source, error in sorted(failures.items()):
+        name = "" if str(source) in str(error) else f"{source}: "
+        print(f"failed: {name}{error}", file=sys.stderr)
     counts = ", ".join(f"{number} {state}" for state, number in done.items())
-    print(f"{len(jobs)} files: {counts}; in {chosen.target}")
+    left = f"; {dropped:,} points without finite coordinates left out" if dropped else ""
+    print(f"{len(jobs)} files: {counts}{left}; in {chosen.target}")
     return 1 if failures else 0
 
 
@@ -133,13 +143,15 @@ def _jobs(chosen: argparse.Namespace) -> list[tuple[Path, Path]]:
         own = path.suffix.lower()
         return wanted or (own if own in WRITERS else ".ply")
 
+    if chosen.keep_attributes and ".obj" in (wanted, target.suffix.lower()):
+        raise UserError("--keep-attributes: .obj holds coordinates alone. Take .ply, .pcd or .npz.")
+    if target.resolve() == source.resolve():
+        raise UserError(f"OUT is IN, {source}: give another.")
     if not source.is_dir():
         if target.is_dir():
             target = target / f"{source.stem}{suffix(source)}"
         if target.suffix.lower() not in WRITERS:
             raise UserError(f"OUT must end in one of {writable}, got {target}.")
-        if target.resolve() == source.resolve():
-            raise UserError(f"OUT is IN, {source}: give another file.")
         return [(source, target)]
     if target.is_file():
         raise UserError(f"OUT must be a folder, as IN is one, got the file {target}.")
@@ -152,8 +164,19 @@ def _jobs(chosen: argparse.Namespace) -> list[tuple[Path, Path]]:
     twice = [path for path, number in Counter(path for _, path in jobs).items() if number > 1]
     if twice:
         both = ", ".join(str(p) for p, goal in jobs if goal == twice[0])
-        raise UserError(f"{both} would both become {twice[0]}. Leave --format out, or rename one.")
+        raise UserError(f"{both} would become {twice[0]}. Rename one, or give another --format.")
     return jobs
+
+
+def _result(future: Future[Any]) -> Any:
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        pool.cache_clear()
+        return UserError(
+            "a worker process died, perhaps for want of memory, and took this file along: the "
+            "same command does the rest; try it with fewer --workers."
+        )
 
 
 @contextmanager
@@ -167,7 +190,7 @@ def _mapped(jobs: list[tuple[Path, Path]], settings: Any, workers: int) -> Itera
     workers = min(workers, len(jobs))
     futures = {pool(workers).submit(attempt, *job, settings, workers): job for job in jobs}
     try:
-        yield ((futures[future], future.result()) for future in as_completed(futures))
+        yield ((futures[future], _result(future)) for future in as_completed(futures))
     finally:
         for future in futures:
             future.cancel()

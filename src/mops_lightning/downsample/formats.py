@@ -1,5 +1,6 @@
 """Which file formats can be read and written, and by what."""
 
+import re
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -10,7 +11,14 @@ from numpy.typing import NDArray
 
 from mops_lightning.data.mesh_io import SUFFIXES as MESHES
 from mops_lightning.downsample import las, pcd
-from mops_lightning.downsample.table import BadCloudError, Column, Table, from_array
+from mops_lightning.downsample.table import (
+    BadCloudError,
+    Column,
+    Table,
+    coordinates,
+    from_array,
+    unique_names,
+)
 
 PLY_TYPES = {
     "f4": "float", "f8": "double", "i1": "char", "u1": "uchar",
@@ -20,39 +28,51 @@ PLY_TYPES = {
 
 def read_text(path: Path) -> Table:
     """Read rows of numbers between blanks, commas or semicolons, with or without a head line."""
-    text = path.read_text(encoding="latin-1")
-    lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] not in "#/"]
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    lines = [re.split("#|//", line)[0].strip() for line in text.splitlines()]
+    lines = [line for line in lines if line]
     if not lines:
         raise BadCloudError(f"{path} is empty.")
-    comma = next((mark for mark in ",;" if mark in lines[0]), None)
-    notes = [line.strip().lstrip("#/ ").split(comma) for line in text.splitlines()]
-    width = len(lines[0].split(comma))
-    # A head line, perhaps behind a comment sign: as many words as columns, x, y and z among them.
-    heads = [words for words in notes[:20] if len(words) == width and {"x", "y", "z"} <= {*words}]
-    names = [word.strip() for word in heads[0]] if heads else []
+    mark = next((mark for mark in ",;" if mark in lines[-1]), None)
+    if len(lines) > 1 and len(lines[0].split(mark)) == 1 and lines[0].isdigit():
+        lines.pop(0)  # how many points there are
+    if not any(map(_is_number, lines[0].split(mark))):
+        lines.pop(0)  # names of the columns, or of something else
     try:
-        [float(word) for word in lines[0].split(comma)]
-    except ValueError:
-        lines.pop(0)
-    try:
-        array = np.loadtxt(lines, delimiter=comma, ndmin=2)
+        array = np.loadtxt(lines, delimiter=mark, ndmin=2)
     except ValueError as error:
-        if len(lines) > 1 and len(lines[0].split(comma)) == 1:  # the XYZ of chemists: a count first
-            return _numbers(np.loadtxt(lines[1:], delimiter=comma, ndmin=2), path)
-        raise BadCloudError(f"{path} is broken: {error}.") from None
-    if names:
-        return from_array(array, names, path)
+        raise BadCloudError(f"{path} is broken: {str(error).rstrip('.')}.") from None
+    # A head line may stand behind a comment sign: as many words as columns, x, y, z among them.
+    for line in text.lstrip("\ufeff").splitlines()[:20]:
+        words = [word.strip() for word in line.strip().lstrip("#/ ").split(mark)]
+        if len(words) == array.shape[1] and {"x", "y", "z"} <= {word.lower() for word in words}:
+            return from_array(array, words, path)
     return _numbers(array, path)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def write_text(path: Path, table: Table) -> None:
     """Write ``x y z`` and the columns, blanks between, with all digits that count."""
-    columns = [*table.points.T, *table.columns.values()]
-    kinds = ["%.9g" if c.dtype.kind == "f" else "%d" for c in columns]
-    kinds[:3] = ["%.10g"] * 3
-    named = [name for name in table.columns if not name.startswith("column_")]
-    head = " ".join(["x", "y", "z", *table.columns]) if named else ""
+    named = unique_names(table)
+    columns = [*coordinates(table).T, *named.values()]
+    plain = all(name.startswith("column_") for name in named)
+    head = "" if plain else " ".join(["x", "y", "z", *named])
+    kinds = [_digits(column) for column in columns]
     np.savetxt(path, _structured(columns), fmt=kinds, header=head, comments="# ")
+
+
+def _digits(column: Column) -> str:
+    if column.dtype.kind != "f":
+        return "%d"
+    short = column.dtype.itemsize <= 4 or np.array_equal(column.astype("f4"), column)
+    return "%.9g" if short else "%.17g"
 
 
 def read_npy(path: Path) -> Table:
@@ -83,6 +103,8 @@ def read_npz(path: Path) -> Table:
         array = arrays[name]
         if name == chosen[0] or array.ndim == 0 or len(array) != len(table.points):
             continue
+        if array.dtype.kind not in "fiub":
+            continue
         if array.ndim == 1:
             columns[name] = array
         elif array.ndim == 2:
@@ -92,23 +114,30 @@ def read_npz(path: Path) -> Table:
 
 def write_npz(path: Path, table: Table) -> None:
     """Write ``points`` and one array for every column."""
+    named = unique_names(table)
     with path.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, points=table.points, **table.columns)
+        np.savez_compressed(file, allow_pickle=False, points=table.points, **named)
 
 
 def read_bin(path: Path) -> Table:
     """Read KITTI's scans: float32 x, y, z, intensity."""
-    numbers = np.fromfile(path, "<f4")
-    if not len(numbers) or len(numbers) % 4:
-        raise BadCloudError(f"{path} is no KITTI scan: {len(numbers)} floats are no rows of four.")
-    rows = numbers.reshape(-1, 4)
+    length = path.stat().st_size
+    if not length or length % 16:
+        raise BadCloudError(f"{path} is no KITTI scan: {length} bytes are no rows of four floats.")
+    rows = np.fromfile(path, "<f4").reshape(-1, 4)
     return from_array(rows, ["x", "y", "z", "intensity"], path)
 
 
 def write_bin(path: Path, table: Table) -> None:
-    """Write KITTI's form; without an intensity it is 0."""
-    intensity = table.columns.get("intensity", np.zeros(len(table.points)))
-    path.write_bytes(np.column_stack([table.points, intensity]).astype("<f4").tobytes())
+    """Write KITTI's form, float32 alone; without an intensity it is 0."""
+    axes = coordinates(table)
+    if axes.dtype != np.float32:
+        raise BadCloudError(
+            f"{path}: .bin holds float32, which would move these points, far from the origin, by "
+            "more than a millionth of their extent. Write .ply, .npy or .las."
+        )
+    intensity = table.columns.get("intensity", np.zeros(len(axes)))
+    path.write_bytes(np.column_stack([axes, intensity]).astype("<f4").tobytes())
 
 
 def read_ply(path: Path) -> Table | None:
@@ -119,7 +148,8 @@ def read_ply(path: Path) -> Table | None:
         found: Any = load_ply(BytesIO(path.read_bytes()))
     if "faces" in found and len(found["faces"]):
         return None
-    data = found["metadata"]["_ply_raw"]["vertex"]["data"]
+    vertex = found["metadata"]["_ply_raw"]["vertex"]
+    data, announced = vertex["data"], vertex["length"]
     if isinstance(data, dict):  # of an ascii file: columns of shape (N, 1)
         flat = {name: np.asarray(column) for name, column in data.items()}
         flat = {n: c[:, 0] if c.ndim == 2 and c.shape[1] == 1 else c for n, c in flat.items()}
@@ -128,36 +158,40 @@ def read_ply(path: Path) -> Table | None:
         for name, column in flat.items():
             array[name] = column
         data = array
+    if len(data) < announced:
+        raise BadCloudError(f"{path} is broken: it announces {announced} points, not {len(data)}.")
     return from_array(data, list(data.dtype.names), path)
 
 
 def write_ply(path: Path, table: Table) -> None:
-    """Write binary PLY: double coordinates where float32 would lose digits, else float."""
-    single = table.points.astype("<f4")
-    lost = np.abs(single - table.points).max()
-    exact = not lost > 1e-6 * np.ptp(table.points, axis=0).max()
-    axes = single if exact else table.points
-    arrays = [*axes.T, *(column.astype(_ply_kind(column)) for column in table.columns.values())]
+    """Write binary PLY: float coordinates, or double where float would lose digits."""
+    named = unique_names(table)
+    arrays = [
+        *coordinates(table).T,
+        *(column.astype(_ply_kind(column)) for column in named.values()),
+    ]
     rows = _structured(arrays)
-    names = ["x", "y", "z", *(name.replace(" ", "_") for name in table.columns)]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    for name, array in zip(names, arrays, strict=True):
+    for name, array in zip(["x", "y", "z", *named], arrays, strict=True):
         lines.append(f"property {PLY_TYPES[array.dtype.str[1:]]} {name}")
     path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + rows.tobytes())
 
 
 def write_obj(path: Path, table: Table) -> None:
     """Write vertices alone."""
-    np.savetxt(path, table.points, fmt="v %.10g %.10g %.10g")
+    axes = coordinates(table)
+    np.savetxt(path, axes, fmt=f"v {' '.join([_digits(axes)] * 3)}")
 
 
 def _ply_kind(column: Column) -> str:
-    kind = column.dtype.kind
-    if kind in "iub" and column.dtype.itemsize == 8:
-        return "<i4"
-    return {"b": "<u1", "f": f"<f{max(column.dtype.itemsize, 4)}"}.get(
-        kind, column.dtype.newbyteorder("<").str
-    )
+    """Return the PLY type that holds a column: there are no whole numbers of 64 bits."""
+    kind, size = column.dtype.kind, column.dtype.itemsize
+    if kind in "iu" and size == 8:
+        small = len(column) == 0 or (column.min() >= -(2**31) and column.max() < 2**31)
+        return "<i4" if small else "<f8"
+    if kind == "f":
+        return f"<f{min(max(size, 4), 8)}"
+    return "<u1" if kind == "b" else column.dtype.newbyteorder("<").str
 
 
 def _structured(arrays: list[Column]) -> NDArray[Any]:

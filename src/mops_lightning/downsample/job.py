@@ -1,5 +1,6 @@
 """One file: read, normalised as in training, sampled, mapped back, written."""
 
+import re
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -73,6 +74,8 @@ class Settings:
                 "--chunk must be at least 1 and goes with --weights of MOPS-Net and --readout "
                 "generated or matched: everything else needs the whole cloud at once."
             )
+        if self.surface is not None and self.surface < 1:
+            raise UserError(f"--surface must be at least 1, got {self.surface}.")
         if self.readout not in GENERATED_READOUTS:
             raise UserError(f"--readout must be one of {', '.join(GENERATED_READOUTS)}.")
         if self.keep_attributes and self.weights and self.readout == "generated":
@@ -102,6 +105,8 @@ def sampler_of(settings: Settings) -> Sampler:
     assert settings.weights is not None
     path = settings.weights.expanduser()
     path = path / weights.FILE if path.is_dir() else path
+    if not path.is_file():
+        raise UserError(f"--weights: no file {path}. Give a weights.pt, or the folder of its run.")
     content = weights.load(path)
     if content["config"]["learn"] == "task":
         raise UserError(f"--weights: {path} holds a task net; give a sampler's run.")
@@ -145,7 +150,7 @@ def run(source: Path, target: Path, settings: Settings) -> tuple[int, int, int]:
     table = table.take(finite) if dropped else table
     if len(table.points) < m:
         raise BadCloudError(f"{source} holds {len(table.points)} points, fewer than --m {m}.")
-    kept = sampled(table, sampler, m, settings)
+    kept = sampled(source, table, sampler, m, settings)
     _write(target, kept)
     return len(kept.points), len(table.points), dropped
 
@@ -175,8 +180,8 @@ def read(path: Path, surface: int, seed: int) -> Table:
         raise BadCloudError(f"{path} is broken: {type(error).__name__}: {error}.") from None
     if table is not None:
         return table
-    if suffix == ".obj" and not any(line.startswith(b"f ") for line in data.splitlines()):
-        words = [line.split()[1:4] for line in data.splitlines() if line.startswith(b"v ")]
+    if suffix == ".obj" and not re.search(rb"^f\s", data, re.M):
+        words = [line.split()[1:4] for line in data.splitlines() if line[:2] in (b"v ", b"v\t")]
         if not words:
             raise BadCloudError(f"{path} holds no vertices.")
         return Table(np.array(words, np.float64))
@@ -187,10 +192,13 @@ def read(path: Path, surface: int, seed: int) -> Table:
     return Table(np.asarray(points, np.float64), columns)
 
 
-def sampled(table: Table, sampler: Sampler, m: int, settings: Settings) -> Table:
+def sampled(source: Path, table: Table, sampler: Sampler, m: int, settings: Settings) -> Table:
     """Return the kept points of a table, with their attributes if asked for."""
     centre = table.points.mean(0)
-    radius = float(np.linalg.norm(table.points - centre, axis=1).max()) or 1.0
+    with np.errstate(over="ignore"):
+        radius = float(np.linalg.norm(table.points - centre, axis=1).max()) or 1.0
+    if not np.isfinite(radius):
+        raise BadCloudError(f"{source} has coordinates too large to be measured.")
     points = torch.from_numpy(((table.points - centre) / radius).astype(np.float32))
     with torch.no_grad():
         rows, generated = _chosen(points, sampler, m, settings)

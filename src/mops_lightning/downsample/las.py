@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from mops_lightning.downsample.table import BadCloudError, Table
+from mops_lightning.downsample.table import BadCloudError, Column, Table, unique_names
 from mops_lightning.errors import UserError
 
 
@@ -45,13 +45,28 @@ def write(path: Path, table: Table) -> None:
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = table.points.T
     known = set(cloud.point_format.dimension_names)
-    for name, column in table.columns.items():
-        if name in known:
-            cloud[name] = column
-        elif name.isidentifier():
-            cloud.add_extra_dim(laspy.ExtraBytesParams(name=name[:32], type=column.dtype))
-            cloud[name[:32]] = column
+    for name, column in unique_names(table).items():
+        if name in known and _kept_exactly(cloud, name, column):
+            continue
+        kind = np.dtype("u1") if column.dtype.kind == "b" else column.dtype.newbyteorder("=")
+        kind = np.dtype("f4") if kind == np.dtype("f2") else kind
+        own = (f"{name}_" if name in known else name)[:32]
+        cloud.add_extra_dim(laspy.ExtraBytesParams(name=own, type=kind))
+        cloud[own] = column.astype(kind)
     cloud.write(path)
+
+
+def _kept_exactly(cloud: Any, name: str, column: Column) -> bool:
+    """Put a column into a dimension of LAS, if that has room for its numbers."""
+    try:
+        with np.errstate(all="ignore"):
+            cloud[name] = column
+        exact = np.array_equal(np.asarray(cloud[name]), column)
+    except (OverflowError, TypeError, ValueError):
+        exact = False
+    if not exact:
+        cloud[name] = np.zeros(len(column), np.uint8)
+    return exact
 
 
 def laspy_for(path: Path) -> Any:

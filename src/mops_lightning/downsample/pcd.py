@@ -6,7 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.downsample.table import BadCloudError, Table, from_array
+from mops_lightning.downsample.table import (
+    BadCloudError,
+    Table,
+    coordinates,
+    from_array,
+    unique_names,
+)
 
 KINDS = {"F": "f", "I": "i", "U": "u"}
 HEAD = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS")
@@ -41,12 +47,11 @@ def read(path: Path) -> Table:
 
 
 def write(path: Path, table: Table) -> None:
-    """Write a binary PCD file; coordinates as float32, which is what PCL reads."""
-    arrays = {axis: table.points[:, place].astype("<f4") for place, axis in enumerate("xyz")}
-    arrays |= {name: np.ascontiguousarray(column) for name, column in table.columns.items()}
-    arrays = {name.replace(" ", "_"): array for name, array in arrays.items()}
+    """Write a binary PCD file: coordinates as float32, or double where that would lose digits."""
+    arrays = dict(zip("xyz", coordinates(table).T, strict=True)) | unique_names(table)
     kinds = {"f": "F", "i": "I", "u": "U", "b": "U"}
-    array = np.empty(len(table.points), [(name, a.dtype.str) for name, a in arrays.items()])
+    fields = [(name, a.dtype.newbyteorder("<").str) for name, a in arrays.items()]
+    array = np.empty(len(table.points), fields)
     for name, values in arrays.items():
         array[name] = values
     types = [kinds[a.dtype.kind] for a in arrays.values()]

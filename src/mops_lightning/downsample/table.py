@@ -23,7 +23,8 @@ class Table:
 
     Attributes:
         points: ``(N, 3)`` float64 coordinates in the file's own unit.
-        columns: further numbers per point, ``(N,)`` each, under the file's names.
+        columns: further numbers per point, ``(N,)`` each, under the file's names. Texts, dates and
+            lists are left out.
         head: what a format needs to write the like again (LAS: its header).
     """
 
@@ -39,6 +40,29 @@ class Table:
     def bare(self) -> "Table":
         """Return the points alone."""
         return Table(self.points, {}, self.head)
+
+
+RESERVED = ("x", "y", "z", "points")
+
+
+def unique_names(table: Table) -> dict[str, Column]:
+    """Return the columns under names that a file's head can hold: no blanks, no two the same."""
+    named: dict[str, Column] = {}
+    for name, column in table.columns.items():
+        plain = "_".join(name.split()) or "column"
+        while plain.lower() in RESERVED or plain in named:
+            plain += "_"
+        named[plain] = column
+    return named
+
+
+def coordinates(table: Table) -> NDArray[Any]:
+    """Return the points as float32 where that moves none by a millionth of the cloud's size."""
+    single = table.points.astype("<f4")
+    finite = np.isfinite(table.points).all(axis=1)
+    lost = np.abs(single - table.points)[finite].max(initial=0.0)
+    extent = np.ptp(table.points[finite], axis=0).max() if finite.any() else 0.0
+    return single if lost <= 1e-6 * extent else table.points
 
 
 def from_array(array: NDArray[Any], names: list[str], path: Path, head: Any = None) -> Table:
@@ -63,4 +87,5 @@ def from_array(array: NDArray[Any], names: list[str], path: Path, head: Any = No
     axes = [lower[axis] for axis in "xyz"]
     points = np.stack([np.asarray(column(axis), np.float64) for axis in axes], 1)
     rest = {name: column(name) for name in names if name not in axes}
-    return Table(points, {name: c for name, c in rest.items() if c.ndim == 1}, head)
+    numbers = {name: c for name, c in rest.items() if c.ndim == 1 and c.dtype.kind in "fiub"}
+    return Table(points, numbers, head)
