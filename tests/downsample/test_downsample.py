@@ -161,6 +161,7 @@ def test_real_scans(real_data, tmp_path):
     fragment = read(tmp_path / "fragment.pcd", 9, 0)
     assert len(fragment.points) == 100
     assert "normal_x" in fragment.columns
+    assert "nx" in read(tmp_path / "stanford-bunny.ply", 9, 0).columns  # .obj has no room
     assert len(read(tmp_path / "kitti_000000.bin", 9, 0).columns["intensity"]) == 100
 
 

@@ -141,7 +141,8 @@ def _jobs(chosen: argparse.Namespace) -> list[tuple[Path, Path]]:
 
     def suffix(path: Path) -> str:
         own = path.suffix.lower()
-        return wanted or (own if own in WRITERS else ".ply")
+        bare = own == ".obj" and chosen.keep_attributes  # it has no room for them
+        return wanted or (own if own in WRITERS and not bare else ".ply")
 
     if chosen.keep_attributes and ".obj" in (wanted, target.suffix.lower()):
         raise UserError("--keep-attributes: .obj holds coordinates alone. Take .ply, .pcd or .npz.")
