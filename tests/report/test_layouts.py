@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from matplotlib.colors import LogNorm, Normalize
 
 from mops_lightning import records
 from mops_lightning.cloud_files import save_clouds
@@ -99,6 +100,22 @@ def put_planes(folder):
                 values,
                 of={"beta": beta, "gamma": gamma},
             )
+
+
+@pytest.mark.parametrize(("far", "kind"), [(3.0, Normalize), (12000.0, LogNorm)])
+def test_colours_are_logarithmic_where_one_figure_would_hide_the_rest(far, kind, tmp_path):
+    for sampler, keys in (("mops", ("alpha", "tau")), ("samplenet", ("beta", "gamma"))):
+        for down, across in ((1, 1), (1, 2), (2, 1), (2, 2)):
+            corner = sampler == "samplenet" and down + across == 4
+            values = {"generated": far if corner else 1.0 + across, "matched": 2.0}
+            settings = dict(zip(keys, (down, across), strict=True))
+            put_cell(tmp_path, f"{sampler}{down}{across}", sampler, values, of=settings)
+    figure = plots(build(tmp_path))["nre_cd_planes"]
+    images = [image for axis in figure.axes for image in axis.images]
+    assert {type(image.norm) for image in images} == {kind}
+    assert len({(image.norm.vmin, image.norm.vmax) for image in images}) == 1, "one for all"
+    texts = [text.get_text() for axis in figure.axes for text in axis.texts]
+    assert ("12,000" if kind is LogNorm else "3") in texts
 
 
 def test_two_settings_make_a_plane_for_each_sampler(tmp_path):

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from mops_lightning import units
@@ -14,6 +15,9 @@ from mops_lightning.readout_names import GENERATED_READOUTS, INDEX_READOUT
 from mops_lightning.report.axes import Axes, row, value
 from mops_lightning.report.build import Report, plane
 from mops_lightning.report.cells import Cells, place
+
+WIDE = 20
+"""A heat map whose largest figure is so many times its smallest has logarithmic colours."""
 
 
 def plots(report: Report) -> dict[str, Figure]:
@@ -100,6 +104,12 @@ def curves(table: Cells, axes: Axes) -> Figure:
     return figure
 
 
+def _shades(low: float, high: float) -> Normalize:
+    """Return the shared scale of colours: of logarithms where one end would hide all else."""
+    wide = low > 0 and high > WIDE * low
+    return LogNorm(low, high) if wide else Normalize(low, high)
+
+
 def heat_maps(table: Cells, axes: Axes) -> Figure:
     """Draw the planes of all samplers, one row each, a column for each readout, in one scale."""
     assert axes.planes is not None
@@ -108,6 +118,7 @@ def heat_maps(table: Cells, axes: Axes) -> Figure:
     everything = [one for by in found.values() for values in by.values() for one in values.values()]
     scale = units.scale(table.metric)
     low, high = scale * min(everything), scale * max(everything)
+    shades = _shades(low, high)
     width = max(len(by) for by in found.values())
     figure = Figure(figsize=(3.6 * width + 1, 3.2 * len(names)), layout="constrained")
     FigureCanvasAgg(figure)
@@ -120,14 +131,12 @@ def heat_maps(table: Cells, axes: Axes) -> Figure:
             grid = np.full((len(ys), len(xs)), np.nan)
             for (y, x), one in values.items():
                 grid[ys.index(y), xs.index(x)] = scale * one
-            image = axis.imshow(grid, vmin=low, vmax=high, origin="lower", aspect="auto")
+            image = axis.imshow(grid, norm=shades, origin="lower", aspect="auto")
             for (i, j), one in np.ndenumerate(grid):
                 if not np.isnan(one):
-                    light = one < (low + high) / 2
-                    colour = "white" if light else "black"
-                    axis.text(
-                        j, i, f"{one:.4g}", ha="center", va="center", color=colour, fontsize=7
-                    )
+                    colour = "white" if shades(one) < 0.5 else "black"
+                    text = f"{one:.4g}" if one < 1e4 else f"{one:,.0f}"
+                    axis.text(j, i, text, ha="center", va="center", color=colour, fontsize=7)
             axis.set_xticks(range(len(xs)), [f"{x:g}" for x in xs])
             axis.set_yticks(range(len(ys)), [f"{y:g}" for y in ys])
             axis.set_xlabel(across.split(".")[-1])
