@@ -256,7 +256,7 @@ class Experiment(L.LightningModule):
     def _log_loss(self, key: str, value: Tensor, size: int) -> None:
         """Log a mean over clouds that may be spread unevenly over processes."""
         if key not in self.loss_means:
-            self.loss_means[key] = MeanMetric().to(self.device)
+            self.loss_means[key] = MeanMetric(nan_strategy="disable").to(self.device)
         mean: Any = self.loss_means[key]
         mean.update(value, size)
         self.log(key, mean, batch_size=size, metric_attribute=f"loss_means.{key}")
