@@ -36,7 +36,7 @@ def cloud(number: int, clouds: int = 1) -> Tensor:
 def frozen(net: nn.Module, points: Tensor) -> Tensor:
     """Return the points that a sampler, or a plain twin, gives in evaluation."""
     with torch.no_grad():
-        made = net.eval()(points)
+        made = net.eval().requires_grad_(False)(points)
     return made if isinstance(made, Tensor) else made.points
 
 
@@ -88,7 +88,7 @@ def large(peak: dict[str, float], rounds: int) -> list[Row]:
             "fps": f"farthest_point_sample(points, {m})",
         }
         for row in _rows("sampler", calls, {"N": 40960, "m": m}, rounds, peak):
-            memory = peak_memory(_SETUP.format(number=40960, m=m), bodies[row["sampler"]])
+            memory, _ = peak_memory(_SETUP.format(number=40960, m=m), bodies[row["sampler"]])
             rows.append({**row, "peak_bytes": memory})
     return rows
 
@@ -155,16 +155,13 @@ def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
 
 
 def growth(peak: dict[str, float], rounds: int) -> list[Row]:
-    """Time and memory as N grows to 10,000,000, in chunks of 65,536, m=4,096."""
-    sampler = MOPSNet(4096).eval()
+    """Time and memory as N grows to 10,000,000, in chunks of 65,536, m=4,096; one call each."""
     rows: list[Row] = []
     for number in (100_000, 1_000_000, 10_000_000):
-        calls: Calls = {"mops, in chunks": partial(chunked, sampler, cloud(number), 65536)}
-        few = min(rounds, 3 if number < 1_000_000 else 2)
-        names = {"N": number, "m": 4096}
-        (row,) = _rows("sampler", calls, names, few, peak, warm_up=int(number < 1_000_000))
         setup = _SETUP.format(number=number, m=4096)
-        rows.append({**row, "peak_bytes": peak_memory(setup, "chunked(s.eval(), points, 65536)")})
+        memory, seconds = peak_memory(setup, "chunked(s.eval(), points, 65536)")
+        names = {"sampler": "mops, in chunks", "N": number, "m": 4096}
+        rows.append({**names, "seconds": seconds, "rounds": 1, "peak_bytes": memory})
     return rows
 
 
@@ -180,14 +177,12 @@ def _rows(
     rounds: int,
     peak: dict[str, float],
     clouds: int = 1,
-    warm_up: int = 2,
 ) -> list[Row]:
     """Time the calls in turns; one row for each, per cloud."""
     rows = []
-    for name, timing in interleaved(calls, rounds, warm_up).items():
+    for name, timing in interleaved(calls, rounds).items():
         row = {kind: name, **names, **_seconds(timing, clouds)}
-        # Counting walks through the call once more: not for those that take many seconds.
-        operations = flops(calls[name]) if timing.median < 10 else 0
+        operations = flops(calls[name])
         if operations:
             reached = operations / timing.median / peak["flops"]
             row |= {"flop": operations / clouds, "share_of_ceiling": reached}

@@ -37,15 +37,12 @@ class Timing(NamedTuple):
     rounds: int
 
 
-def interleaved(
-    cases: Mapping[str, Callable[[], Any]], rounds: int = 7, warm_up: int = WARM_UP
-) -> dict[str, Timing]:
+def interleaved(cases: Mapping[str, Callable[[], Any]], rounds: int = 7) -> dict[str, Timing]:
     """Time several calls in turns, so that a slow spell of the machine meets all of them.
 
     Args:
         cases: what to call, by name.
         rounds: how often each is timed.
-        warm_up: calls before any is timed.
 
     Returns:
         By name, the median and quartiles of the seconds of one call.
@@ -53,7 +50,7 @@ def interleaved(
     repeats = {}
     for name, call in cases.items():
         last = LEAST
-        for _ in range(warm_up):
+        for _ in range(WARM_UP):
             start = time.perf_counter()
             _wait(call())
             last = time.perf_counter() - start
@@ -108,20 +105,28 @@ def ceiling(rounds: int = 7) -> dict[str, float]:
 
 
 PEAK = """
-import resource
+import re
 import sys
+import time
+from pathlib import Path
 sys.path[:0] = {path!r}
 import torch
 torch.set_num_threads({threads})
 {setup}
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+def status(name):
+    text = Path("/proc/self/status").read_text()
+    return int(re.search(name + ":[^0-9]*([0-9]+)", text)[1]) * 1024
+Path("/proc/self/clear_refs").write_text("5")  # getrusage knows the peak of the parent, too
+before = status("VmRSS")
+start = time.perf_counter()
 {call}
-print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
+print(time.perf_counter() - start)
+print(status("VmHWM") - before)
 """
 
 
-def peak_memory(setup: str, call: str) -> int:
-    """Return the bytes by which a statement raises the peak of a process of its own.
+def peak_memory(setup: str, call: str) -> tuple[int, float]:
+    """Return the bytes by which a statement raises the peak of a process of its own, and seconds.
 
     Args:
         setup: statements before; what they hold is not counted.
@@ -132,7 +137,8 @@ def peak_memory(setup: str, call: str) -> int:
     done = subprocess.run(
         [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=os.environ
     )
-    return int(done.stdout.split()[-1])
+    seconds, peak = done.stdout.split()[-2:]
+    return int(peak), float(seconds)
 
 
 def machine() -> dict[str, Any]:
