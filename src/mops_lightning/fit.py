@@ -198,6 +198,8 @@ def log_hparams(trainer: L.Trainer, cfg: DictConfig, metrics: dict[str, float]) 
     flat["max_epochs"] = plain["trainer"]["max_epochs"]
     if isinstance(trainer.logger, TensorBoardLogger):
         trainer.logger.log_hyperparams(flat, {f"hparams/{k}": v for k, v in metrics.items()})
+        # Lightning has closed it after the test; this opened it again, with a thread of its own.
+        trainer.logger.finalize("success")
     elif trainer.logger is not None:
         trainer.logger.log_hyperparams(flat)
 
