@@ -50,14 +50,17 @@ class StopBetweenSteps(Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, *args: Any) -> None:
         """Stop here if asked to, all processes of a run after the same step."""
-        if trainer.strategy.reduce_boolean_decision(self.received is not None, all=False):
-            trainer.save_checkpoint(self.checkpoint)
-            raise Interrupted(f"Go on with the same command and ckpt_path={self.checkpoint}")
+        self._stop_if_asked(trainer, save=True)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Stop after the last step, or stop listening."""
         self._restore()
+        self._stop_if_asked(trainer, save=False)
+
+    def _stop_if_asked(self, trainer: L.Trainer, save: bool) -> None:
         if trainer.strategy.reduce_boolean_decision(self.received is not None, all=False):
+            if save:
+                trainer.save_checkpoint(self.checkpoint)
             raise Interrupted(f"Go on with the same command and ckpt_path={self.checkpoint}")
 
     def on_exception(self, trainer: L.Trainer, *args: Any) -> None:
@@ -82,6 +85,8 @@ class EpochLines(Callback):
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Print what the progress bar would show."""
+        if not trainer.is_global_zero:
+            return
         numbers = {
             name: float(value)
             for name, value in trainer.callback_metrics.items()
@@ -89,8 +94,6 @@ class EpochLines(Callback):
             or (name.startswith("val/") and name.endswith(f"/{self.score}"))
         }
         shown = "  ".join(f"{name} {value:.4f}" for name, value in numbers.items())
-        if not trainer.is_global_zero:
-            return
         print(f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}  {shown}", flush=True)
 
 

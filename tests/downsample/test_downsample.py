@@ -229,7 +229,17 @@ def die(*_):
 
 
 def test_coordinates_beyond_measure_are_refused(folder, tmp_path):
-    np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(size=(9, 3)) * 1e200)
-    status, _, err = call(tmp_path / "a.npy", tmp_path / "b.npy", "--method", "fps", "--m", 4)
+    np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(size=(90, 3)) * 1e200)
+    learned = ["--weights", folder, "--readout", "matched", "--chunk", 60]
+    for settings in (["--method", "fps", "--m", 4], learned):
+        status, _, err = call(tmp_path / "a.npy", tmp_path / "b.npy", *settings)
+        assert status == 2
+        assert "too large" in err
+
+
+def test_an_array_in_column_order_is_refused_by_chunks(folder, tmp_path):
+    np.save(tmp_path / "a.npy", np.asfortranarray(np.ones((90, 3))))
+    settings = ["--weights", folder, "--readout", "matched", "--chunk", 60]
+    status, _, err = call(tmp_path / "a.npy", tmp_path / "b.npy", *settings)
     assert status == 2
-    assert "too large" in err
+    assert "C order" in err

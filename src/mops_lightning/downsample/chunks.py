@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mops_lightning.downsample.las import laspy_for, table_of
-from mops_lightning.downsample.table import BadCloudError, Table, from_array
+from mops_lightning.downsample.table import BadCloudError, Table, column_names, from_array
 
 PLY_KINDS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -48,14 +48,19 @@ def _npy(path: Path, size: int) -> Iterator[Table]:
         if kind.names:
             yield from _rows(file, path, kind, list(kind.names), shape[0], size)
             return
-        if len(shape) != 2 or shape[1] < 3 or fortran or kind.kind not in "fiu":
-            raise BadCloudError(f"{path} must hold rows of x, y, z, got shape {shape}.")
-        names = ["x", "y", "z", *(f"column_{place}" for place in range(3, shape[1]))]
+        names = column_names(shape, kind.kind, path)
+        if fortran:
+            raise BadCloudError(f"{path}: --chunk needs an array in C order, not in Fortran's.")
         rows = np.dtype([(name, kind) for name in names])
         yield from _rows(file, path, rows, names, shape[0], size)
 
 
-def _bin(path: Path, size: int) -> Iterator[Table]:
+def bin_chunks(path: Path, size: int) -> Iterator[Table]:
+    """Yield KITTI's scans, float32 x, y, z, intensity, in tables of up to ``size`` points.
+
+    Raises:
+        BadCloudError: the file is no such scan.
+    """
     names = ["x", "y", "z", "intensity"]
     length = path.stat().st_size
     if not length or length % 16:
@@ -106,7 +111,7 @@ def _rows(
 
 READERS: dict[str, Callable[[Path, int], Iterator[Table]]] = {
     ".npy": _npy,
-    ".bin": _bin,
+    ".bin": bin_chunks,
     ".ply": _ply,
     ".las": _las,
     ".laz": _las,

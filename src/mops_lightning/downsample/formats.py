@@ -11,19 +11,18 @@ from numpy.typing import NDArray
 
 from mops_lightning.data.mesh_io import SUFFIXES as MESHES
 from mops_lightning.downsample import las, pcd
+from mops_lightning.downsample.chunks import PLY_KINDS, bin_chunks
 from mops_lightning.downsample.table import (
     BadCloudError,
     Column,
     Table,
+    column_names,
     coordinates,
     from_array,
     unique_names,
 )
 
-PLY_TYPES = {
-    "f4": "float", "f8": "double", "i1": "char", "u1": "uchar",
-    "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint",
-}  # fmt: skip
+PLY_TYPES = {kind: name for name, kind in PLY_KINDS.items() if not name[-1].isdigit()}
 
 
 def read_text(path: Path) -> Table:
@@ -121,11 +120,7 @@ def write_npz(path: Path, table: Table) -> None:
 
 def read_bin(path: Path) -> Table:
     """Read KITTI's scans: float32 x, y, z, intensity."""
-    length = path.stat().st_size
-    if not length or length % 16:
-        raise BadCloudError(f"{path} is no KITTI scan: {length} bytes are no rows of four floats.")
-    rows = np.fromfile(path, "<f4").reshape(-1, 4)
-    return from_array(rows, ["x", "y", "z", "intensity"], path)
+    return next(bin_chunks(path, path.stat().st_size))
 
 
 def write_bin(path: Path, table: Table) -> None:
@@ -202,10 +197,7 @@ def _structured(arrays: list[Column]) -> NDArray[Any]:
 
 
 def _numbers(array: NDArray[Any], path: Path) -> Table:
-    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
-        raise BadCloudError(f"{path} must hold rows of x, y, z, got shape {array.shape}.")
-    names = ["x", "y", "z", *(f"column_{place}" for place in range(3, array.shape[1]))]
-    return from_array(array, names, path)
+    return from_array(array, column_names(array.shape, array.dtype.kind, path), path)
 
 
 def _loaded(path: Path) -> Any:

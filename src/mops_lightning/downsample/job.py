@@ -16,7 +16,7 @@ from mops_lightning import weights
 from mops_lightning.data.mesh_io import parse_mesh
 from mops_lightning.downsample.formats import READABLE, READERS, WRITERS
 from mops_lightning.downsample.large import by_chunks
-from mops_lightning.downsample.table import BadCloudError, Table
+from mops_lightning.downsample.table import BadCloudError, Table, largest_distance
 from mops_lightning.errors import UserError
 from mops_lightning.io import atomic_write
 from mops_lightning.readout import complete
@@ -195,10 +195,7 @@ def read(path: Path, surface: int, seed: int) -> Table:
 def sampled(source: Path, table: Table, sampler: Sampler, m: int, settings: Settings) -> Table:
     """Return the kept points of a table, with their attributes if asked for."""
     centre = table.points.mean(0)
-    with np.errstate(over="ignore"):
-        radius = float(np.linalg.norm(table.points - centre, axis=1).max()) or 1.0
-    if not np.isfinite(radius):
-        raise BadCloudError(f"{source} has coordinates too large to be measured.")
+    radius = largest_distance([table.points], centre, source)
     points = torch.from_numpy(((table.points - centre) / radius).astype(np.float32))
     with torch.no_grad():
         rows, generated = _chosen(points, sampler, m, settings)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.downsample.chunks import chunks_of
-from mops_lightning.downsample.table import BadCloudError, Column, Table
+from mops_lightning.downsample.table import BadCloudError, Column, Table, largest_distance
 from mops_lightning.streaming import stream_match, stream_sample
 
 
@@ -37,8 +37,7 @@ def by_chunks(
     if number < m:
         raise BadCloudError(f"{source} holds {number} points, fewer than --m {m}.")
     centre = total / number
-    away = (np.linalg.norm(part.points - centre, axis=1) for part in chunks_of(source, size))
-    radius = max(float(distance.max(initial=0.0)) for distance in away) or 1.0
+    radius = largest_distance((part.points for part in chunks_of(source, size)), centre, source)
 
     def chunks() -> Iterator[Tensor]:
         for part in chunks_of(source, size):

@@ -1,6 +1,6 @@
 """A cloud as its file has it: coordinates, and columns of whatever else."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,20 @@ class Table:
     def bare(self) -> "Table":
         """Return the points alone."""
         return Table(self.points, {}, self.head)
+
+
+def largest_distance(parts: Iterable[NDArray[np.float64]], centre: Any, path: Path) -> float:
+    """Return how far the farthest point lies from ``centre``, (3,); 1 where all coincide.
+
+    Raises:
+        BadCloudError: too far for the number to be finite.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        away = (np.linalg.norm(part - centre, axis=1).max(initial=0.0) for part in parts)
+        radius = float(np.max(list(away)))
+    if not np.isfinite(radius):
+        raise BadCloudError(f"{path} has coordinates too large to be measured.")
+    return radius or 1.0
 
 
 RESERVED = ("x", "y", "z", "points")
@@ -89,3 +103,19 @@ def from_array(array: NDArray[Any], names: list[str], path: Path, head: Any = No
     rest = {name: column(name) for name in names if name not in axes}
     numbers = {name: c for name, c in rest.items() if c.ndim == 1 and c.dtype.kind in "fiub"}
     return Table(points, numbers, head)
+
+
+def column_names(shape: tuple[int, ...], kind: str, path: Path) -> list[str]:
+    """Return the names of the columns of a plain array: x, y, z, and column_3 and so on.
+
+    Args:
+        shape: of the array.
+        kind: of its numbers, as numpy's ``dtype.kind`` has it.
+        path: for errors.
+
+    Raises:
+        BadCloudError: it holds no rows of three numbers or more.
+    """
+    if len(shape) != 2 or shape[1] < 3 or kind not in "fiu":
+        raise BadCloudError(f"{path} must hold rows of x, y, z, got shape {shape}.")
+    return ["x", "y", "z", *(f"column_{place}" for place in range(3, shape[1]))]
