@@ -62,15 +62,25 @@ def _parser() -> argparse.ArgumentParser:
     add("--keep-attributes", action="store_true", help="keep colours, normals, intensities, ...")
     add("--surface", type=int, help="points to sample from a mesh first; default: 10000 or 8m")
     add("--format", help="suffix of the files in a folder OUT, such as ply; default: as IN")
-    add("--workers", type=int, default=1, help="processes that share a folder's files")
+    add(
+        "--workers",
+        type=int,
+        default=1,
+        help="processes that share a folder's files, or with --cluster local their chunks",
+    )
     add("--chunk", type=int, help="read so many points at a time, for clouds larger than memory")
+    add(
+        "--cluster",
+        metavar="ADDRESS",
+        help="share the chunks of every file among Dask workers: the address of a scheduler, or "
+        "'local' for --workers processes of this machine",
+    )
     add("--seed", type=int, default=0, help="of what is random")
     add("--overwrite", action="store_true", help="replace files that are there")
     return parser
 
 
 def _run(chosen: argparse.Namespace) -> int:
-    from mops_lightning.downsample.files import attempt
     from mops_lightning.downsample.job import Settings, sampler_of
 
     if chosen.readout and chosen.method:
@@ -87,23 +97,42 @@ def _run(chosen: argparse.Namespace) -> int:
         chosen.seed,
         chosen.chunk,
     )
+    if chosen.cluster and chosen.chunk is None:
+        raise UserError("--cluster shares the chunks of a file: give --chunk as well.")
     sampler_of(settings)  # its mistakes come before any file
     jobs = _jobs(chosen)
-    if not chosen.source.is_dir():
-        ((source, target),) = jobs
-        if target.exists() and not chosen.overwrite:
-            raise UserError(f"{target} is there already. Give another OUT, or --overwrite.")
-        start = time.perf_counter()
-        result = attempt(source, target, settings, None)
-        if isinstance(result, UserError):
-            raise result
-        number, whole, dropped = result
-        print(f"{target}: {_said(number, whole, dropped)}, {time.perf_counter() - start:.1f} s")
-        return 0
+    with _engine(chosen) as engine:
+        if chosen.source.is_dir():
+            return _folder(jobs, settings, chosen, engine)
+        return _file(*jobs[0], settings, chosen, engine)
+
+
+def _file(source: Path, target: Path, settings: Any, chosen: Any, engine: Any) -> int:
+    from mops_lightning.downsample.files import attempt
+
+    if target.exists() and not chosen.overwrite:
+        raise UserError(f"{target} is there already. Give another OUT, or --overwrite.")
+
+    def with_bar(title: str, function: Any, cloud: Any, stretches: Any, *common: Any) -> Any:
+        results = engine(title, function, cloud, stretches, *common)
+        total, hidden = len(stretches), not sys.stdout.isatty()
+        return track(results, title, total=total, disable=hidden, transient=True)
+
+    start = time.perf_counter()
+    result = attempt(source, target, settings, None, with_bar)
+    if isinstance(result, UserError):
+        raise result
+    number, whole, dropped = result
+    print(f"{target}: {_said(number, whole, dropped)}, {time.perf_counter() - start:.1f} s")
+    return 0
+
+
+def _folder(jobs: list[tuple[Path, Path]], settings: Any, chosen: Any, engine: Any) -> int:
+    workers = 1 if chosen.cluster else chosen.workers
     done: Counter[str] = Counter()
     todo = [job for job in jobs if chosen.overwrite or not job[1].exists()]
     failures, dropped = {}, 0
-    with _mapped(todo, settings, chosen.workers) as results:
+    with _mapped(todo, settings, workers, engine) as results:
         for (source, _), result in track(
             results, "downsampling", total=len(todo), disable=not sys.stdout.isatty()
         ):
@@ -181,12 +210,28 @@ def _result(future: Future[Any]) -> Any:
 
 
 @contextmanager
-def _mapped(jobs: list[tuple[Path, Path]], settings: Any, workers: int) -> Iterator[Iterator[Any]]:
+def _engine(chosen: argparse.Namespace) -> Iterator[Any]:
+    """Give what works on the chunks of a file; see ``large.Engine``."""
+    if not chosen.cluster:
+        from mops_lightning.downsample.large import in_turn
+
+        yield in_turn
+        return
+    from mops_lightning.downsample.cluster import cluster
+
+    with cluster(chosen.cluster, chosen.workers) as engine:
+        yield engine
+
+
+@contextmanager
+def _mapped(
+    jobs: list[tuple[Path, Path]], settings: Any, workers: int, engine: Any
+) -> Iterator[Iterator[Any]]:
     """Give pairs of job and result, in the order in which they come."""
     from mops_lightning.downsample.files import attempt
 
     if workers == 1 or len(jobs) < 2:
-        yield ((job, attempt(*job, settings, None)) for job in jobs)
+        yield ((job, attempt(*job, settings, None, engine)) for job in jobs)
         return
     workers = min(workers, len(jobs))
     futures = {pool(workers).submit(attempt, *job, settings, workers): job for job in jobs}

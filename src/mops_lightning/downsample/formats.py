@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mops_lightning.data.mesh_io import SUFFIXES as MESHES
 from mops_lightning.downsample import las, pcd
-from mops_lightning.downsample.chunks import PLY_KINDS, bin_chunks
+from mops_lightning.downsample.chunks import PLY_KINDS, kitti
 from mops_lightning.downsample.table import (
     BadCloudError,
     Column,
@@ -120,7 +120,8 @@ def write_npz(path: Path, table: Table) -> None:
 
 def read_bin(path: Path) -> Table:
     """Read KITTI's scans: float32 x, y, z, intensity."""
-    return next(bin_chunks(path, path.stat().st_size))
+    rows = kitti(path)
+    return rows.raw(range(rows.number))
 
 
 def write_bin(path: Path, table: Table) -> None:

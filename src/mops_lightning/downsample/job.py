@@ -15,8 +15,8 @@ from torch import Tensor
 from mops_lightning import weights
 from mops_lightning.data.mesh_io import parse_mesh
 from mops_lightning.downsample.formats import READABLE, READERS, WRITERS
-from mops_lightning.downsample.large import by_chunks
-from mops_lightning.downsample.table import BadCloudError, Table, largest_distance
+from mops_lightning.downsample.large import Engine, by_chunks, in_turn
+from mops_lightning.downsample.table import BadCloudError, Table, radius_of, reach
 from mops_lightning.errors import UserError
 from mops_lightning.io import atomic_write
 from mops_lightning.readout import complete
@@ -126,7 +126,9 @@ def sampler_of(settings: Settings) -> Sampler:
     return sampler.eval()
 
 
-def run(source: Path, target: Path, settings: Settings) -> tuple[int, int, int]:
+def run(
+    source: Path, target: Path, settings: Settings, engine: Engine = in_turn
+) -> tuple[int, int, int]:
     """Downsample one file into another.
 
     Returns:
@@ -140,7 +142,7 @@ def run(source: Path, target: Path, settings: Settings) -> tuple[int, int, int]:
     m = settings.m or sampler.m
     if settings.chunk:
         kept, number = by_chunks(
-            source, sampler, m, settings.chunk, settings.readout, settings.keep_attributes
+            source, sampler, m, settings.chunk, settings.readout, settings.keep_attributes, engine
         )
         _write(target, kept)
         return len(kept.points), number, 0
@@ -195,7 +197,7 @@ def read(path: Path, surface: int, seed: int) -> Table:
 def sampled(source: Path, table: Table, sampler: Sampler, m: int, settings: Settings) -> Table:
     """Return the kept points of a table, with their attributes if asked for."""
     centre = table.points.mean(0)
-    radius = largest_distance([table.points], centre, source)
+    radius = radius_of(reach(table.points, centre), source)
     points = torch.from_numpy(((table.points - centre) / radius).astype(np.float32))
     with torch.no_grad():
         rows, generated = _chosen(points, sampler, m, settings)

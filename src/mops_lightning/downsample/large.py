@@ -1,70 +1,146 @@
-"""One file that need not fit in memory: several passes over its chunks."""
+"""One file that need not fit in memory: several passes over stretches of it.
 
-from collections.abc import Iterator
+What a pass wants of a stretch does not depend on the others, so an engine may have several
+processes or machines do them; the results are put together in the order of the file, so that the
+outcome does not depend on who did what.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.downsample.chunks import chunks_of
-from mops_lightning.downsample.table import BadCloudError, Column, Table, largest_distance
-from mops_lightning.streaming import stream_match, stream_sample
+from mops_lightning.downsample.chunks import Stored, stored
+from mops_lightning.downsample.table import BadCloudError, Table, radius_of, reach
+from mops_lightning.errors import UserError
+from mops_lightning.geometry import nearest
+from mops_lightning.samplers.folded import FoldedMOPS, fold
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.sampling_matrix import Partial
+from mops_lightning.streaming import global_part, sum_part
+
+Engine = Callable[..., Iterable[Any]]
+"""``engine(title, function, cloud, stretches, *common)`` gives ``function(cloud, rows, *common)``
+for the rows of every stretch, in order."""
+
+
+class Unit(NamedTuple):
+    """How a cloud is put into the unit sphere: its centre ``(3,)`` and largest distance from it."""
+
+    centre: NDArray[np.float64]
+    radius: float
+
+    def points(self, table: Table) -> Tensor:
+        """Return the normalised points ``(n, 3)``."""
+        return torch.from_numpy(((table.points - self.centre) / self.radius).astype(np.float32))
+
+
+class Nearest(NamedTuple):
+    """The nearest points so far: their squared distances ``(m,)`` and their rows of the file."""
+
+    distance: NDArray[np.float32]
+    table: Table
+
+    def merge(self, other: "Nearest") -> "Nearest":
+        """Keep the nearer ones; where they are equally near, those of the earlier stretch."""
+        nearer = other.distance < self.distance
+        columns = {
+            name: np.where(nearer, other.table.columns[name], column)
+            for name, column in self.table.columns.items()
+        }
+        points = np.where(nearer[:, None], other.table.points, self.table.points)
+        return Nearest(np.minimum(self.distance, other.distance), Table(points, columns))
+
+
+def in_turn(
+    title: str, function: Callable[..., Any], cloud: Stored, stretches: list[range], *common: Any
+) -> Iterable[Any]:
+    """Do one stretch after the other here: the plainest engine."""
+    return (function(cloud, rows, *common) for rows in stretches)
 
 
 def by_chunks(
-    source: Path, sampler: Any, m: int, size: int, readout: str, keep_attributes: bool
+    source: Path,
+    sampler: Any,
+    m: int,
+    size: int,
+    readout: str,
+    keep_attributes: bool,
+    engine: Engine = in_turn,
 ) -> tuple[Table, int]:
     """Return what a trained MOPS-Net keeps of a file, and how many points it has.
 
     Args:
-        source: of a format of ``chunks.READERS``.
+        source: of a format of ``chunks.FORMATS``.
         sampler: trained.
         m: how many points.
-        size: of the chunks; with m it bounds the memory.
+        size: of the stretches; with m it bounds the memory.
         readout: generated or matched.
         keep_attributes: keep the columns of matched points.
+        engine: does the work.
 
     Raises:
         UserError: the file is broken or too small, or the sampler cannot work by chunks.
     """
+    if not isinstance(sampler, MOPSNet):
+        raise UserError(f"--chunk works with MOPS-Net and FMOPS-Net, not {type(sampler).__name__}.")
+    sampler._check_m(m)
+    whole = stored(source.resolve())
+    cloud, stretches = replace(whole, head=None), whole.stretches(size)
+
+    def over(title: str, function: Callable[..., Any], *common: Any) -> Iterable[Any]:
+        results = engine(title, function, cloud, stretches, *common)
+        return (result for result in results if result is not None)
+
     number, total = 0, np.zeros(3)
-    for part in chunks_of(source, size):
-        number += len(part.points)
-        total += part.points.sum(0)
+    for count, part in over("centre", _count_and_sum):
+        number += count
+        total += part
     if number < m:
         raise BadCloudError(f"{source} holds {number} points, fewer than --m {m}.")
     centre = total / number
-    radius = largest_distance((part.points for part in chunks_of(source, size)), centre, source)
-
-    def chunks() -> Iterator[Tensor]:
-        for part in chunks_of(source, size):
-            if len(part.points):
-                yield torch.from_numpy(((part.points - centre) / radius).astype(np.float32))
-
-    generated = stream_sample(sampler, chunks, m)
+    unit = Unit(centre, radius_of(max(over("radius", _reach, centre)), source))
+    net = fold(sampler)
+    global_ = reduce(torch.maximum, over("global feature", _global, unit, net))
+    sums: Partial = reduce(Partial.merge, over("sampling", _sum, unit, net, global_, m))
+    generated = sums.result()
     if readout == "generated":
-        return Table(generated.double().numpy() * radius + centre), number
-    rows = stream_match(generated, chunks).numpy()
-    kept = _gathered(source, size, rows)
+        return Table(generated.double().numpy() * unit.radius + centre), number
+    found: Nearest = reduce(Nearest.merge, over("matching", _nearest, unit, generated))
+    kept = replace(found.table, head=whole.head)
     return (kept if keep_attributes else kept.bare()), number
 
 
-def _gathered(source: Path, size: int, rows: NDArray[np.int64]) -> Table:
-    """Return the given rows of a file, in their order."""
-    start, places, tables = 0, [], []
-    for part in chunks_of(source, size):
-        inside = np.flatnonzero((rows >= start) & (rows < start + len(part.points)))
-        places.append(inside)
-        tables.append(part.take(rows[inside] - start))
-        start += len(part.points)
-    order = np.argsort(np.concatenate(places))
+def _count_and_sum(cloud: Stored, rows: range) -> tuple[int, NDArray[np.float64]]:
+    table = cloud.read(rows)
+    return len(table.points), table.points.sum(0)
 
-    def joined(columns: list[Column]) -> Column:
-        return np.concatenate(columns)[order]
 
-    names = list(tables[0].columns)
-    columns = {name: joined([table.columns[name] for table in tables]) for name in names}
-    return Table(joined([table.points for table in tables]), columns, tables[0].head)
+def _reach(cloud: Stored, rows: range, centre: NDArray[np.float64]) -> float:
+    return reach(cloud.read(rows).points, centre)
+
+
+def _global(cloud: Stored, rows: range, unit: Unit, net: FoldedMOPS) -> Tensor | None:
+    points = unit.points(cloud.read(rows))
+    return global_part(net, points) if len(points) else None
+
+
+def _sum(
+    cloud: Stored, rows: range, unit: Unit, net: FoldedMOPS, global_: Tensor, m: int
+) -> Partial | None:
+    points = unit.points(cloud.read(rows))
+    return sum_part(net, points, global_, m) if len(points) else None
+
+
+def _nearest(cloud: Stored, rows: range, unit: Unit, generated: Tensor) -> Nearest | None:
+    table = cloud.read(rows)
+    if not len(table.points):
+        return None
+    distance, row = nearest(generated[None], unit.points(table)[None])
+    return Nearest(distance[0].numpy(), table.take(row[0].numpy()))

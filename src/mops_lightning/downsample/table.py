@@ -1,6 +1,6 @@
 """A cloud as its file has it: coordinates, and columns of whatever else."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -42,18 +42,21 @@ class Table:
         return Table(self.points, {}, self.head)
 
 
-def largest_distance(parts: Iterable[NDArray[np.float64]], centre: Any, path: Path) -> float:
-    """Return how far the farthest point lies from ``centre``, (3,); 1 where all coincide.
+def reach(points: NDArray[np.float64], centre: NDArray[np.float64]) -> float:
+    """Return how far the farthest of ``(n, 3)`` points lies from ``centre``, ``(3,)``."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.linalg.norm(points - centre, axis=1).max(initial=0.0))
+
+
+def radius_of(distance: float, path: Path) -> float:
+    """Return by what to divide a cloud whose farthest point has this distance from its centre.
 
     Raises:
-        BadCloudError: too far for the number to be finite.
+        BadCloudError: it is too far for the number to be finite.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        away = (np.linalg.norm(part - centre, axis=1).max(initial=0.0) for part in parts)
-        radius = float(np.max(list(away)))
-    if not np.isfinite(radius):
+    if not np.isfinite(distance):
         raise BadCloudError(f"{path} has coordinates too large to be measured.")
-    return radius or 1.0
+    return distance or 1.0
 
 
 RESERVED = ("x", "y", "z", "points")

@@ -1,0 +1,157 @@
+"""The chunks of one file shared among Dask workers, one of which is killed."""
+
+import os
+import signal
+import sys
+
+import distributed
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning import weights
+from mops_lightning.downsample.chunks import stored
+from mops_lightning.downsample.cluster import cluster, engine_of
+from mops_lightning.downsample.formats import WRITERS
+from mops_lightning.downsample.job import read
+from mops_lightning.downsample.large import by_chunks
+from mops_lightning.downsample.table import Table
+from mops_lightning.errors import UserError
+from mops_lightning.samplers.mops import MOPSNet
+from tests.downsample.test_downsample import call
+
+
+@pytest.fixture(scope="module")
+def client():
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as two,
+        distributed.Client(two) as client,
+    ):
+        yield client
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    """A cloud with a hole in its numbers, and a sampler."""
+    folder = tmp_path_factory.mktemp("scan")
+    points = np.random.default_rng(0).normal(size=(3000, 3)) * [5, 1, 1] + [1000, 0, 0]
+    points[200:420] = np.nan
+    points[700] = points[1900]  # equally near ones in different chunks
+    WRITERS[".ply"](folder / "scan.ply", Table(points, {"label": np.arange(3000)}))
+    torch.manual_seed(0)
+    node = {"_target_": "mops_lightning.samplers.mops.MOPSNet", "m": 24}
+    sampler = MOPSNet(24).eval()
+    weights.save(folder / "weights.pt", sampler, {"learn": "sampler", "sampler": node}, {})
+    return folder / "scan.ply", sampler
+
+
+def same(one: Table, other: Table) -> None:
+    np.testing.assert_array_equal(one.points, other.points)
+    assert list(one.columns) == list(other.columns)
+    for name, column in one.columns.items():
+        np.testing.assert_array_equal(column, other.columns[name])
+
+
+@pytest.mark.parametrize("readout", ["generated", "matched"])
+def test_workers_give_what_one_process_gives(readout, client, scan):
+    here, number = by_chunks(scan[0], scan[1], 24, 300, readout, True)
+    there, same_number = by_chunks(scan[0], scan[1], 24, 300, readout, True, engine_of(client))
+    assert number == same_number == 2780
+    # Threads differ between the two, and with them the order of sums.
+    np.testing.assert_allclose(there.points, here.points, atol=1e-5 * np.ptp(here.points))
+
+
+def test_a_worker_that_is_killed_does_not_change_the_result(client, scan):
+    engine, killed = engine_of(client), []
+    whole, _ = by_chunks(scan[0], scan[1], 24, 300, "matched", True, engine)
+
+    def killing(title, function, cloud, stretches, *common):
+        for done, result in enumerate(engine(title, function, cloud, stretches, *common)):
+            if title in ("sampling", "matching") and done == 3:
+                pids = client.run(os.getpid)
+                os.kill(next(iter(pids.values())), signal.SIGKILL)
+                killed.append(title)
+            yield result
+
+    again, _ = by_chunks(scan[0], scan[1], 24, 300, "matched", True, killing)
+    assert killed == ["sampling", "matching"]
+    same(again, whole)
+
+
+def test_from_the_command_line(scan, tmp_path):
+    settings = ["--weights", scan[0].parent, "--readout", "matched", "--keep-attributes"]
+    settings += ["--chunk", 500]
+    assert call(scan[0], tmp_path / "one.npz", *settings)[0] == 0
+    status, out, err = call(
+        scan[0], tmp_path / "two.npz", *settings, "--cluster", "local", "--workers", 2
+    )
+    assert (status, err) == (0, "")
+    assert "24 of 2,780 points" in out
+    same(read(tmp_path / "one.npz", 9, 0), read(tmp_path / "two.npz", 9, 0))
+
+
+def test_a_scheduler_that_runs_already_is_used(client, scan, tmp_path):
+    settings = ["--weights", scan[0].parent, "--readout", "generated", "--chunk", 500]
+    address = client.scheduler.address
+    assert call(scan[0], tmp_path / "a.ply", *settings, "--cluster", address)[::2] == (0, "")
+
+
+def test_a_broken_file_is_named_by_the_workers(client, scan, tmp_path):
+    (tmp_path / "in").mkdir()
+    content = scan[0].read_bytes()
+    (tmp_path / "in" / "bad.ply").write_bytes(content[:-50])
+    (tmp_path / "in" / "good.ply").write_bytes(content)
+    settings = ["--weights", scan[0].parent, "--readout", "generated", "--chunk", 500]
+    address = client.scheduler.address
+    status, out, err = call(tmp_path / "in", tmp_path / "out", *settings, "--cluster", address)
+    assert status == 1
+    assert "bad.ply is broken: it ends after 2996 points" in err
+    assert "2 files: 1 failed, 1 done" in out
+
+
+def test_no_scheduler_at_the_address(scan, tmp_path, monkeypatch):
+    monkeypatch.setattr("mops_lightning.downsample.cluster.PATIENCE", 1)
+    settings = ["--weights", scan[0].parent, "--readout", "generated", "--chunk", 500]
+    for address in ("tcp://127.0.0.1:9", "nonsense://"):
+        status, _, err = call(scan[0], tmp_path / "a.ply", *settings, "--cluster", address)
+        assert status == 2
+        assert f"no Dask scheduler answers at {address}" in err
+
+
+def test_a_scheduler_without_workers(monkeypatch):
+    monkeypatch.setattr("mops_lightning.downsample.cluster.PATIENCE", 1)
+    with (
+        distributed.LocalCluster(n_workers=0, dashboard_address=":0") as empty,
+        pytest.raises(UserError, match="has no workers"),
+        cluster(empty.scheduler_address, 1),
+    ):
+        raise AssertionError("there is nobody to work")
+
+
+def test_without_dask_the_package_is_named(scan, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    settings = ["--weights", scan[0].parent, "--readout", "generated", "--chunk", 500]
+    status, _, err = call(scan[0], tmp_path / "a.ply", *settings, "--cluster", "local")
+    assert status == 2
+    assert "pip install 'mops-lightning[cluster]'" in err
+
+
+def test_what_does_not_go_with_a_cluster(scan, tmp_path):
+    settings = ["--weights", scan[0].parent, "--readout", "generated", "--cluster", "local"]
+    status, _, err = call(scan[0], tmp_path / "a.ply", *settings)
+    assert status == 2
+    assert "give --chunk" in err
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".npy", ".bin", ".las", ".laz"])
+def test_any_stretch_of_a_file_can_be_read_alone(suffix, tmp_path):
+    points = np.random.default_rng(1).normal(size=(500, 3)).astype(np.float32).astype(float)
+    path = tmp_path / f"in{suffix}"
+    WRITERS[suffix](path, Table(points, {"intensity": np.arange(500, dtype=np.uint16)}))
+    cloud = stored(path)
+    assert cloud.number == 500
+    assert [len(rows) for rows in cloud.stretches(200)] == [200, 200, 100]
+    whole = cloud.read(range(500))
+    np.testing.assert_allclose(whole.points, points, atol=1e-6)
+    for rows in (range(0, 3), range(200, 400), range(499, 500)):
+        np.testing.assert_array_equal(cloud.read(rows).points, whole.points[rows.start : rows.stop])
