@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from twins import PlainMOPS, plain_farthest_point_sample
 
 from mops_lightning.geometry import farthest_point_sample
+from mops_lightning.nets.foldingnet import MFoldingNet
+from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.folded import fold
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
@@ -101,20 +103,60 @@ torch.randn(512, 512) @ torch.randn(512, 512)
 
 
 def modules(peak: dict[str, float], rounds: int) -> list[Row]:
-    """Where the time of one cloud of 40,960 points goes: features, sampling matrix, regression."""
+    """Where time and memory of one cloud of 40,960 points go (the paper's table of modules)."""
     points = cloud(40960)[0]
     rows: list[Row] = []
     for m in LARGE:
-        net = fold(MOPSNet(m).eval())
-        local = net.local_features(points)
-        calls: Calls = {
-            "features": partial(net.local_features, points),
-            "matrix": partial(net.keys, local, local.amax(0)),
-            "regression": partial(attend, net.queries, net.keys(local, local.amax(0)), points),
-        }
-        with torch.no_grad():
-            rows += _rows("module", calls, {"N": 40960, "m": m}, rounds, peak)
+        found = Parts(points, m)
+        calls: Calls = {name: getattr(found, name) for name in PARTS}
+        timed = _rows("module", calls, {"N": 40960, "m": m}, rounds, peak)
+        for row in timed:
+            setup = _SETUP.format(number=40960, m=m) + "parts = Parts(points[0], s.m)\n"
+            memory, _ = peak_memory(setup, f"parts.{row['module']}()")
+            rows.append({**row, "peak_bytes": memory})
     return rows
+
+
+PARTS = ("features", "matrix", "regression", "pointnet", "mfoldingnet")
+
+
+class Parts:
+    """MOPS-Net's modules one by one, and two task nets behind it, each ready to be called.
+
+    Args:
+        points: ``(N, 3)``.
+        m: how many are generated.
+    """
+
+    def __init__(self, points: Tensor, m: int) -> None:
+        self.points = points
+        self.net = fold(MOPSNet(m).eval())
+        self.local = self.net.local_features(points)
+        self.peak = self.local.amax(0)
+        self.keys = self.net.keys(self.local, self.peak)
+        self.generated = attend(self.net.queries, self.keys, points).result()[None]
+        self.classifier = PointNetVanilla(40).eval().requires_grad_(False)
+        self.builder = MFoldingNet(len(points), 128, 2048).eval().requires_grad_(False)
+
+    def features(self) -> Tensor:
+        """Extract local features."""
+        return self.net.local_features(self.points)
+
+    def matrix(self) -> Tensor:
+        """Learn the sampling matrix, as its keys."""
+        return self.net.keys(self.local, self.peak)
+
+    def regression(self) -> Tensor:
+        """Regress the points."""
+        return attend(self.net.queries, self.keys, self.points).result()
+
+    def pointnet(self) -> Tensor:
+        """Classify the generated points."""
+        return self.classifier(self.generated)
+
+    def mfoldingnet(self) -> Tensor:
+        """Rebuild N points from the generated ones."""
+        return self.builder(self.generated)
 
 
 def training(peak: dict[str, float], rounds: int) -> list[Row]:
@@ -155,12 +197,14 @@ def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
 
 
 def growth(peak: dict[str, float], rounds: int) -> list[Row]:
-    """Time and memory as N grows to 10,000,000, in chunks of 65,536, m=4,096; one call each."""
+    """Time and memory as N grows to 10,000,000 and m to 65,536, chunks of 65,536; one call each."""
+    sizes = [(100_000, m) for m in (256, 4096, 16384, 65536)]
+    sizes += [(number, 4096) for number in (1_000_000, 10_000_000)]
     rows: list[Row] = []
-    for number in (100_000, 1_000_000, 10_000_000):
-        setup = _SETUP.format(number=number, m=4096)
+    for number, m in sizes:
+        setup = _SETUP.format(number=number, m=m)
         memory, seconds = peak_memory(setup, "chunked(s.eval(), points, 65536)")
-        names = {"sampler": "mops, in chunks", "N": number, "m": 4096}
+        names = {"sampler": "mops, in chunks", "N": number, "m": m}
         rows.append({**names, "seconds": seconds, "rounds": 1, "peak_bytes": memory})
     return rows
 

@@ -176,13 +176,16 @@ def attend(queries: Tensor, keys: Tensor, values: Tensor) -> Partial:
     """
     m = len(queries)
     whole = Partial(keys.new_empty(m), keys.new_empty(m), values.new_empty(m, values.shape[1]))
+    # A product with a few rows on the left takes a third of that with a few columns on the right;
+    # a row of ones gives the sum as well.
+    held = torch.cat([values, values.new_ones(len(values), 1)], 1).mT.contiguous()
     for columns in _slices(m, BLOCK_QUERIES):
         parts: Partial | None = None
         for rows in _slices(len(keys), BLOCK_POINTS):
             logits = queries[columns] @ keys[rows].mT
             peak = logits.amax(1)
-            share = _shares(logits, peak)
-            part = Partial(peak, share.sum(1), share @ values[rows])
+            sums = held[:, rows] @ _shares(logits, peak).mT
+            part = Partial(peak, sums[-1], sums[:-1].mT)
             parts = part if parts is None else parts.merge(part)
         assert parts is not None
         for kept, found in zip(whole, parts, strict=True):
@@ -225,5 +228,5 @@ class _StreamedAttention(torch.autograd.Function):
                     change.sub_(inner[cloud, columns, None]).mul_(share)
                     grad_queries[columns] += change @ keys[cloud, rows]
                     grad_keys[cloud, rows] += change.mT @ queries[columns]
-                    grad_values[cloud, rows] += share.mT @ grad[cloud, columns]
+                    grad_values[cloud, rows] += (grad[cloud, columns].mT @ share).mT
         return grad_queries, grad_keys, grad_values
