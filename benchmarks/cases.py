@@ -176,7 +176,7 @@ def training(peak: dict[str, float], rounds: int) -> list[Row]:
 def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
     """Farthest point sampling beside the plain form, and beside fpsample where it is installed."""
     rows: list[Row] = []
-    for number, m in ((1024, 32), (10_000, 1024), (100_000, 1024)):
+    for number, m in ((1024, 32), (10_000, 1024), (100_000, 1024), (1_000_000, 4096)):
         points = cloud(number)
         calls: Calls = {
             "fps": partial(farthest_point_sample, points, m),

@@ -1,8 +1,9 @@
 """Nearest points, farthest points and the like: pure functions on batches of clouds.
 
-All of them run where their input lies, loop over points at most, never over clouds, and measure
-distances as differences of coordinates: |a|² + |b|² − 2⟨a, b⟩ would be one matrix product, but it
-cancels, and takes wrong neighbours where points lie 1e-3 apart in the unit sphere.
+All of them run where their input lies, loop over points at most (over clouds only where these are
+large), and measure distances as differences of coordinates: |a|² + |b|² − 2⟨a, b⟩ would be one
+matrix product, but it cancels, and takes wrong neighbours where points lie 1e-3 apart in the unit
+sphere.
 """
 
 import math
@@ -12,11 +13,15 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
+from mops_lightning.farthest import take_farthest_by_groups
 
 GROUP = 32
 """Values per group in ``first_extreme``."""
 BLOCK = {"cpu": 2**19, "other": 2**24}
 """How many distances ``nearest`` holds at a time: what a CPU keeps in its cache; 64 MiB."""
+
+MANY_POINTS, MANY_STEPS = 65536, 256
+"""From both on, farthest points of a cloud are faster taken by groups than from all points."""
 
 
 def gather_points(points: Tensor, indices: Tensor) -> Tensor:
@@ -244,6 +249,9 @@ def _take_farthest(points: Tensor, distances: Tensor, steps: int) -> Tensor:
         ``(B, steps)`` int64.
     """
     _, n, channels = points.shape
+    if points.device.type == "cpu" and n >= MANY_POINTS and steps >= MANY_STEPS and channels <= 4:
+        clouds = zip(points, distances, strict=True)
+        return torch.stack([take_farthest_by_groups(*cloud, steps) for cloud in clouds])
     planes = _planes(points.to(distances.dtype), padding=0.0)
     distances = F.pad(distances, (0, planes.shape[2] - n), value=-1.0)
     differences = torch.empty_like(planes)

@@ -1,0 +1,107 @@
+"""Farthest point sampling of large clouds on a CPU, where most points are far from the new one.
+
+Neighbouring points form groups. A group that is farther from the new point than all its points are
+from the chosen ones keeps its distances, so that a step looks at a few groups only. (Han et al.,
+"QuickFPS", IEEE TCAD 2023, and others before them do so in trees.)
+"""
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+SIZE = 128
+"""Points in a group: fewer make the groups many, more make each step look at more points."""
+
+SAFE = 1 - 1e-6
+"""Bounds are lowered by it, for sums of squares are rounded in another way than distances are."""
+
+
+def take_farthest_by_groups(points: Tensor, distances: Tensor, steps: int) -> Tensor:
+    """Take the point with the largest distance, lower the distances to it, and so on.
+
+    Args:
+        points: ``(N, C)`` on the CPU, C up to 4.
+        distances: ``(N,)`` squared distances to start from, of at least float32; what is taken
+            stands at -1.
+        steps: how many points to take, at most as many as are not taken.
+
+    Returns:
+        ``(steps,)`` int64, the lowest row of equally far ones; bit for bit what looking at all
+        points gives.
+    """
+    n = len(points)
+    array = points.to(distances.dtype).numpy()
+    # Rows stand in order within a group, so that its first maximum is that of the lowest row; the
+    # last group is filled up with copies that count as taken.
+    rows = np.full(math.ceil(n / SIZE) * SIZE, n)
+    rows[:n] = np.argsort(_places_on_curve(array), kind="stable")
+    rows = np.sort(rows.reshape(-1, SIZE), axis=1)
+    filled = np.minimum(rows, n - 1)
+    filled = np.where(rows < n, filled, filled[:, :1])
+    planes = np.ascontiguousarray(array[filled].transpose(2, 0, 1))
+    far = np.where(rows < n, distances.numpy()[filled], -1).astype(array.dtype)
+    low, high = planes.min(2), planes.max(2)
+    places = far.argmax(1)
+    every = np.arange(len(rows))
+    peaks, peak_rows = far[every, places], rows[every, places]
+    taken = np.empty(steps, np.int64)
+    for step in range(steps):
+        equal = np.flatnonzero(peaks == peaks.max())
+        group = equal[peak_rows[equal].argmin()]
+        place = places[group]
+        taken[step] = rows[group, place]
+        far[group, place] = -1
+        new = planes[:, group, place]
+        bound = _distances_to_boxes(low, high, new) * SAFE
+        near = bound < peaks
+        near[group] = True
+        touched = np.flatnonzero(near)
+        lowered = _lowered(planes.take(touched, 1), new, far.take(touched, 0))
+        far[touched] = lowered
+        inside = lowered.argmax(1)
+        places[touched] = inside
+        peaks[touched] = lowered[every[: len(touched)], inside]
+        peak_rows[touched] = rows[touched, inside]
+    return torch.from_numpy(taken)
+
+
+def _lowered(
+    planes: NDArray[np.floating], new: NDArray[np.floating], far: NDArray[np.floating]
+) -> NDArray[np.floating]:
+    """Return the lower of old distances and those to a new point.
+
+    By the operations that ``geometry`` uses for all points at once, which multiply and add in one
+    rounding on some processors and in two on others.
+    """
+    total, *others = torch.from_numpy(planes).sub_(torch.from_numpy(new)[:, None, None]).unbind(0)
+    total.mul_(total)
+    for other in others:
+        total.addcmul_(other, other)
+    return torch.minimum(torch.from_numpy(far), total).numpy()
+
+
+def _distances_to_boxes(
+    low: NDArray[np.floating], high: NDArray[np.floating], point: NDArray[np.floating]
+) -> NDArray[np.floating]:
+    """Return the squared distances from a point ``(C,)`` to boxes with corners ``(C, G)``."""
+    away = np.maximum(low - point[:, None], point[:, None] - high)
+    np.maximum(away, 0, out=away)
+    away *= away
+    return away.sum(0)
+
+
+def _places_on_curve(points: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Return where points ``(N, C)`` lie on a Z-order curve: near on it is near in space."""
+    bits = 30 // points.shape[1]
+    low = points.min(0)
+    extent = float((points.max(0) - low).max())
+    scale = (2**bits - 1) / extent if extent > 0 else 0.0
+    cells = ((points - low) * scale).astype(np.int64)
+    code = np.zeros(len(points), np.int64)
+    for bit in range(bits):
+        for axis in range(points.shape[1]):
+            code |= (cells[:, axis] >> bit & 1) << (points.shape[1] * bit + axis)
+    return code
