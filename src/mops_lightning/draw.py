@@ -30,7 +30,7 @@ class DrawClouds(Callback):
     """Draws a fixed set of clouds with every readout, S with SᵀS, and what the task draws.
 
     TensorBoard gets them about ten times in a run and after the test; the run's folder gets PNGs
-    after the test.
+    after the test, where the task shows the baselines too.
 
     Args:
         batch: the test clouds to draw, as the task takes them.
@@ -66,9 +66,13 @@ class DrawClouds(Callback):
         training = module.training
         module.eval()
         batch = move_data_to_device(self.batch, module.device)
-        readouts = BatchReadouts(sampler, {}, (m,))
+        beside: Any = module.baselines
+        # The baselines do not change in training: they are drawn once, at the end.
+        baselines = dict(beside.items()) if folder is not None else {}
+        readouts = BatchReadouts(sampler, baselines, (m,))
         samples = {name: readouts.sample_as(name, m) for name in readout_names(sampler)}
-        figures = task.figures(batch, samples, self.titles)
+        methods = {name: readouts.sample_as(name, m) for name in baselines}
+        figures = task.figures(batch, {**methods, **samples}, self.titles)
         titles = task.cloud_titles(self.titles)
         sampled = {}
         if sampler is not None:

@@ -141,7 +141,7 @@ def test_figures_show_samples_and_reconstructions(rng):
     axes = module.figures(given, samples, ["long", "tall"])["reconstructions"].axes
     assert [one.get_title() for one in axes[:4]] == [
         "input",
-        "all points",
+        "from all points",
         "sampled",
         "from sampled",
     ]
