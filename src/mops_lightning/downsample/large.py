@@ -91,7 +91,7 @@ def by_chunks(
     if not isinstance(sampler, MOPSNet):
         raise UserError(f"--chunk works with MOPS-Net and FMOPS-Net, not {type(sampler).__name__}.")
     sampler._check_m(m)
-    whole = stored(source.resolve())
+    whole = stored(source.absolute())
     cloud, stretches = replace(whole, head=None), whole.stretches(size)
 
     def over(title: str, function: Callable[..., Any], *common: Any) -> Iterable[Any]:
