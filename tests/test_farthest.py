@@ -7,7 +7,7 @@ from torch.nn import functional as F
 from mops_lightning import geometry
 from mops_lightning.geometry import farthest_point_fill, farthest_point_sample
 
-KINDS = ["sphere", "normal", "grid", "line", "copies", "one point", "far away"]
+KINDS = ["sphere", "normal", "grid", "line", "copies", "one point", "far away", "tiny", "huge"]
 
 
 def cloud(kind, n, dtype, rng):
@@ -24,6 +24,10 @@ def cloud(kind, n, dtype, rng):
         points[:] = 0.25
     if kind == "far away":
         points = points + 1000
+    if kind == "tiny":
+        points = points * torch.finfo(dtype).tiny
+    if kind == "huge":  # squares of differences are infinite, some differences too
+        points = points.clamp(-3, 3) / 3 * torch.finfo(dtype).max
     return points
 
 
@@ -63,6 +67,14 @@ def test_groups_fill_up_as_all_points_do(kind, rng, by_groups):
 @pytest.mark.parametrize("channels", [1, 2, 4])
 def test_groups_in_other_dimensions(channels, rng, by_groups):
     points = torch.rand(1, 600, channels, generator=rng)
+    groups, all_points = by_groups(farthest_point_sample, points, 300)
+    assert torch.equal(groups, all_points)
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
+def test_what_is_not_finite_is_left_to_the_search_of_all_points(wrong, rng, by_groups):
+    points = torch.rand(1, 600, 3, generator=rng)
+    points[0, 7, 0] = wrong
     groups, all_points = by_groups(farthest_point_sample, points, 300)
     assert torch.equal(groups, all_points)
 

@@ -23,7 +23,7 @@ def take_farthest_by_groups(points: Tensor, distances: Tensor, steps: int) -> Te
     """Take the point with the largest distance, lower the distances to it, and so on.
 
     Args:
-        points: ``(N, C)`` on the CPU, C up to 4.
+        points: ``(N, C)`` on the CPU, finite, C up to 4.
         distances: ``(N,)`` squared distances to start from, of at least float32; what is taken
             stands at -1.
         steps: how many points to take, at most as many as are not taken.
@@ -87,19 +87,22 @@ def _distances_to_boxes(
     low: NDArray[np.floating], high: NDArray[np.floating], point: NDArray[np.floating]
 ) -> NDArray[np.floating]:
     """Return the squared distances from a point ``(C,)`` to boxes with corners ``(C, G)``."""
-    away = np.maximum(low - point[:, None], point[:, None] - high)
-    np.maximum(away, 0, out=away)
-    away *= away
-    return away.sum(0)
+    with np.errstate(over="ignore"):
+        away = np.maximum(low - point[:, None], point[:, None] - high)
+        np.maximum(away, 0, out=away)
+        away *= away
+        return away.sum(0)
 
 
 def _places_on_curve(points: NDArray[np.floating]) -> NDArray[np.int64]:
     """Return where points ``(N, C)`` lie on a Z-order curve: near on it is near in space."""
     bits = 30 // points.shape[1]
-    low = points.min(0)
-    extent = float((points.max(0) - low).max())
-    scale = (2**bits - 1) / extent if extent > 0 else 0.0
-    cells = ((points - low) * scale).astype(np.int64)
+    low = points.min(0).astype(np.float64)
+    with np.errstate(all="ignore"):
+        scale = (2**bits - 1) / (points.max(0) - low).max()
+        if not 0 < scale < np.inf:  # all coincide, or too far apart to be told
+            return np.zeros(len(points), np.int64)
+        cells = ((points - low) * scale).astype(np.int64)
     code = np.zeros(len(points), np.int64)
     for bit in range(bits):
         for axis in range(points.shape[1]):

@@ -249,7 +249,8 @@ def _take_farthest(points: Tensor, distances: Tensor, steps: int) -> Tensor:
         ``(B, steps)`` int64.
     """
     _, n, channels = points.shape
-    if points.device.type == "cpu" and n >= MANY_POINTS and steps >= MANY_STEPS and channels <= 4:
+    many = points.device.type == "cpu" and n >= MANY_POINTS and steps >= MANY_STEPS
+    if many and channels <= 4 and bool(points.isfinite().all()):
         clouds = zip(points, distances, strict=True)
         return torch.stack([take_farthest_by_groups(*cloud, steps) for cloud in clouds])
     planes = _planes(points.to(distances.dtype), padding=0.0)

@@ -5,6 +5,7 @@ import signal
 import sys
 
 import distributed
+import laspy
 import numpy as np
 import pytest
 import torch
@@ -54,16 +55,18 @@ def same(one: Table, other: Table) -> None:
 
 @pytest.mark.parametrize("readout", ["generated", "matched"])
 def test_workers_give_what_one_process_gives(readout, client, scan):
-    here, number = by_chunks(scan[0], scan[1], 24, 300, readout, True)
-    there, same_number = by_chunks(scan[0], scan[1], 24, 300, readout, True, engine_of(client))
-    assert number == same_number == 2780
+    here, number, _ = by_chunks(scan[0], scan[1], 24, 300, readout, True)
+    there, same_number, left_out = by_chunks(
+        scan[0], scan[1], 24, 300, readout, True, engine_of(client)
+    )
+    assert (number, same_number, left_out) == (2780, 2780, 220)
     # Threads differ between the two, and with them the order of sums.
     np.testing.assert_allclose(there.points, here.points, atol=1e-5 * np.ptp(here.points))
 
 
 def test_a_worker_that_is_killed_does_not_change_the_result(client, scan):
     engine, killed = engine_of(client), []
-    whole, _ = by_chunks(scan[0], scan[1], 24, 300, "matched", True, engine)
+    whole, *_ = by_chunks(scan[0], scan[1], 24, 300, "matched", True, engine)
 
     def killing(title, function, cloud, stretches, *common):
         for done, result in enumerate(engine(title, function, cloud, stretches, *common)):
@@ -73,7 +76,7 @@ def test_a_worker_that_is_killed_does_not_change_the_result(client, scan):
                 killed.append(title)
             yield result
 
-    again, _ = by_chunks(scan[0], scan[1], 24, 300, "matched", True, killing)
+    again, *_ = by_chunks(scan[0], scan[1], 24, 300, "matched", True, killing)
     assert killed == ["sampling", "matching"]
     same(again, whole)
 
@@ -86,7 +89,7 @@ def test_from_the_command_line(scan, tmp_path):
         scan[0], tmp_path / "two.npz", *settings, "--cluster", "local", "--workers", 2
     )
     assert (status, err) == (0, "")
-    assert "24 of 2,780 points" in out
+    assert "24 of 2,780 points (220 more without finite coordinates left out)" in out
     same(read(tmp_path / "one.npz", 9, 0), read(tmp_path / "two.npz", 9, 0))
 
 
@@ -141,6 +144,76 @@ def test_what_does_not_go_with_a_cluster(scan, tmp_path):
     status, _, err = call(scan[0], tmp_path / "a.ply", *settings)
     assert status == 2
     assert "give --chunk" in err
+    status, _, err = call(scan[0], tmp_path / "a.ply", *settings[:-1], "", "--chunk", 500)
+    assert status == 2
+    assert "got ''" in err
+
+
+def test_a_scheduler_that_goes_away(scan, tmp_path):
+    cluster = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=50
+    )
+    with distributed.Client(cluster) as client:
+        engine = engine_of(client)
+
+        def closing(*arguments):
+            for result in engine(*arguments):
+                if cluster.status.name == "running":
+                    cluster.close()
+                yield result
+
+        with pytest.raises(UserError, match="the scheduler has gone"):
+            by_chunks(scan[0], scan[1], 24, 10, "generated", False, closing)
+
+
+HEADS = {
+    "comment between": ("property float z", "comment made by hand\nproperty float z"),
+    "obj_info between": ("property float z", "obj_info num_cols 4\nproperty float z"),
+    "blanks and tabs": ("property float z", "property \t float   z \t"),
+    "element in a comment": ("element vertex", "comment one element per scan\nelement vertex"),
+    "line ends of Windows": ("\n", "\r\n"),
+}
+
+
+@pytest.mark.parametrize("kind", HEADS)
+def test_a_head_of_ply_may_be_written_in_other_ways(kind, tmp_path):
+    points = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32).astype(float)
+    path = tmp_path / "a.ply"
+    WRITERS[".ply"](path, Table(points, {"red": np.arange(50, dtype=np.uint8)}))
+    head, end, rows = path.read_bytes().partition(b"end_header\n")
+    path.write_bytes((head + end).decode().replace(*HEADS[kind]).encode() + rows)
+    table = stored(path).read(range(10, 50))
+    np.testing.assert_array_equal(table.points, points[10:])
+    np.testing.assert_array_equal(table.columns["red"], np.arange(10, 50))
+
+
+def test_vertices_with_lists_are_refused(tmp_path):
+    path = tmp_path / "a.ply"
+    head = "element vertex 1\nproperty float x\nproperty list uchar int seen\n"
+    path.write_text(f"ply\nformat binary_little_endian 1.0\n{head}end_header\n")
+    with pytest.raises(UserError, match="without lists"):
+        stored(path)
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+def test_a_las_file_that_is_cut_between_points_is_broken(chunked, tmp_path):
+    path = tmp_path / "a.las"
+    points = np.random.default_rng(1).normal(size=(90, 3))
+    WRITERS[".las"](path, Table(points))
+    with laspy.open(path) as file:
+        length = file.header.point_format.size
+    path.write_bytes(path.read_bytes()[: -30 * length])
+    with pytest.raises(UserError, match="ends after 60 points"):
+        stored(path).read(range(90)) if chunked else read(path, 9, 0)
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+@pytest.mark.parametrize("shape", [(20, 10), ()])
+def test_named_fields_need_one_row_a_point(shape, chunked, tmp_path):
+    path = tmp_path / "a.npy"
+    np.save(path, np.zeros(shape, [("x", "f4"), ("y", "f4"), ("z", "f4")]))
+    with pytest.raises(UserError, match="one row of fields a point"):
+        stored(path) if chunked else read(path, 9, 0)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".npy", ".bin", ".las", ".laz"])

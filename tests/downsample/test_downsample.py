@@ -115,7 +115,8 @@ def test_a_folder_is_done_again_only_where_something_is_missing_or_bad(folder, t
         (["--weights", "nowhere.pt"], "--weights: no file nowhere.pt"),
         (["--weights", "weights.pt", "--keep-attributes", "--readout", "generated"], "are new"),
         (["--m", 500, "--method", "fps"], "holds 299 points, fewer than --m 500"),
-        (["--m", 5, "--method", "fps", "--chunk", 9], "--chunk must be at least 1"),
+        (["--m", 5, "--method", "fps", "--chunk", 9], "--chunk goes with --weights"),
+        (["--weights", "weights.pt", "--chunk", 0], "--chunk must be at least 1, got 0"),
         (["--weights", "weights.pt", "--chunk", 9], "--readout generated or matched"),
         (["--m", 5, "--method", "fps", "--workers", 0], "--workers must be"),
         (["--m", 5, "--method", "fps", "--readout", "matched"], "--readout is for --weights"),
@@ -178,7 +179,7 @@ def test_chunks_of_a_file_give_what_the_whole_file_gives(suffix, readout, folder
     assert call(source, tmp_path / "whole.npz", *settings)[0] == 0
     status, out, err = call(source, tmp_path / "parts.npz", *settings, "--chunk", 60)
     assert (status, err) == (0, "")
-    assert f"40 of {500 if suffix == '.laz' else 440} points" in out
+    assert ("40 of 500 points" if suffix == ".laz" else "40 of 440 points (60 more") in out
     whole, parts = (read(tmp_path / f"{name}.npz", 9, 0) for name in ("whole", "parts"))
     np.testing.assert_allclose(parts.points, whole.points, atol=1e-5)
     assert list(parts.columns) == list(whole.columns)

@@ -1,7 +1,7 @@
 """Clouds in files that need not fit in memory: any stretch of their points can be read alone."""
 
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 
 from mops_lightning.downsample.las import laspy_for, table_of
-from mops_lightning.downsample.table import BadCloudError, Table, column_names, from_array
+from mops_lightning.downsample.table import (
+    BadCloudError,
+    Table,
+    column_names,
+    ends_early,
+    from_array,
+)
+from mops_lightning.errors import UserError
 
 PLY_KINDS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -47,28 +54,39 @@ class Stored:
         Raises:
             BadCloudError: the file is broken, or gone.
         """
-        try:
+        with _broken(self.path):
             table = self.raw(rows)
-        except BadCloudError:
-            raise
-        except (OSError, ValueError, KeyError) as error:
-            raise _broken(self.path, error) from None
         finite = np.isfinite(table.points).all(axis=1)
         return table if finite.all() else table.take(np.flatnonzero(finite))
 
     def raw(self, rows: range) -> Table:
-        """Read a stretch of rows with all its points; the format's own errors pass through."""
+        """Read a stretch of rows with all its points; the format's own errors pass through.
+
+        Raises:
+            BadCloudError: the file ends too early.
+        """
         if self.kind is None:
             with laspy_for(self.path).open(self.path) as file:
                 file.seek(rows.start)
-                return table_of(file.read_points(len(rows)), None)
-        start = self.offset + rows.start * self.kind.itemsize
-        array = np.fromfile(self.path, self.kind, len(rows), offset=start)
-        if len(array) < len(rows):
-            raise BadCloudError(
-                f"{self.path} is broken: it ends after {rows.start + len(array)} points."
-            )
-        return from_array(array, list(self.kind.names or ()), self.path)
+                table = table_of(file.read_points(len(rows)), None)
+        else:
+            start = self.offset + rows.start * self.kind.itemsize
+            array = np.fromfile(self.path, self.kind, len(rows), offset=start)
+            table = from_array(array, list(self.kind.names or ()), self.path)
+        if len(table.points) < len(rows):
+            raise ends_early(self.path, rows.start + len(table.points))
+        return table
+
+
+@contextmanager
+def _broken(path: Path) -> Iterator[None]:
+    """Name the file in whatever a broken one makes the parsers stumble over."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise BadCloudError(f"{path} is broken: {type(error).__name__}: {error}.") from None
 
 
 def stored(path: Path) -> Stored:
@@ -82,34 +100,21 @@ def stored(path: Path) -> Stored:
         raise BadCloudError(f"{path}: --chunk works with {', '.join(FORMATS)}.")
     if not path.is_file():
         raise BadCloudError(f"{path}: no such file.")
-    try:
+    with _broken(path):
         return FORMATS[suffix](path)
-    except BadCloudError:
-        raise
-    except (OSError, ValueError, KeyError) as error:
-        raise _broken(path, error) from None
-
-
-def _broken(path: Path, error: Exception) -> BadCloudError:
-    return BadCloudError(f"{path} is broken: {type(error).__name__}: {error}.")
 
 
 def _npy(path: Path) -> Stored:
-    with path.open("rb") as file:
-        version = np.lib.format.read_magic(file)
-        head = (
-            np.lib.format.read_array_header_1_0
-            if version == (1, 0)
-            else np.lib.format.read_array_header_2_0
-        )
-        shape, fortran, kind = head(file)
-        offset = file.tell()
+    array = np.load(path, mmap_mode="r", allow_pickle=False)
+    kind = array.dtype
     if kind.names is None:
-        names = column_names(shape, kind.kind, path)
-        if fortran:
+        names = column_names(array.shape, kind.kind, path)
+        if not array.flags.c_contiguous:
             raise BadCloudError(f"{path}: --chunk needs an array in C order, not in Fortran's.")
         kind = np.dtype([(name, kind) for name in names])
-    return Stored(path, shape[0], kind, offset)
+    elif array.ndim != 1:
+        raise BadCloudError(f"{path} must hold one row of fields a point, got {array.shape}.")
+    return Stored(path, array.shape[0], kind, array.offset)
 
 
 def kitti(path: Path) -> Stored:
@@ -127,25 +132,26 @@ def kitti(path: Path) -> Stored:
 
 def _ply(path: Path) -> Stored:
     with path.open("rb") as file:
-        head = b""
-        while not head.endswith(b"end_header\n") and len(head) < 65536:
-            line = file.readline()
-            if not line:
-                break
-            head += line.replace(b"\r\n", b"\n")
+        lines = []
+        while (line := file.readline(65536)) and line.split() != [b"end_header"]:
+            lines.append(line.decode("latin-1").split())
         offset = file.tell()
-    text = head.decode("latin-1")
+    words = [line for line in lines if line and line[0] not in ("ply", "comment", "obj_info")]
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}
-    form = re.search(r"^format (\S+)", text, re.M)
-    first = re.search(r"^element vertex (\d+)\n((?:property \S+ \S+\n)*)", text, re.M)
-    before = text.split("element vertex")[0]
-    if not form or form[1] not in order or not first or "element" in before:
-        raise BadCloudError(f"{path}: --chunk needs binary PLY whose vertices come first.")
-    if re.search(r"^element face [1-9]", text, re.M):
+    form, *elements = words or [["format", "of no kind"]]
+    begin = [place for place, line in enumerate(elements) if line[0] == "element"]
+    if form[:1] != ["format"] or form[1] not in order or begin[:1] != [0]:
+        raise BadCloudError(f"{path}: --chunk needs binary PLY with a complete head.")
+    first, *others = (elements[start] for start in begin)
+    if first[1] != "vertex":
+        raise BadCloudError(f"{path}: --chunk needs PLY whose vertices come before other elements.")
+    if any(other[1] == "face" and other[2] != "0" for other in others):
         raise BadCloudError(f"{path} is a mesh: --chunk is for clouds.")
-    fields = [line.split()[1:] for line in first[2].splitlines()]
-    kind = np.dtype([(name, order[form[1]] + PLY_KINDS[typed]) for typed, name in fields])
-    return Stored(path, int(first[1]), kind, offset)
+    fields = elements[1 : begin[1] if others else None]
+    if any(field[1] not in PLY_KINDS for field in fields):
+        raise BadCloudError(f"{path}: --chunk needs vertices without lists.")
+    kind = np.dtype([(name, order[form[1]] + PLY_KINDS[typed]) for _, typed, name in fields])
+    return Stored(path, int(first[2]), kind, offset)
 
 
 def _las(path: Path) -> Stored:

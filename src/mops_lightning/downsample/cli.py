@@ -97,6 +97,8 @@ def _run(chosen: argparse.Namespace) -> int:
         chosen.seed,
         chosen.chunk,
     )
+    if chosen.cluster == "":
+        raise UserError("--cluster must be 'local' or the address of a Dask scheduler, got ''.")
     if chosen.cluster and chosen.chunk is None:
         raise UserError("--cluster shares the chunks of a file: give --chunk as well.")
     sampler_of(settings)  # its mistakes come before any file

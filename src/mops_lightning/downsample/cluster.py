@@ -5,9 +5,12 @@ it has to do here is little: hand out stretches, and hand them out again when a 
 """
 
 import logging
+import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from mops_lightning.downsample.chunks import Stored
@@ -36,22 +39,36 @@ def cluster(address: str, workers: int) -> Iterator[Engine]:
     distributed = _distributed()
     import dask
 
+    # What is worth telling a user is told by errors.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     # The net is sent as part of a task's description, for workers that come later.
     with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}):
         if address != LOCAL:
             with _client(distributed, address) as client:
                 yield engine_of(client)
             return
-        with (
-            distributed.LocalCluster(
+        with _no_interrupts():
+            # So that Ctrl-C reaches this process alone, and not the workers that it starts.
+            processes = distributed.LocalCluster(
                 n_workers=workers,
                 threads_per_worker=1,
                 dashboard_address=":0",
                 silence_logs=logging.CRITICAL,
-            ) as processes,
-            distributed.Client(processes) as client,
-        ):
+            )
+        with processes, distributed.Client(processes) as client:
             yield engine_of(client)
+
+
+@contextmanager
+def _no_interrupts() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _distributed() -> Any:
@@ -87,7 +104,8 @@ def _client(distributed: Any, address: str) -> Iterator[Any]:
 
 def engine_of(client: Any) -> Engine:
     """Make an engine of a client; see ``large.Engine``."""
-    from distributed import KilledWorker
+    from distributed import CancelledError, KilledWorker
+    from distributed.comm import CommClosedError
 
     def engine(
         title: str,
@@ -96,12 +114,14 @@ def engine_of(client: Any) -> Engine:
         stretches: list[range],
         *common: Any,
     ) -> Iterator[Any]:
-        # As tasks, not as scattered data: a task is done again when the worker that has it dies.
-        shared = [client.submit(_same, value, pure=False) for value in common]
-        ahead = AHEAD * max(sum(client.nthreads().values()), 1)
+        # Workers may have another working directory.
+        cloud = replace(cloud, path=cloud.path.absolute())
         futures: deque[Any] = deque()
         rest = iter(stretches)
         try:
+            # As tasks, not as scattered data: a task is done again when the worker that has it dies.
+            shared = [client.submit(_same, value, pure=False) for value in common]
+            ahead = AHEAD * max(sum(client.nthreads().values()), 1)
             while True:
                 while len(futures) < ahead and (rows := next(rest, None)) is not None:
                     futures.append(client.submit(function, cloud, rows, *shared, pure=False))
@@ -112,6 +132,14 @@ def engine_of(client: Any) -> Engine:
             raise UserError(
                 f"--cluster: workers died again and again over {cloud.path} ({title}), perhaps for "
                 "want of memory: try a smaller --chunk."
+            ) from None
+        except Exception as error:  # Dask has many ways to say so
+            lost = isinstance(error, CancelledError | CommClosedError)
+            if not lost and client.status == "running":
+                raise
+            raise UserError(
+                f"--cluster: the scheduler has gone ({type(error).__name__}). Start it again, and "
+                "the same command."
             ) from None
 
     return engine

@@ -69,9 +69,11 @@ class Settings:
         if (self.m is not None and self.m < 1) or (self.m is None and self.method):
             raise UserError(f"--m must be a whole number of at least 1, got {self.m}.")
         whole = self.method or self.readout == "completed"
-        if self.chunk is not None and (self.chunk < 1 or whole):
+        if self.chunk is not None and self.chunk < 1:
+            raise UserError(f"--chunk must be at least 1, got {self.chunk}.")
+        if self.chunk is not None and whole:
             raise UserError(
-                "--chunk must be at least 1 and goes with --weights of MOPS-Net and --readout "
+                "--chunk goes with --weights of MOPS-Net and --readout "
                 "generated or matched: everything else needs the whole cloud at once."
             )
         if self.surface is not None and self.surface < 1:
@@ -141,11 +143,11 @@ def run(
     sampler = sampler_of(settings)
     m = settings.m or sampler.m
     if settings.chunk:
-        kept, number = by_chunks(
+        kept, number, dropped = by_chunks(
             source, sampler, m, settings.chunk, settings.readout, settings.keep_attributes, engine
         )
         _write(target, kept)
-        return len(kept.points), number, 0
+        return len(kept.points), number, dropped
     table = read(source, settings.surface or max(10_000, 8 * m), settings.seed)
     finite = np.flatnonzero(np.isfinite(table.points).all(axis=1))
     dropped = len(table.points) - len(finite)

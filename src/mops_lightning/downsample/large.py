@@ -73,8 +73,10 @@ def by_chunks(
     readout: str,
     keep_attributes: bool,
     engine: Engine = in_turn,
-) -> tuple[Table, int]:
-    """Return what a trained MOPS-Net keeps of a file, and how many points it has.
+) -> tuple[Table, int, int]:
+    """Return what a trained MOPS-Net keeps of a file, how many points it has, and how many more.
+
+    What more there are is left out for not being finite.
 
     Args:
         source: of a format of ``chunks.FORMATS``.
@@ -91,7 +93,7 @@ def by_chunks(
     if not isinstance(sampler, MOPSNet):
         raise UserError(f"--chunk works with MOPS-Net and FMOPS-Net, not {type(sampler).__name__}.")
     sampler._check_m(m)
-    whole = stored(source.absolute())
+    whole = stored(source)
     cloud, stretches = replace(whole, head=None), whole.stretches(size)
 
     def over(title: str, function: Callable[..., Any], *common: Any) -> Iterable[Any]:
@@ -111,10 +113,14 @@ def by_chunks(
     sums: Partial = reduce(Partial.merge, over("sampling", _sum, unit, net, global_, m))
     generated = sums.result()
     if readout == "generated":
-        return Table(generated.double().numpy() * unit.radius + centre), number
+        return (
+            Table(generated.double().numpy() * unit.radius + centre),
+            number,
+            whole.number - number,
+        )
     found: Nearest = reduce(Nearest.merge, over("matching", _nearest, unit, generated))
     kept = replace(found.table, head=whole.head)
-    return (kept if keep_attributes else kept.bare()), number
+    return (kept if keep_attributes else kept.bare()), number, whole.number - number
 
 
 def _count_and_sum(cloud: Stored, rows: range) -> tuple[int, NDArray[np.float64]]:

@@ -94,6 +94,8 @@ def from_array(array: NDArray[Any], names: list[str], path: Path, head: Any = No
     Raises:
         BadCloudError: there are no coordinates.
     """
+    if array.dtype.names and array.ndim != 1:
+        raise BadCloudError(f"{path} must hold one row of fields a point, got {array.shape}.")
     lower = {name.lower(): name for name in reversed(names)}
     if not {"x", "y", "z"} <= set(lower):
         raise BadCloudError(f"{path} has no x, y and z; its columns are {', '.join(names)}.")
@@ -106,6 +108,11 @@ def from_array(array: NDArray[Any], names: list[str], path: Path, head: Any = No
     rest = {name: column(name) for name in names if name not in axes}
     numbers = {name: c for name, c in rest.items() if c.ndim == 1 and c.dtype.kind in "fiub"}
     return Table(points, numbers, head)
+
+
+def ends_early(path: Path, number: int) -> BadCloudError:
+    """Say that a file holds fewer points than it announces."""
+    return BadCloudError(f"{path} is broken: it ends after {number} points.")
 
 
 def column_names(shape: tuple[int, ...], kind: str, path: Path) -> list[str]:
