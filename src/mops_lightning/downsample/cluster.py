@@ -119,7 +119,7 @@ def engine_of(client: Any) -> Engine:
         futures: deque[Any] = deque()
         rest = iter(stretches)
         try:
-            # As tasks, not as scattered data: a task is done again when the worker that has it dies.
+            # As tasks, not scattered: they are done again when the worker that has them dies.
             shared = [client.submit(_same, value, pure=False) for value in common]
             ahead = AHEAD * max(sum(client.nthreads().values()), 1)
             while True:
