@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mops_lightning.geometry import nearest
+from mops_lightning.neighbours import nearest_distances
 
 
 def subset_loss(points: Tensor, samples: Tensor) -> Tensor:
@@ -30,7 +30,7 @@ def subset_loss(points: Tensor, samples: Tensor) -> Tensor:
 
 def subset_losses(points: Tensor, samples: Tensor, sizes: Sequence[int]) -> dict[int, Tensor]:
     """Return, by size m, the ``subset_loss`` of the first m samples."""
-    distances = nearest(samples, points)[0]
+    distances = nearest_distances(samples, points)
     return {m: distances[:, :m].mean() for m in sizes}
 
 
@@ -64,11 +64,11 @@ def simplification_losses(
     coverage_per_point: float = 0.0,
 ) -> dict[int, Tensor]:
     """Return, by size m, the ``simplification_loss`` of the first m samples."""
-    to_cloud = nearest(samples, points)[0]
+    to_cloud = nearest_distances(samples, points)
     losses, begin, from_cloud = {}, 0, None
     for m in sorted(set(sizes)):
         # Nearest among the first m: nearest among the smaller size, or among what is added to it.
-        added = nearest(points, samples[:, begin:m])[0]
+        added = nearest_distances(points, samples[:, begin:m])
         from_cloud = added if from_cloud is None else torch.minimum(from_cloud, added)
         begin = m
         there = to_cloud[:, :m].mean(1) + to_cloud[:, :m].amax(1)
@@ -80,8 +80,8 @@ def simplification_losses(
 def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
     """Return the squared chamfer distance of two clouds, both directions, each a mean over points.
 
-    CD(P, Q) = 1/|P| Σ_p min_q ‖p − q‖² + 1/|Q| Σ_q min_p ‖q − p‖². The search runs in blocks, so
-    memory does not grow with |P|·|Q|; gradients flow to both clouds through the nearest points.
+    CD(P, Q) = 1/|P| Σ_p min_q ‖p − q‖² + 1/|Q| Σ_q min_p ‖q − p‖². Memory does not grow with
+    |P|·|Q|; gradients flow to both clouds through the nearest points.
 
     Args:
         points: ``(B, N, 3)`` the clouds P.
@@ -90,4 +90,4 @@ def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
     Returns:
         ``(B,)`` in squared units of the coordinates.
     """
-    return nearest(points, others)[0].mean(1) + nearest(others, points)[0].mean(1)
+    return nearest_distances(points, others).mean(1) + nearest_distances(others, points).mean(1)
