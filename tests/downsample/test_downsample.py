@@ -193,6 +193,8 @@ def test_chunks_of_a_file_give_what_the_whole_file_gives(suffix, readout, folder
         ("a.xyz", b"1 2 3", "--chunk works with .npy"),
         ("a.bin", b"123", "no KITTI scan"),
         ("a.npy", b"123", "a.npy is broken"),
+        ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n", "does not end"),
+        ("a.ply", b"\n" * 10_000, "does not end"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n", "needs binary PLY"),
     ],
 )

@@ -24,6 +24,9 @@ PLY_KINDS = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 
+LONGEST_LINE, MOST_LINES = 4096, 1000
+"""What a head of PLY may hold; beyond, the file is something else."""
+
 
 @dataclass(frozen=True)
 class Stored:
@@ -133,7 +136,9 @@ def kitti(path: Path) -> Stored:
 def _ply(path: Path) -> Stored:
     with path.open("rb") as file:
         lines = []
-        while (line := file.readline(65536)) and line.split() != [b"end_header"]:
+        while (line := file.readline(LONGEST_LINE)).split() != [b"end_header"]:
+            if not line or len(lines) == MOST_LINES:
+                raise BadCloudError(f"{path} is broken: its head does not end.")
             lines.append(line.decode("latin-1").split())
         offset = file.tell()
     words = [line for line in lines if line and line[0] not in ("ply", "comment", "obj_info")]
