@@ -135,7 +135,7 @@ def kitti(path: Path) -> Stored:
 
 def _ply(path: Path) -> Stored:
     with path.open("rb") as file:
-        lines = []
+        lines: list[list[str]] = []
         while (line := file.readline(LONGEST_LINE)).split() != [b"end_header"]:
             if not line or len(lines) == MOST_LINES:
                 raise BadCloudError(f"{path} is broken: its head does not end.")
