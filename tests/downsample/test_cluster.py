@@ -12,7 +12,7 @@ import torch
 
 from mops_lightning import weights
 from mops_lightning.downsample.chunks import stored
-from mops_lightning.downsample.cluster import cluster, engine_of
+from mops_lightning.downsample.cluster import cluster, engine_of, environment_kept
 from mops_lightning.downsample.formats import WRITERS
 from mops_lightning.downsample.job import read
 from mops_lightning.downsample.large import by_chunks
@@ -25,6 +25,7 @@ from tests.downsample.test_downsample import call
 @pytest.fixture(scope="module")
 def client():
     with (
+        environment_kept(),
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as two,
         distributed.Client(two) as client,
     ):
@@ -82,6 +83,7 @@ def test_a_worker_that_is_killed_does_not_change_the_result(client, scan):
 
 
 def test_from_the_command_line(scan, tmp_path):
+    before = dict(os.environ)
     settings = ["--weights", scan[0].parent, "--readout", "matched", "--keep-attributes"]
     settings += ["--chunk", 500]
     assert call(scan[0], tmp_path / "one.npz", *settings)[0] == 0
@@ -91,6 +93,7 @@ def test_from_the_command_line(scan, tmp_path):
     assert (status, err) == (0, "")
     assert "24 of 2,780 points (220 more without finite coordinates left out)" in out
     same(read(tmp_path / "one.npz", 9, 0), read(tmp_path / "two.npz", 9, 0))
+    assert dict(os.environ) == before, "what comes later must not be bound to one thread"
 
 
 def test_a_scheduler_that_runs_already_is_used(client, scan, tmp_path):
@@ -124,6 +127,7 @@ def test_no_scheduler_at_the_address(scan, tmp_path, monkeypatch):
 def test_a_scheduler_without_workers(monkeypatch):
     monkeypatch.setattr("mops_lightning.downsample.cluster.PATIENCE", 1)
     with (
+        environment_kept(),
         distributed.LocalCluster(n_workers=0, dashboard_address=":0") as empty,
         pytest.raises(UserError, match="has no workers"),
         cluster(empty.scheduler_address, 1),
@@ -149,17 +153,20 @@ def test_what_does_not_go_with_a_cluster(scan, tmp_path):
     assert "got ''" in err
 
 
-def test_a_scheduler_that_goes_away(scan, tmp_path):
-    cluster = distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=50
-    )
-    with distributed.Client(cluster) as client:
+def test_a_scheduler_that_goes_away(scan):
+    with (
+        environment_kept(),
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=50
+        ) as one,
+        distributed.Client(one) as client,
+    ):
         engine = engine_of(client)
 
         def closing(*arguments):
             for result in engine(*arguments):
-                if cluster.status.name == "running":
-                    cluster.close()
+                if one.status.name == "running":
+                    one.close()
                 yield result
 
         with pytest.raises(UserError, match="the scheduler has gone"):

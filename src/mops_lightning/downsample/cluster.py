@@ -5,6 +5,7 @@ it has to do here is little: hand out stretches, and hand them out again when a 
 """
 
 import logging
+import os
 import signal
 import threading
 from collections import deque
@@ -47,16 +48,28 @@ def cluster(address: str, workers: int) -> Iterator[Engine]:
             with _client(distributed, address) as client:
                 yield engine_of(client)
             return
-        with _no_interrupts():
-            # So that Ctrl-C reaches this process alone, and not the workers that it starts.
-            processes = distributed.LocalCluster(
-                n_workers=workers,
-                threads_per_worker=1,
-                dashboard_address=":0",
-                silence_logs=logging.CRITICAL,
-            )
-        with processes, distributed.Client(processes) as client:
-            yield engine_of(client)
+        with environment_kept():
+            with _no_interrupts():
+                # So that Ctrl-C reaches this process alone, and not the workers that it starts.
+                processes = distributed.LocalCluster(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    dashboard_address=":0",
+                    silence_logs=logging.CRITICAL,
+                )
+            with processes, distributed.Client(processes) as client:
+                yield engine_of(client)
+
+
+@contextmanager
+def environment_kept() -> Iterator[None]:
+    """Undo what Dask sets for its workers: OMP_NUM_THREADS=1 would hold for what comes later."""
+    before = dict(os.environ)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 @contextmanager
