@@ -1,7 +1,6 @@
 """Clouds in files that need not fit in memory: any stretch of their points can be read alone."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,8 @@ from mops_lightning.downsample.table import (
     column_names,
     ends_early,
     from_array,
+    naming,
 )
-from mops_lightning.errors import UserError
 
 PLY_KINDS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -57,10 +56,8 @@ class Stored:
         Raises:
             BadCloudError: the file is broken, or gone.
         """
-        with _broken(self.path):
-            table = self.raw(rows)
-        finite = np.isfinite(table.points).all(axis=1)
-        return table if finite.all() else table.take(np.flatnonzero(finite))
+        with naming(self.path):
+            return self.raw(rows).finite()
 
     def raw(self, rows: range) -> Table:
         """Read a stretch of rows with all its points; the format's own errors pass through.
@@ -81,17 +78,6 @@ class Stored:
         return table
 
 
-@contextmanager
-def _broken(path: Path) -> Iterator[None]:
-    """Name the file in whatever a broken one makes the parsers stumble over."""
-    try:
-        yield
-    except UserError:
-        raise
-    except Exception as error:
-        raise BadCloudError(f"{path} is broken: {type(error).__name__}: {error}.") from None
-
-
 def stored(path: Path) -> Stored:
     """Find out where the points of a file lie.
 
@@ -103,20 +89,17 @@ def stored(path: Path) -> Stored:
         raise BadCloudError(f"{path}: --chunk works with {', '.join(FORMATS)}.")
     if not path.is_file():
         raise BadCloudError(f"{path}: no such file.")
-    with _broken(path):
+    with naming(path):
         return FORMATS[suffix](path)
 
 
 def _npy(path: Path) -> Stored:
     array = np.load(path, mmap_mode="r", allow_pickle=False)
-    kind = array.dtype
+    names, kind = column_names(array, path), array.dtype
     if kind.names is None:
-        names = column_names(array.shape, kind.kind, path)
         if not array.flags.c_contiguous:
             raise BadCloudError(f"{path}: --chunk needs an array in C order, not in Fortran's.")
         kind = np.dtype([(name, kind) for name in names])
-    elif array.ndim != 1:
-        raise BadCloudError(f"{path} must hold one row of fields a point, got {array.shape}.")
     return Stored(path, array.shape[0], kind, array.offset)
 
 

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -103,17 +103,16 @@ def _run(chosen: argparse.Namespace) -> int:
         raise UserError("--cluster shares the chunks of a file: give --chunk as well.")
     sampler_of(settings)  # its mistakes come before any file
     jobs = _jobs(chosen)
+    if not chosen.source.is_dir() and jobs[0][1].exists() and not chosen.overwrite:
+        raise UserError(f"{jobs[0][1]} is there already. Give another OUT, or --overwrite.")
     with _engine(chosen) as engine:
         if chosen.source.is_dir():
             return _folder(jobs, settings, chosen, engine)
-        return _file(*jobs[0], settings, chosen, engine)
+        return _file(*jobs[0], settings, engine)
 
 
-def _file(source: Path, target: Path, settings: Any, chosen: Any, engine: Any) -> int:
+def _file(source: Path, target: Path, settings: Any, engine: Any) -> int:
     from mops_lightning.downsample.files import attempt
-
-    if target.exists() and not chosen.overwrite:
-        raise UserError(f"{target} is there already. Give another OUT, or --overwrite.")
 
     def with_bar(title: str, function: Any, cloud: Any, stretches: Any, *common: Any) -> Any:
         results = engine(title, function, cloud, stretches, *common)
@@ -211,18 +210,15 @@ def _result(future: Future[Any]) -> Any:
         )
 
 
-@contextmanager
-def _engine(chosen: argparse.Namespace) -> Iterator[Any]:
-    """Give what works on the chunks of a file; see ``large.Engine``."""
+def _engine(chosen: argparse.Namespace) -> AbstractContextManager[Any]:
+    """Return what works on the chunks of a file; see ``large.Engine``."""
     if not chosen.cluster:
         from mops_lightning.downsample.large import in_turn
 
-        yield in_turn
-        return
+        return nullcontext(in_turn)
     from mops_lightning.downsample.cluster import cluster
 
-    with cluster(chosen.cluster, chosen.workers) as engine:
-        yield engine
+    return cluster(chosen.cluster, chosen.workers)
 
 
 @contextmanager

@@ -76,10 +76,7 @@ def _digits(column: Column) -> str:
 
 def read_npy(path: Path) -> Table:
     """Read one array: ``(N, K)`` numbers, x, y and z first, or named fields."""
-    array = _loaded(path)
-    if array.dtype.names:
-        return from_array(array, list(array.dtype.names), path)
-    return _numbers(array, path)
+    return _numbers(_loaded(path), path)
 
 
 def write_npy(path: Path, table: Table) -> None:
@@ -198,7 +195,7 @@ def _structured(arrays: list[Column]) -> NDArray[Any]:
 
 
 def _numbers(array: NDArray[Any], path: Path) -> Table:
-    return from_array(array, column_names(array.shape, array.dtype.kind, path), path)
+    return from_array(array, column_names(array, path), path)
 
 
 def _loaded(path: Path) -> Any:

@@ -16,7 +16,14 @@ from mops_lightning import weights
 from mops_lightning.data.mesh_io import parse_mesh
 from mops_lightning.downsample.formats import READABLE, READERS, WRITERS
 from mops_lightning.downsample.large import Engine, by_chunks, in_turn
-from mops_lightning.downsample.table import BadCloudError, Table, radius_of, reach
+from mops_lightning.downsample.table import (
+    BadCloudError,
+    Table,
+    check_enough,
+    naming,
+    radius_of,
+    reach,
+)
 from mops_lightning.errors import UserError
 from mops_lightning.io import atomic_write
 from mops_lightning.readout import complete
@@ -149,14 +156,12 @@ def run(
         _write(target, kept)
         return len(kept.points), number, dropped
     table = read(source, settings.surface or max(10_000, 8 * m), settings.seed)
-    finite = np.flatnonzero(np.isfinite(table.points).all(axis=1))
-    dropped = len(table.points) - len(finite)
-    table = table.take(finite) if dropped else table
-    if len(table.points) < m:
-        raise BadCloudError(f"{source} holds {len(table.points)} points, fewer than --m {m}.")
-    kept = sampled(source, table, sampler, m, settings)
+    finite = table.finite()
+    number = len(finite.points)
+    check_enough(source, number, m)
+    kept = sampled(source, finite, sampler, m, settings)
     _write(target, kept)
-    return len(kept.points), len(table.points), dropped
+    return len(kept.points), number, len(table.points) - number
 
 
 def _write(target: Path, table: Table) -> None:
@@ -175,13 +180,9 @@ def read(path: Path, surface: int, seed: int) -> Table:
         raise BadCloudError(f"{path} must end in {', '.join(READABLE)}.")
     if not path.is_file():
         raise BadCloudError(f"{path}: no such file.")
-    try:
+    with naming(path):
         table = READERS[suffix](path) if suffix in READERS else None
         data = path.read_bytes() if table is None else b""
-    except UserError:
-        raise
-    except Exception as error:  # the parsers raise whatever a broken file makes them stumble over
-        raise BadCloudError(f"{path} is broken: {type(error).__name__}: {error}.") from None
     if table is not None:
         return table
     if suffix == ".obj" and not re.search(rb"^f\s", data, re.M):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.downsample.chunks import Stored, stored
-from mops_lightning.downsample.table import BadCloudError, Table, radius_of, reach
+from mops_lightning.downsample.table import Table, check_enough, radius_of, reach
 from mops_lightning.errors import UserError
 from mops_lightning.geometry import nearest
 from mops_lightning.samplers.folded import FoldedMOPS, fold
@@ -104,8 +104,7 @@ def by_chunks(
     for count, part in over("centre", _count_and_sum):
         number += count
         total += part
-    if number < m:
-        raise BadCloudError(f"{source} holds {number} points, fewer than --m {m}.")
+    check_enough(source, number, m)
     centre = total / number
     unit = Unit(centre, radius_of(max(over("radius", _reach, centre)), source))
     net = fold(sampler)

@@ -1,6 +1,7 @@
 """A cloud as its file has it: coordinates, and columns of whatever else."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,11 @@ class Table:
         """Return some of the points with all that belongs to them."""
         columns = {name: column[rows] for name, column in self.columns.items()}
         return Table(self.points[rows], columns, self.head)
+
+    def finite(self) -> "Table":
+        """Return the points whose coordinates are all finite."""
+        finite = np.isfinite(self.points).all(axis=1)
+        return self if finite.all() else self.take(np.flatnonzero(finite))
 
     def bare(self) -> "Table":
         """Return the points alone."""
@@ -94,8 +100,6 @@ def from_array(array: NDArray[Any], names: list[str], path: Path, head: Any = No
     Raises:
         BadCloudError: there are no coordinates.
     """
-    if array.dtype.names and array.ndim != 1:
-        raise BadCloudError(f"{path} must hold one row of fields a point, got {array.shape}.")
     lower = {name.lower(): name for name in reversed(names)}
     if not {"x", "y", "z"} <= set(lower):
         raise BadCloudError(f"{path} has no x, y and z; its columns are {', '.join(names)}.")
@@ -110,22 +114,51 @@ def from_array(array: NDArray[Any], names: list[str], path: Path, head: Any = No
     return Table(points, numbers, head)
 
 
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Name the file in whatever a broken one makes the parsers stumble over.
+
+    Raises:
+        BadCloudError: in place of any error but ``UserError``.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise BadCloudError(f"{path} is broken: {type(error).__name__}: {error}.") from None
+
+
+def check_enough(path: Path, number: int, m: int) -> None:
+    """Refuse a cloud of fewer points than are to be kept.
+
+    Raises:
+        BadCloudError: it has fewer.
+    """
+    if number < m:
+        raise BadCloudError(f"{path} holds {number} points, fewer than --m {m}.")
+
+
 def ends_early(path: Path, number: int) -> BadCloudError:
     """Say that a file holds fewer points than it announces."""
     return BadCloudError(f"{path} is broken: it ends after {number} points.")
 
 
-def column_names(shape: tuple[int, ...], kind: str, path: Path) -> list[str]:
-    """Return the names of the columns of a plain array: x, y, z, and column_3 and so on.
+def column_names(array: NDArray[Any], path: Path) -> list[str]:
+    """Return the names of the columns of an array: its fields, or x, y, z, column_3 and so on.
 
     Args:
-        shape: of the array.
-        kind: of its numbers, as numpy's ``dtype.kind`` has it.
+        array: plain or structured; its numbers are not read.
         path: for errors.
 
     Raises:
-        BadCloudError: it holds no rows of three numbers or more.
+        BadCloudError: it holds no rows of three numbers or more, nor one row of fields a point.
     """
+    shape, kind = array.shape, array.dtype.kind
+    if array.dtype.names:
+        if array.ndim != 1:
+            raise BadCloudError(f"{path} must hold one row of fields a point, got {shape}.")
+        return list(array.dtype.names)
     if len(shape) != 2 or shape[1] < 3 or kind not in "fiu":
         raise BadCloudError(f"{path} must hold rows of x, y, z, got shape {shape}.")
     return ["x", "y", "z", *(f"column_{place}" for place in range(3, shape[1]))]
