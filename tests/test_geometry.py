@@ -17,6 +17,15 @@ from mops_lightning.losses import subset_loss
 FLOATS = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
 
+@pytest.fixture(params=[0, geometry.FEW], ids=["in groups", "few"])
+def few(request, monkeypatch):
+    monkeypatch.setattr(geometry, "FEW", request.param)
+
+
+BOTH = pytest.mark.usefixtures("few")
+"""Small searches and large ones go different ways; here small ones go both."""
+
+
 def squared(a, b):
     return sum((x - y) ** 2 for x, y in zip(a, b, strict=True))
 
@@ -47,6 +56,7 @@ def plain_farthest(cloud, chosen, m):
     return chosen
 
 
+@BOTH
 @FLOATS
 @pytest.mark.parametrize("n", [5, 32, 75])
 def test_nearest_equals_the_double_loop(n, dtype, rng):
@@ -100,6 +110,7 @@ def test_nearest_does_not_cancel(offset, rng):
         torch.testing.assert_close(distances[b].double().sqrt(), exact, rtol=1e-5, atol=0)
 
 
+@BOTH
 def test_nearest_takes_the_lowest_of_equals():
     points = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0]]]).repeat(1, 20, 1)
     assert nearest(torch.zeros(1, 1, 3), points)[1].item() == 2
@@ -122,6 +133,7 @@ def test_nearest_names_shapes_that_do_not_fit(queries, points):
         nearest(torch.zeros(queries), torch.zeros(points))
 
 
+@BOTH
 @FLOATS
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (20, 20), (32, 7), (75, 30)])
 def test_fps_equals_the_double_loop(n, m, dtype, rng):
@@ -146,6 +158,7 @@ def test_fps_start(rng):
     assert not torch.equal(drawn(1)[:, 0], drawn(2)[:, 0])
 
 
+@BOTH
 def test_fps_of_coincident_points_is_distinct():
     points = torch.zeros(2, 40, 3)
     points[1, 10:20] = 1.0
@@ -160,6 +173,7 @@ def test_fps_names_what_is_out_of_range(m, start):
         farthest_point_sample(torch.zeros(1, 5, 3), m, start=start)
 
 
+@BOTH
 def test_fill_equals_the_double_loop(rng):
     points = torch.randn(3, 45, 3, generator=rng)
     given = torch.tensor([1, 6, 12])
@@ -170,6 +184,7 @@ def test_fill_equals_the_double_loop(rng):
         assert filled[b].tolist() == plain_farthest(points[b], chosen, 12)
 
 
+@BOTH
 @pytest.mark.parametrize("largest", [True, False])
 def test_first_extreme_is_the_lowest_position(largest, rng):
     values = torch.randint(0, 9, (50, 3 * geometry.GROUP), generator=rng).float()

@@ -15,8 +15,8 @@ from torch.nn import functional as F
 from mops_lightning.errors import UserError
 from mops_lightning.farthest import take_farthest_by_groups
 
-GROUP = 32
-"""Values per group in ``first_extreme``."""
+GROUP, FEW = 32, 8192
+"""Values per group in ``first_extreme``, and up to how many values groups do not pay there."""
 BLOCK = {"cpu": 2**19, "other": 2**24}
 """How many distances ``nearest`` holds at a time: what a CPU keeps in its cache; 64 MiB."""
 
@@ -185,6 +185,8 @@ def first_extreme(values: Tensor, largest: bool) -> Tensor:
     Returns:
         ``(rows, 1)`` int64; the lowest position where several values are equal.
     """
+    if values.numel() <= FEW:
+        return values.argmax(1, keepdim=True) if largest else values.argmin(1, keepdim=True)
     groups = values.view(len(values), -1, GROUP)
     peaks = groups.amax(2) if largest else groups.amin(2)
     group = peaks.argmax(1, keepdim=True) if largest else peaks.argmin(1, keepdim=True)
