@@ -4,12 +4,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import rivals
 import torch
 from measure import Timing, flops, interleaved, peak_memory
 from torch import Tensor, nn
 from twins import PlainMOPS, plain_farthest_point_sample
 
-from mops_lightning.geometry import farthest_point_sample
+from mops_lightning.geometry import farthest_point_sample, nearest
+from mops_lightning.neighbours import nearest_distances
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.folded import fold
@@ -174,25 +176,40 @@ def training(peak: dict[str, float], rounds: int) -> list[Row]:
 
 
 def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
-    """Farthest point sampling beside the plain form, and beside fpsample where it is installed."""
+    """Farthest point sampling beside the plain form (to 100,000) and what else is installed."""
     rows: list[Row] = []
-    for number, m in ((1024, 32), (10_000, 1024), (100_000, 1024), (1_000_000, 4096)):
+    for number, m in ((1024, 32), (1024, 512), (10_000, 1024), (100_000, 1024), (1_000_000, 4096)):
         points = cloud(number)
-        calls: Calls = {
-            "fps": partial(farthest_point_sample, points, m),
-            "fps, plain twin": partial(plain_farthest_point_sample, points[0], m),
+        own = partial(farthest_point_sample, points, m)
+        calls: Calls = {"fps": own}
+        if number <= 100_000:
+            calls["fps, plain twin"] = partial(plain_farthest_point_sample, points[0], m)
+        others = rivals.farthest(points[0], m)
+        wanted = {tuple(point) for point in points[0, own()[0]].tolist()}
+        shared = {
+            name: len(wanted & {tuple(point) for point in call().astype("f4").tolist()})
+            for name, call in others.items()
         }
-        try:
-            import fpsample  # type: ignore[import-not-found]
+        for row in _rows("sampler", calls | others, {"N": number, "m": m}, rounds, peak):
+            same = shared.get(row["sampler"], m)
+            rows.append({**row, "points as ours": same})
+    return rows
 
-            array = points[0].numpy()
-            calls["fpsample, plain"] = partial(fpsample.fps_sampling, array, m, 0)
-            calls["fpsample, buckets"] = partial(
-                fpsample.bucket_fps_kdline_sampling, array, m, 5, 0
-            )
-        except ModuleNotFoundError:
-            pass
-        rows += _rows("sampler", calls, {"N": number, "m": m}, rounds, peak)
+
+def neighbours(peak: dict[str, float], rounds: int) -> list[Row]:
+    """Nearest points of a cloud: ours by looking at all, by a tree where it pays, and others."""
+    rows: list[Row] = []
+    for number, m in ((1024, 1024), (10_000, 1024), (40_960, 4096), (40_960, 40_960)):
+        points, queries = cloud(number), cloud(m + 1)[:, :m]
+        calls: Calls = {
+            "nearest": partial(nearest, queries, points),
+            "nearest_distances": partial(nearest_distances, queries, points),
+        }
+        others = rivals.nearest(queries[0], points[0])
+        own = nearest(queries, points)[1][0].numpy()
+        shared = {name: int((call() == own).sum()) for name, call in others.items()}
+        for row in _rows("search", calls | others, {"N": number, "m": m}, rounds, peak):
+            rows.append({**row, "points as ours": shared.get(row["search"], m)})
     return rows
 
 
@@ -245,5 +262,6 @@ ALL: dict[str, Callable[[dict[str, float], int], list[Row]]] = {
     "modules": modules,
     "training": training,
     "farthest": farthest,
+    "neighbours": neighbours,
     "growth": growth,
 }
