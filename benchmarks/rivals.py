@@ -1,0 +1,72 @@
+"""Other libraries that find farthest or nearest points, each where it is installed.
+
+They are called as their documentation says, on arrays of their own kind; what it takes to make
+these is not timed. None of them is a requirement: ``pip install fpsample open3d-cpu
+point-cloud-utils``, in an environment of their own if their requirements do not agree with ours.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+Calls = dict[str, Callable[[], Any]]
+
+
+def installed(name: str) -> Any:
+    """Return a library, or None."""
+    try:
+        return import_module(name)
+    except ImportError:
+        return None
+
+
+def farthest(points: Tensor, m: int) -> Calls:
+    """Return calls that take m farthest points ``(m, 3)`` of ``(N, 3)``, from row 0 on.
+
+    fpsample's buckets begin with a row of their own, whatever they are told.
+    """
+    array, calls = points.numpy(), Calls()
+    if fpsample := installed("fpsample"):
+        calls["fpsample, plain"] = lambda: array[fpsample.fps_sampling(array, m, 0)]
+        calls["fpsample, buckets"] = lambda: array[
+            fpsample.bucket_fps_kdline_sampling(array, m, 7, 0)
+        ]
+    if open3d := installed("open3d"):
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(array.astype(float)))
+        calls["Open3D"] = lambda: np.asarray(cloud.farthest_point_down_sample(m, 0).points)
+    return calls
+
+
+def nearest(queries: Tensor, points: Tensor) -> Calls:
+    """Return calls that find the row of the nearest of ``(N, 3)`` for each of ``(M, 3)``.
+
+    What a library builds first, a tree in most, is part of the call.
+    """
+    many, few = points.numpy(), queries.numpy()
+
+    def by_scipy() -> NDArray[np.int64]:
+        return np.asarray(cKDTree(many).query(few, workers=-1)[1])
+
+    calls: Calls = {"scipy": by_scipy}
+    if utils := installed("point_cloud_utils"):
+        calls["point-cloud-utils"] = partial(_second, utils.k_nearest_neighbors, few, many, 1)
+    if open3d := installed("open3d"):
+        core = open3d.core
+
+        def by_open3d() -> NDArray[np.int64]:
+            search = core.nns.NearestNeighborSearch(core.Tensor(many))
+            search.knn_index()
+            return search.knn_search(core.Tensor(few), 1)[0].numpy().ravel()
+
+        calls["Open3D"] = by_open3d
+    return calls
+
+
+def _second(function: Callable[..., Any], *arguments: Any) -> Any:
+    return function(*arguments)[1].ravel()
