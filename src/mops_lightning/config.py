@@ -38,6 +38,9 @@ RUN_KEYS = (
 )
 """Keys of the configuration that are no group; ``--help`` says what each means."""
 
+PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
+"""What ``trainer.precision`` may be; Lightning has more."""
+
 GROUPS = ("task", "dataset", "sampler", "optimizer", "trainer", "logger")
 LEARN = ("task", "sampler", "joint", "nothing")
 
@@ -149,6 +152,11 @@ def check(cfg: DictConfig) -> None:
     for group in {*GROUPS, "pretrain", "baselines"} - set(unused):
         _check_node(cfg.get(group), group)
     _whole(cfg.trainer, "max_epochs", int(cfg.learn != "nothing"), "trainer.max_epochs")
+    if cfg.trainer.get("precision") not in (*PRECISIONS, "32", 32, None):
+        raise UserError(
+            f"trainer.precision must be one of {', '.join(PRECISIONS)}, got "
+            f"{cfg.trainer.precision!r}. Others would round coordinates, or the weights."
+        )
     _whole(cfg.pretrain, "max_epochs", 1, "pretrain.max_epochs")
     several.check(cfg)
     points = cfg.dataset.get("n_points")

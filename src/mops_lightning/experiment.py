@@ -13,6 +13,7 @@ from torchmetrics import MeanMetric
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics import SET_METRICS
+from mops_lightning.precision import full_precision, wide_layers_mixed
 from mops_lightning.readout_names import FULL, SOFT_PROJECTED, size_prefix
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.scoring import BatchReadouts, full_cloud, readout_names
@@ -172,6 +173,10 @@ class Experiment(L.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the task loss plus the sampler's losses, over all sizes of this step."""
+        with wide_layers_mixed(self.device.type):
+            return self._training_step(batch, batch_idx)
+
+    def _training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         sizes = (0,) if self.sampler is None else self.sampler.training_sizes()
         if self.global_rank:  # sizes are everyone's, what is drawn for clouds each process's own
             torch.manual_seed(
@@ -219,12 +224,17 @@ class Experiment(L.LightningModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Score the learned readouts on held-out training clouds, at one size."""
-        readouts = BatchReadouts(self.sampler, {}, (self.m,))
-        self._score(batch, "val/", readouts, self.m, self.own_readouts)
-        self._score_sets(readouts, {self.m: "val/"}, len(batch.points))
+        with full_precision(self.device.type):
+            readouts = BatchReadouts(self.sampler, {}, (self.m,))
+            self._score(batch, "val/", readouts, self.m, self.own_readouts)
+            self._score_sets(readouts, {self.m: "val/"}, len(batch.points))
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         """Score the learned readouts and the baselines at every size, and the full clouds."""
+        with full_precision(self.device.type):
+            self._test_step(batch)
+
+    def _test_step(self, batch: Batch) -> None:
         baselines: Any = dict(self.baselines.items())
         readouts = BatchReadouts(self.sampler, baselines, self.sizes)
         names = [name for name in (*self.own_readouts, *baselines) if name != FULL]

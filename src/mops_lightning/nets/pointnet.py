@@ -15,6 +15,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from mops_lightning.geometry import GROUP, first_extreme
+from mops_lightning.precision import wide_dtype, wide_layers
 
 FEW_POINTS = 32
 """Up to here ``PointMaxPool`` computes the plain layers; on a CPU both ways are equal around it."""
@@ -42,6 +43,9 @@ def linear_norm_relu(channels: Sequence[int], norm: bool = True) -> nn.Sequentia
 class PointMLP(nn.Module):
     """One MLP shared by all points.
 
+    In mixed precision all but its first layer, which sees coordinates, is of half precision, and so
+    is the result.
+
     Args:
         channels: input size, then the output size of every layer.
         norm: False leaves BatchNorm out.
@@ -53,7 +57,15 @@ class PointMLP(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, N, channels[0])`` to ``(B, N, channels[-1])``."""
-        return self.layers(features.flatten(0, 1)).unflatten(0, features.shape[:2])
+        rows = features.flatten(0, 1)
+        if wide_dtype() is None:
+            return self.layers(rows).unflatten(0, features.shape[:2])
+        first, *others = self.layers.children()
+        rows = first(rows.to(next(first.parameters())))
+        with wide_layers(rows.device.type):
+            for layer in others:
+                rows = layer(rows)
+        return rows.unflatten(0, features.shape[:2])
 
 
 class PointMaxPool(nn.Module):
@@ -77,8 +89,9 @@ class PointMaxPool(nn.Module):
         self.norm = nn.BatchNorm1d(channels_out) if norm else None
 
     def forward(self, features: Tensor) -> Tensor:
-        """Map ``(B, N, channels_in)`` to ``(B, channels_out)``."""
+        """Map ``(B, N, channels_in)`` to ``(B, channels_out)`` in the precision of the weights."""
         if features.shape[1] <= FEW_POINTS:
+            features = features.to(self.linear.weight)
             # For few points the plain product costs less than what finding winners adds to it.
             rows = self.linear(features.flatten(0, 1))
             rows = rows if self.norm is None else self.norm(rows)
@@ -99,7 +112,7 @@ class PointMaxPool(nn.Module):
         if not self.training:
             mean, variance = norm.running_mean, norm.running_var
         else:
-            rows = features.flatten(0, 1)
+            rows = features.flatten(0, 1).to(weight)
             centre = rows.mean(0)
             centred = rows - centre
             covariance = centred.mT @ centred / rows.shape[0]
@@ -116,8 +129,10 @@ class PointMaxPool(nn.Module):
 
     def _peaks(self, features: Tensor, falling: Tensor) -> Tensor:
         """Return, per cloud and channel, the extreme value of the product: ``(B, C)``."""
-        sign = torch.where(falling, -1.0, 1.0).to(features)
-        return sign * _MaxOverPoints.apply(features, sign[:, None] * self.linear.weight)
+        weight = self.linear.weight
+        sign = torch.where(falling, -1.0, 1.0).to(weight)
+        turned = (sign[:, None] * weight).to(features)
+        return sign * _MaxOverPoints.apply(features, turned).to(weight)
 
 
 class _MaxOverPoints(Function):
@@ -154,6 +169,9 @@ class _MaxOverPoints(Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None]:
         features, weight, winners = ctx.saved_tensors
         (gradient,) = gradients
+        kind = features.dtype
+        if kind.itemsize < 4:  # few rows are summed here: no need to do so coarsely
+            features, weight, gradient = features.float(), weight.float(), gradient.float()
         clouds, n, _ = features.shape
         channels = len(weight)
         to_features = to_weight = None
@@ -177,7 +195,10 @@ class _MaxOverPoints(Function):
                 mode="sum",
                 per_sample_weights=gradient.T.contiguous(),
             )
-        return to_features, to_weight
+        return (
+            None if to_features is None else to_features.to(kind),
+            None if to_weight is None else to_weight.to(kind),
+        )
 
 
 class PointNetVanilla(nn.Module):

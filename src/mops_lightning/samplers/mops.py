@@ -10,6 +10,7 @@ from torch.nn import functional as F
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.losses import subset_losses
 from mops_lightning.nets.pointnet import PointFeatures, linear_norm_relu
+from mops_lightning.precision import wide_layers
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.folded import fold
 from mops_lightning.sampling_matrix import SamplingMatrix
@@ -90,10 +91,13 @@ class MOPSNet(Sampler):
         plain = self.training or torch.is_grad_enabled()
         if not plain and not torch.is_autocast_enabled(points.device.type):
             return self._evaluated(points)
-        local, global_ = self.features(points)
-        hidden = F.linear(local, self.rho_local.weight) + self.rho_global(global_)[:, None]
-        keys = self.rho(self.rho_first(hidden.flatten(0, 1)))
-        return SamplingMatrix(self.queries.weight, keys.unflatten(0, points.shape[:2]), self.tau)
+        with wide_layers(points.device.type):
+            local, global_ = self.features(points)
+            hidden = F.linear(local, self.rho_local.weight) + self.rho_global(global_)[:, None]
+            rows = self.rho(self.rho_first(hidden.flatten(0, 1)))
+        queries = self.queries.weight
+        keys = rows.to(queries).unflatten(0, points.shape[:2])
+        return SamplingMatrix(queries, keys, self.tau)
 
     def _evaluated(self, points: Tensor) -> SamplingMatrix:
         """Return S without gradients, by folded layers."""
