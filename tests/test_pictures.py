@@ -1,6 +1,7 @@
 import matplotlib.image
 import numpy as np
 import torch
+from torch.nn import functional as F
 
 from mops_lightning.pictures import COLOURS, cloud_grid, matrix_figure, save_figure
 
@@ -31,3 +32,14 @@ def test_an_ideal_matrix_is_drawn_as_a_diagonal():
     rows = np.asarray(left).argmax(0)
     assert (np.diff(rows) > 0).all()
     np.testing.assert_array_equal(np.asarray(right), np.eye(4))
+
+
+def test_samples_lie_above_a_dense_cloud(tmp_path, rng):
+    """As many pixels show them as without the cloud."""
+    points = F.normalize(torch.randn(8192, 3, generator=rng), dim=1)
+    far = points[points[:, 0] < -0.3][:100]
+    shown = []
+    for cloud in (points, far):
+        image = pixels(cloud_grid(cloud[None], {"matched": far[None]}, [""]), tmp_path)
+        shown.append((np.abs(image - np.array(COLOURS["matched"]) / 255).max(2) < 0.02).sum())
+    assert shown[0] > 0.2 * shown[1]  # which is larger, for its frame is tighter

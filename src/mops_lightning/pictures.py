@@ -51,7 +51,11 @@ def cloud_grid(points: Tensor, readouts: Mapping[str, Tensor], titles: Sequence[
 def draw_cloud(
     axes: Axes3D, cloud: np.ndarray, samples: np.ndarray | None, readout: str, size: float = 22
 ) -> None:
-    """Draw one cloud ``(N, 3)``, z up, faint where there are samples ``(M, 3)`` to be seen."""
+    """Draw one cloud ``(N, 3)``, z up, faint where there are samples ``(M, 3)`` to be seen.
+
+    Samples lie above all of the cloud: a dense one would hide what is not on its outline.
+    """
+    axes.computed_zorder = False
     faint = samples is not None
     axes.scatter(
         *cloud.T,
@@ -63,7 +67,7 @@ def draw_cloud(
     )
     if samples is not None:
         colour = np.array(COLOURS.get(readout, COLOURS["sampled"])) / 255
-        axes.scatter(*samples.T, s=size, color=colour, depthshade=False)
+        axes.scatter(*samples.T, s=size, color=colour, depthshade=False, zorder=2)
     frame_cloud(axes, cloud)
 
 
