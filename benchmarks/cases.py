@@ -164,15 +164,27 @@ class Parts:
 def training(peak: dict[str, float], rounds: int) -> list[Row]:
     """One cloud's share of a training step of the sampler alone, 32 clouds in a batch."""
     points = cloud(1024, 32)
-
-    def step(net: nn.Module) -> None:
-        net.zero_grad()
-        made = net(points)
-        (made if isinstance(made, Tensor) else made.points).square().sum().backward()
-
     nets = {"mops": MOPSNet(32).train(), "mops, plain twin": PlainMOPS(MOPSNet(32)).train()}
-    calls: Calls = {name: partial(step, net) for name, net in nets.items()}
+    calls: Calls = {name: partial(step, net, points) for name, net in nets.items()}
     return _rows("training", calls, {"N": 1024, "m": 32}, rounds, peak, clouds=32)
+
+
+def compiled(peak: dict[str, float], rounds: int) -> list[Row]:
+    """The same step by torch.compile, which wants a C++ compiler and minutes before the first."""
+    points, net, made = cloud(1024, 32), MOPSNet(32).train(), MOPSNet(32).train()
+    made.compile()
+    calls: Calls = {
+        "mops": partial(step, net, points),
+        "mops, compiled": partial(step, made, points),
+    }
+    return _rows("training", calls, {"N": 1024, "m": 32}, rounds, peak, clouds=32)
+
+
+def step(net: nn.Module, points: Tensor) -> None:
+    """Go forwards and backwards once."""
+    net.zero_grad()
+    made = net(points)
+    (made if isinstance(made, Tensor) else made.points).square().sum().backward()
 
 
 def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
@@ -261,6 +273,7 @@ ALL: dict[str, Callable[[dict[str, float], int], list[Row]]] = {
     "large": large,
     "modules": modules,
     "training": training,
+    "compiled": compiled,
     "farthest": farthest,
     "neighbours": neighbours,
     "growth": growth,
