@@ -110,6 +110,8 @@ def test_gradcheck(rng):
     [
         ({"tau_min": 0.0}, "sampler.tau_min"),
         ({"tau_min": 1.5}, "sampler.tau_min"),
+        ({"feature_channels": ()}, "sampler.feature_channels must be sizes of at least 1 layer,"),
+        ({"rho_channels": (8, 0)}, "sampler.rho_channels must be sizes"),
         ({"alpha": -1.0}, "sampler.alpha"),
         ({"annealing": "exponentail"}, "exponential"),
     ],

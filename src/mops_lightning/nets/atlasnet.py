@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from mops_lightning.errors import UserError
 from mops_lightning.nets.autoencoder import PointEncoder
 from mops_lightning.nets.foldingnet import REACH, square_grid
-from mops_lightning.nets.pointnet import linear_norm_relu
+from mops_lightning.nets.pointnet import check_channels, linear_norm_relu
 
 
 class Patch(nn.Module):
@@ -64,11 +64,7 @@ class AtlasNet(nn.Module):
                 "task.net.pieces must be at least 1, and task.net.n_points at least as many, got "
                 f"{pieces} and {n_points}."
             )
-        if not patch_channels or min(patch_channels) < 1:
-            raise UserError(
-                "task.net.patch_channels must be sizes of at least 1 layer, each at least 1, "
-                f"got {list(patch_channels)}."
-            )
+        check_channels("task.net.patch_channels", patch_channels)
         self.n_points = n_points
         self.encoder = PointEncoder(codeword)
         self.patches = nn.ModuleList(Patch(codeword, patch_channels) for _ in range(pieces))

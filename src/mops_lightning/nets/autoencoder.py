@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, linear_norm_relu
+from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, check_channels, linear_norm_relu
 
 
 class PointEncoder(nn.Module):
@@ -62,11 +62,7 @@ class AutoEncoder(nn.Module):
         super().__init__()
         if n_points < 1:
             raise UserError(f"task.net.n_points must be at least 1, got {n_points}.")
-        if not decoder_channels or min(decoder_channels) < 1:
-            raise UserError(
-                "task.net.decoder_channels must be sizes of at least 1 layer, each at least 1, "
-                f"got {list(decoder_channels)}."
-            )
+        check_channels("task.net.decoder_channels", decoder_channels)
         self.n_points = n_points
         self.encoder = PointEncoder(codeword, encoder_channels)
         self.decoder = nn.Sequential(

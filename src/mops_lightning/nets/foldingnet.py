@@ -15,7 +15,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.geometry import gather_points, k_nearest
 from mops_lightning.nets.autoencoder import PointEncoder
 from mops_lightning.nets.folding import Fold
-from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, linear_norm_relu
+from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, check_channels, linear_norm_relu
 
 REACH = 0.3
 """The grid covers [-0.3, 0.3]², as FoldingNet's."""
@@ -57,11 +57,7 @@ class FoldingDecoder(nn.Module):
             raise UserError(
                 f"task.net.pieces must divide the codeword's {codeword} numbers, got {pieces}."
             )
-        if not channels or min(channels) < 1:
-            raise UserError(
-                "task.net.fold_channels must be sizes of at least 1 layer, each at least 1, "
-                f"got {list(channels)}."
-            )
+        check_channels("task.net.fold_channels", channels)
         self.pieces = pieces
         self.first = Fold(codeword // pieces, 2, channels)
         self.second = Fold(codeword // pieces, 3, channels)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, linear_norm_relu
+from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, check_channels, linear_norm_relu
 from mops_lightning.rigid import Motion, identity_motion
 
 
@@ -44,13 +44,8 @@ class PCRNet(nn.Module):
         super().__init__()
         if iterations < 1:
             raise UserError(f"task.net.iterations must be at least 1, got {iterations}.")
-        layers = {"feature_channels": (feature_channels, 2), "head_channels": (head_channels, 1)}
-        for name, (channels, least) in layers.items():
-            if len(channels) < least or min(channels) < 1:
-                raise UserError(
-                    f"task.net.{name} must be sizes of at least {least} layers, each at least 1, "
-                    f"got {list(channels)}."
-                )
+        check_channels("task.net.feature_channels", feature_channels, 2)
+        check_channels("task.net.head_channels", head_channels)
         self.iterations = iterations
         self.features = PointMLP([3, *feature_channels[:-1]], norm=False)
         self.pool = PointMaxPool(feature_channels[-2], feature_channels[-1], norm=False)

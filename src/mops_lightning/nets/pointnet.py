@@ -14,11 +14,31 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from mops_lightning.errors import UserError
 from mops_lightning.geometry import GROUP, first_extreme
 from mops_lightning.precision import wide_dtype, wide_layers
 
 FEW_POINTS = 32
 """Up to here ``PointMaxPool`` computes the plain layers; on a CPU both ways are equal around it."""
+
+
+def check_channels(setting: str, channels: Sequence[int], least: int = 1) -> None:
+    """Refuse layers that cannot be built.
+
+    Args:
+        setting: its name, for the error.
+        channels: sizes of layers.
+        least: how many there must be.
+
+    Raises:
+        UserError: there are fewer, or one has no channels.
+    """
+    if len(channels) < least or min(channels) < 1:
+        layers = "layer" if least == 1 else "layers"
+        raise UserError(
+            f"{setting} must be sizes of at least {least} {layers}, each at least 1, "
+            f"got {list(channels)}."
+        )
 
 
 def linear_norm_relu(channels: Sequence[int], norm: bool = True) -> nn.Sequential:

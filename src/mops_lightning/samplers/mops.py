@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.losses import subset_losses
-from mops_lightning.nets.pointnet import PointFeatures, linear_norm_relu
+from mops_lightning.nets.pointnet import PointFeatures, check_channels, linear_norm_relu
 from mops_lightning.precision import wide_layers
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.folded import fold
@@ -35,7 +35,8 @@ class MOPSNet(Sampler):
         rho_channels: sizes of ρ's hidden layers, before the m outputs.
 
     Raises:
-        UserError: tau_min is not in (0, 1], alpha is negative or annealing is unknown.
+        UserError: tau_min is not in (0, 1], alpha is negative, annealing is unknown, or a layer has
+            no channels.
     """
 
     generates = True
@@ -58,6 +59,8 @@ class MOPSNet(Sampler):
             raise UserError(
                 f"sampler.annealing: unknown {annealing!r}.{did_you_mean(annealing, ANNEALINGS)}"
             )
+        check_channels("sampler.feature_channels", feature_channels)
+        check_channels("sampler.rho_channels", rho_channels)
         self.alpha = alpha
         self.tau_min = tau_min
         self.annealing = annealing

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.losses import simplification_losses
-from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, linear_norm_relu
+from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, check_channels, linear_norm_relu
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.types import SampleOutput
 
@@ -50,16 +50,8 @@ class SNet(Sampler):
         for name, value in weights.items():
             if value < 0:
                 raise UserError(f"sampler.{name} must not be negative, got {value}.")
-        layers_wanted = {
-            "feature_channels": (feature_channels, 2),
-            "head_channels": (head_channels, 1),
-        }
-        for name, (channels, least) in layers_wanted.items():
-            if len(channels) < least or min(channels) < 1:
-                raise UserError(
-                    f"sampler.{name} must be sizes of at least {least} layers, each at least 1, "
-                    f"got {list(channels)}."
-                )
+        check_channels("sampler.feature_channels", feature_channels, 2)
+        check_channels("sampler.head_channels", head_channels)
         self.alpha = alpha
         self.coverage = coverage
         self.coverage_per_point = coverage_per_point
