@@ -10,7 +10,8 @@ from mops_lightning.samplers.mops import MOPSNet
 
 def small(m=5, **settings):
     torch.manual_seed(0)
-    return MOPSNet(m, feature_channels=(8, 6), rho_channels=(12, 10), **settings)
+    layers = {"feature_channels": (8, 6), "rho_channels": (12, 10)}
+    return MOPSNet(m, **(layers | settings))
 
 
 class PlainMOPS(nn.Module):
