@@ -7,8 +7,11 @@ import torch
 from torch.nn import functional as F
 
 from mops_lightning.config import compose
+from mops_lightning.nets.foldingnet import MFoldingNet
+from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import FEW_POINTS, PointMaxPool, PointMLP
 from mops_lightning.precision import full_precision, wide_layers_mixed
+from mops_lightning.rigid import Motion
 from mops_lightning.run import run
 from mops_lightning.samplers.mops import MOPSNet
 from tests.command_line import TINY, call
@@ -117,6 +120,29 @@ def test_one_net_has_the_same_scores_whatever_the_precision(tmp_path):
         assert status == 0, err
     records = [json.loads((tmp_path / n / "result.json").read_text()) for n in ("single", "half")]
     assert records[0]["metrics"] == records[1]["metrics"]
+
+
+@pytest.mark.parametrize("net", [PCRNet(), MFoldingNet(64, 4, 64), MFoldingNet(64, 1, 64, "graph")])
+def test_nets_alone_can_be_put_under_autocast(net, rng):
+    points = torch.randn(4, 60, 3, generator=rng)
+    arguments = (points, points + 0.1) if isinstance(net, PCRNet) else (points,)
+    results = []
+    for mixed in (False, True):
+        with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+            made = net(*arguments)
+        result = (made.quaternion if isinstance(made, Motion) else made).float()
+        net.zero_grad()
+        result[..., 1].sum().backward()
+        gradients = [p.grad.flatten() for p in net.parameters() if p.grad is not None]
+        results.append((result.detach(), torch.cat(gradients)))
+    torch.testing.assert_close(results[1][0], results[0][0], rtol=0.05, atol=0.05)
+    assert F.cosine_similarity(results[1][1], results[0][1], dim=0) > 0.9
+
+
+def test_a_precision_that_only_gpus_have_is_refused_on_a_cpu(tmp_path):
+    status, _, err = call([*TINY, "trainer.precision=16-mixed"], tmp_path)
+    assert status != 0
+    assert "take bf16-mixed" in err
 
 
 @pytest.mark.parametrize("precision", ["bf16-true", "64-true", "transformer-engine", "half"])

@@ -153,9 +153,10 @@ def check(cfg: DictConfig) -> None:
         _check_node(cfg.get(group), group)
     _whole(cfg.trainer, "max_epochs", int(cfg.learn != "nothing"), "trainer.max_epochs")
     if cfg.trainer.get("precision") not in (*PRECISIONS, "32", 32, None):
+        got = str(cfg.trainer.precision)
         raise UserError(
-            f"trainer.precision must be one of {', '.join(PRECISIONS)}, got "
-            f"{cfg.trainer.precision!r}. Others would round coordinates, or the weights."
+            f"trainer.precision must be one of {', '.join(PRECISIONS)}, got {got!r}."
+            f"{did_you_mean(got, PRECISIONS)}"
         )
     _whole(cfg.pretrain, "max_epochs", 1, "pretrain.max_epochs")
     several.check(cfg)

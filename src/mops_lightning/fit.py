@@ -36,6 +36,7 @@ HARMLESS = (
     ".*smaller than the logging interval.*",  # it is lowered for small data sets
     ".*isinstance.treespec, LeafSpec.*",  # Lightning 2.6 calls an old name of torch 2.13
     ".*GPU available but not used.*",  # trainer=cpu is a choice
+    ".*AMP with fp16 is not supported on CPU.*",  # an error says so
 )
 """Warnings about what is meant to be so."""
 
@@ -165,7 +166,7 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset, task: Tas
     if titles:
         batch = _scored(dataset.test, cfg.batch_size, task).batch_of(rows)
         drawing = [DrawClouds(batch, titles, folder / "pictures")]
-    return build(
+    trainer: L.Trainer = build(
         cfg.trainer,
         logger=logger,
         callbacks=[
@@ -177,6 +178,11 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset, task: Tas
         enable_model_summary=False,
         enable_progress_bar=sys.stdout.isatty(),
     )
+    if cfg.trainer.get("precision") == "16-mixed" and trainer.precision != "16-mixed":
+        raise UserError(
+            "trainer.precision=16-mixed needs a GPU, and there is none here: take bf16-mixed."
+        )
+    return trainer
 
 
 def choose_shown(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str]]:

@@ -19,6 +19,7 @@ COLOURS = {
 }
 """RGB, 0 to 255. Blue, red and orange as in the paper; green for index samplers."""
 INPUT_COLOUR = (190, 190, 190)
+FEW = 256
 
 
 def cloud_grid(points: Tensor, readouts: Mapping[str, Tensor], titles: Sequence[str]) -> Figure:
@@ -53,7 +54,8 @@ def draw_cloud(
 ) -> None:
     """Draw one cloud ``(N, 3)``, z up, faint where there are samples ``(M, 3)`` to be seen.
 
-    Samples lie above all of the cloud: a dense one would hide what is not on its outline.
+    Samples lie above all of the cloud: a dense one would hide what is not on its outline. ``size``
+    is that of up to ``FEW`` samples; more are drawn smaller, to be told apart.
     """
     axes.computed_zorder = False
     faint = samples is not None
@@ -67,6 +69,7 @@ def draw_cloud(
     )
     if samples is not None:
         colour = np.array(COLOURS.get(readout, COLOURS["sampled"])) / 255
+        size = max(size * min(1, FEW / max(len(samples), 1)), 1.5)
         axes.scatter(*samples.T, s=size, color=colour, depthshade=False, zorder=2)
     frame_cloud(axes, cloud)
 

@@ -223,6 +223,25 @@ def test_named_fields_need_one_row_a_point(shape, chunked, tmp_path):
         stored(path) if chunked else read(path, 9, 0)
 
 
+@pytest.mark.parametrize("chunked", [True, False])
+def test_named_coordinates_must_be_numbers(chunked, tmp_path):
+    path = tmp_path / "a.npy"
+    np.save(path, np.zeros(20, [("x", "f4"), ("y", "c8"), ("z", "f4")]))
+    with pytest.raises(UserError, match="y must be numbers, got complex64"):
+        stored(path).read(range(9)) if chunked else read(path, 9, 0)
+
+
+@pytest.mark.parametrize("size", [500, 3000])
+def test_what_a_damaged_laz_file_gives_is_no_cloud(size, tmp_path):
+    path = tmp_path / "a.laz"
+    WRITERS[".laz"](path, Table(np.random.default_rng(1).uniform(0, 50, size=(3000, 3))))
+    content = bytearray(path.read_bytes())
+    content[600:1500] = bytes(np.random.default_rng(2).integers(0, 256, 900, np.uint8))
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=r"a\.laz is broken"):
+        stored(path).read(range(size))
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".npy", ".bin", ".las", ".laz"])
 def test_any_stretch_of_a_file_can_be_read_alone(suffix, tmp_path):
     points = np.random.default_rng(1).normal(size=(500, 3)).astype(np.float32).astype(float)

@@ -148,7 +148,7 @@ def test_nothing_is_overwritten_unasked(folder, tmp_path):
         "holds coordinates alone"
         in call(source, tmp_path / "out.obj", *settings, "--keep-attributes")[2]
     )
-    assert "FileExistsError" in call(source, target / "below.ply", *settings)[2]
+    assert "a file and no folder" in call(source, target / "below.ply", *settings)[2]
     assert "OUT must end in" in call(source, tmp_path / "out.stl", *settings)[2]
     assert "no such file or folder" in call(tmp_path / "no", target, *settings)[2]
 
@@ -231,8 +231,9 @@ def die(*_):
     os._exit(9)
 
 
-def test_coordinates_beyond_measure_are_refused(folder, tmp_path):
-    np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(size=(90, 3)) * 1e200)
+@pytest.mark.parametrize("size", [1e200, 1e307])
+def test_coordinates_beyond_measure_are_refused(size, folder, tmp_path):
+    np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(1, 9, size=(90, 3)) * size)
     learned = ["--weights", folder, "--readout", "matched", "--chunk", 60]
     for settings in (["--method", "fps", "--m", 4], learned):
         status, _, err = call(tmp_path / "a.npy", tmp_path / "b.npy", *settings)
@@ -246,3 +247,11 @@ def test_an_array_in_column_order_is_refused_by_chunks(folder, tmp_path):
     status, _, err = call(tmp_path / "a.npy", tmp_path / "b.npy", *settings)
     assert status == 2
     assert "C order" in err
+
+
+def test_a_file_where_out_needs_a_folder_is_named(tmp_path):
+    np.save(tmp_path / "a.npy", np.ones((90, 3)))
+    settings = ["--method", "fps", "--m", 4]
+    status, _, err = call(tmp_path / "a.npy", tmp_path / "a.npy" / "b.npy", *settings)
+    assert status == 2
+    assert f"OUT lies in {tmp_path / 'a.npy'}, which is a file" in err

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mops_lightning.downsample.las import laspy_for, table_of
+from mops_lightning.downsample.las import check_bounds, laspy_for, table_of
 from mops_lightning.downsample.table import (
     BadCloudError,
     Table,
@@ -69,6 +69,7 @@ class Stored:
             with laspy_for(self.path).open(self.path) as file:
                 file.seek(rows.start)
                 table = table_of(file.read_points(len(rows)), None)
+                check_bounds(self.path, table, file.header)
         else:
             start = self.offset + rows.start * self.kind.itemsize
             array = np.fromfile(self.path, self.kind, len(rows), offset=start)

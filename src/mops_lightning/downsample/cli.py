@@ -178,6 +178,8 @@ def _jobs(chosen: argparse.Namespace) -> list[tuple[Path, Path]]:
         raise UserError("--keep-attributes: .obj holds coordinates alone. Take .ply, .pcd or .npz.")
     if target.resolve() == source.resolve():
         raise UserError(f"OUT is IN, {source}: give another.")
+    if in_the_way := next((p for p in target.parents if p.exists() and not p.is_dir()), None):
+        raise UserError(f"OUT lies in {in_the_way}, which is a file and no folder: give another.")
     if not source.is_dir():
         if target.is_dir():
             target = target / f"{source.stem}{suffix(source)}"

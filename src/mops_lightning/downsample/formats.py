@@ -92,7 +92,9 @@ def read_npz(path: Path) -> Table:
     chosen = [name for name in ("points", "xyz", "pos") if name in names] or names[:1]
     if not chosen or (len(names) > 1 and chosen == names[:1] and chosen[0] not in
                       ("points", "xyz", "pos")):  # fmt: skip
-        raise BadCloudError(f"{path} has no array named points; it has {', '.join(names)}.")
+        raise BadCloudError(
+            f"{path} has no array named points; it has {', '.join(names) or 'none at all'}."
+        )
     table = _numbers(arrays[chosen[0]], path)
     columns: dict[str, Column] = dict(table.columns)
     for name in names:

@@ -23,6 +23,7 @@ from mops_lightning.downsample.table import (
     naming,
     radius_of,
     reach,
+    total,
 )
 from mops_lightning.errors import UserError
 from mops_lightning.io import atomic_write
@@ -199,7 +200,7 @@ def read(path: Path, surface: int, seed: int) -> Table:
 
 def sampled(source: Path, table: Table, sampler: Sampler, m: int, settings: Settings) -> Table:
     """Return the kept points of a table, with their attributes if asked for."""
-    centre = table.points.mean(0)
+    centre = total(table.points) / len(table.points)
     radius = radius_of(reach(table.points, centre), source)
     points = torch.from_numpy(((table.points - centre) / radius).astype(np.float32))
     with torch.no_grad():

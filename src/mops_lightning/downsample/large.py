@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.downsample.chunks import Stored, stored
-from mops_lightning.downsample.table import Table, check_enough, radius_of, reach
+from mops_lightning.downsample.table import Table, check_enough, radius_of, reach, total
 from mops_lightning.errors import UserError
 from mops_lightning.geometry import nearest
 from mops_lightning.samplers.folded import FoldedMOPS, fold
@@ -100,12 +100,12 @@ def by_chunks(
         results = engine(title, function, cloud, stretches, *common)
         return (result for result in results if result is not None)
 
-    number, total = 0, np.zeros(3)
+    number, summed = 0, np.zeros(3)
     for count, part in over("centre", _count_and_sum):
         number += count
-        total += part
+        summed += part
     check_enough(source, number, m)
-    centre = total / number
+    centre = summed / number
     unit = Unit(centre, radius_of(max(over("radius", _reach, centre)), source))
     net = fold(sampler)
     global_ = reduce(torch.maximum, over("global feature", _global, unit, net))
@@ -124,7 +124,7 @@ def by_chunks(
 
 def _count_and_sum(cloud: Stored, rows: range) -> tuple[int, NDArray[np.float64]]:
     table = cloud.read(rows)
-    return len(table.points), table.points.sum(0)
+    return len(table.points), total(table.points)
 
 
 def _reach(cloud: Stored, rows: range, centre: NDArray[np.float64]) -> float:

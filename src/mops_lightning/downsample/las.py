@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from mops_lightning.downsample.table import Column, Table, ends_early, unique_names
+from mops_lightning.downsample.table import BadCloudError, Column, Table, ends_early, unique_names
 from mops_lightning.errors import UserError
 
 
@@ -14,11 +14,26 @@ def read(path: Path) -> Table:
     laspy = laspy_for(path)
     with laspy.open(path) as file:
         announced = file.header.point_count
-        cloud = file.read()
+        try:
+            cloud = file.read()
+        except ValueError as error:
+            raise BadCloudError(f"{path} is broken: it ends too early ({error}).") from None
     table = table_of(cloud, cloud.header)
     if len(table.points) < announced:
         raise ends_early(path, len(table.points))
     return table
+
+
+def check_bounds(path: Path, table: Table, header: Any) -> None:
+    """Refuse what cannot be the file's points: a broken LAZ may give any before its end is read.
+
+    Raises:
+        BadCloudError: a point lies far outside of the bounds that the head gives, if it gives any.
+    """
+    low, high = np.asarray(header.mins), np.asarray(header.maxs)
+    far = (high - low).max()
+    if far > 0 and ((table.points < low - far) | (table.points > high + far)).any():
+        raise BadCloudError(f"{path} is broken: points lie far outside of the bounds in its head.")
 
 
 def table_of(cloud: Any, header: Any) -> Table:

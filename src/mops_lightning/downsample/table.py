@@ -48,6 +48,12 @@ class Table:
         return Table(self.points, {}, self.head)
 
 
+def total(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sum ``(3,)`` of points ``(n, 3)``, which may be infinite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return points.sum(0)
+
+
 def reach(points: NDArray[np.float64], centre: NDArray[np.float64]) -> float:
     """Return how far the farthest of ``(n, 3)`` points lies from ``centre``, ``(3,)``."""
     with np.errstate(over="ignore", invalid="ignore"):
@@ -108,6 +114,9 @@ def from_array(array: NDArray[Any], names: list[str], path: Path, head: Any = No
         return array[name] if array.dtype.names else array[:, names.index(name)]
 
     axes = [lower[axis] for axis in "xyz"]
+    for name in axes:
+        if column(name).dtype.kind not in "fiu":
+            raise BadCloudError(f"{path}: {name} must be numbers, got {column(name).dtype}.")
     points = np.stack([np.asarray(column(axis), np.float64) for axis in axes], 1)
     rest = {name: column(name) for name in names if name not in axes}
     numbers = {name: c for name, c in rest.items() if c.ndim == 1 and c.dtype.kind in "fiub"}
@@ -160,5 +169,7 @@ def column_names(array: NDArray[Any], path: Path) -> list[str]:
             raise BadCloudError(f"{path} must hold one row of fields a point, got {shape}.")
         return list(array.dtype.names)
     if len(shape) != 2 or shape[1] < 3 or kind not in "fiu":
-        raise BadCloudError(f"{path} must hold rows of x, y, z, got shape {shape}.")
+        raise BadCloudError(
+            f"{path} must hold numbers in rows of x, y, z, got {array.dtype} of shape {shape}."
+        )
     return ["x", "y", "z", *(f"column_{place}" for place in range(3, shape[1]))]

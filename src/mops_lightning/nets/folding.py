@@ -41,9 +41,10 @@ class Fold(nn.Module):
 
     def forward(self, pieces: Tensor, coordinates: Tensor) -> Tensor:
         """Fold ``(P, piece)`` and ``(P or 1, g, coordinates)`` to ``(P, g, 3)``."""
-        narrow = self.narrow
-        first = (self.from_piece(pieces), coordinates, self.from_coordinates.weight)
-        return self.rest(_WideLayer.apply(*first, narrow.weight, narrow.bias))
+        narrow, offsets = self.narrow, self.from_piece(pieces)
+        others = (coordinates, self.from_coordinates.weight, narrow.weight, narrow.bias)
+        # Under autocast the offsets alone would be of half precision.
+        return self.rest(_WideLayer.apply(offsets, *(other.to(offsets) for other in others)))
 
 
 class _WideLayer(Function):

@@ -74,7 +74,7 @@ class PCRNet(nn.Module):
             else:
                 mine = self._global(moved)
                 aim = self._global(target) if aim is None else aim
-            answer = self.motion(self.head(torch.cat([mine, aim], 1)))
+            answer = self.motion(self.head(torch.cat([mine, aim], 1))).to(source)
             step = Motion(F.normalize(answer[:, :4], dim=1), answer[:, 4:])
             total = step.after(total)
         return total
