@@ -81,8 +81,17 @@ def test_one_more_setting_makes_columns(tmp_path):
         ["all points", "0.5", "0.52", "0.6"],
     ]
     put_cell(tmp_path, "c", "mops", {"generated": 1.0}, noise=0.0, m=8)
-    with pytest.raises(UserError, match=r"differ in size \(m=8, m=32\) and in noise"):
+    with pytest.raises(UserError, match=r"differ in size \(m=8, m=32\) and in noise.*--mixed"):
         table(tmp_path)
+
+
+def test_sizes_of_different_kinds_stand_beside_each_other_if_asked(tmp_path):
+    put_cell(tmp_path, "a", "mops", {"generated": 1.0}, noise=0.0, m=32)
+    put_cell(tmp_path, "b", "mops", {"generated": 2.0}, noise=0.1, m=8)
+    assert rows(table(tmp_path, mixed=True))[:2] == [
+        ["sampled by", "m=32", "m=8"],
+        ["mops", "1", "2"],
+    ]
 
 
 def put_planes(folder):

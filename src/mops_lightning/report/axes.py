@@ -51,9 +51,12 @@ def axes(found: list[Record], net: str, mixed: bool = False) -> Axes:
     plane = all(len(one) == 2 and set(one) <= numbers for one in different.values())
     sizes = sorted({record["config"]["m"] for record in found})
     if (line or plane) and len(sizes) > 1:
+        if mixed:
+            return Axes()
         raise UserError(
             f"The runs differ in size (m={', m='.join(map(str, sizes))}) and in "
-            f"{', '.join(sorted(keys))}. Give a folder with runs of one size."
+            f"{', '.join(sorted(keys))}. Give a folder with runs of one size, or, if their figures "
+            "may stand in one table all the same, add --mixed."
         )
     if line:
         return Axes(column=min(keys))
