@@ -1,6 +1,7 @@
 """The procedural dataset: content, reproducibility, difficulty, cache and errors."""
 
 import os
+import select
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -283,12 +284,14 @@ def test_nothing_is_printed_where_there_is_no_terminal(
 def test_progress_shows_on_a_terminal_and_is_wiped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm")
     ours, theirs = os.openpty()
-    os.set_blocking(ours, False)
     with open(theirs, "w") as terminal:  # noqa: PTH123
         monkeypatch.setattr(sys, "stderr", terminal)
         shapes(**SMALL)
         terminal.flush()
-        shown = os.read(ours, 65536).decode()
+        shown = ""
+        # A terminal hands out what was written bit by bit, and a little later.
+        while select.select([ours], [], [], 1.0)[0]:
+            shown += os.read(ours, 65536).decode()
         monkeypatch.undo()
     os.close(ours)
     assert "Making shapes" in shown
