@@ -7,7 +7,7 @@ point-cloud-utils``, in an environment of their own if their requirements do not
 
 from collections.abc import Callable
 from functools import partial
-from importlib import import_module
+from importlib import import_module, metadata
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,17 @@ def installed(name: str) -> Any:
         return import_module(name)
     except ImportError:
         return None
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what is installed, by the names that pip knows."""
+    found = {}
+    for name in ("scipy", "fpsample", "open3d", "open3d-cpu", "point-cloud-utils"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
 
 
 def farthest(points: Tensor, m: int) -> Calls:

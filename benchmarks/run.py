@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import rivals
 import torch
 from cases import ALL
 from measure import ceiling, machine
@@ -33,7 +34,8 @@ def main() -> None:
     torch.set_num_threads(chosen.threads)
     torch.manual_seed(0)
     peak = ceiling(chosen.rounds)
-    record: dict[str, Any] = {"machine": machine(), "ceiling": peak, "cases": {}}
+    where = {**machine(), "others": rivals.versions()}
+    record: dict[str, Any] = {"machine": where, "ceiling": peak, "cases": {}}
     print(f"ceiling: {peak['flops'] / 1e9:.0f} GFLOP/s, {peak['bytes'] / 1e9:.1f} GB/s", flush=True)
     for name in chosen.cases or ALL:
         record["cases"][name] = ALL[name](peak, chosen.rounds)
