@@ -7,6 +7,7 @@ from typing import Any
 import rivals
 import torch
 from measure import Timing, flops, interleaved, peak_memory
+from rivals import Calls
 from torch import Tensor, nn
 from twins import PlainMOPS, plain_farthest_point_sample
 
@@ -25,7 +26,6 @@ from mops_lightning.sampling_matrix import attend
 from mops_lightning.streaming import stream_sample
 
 Row = dict[str, Any]
-Calls = dict[str, Callable[[], Any]]
 SIZES = (512, 256, 128, 64, 32, 16, 8)
 LARGE = (4096, 1024, 256)
 CHUNK = 8192

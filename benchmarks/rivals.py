@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 Calls = dict[str, Callable[[], Any]]
+"""What to time, by name."""
 
 
 def installed(name: str) -> Any:

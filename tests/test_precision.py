@@ -50,6 +50,14 @@ def test_all_layers_but_the_first_are_of_half_precision(rng):
     assert set(seen_dtypes(net, lambda: net(points)).values()) == {torch.float32}
 
 
+def test_mops_net_sees_coordinates_in_single_precision(rng):
+    points = torch.randn(2, 50, 3, generator=rng)
+    net = MOPSNet(8)
+    seen = seen_dtypes(net, lambda: mixed(net, points))
+    assert seen.pop("features.mlp.layers.0") == torch.float32
+    assert set(seen.values()) == {torch.bfloat16}
+
+
 def test_scores_leave_autocast(rng):
     points = torch.randn(2, 50, 3, generator=rng)
     net = MOPSNet(8).eval()

@@ -20,6 +20,7 @@ COLOURS = {
 """RGB, 0 to 255. Blue, red and orange as in the paper; green for index samplers."""
 INPUT_COLOUR = (190, 190, 190)
 FEW = 256
+"""Up to so many samples are drawn large."""
 
 
 def cloud_grid(points: Tensor, readouts: Mapping[str, Tensor], titles: Sequence[str]) -> Figure:

@@ -6,23 +6,22 @@ go back into it.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
+from typing import Any
 
 import torch
 
 _WIDE: ContextVar[torch.dtype | None] = ContextVar("wide", default=None)
 
 
-@contextmanager
-def full_precision(device: str) -> Iterator[None]:
+def full_precision(device: str) -> torch.autocast:
     """Leave autocast altogether, for scores.
 
     Args:
         device: type of the device, such as ``cuda``.
     """
-    with torch.autocast(device, enabled=False):
-        yield
+    return torch.autocast(device, enabled=False)
 
 
 @contextmanager
@@ -35,7 +34,7 @@ def wide_layers_mixed(device: str) -> Iterator[None]:
     mixed = torch.is_autocast_enabled(device)
     token = _WIDE.set(torch.get_autocast_dtype(device) if mixed else None)
     try:
-        with torch.autocast(device, enabled=False):
+        with full_precision(device):
             yield
     finally:
         _WIDE.reset(token)
@@ -46,16 +45,11 @@ def wide_dtype() -> torch.dtype | None:
     return _WIDE.get()
 
 
-@contextmanager
-def wide_layers(device: str) -> Iterator[None]:
+def wide_layers(device: str) -> AbstractContextManager[Any]:
     """Run layers that every point goes through, in mixed precision where that is asked for.
 
     Args:
         device: type of the device, such as ``cuda``.
     """
     dtype = _WIDE.get()
-    if dtype is None:
-        yield
-        return
-    with torch.autocast(device, dtype=dtype):
-        yield
+    return nullcontext() if dtype is None else torch.autocast(device, dtype=dtype)

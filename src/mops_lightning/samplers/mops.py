@@ -94,8 +94,8 @@ class MOPSNet(Sampler):
         plain = self.training or torch.is_grad_enabled()
         if not plain and not torch.is_autocast_enabled(points.device.type):
             return self._evaluated(points)
+        local, global_ = self.features(points)
         with wide_layers(points.device.type):
-            local, global_ = self.features(points)
             hidden = F.linear(local, self.rho_local.weight) + self.rho_global(global_)[:, None]
             rows = self.rho(self.rho_first(hidden.flatten(0, 1)))
         queries = self.queries.weight
