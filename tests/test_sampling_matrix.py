@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from mops_lightning import sampling_matrix
-from mops_lightning.sampling_matrix import SamplingMatrix
+from mops_lightning.sampling_matrix import SamplingMatrix, attend
 
 
 def random_matrix(batch=2, n=37, m=11, c=8, tau=0.3, dtype=torch.float64, seed=0):
@@ -28,9 +28,8 @@ def plain_dense(matrix):
 @pytest.fixture(params=["dense", "streamed"])
 def path(request, monkeypatch):
     """Both ways to SᵀP, the streamed one with blocks that divide nothing evenly."""
-    monkeypatch.setattr(sampling_matrix, "BLOCK_QUERIES", 4)
-    monkeypatch.setattr(sampling_matrix, "BLOCK_POINTS", 10)
-    monkeypatch.setattr(sampling_matrix, "DENSE_LIMIT", 0 if request.param == "streamed" else 2**22)
+    dense = 0 if request.param == "streamed" else 2**22
+    monkeypatch.setitem(sampling_matrix.BLOCKS, "cpu", sampling_matrix.Blocks(dense, 4, 10))
     return request.param
 
 
@@ -76,12 +75,45 @@ def test_sample_survives_logits_that_overflow_without_a_running_maximum(path):
     )
 
 
+@pytest.mark.parametrize("height", [-50.0, 30.0, 100.0, 3e4])
+def test_points_far_above_all_that_were_looked_at_first_are_weighed_rightly(height):
+    matrix, points = random_matrix(batch=1, n=3000, m=5, tau=1.0, dtype=torch.float32)
+    keys = matrix.keys[0].clone()
+    # Rows 1 and 2 are no probes, for these are some 46 rows apart and begin with row 0.
+    keys[1] = matrix.queries[3] * height / matrix.queries[3].square().sum()
+    keys[2] = keys[1] * 0.999
+    found = attend(matrix.queries, keys, points[0])
+    logits = matrix.queries.double() @ keys.double().mT
+    want = logits.softmax(1) @ points[0].double()
+    torch.testing.assert_close(found.result().double(), want, rtol=1e-4, atol=1e-5)
+    parts = [
+        attend(matrix.queries, keys[rows], points[0, rows])
+        for rows in (slice(0, 1), slice(1, 2), slice(2, 3000))
+    ]
+    merged = parts[0].merge(parts[1]).merge(parts[2])
+    torch.testing.assert_close(merged.result(), found.result(), rtol=1e-4, atol=1e-5)
+
+
+def test_sums_over_many_points_keep_their_digits(rng):
+    queries, keys = torch.zeros(3, 4), torch.zeros(300_000, 4)
+    values = torch.rand(300_000, 3, generator=rng)
+    found = attend(queries, keys, values).result()
+    torch.testing.assert_close(
+        found, values.double().mean(0).float().expand(3, 3), rtol=1e-6, atol=0
+    )
+
+
 def test_streamed_equals_dense_in_float32_at_real_sizes():
     matrix, points = random_matrix(batch=1, n=5000, m=1500, c=16, tau=0.1, dtype=torch.float32)
-    assert matrix.keys.shape[1] * len(matrix.queries) > sampling_matrix.DENSE_LIMIT
-    torch.testing.assert_close(
-        matrix.sample(points), matrix.dense().mT @ points, atol=2e-6, rtol=1e-4
-    )
+    assert matrix.keys.shape[1] * len(matrix.queries) > sampling_matrix.BLOCKS["cpu"].dense
+    exact = SamplingMatrix(matrix.queries.double(), matrix.keys.double(), matrix.tau)
+    logits = exact.queries @ exact.keys[0].mT / exact.tau
+    # Float32 holds a logit, and so the logarithm of a share, to this.
+    digits = float(logits.abs().max()) * torch.finfo(torch.float32).eps
+    want = exact.dense().mT @ points.double()
+    torch.testing.assert_close(matrix.sample(points).double(), want, atol=digits, rtol=0)
+    plain = matrix.dense().mT @ points
+    torch.testing.assert_close(plain.double(), want, atol=digits, rtol=0)
 
 
 def test_sparse_at_threshold_zero_is_dense(path):

@@ -7,6 +7,7 @@ W ``(M, C)``, keys H ``(B, N, C)`` and values P ``(B, N, 3)``. A softmax over po
 block by block (running maximum, sum, weighted sum), so Q never needs N·M numbers at once.
 """
 
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -14,11 +15,37 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-DENSE_LIMIT = 2**22
-"""Up to this many entries of S per batch the plain dense product is as good as any."""
-BLOCK_QUERIES = 512
-BLOCK_POINTS = 2048
-"""Blocks of 2^20 logits, 4 MiB in float32: they stay in the last-level cache."""
+LOG2_E = 1 / math.log(2)
+"""Logits are taken to the base 2 in blocks, since powers of 2 are quicker than those of e."""
+
+PROBES = 64
+"""About so many points of a cloud show how large a column's logits are."""
+
+HIGH = 2.0**64
+"""Sums above it are taken anew; far below what float32 holds, so that sums can still be merged."""
+
+
+class Blocks(NamedTuple):
+    """How S is cut into pieces on a device.
+
+    Attributes:
+        dense: up to this many entries of S per batch the plain dense product is as good as any.
+        queries: columns of S in a block.
+        points: rows of S in a block.
+    """
+
+    dense: int
+    queries: int
+    points: int
+
+
+BLOCKS = {"cpu": Blocks(2**22, 1024, 1024), "cuda": Blocks(2**26, 4096, 2**14)}
+"""On a CPU a block's logits, 4 MiB in float32, stay in the last-level cache, and its keys in the
+second; on a GPU a block should keep all of it busy."""
+
+
+def _blocks_on(device: torch.device) -> Blocks:
+    return BLOCKS.get(device.type, BLOCKS["cuda"])
 
 
 class SamplingMatrix(NamedTuple):
@@ -45,11 +72,11 @@ class SamplingMatrix(NamedTuple):
             points: ``(B, N, 3)``, or any other values per point.
 
         Returns:
-            ``(B, M, 3)``; differentiable in queries, keys and points. Above ``DENSE_LIMIT`` entries
-            S is recomputed block by block in the backward pass too.
+            ``(B, M, 3)``; differentiable in queries, keys and points. Above ``Blocks.dense``
+            entries S is recomputed block by block in the backward pass too.
         """
         entries = self.keys.shape[0] * self.keys.shape[1] * self.queries.shape[0]
-        if entries <= DENSE_LIMIT:
+        if entries <= _blocks_on(self.keys.device).dense:
             return self._columns() @ points
         return _StreamedAttention.apply(self.queries / self.tau, self.keys, points)
 
@@ -116,47 +143,51 @@ class SamplingMatrix(NamedTuple):
         return ((self.queries / self.tau) @ self.keys.mT).softmax(-1)
 
     def _blocks(
-        self, block_queries: int = BLOCK_QUERIES
+        self, block_queries: int | None = None
     ) -> Iterator[tuple[int, slice, slice, Tensor]]:
         """Yield (cloud, rows, columns, block of Sᵀ) over all of S."""
         queries = self.queries / self.tau
         no_values = self.keys.new_zeros(*self.keys.shape[:2], 0)
         _, log_sum = _attend(queries, self.keys, no_values)
+        queries *= LOG2_E
+        size = _blocks_on(queries.device)
         for cloud, keys in enumerate(self.keys):
-            for columns in _slices(len(queries), block_queries):
-                for rows in _slices(len(keys), BLOCK_POINTS):
-                    logits = queries[columns] @ keys[rows].mT
-                    yield cloud, rows, columns, _shares(logits, log_sum[cloud, columns])
+            for columns in _slices(len(queries), block_queries or size.queries):
+                for rows in _slices(len(keys), size.points):
+                    share = _shares(queries[columns], keys[rows], log_sum[cloud, columns])
+                    yield cloud, rows, columns, share
 
 
 def _slices(total: int, size: int) -> list[slice]:
     return [slice(start, min(start + size, total)) for start in range(0, total, size)]
 
 
-def _shares(logits: Tensor, log_sum: Tensor) -> Tensor:
-    """Turn logits ``(columns, rows)`` into entries of Sᵀ, in place."""
-    return logits.sub_(log_sum[:, None]).exp_()
+def _shares(queries: Tensor, keys: Tensor, level: Tensor, out: Tensor | None = None) -> Tensor:
+    """Return 2^(⟨query, key⟩ - level), ``(columns, rows)``, for queries to the base 2."""
+    return torch.addmm(-level[:, None], queries, keys.mT, out=out).exp2_()
 
 
 class Partial(NamedTuple):
     """The softmax-weighted sum over some of a cloud's points; such sums merge to that over all.
 
+    Logits and their level are to the base 2.
+
     Attributes:
-        peak: ``(M,)``, the largest logit of every column.
-        total: ``(M,)``, the sum of exp(logit - peak).
-        weighted: ``(M, V)``, the sum of exp(logit - peak) times the point's values.
+        level: ``(M,)``, a number near the largest logit of every column.
+        total: ``(M,)``, the sum of 2^(logit - level).
+        weighted: ``(M, V)``, the sum of 2^(logit - level) times the point's values.
     """
 
-    peak: Tensor
+    level: Tensor
     total: Tensor
     weighted: Tensor
 
     def merge(self, other: "Partial") -> "Partial":
         """Return the sum over the points of both, in whatever order they are merged."""
-        peak = torch.maximum(self.peak, other.peak)
-        mine, theirs = (self.peak - peak).exp(), (other.peak - peak).exp()
+        level = torch.maximum(self.level, other.level)
+        mine, theirs = (self.level - level).exp2(), (other.level - level).exp2()
         return Partial(
-            peak,
+            level,
             self.total * mine + other.total * theirs,
             self.weighted * mine[:, None] + other.weighted * theirs[:, None],
         )
@@ -166,38 +197,61 @@ class Partial(NamedTuple):
         return self.weighted / self.total[:, None]
 
 
+@torch.no_grad()
 def attend(queries: Tensor, keys: Tensor, values: Tensor) -> Partial:
     """Sum values over points with the weights exp⟨query, key⟩, without the M·N logits at once.
+
+    What is subtracted from a column's logits cancels, so it need not be their maximum, which would
+    take a pass over all of them; it must only be near enough for the powers to fit their type. The
+    maximum over a few points nearly always is; columns where it is not are taken again.
 
     Args:
         queries: ``(M, C)``, already divided by the temperature.
         keys: ``(N, C)``.
         values: ``(N, V)``.
     """
-    m = len(queries)
-    whole = Partial(keys.new_empty(m), keys.new_empty(m), values.new_empty(m, values.shape[1]))
-    # A product with a few rows on the left takes a third of that with a few columns on the right;
-    # a row of ones gives the sum as well.
-    held = torch.cat([values, values.new_ones(len(values), 1)], 1).mT.contiguous()
-    for columns in _slices(m, BLOCK_QUERIES):
-        parts: Partial | None = None
-        for rows in _slices(len(keys), BLOCK_POINTS):
-            logits = queries[columns] @ keys[rows].mT
-            peak = logits.amax(1)
-            sums = held[:, rows] @ _shares(logits, peak).mT
-            part = Partial(peak, sums[-1], sums[:-1].mT)
-            parts = part if parts is None else parts.merge(part)
-        assert parts is not None
-        for kept, found in zip(whole, parts, strict=True):
-            kept[columns] = found
-    return whole
+    queries = queries * LOG2_E
+    # A column of ones gives the sum of the weights as well.
+    held = torch.cat([values, values.new_ones(len(values), 1)], 1)
+    level = _peaks(queries, keys[:: max(len(keys) // PROBES, 1)])
+    sums = _sums(queries, keys, held, level)
+    high = ~(sums[:, -1] < HIGH)
+    if high.any():
+        level[high] = _peaks(queries[high], keys)
+        sums[high] = _sums(queries[high], keys, held, level[high])
+    return Partial(level, sums[:, -1], sums[:, :-1])
+
+
+def _sums(queries: Tensor, keys: Tensor, held: Tensor, level: Tensor) -> Tensor:
+    size = _blocks_on(keys.device)
+    result = held.new_zeros(len(queries), held.shape[1])
+    room = keys.new_empty(min(size.queries, len(queries)) * min(size.points, len(keys)))
+    for columns in _slices(len(queries), size.queries):
+        for rows in _slices(len(keys), size.points):
+            shape = (columns.stop - columns.start, rows.stop - rows.start)
+            out = room[: math.prod(shape)].view(shape)
+            shares = _shares(queries[columns], keys[rows], level[columns], out)
+            # Not addmm_: its sums would run over all points one by one, and lose digits.
+            result[columns] += shares @ held[rows]
+    return result
+
+
+def _peaks(queries: Tensor, keys: Tensor) -> Tensor:
+    """Return the largest of every query's logits ``(M,)``."""
+    size = _blocks_on(keys.device)
+    peaks = queries.new_full((len(queries),), -torch.inf)
+    for columns in _slices(len(queries), size.queries):
+        for rows in _slices(len(keys), size.points):
+            here = (queries[columns] @ keys[rows].mT).amax(1)
+            peaks[columns] = torch.maximum(peaks[columns], here)
+    return peaks
 
 
 def _attend(queries: Tensor, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-    """Return softmax-weighted values ``(B, M, V)`` and the log of the softmax sums ``(B, M)``."""
+    """Return softmax-weighted values ``(B, M, V)`` and the softmax sums' logarithms ``(B, M)``."""
     wholes = [attend(queries, *cloud) for cloud in zip(keys, values, strict=True)]
     results = torch.stack([whole.result() for whole in wholes])
-    return results, torch.stack([whole.peak + whole.total.log() for whole in wholes])
+    return results, torch.stack([whole.level + whole.total.log2() for whole in wholes])
 
 
 class _StreamedAttention(torch.autograd.Function):
@@ -218,15 +272,15 @@ class _StreamedAttention(torch.autograd.Function):
         grad_values = torch.zeros_like(values)
         # The softmax's backward: dS = S ∘ (dA − ⟨dQ, Q⟩), with dA = dQ·Pᵀ.
         inner = (grad * result).sum(-1)
+        powers, size = queries * LOG2_E, _blocks_on(keys.device)
         for cloud in range(len(keys)):
-            for columns in _slices(len(queries), BLOCK_QUERIES):
-                for rows in _slices(keys.shape[1], BLOCK_POINTS):
-                    share = _shares(
-                        queries[columns] @ keys[cloud, rows].mT, log_sum[cloud, columns]
-                    )
+            for columns in _slices(len(queries), size.queries):
+                for rows in _slices(keys.shape[1], size.points):
+                    key = keys[cloud, rows]
+                    share = _shares(powers[columns], key, log_sum[cloud, columns])
+                    grad_values[cloud, rows] += share.mT @ grad[cloud, columns]
                     change = grad[cloud, columns] @ values[cloud, rows].mT
                     change.sub_(inner[cloud, columns, None]).mul_(share)
-                    grad_queries[columns] += change @ keys[cloud, rows]
+                    grad_queries[columns] += change @ key
                     grad_keys[cloud, rows] += change.mT @ queries[columns]
-                    grad_values[cloud, rows] += (grad[cloud, columns].mT @ share).mT
         return grad_queries, grad_keys, grad_values

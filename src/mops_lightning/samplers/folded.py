@@ -10,7 +10,7 @@ from torch.nn.utils.fusion import fuse_linear_bn_weights
 if TYPE_CHECKING:
     from mops_lightning.samplers.mops import MOPSNet
 
-BLOCK_ROWS = {"cpu": 1024, "cuda": 2**18}
+BLOCK_ROWS = {"cpu": 2048, "cuda": 2**18}
 """Points that pass all layers together: on a CPU their widest layer should stay in the cache."""
 
 
