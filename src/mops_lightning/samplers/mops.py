@@ -5,7 +5,6 @@ from typing import Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.losses import subset_losses
@@ -96,7 +95,7 @@ class MOPSNet(Sampler):
             return self._evaluated(points)
         local, global_ = self.features(points)
         with wide_layers(points.device.type):
-            hidden = F.linear(local, self.rho_local.weight) + self.rho_global(global_)[:, None]
+            hidden = self.rho_local(local).add_(self.rho_global(global_)[:, None])
             rows = self.rho(self.rho_first(hidden.flatten(0, 1)))
         queries = self.queries.weight
         keys = rows.to(queries).unflatten(0, points.shape[:2])
