@@ -1,6 +1,8 @@
 # Needs only Python >= 3.11 with venv, and make.
 PYTHON ?= python3
 BIN := .venv/bin
+# Test processes, each of one thread and about 1 GB.
+WORKERS ?= 2
 
 .PHONY: setup run test check clean
 
@@ -16,7 +18,7 @@ run: setup
 	$(BIN)/python -m mops_lightning
 
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 check: setup
 	$(BIN)/ruff check .
