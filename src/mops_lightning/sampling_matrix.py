@@ -39,7 +39,7 @@ class Blocks(NamedTuple):
     points: int
 
 
-BLOCKS = {"cpu": Blocks(2**22, 1024, 1024), "cuda": Blocks(2**26, 4096, 2**14)}
+BLOCKS = {"cpu": Blocks(2**22, 2048, 512), "cuda": Blocks(2**26, 4096, 2**14)}
 """On a CPU a block's logits, 4 MiB in float32, stay in the last-level cache, and its keys in the
 second; on a GPU a block should keep all of it busy."""
 
@@ -77,7 +77,8 @@ class SamplingMatrix(NamedTuple):
         """
         entries = self.keys.shape[0] * self.keys.shape[1] * self.queries.shape[0]
         if entries <= _blocks_on(self.keys.device).dense:
-            return self._columns() @ points
+            # Values whose columns lie together in memory halve the time of the product.
+            return self._columns() @ points.mT.contiguous().mT
         return _StreamedAttention.apply(self.queries / self.tau, self.keys, points)
 
     def sparse(self, threshold: float = 0.01) -> Tensor:
@@ -211,8 +212,8 @@ def attend(queries: Tensor, keys: Tensor, values: Tensor) -> Partial:
         values: ``(N, V)``.
     """
     queries = queries * LOG2_E
-    # A column of ones gives the sum of the weights as well.
-    held = torch.cat([values, values.new_ones(len(values), 1)], 1)
+    # Ones give the sum of the weights as well; columns lie together in memory here, too.
+    held = torch.cat([values.mT, values.new_ones(1, len(values))]).mT
     level = _peaks(queries, keys[:: max(len(keys) // PROBES, 1)])
     sums = _sums(queries, keys, held, level)
     high = ~(sums[:, -1] < HIGH)

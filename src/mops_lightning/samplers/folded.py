@@ -52,11 +52,17 @@ class FoldedMOPS(NamedTuple):
         return result
 
     @torch.no_grad()
-    def keys(self, local: Tensor, global_: Tensor) -> Tensor:
-        """Map local features ``(N, D)`` and a global one ``(D,)`` to the keys ``(N, C)`` of S."""
+    def keys(self, local: Tensor, global_: Tensor, into: Tensor | None = None) -> Tensor:
+        """Map local features ``(N, D)`` and a global one ``(D,)`` to the keys ``(N, C)`` of S.
+
+        Args:
+            local: of some points of a cloud.
+            global_: of the whole cloud.
+            into: where to write the keys; None: new memory.
+        """
         bias = torch.addmv(self.local.bias, self.global_weight, global_)
         layers = (self.local._replace(bias=bias), *self.rest)
-        result = local.new_empty(len(local), self.queries.shape[1])
+        result = local.new_empty(len(local), self.queries.shape[1]) if into is None else into
         size = _block(local)
         for rows, out in zip(local.split(size), result.split(size), strict=True):
             out.copy_(_through(layers, rows))

@@ -105,8 +105,10 @@ class MOPSNet(Sampler):
         """Return S without gradients, by folded layers."""
         net = fold(self)
         local = net.local_features(points.flatten(0, 1)).unflatten(0, points.shape[:2])
-        keys = [net.keys(cloud, peak) for cloud, peak in zip(local, local.amax(1), strict=True)]
-        return SamplingMatrix(self.queries.weight, torch.stack(keys), self.tau)
+        keys = local.new_empty(*local.shape[:2], net.queries.shape[1])
+        for cloud, peak, into in zip(local, local.amax(1), keys, strict=True):
+            net.keys(cloud, peak, into)
+        return SamplingMatrix(self.queries.weight, keys, self.tau)
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Generate points; see ``Sampler.forward``."""
