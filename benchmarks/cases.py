@@ -281,7 +281,7 @@ ALL: dict[str, Callable[[dict[str, float], int], list[Row]]] = {
     "farthest": farthest,
     "neighbours": neighbours,
     "growth": growth,
-    # Last, for what they do to the process's memory lasts.
+    # Last, for what they do to the process's memory lasts; give them last on the command line, too.
     "training": training,
     "compiled": compiled,
 }

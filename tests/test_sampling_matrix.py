@@ -94,6 +94,24 @@ def test_points_far_above_all_that_were_looked_at_first_are_weighed_rightly(heig
     torch.testing.assert_close(merged.result(), found.result(), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_halves_overflow_nowhere(dtype):
+    matrix, points = random_matrix(batch=1, n=3000, m=50, tau=0.2, dtype=torch.float32)
+    found = attend(matrix.queries.to(dtype) / 0.2, matrix.keys[0].to(dtype), points[0].to(dtype))
+    logits = (matrix.queries.to(dtype) / 0.2).double() @ matrix.keys[0].to(dtype).double().mT
+    want = logits.softmax(1) @ points[0].double()
+    digits = float(logits.abs().max()) * torch.finfo(dtype).eps
+    torch.testing.assert_close(found.result().double(), want, rtol=0, atol=2 * digits)
+
+
+def test_logits_without_digits_give_points_of_the_cloud_s_size():
+    matrix, points = random_matrix(batch=1, n=1500, m=300, c=257, dtype=torch.float32)
+    found = attend(matrix.queries * 1e8, matrix.keys[0].relu(), points[0])
+    # Which point wins is chance, for logits of 1e9 are whole hundreds; a number it must be.
+    assert found.result().abs().max() <= points.abs().max() * 1.001
+    assert found.total.min() >= 0.5
+
+
 def test_sums_over_many_points_keep_their_digits(rng):
     queries, keys = torch.zeros(3, 4), torch.zeros(300_000, 4)
     values = torch.rand(300_000, 3, generator=rng)

@@ -21,9 +21,6 @@ LOG2_E = 1 / math.log(2)
 PROBES = 64
 """About so many points of a cloud show how large a column's logits are."""
 
-HIGH = 2.0**64
-"""Sums above it are taken anew; far below what float32 holds, so that sums can still be merged."""
-
 
 class Blocks(NamedTuple):
     """How S is cut into pieces on a device.
@@ -150,12 +147,11 @@ class SamplingMatrix(NamedTuple):
         queries = self.queries / self.tau
         no_values = self.keys.new_zeros(*self.keys.shape[:2], 0)
         _, log_sum = _attend(queries, self.keys, no_values)
-        queries *= LOG2_E
-        size = _blocks_on(queries.device)
+        powers, size = queries * LOG2_E, _blocks_on(queries.device)
         for cloud, keys in enumerate(self.keys):
             for columns in _slices(len(queries), block_queries or size.queries):
                 for rows in _slices(len(keys), size.points):
-                    share = _shares(queries[columns], keys[rows], log_sum[cloud, columns])
+                    share = _shares(powers[columns], keys[rows], log_sum[cloud, columns])
                     yield cloud, rows, columns, share
 
 
@@ -163,9 +159,9 @@ def _slices(total: int, size: int) -> list[slice]:
     return [slice(start, min(start + size, total)) for start in range(0, total, size)]
 
 
-def _shares(queries: Tensor, keys: Tensor, level: Tensor, out: Tensor | None = None) -> Tensor:
-    """Return 2^(⟨query, key⟩ - level), ``(columns, rows)``, for queries to the base 2."""
-    return torch.addmm(-level[:, None], queries, keys.mT, out=out).exp2_()
+def _shares(powers: Tensor, keys: Tensor, level: Tensor) -> Tensor:
+    """Return 2^(⟨power, key⟩ - level), ``(columns, rows)``; powers are queries to the base 2."""
+    return (powers @ keys.mT).sub_(level[:, None]).exp2_()
 
 
 class Partial(NamedTuple):
@@ -174,7 +170,8 @@ class Partial(NamedTuple):
     Logits and their level are to the base 2.
 
     Attributes:
-        level: ``(M,)``, a number near the largest logit of every column.
+        level: ``(M,)``, what every column's logits are measured from, so that no power of 2 is
+            too large for its type and not all are too small.
         total: ``(M,)``, the sum of 2^(logit - level).
         weighted: ``(M, V)``, the sum of 2^(logit - level) times the point's values.
     """
@@ -202,54 +199,63 @@ class Partial(NamedTuple):
 def attend(queries: Tensor, keys: Tensor, values: Tensor) -> Partial:
     """Sum values over points with the weights exp⟨query, key⟩, without the M·N logits at once.
 
-    What is subtracted from a column's logits cancels, so it need not be their maximum, which would
-    take a pass over all of them; it must only be near enough for the powers to fit their type. The
-    maximum over a few points nearly always is; columns where it is not are taken again.
+    What a column's logits are measured from cancels, so it need not be their maximum, which would
+    take a pass over all of them: the maximum over a few points nearly always serves. Columns where
+    it does not are taken again from their true maximum, at worst at three times the cost.
 
     Args:
         queries: ``(M, C)``, already divided by the temperature.
-        keys: ``(N, C)``.
+        keys: ``(N, C)``, N at least 1.
         values: ``(N, V)``.
     """
-    queries = queries * LOG2_E
-    # Ones give the sum of the weights as well; columns lie together in memory here, too.
+    powers = queries * LOG2_E
+    # Ones give the sum of the weights as well. Columns together in memory halve the product's time.
     held = torch.cat([values.mT, values.new_ones(1, len(values))]).mT
-    level = _peaks(queries, keys[:: max(len(keys) // PROBES, 1)])
-    sums = _sums(queries, keys, held, level)
-    high = ~(sums[:, -1] < HIGH)
-    if high.any():
-        level[high] = _peaks(queries[high], keys)
-        sums[high] = _sums(queries[high], keys, held, level[high])
+    probes = keys[:: max(len(keys) // PROBES, 1)]
+    # Sums up to here can be merged, and multiplied by any value of their own size.
+    high = math.sqrt(torch.finfo(held.dtype).max)
+    level = powers.new_empty(len(powers))
+    sums = held.new_empty(len(powers), held.shape[1])
+    for columns in _slices(len(powers), _blocks_on(keys.device).queries):
+        here = powers[columns]
+        near = (here @ probes.mT).amax(1)
+        found = _sums(here, keys, held, near)
+        unsure = ~((found[:, -1] > 0.5) & (found[:, -1] < high))
+        if unsure.any():
+            near[unsure], found[unsure] = _sums_from_peaks(here[unsure], keys, held)
+        level[columns], sums[columns] = near, found
     return Partial(level, sums[:, -1], sums[:, :-1])
 
 
-def _sums(queries: Tensor, keys: Tensor, held: Tensor, level: Tensor) -> Tensor:
-    size = _blocks_on(keys.device)
-    result = held.new_zeros(len(queries), held.shape[1])
-    room = keys.new_empty(min(size.queries, len(queries)) * min(size.points, len(keys)))
-    for columns in _slices(len(queries), size.queries):
-        for rows in _slices(len(keys), size.points):
-            shape = (columns.stop - columns.start, rows.stop - rows.start)
-            out = room[: math.prod(shape)].view(shape)
-            shares = _shares(queries[columns], keys[rows], level[columns], out)
-            # Not addmm_: its sums would run over all points one by one, and lose digits.
-            result[columns] += shares @ held[rows]
+def _sums(powers: Tensor, keys: Tensor, held: Tensor, level: Tensor) -> Tensor:
+    """Return the sums of ``held`` with the weights 2^(⟨power, key⟩ - level)."""
+    blocks = _slices(len(keys), _blocks_on(keys.device).points)
+    result = held.new_zeros(len(powers), held.shape[1])
+    room = keys.new_empty(len(powers) * (blocks[0].stop - blocks[0].start))
+    for rows in blocks:
+        shape = (len(powers), rows.stop - rows.start)
+        out = room[: math.prod(shape)].view(shape)
+        shares = torch.addmm(-level[:, None], powers, keys[rows].mT, out=out).exp2_()
+        # Not addmm_: its sums would run over all points one by one, and lose digits.
+        result += shares @ held[rows]
     return result
 
 
-def _peaks(queries: Tensor, keys: Tensor) -> Tensor:
-    """Return the largest of every query's logits ``(M,)``."""
-    size = _blocks_on(keys.device)
-    peaks = queries.new_full((len(queries),), -torch.inf)
-    for columns in _slices(len(queries), size.queries):
-        for rows in _slices(len(keys), size.points):
-            here = (queries[columns] @ keys[rows].mT).amax(1)
-            peaks[columns] = torch.maximum(peaks[columns], here)
-    return peaks
+def _sums_from_peaks(powers: Tensor, keys: Tensor, held: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the largest logits, and the same sums measured from them."""
+    whole: Partial | None = None
+    for rows in _slices(len(keys), _blocks_on(keys.device).points):
+        logits = powers @ keys[rows].mT
+        peak = logits.amax(1)
+        sums = logits.sub_(peak[:, None]).exp2_() @ held[rows]
+        part = Partial(peak, sums[:, -1], sums)
+        whole = part if whole is None else whole.merge(part)
+    assert whole is not None
+    return whole.level, whole.weighted
 
 
 def _attend(queries: Tensor, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-    """Return softmax-weighted values ``(B, M, V)`` and the softmax sums' logarithms ``(B, M)``."""
+    """Return softmax-weighted values ``(B, M, V)`` and the sums' logarithms to the base 2."""
     wholes = [attend(queries, *cloud) for cloud in zip(keys, values, strict=True)]
     results = torch.stack([whole.result() for whole in wholes])
     return results, torch.stack([whole.level + whole.total.log2() for whole in wholes])

@@ -58,7 +58,7 @@ class FoldedMOPS(NamedTuple):
         Args:
             local: of some points of a cloud.
             global_: of the whole cloud.
-            into: where to write the keys; None: new memory.
+            into: ``(N, C)``, where to write the keys; None: new memory.
         """
         bias = torch.addmv(self.local.bias, self.global_weight, global_)
         layers = (self.local._replace(bias=bias), *self.rest)
