@@ -30,6 +30,7 @@ def path(request, monkeypatch):
     """Both ways to SᵀP, the streamed one with blocks that divide nothing evenly."""
     dense = 0 if request.param == "streamed" else 2**22
     monkeypatch.setitem(sampling_matrix.BLOCKS, "cpu", sampling_matrix.Blocks(dense, 4, 10))
+    monkeypatch.setattr(sampling_matrix, "GRAM_ROWS", 4)
     return request.param
 
 
