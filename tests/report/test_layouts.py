@@ -230,3 +230,14 @@ def test_a_cloud_is_drawn_at_every_noise_level(tmp_path, rng):
     figure = plots(build(tmp_path))["clouds"]
     assert [axes.get_title() for axes in figure.axes[:2]] == ["noise=0", "noise=0.1"]
     assert len(figure.axes) == 4
+
+
+def test_runs_of_one_sampler_made_in_several_ways_are_named(tmp_path):
+    values = {"generated": 1.0, "matched": 1.5}
+    for name, m, length in (("short-8", 8, 3), ("short-16", 16, 3), ("long", 32, 9)):
+        put_cell(tmp_path, name, "mops", values, m=m, trainer={"max_epochs": length})
+    put_cell(tmp_path, "other", "samplenet", values, m=8, trainer={"max_epochs": 9})
+    text = table(tmp_path, mixed=True)
+    assert "- mops (short-16, short-8): 3 epochs, seed 0" in text
+    assert "- mops (long): 9 epochs, seed 0" in text
+    assert "- samplenet: 9 epochs, seed 0" in text

@@ -25,6 +25,9 @@ from mops_lightning.report.text import PAPER, Grid
 NORMALIZED = {"nre_cd": "chamfer", "nre_emd": "emd"}
 """Errors that are 1 on all points, and what they are normalized by, which is shown instead."""
 
+NAMED = 8
+"""Runs that were made in one way are named up to this number."""
+
 
 @dataclass(frozen=True)
 class Report:
@@ -182,8 +185,11 @@ def _full(found: list[Record], names: dict[str, str], metric: str) -> list[str]:
 
 
 def how(found: Iterable[Record], net: str) -> list[str]:
-    """Say how each kind of run was made: epochs, seeds, device, commit; other nets are named."""
-    lines: dict[str, None] = {}
+    """Say how each kind of run was made: epochs, seeds, device, commit; other nets are named.
+
+    Where runs of one kind were made in several ways, the lines name their folders.
+    """
+    made: dict[str, dict[str, list[str]]] = {}
     for record in found:
         config, names = record["config"], record["config"]["names"]
         what = names["net"] if config["learn"] == "task" else names["sampler"]
@@ -195,12 +201,17 @@ def how(found: Iterable[Record], net: str) -> list[str]:
         if not trained and epochs(record) is not None:
             length = f"evaluated after {length}"
         commit = (record["git"]["commit"] or "a wheel")[:10]
-        lines[
-            f"- {what}{joint}: {length}seed {seed(record)}, {record['device']}, "
-            f"{record['threads']} threads, commit {commit}"
-            + (" with changes" if record["git"]["dirty"] else "")
-        ] = None
-    return list(lines)
+        way = (
+            f"{length}seed {seed(record)}, {record['device']}, {record['threads']} threads, "
+            f"commit {commit}" + (" with changes" if record["git"]["dirty"] else "")
+        )
+        made.setdefault(what + joint, {}).setdefault(way, []).append(Path(record["folder"]).name)
+    lines = []
+    for kind, ways in made.items():
+        for way, folders in ways.items():
+            those = f" ({', '.join(folders)})" if len(ways) > 1 and len(folders) <= NAMED else ""
+            lines.append(f"- {kind}{those}: {way}")
+    return lines
 
 
 def _undone(found: Found) -> list[str]:
