@@ -1,10 +1,10 @@
-"""Farthest points by groups beside those from all points: the same rows, bit for bit."""
+"""Farthest points by groups or a table beside those from all points: the same rows, bit for bit."""
 
 import pytest
 import torch
 from torch.nn import functional as F
 
-from mops_lightning import geometry
+from mops_lightning import farthest, geometry
 from mops_lightning.geometry import farthest_point_fill, farthest_point_sample
 
 KINDS = ["sphere", "normal", "grid", "line", "copies", "one point", "far away", "tiny", "huge"]
@@ -31,15 +31,17 @@ def cloud(kind, n, dtype, rng):
     return points
 
 
-@pytest.fixture
-def by_groups(monkeypatch):
-    """Call with groups whatever the sizes, and without them."""
+@pytest.fixture(params=["groups", "table"])
+def both_ways(request, monkeypatch):
+    """Call with groups or a table whatever the sizes, and without them."""
 
     def both(function, *arguments, **options):
         results = []
-        for least in (1, 10**9):
-            monkeypatch.setattr(geometry, "MANY_POINTS", least)
+        for special in (True, False):
+            groups, table = (special and request.param == way for way in ("groups", "table"))
+            monkeypatch.setattr(geometry, "MANY_POINTS", 1 if groups else 10**9)
             monkeypatch.setattr(geometry, "MANY_STEPS", 1)
+            monkeypatch.setattr(geometry, "FEW_POINTS", 10**9 if table else 0)
             results.append(function(*arguments, **options))
         return results
 
@@ -49,40 +51,40 @@ def by_groups(monkeypatch):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (90, 90), (128, 60), (1500, 700)])
-def test_groups_give_the_rows_that_all_points_give(n, m, kind, dtype, rng, by_groups):
+def test_both_give_the_rows_that_all_points_give(n, m, kind, dtype, rng, both_ways):
     points = cloud(kind, n, dtype, rng)
     start = torch.randint(n, (2,), generator=rng)
-    groups, all_points = by_groups(farthest_point_sample, points, m, start=start)
-    assert torch.equal(groups, all_points)
+    special, all_points = both_ways(farthest_point_sample, points, m, start=start)
+    assert torch.equal(special, all_points)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_groups_fill_up_as_all_points_do(kind, rng, by_groups):
+def test_both_fill_up_as_all_points_do(kind, rng, both_ways):
     points = cloud(kind, 700, torch.float32, rng)
     indices = torch.stack([torch.randperm(700, generator=rng)[:200] for _ in range(2)])
-    groups, all_points = by_groups(farthest_point_fill, points, indices, torch.tensor([1, 150]))
-    assert torch.equal(groups, all_points)
+    special, all_points = both_ways(farthest_point_fill, points, indices, torch.tensor([1, 150]))
+    assert torch.equal(special, all_points)
 
 
 @pytest.mark.parametrize("channels", [1, 2, 4])
-def test_groups_in_other_dimensions(channels, rng, by_groups):
+def test_both_in_other_dimensions(channels, rng, both_ways):
     points = torch.rand(1, 600, channels, generator=rng)
-    groups, all_points = by_groups(farthest_point_sample, points, 300)
-    assert torch.equal(groups, all_points)
+    special, all_points = both_ways(farthest_point_sample, points, 300)
+    assert torch.equal(special, all_points)
 
 
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
-def test_what_is_not_finite_is_left_to_the_search_of_all_points(wrong, rng, by_groups):
+def test_what_is_not_finite_is_left_to_the_search_of_all_points(wrong, rng, both_ways):
     points = torch.rand(1, 600, 3, generator=rng)
     points[0, 7, 0] = wrong
-    groups, all_points = by_groups(farthest_point_sample, points, 300)
-    assert torch.equal(groups, all_points)
+    special, all_points = both_ways(farthest_point_sample, points, 300)
+    assert torch.equal(special, all_points)
 
 
-def test_half_precision_is_searched_in_float32(rng, by_groups):
+def test_half_precision_is_searched_in_float32(rng, both_ways):
     points = torch.rand(1, 600, 3, generator=rng).half()
-    groups, all_points = by_groups(farthest_point_sample, points, 300)
-    assert torch.equal(groups, all_points)
+    special, all_points = both_ways(farthest_point_sample, points, 300)
+    assert torch.equal(special, all_points)
 
 
 def test_large_clouds_are_taken_by_groups(rng, monkeypatch):
@@ -90,3 +92,22 @@ def test_large_clouds_are_taken_by_groups(rng, monkeypatch):
     taken = farthest_point_sample(points, m, start=5)
     monkeypatch.setattr(geometry, "MANY_STEPS", m + 1)
     assert torch.equal(taken, farthest_point_sample(points, m, start=5))
+
+
+@pytest.mark.parametrize(
+    ("clouds", "n", "m", "tables"),
+    [(4, 1024, 128, 4), (4, 1024, 127, 0), (5, 1024, 128, 0), (1, 1025, 900, 0), (1, 8, 8, 1)],
+)
+def test_few_small_clouds_are_taken_from_a_table(clouds, n, m, tables, rng, monkeypatch):
+    sizes = []
+
+    def counted(points, distances, steps):
+        sizes.append(len(points))
+        return farthest.take_farthest_by_table(points, distances, steps)
+
+    monkeypatch.setattr(geometry, "take_farthest_by_table", counted)
+    points = torch.rand(clouds, n, 3, generator=rng)
+    taken = farthest_point_sample(points, m)
+    assert sizes == [n] * tables
+    monkeypatch.setattr(geometry, "FEW_POINTS", 0)
+    assert torch.equal(taken, farthest_point_sample(points, m))

@@ -1,8 +1,11 @@
-"""Farthest point sampling of large clouds on a CPU, where most points are far from the new one.
+"""Farthest point sampling on a CPU by fewer operations than looking at all points at each step.
 
-Neighbouring points form groups. A group that is farther from the new point than all its points are
-from the chosen ones keeps its distances, so that a step looks at a few groups only. (Han et al.,
-"QuickFPS", IEEE TCAD 2023, and others before them do so in trees.)
+Of small clouds all distances are taken at once, and a step has no more to do than to compare.
+
+In large clouds most points are far from the new one. Neighbouring points form groups. A group that
+is farther from the new point than all its points are from the chosen ones keeps its distances, so
+that a step looks at a few groups only. (Han et al., "QuickFPS", IEEE TCAD 2023, and others before
+them do so in trees.)
 """
 
 import math
@@ -17,6 +20,34 @@ SIZE = 128
 
 SAFE = 1 - 1e-6
 """Bounds are lowered by it, for sums of squares are rounded in another way than distances are."""
+
+
+def take_farthest_by_table(points: Tensor, distances: Tensor, steps: int) -> Tensor:
+    """Do what ``take_farthest_by_groups`` does, from a table of all distances.
+
+    Args:
+        points: ``(N, C)`` on the CPU, finite; N² distances are held.
+        distances: as there.
+        steps: as there.
+
+    Returns:
+        As there.
+    """
+    first, *others = points.to(distances.dtype).mT.contiguous()
+    table = first[:, None] - first
+    table.mul_(table)
+    room = torch.empty_like(table)
+    for other in others:
+        torch.sub(other[:, None], other, out=room)
+        table.addcmul_(room, room)
+    rows, far = table.numpy(), distances.numpy().copy()
+    taken = np.empty(steps, np.int64)
+    for step in range(steps):
+        row = far.argmax()
+        taken[step] = row
+        far[row] = -1
+        np.minimum(far, rows[row], out=far)
+    return torch.from_numpy(taken)
 
 
 def take_farthest_by_groups(points: Tensor, distances: Tensor, steps: int) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
-from mops_lightning.farthest import take_farthest_by_groups
+from mops_lightning.farthest import take_farthest_by_groups, take_farthest_by_table
 
 GROUP, FEW = 32, 8192
 """Values per group in ``first_extreme``, and up to how many values groups do not pay there."""
@@ -22,6 +22,8 @@ BLOCK = {"cpu": 2**19, "other": 2**24}
 
 MANY_POINTS, MANY_STEPS = 65536, 256
 """From both on, farthest points of a cloud are faster taken by groups than from all points."""
+FEW_CLOUDS, FEW_POINTS = 4, 1024
+"""Up to both, many farthest points of a cloud are faster taken from a table of all distances."""
 
 
 def gather_points(points: Tensor, indices: Tensor) -> Tensor:
@@ -251,10 +253,12 @@ def _take_farthest(points: Tensor, distances: Tensor, steps: int) -> Tensor:
         ``(B, steps)`` int64.
     """
     _, n, channels = points.shape
-    many = points.device.type == "cpu" and n >= MANY_POINTS and steps >= MANY_STEPS
-    if many and channels <= 4 and bool(points.isfinite().all()):
+    few = len(points) <= FEW_CLOUDS and n <= FEW_POINTS and 8 * steps >= n
+    many = n >= MANY_POINTS and steps >= MANY_STEPS and channels <= 4
+    if points.device.type == "cpu" and (few or many) and bool(points.isfinite().all()):
+        take = take_farthest_by_table if few else take_farthest_by_groups
         clouds = zip(points, distances, strict=True)
-        return torch.stack([take_farthest_by_groups(*cloud, steps) for cloud in clouds])
+        return torch.stack([take(*cloud, steps) for cloud in clouds])
     planes = _planes(points.to(distances.dtype), padding=0.0)
     distances = F.pad(distances, (0, planes.shape[2] - n), value=-1.0)
     differences = torch.empty_like(planes)
