@@ -22,6 +22,19 @@ SAFE = 1 - 1e-6
 """Bounds are lowered by it, for sums of squares are rounded in another way than distances are."""
 
 
+def squared_lengths_(planes: Tensor) -> Tensor:
+    """Sum the squares of planes ``(C, ...)``, in place of the first one.
+
+    All ways to farthest points do it here: some processors multiply and add in one rounding, others
+    in two, and all ways must come to the same bits.
+    """
+    total, *others = planes.unbind(0)
+    total.mul_(total)
+    for other in others:
+        total.addcmul_(other, other)
+    return total
+
+
 def take_farthest_by_table(points: Tensor, distances: Tensor, steps: int) -> Tensor:
     """Do what ``take_farthest_by_groups`` does, from a table of all distances.
 
@@ -33,13 +46,8 @@ def take_farthest_by_table(points: Tensor, distances: Tensor, steps: int) -> Ten
     Returns:
         As there.
     """
-    first, *others = points.to(distances.dtype).mT.contiguous()
-    table = first[:, None] - first
-    table.mul_(table)
-    room = torch.empty_like(table)
-    for other in others:
-        torch.sub(other[:, None], other, out=room)
-        table.addcmul_(room, room)
+    planes = points.to(distances.dtype).mT.contiguous()
+    table = squared_lengths_(planes[:, :, None] - planes[:, None])
     rows, far = table.numpy(), distances.numpy().copy()
     taken = np.empty(steps, np.int64)
     for step in range(steps):
@@ -102,16 +110,9 @@ def take_farthest_by_groups(points: Tensor, distances: Tensor, steps: int) -> Te
 def _lowered(
     planes: NDArray[np.floating], new: NDArray[np.floating], far: NDArray[np.floating]
 ) -> NDArray[np.floating]:
-    """Return the lower of old distances and those to a new point.
-
-    By the operations that ``geometry`` uses for all points at once, which multiply and add in one
-    rounding on some processors and in two on others.
-    """
-    total, *others = torch.from_numpy(planes).sub_(torch.from_numpy(new)[:, None, None]).unbind(0)
-    total.mul_(total)
-    for other in others:
-        total.addcmul_(other, other)
-    return torch.minimum(torch.from_numpy(far), total).numpy()
+    """Return the lower of old distances and those to a new point."""
+    differences = torch.from_numpy(planes).sub_(torch.from_numpy(new)[:, None, None])
+    return torch.minimum(torch.from_numpy(far), squared_lengths_(differences)).numpy()
 
 
 def _distances_to_boxes(

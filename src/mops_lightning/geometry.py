@@ -13,7 +13,11 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
-from mops_lightning.farthest import take_farthest_by_groups, take_farthest_by_table
+from mops_lightning.farthest import (
+    squared_lengths_,
+    take_farthest_by_groups,
+    take_farthest_by_table,
+)
 
 GROUP, FEW = 32, 8192
 """Values per group in ``first_extreme``, and up to how many values groups do not pay there."""
@@ -262,15 +266,11 @@ def _take_farthest(points: Tensor, distances: Tensor, steps: int) -> Tensor:
     planes = _planes(points.to(distances.dtype), padding=0.0)
     distances = F.pad(distances, (0, planes.shape[2] - n), value=-1.0)
     differences = torch.empty_like(planes)
-    total, *others = differences.unbind(0)
     taken = []
     for _ in range(steps):
         index = first_extreme(distances, largest=True)
         taken.append(index)
         distances.scatter_(1, index, -1.0)
         torch.sub(planes, planes.gather(2, index.expand(channels, -1, -1)), out=differences)
-        total.mul_(total)
-        for other in others:
-            total.addcmul_(other, other)
-        torch.minimum(distances, total, out=distances)
+        torch.minimum(distances, squared_lengths_(differences), out=distances)
     return torch.cat(taken, 1)

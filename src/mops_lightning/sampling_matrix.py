@@ -21,7 +21,6 @@ LOG2_E = 1 / math.log(2)
 PROBES = 64
 """About so many points of a cloud show how large a column's logits are."""
 
-
 GRAM_ROWS = 256
 """Rows of SᵀS that are computed together."""
 
@@ -291,7 +290,9 @@ class _StreamedAttention(torch.autograd.Function):
                 for rows in _slices(keys.shape[1], size.points):
                     key = keys[cloud, rows]
                     share = _shares(powers[columns], key, log_sum[cloud, columns])
-                    grad_values[cloud, rows] += share.mT @ grad[cloud, columns]
+                    if ctx.needs_input_grad[2]:
+                        # A few rows on the left are quicker than a few columns on the right.
+                        grad_values[cloud, rows] += (grad[cloud, columns].mT @ share).mT
                     change = grad[cloud, columns] @ values[cloud, rows].mT
                     change.sub_(inner[cloud, columns, None]).mul_(share)
                     grad_queries[columns] += change @ key
