@@ -3,7 +3,6 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mops_lightning.losses import chamfer_distance
 from mops_lightning.rigid import Motion, rotation_angle
 from mops_lightning.rigid_losses import (
     frobenius_chamfer_loss,
@@ -78,24 +77,3 @@ def test_weights_of_the_terms():
     )
     torch.testing.assert_close(one, torch.tensor(6.0).double())
     torch.testing.assert_close(two, 2 * one)
-
-
-def plain_chamfer(points, others):
-    squares = (points[:, :, None] - others[:, None]).square().sum(-1)
-    return squares.min(2).values.mean(1) + squares.min(1).values.mean(1)
-
-
-@pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 7), (40, 25), (300, 900)])
-def test_chamfer_distance_equals_its_plain_twin(n, m, rng):
-    points = torch.randn(3, n, 3, dtype=torch.float64, generator=rng, requires_grad=True)
-    others = torch.randn(3, m, 3, dtype=torch.float64, generator=rng, requires_grad=True)
-    got, want = chamfer_distance(points, others), plain_chamfer(points, others)
-    torch.testing.assert_close(got, want)
-    gradients = [torch.autograd.grad(value.sum(), [points, others]) for value in (got, want)]
-    torch.testing.assert_close(*gradients)
-
-
-def test_chamfer_distance_is_zero_for_the_same_points_in_any_order(rng):
-    points = torch.randn(2, 20, 3, generator=rng)
-    order = torch.randperm(20, generator=rng)
-    assert not chamfer_distance(points, points[:, order]).any()
