@@ -11,20 +11,20 @@ from rivals import Calls
 from torch import Tensor, nn
 from twins import PlainMOPS, plain_farthest_point_sample
 
-from mops_lightning.geometry import farthest_point_sample, nearest
-from mops_lightning.malloc import keep_freed_memory
-from mops_lightning.neighbours import nearest_distances
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.ops.nearest import nearest_distances
+from mops_lightning.ops.points import farthest_point_sample, nearest
+from mops_lightning.ops.sampling_matrix import attend
 from mops_lightning.samplers.folded import fold
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.samplenet import SampleNet
 from mops_lightning.samplers.snet import SNet
+from mops_lightning.samplers.streaming import stream_sample
 from mops_lightning.samplers.voxel import VoxelSampler
-from mops_lightning.sampling_matrix import attend
-from mops_lightning.streaming import stream_sample
+from mops_lightning.training.malloc import keep_freed_memory
 
 Row = dict[str, Any]
 SIZES = (512, 256, 128, 64, 32, 16, 8)

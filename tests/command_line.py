@@ -12,7 +12,7 @@ from unittest.mock import patch
 import torch
 from hydra.core.global_hydra import GlobalHydra
 
-from mops_lightning.cli import main
+from mops_lightning.cli.main import main
 
 TINY = [
     "trainer=cpu",

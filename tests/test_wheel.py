@@ -84,13 +84,15 @@ def test_the_wheel_declares_the_console_script_and_carries_the_licence(wheel: Pa
         scripts = archive.read(f"{info}/entry_points.txt").decode().splitlines()
         licence = archive.read(f"{info}/licenses/LICENSE")
     assert scripts[scripts.index("[console_scripts]") + 1] == (
-        "mops-lightning = mops_lightning.cli:main"
+        "mops-lightning = mops_lightning.cli.main:main"
     )
     assert licence == (ROOT / "LICENSE").read_bytes()
 
 
 def test_the_installed_copy_is_what_these_tests_import(installed: Path, tmp_path: Path) -> None:
-    code = "import mops_lightning, mops_lightning.config as c; print(mops_lightning.__file__)"
+    code = (
+        "import mops_lightning, mops_lightning.config.validate as c; print(mops_lightning.__file__)"
+    )
     lines = python("-c", f"{code}; print(c.conf_dir())", cwd=tmp_path, path=installed).split("\n")
     assert Path(lines[0]) == installed / "mops_lightning" / "__init__.py"
     assert Path(lines[1]) == installed.resolve() / "mops_lightning" / "conf"

@@ -2,6 +2,6 @@
 
 if __name__ == "__main__":
     # Worker processes import this module too and need nothing of what follows.
-    from mops_lightning.cli import main
+    from mops_lightning.cli.main import main
 
     main()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from mops_lightning.sampling_matrix import SamplingMatrix
+    from mops_lightning.ops.sampling_matrix import SamplingMatrix
 
 
 class Batch(NamedTuple):

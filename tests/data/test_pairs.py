@@ -4,7 +4,7 @@ import torch
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.data.pairs import Pairs, pair_batch
 from mops_lightning.errors import UserError
-from mops_lightning.rigid import Motion
+from mops_lightning.ops.rigid import Motion
 from mops_lightning.seeding import generator
 from mops_lightning.types import Batch
 from tests.conftest import small_dataset

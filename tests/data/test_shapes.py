@@ -13,8 +13,8 @@ import torch
 from scipy.spatial import cKDTree
 
 from mops_lightning.data.clouds import CloudDataset, Clouds
-from mops_lightning.data.mesh_parts import join, turned
-from mops_lightning.data.shape_builders import BUILDERS
+from mops_lightning.data.procedural.builders import BUILDERS
+from mops_lightning.data.procedural.mesh_parts import join, turned
 from mops_lightning.data.shapes import _sample, shapes
 from mops_lightning.errors import UserError
 

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import torch
 
-from mops_lightning import weights
-from mops_lightning.downsample.chunks import stored
 from mops_lightning.downsample.cluster import cluster, engine_of, environment_kept
-from mops_lightning.downsample.formats import WRITERS
+from mops_lightning.downsample.formats.chunks import stored
+from mops_lightning.downsample.formats.registry import WRITERS
+from mops_lightning.downsample.formats.table import Table
 from mops_lightning.downsample.job import read
 from mops_lightning.downsample.large import by_chunks
-from mops_lightning.downsample.table import Table
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.zoo import weights
 from tests.downsample.test_downsample import call
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from mops_lightning import weights
 from mops_lightning.downsample.cli import main
-from mops_lightning.downsample.formats import WRITERS
+from mops_lightning.downsample.formats.registry import WRITERS
+from mops_lightning.downsample.formats.table import Table
 from mops_lightning.downsample.job import read
-from mops_lightning.downsample.table import Table
 from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.zoo import weights
 
 
 def call(*arguments):

@@ -3,7 +3,7 @@ import torch
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.icp import ICP
-from mops_lightning.rigid import random_motion, rotation_angle
+from mops_lightning.ops.rigid import random_motion, rotation_angle
 from mops_lightning.seeding import generator
 
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 from matplotlib.colors import LogNorm, Normalize
 
-from mops_lightning import records
-from mops_lightning.cloud_files import save_clouds
 from mops_lightning.errors import UserError
+from mops_lightning.records import run_record
 from mops_lightning.report.build import build
 from mops_lightning.report.cli import main
 from mops_lightning.report.plots import plots
+from mops_lightning.viz.snapshots import save_clouds
+from tests.records.test_run_record import record
 from tests.report.test_tables import put, rows, table
-from tests.test_records import record
 
 
 def put_cell(folder, name, sampler, values, seed=0, **settings):
@@ -39,8 +39,8 @@ def put_cell(folder, name, sampler, values, seed=0, **settings):
     (folder / name).mkdir(parents=True)
     seconds = {"total": 1.0, "fit": 0.5}
     content = record(config=config, metrics=metrics, notes=notes, seed=seed, seconds=seconds)
-    records.write(folder / name, content)
-    return folder / name / records.FILE
+    run_record.write(folder / name, content)
+    return folder / name / run_record.FILE
 
 
 def test_seeds_are_summed_up_with_their_count(tmp_path):
@@ -162,7 +162,7 @@ def test_each_seed_may_have_data_of_its_own_if_every_sampler_has_every_seed(tmp_
             }
             path.write_text(json.dumps(content))
     assert rows(table(tmp_path))[1] == ["fps", "1.5 ± 0.71 (n=2)"]
-    path.parent.joinpath(records.FILE).unlink()
+    path.parent.joinpath(run_record.FILE).unlink()
     with pytest.raises(UserError, match="every sampler must have every seed"):
         table(tmp_path)
 

@@ -5,9 +5,9 @@ import json
 import pytest
 import torch
 
-from mops_lightning import records
-from mops_lightning.cloud_files import load_clouds, save_clouds
+from mops_lightning.records import run_record
 from mops_lightning.report.cli import main
+from mops_lightning.viz.snapshots import load_clouds, save_clouds
 from tests.report.test_layouts import put_planes
 from tests.report.test_tables import put
 
@@ -30,7 +30,7 @@ def reported(tmp_path, rng):
     put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.8, "test/matched/accuracy": 0.77})
     put(tmp_path, "voxel", 32, {"test/sampled/accuracy": 0.055})
     for name, readout in (("fps-32", "sampled"), ("mops-32", "generated")):
-        path = tmp_path / f"{name}-pointnet" / records.FILE
+        path = tmp_path / f"{name}-pointnet" / run_record.FILE
         content = json.loads(path.read_text())
         content["files"]["clouds"] = "pictures/clouds.npz"
         path.write_text(json.dumps(content))

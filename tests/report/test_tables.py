@@ -2,12 +2,13 @@ import json
 
 import pytest
 
-from mops_lightning import paper, records
 from mops_lightning.errors import UserError
+from mops_lightning.records import run_record
+from mops_lightning.report import paper
 from mops_lightning.report.build import build
 from mops_lightning.report.cli import main
 from mops_lightning.report.text import markdown
-from tests.test_records import record
+from tests.records.test_run_record import record
 
 
 def table(folder, *metrics, mixed=False):
@@ -27,7 +28,7 @@ def put(folder, sampler, m, metrics, task="classification", net="pointnet", **ch
     notes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **changes.pop("notes", {})}
     target = folder / f"{sampler}-{m}-{net}"
     target.mkdir()
-    records.write(target, record(config=config, metrics=metrics, notes=notes, **changes))
+    run_record.write(target, record(config=config, metrics=metrics, notes=notes, **changes))
 
 
 def rows(text):
@@ -206,7 +207,7 @@ def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):
         "dataset": {"n_points": points},
     }
     notes = {"score": next(iter(metrics)), "shown": shown, "parameters": {"task": 1_025_000}}
-    return records.write(target, record(config=config, metrics=metrics, notes=notes))
+    return run_record.write(target, record(config=config, metrics=metrics, notes=notes))
 
 
 def test_a_folder_of_task_nets_alone_is_a_table_of_nets(tmp_path):

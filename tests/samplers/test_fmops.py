@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.losses import subset_loss
+from mops_lightning.losses.subset import subset_loss
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 

@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.readout import match
+from mops_lightning.ops.readout import match
+from mops_lightning.ops.sampling_matrix import Partial, attend
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.folded import fold
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.snet import SNet
-from mops_lightning.sampling_matrix import Partial, attend
-from mops_lightning.streaming import global_part, stream_match, stream_sample, sum_part
+from mops_lightning.samplers.streaming import global_part, stream_match, stream_sample, sum_part
 
 
 @pytest.fixture(params=[MOPSNet, FMOPSNet])

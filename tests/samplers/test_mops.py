@@ -3,7 +3,7 @@ import torch
 from torch import nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.losses import subset_loss
+from mops_lightning.losses.subset import subset_loss
 from mops_lightning.nets.pointnet import linear_norm_relu
 from mops_lightning.samplers.mops import MOPSNet
 

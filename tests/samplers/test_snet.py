@@ -2,9 +2,9 @@ import pytest
 import torch
 from torch import nn
 
-from mops_lightning import losses
 from mops_lightning.errors import UserError
-from mops_lightning.losses import simplification_loss
+from mops_lightning.losses import subset as losses
+from mops_lightning.losses.subset import simplification_loss
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 
 

@@ -2,20 +2,20 @@ import pytest
 import torch
 
 from mops_lightning.data.loader import CloudLoader
-from mops_lightning.emd import earth_mover_distance
 from mops_lightning.errors import UserError
-from mops_lightning.experiment import Experiment
-from mops_lightning.losses import chamfer_distance
+from mops_lightning.losses.subset import chamfer_distance
+from mops_lightning.metrics.reconstruction import Distances, MeanDistance, NormalizedError
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
-from mops_lightning.reconstruction_metrics import Distances, MeanDistance, NormalizedError
+from mops_lightning.ops.emd import earth_mover_distance
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.scoring import full_cloud
 from mops_lightning.tasks.reconstruction import Reconstruction
+from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.readouts import full_cloud
 from mops_lightning.types import Batch
 from tests.conftest import quiet_trainer, small_dataset
-from tests.test_experiment import changed, state
+from tests.training.test_experiment import changed, state
 
 
 def task(**extra):

@@ -6,22 +6,22 @@ import torch
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.data.pairs import Pairs, pair_batch
 from mops_lightning.errors import UserError
-from mops_lightning.experiment import Experiment
-from mops_lightning.motion_metrics import RotationError
+from mops_lightning.losses.registration import frobenius_chamfer_loss, quaternion_loss
+from mops_lightning.metrics.registration import RotationError
 from mops_lightning.nets.icp import ICP
 from mops_lightning.nets.pcrnet import PCRNet
-from mops_lightning.rigid import Motion, identity_motion, quaternion_from_matrix
-from mops_lightning.rigid_losses import frobenius_chamfer_loss, quaternion_loss
+from mops_lightning.ops.rigid import Motion, identity_motion, quaternion_from_matrix
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.samplenet import SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
-from mops_lightning.scoring import full_cloud
 from mops_lightning.tasks.registration import Registration
+from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.readouts import full_cloud
 from tests.conftest import quiet_trainer, small_dataset
-from tests.test_experiment import changed, state
-from tests.test_rigid import motion
+from tests.ops.test_rigid import motion
+from tests.training.test_experiment import changed, state
 
 
 class Kabsch(torch.nn.Module):

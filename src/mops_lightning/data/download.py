@@ -23,7 +23,7 @@ from rich.progress import (
 )
 
 from mops_lightning.errors import UserError
-from mops_lightning.io import atomic_write, lock
+from mops_lightning.files import atomic_write, lock
 
 TIMEOUT = 60.0  # seconds without a byte
 CHUNK = 1 << 16

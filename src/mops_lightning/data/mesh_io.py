@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from mops_lightning.errors import UserError
-from mops_lightning.io import atomic_write
+from mops_lightning.files import atomic_write
 
 SUFFIXES = (".off", ".obj", ".ply", ".stl", ".glb")
 VERSION = 1

@@ -8,8 +8,8 @@ import torch
 from torch import Generator, Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.geometry import gather_points
-from mops_lightning.rigid import Motion, random_motion
+from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.rigid import Motion, random_motion
 from mops_lightning.types import PairBatch
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
 from mops_lightning.data.hdf5 import choose_and_sign, read_clouds
 from mops_lightning.errors import UserError
-from mops_lightning.geometry import normalize_unit_sphere
+from mops_lightning.ops.points import normalize_unit_sphere
 from mops_lightning.seeding import derive_seed
 
 Cloud = NDArray[np.float32]

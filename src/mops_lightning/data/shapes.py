@@ -19,9 +19,9 @@ from rich.console import Console
 from rich.progress import track
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
-from mops_lightning.data.shape_builders import BUILDERS
+from mops_lightning.data.procedural.builders import BUILDERS
 from mops_lightning.errors import UserError
-from mops_lightning.io import atomic_write
+from mops_lightning.files import atomic_write
 
 GENERATOR_VERSION = 1
 """To be raised with every change of the shapes: it makes old cache files and weights unused."""

@@ -14,7 +14,7 @@ from typing import Any
 from rich.progress import track
 
 from mops_lightning.errors import UserError
-from mops_lightning.workers import pool
+from mops_lightning.ops.workers import pool
 
 DESCRIPTION = """Downsample clouds and meshes from files.
 
@@ -159,7 +159,7 @@ def _said(number: int, whole: int, dropped: int) -> str:
 
 
 def _jobs(chosen: argparse.Namespace) -> list[tuple[Path, Path]]:
-    from mops_lightning.downsample.formats import READABLE, WRITERS
+    from mops_lightning.downsample.formats.registry import READABLE, WRITERS
 
     source, target = chosen.source, chosen.target
     wanted = f".{chosen.format.lstrip('.').lower()}" if chosen.format else None

@@ -12,11 +12,9 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning import weights
 from mops_lightning.data.mesh_io import parse_mesh
-from mops_lightning.downsample.formats import READABLE, READERS, WRITERS
-from mops_lightning.downsample.large import Engine, by_chunks, in_turn
-from mops_lightning.downsample.table import (
+from mops_lightning.downsample.formats.registry import READABLE, READERS, WRITERS
+from mops_lightning.downsample.formats.table import (
     BadCloudError,
     Table,
     check_enough,
@@ -25,17 +23,19 @@ from mops_lightning.downsample.table import (
     reach,
     total,
 )
+from mops_lightning.downsample.large import Engine, by_chunks, in_turn
 from mops_lightning.errors import UserError
-from mops_lightning.io import atomic_write
-from mops_lightning.readout import complete
-from mops_lightning.readout_names import GENERATED_READOUTS
+from mops_lightning.files import atomic_write
+from mops_lightning.ops.readout import complete
+from mops_lightning.records.readout_names import GENERATED_READOUTS
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.poisson import PoissonSampler
 from mops_lightning.samplers.random import RandomSampler
+from mops_lightning.samplers.streaming import stream_match, stream_sample
 from mops_lightning.samplers.voxel import VoxelSampler
-from mops_lightning.streaming import stream_match, stream_sample
+from mops_lightning.zoo import weights
 
 CHUNK = 65536
 """Points that a learned sampler sees at a time; it bounds the memory that its features take."""
@@ -122,7 +122,7 @@ def sampler_of(settings: Settings) -> Sampler:
         raise UserError(f"--weights: {path} holds a task net; give a sampler's run.")
     from omegaconf import OmegaConf
 
-    from mops_lightning.config import build
+    from mops_lightning.config.validate import build
 
     sampler: Sampler = build(OmegaConf.create(content["config"]["sampler"]))
     weights.fit_state(sampler, content["state"], path)

@@ -16,14 +16,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.downsample.chunks import Stored, stored
-from mops_lightning.downsample.table import Table, check_enough, radius_of, reach, total
+from mops_lightning.downsample.formats.chunks import Stored, stored
+from mops_lightning.downsample.formats.table import Table, check_enough, radius_of, reach, total
 from mops_lightning.errors import UserError
-from mops_lightning.geometry import nearest
+from mops_lightning.ops.points import nearest
+from mops_lightning.ops.sampling_matrix import Partial
 from mops_lightning.samplers.folded import FoldedMOPS, fold
 from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.sampling_matrix import Partial
-from mops_lightning.streaming import global_part, sum_part
+from mops_lightning.samplers.streaming import global_part, sum_part
 
 Engine = Callable[..., Iterable[Any]]
 """``engine(title, function, cloud, stretches, *common)`` gives ``function(cloud, rows, *common)``

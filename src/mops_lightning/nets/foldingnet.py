@@ -12,10 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.geometry import gather_points, k_nearest
 from mops_lightning.nets.autoencoder import PointEncoder
 from mops_lightning.nets.folding import Fold
 from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, check_channels, linear_norm_relu
+from mops_lightning.ops.points import gather_points, k_nearest
 
 REACH = 0.3
 """The grid covers [-0.3, 0.3]², as FoldingNet's."""

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.rigid import Motion, quaternion_from_matrix
+from mops_lightning.ops.rigid import Motion, quaternion_from_matrix
 
 
 class ICP(nn.Module):

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, check_channels, linear_norm_relu
-from mops_lightning.rigid import Motion, identity_motion
+from mops_lightning.ops.rigid import Motion, identity_motion
 
 
 class PCRNet(nn.Module):

@@ -15,8 +15,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
-from mops_lightning.geometry import GROUP, first_extreme
-from mops_lightning.precision import wide_dtype, wide_layers
+from mops_lightning.ops.points import GROUP, first_extreme
+from mops_lightning.ops.precision import wide_dtype, wide_layers
 
 FEW_POINTS = 32
 """Up to here ``PointMaxPool`` computes the plain layers; on a CPU both ways are equal around it."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mops_lightning.errors import UserError
-from mops_lightning.records import dotted
+from mops_lightning.records.run_record import dotted
 from mops_lightning.report.collect import Record, epochs
 
 CONSIDERED = ("sampler", "optimizer", "task", "augment", "batch_size", "noise", "task_rate")

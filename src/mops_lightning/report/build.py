@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mops_lightning import paper, units
-from mops_lightning.readout_names import FULL, GENERATED_READOUTS
+from mops_lightning.records import metric_format
+from mops_lightning.records.readout_names import FULL, GENERATED_READOUTS
+from mops_lightning.report import paper
 from mops_lightning.report.axes import Axes, axes, value
 from mops_lightning.report.cells import Cells, cells, place
 from mops_lightning.report.collect import (
@@ -106,8 +107,8 @@ def _by_column(table: Cells, names: dict[str, str], layout: Axes) -> Grid:
             rows.append([PAPER, *texts])
     size = "" if layout == Axes() else f", m={names['m']},"
     title = (
-        f"Test {units.title(table.metric)}: {names['task']} on {names['dataset']}{size} under "
-        f"{names['net']}; generated / matched / completed sets, or one figure for samplers that "
+        f"Test {metric_format.title(table.metric)}: {names['task']} on {names['dataset']}{size} "
+        f"under {names['net']}; generated / matched / completed sets, or one figure for samplers that "
         "choose input points."
     )
     return Grid(title, ["sampled by", *(f"{layout.column}={one}" for one in columns)], rows)
@@ -125,8 +126,8 @@ def _planes(table: Cells, names: dict[str, str], layout: Axes) -> list[Grid]:
             for left in sorted({column[0] for column in table.figures[name]})
         ]
         title = (
-            f"Test {units.title(table.metric)} of {name}: {names['task']} on {names['dataset']}, "
-            f"m={names['m']}, under {names['net']}; generated / matched / completed sets."
+            f"Test {metric_format.title(table.metric)} of {name}: {names['task']} on "
+            f"{names['dataset']}, m={names['m']}, under {names['net']}; generated / matched / completed sets."
         )
         head = [f"{down.split('.')[-1]} \\ {across.split('.')[-1]}", *map(str, columns)]
         grids.append(Grid(title, head, rows, [spread(table, name)]))
@@ -138,7 +139,8 @@ def spread(table: Cells, name: str) -> str:
     parts = []
     for readout, values in plane(table, name).items():
         low, high = min(values.values()), max(values.values())
-        span = f"{units.figure(table.metric, low)} to {units.figure(table.metric, high)}"
+        ends = [metric_format.figure(table.metric, end) for end in (low, high)]
+        span = " to ".join(ends)
         times = f" (factor {high / low:.3g})" if low > 0 else ""
         parts.append(f"{readout} {span}{times}")
     return f"Spread over the plane of {name}: {', '.join(parts)}."
@@ -159,7 +161,7 @@ def _full_row(found: list[Record], table: Cells, layout: Axes) -> list[str]:
     for record in found:
         figure = record["metrics"].get(f"test/{FULL}/{table.metric}")
         if figure is not None:
-            shown[value(record, layout.column)] = units.figure(table.metric, figure)
+            shown[value(record, layout.column)] = metric_format.figure(table.metric, figure)
     return ["all points", *(shown.get(column, "") for column in table.columns()[::-1])]
 
 
@@ -177,8 +179,10 @@ def _full(found: list[Record], names: dict[str, str], metric: str) -> list[str]:
             f" after joint training with {config['sampler']}" if learned(record) == "joint" else ""
         )
         if figure is not None:
-            shown = units.figure(metric, figure)
-            shown = f"{units.title(metric)} {shown}" if metric in NORMALIZED.values() else shown
+            shown = metric_format.figure(metric, figure)
+            shown = (
+                f"{metric_format.title(metric)} {shown}" if metric in NORMALIZED.values() else shown
+            )
             shown += published if config["net"] == names["net"] else ""
             lines[f"{config['net']} on all points{with_}: {shown}."] = None
     return list(lines)

@@ -4,9 +4,9 @@ import statistics
 from dataclasses import dataclass, field
 from typing import Any
 
-from mops_lightning import units
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT, parse
+from mops_lightning.records import metric_format
+from mops_lightning.records.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT, parse
 from mops_lightning.report.axes import Axes, row, value
 from mops_lightning.report.collect import Record, learned, seed
 
@@ -104,12 +104,12 @@ def _add(table: Cells, record: Record, net: str, axes: Axes) -> None:
 
 def over_seeds(metric: str, values: list[float]) -> str:
     """Return a value, or mean ± standard deviation of several, in the metric's unit."""
-    mean = units.figure(metric, statistics.fmean(values))
+    mean = metric_format.figure(metric, statistics.fmean(values))
     if len(values) == 1:
         return mean
     # To the mean's last place: more would be noise.
     places = len(mean.partition(".")[2]) if "e" not in mean else 0
-    deviation = units.scale(metric) * statistics.stdev(values)
+    deviation = metric_format.scale(metric) * statistics.stdev(values)
     return f"{mean} ± {deviation:.{max(places, 2)}f}"
 
 

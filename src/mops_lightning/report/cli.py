@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from mops_lightning.errors import UserError
-from mops_lightning.io import atomic_write
+from mops_lightning.files import atomic_write
 from mops_lightning.report.build import Report, build
 from mops_lightning.report.text import latex, long_csv, markdown
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mops_lightning import records
 from mops_lightning.errors import UserError
-from mops_lightning.readout_names import parse
-from mops_lightning.sweep_names import ASIDE, FAILED
+from mops_lightning.records import run_record
+from mops_lightning.records.attempts import ASIDE, FAILED
+from mops_lightning.records.readout_names import parse
 
 Record = dict[str, Any]
 """A run record, and ``folder``, where it lies."""
@@ -39,13 +39,13 @@ def collect(folder: Path) -> Found:
         raise UserError(f"{folder}: no such folder. Give a run's, a sweep's or any above records.")
     done: list[Record] = []
     undone: dict[str, str] = {}
-    paths = [*folder.rglob(records.FILE), *folder.rglob(FAILED)]
+    paths = [*folder.rglob(run_record.FILE), *folder.rglob(FAILED)]
     runs = sorted({path.parent for path in paths if ASIDE not in path.parts})
     if not runs:
-        raise UserError(f"{folder}: no {records.FILE} below it.")
+        raise UserError(f"{folder}: no {run_record.FILE} below it.")
     for run in runs:
         try:
-            record = records.read(run)
+            record = run_record.read(run)
         except UserError:
             text = (run / FAILED).read_text() if (run / FAILED).exists() else "not readable"
             undone[str(run)] = text.strip()

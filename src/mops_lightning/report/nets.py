@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from typing import Any
 
-from mops_lightning import paper, units
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.readout_names import FULL
+from mops_lightning.records import metric_format
+from mops_lightning.records.readout_names import FULL
+from mops_lightning.report import paper
 from mops_lightning.report.axes import varying
 from mops_lightning.report.cells import over_seeds
 from mops_lightning.report.collect import Record, one_commit, same_for_every_seed, score, seed
@@ -63,7 +64,7 @@ def nets_grid(found: list[Record], metrics: Sequence[str] = (), mixed: bool = Fa
             )
         groups[place][seed(record)] = record
     rows = [_row(list(groups[place].values()), keys, shown) for place in sorted(groups)]
-    head = ["net", *keys, "points", *map(units.title, shown), "MB", PAPER]
+    head = ["net", *keys, "points", *map(metric_format.title, shown), "MB", PAPER]
     if not any(row[-1] for row in rows):
         head, rows = head[:-1], [row[:-1] for row in rows]
     title = f"No sampler was tested; {names['task']} on {names['dataset']} from all points."

@@ -9,10 +9,10 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from mops_lightning.cloud_files import INPUT, load_clouds
-from mops_lightning.pictures import COLOURS, INPUT_COLOUR
 from mops_lightning.report.build import Report
 from mops_lightning.report.text import PAPER, Grid
+from mops_lightning.viz.clouds import COLOURS, INPUT_COLOUR
+from mops_lightning.viz.snapshots import INPUT, load_clouds
 
 SHOWN = 24
 """Most runs whose clouds are put into a page; more make it too large to open."""

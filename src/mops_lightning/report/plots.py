@@ -8,13 +8,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from mops_lightning import units
-from mops_lightning.cloud_files import INPUT, load_clouds
-from mops_lightning.pictures import draw_cloud, upright
-from mops_lightning.readout_names import GENERATED_READOUTS, INDEX_READOUT
+from mops_lightning.records import metric_format
+from mops_lightning.records.readout_names import GENERATED_READOUTS, INDEX_READOUT
 from mops_lightning.report.axes import Axes, row, value
 from mops_lightning.report.build import Report, plane
 from mops_lightning.report.cells import Cells, place
+from mops_lightning.viz.clouds import draw_cloud, upright
+from mops_lightning.viz.snapshots import INPUT, load_clouds
 
 WIDE = 20
 """A heat map whose largest figure is so many times its smallest has logarithmic colours."""
@@ -73,7 +73,7 @@ def curves(table: Cells, axes: Axes) -> Figure:
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(GENERATED_READOUTS), sharey=True)
     columns = table.columns()[::-1]
-    scale = units.scale(table.metric)
+    scale = metric_format.scale(table.metric)
     for axis, readout in zip(panels, GENERATED_READOUTS, strict=True):
         for number, name in enumerate(table.rows()):
             cells = table.figures[name]
@@ -99,7 +99,7 @@ def curves(table: Cells, axes: Axes) -> Figure:
         axis.set_xlabel(axes.column)
         axis.set_xticks(range(len(columns)), [f"{column:g}" for column in columns])
         axis.grid(alpha=0.3)
-    panels[0].set_ylabel(units.title(table.metric))
+    panels[0].set_ylabel(metric_format.title(table.metric))
     panels[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
@@ -116,7 +116,7 @@ def heat_maps(table: Cells, axes: Axes) -> Figure:
     names = sorted(axes.planes, key=place)
     found = {name: plane(table, name) for name in names}
     everything = [one for by in found.values() for values in by.values() for one in values.values()]
-    scale = units.scale(table.metric)
+    scale = metric_format.scale(table.metric)
     low, high = scale * min(everything), scale * max(everything)
     shades = _shades(low, high)
     width = max(len(by) for by in found.values())
@@ -142,5 +142,5 @@ def heat_maps(table: Cells, axes: Axes) -> Figure:
             axis.set_xlabel(across.split(".")[-1])
             axis.set_ylabel(down.split(".")[-1])
             axis.set_title(f"{name}, {readout}")
-    figure.colorbar(image, ax=panels, label=units.title(table.metric))
+    figure.colorbar(image, ax=panels, label=metric_format.title(table.metric))
     return figure

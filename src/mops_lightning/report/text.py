@@ -4,7 +4,7 @@ import csv
 import io
 from dataclasses import dataclass, field
 
-from mops_lightning.readout_names import parse
+from mops_lightning.records.readout_names import parse
 from mops_lightning.report.axes import row, value
 from mops_lightning.report.collect import Record, epochs, learned, seed
 

@@ -3,7 +3,7 @@
 from torch import Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.geometry import farthest_point_sample, gather_points
+from mops_lightning.ops.points import farthest_point_sample, gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import seeded_order
 from mops_lightning.types import SampleOutput

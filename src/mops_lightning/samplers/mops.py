@@ -7,12 +7,12 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.losses import subset_losses
+from mops_lightning.losses.subset import subset_losses
 from mops_lightning.nets.pointnet import PointFeatures, check_channels, linear_norm_relu
-from mops_lightning.precision import wide_layers
+from mops_lightning.ops.precision import wide_layers
+from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.folded import fold
-from mops_lightning.sampling_matrix import SamplingMatrix
 from mops_lightning.types import SampleOutput
 
 ANNEALINGS = ("exponential", "linear")

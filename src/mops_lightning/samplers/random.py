@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from mops_lightning.geometry import gather_points
+from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import seeded_order
 from mops_lightning.types import SampleOutput

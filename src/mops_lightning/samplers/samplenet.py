@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.geometry import gather_points, k_nearest
+from mops_lightning.ops.points import gather_points, k_nearest
 from mops_lightning.samplers.snet import Progressive, SNet
 from mops_lightning.types import SampleOutput
 

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 from torchmetrics import Metric, MetricCollection
 
-from mops_lightning.emd import earth_mover_distance
 from mops_lightning.errors import UserError
-from mops_lightning.losses import chamfer_distance
-from mops_lightning.reconstruction_metrics import Distances, MeanDistance, NormalizedError
+from mops_lightning.losses.subset import chamfer_distance
+from mops_lightning.metrics.reconstruction import Distances, MeanDistance, NormalizedError
+from mops_lightning.ops.emd import earth_mover_distance
 from mops_lightning.tasks.base import Sample, Task
 from mops_lightning.types import Batch, TaskOutput
 
@@ -114,7 +114,7 @@ class Reconstruction(Task):
             samples: what the net is to see, by readout.
             titles: one per cloud.
         """
-        from mops_lightning.pictures_rebuilt import Rebuilt, rebuilt_grid
+        from mops_lightning.viz.reconstruction import Rebuilt, rebuilt_grid
 
         n = batch.points.shape[1]
         full = self.net(batch.points, n)

@@ -8,8 +8,8 @@ from torchmetrics import Metric, MetricCollection
 
 from mops_lightning.data.pairs import Pairs
 from mops_lightning.errors import UserError
-from mops_lightning.motion_metrics import RotationError, RotationRecall, TranslationError
-from mops_lightning.rigid import Motion, identity_motion
+from mops_lightning.metrics.registration import RotationError, RotationRecall, TranslationError
+from mops_lightning.ops.rigid import Motion, identity_motion
 from mops_lightning.tasks.base import Sample, Task
 from mops_lightning.types import Batch, PairBatch, TaskOutput
 
@@ -114,7 +114,7 @@ class Registration(Task):
             samples: what the net is to see, by readout.
             titles: one per pair.
         """
-        from mops_lightning.pictures_pairs import Aligned, pair_grid
+        from mops_lightning.viz.pairs import Aligned, pair_grid
 
         source, target = batch.points.chunk(2)
         columns = {}

@@ -1,0 +1,1 @@
+"""Settings: composing, validating and building what they describe."""

@@ -1,0 +1,257 @@
+"""Where conf/ is, what the run-level keys mean, and how nodes become objects."""
+
+import inspect
+import math
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from mops_lightning.config import distributed
+from mops_lightning.config.annotations import misfit
+from mops_lightning.errors import UserError, did_you_mean
+
+RUN_KEYS = (
+    "m",
+    "sizes",
+    "learn",
+    "seed",
+    "weights",
+    "ckpt_path",
+    "evaluate",
+    "task_rate",
+    "batch_size",
+    "val_fraction",
+    "noise",
+    "pictures",
+    "out",
+    "cache",
+    "epochs",
+    "schedules",
+    "augment",
+    "pretrain",
+    "paper",
+    "rivals",
+    "baselines",
+    "labels",
+    "names",
+)
+"""Keys of the configuration that are no group; ``--help`` says what each means."""
+
+PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
+"""What ``trainer.precision`` may be; Lightning has more."""
+
+GROUPS = ("task", "dataset", "sampler", "optimizer", "trainer", "logger")
+LEARN = ("task", "sampler", "joint", "nothing")
+
+
+def conf_dir() -> Path:
+    """Return the folder with the Hydra groups: in the wheel, or at the top of a checkout.
+
+    Raises:
+        UserError: neither is there; the installation is broken.
+    """
+    here = Path(__file__).resolve().parents[1]
+    for folder in (here / "conf", here.parents[1] / "conf"):
+        if (folder / "config.yaml").is_file():
+            return folder
+    raise UserError(
+        f"conf/ is neither in {here} nor beside src/: reinstall with "
+        "pip install --force-reinstall mops-lightning."
+    )
+
+
+def compose(overrides: list[str] | None = None) -> DictConfig:
+    """Compose a configuration as the command line does, for notebooks and tests.
+
+    Args:
+        overrides: such as ``["m=64", "sampler=fps"]``.
+    """
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.core.hydra_config import HydraConfig
+
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        cfg = hydra_compose("config", overrides=overrides or [], return_hydra_config=True)
+    HydraConfig.instance().set_config(cfg)
+    plain = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
+    # Names come from Hydra's choices; resolved here they outlive the global HydraConfig.
+    plain.names = OmegaConf.to_container(cfg.names, resolve=True)
+    return plain
+
+
+def build(node: Any, **extra: Any) -> Any:
+    """Make the object that a node describes; the only caller of Hydra's instantiate.
+
+    Args:
+        node: a configuration with ``_target_``.
+        **extra: further arguments of the constructor, which no YAML could know.
+
+    Raises:
+        UserError: what the constructor itself found wrong, without Hydra's wrapping.
+    """
+    from hydra.errors import InstantiationException
+    from hydra.utils import instantiate
+
+    try:
+        return instantiate(node, **extra, _convert_="all")
+    except InstantiationException as error:
+        cause: BaseException | None = error
+        while cause is not None:
+            if isinstance(cause, UserError):
+                raise cause from None
+            if isinstance(cause, ModuleNotFoundError):
+                target = node.get("_target_", node)
+                raise UserError(f"{target} needs a package that is not here: {cause}") from None
+            if type(cause).__name__ == "MisconfigurationException":
+                # Lightning's word for a trainer that this machine cannot run, such as trainer=gpu.
+                raise UserError(f"trainer: {cause} Try trainer=auto or trainer=cpu.") from None
+            cause = cause.__cause__
+        raise
+
+
+def accepted(node: DictConfig, offered: dict[str, Any]) -> dict[str, Any]:
+    """Return those of the offered arguments that a node's constructor takes."""
+    parameters = signature(str(node["_target_"]), "")
+    return {name: value for name, value in offered.items() if name in parameters}
+
+
+def check(cfg: DictConfig) -> None:
+    """Find mistakes in a configuration before any heavy work.
+
+    Raises:
+        UserError: an unknown key (the nearest known one is named), a value out of range, or a
+            ``_target_`` that cannot be imported or does not take one of its arguments.
+    """
+    known = (*RUN_KEYS, *GROUPS)
+    for name in known:
+        if name not in cfg and name != "logger":
+            raise UserError(f"{name} cannot be removed. Choose another one with {name}=...")
+    if not isinstance(cfg.task.get("net"), DictConfig):
+        raise UserError("task.net cannot be removed. Choose another one with task/net=NAME.")
+    for key in cfg:
+        if str(key) not in known:
+            raise UserError(f"Unknown setting {key!r}.{did_you_mean(str(key), known)}")
+    if cfg.learn not in LEARN:
+        raise UserError(f"learn: unknown value {cfg.learn!r}.{did_you_mean(str(cfg.learn), LEARN)}")
+    _check_evaluation(cfg)
+    _whole(cfg, "m", 1)
+    _check_sizes(cfg.sizes)
+    _whole(cfg, "seed", 0)
+    _whole(cfg, "batch_size", 2)  # BatchNorm cannot learn from one cloud
+    _whole(cfg, "pictures", 0)
+    if not isinstance(cfg.task_rate, int | float) or cfg.task_rate <= 0:
+        raise UserError(f"task_rate must be a number above 0, got {cfg.task_rate!r}.")
+    if not isinstance(cfg.val_fraction, int | float) or not 0 <= cfg.val_fraction < 1:
+        raise UserError(f"val_fraction must be in [0, 1), got {cfg.val_fraction!r}.")
+    if not isinstance(cfg.noise, int | float) or not 0 <= cfg.noise < math.inf:
+        raise UserError(f"noise must be a number of at least 0, got {cfg.noise!r}.")
+    if "m_max" in cfg.sampler and cfg.learn != "task":
+        _whole(cfg.sampler, "m_max", 1, "sampler.m_max")
+    unused = ("sampler", "baselines") if cfg.learn == "task" else ()
+    for group in {*GROUPS, "pretrain", "baselines"} - set(unused):
+        _check_node(cfg.get(group), group)
+    _whole(cfg.trainer, "max_epochs", int(cfg.learn != "nothing"), "trainer.max_epochs")
+    if cfg.trainer.get("precision") not in (*PRECISIONS, "32", 32, None):
+        got = str(cfg.trainer.precision)
+        raise UserError(
+            f"trainer.precision must be one of {', '.join(PRECISIONS)}, got {got!r}."
+            f"{did_you_mean(got, PRECISIONS)}"
+        )
+    _whole(cfg.pretrain, "max_epochs", 1, "pretrain.max_epochs")
+    distributed.check(cfg)
+    points = cfg.dataset.get("n_points")
+    if isinstance(points, int) and 1 <= points < cfg.m:
+        raise UserError(
+            f"m must be at most dataset.n_points={points}, got m={cfg.m}. "
+            f"Try m={points} or dataset.n_points={cfg.m}."
+        )
+
+
+def _check_evaluation(cfg: DictConfig) -> None:
+    if cfg.evaluate and cfg.learn not in ("nothing", "task"):
+        raise UserError(
+            f"evaluate: trains nothing, got learn={cfg.learn}. Leave learn out, or train anew "
+            "without evaluate."
+        )
+    if not cfg.evaluate and cfg.weights == "run":
+        raise UserError("weights=run means the run named by evaluate=RUN, which is not given.")
+    if cfg.learn == "nothing" and cfg.ckpt_path is not None:
+        raise UserError("ckpt_path resumes a training; to test a trained run give evaluate=RUN.")
+
+
+def _check_sizes(sizes: Any) -> None:
+    whole = OmegaConf.is_list(sizes) and all(type(size) is int for size in sizes)
+    if sizes != "auto" and not (whole and len(sizes) and min(sizes) >= 1):
+        raise UserError(
+            f"sizes must be auto or a list of whole numbers of at least 1, got {sizes!r}. "
+            "Try sizes=[8,16,32]."
+        )
+
+
+def _whole(cfg: DictConfig, key: str, least: int, name: str | None = None) -> None:
+    value = cfg[key]
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise UserError(f"{name or key} must be a whole number of at least {least}, got {value!r}.")
+
+
+def _check_node(node: Any, where: str) -> None:
+    """Compare every ``_target_`` below ``node`` with its constructor's signature."""
+    if not isinstance(node, DictConfig):
+        return
+    if node.get("_target_") is not None:
+        parameters = signature(str(node["_target_"]), where)
+        takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+        for key in node:
+            name = str(key)
+            if not name.startswith("_") and name not in parameters and not takes_any:
+                raise UserError(
+                    f"{where}: {node['_target_']} takes no setting {name!r}."
+                    f"{did_you_mean(name, parameters)}"
+                )
+            if OmegaConf.is_missing(node, key):
+                raise UserError(f"{where}.{name} must be set: try {where}.{name}=VALUE.")
+            if name in parameters and not isinstance(node[key], DictConfig):
+                value = node[key]
+                value = OmegaConf.to_container(value) if OmegaConf.is_list(value) else value
+                wanted = misfit(value, parameters[name].annotation)
+                if wanted:
+                    raise UserError(f"{where}.{name} must be {wanted}, got {value!r}.")
+    for key in node:
+        if not OmegaConf.is_missing(node, key):
+            _check_node(node[key], f"{where}.{key!s}")
+
+
+def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
+    """Return the parameters of a target; what a class hands on to its bases belongs to them."""
+    from hydra.utils import get_object
+
+    try:
+        found = get_object(target)
+    except Exception as error:
+        raise UserError(
+            f"{where}._target_: cannot import {target!r}: {str(error).splitlines()[0]}"
+        ) from None
+    if not inspect.isclass(found):
+        return _own_signature(found)
+    parameters: dict[str, inspect.Parameter] = {}
+    for cls in found.__mro__:
+        if "__init__" not in vars(cls):
+            continue
+        own = _own_signature(vars(cls)["__init__"])
+        own.pop("self", None)
+        rest = [name for name, p in own.items() if p.kind is p.VAR_KEYWORD]
+        named = {name: p for name, p in own.items() if name not in rest}
+        if parameters:  # what a base must be given, the class above gives it
+            named = {name: p for name, p in named.items() if p.default is not p.empty}
+        parameters = {**named, **parameters}
+        if not rest:
+            return parameters
+    return {**parameters, **own}  # nobody says what else is allowed
+
+
+def _own_signature(function: Any) -> dict[str, inspect.Parameter]:
+    try:
+        return dict(inspect.signature(function, eval_str=True).parameters)
+    except NameError:  # an annotation that exists for type checkers only
+        return dict(inspect.signature(function).parameters)

@@ -1,0 +1,192 @@
+"""Builders of what stands in a room and is not sat on: desk, lamp, shelf, table."""
+
+from itertools import pairwise, product
+
+import numpy as np
+from numpy.random import Generator
+from trimesh import Trimesh
+
+from mops_lightning.data.procedural.mesh_parts import (
+    Span,
+    around,
+    box,
+    disc,
+    join,
+    rod,
+    smooth,
+    tube,
+    turned,
+)
+from mops_lightning.data.procedural.seats import rungs, stand
+
+
+def table(rng: Generator) -> Trimesh:
+    """Return a table: round, oval or rectangular top on legs, a pillar or two trestles."""
+    width, height = rng.uniform(0.6, 1.9), rng.uniform(0.5, 1.1)
+    depth = width * rng.uniform(0.5, 1.0)
+    thick, y = rng.uniform(0.03, 0.1), height
+    under = y - thick
+    if rng.random() < 0.4:
+        top = disc(width / 2, (under, y))
+        top.apply_scale((1, 1, depth / width))
+        inset = 0.68
+    else:
+        top = box(around(width), (under, y), around(depth))
+        inset = rng.uniform(0.82, 0.98)
+    parts = [top]
+    kind = rng.random()
+    if kind < 0.2:
+        foot = min(width, depth) * rng.uniform(0.22, 0.34)
+        turned_foot = [(foot, 0), (foot, 0.04), (0.08, 0.14), (0.07, under * 0.5), (0.1, under)]
+        parts.append(turned([(0, 0), *smooth(turned_foot, 16)]))
+    elif kind < 0.35:
+        for side in (-1, 1):
+            x = side * width * 0.34
+            parts.append(box(around(0.07, x), (0.05, under), around(depth * 0.16)))
+            parts.append(box(around(0.09, x), (0, 0.06), around(depth * 0.75)))
+        parts.append(box(around(width * 0.68), around(0.1, under * 0.4), around(0.05)))
+    else:
+        radius = rng.uniform(0.035, 0.06)
+        legs, ends = stand(rng, width * inset, depth * inset, under, radius, rng.uniform(0, 0.1))
+        parts += legs
+        if rng.random() < 0.4:
+            parts += _apron(width * inset, depth * inset, (under - rng.uniform(0.07, 0.14), under))
+        if rng.random() < 0.25:
+            parts += rungs(ends, rng.uniform(0.12, 0.25), 0.03, (0, 1, 2, 3))
+    return join(parts)
+
+
+def _apron(width: float, depth: float, y: Span) -> list[Trimesh]:
+    parts = [box(around(width - 0.1), y, around(0.03, z)) for z in around(depth - 0.06)]
+    return parts + [box(around(0.03, x), y, around(depth - 0.1)) for x in around(width - 0.06)]
+
+
+def desk(rng: Generator) -> Trimesh:
+    """Return a desk: drawer blocks or flat drawers, maybe a back panel, maybe a hutch."""
+    width, height = rng.uniform(1.2, 1.9), rng.uniform(0.7, 0.95)
+    depth = rng.uniform(0.6, 0.9)
+    under = height - rng.uniform(0.03, 0.06)
+    parts = [box(around(width), (under, height), around(depth))]
+    block = width * rng.uniform(0.22, 0.32)
+    kind = rng.random()
+    with_drawers = (-1, 1) if kind < 0.35 else (rng.choice((-1, 1)),) if kind < 0.75 else ()
+    if not with_drawers:  # flat drawers under the whole top
+        low = under - rng.uniform(0.1, 0.16)
+        for x in (-width / 4, width / 4):
+            front = around(width * 0.46, x)
+            parts += _drawers(front, (low, under), around(depth * 0.85), 1)
+    for side in (-1, 1):
+        outer = side * (width / 2 - 0.03)
+        inner = outer - side * block
+        if side in with_drawers:
+            floor, feet = under * rng.choice((0.08, 0.45)), [outer, inner]
+            rows = int(rng.integers(2, 4))
+            parts += _drawers((min(feet), max(feet)), (floor, under), around(depth * 0.9), rows)
+        elif rng.random() < 0.5:
+            parts.append(box(around(0.04, outer), (0, under), around(depth * 0.9)))
+            continue
+        else:
+            floor, feet = under, [outer]
+        for x, z in product(feet, around(depth * 0.8)):
+            parts.append(rod((x, 0, z), (x, floor, z), 0.03, 4))
+    if rng.random() < 0.6:
+        panel = under * rng.uniform(0.3, 0.75)
+        parts.append(box(around(width * 0.94), (panel, under), around(0.02, -depth * 0.42)))
+    if rng.random() < 0.35:
+        parts += _hutch(rng, width, (height, height + rng.uniform(0.3, 0.6)), -depth / 2)
+    return join(parts)
+
+
+def _drawers(x: Span, y: Span, z: Span, rows: int) -> list[Trimesh]:
+    parts = [box(x, y, z)]
+    levels = np.linspace(y[0], y[1], rows + 1)
+    middle = (x[0] + x[1]) / 2
+    for low, high in pairwise(levels):
+        parts.append(box((x[0] + 0.02, x[1] - 0.02), (low + 0.02, high - 0.02), around(0.04, z[1])))
+        parts.append(box(around(0.12, middle), around(0.025, (low + high) / 2), around(0.1, z[1])))
+    return parts
+
+
+def _hutch(rng: Generator, width: float, y: Span, back: float) -> list[Trimesh]:
+    z = (back, back + 0.25)
+    parts = [box(around(width), (y[1] - 0.03, y[1]), z)]
+    for x in np.linspace(-width / 2 + 0.02, width / 2 - 0.02, rng.integers(2, 5)):
+        parts.append(box(around(0.03, x), (y[0], y[1] - 0.03), z))
+    return parts
+
+
+def shelf(rng: Generator) -> Trimesh:
+    """Return a shelf: two sides, boards, maybe a back, dividers and books."""
+    width, height = rng.uniform(0.6, 1.6), rng.uniform(0.65, 1.9)
+    depth, board = rng.uniform(0.25, 0.5), rng.uniform(0.03, 0.05)
+    foot = rng.uniform(0.0, 0.12)
+    floors = np.linspace(foot, height - board, rng.integers(3, 7))
+    half, z = width / 2, around(depth)
+    parts = [box((-half + board, half - board), (y, y + board), z) for y in floors]
+    if rng.random() < 0.8:
+        parts += [box(around(board, x), (0, height), z) for x in around(width - board)]
+    else:
+        posts = [(x, at) for x in around(width - 0.06) for at in around(depth - 0.06)]
+        parts += [rod((x, 0, at), (x, height, at), 0.03, 4) for x, at in posts]
+    if rng.random() < 0.45:
+        parts.append(box(around(width - 2 * board), (foot, height), around(0.01, z[0])))
+    bays = np.linspace(-half + board, half - board, 1 + int(rng.integers(1, 3 if width > 1 else 2)))
+    parts += [box(around(board * 0.8, x), (foot, height), z) for x in bays[1:-1]]
+    for y, above in pairwise(floors):
+        for left, right in pairwise(bays):
+            if rng.random() < 0.45:
+                parts += _books(rng, (left + 0.02, right - 0.02), y + board, above - y - board, z)
+    return join(parts)
+
+
+def _books(rng: Generator, x: Span, y: float, room: float, z: Span) -> list[Trimesh]:
+    """Return a row of books that fills part of a bay, from the left or the right."""
+    filled = (x[1] - x[0]) * rng.uniform(0.3, 0.9)
+    thick = rng.uniform(0.04, 0.11, max(2, int(filled / 0.09)))
+    edges = np.concatenate(([0], np.cumsum(thick))) * filled / thick.sum()
+    edges = x[0] + edges if rng.random() < 0.5 else x[1] - filled + edges
+    parts = []
+    for left, right in pairwise(edges):
+        tall, deep = room * rng.uniform(0.55, 0.9), (z[1] - z[0]) * rng.uniform(0.6, 0.9)
+        parts.append(box((left, right), (y, y + tall), (z[0] + 0.02, z[0] + deep)))
+    return parts
+
+
+def lamp(rng: Generator) -> Trimesh:
+    """Return a lamp: shaded on a pole or a turned foot, bent over, or with a jointed arm."""
+    base = rng.uniform(0.14, 0.28)
+    parts = [turned([(0, 0), (base, 0), (base, 0.03), (base * 0.3, 0.06), (0, 0.06)])]
+    kind = rng.random()
+    wide, low = rng.uniform(0.2, 0.36), rng.uniform(0.3, 0.95)
+    deep = rng.uniform(0.2, 0.36)
+    narrow = wide * rng.uniform(0.4, 1.0)
+    pole = rng.uniform(0.016, 0.03)
+    if kind < 0.45:  # pole
+        y = rng.uniform(0.65, 1.25)
+        parts.append(rod((0, 0.03, 0), (0, y + deep * 0.8, 0), pole, 8))
+        parts.append(turned([(wide, y), (narrow, y + deep)]))
+        bar = y + deep - 0.01
+        parts.append(rod((-narrow, bar, 0), (narrow, bar, 0), 0.01, 6))
+        bulb = [(0, y + 0.04), (0.05, y + 0.07), (0.06, y + 0.1), (0, y + 0.16)]
+        parts.append(turned(bulb, 10))
+    elif kind < 0.7:  # turned foot, as table lamps have
+        foot = rng.uniform(0.1, 0.22)
+        profile = [(base * 0.5, 0.05), (foot, low * 0.4), (0.03, low * 0.9), (0.025, low + deep)]
+        parts.append(turned(smooth(profile, 18)))
+        parts.append(turned([(wide, low), (narrow, low + deep)]))
+    elif kind < 0.85:  # bent over
+        y, reach = rng.uniform(0.9, 1.3), rng.uniform(0.35, 0.6)
+        path = [(0, 0.05, 0), (0, y * 0.75, 0), (reach * 0.4, y, 0), (reach, y * 0.85, 0)]
+        parts.append(tube(smooth(path, 20), pole, 8, across=(0, 0, 1)))
+        shade = turned([(wide * 0.7, y * 0.85 - 0.2), (0.05, y * 0.85 + 0.02)])
+        parts.append(shade.apply_translation((reach, 0, 0)))
+    else:  # jointed arm
+        elbow = np.array((-rng.uniform(0.1, 0.35), rng.uniform(0.4, 0.6), 0))
+        head = elbow + np.array((rng.uniform(0.4, 0.65), rng.uniform(0.1, 0.4), 0))
+        parts += [rod((0, 0.05, 0), elbow, pole), rod(elbow, head, pole)]
+        hinge = np.array((0, 0, 0.04))
+        parts.append(rod(elbow - hinge, elbow + hinge, 0.04))
+        aim = np.array((rng.uniform(0.1, 0.5), -1.0, 0))
+        tip = head + 0.22 * aim / np.linalg.norm(aim)
+        parts.append(rod(head - (tip - head) * 0.3, tip, (0.05, wide * 0.55), 24))
+    return join(parts)

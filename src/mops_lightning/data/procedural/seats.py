@@ -1,0 +1,248 @@
+"""Builders of what one sits or lies on: bed, chair, sofa, stool."""
+
+import numpy as np
+from numpy.random import Generator
+from trimesh import Trimesh
+
+from mops_lightning.data.procedural.mesh_parts import (
+    Array,
+    Span,
+    around,
+    box,
+    cushion,
+    disc,
+    join,
+    rod,
+    tube,
+)
+
+
+def stand(
+    rng: Generator, width: float, depth: float, height: float, radius: float, splay: float = 0.0
+) -> tuple[list[Trimesh], Array]:
+    """Return four legs, round or square, straight or tapered, and where they start and end.
+
+    Args:
+        rng: chooses the form of the legs.
+        width: distance of the outer sides along x at the top.
+        depth: distance of the outer sides along z at the top.
+        height: y of the top; the feet stand at 0.
+        radius: half the thickness of a leg at the top.
+        splay: how far a foot stands outside its top, over the height.
+
+    Returns:
+        The legs, and ``(4, 2, 3)`` their tops and feet: left front, right front, right back,
+        left back.
+    """
+    sections = int(rng.choice((4, 12)))
+    taper = rng.uniform(0.5, 1.0)
+    corners = np.array([(-1, 1), (1, 1), (1, -1), (-1, -1)])
+    tops = corners * (width / 2 - radius, depth / 2 - radius)
+    feet = tops + corners * splay * height
+    ends = np.stack(
+        (np.insert(tops, 1, height, axis=1), np.insert(feet, 1, 0.0, axis=1)), axis=1
+    ).astype(np.float64)
+    return [rod(top, foot, (radius, radius * taper), sections) for top, foot in ends], ends
+
+
+def rungs(ends: Array, level: float, radius: float, sides: tuple[int, ...]) -> list[Trimesh]:
+    """Return bars between neighbouring legs.
+
+    Args:
+        ends: from ``stand``.
+        level: height of the bars as a share of the legs' height.
+        radius: half the thickness of a bar.
+        sides: numbers of the legs from which a bar runs to the next leg.
+    """
+    at = ends[:, 1] + level * (ends[:, 0] - ends[:, 1])
+    return [rod(at[i], at[(i + 1) % len(at)], radius, 8) for i in sides]
+
+
+def chair(rng: Generator) -> Trimesh:
+    """Return a chair: seat, back of one of four kinds, legs or a swivel foot, maybe arms."""
+    width, depth = rng.uniform(0.75, 1.05), rng.uniform(0.75, 1.0)
+    seat, rise = rng.uniform(0.65, 1.15), rng.uniform(0.3, 1.25)
+    thick = rng.uniform(0.06, 0.16)
+    parts = [_pad(rng, width, depth, (seat - thick, seat))]
+    if rng.random() < 0.25:
+        parts += _swivel(rng, seat - thick, min(width, depth) * 0.5)
+    else:
+        legs, ends = stand(
+            rng, width, depth, seat - thick, rng.uniform(0.035, 0.06), rng.uniform(0, 0.12)
+        )
+        parts += legs
+        if rng.random() < 0.4:
+            parts += rungs(ends, rng.uniform(0.25, 0.5), 0.025, (0, 1, 2, 3))
+    parts.append(_chair_back(rng, width, -depth / 2, (seat, seat + rise)))
+    if rng.random() < 0.3:
+        y, reach = seat + rise * rng.uniform(0.3, 0.6), depth * rng.uniform(0.25, 0.45)
+        for side in (-1, 1):
+            x = side * (width / 2 - 0.03)
+            parts.append(box(around(0.09, x), around(0.05, y), (-depth / 2, reach)))
+            parts.append(rod((x, seat - thick / 2, reach - 0.06), (x, y, reach - 0.06), 0.03, 8))
+    return join(parts)
+
+
+def _pad(rng: Generator, width: float, depth: float, y: Span) -> Trimesh:
+    if rng.random() < 0.5:
+        return cushion(around(width), y, around(depth), 0.05)
+    return box(around(width), y, around(depth))
+
+
+def _swivel(rng: Generator, height: float, reach: float) -> list[Trimesh]:
+    star = rng.integers(4, 6)
+    parts = [rod((0, 0.12, 0), (0, height, 0), 0.05)]
+    for turn in 2 * np.pi * np.arange(star) / star + np.pi / 2:
+        foot = (reach * np.cos(turn), 0.04, reach * np.sin(turn))
+        parts.append(rod((0, 0.15, 0), foot, (0.05, 0.03), 6))
+    return parts
+
+
+def _chair_back(rng: Generator, width: float, z: float, y: Span) -> Trimesh:
+    """Return posts and rails, slats, rungs or a panel, upright at ``z`` and then leant back."""
+    low, high = y
+    post, half = 0.045, width / 2 - 0.045
+    kind = rng.integers(4)
+    if kind == 0:
+        gap = rng.uniform(0.0, 0.25)
+        parts = [cushion(around(width * 0.95), (low + gap, high), around(0.11), 0.05)]
+        parts += [rod((x, low - 0.05, 0), (x, low + gap + 0.1, 0), post) for x in (-half, half)]
+    else:
+        parts = [rod((x, low - 0.05, 0), (x, high, 0), post, 8) for x in (-half, half)]
+        parts.append(box((-half, half), (high - 0.16, high), around(0.06)))
+    if kind == 1:
+        for x in np.linspace(-half, half, rng.integers(5, 8))[1:-1]:
+            parts.append(box(around(0.06, x), (low, high - 0.16), around(0.04)))
+    elif kind == 2:
+        for level in np.linspace(low, high - 0.08, rng.integers(4, 6))[1:-1]:
+            parts.append(box((-half, half), around(0.1, level), around(0.04)))
+    elif kind == 3:
+        parts.append(box((-half, half), (low + (high - low) * 0.2, high - 0.1), around(0.04)))
+    back = join(parts)
+    lean = rng.uniform(0.0, 0.28)
+    back.vertices[:, 2] += z + 0.05 - lean * np.clip(back.vertices[:, 1] - low, 0, None)
+    return back
+
+
+def stool(rng: Generator) -> Trimesh:
+    """Return a stool: round or square seat without a back, on three or four legs or one foot."""
+    width, height = rng.uniform(0.6, 1.0), rng.uniform(0.5, 1.4)
+    depth = width * rng.uniform(0.8, 1.0)
+    thick = rng.uniform(0.04, 0.2)
+    y = (height - thick, height)
+    is_round = rng.random() < 0.55
+    parts = [disc(width / 2, y) if is_round else _pad(rng, width, depth, y)]
+    kind = rng.random()
+    if kind < 0.25:
+        base = width * rng.uniform(0.4, 0.55)
+        parts += [disc(base, (0, 0.05)), rod((0, 0, 0), (0, height - thick, 0), 0.05)]
+        if height > 0.9:
+            parts.append(_ring(width * 0.33, height * rng.uniform(0.3, 0.45)))
+        return join(parts)
+    splay, radius = rng.uniform(0.03, 0.2), rng.uniform(0.03, 0.055)
+    inset = 0.75 if is_round else 1.0
+    if is_round and kind < 0.6:
+        turn = 2 * np.pi * np.arange(3) / 3 + np.pi / 2
+        out = np.column_stack((np.cos(turn), np.zeros(3), np.sin(turn)))
+        tops = out * width * 0.36 + (0, y[0], 0)
+        ends = np.stack((tops, out * (width * 0.36 + splay * y[0])), axis=1)
+        parts += [rod(top, foot, (radius, radius * 0.8)) for top, foot in ends]
+    else:
+        legs, ends = stand(rng, width * inset, depth * inset, y[0], radius, splay)
+        parts += legs
+    if rng.random() < 0.7:
+        parts += rungs(ends, rng.uniform(0.2, 0.45), 0.025, tuple(range(len(ends))))
+    return join(parts)
+
+
+def _ring(radius: float, y: float) -> Trimesh:
+    turn = np.linspace(0, 2 * np.pi, 25)
+    path = np.column_stack((np.cos(turn) * radius, np.full(25, y), np.sin(turn) * radius))
+    return join(
+        tube(path, 0.025, 8, across=(0, 1, 0)),
+        rod((-radius, y, 0), (radius, y, 0), 0.02, 8),
+    )
+
+
+def sofa(rng: Generator) -> Trimesh:
+    """Return a sofa of one to three seats with arms and back, sometimes with a long side."""
+    seats = int(rng.integers(1, 4))
+    arm = rng.uniform(0.1, 0.28)
+    width = seats * rng.uniform(0.6, 0.8)
+    depth = rng.uniform(0.8, 1.0)
+    foot, seat = rng.uniform(0.05, 0.18), rng.uniform(0.4, 0.52)
+    back, rest = seat + rng.uniform(0.32, 0.6), seat + rng.uniform(0.1, 0.28)
+    thick = rng.uniform(0.18, 0.28)
+    whole = width + 2 * arm
+    base = seat - rng.uniform(0.14, 0.2)
+    edge = rng.uniform(0.03, 0.09)
+    parts = [
+        box(around(width), (foot, base), (depth / 2 - 0.1, depth / 2 - 0.03)),
+        cushion(around(whole), (foot, back), (-depth / 2, -depth / 2 + thick * 0.5), edge),
+    ]
+    for side in (-1, 1):
+        x = around(arm, side * (width + arm) / 2)
+        parts.append(cushion(x, (foot, rest), (-depth / 2 + thick * 0.3, depth / 2), edge))
+        for z in (-depth / 2 + 0.1, depth / 2 - 0.1):
+            x_foot = side * (whole / 2 - 0.08)
+            parts.append(rod((x_foot, 0, z), (x_foot, foot + 0.01, z), 0.035, 8))
+    long_side = rng.choice((-1, 1)) if seats > 1 and rng.random() < 0.3 else 0
+    each = width / seats
+    for i in range(seats):
+        x = around(each * 0.97, (i - (seats - 1) / 2) * each)
+        stretch = 0.6 if long_side * (i - (seats - 1) / 2) == (seats - 1) / 2 > 0 else 0.0
+        front = depth / 2 + stretch
+        parts.append(cushion(x, (base, seat), (-depth / 2 + thick * 0.5, front), 0.06))
+        behind = (-depth / 2 + thick * 0.45, -depth / 2 + thick)
+        parts.append(cushion(x, (seat, back + 0.03), behind, 0.06))
+        if stretch:
+            parts.append(box(x, (foot, base), (depth / 2, front)))
+    return join(parts)
+
+
+def bed(rng: Generator) -> Trimesh:
+    """Return a bed: frame, mattress, pillows, headboard, maybe footboard or four posts."""
+    width, length = rng.uniform(0.8, 1.7), rng.uniform(1.7, 2.1)
+    foot, frame = rng.uniform(0.08, 0.3), rng.uniform(0.12, 0.22)
+    top = foot + frame + rng.uniform(0.14, 0.28)
+    head = top + rng.uniform(0.2, 0.7)
+    z = around(length)
+    # Rails and no full box, and no mattress under the blanket: what nobody sees takes no points.
+    parts = [box(around(width), (foot, foot + frame), around(0.06, at)) for at in z]
+    parts += [box(around(0.06, x), (foot, foot + frame), z) for x in around(width - 0.06)]
+    fold = z[1] - (length * rng.uniform(0.3, 0.6) if rng.random() < 0.5 else 0.0)
+    mattress = (z[0] + 0.03, fold - 0.03)
+    parts.append(cushion(around(width * 0.96), (foot + frame * 0.8, top), mattress, 0.08))
+    if fold < z[1]:
+        blanket = (foot + frame * 0.6, top + 0.04)
+        parts.append(cushion(around(width * 1.03), blanket, (fold - 0.05, z[1] + 0.02), 0.06))
+    for x in (-width / 2 + 0.06, width / 2 - 0.06):
+        parts += [rod((x, 0, at), (x, foot + 0.02, at), 0.05, 4) for at in (z[0] + 0.1, z[1] - 0.1)]
+    double = width > 1.15
+    wide = width * 0.42 if double else min(0.62, width * 0.8)
+    for x in (-width / 4, width / 4) if double else (0.0,):
+        pillow = around(0.38, z[0] + 0.3)
+        parts.append(cushion(around(wide, x), (top - 0.03, top + 0.11), pillow, 0.1))
+    parts += _board(rng, width, (0.0, head), z[0] - 0.03)
+    if rng.random() < 0.45:
+        parts += _board(rng, width, (0.0, top + rng.uniform(0.0, 0.25)), z[1] + 0.05)
+    elif rng.random() < 0.3:
+        tall = top + rng.uniform(0.8, 1.1)
+        posts = [(x, at) for at in z for x in around(width)]
+        parts += [rod((x, 0, at), (x, tall, at), 0.045, 8) for x, at in posts]
+        for start, end in ((0, 1), (1, 3), (3, 2), (2, 0)):
+            (x0, z0), (x1, z1) = posts[start], posts[end]
+            parts.append(rod((x0, tall, z0), (x1, tall, z1), 0.035, 8))
+    return join(parts)
+
+
+def _board(rng: Generator, width: float, y: Span, z: float) -> list[Trimesh]:
+    """Return a head- or footboard: a panel, or posts with a rail and slats."""
+    low, high = y
+    if rng.random() < 0.6:
+        return [box(around(width * 1.03), (low + 0.1, high), around(0.07, z))]
+    parts = [rod((x, low, z), (x, high, z), 0.045, 8) for x in around(width)]
+    parts.append(box(around(width), (high - 0.14, high - 0.04), around(0.05, z)))
+    for x in np.linspace(-width / 2, width / 2, rng.integers(7, 11))[1:-1]:
+        parts.append(rod((x, low + 0.2, z), (x, high - 0.1, z), 0.02, 6))
+    return parts

@@ -1,0 +1,194 @@
+"""Builders of the vessel classes: bottle, bowl, bucket, cup, goblet, teapot, vase.
+
+Walls are single surfaces, so no points are lost on an inside that nobody sees.
+"""
+
+import numpy as np
+from numpy.random import Generator
+from trimesh import Trimesh
+
+from mops_lightning.data.procedural.mesh_parts import (
+    Array,
+    bow,
+    disc,
+    join,
+    rod,
+    smooth,
+    tube,
+    turned,
+)
+
+
+def bottle(rng: Generator) -> Trimesh:
+    """Return a bottle: straight, waisted or round body, narrow neck, mostly with a cap."""
+    radius, height = rng.uniform(0.22, 0.42), 1.0
+    neck = radius * rng.uniform(0.28, 0.6)
+    shoulder = rng.uniform(0.48, 0.68)
+    start = shoulder + rng.uniform(0.1, 0.2)
+    kind = rng.choice(3, p=(0.5, 0.25, 0.25))
+    waist = (1.0, rng.uniform(0.72, 0.88), rng.uniform(1.1, 1.25))[kind]
+    body = [
+        (radius * 0.9, 0.0),
+        (radius, 0.04),
+        (radius * waist, shoulder * rng.uniform(0.4, 0.6)),
+        (radius, shoulder),
+        (neck, start),
+        (neck, height),
+    ]
+    if kind == 0:  # a straight wall, which the smooth curve would round off
+        del body[2]
+    parts = [turned([(0.0, 0.0), *smooth(body, 28)])]
+    if rng.random() < 0.7:
+        parts.append(disc(neck * rng.uniform(1.15, 1.5), (height - 0.09, height + 0.03)))
+    else:
+        parts.append(turned([(neck * 1.25, height - 0.05), (neck * 1.25, height)]))
+    return join(parts)
+
+
+def vase(rng: Generator) -> Trimesh:
+    """Return a vase: foot, belly, neck and lip, sometimes with two handles; or a mere beaker."""
+    belly, height = rng.uniform(0.24, 0.45), 1.0
+    foot = belly * rng.uniform(0.4, 0.7)
+    neck = belly * rng.uniform(0.28, 0.85)
+    lip = min(neck * rng.uniform(1.05, 1.9), belly * 1.15)
+    low, high = rng.uniform(0.3, 0.55), rng.uniform(0.72, 0.85)
+    if rng.random() < 0.25:  # a beaker: no belly, wider upwards
+        wall = smooth([(foot, 0), (foot * rng.uniform(0.9, 1.3), low), (belly, height)], 24)
+        return turned([(0.0, 0.0), *wall])
+    wall = smooth([(foot, 0), (foot * 0.85, 0.06), (belly, low), (neck, high), (lip, height)], 32)
+    parts = [turned([(0.0, 0.0), *wall])]
+    if rng.random() < 0.3:
+        reach, thick = rng.uniform(0.12, 0.22), rng.uniform(0.022, 0.035)
+        ends = (high + height) / 2, (low + high) / 2
+        parts += [_handle(wall, *ends, side * reach, thick) for side in (-1, 1)]
+    return join(parts)
+
+
+def bowl(rng: Generator) -> Trimesh:
+    """Return a bowl: open, wide, on a foot ring; a deep one is near a cup without its handle."""
+    radius, depth = 0.5, rng.uniform(0.28, 0.75)
+    foot = radius * rng.uniform(0.3, 0.55)
+    ring = rng.uniform(0.02, 0.14)
+    bulge = rng.uniform(1.5, 3.2)
+    up = np.linspace(0, 1, 16)
+    wall = foot + (radius - foot) * (1 - (1 - up) ** bulge) ** (1 / 1.3)
+    profile = np.column_stack((wall, ring + depth * up))
+    parts = [turned([(0.0, ring), *profile]), turned([(foot * 0.95, 0), (foot * 0.95, ring)])]
+    if rng.random() < 0.4:
+        lip = rng.uniform(0.03, 0.1)
+        parts.append(turned([(radius, ring + depth), (radius + lip, ring + depth + lip * 0.3)]))
+    return join(parts)
+
+
+def cup(rng: Generator) -> Trimesh:
+    """Return a cup: a wall of one of three forms and a handle; sometimes a saucer."""
+    radius, height = rng.uniform(0.34, 0.5), rng.uniform(0.55, 1.0)
+    foot = radius * rng.uniform(0.55, 1.0)
+    waist = rng.uniform(0.85, 1.12)
+    middle = (radius + foot) / 2 * waist
+    wall = smooth([(foot, 0), (middle, height * 0.45), (radius, height)], 14)
+    parts = [turned([(0.0, 0.0), *wall])]
+    top, low = height * rng.uniform(0.78, 0.92), height * rng.uniform(0.15, 0.4)
+    parts.append(_handle(wall, top, low, rng.uniform(0.15, 0.36), rng.uniform(0.025, 0.05)))
+    if rng.random() < 0.25:
+        plate = radius * rng.uniform(1.5, 1.9)
+        parts.append(turned([(0, -0.03), (plate * 0.6, -0.03), (plate, 0.05)]))
+    return join(parts)
+
+
+def bucket(rng: Generator) -> Trimesh:
+    """Return a bucket: straight wall that widens upwards, rim, and a bail, up or laid down."""
+    radius, height = 0.5, rng.uniform(0.75, 1.1)
+    foot = radius * rng.uniform(0.6, 0.85)
+    parts = [turned([(0, 0), (foot, 0), (radius, height)])]
+    rim = rng.uniform(0.025, 0.06)
+    parts.append(turned([(radius, height - rim), (radius + rim, height - rim), (radius, height)]))
+    for level in rng.uniform(0.3, 0.8, rng.integers(0, 3)):
+        at = foot + (radius - foot) * level
+        y = height * level
+        parts.append(turned([(at, y - 0.02), (at + 0.03, y), (at, y + 0.02)]))
+    swing = np.pi * rng.choice((0.5, rng.uniform(0.15, 0.85), -0.12))
+    turn = np.linspace(0, np.pi, 16)
+    ear = radius + rim
+    lift = ear * rng.uniform(0.85, 1.1)
+    out = np.sin(turn) * lift
+    rise = height - rim / 2 + np.sin(swing) * out
+    path = np.column_stack((np.cos(turn) * ear, rise, np.cos(swing) * out))
+    # A laid bail rests outside the wall, which the rim keeps it off.
+    across = (0, -np.cos(swing), np.sin(swing))
+    parts.append(tube(path, rng.uniform(0.018, 0.03), 8, across))
+    for side in (-1, 1):
+        parts.append(rod((side * radius * 0.97, height - rim, 0), (side * ear, height, 0), 0.05))
+    return join(parts)
+
+
+def goblet(rng: Generator) -> Trimesh:
+    """Return a stemmed glass: round, tall, conical or tulip bowl over a thin stem and a foot."""
+    foot, stem = rng.uniform(0.2, 0.3), rng.uniform(0.025, 0.045)
+    rise = rng.uniform(0.15, 0.55)
+    deep = 1.0 - rise
+    wide = rng.uniform(0.18, 0.42)
+    start = [(foot, 0.0), (foot * 0.5, 0.03), (stem, 0.08), (stem, rise * 0.95)]
+    if rng.random() < 0.25:  # conical
+        return turned([(0, 0), *smooth(start, 12), (stem, rise), (wide, 1.0)])
+    mouth = rng.uniform(0.7, 1.1)
+    glass = [
+        (stem, rise),
+        (wide * 0.75, rise + deep * 0.15),
+        (wide, rise + deep * rng.uniform(0.4, 0.6)),
+        (wide * mouth, 1.0),
+    ]
+    parts = [turned([(0.0, 0.0), *smooth(start, 12), *smooth(glass, 18)])]
+    if rng.random() < 0.4:
+        knob, y, half = stem * rng.uniform(1.6, 2.4), rise * rng.uniform(0.4, 0.8), 0.04
+        parts.append(turned(smooth([(stem, y - half), (knob, y), (stem, y + half)], 9), 16))
+    return join(parts)
+
+
+def teapot(rng: Generator) -> Trimesh:
+    """Return a teapot: round body, lid with knob, spout, handle at the back or over the top."""
+    radius, height = 0.5, rng.uniform(0.6, 1.1)
+    foot, mouth = radius * rng.uniform(0.5, 0.8), radius * rng.uniform(0.35, 0.6)
+    widest = height * rng.uniform(0.3, 0.55)
+    wall = smooth([(foot, 0), (radius, widest), (mouth, height)], 18)
+    dome = rng.uniform(0.06, 0.16)
+    lid = smooth([(mouth, height), (mouth * 0.7, height + dome * 0.7), (0, height + dome)], 8)
+    knob = rng.uniform(0.045, 0.075)
+    ball = height + dome + knob * 0.8 + knob * np.array((-1, -0.7, 0, 0.7, 1))
+    parts = [
+        turned([(0.0, 0.0), *wall]),
+        turned(lid),
+        turned(np.column_stack((knob * np.array((0, 0.7, 1, 0.7, 0)), ball)), 12),
+    ]
+    reach, tip = rng.uniform(0.3, 0.5), height * rng.uniform(0.85, 1.1)
+    root = widest * rng.uniform(0.6, 1.0)
+    spout = [
+        (-radius * 0.85, root, 0),
+        (-radius - reach * 0.45, root + (tip - root) * 0.3, 0),
+        (-radius - reach * 0.7, root + (tip - root) * 0.75, 0),
+        (-radius - reach, tip, 0),
+    ]
+    wide = rng.uniform(0.09, 0.14)
+    parts.append(tube(smooth(spout, 12), np.linspace(wide, wide * 0.4, 12), 12, across=(0, 0, 1)))
+    thick = rng.uniform(0.03, 0.05)
+    if rng.random() < 0.25:  # over the top
+        turn = np.linspace(0, np.pi, 16)
+        y = height * 0.8
+        start = np.interp(y, wall[:, 1], wall[:, 0])
+        rise = y + np.sin(turn) * rng.uniform(0.5, 0.75)
+        path = np.column_stack((np.cos(turn) * start, rise, np.zeros(16)))
+        parts.append(tube(path, thick, 10, across=(0, 0, 1)))
+    else:
+        top, low = height * rng.uniform(0.75, 0.92), height * rng.uniform(0.15, 0.35)
+        parts.append(_handle(wall, top, low, rng.uniform(0.28, 0.45), thick))
+    return join(parts)
+
+
+def _handle(wall: Array, top: float, low: float, reach: float, thick: float) -> Trimesh:
+    """Return a bowed handle between two heights of a wall; a negative reach puts it to the left."""
+    side = np.sign(reach)
+    # The ends lie a little inside the wall, so that no gap shows.
+    start, end = (
+        (side * 0.96 * float(np.interp(y, wall[:, 1], wall[:, 0])), y) for y in (top, low)
+    )
+    return tube(bow(start, end, reach), thick, 10, across=(0, 0, 1))

@@ -1,0 +1,38 @@
+"""The paper's figures, as its tables have them; they stand beside ours in reports."""
+
+import json
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+
+@cache
+def tables() -> dict[str, dict[str, Any]]:
+    """Return all tables by name, each with its source; see ``paper.json``."""
+    return json.loads(files("mops_lightning.report").joinpath("paper.json").read_text())
+
+
+def table(task: str, dataset: str, metric: str, joint: bool = False) -> dict[str, Any]:
+    """Return the paper's table for a task, data and a metric, or nothing if it has none.
+
+    Returns:
+        ``rows``: sampler → size → figures of generated, matched and completed sets, or one; and
+        where the paper has it ``full``, the figure on all points.
+    """
+    wanted = (task, dataset, metric, joint)
+    for one in tables().values():
+        if (one["task"], one.get("dataset"), one.get("metric"), one.get("joint", False)) == wanted:
+            return one
+    return {}
+
+
+def net(name: str, pieces: int | None, n_points: int | None) -> list[float] | None:
+    """Return chamfer and earth mover's distance and size in MB of a net that reconstructs.
+
+    Args:
+        name: such as ``autoencoder``.
+        pieces: M of M-FoldingNet; FoldingNet has 1.
+        n_points: of the clouds.
+    """
+    key = str(pieces) if name in ("foldingnet", "mfoldingnet") else name
+    return tables()["frameworks"]["nets"].get(key, {}).get(str(n_points))

@@ -1,0 +1,119 @@
+"""Finding the checkpoint to go on from, and making sure that it belongs to this run."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from mops_lightning.errors import UserError
+from mops_lightning.training.callbacks import CHECKPOINT
+from mops_lightning.training.experiment import CHECKPOINT_KEY
+from mops_lightning.zoo.weights import load, read_plain
+
+
+def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
+    """Return what must be equal for a checkpoint to be resumed, as text by setting.
+
+    ``epochs`` is noted too, but may differ: a finished run may be made longer.
+    """
+    task: Any = OmegaConf.to_container(cfg.task, resolve=True)
+    task.pop("emd_workers", None)  # how many processes there are changes no result
+    if isinstance(task.get("pairs"), dict):
+        task["pairs"].pop("test_seed", None)  # of what is scored, not of what is learned
+    parts = {
+        "task": task,
+        "sampler": cfg.sampler if cfg.learn != "task" else None,
+        "optimizer": cfg.optimizer,
+        "augment": cfg.augment.get(cfg.learn),
+        "learn": cfg.learn,
+        "seed": cfg.seed,
+        "batch_size": cfg.batch_size,
+        **({"task_rate": cfg.task_rate} if cfg.learn == "joint" else {}),
+        "val_fraction": cfg.val_fraction,
+        "dataset": fingerprint,
+        "epochs": cfg.trainer.max_epochs,
+        **_given_weights(cfg),
+    }
+    return {
+        name: json.dumps(
+            OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value,
+            sort_keys=True,
+        )
+        for name, value in parts.items()
+    }
+
+
+def _given_weights(cfg: DictConfig) -> dict[str, str]:
+    """Return the hash of the weights file that the run begins with, if it is one of the user's."""
+    if cfg.weights in (None, "auto", "run") or not Path(cfg.weights).expanduser().is_file():
+        return {}
+    return {"weights": str(load(cfg.weights)["sha256"])}
+
+
+def lengthened(cfg: DictConfig, checkpoint: Path) -> bool:
+    """Return whether ``checkpoint`` comes from a run of another planned length."""
+    return _read(checkpoint).get("epochs") != json.dumps(cfg.trainer.max_epochs)
+
+
+def find(cfg: DictConfig, mine: dict[str, str]) -> Path | None:
+    """Return the checkpoint that ``ckpt_path`` means, or None when it is not set.
+
+    Args:
+        cfg: ``ckpt_path`` may be ``last`` (the newest run below ``out`` with these settings), a
+            run's folder or a file.
+        mine: this run's ``identity``.
+
+    Raises:
+        UserError: there is no such checkpoint, or it belongs to other settings.
+    """
+    if cfg.ckpt_path is None:
+        return None
+    if cfg.ckpt_path == "last":
+        return _newest(Path(cfg.out), mine)
+    path = Path(cfg.ckpt_path).expanduser()
+    if path.is_dir():
+        path = path / "checkpoints" / CHECKPOINT
+    if not path.is_file():
+        raise UserError(
+            f"ckpt_path: no checkpoint {path}. Give a run's folder, a .ckpt file, or last."
+        )
+    theirs = _read(path)
+    different = _different(theirs, mine)
+    if different:
+        name = different[0]
+        raise UserError(
+            f"ckpt_path: {path} is of a run with other settings ({', '.join(different)}); "
+            f"{name} is {mine.get(name)} here and {theirs.get(name)} there. "
+            "Give the same settings, or leave ckpt_path out to start anew."
+        )
+    return path
+
+
+def _newest(out: Path, mine: dict[str, str]) -> Path:
+    found = sorted(
+        out.glob(f"**/checkpoints/{CHECKPOINT}"), key=lambda p: p.stat().st_mtime, reverse=True
+    )
+    for path in found:
+        try:
+            theirs = _read(path)
+        except UserError:
+            continue
+        if not _different(theirs, mine):
+            return path
+    raise UserError(
+        f"ckpt_path=last: none of the {len(found)} checkpoints below {out} has these settings. "
+        "Leave ckpt_path out to start anew, or name a run's folder."
+    )
+
+
+def _different(theirs: dict[str, str], mine: dict[str, str]) -> list[str]:
+    names = [name for name in {**mine, **theirs} if name != "epochs"]
+    return [name for name in names if theirs.get(name) != mine.get(name)]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    content = read_plain(path, "ckpt_path", "a checkpoint")
+    if CHECKPOINT_KEY not in content:
+        raise UserError(f"ckpt_path: {path} is not a checkpoint of this program.")
+    return content[CHECKPOINT_KEY]

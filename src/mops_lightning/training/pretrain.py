@@ -1,0 +1,113 @@
+"""The task net's weights: given, found in the cache, or trained first."""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from mops_lightning.config import distributed
+from mops_lightning.data.clouds import CloudDataset
+from mops_lightning.errors import Interrupted, UserError
+from mops_lightning.files import atomic_write
+from mops_lightning.training import checkpoint
+from mops_lightning.training.callbacks import CHECKPOINT
+from mops_lightning.training.evaluate import OF_RUN
+from mops_lightning.zoo.weights import FILE
+
+
+def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
+    """Return the file that ``weights`` means; ``auto`` trains the net when it is not cached.
+
+    With ``learn=task`` a file is where the training starts from; ``auto`` starts anew.
+
+    Returns:
+        None for ``weights=null``, which leaves the net as it was initialised, for a resumed run,
+        whose checkpoint holds the task net as well, and for the net of an evaluated run.
+    """
+    if cfg.weights in (None, OF_RUN) or cfg.ckpt_path is not None:
+        return None
+    if cfg.weights == "auto" and cfg.learn == "task":
+        return None
+    if cfg.weights != "auto":
+        return Path(cfg.weights)
+    folder = cache_folder(cfg, dataset)
+    if not (folder / FILE).is_file():
+        if distributed.started_together(cfg):
+            raise UserError(
+                f"weights: {cfg.names.net} must be trained before a launcher starts several "
+                "processes. Run the same command once with learn=task trainer=auto and without "
+                "the launcher, or give weights=FILE."
+            )
+        print(
+            f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it first, "
+            f"{cfg.pretrain.max_epochs} epochs. It is kept in {folder}",
+            flush=True,
+        )
+        _train(cfg, folder, dataset)
+    return folder / FILE
+
+
+def task_config(cfg: DictConfig) -> DictConfig:
+    """Return the configuration of the run that trains the task net of ``cfg`` alone."""
+    own = cfg.copy()
+    with open_dict(own):
+        if cfg.learn != "task":
+            own.trainer.max_epochs = cfg.pretrain.max_epochs
+            own.optimizer = cfg.pretrain.optimizer
+            own.weights = "auto"
+        own.learn = "task"
+        own.trainer.devices, own.trainer.num_nodes, own.trainer.strategy = 1, 1, "auto"
+        own.ckpt_path = None
+        own.evaluate = None
+    return own
+
+
+def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
+    """Return where the task net of these settings and data is kept, there or not."""
+    own = task_config(cfg)
+    # Where it runs and what it logs do not change the net; all else about the trainer may.
+    elsewhere = {
+        "accelerator",
+        "devices",
+        "num_nodes",
+        "strategy",
+        "log_every_n_steps",
+        "_target_",
+    }
+    trainer: dict[str, Any] = OmegaConf.to_container(own.trainer, resolve=True)  # type: ignore[assignment]
+    key = {
+        **checkpoint.identity(own, dataset.fingerprint),
+        "trainer": {name: value for name, value in trainer.items() if name not in elsewhere},
+    }
+    digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:12]
+    name = f"{cfg.names.task}-{cfg.names.net}-{cfg.names.dataset}-{digest}"
+    return Path(cfg.cache).expanduser() / "weights" / name
+
+
+def publish(cfg: DictConfig, weights: Path, dataset: CloudDataset) -> None:
+    """Copy a task net trained with ``learn=task`` into the cache, unless one is there.
+
+    Not for a run that was made longer by resuming it, for its learning rate went another way, and
+    not for one that began with given weights.
+    """
+    target = cache_folder(cfg, dataset) / FILE
+    if not target.exists():
+        with atomic_write(target) as temporary:
+            shutil.copyfile(weights, temporary)
+
+
+def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
+    from mops_lightning.training.run import fit_and_test, recorded  # they call this module
+
+    own = task_config(cfg)
+    if (folder / "checkpoints" / CHECKPOINT).is_file():
+        # An earlier pretraining was cut off: go on from there.
+        own.ckpt_path = str(folder)
+    try:
+        with recorded(own, folder, []) as record:
+            fit_and_test(own, folder, dataset, record)
+    except (KeyboardInterrupt, Interrupted):
+        raise Interrupted("The task net was in training: the same command goes on there.") from None

@@ -1,0 +1,115 @@
+"""The callback that draws the same few test clouds while a sampler learns, and when it is done."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import numpy as np
+import torch
+from lightning.fabric.utilities import move_data_to_device
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch import Tensor
+
+from mops_lightning.training.readouts import BatchReadouts, readout_names
+from mops_lightning.viz.clouds import (
+    COLOURS,
+    INPUT_COLOUR,
+    cloud_grid,
+    matrix_figure,
+    save_figure,
+)
+from mops_lightning.viz.snapshots import CLOUDS, save_clouds
+
+DENSE_PIXELS = 2**20
+"""Largest S that is drawn: 1,024 points by 1,024 columns."""
+
+
+class DrawClouds(Callback):
+    """Draws a fixed set of clouds with every readout, S with SᵀS, and what the task draws.
+
+    TensorBoard gets them about ten times in a run and after the test; the run's folder gets PNGs
+    after the test, where the task shows the baselines too.
+
+    Args:
+        batch: the test clouds to draw, as the task takes them.
+        titles: one per cloud of the dataset.
+        folder: where the PNGs go.
+    """
+
+    def __init__(self, batch: Any, titles: Sequence[str], folder: Path) -> None:
+        self.batch = batch
+        self.titles = list(titles)
+        self.folder = folder
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Draw into TensorBoard every tenth of the run."""
+        every = max((trainer.max_epochs or 1) // 10, 1)
+        if trainer.current_epoch % every == 0:
+            self._draw(trainer, pl_module, None)
+
+    def on_test_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Draw into TensorBoard and as PNG."""
+        self._draw(trainer, pl_module, self.folder)
+
+    @torch.no_grad()
+    def _draw(self, trainer: L.Trainer, module: L.LightningModule, folder: Path | None) -> None:
+        if not trainer.is_global_zero:
+            return
+        board = trainer.logger if isinstance(trainer.logger, TensorBoardLogger) else None
+        if board is None and folder is None:
+            return
+        sampler: Any = module.sampler
+        task: Any = module.task
+        m: Any = module.m
+        training = module.training
+        module.eval()
+        batch = move_data_to_device(self.batch, module.device)
+        beside: Any = module.baselines
+        # The baselines do not change in training: they are drawn once, at the end.
+        baselines = dict(beside.items()) if folder is not None else {}
+        readouts = BatchReadouts(sampler, baselines, (m,))
+        samples = {name: readouts.sample_as(name, m) for name in readout_names(sampler)}
+        methods = {name: readouts.sample_as(name, m) for name in baselines}
+        figures = task.figures(batch, {**methods, **samples}, self.titles)
+        titles = task.cloud_titles(self.titles)
+        sampled = {}
+        if sampler is not None:
+            sampled = {name: sample(batch.points).points for name, sample in samples.items()}
+            figures["clouds"] = cloud_grid(batch.points, sampled, titles)
+            matrix = readouts.outputs(m)[0][1].matrix
+            if matrix is not None and batch.points.shape[1] * len(matrix.queries) <= DENSE_PIXELS:
+                first = matrix._replace(keys=matrix.keys[:1])
+                figures["matrix"] = matrix_figure(first.dense()[0], first.gram()[0], titles[0])
+        if folder is not None and sampled:
+            save_clouds(folder / CLOUDS, batch.points, sampled, titles)
+        module.train(training)
+        step = trainer.global_step
+        for name, figure in figures.items():
+            if folder is not None:
+                save_figure(figure, folder / f"{name}.png")
+            if board is not None:
+                board.experiment.add_figure(name, figure, step)
+        if board is not None:
+            for name, chosen in sampled.items():
+                for number, title in enumerate(titles):
+                    vertices, colours = _coloured(batch.points[number], chosen[number], name)
+                    board.experiment.add_mesh(
+                        f"{name}/{number}_{title}",
+                        vertices=vertices,
+                        colors=colours,
+                        config_dict={"material": {"cls": "PointsMaterial", "size": 0.03}},
+                        global_step=step,
+                    )
+
+
+def _coloured(points: Tensor, samples: Tensor, readout: str) -> tuple[Tensor, Tensor]:
+    """Join one cloud and its samples, ``(1, N + M, 3)``, with a colour for each point."""
+    colours = np.concatenate(
+        [
+            np.tile(np.array(INPUT_COLOUR, np.uint8), (len(points), 1)),
+            np.tile(np.array(COLOURS[readout], np.uint8), (len(samples), 1)),
+        ]
+    )
+    return torch.cat([points, samples]).cpu()[None], torch.from_numpy(colours)[None]

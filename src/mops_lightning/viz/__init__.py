@@ -1,0 +1,1 @@
+"""Figures of clouds, sampling matrices, pairs and reconstructions."""

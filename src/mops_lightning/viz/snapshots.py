@@ -1,0 +1,52 @@
+"""The few test clouds that a run keeps beside its pictures, for 3-D views in reports."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mops_lightning.errors import UserError
+from mops_lightning.files import atomic_write
+
+CLOUDS = "clouds.npz"
+INPUT = "input"
+TITLES = "titles"
+KEPT = 8192
+"""Most input points that are kept of a cloud; samples are kept whole."""
+
+
+def save_clouds(
+    path: Path, points: Tensor, sampled: Mapping[str, Tensor], titles: Sequence[str]
+) -> None:
+    """Write clouds and what was sampled of them.
+
+    Args:
+        path: the file.
+        points: ``(K, N, 3)`` input, y up.
+        sampled: ``(K, M, 3)`` by readout.
+        titles: one per cloud.
+    """
+    thinned = points[:, :: -(-points.shape[1] // KEPT)]
+    clouds = {INPUT: thinned, **sampled}
+    arrays = {name: cloud.detach().cpu().float().numpy() for name, cloud in clouds.items()}
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **{TITLES: np.array(titles)}, **arrays)
+
+
+def load_clouds(path: Path) -> tuple[list[str], dict[str, NDArray[np.float32]]]:
+    """Read such a file.
+
+    Returns:
+        The titles, and ``(K, points, 3)`` by name, ``input`` first.
+
+    Raises:
+        UserError: it is not such a file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        return [str(title) for title in arrays.pop(TITLES)], arrays
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(f"{path}: not a file of clouds: {error}") from None

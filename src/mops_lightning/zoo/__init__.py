@@ -1,0 +1,1 @@
+"""Weights files of trained samplers and task nets."""

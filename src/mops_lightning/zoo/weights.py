@@ -1,0 +1,127 @@
+"""Weights files: plain tensors and plain data, checked when read."""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mops_lightning.errors import UserError
+from mops_lightning.files import atomic_write
+
+SCHEMA = "mops_lightning/weights/1"
+FILE = "weights.pt"
+
+
+def save(
+    path: Path,
+    module: nn.Module,
+    config: dict[str, Any],
+    metrics: dict[str, float],
+    classes: Sequence[str] = (),
+) -> None:
+    """Write a module's tensors with what made them.
+
+    Args:
+        path: the file; replaced in one step.
+        module: whose state is kept.
+        config: plain data that says how the weights came about.
+        metrics: what they scored.
+        classes: names of the classes that were told apart, in order.
+    """
+    state = {name: value.detach().cpu().contiguous() for name, value in module.state_dict().items()}
+    content = {
+        "schema": SCHEMA,
+        "config": config,
+        "metrics": metrics,
+        "classes": list(classes),
+        "sha256": digest(state),
+        "state": state,
+    }
+    with atomic_write(path) as temporary:
+        torch.save(content, temporary)
+
+
+def load(path: str | Path) -> dict[str, Any]:
+    """Read a weights file and verify it.
+
+    Returns:
+        The content as saved: ``config``, ``metrics``, ``sha256`` and ``state``.
+
+    Raises:
+        UserError: the file is missing, damaged or no weights file.
+    """
+    path = Path(path).expanduser()
+    if not path.is_file():
+        raise UserError(f"weights: no file {path}. Give a weights.pt, or weights=auto.")
+    content = read_plain(path, "weights", "a weights file")
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+        raise UserError(
+            f"weights: {path} is not a {SCHEMA} file. "
+            "Lightning checkpoints are for ckpt_path; weights.pt lies beside them."
+        )
+    if digest(content["state"]) != content["sha256"]:
+        raise UserError(f"weights: {path} is damaged (sha256 differs). Delete it and run again.")
+    return content
+
+
+def read_plain(path: Path, setting: str, what: str) -> Any:
+    """Read a file of plain tensors and plain data; ``setting`` and ``what`` name it in the error.
+
+    Raises:
+        UserError: the file is damaged, or holds more than plain data.
+    """
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        first = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise UserError(f"{setting}: {path} cannot be read as {what}: {first}") from None
+
+
+def load_into(module: nn.Module, path: str | Path) -> dict[str, Any]:
+    """Read a weights file into a module, strictly.
+
+    Returns:
+        The file's content; see ``load``.
+
+    Raises:
+        UserError: the file is unusable, or holds the weights of another net.
+    """
+    content = load(path)
+    fit_state(module, content["state"], path)
+    return content
+
+
+def fit_state(module: nn.Module, have: dict[str, Tensor], path: str | Path) -> None:
+    """Load tensors into a module, strictly; ``path`` names them in the error.
+
+    Raises:
+        UserError: they are those of another net.
+    """
+    want = module.state_dict()
+    wrong = [f"{name} is missing" for name in want if name not in have]
+    wrong += [f"{name} is unknown" for name in have if name not in want]
+    wrong += [
+        f"{name} is {tuple(have[name].shape)} instead of {tuple(want[name].shape)}"
+        for name in want
+        if name in have and have[name].shape != want[name].shape
+    ]
+    if wrong:
+        more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
+        raise UserError(
+            f"weights: {path} holds another net's weights: {'; '.join(wrong[:3])}{more}. "
+            "Check task, task/net and dataset.classes, or use weights=auto."
+        )
+    module.load_state_dict(have, strict=True)
+
+
+def digest(state: dict[str, Tensor]) -> str:
+    """Return the sha256 over names, shapes, types and bytes of tensors, whatever their order."""
+    total = hashlib.sha256()
+    for name in sorted(state):
+        value = state[name].detach().cpu().contiguous()
+        total.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
+        total.update(value.view(-1).view(torch.uint8).numpy().tobytes())
+    return total.hexdigest()

@@ -1,0 +1,103 @@
+"""Cells of a sweep that is started again."""
+
+import fcntl
+import json
+import math
+
+import pytest
+
+from mops_lightning.cli.sweep import run_cell
+from mops_lightning.config.validate import compose
+from mops_lightning.records import run_record
+from mops_lightning.records.attempts import ASIDE, FAILED
+from tests.training.test_evaluate import TINY
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Start the cell, as a sweep does each time."""
+
+    def cell(*arguments):
+        overrides = [*TINY, f"cache={tmp_path}/cache", *arguments]
+        return run_cell(compose(overrides), tmp_path / "cell", overrides)
+
+    return cell
+
+
+def test_a_finished_cell_is_not_run_again(start, tmp_path):
+    score = start("sampler=fps", "weights=null")
+    path = tmp_path / "cell" / run_record.FILE
+    before = path.stat().st_mtime_ns
+    assert (
+        start("sampler=fps", "weights=null", "pictures=1", "out=elsewhere", "dataset.cache=there")
+        == score
+    )
+    assert path.stat().st_mtime_ns == before
+    assert not (tmp_path / "cell" / ASIDE).exists()
+
+
+def test_a_cell_of_other_settings_is_left_alone(start, tmp_path, caplog):
+    score = start("sampler=fps", "weights=null")
+    assert math.isnan(start("sampler=fps", "weights=null", "seed=3"))
+    assert "other settings: seed is 3 now and was 0" in caplog.text
+    assert "hydra.sweep.dir" in (tmp_path / "cell" / FAILED).read_text()
+    assert start("sampler=fps", "weights=null") == score
+    assert not (tmp_path / "cell" / FAILED).exists()
+
+
+def test_a_failed_cell_is_tried_again(start, tmp_path, caplog):
+    file = tmp_path / "net.pt"
+    assert math.isnan(start("sampler=fps", f"weights={file}"))
+    assert f"no file {file}" in caplog.text
+    assert run_record.read(tmp_path / "cell")["status"] == "failed"
+    overrides = [*TINY, "learn=task"]
+    run_cell(compose(overrides), tmp_path / "task", overrides)
+    (tmp_path / "task" / "weights.pt").rename(file)
+    assert math.isfinite(start("sampler=fps", f"weights={file}"))
+    assert run_record.read(tmp_path / "cell")["status"] == "completed"
+    assert run_record.read(tmp_path / "cell" / ASIDE / "1")["status"] == "failed"
+
+
+def test_an_interrupted_cell_goes_on_to_the_same_result(start, tmp_path):
+    longer = ["sampler=mops", "weights=null", "trainer.max_epochs=2"]
+    score = start(*longer)
+    whole = run_record.read(tmp_path / "cell")
+    # What a killed process leaves: a record that says "running", and its last checkpoint.
+    path = tmp_path / "cell" / run_record.FILE
+    path.write_text(json.dumps({**whole, "status": "running", "metrics": {}, "score": None}))
+    assert start(*longer) == score
+    again = run_record.read(tmp_path / "cell")
+    assert again["metrics"] == whole["metrics"]
+    assert again["notes"]["resumed_from"].endswith(f"{ASIDE}/1/checkpoints/last.ckpt")
+    assert start(*longer) == score
+    # Cut off again before it has a checkpoint of its own, or a record: the first one still counts.
+    (tmp_path / "cell" / "checkpoints" / "last.ckpt").unlink(missing_ok=True)
+    path.write_text(json.dumps({**again, "status": "interrupted", "metrics": {}, "score": None}))
+    assert start(*longer) == score
+    for name in (run_record.FILE, "weights.pt"):
+        (tmp_path / "cell" / name).unlink()
+    (tmp_path / "cell" / "checkpoints" / "last.ckpt").unlink(missing_ok=True)
+    assert start(*longer) == score
+    resumed = run_record.read(tmp_path / "cell")["notes"]["resumed_from"]
+    assert resumed.endswith(f"{ASIDE}/1/checkpoints/last.ckpt")
+
+
+def test_a_cell_that_another_process_runs_is_left_to_it(start, tmp_path, caplog):
+    folder = tmp_path / "cell"
+    folder.mkdir()
+    with (folder / ".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert math.isnan(start("sampler=fps", "weights=null"))
+    assert "another process runs this cell" in caplog.text
+    assert not (folder / FAILED).exists()
+    assert math.isfinite(start("sampler=fps", "weights=null"))
+
+
+def test_errors_of_the_program_do_not_end_the_sweep(start, tmp_path, monkeypatch, caplog):
+    def broken(*_):
+        raise RuntimeError("out of something")
+
+    monkeypatch.setattr("mops_lightning.training.run.fit_and_test", broken)
+    assert math.isnan(start("sampler=fps", "weights=null"))
+    assert (tmp_path / "cell" / FAILED).read_text() == "RuntimeError: out of something\n"
+    assert "Traceback" in caplog.text

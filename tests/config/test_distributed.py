@@ -1,0 +1,115 @@
+"""One run over two processes: the same clouds, and the same metrics as from one."""
+
+import json
+
+import pytest
+import torch
+
+from mops_lightning.config.distributed import check_shares, check_start
+from mops_lightning.config.validate import compose
+from mops_lightning.data.clouds import Clouds
+from mops_lightning.data.loader import Augmentation, CloudLoader
+from mops_lightning.errors import UserError
+from tests.command_line import TINY, call, call_anew
+
+
+def clouds(number):
+    points = torch.rand(number, 5, 3, generator=torch.Generator().manual_seed(number))
+    return Clouds(points, torch.arange(number))
+
+
+def loaders(number, processes, batch_size=8, **extra):
+    return [
+        CloudLoader(clouds(number), batch_size, part=(rank, processes), **extra)
+        for rank in range(processes)
+    ]
+
+
+@pytest.mark.parametrize("number", [16, 29])
+def test_the_shares_of_a_training_batch_are_the_batch_of_one_process(number):
+    settings = {"shuffle": True, "drop_last": True, "augment": Augmentation(True, 0.1)}
+    (alone,) = loaders(number, 1, **settings)
+    for whole, *shares in zip(alone, *loaders(number, 2, **settings), strict=True):
+        assert len({len(share.points) for share in shares}) == 1
+        assert torch.equal(torch.cat([share.points for share in shares]), whole.points)
+        assert torch.equal(torch.cat([share.labels for share in shares]), whole.labels)
+
+
+def test_a_batch_that_does_not_go_round_leaves_the_last_clouds_out():
+    first, second = (list(loader) for loader in loaders(7, 2, shuffle=True))
+    assert [len(batch.points) for batch in (*first, *second)] == [3, 3]
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3, 4])
+def test_every_cloud_is_scored_once_in_equally_many_batches_none_of_them_empty(processes):
+    for number in range(processes, 60):
+        shares = [list(loader) for loader in loaders(number, processes)]
+        assert {len(share) for share in shares} == {-(-number // 8)}
+        sizes = [len(batch.points) for share in shares for batch in share]
+        assert min(sizes) > 0
+        labels = torch.cat([batch.labels for share in shares for batch in share])
+        assert torch.equal(labels.sort().values, torch.arange(number))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "said"),
+    [
+        ((15, 99, 0, 2), "Try batch_size=16"),
+        ((4, 99, 0, 4), "Try batch_size=8"),
+        ((8, 3, 0, 4), "devices=3"),
+        ((8, 9, 1, 2), "val_fraction holds out 1 training clouds, fewer than the 2 devices"),
+    ],
+)
+def test_data_that_do_not_go_round_are_refused(numbers, said):
+    with pytest.raises(UserError, match=said):
+        check_shares(*numbers)
+
+
+def test_processes_of_a_launcher_must_be_meant_and_share_a_folder(monkeypatch):
+    several = compose(["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"])
+    check_start(several, [])
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(UserError, match=r"hydra\.run\.dir=FOLDER"):
+        check_start(several, [])
+    check_start(several, ["hydra.run.dir=here"])
+    with pytest.raises(UserError, match="2 processes were started"):
+        check_start(compose(["trainer=cpu"]), ["hydra.run.dir=here"])
+
+
+def test_a_wrong_batch_is_refused_before_the_task_net_is_trained(tmp_path):
+    devices = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "batch_size=15"]
+    status, out, err = call([*TINY[1:], *devices], tmp_path)
+    assert status == 2
+    assert "Try batch_size=16" in err
+    assert "training it first" not in out
+
+
+REGISTRATION = [*TINY, "task=registration", "learn=task", "trainer.max_epochs=2", "batch_size=8"]
+
+
+def test_two_processes_give_the_metrics_of_one_and_only_the_first_writes(tmp_path):
+    """PCRNet has no BatchNorm, so that nothing but the order of sums may differ."""
+    status, _, err = call([*REGISTRATION, "hydra.run.dir=one"], tmp_path)
+    assert status == 0, err
+    two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "hydra.run.dir=two"]
+    status, out, err = call_anew([*REGISTRATION[1:], *two], tmp_path)
+    assert status == 0, err
+    assert err == ""
+    assert out.count("epoch 2/2") == out.count("completed in") == 1
+    one, both = (json.loads((tmp_path / run / "result.json").read_text()) for run in ("one", "two"))
+    assert (one["notes"]["processes"], both["notes"]["processes"]) == (1, 2)
+    assert both["metrics"] == pytest.approx(one["metrics"], rel=1e-4)
+    weights = [torch.load(tmp_path / run / "weights.pt")["state"] for run in ("one", "two")]
+    for name, value in weights[0].items():
+        torch.testing.assert_close(weights[1][name], value, rtol=1e-3, atol=1e-5)
+    # Those that follow have a log of their own and nothing else.
+    more = {path.name for path in (tmp_path / "two").iterdir()}
+    assert more - {path.name for path in (tmp_path / "one").iterdir()} == {
+        "train_ddp_process_1.log"
+    }
+
+
+def test_a_sweep_over_several_devices_is_refused_with_the_way_out(tmp_path):
+    status, _, err = call(["-m", *TINY, "trainer.devices=2", "m=4,8"], tmp_path)
+    assert status == 2
+    assert "hydra/launcher=joblib" in err

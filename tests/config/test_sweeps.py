@@ -1,0 +1,49 @@
+"""The files below sweeps/: each composes, and names every cell apart."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
+
+from mops_lightning.config.validate import check, conf_dir
+
+ROOT = Path(__file__).parents[2] / "sweeps"
+SWEEPS = sorted(
+    str(path.relative_to(ROOT).with_suffix(""))
+    for path in ROOT.rglob("*.yaml")
+    if path.stem != "minutes"
+)
+
+
+def composed(name, overrides=()):
+    path = [f"hydra.searchpath=[file://{conf_dir()}]"]
+    with initialize_config_dir(str(ROOT), version_base="1.3"):
+        cfg = compose(name, [*path, *overrides], return_hydra_config=True)
+    HydraConfig.instance().set_config(cfg)
+    return cfg
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_cells_are_valid_and_named_by_all_that_is_swept(name):
+    quick = name.startswith("quick/")
+    cfg = composed(name)
+    raw: Any = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)
+    for key in cfg.hydra.sweeper.params:
+        known_as = "names.sampler" if key == "sampler" else key
+        assert f"${{{known_as}}}" in raw["subdir"], "two cells would share a folder"
+    assert "${" not in f"{cfg.hydra.sweep.dir}/{cfg.hydra.sweep.subdir}"
+    assert cfg.hydra.mode.name == "MULTIRUN"
+    assert ("/sweeps/quick/" in cfg.hydra.sweep.dir) == quick
+    assert (cfg.names.dataset == "shapes") == quick or name == "noise"
+    assert not quick or cfg.trainer.max_epochs <= 4
+    if OmegaConf.is_missing(cfg.dataset, "root"):
+        cfg.dataset.root = "the user's"
+    check(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"]))
+
+
+def test_every_sweep_has_its_quick_form():
+    full = {name for name in SWEEPS if "/" not in name}
+    assert {f"quick/{name}" for name in full - {"noise"}} == set(SWEEPS) - full

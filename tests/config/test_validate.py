@@ -1,0 +1,182 @@
+from typing import Any
+
+import pytest
+from hydra.utils import get_object
+from omegaconf import DictConfig, OmegaConf
+
+from mops_lightning.config.validate import (
+    GROUPS,
+    RUN_KEYS,
+    build,
+    check,
+    compose,
+    conf_dir,
+    signature,
+)
+from mops_lightning.errors import UserError
+
+
+def choices():
+    """Every (group, name) that conf/ offers, as an override."""
+    for path in sorted(conf_dir().rglob("*.yaml")):
+        group = path.parent.relative_to(conf_dir()).as_posix()
+        if group != "." and not group.startswith("hydra"):
+            yield f"{group}={path.stem}"
+
+
+EXTRA = {
+    "dataset=meshes": ["dataset.root=somewhere"],
+    "dataset=hdf5": ["dataset.root=somewhere"],
+    "dataset=mesh_sequence": ["dataset.root=somewhere"],
+    "task/loss=quaternion": ["task=registration"],
+    "task/loss=frobenius_chamfer": ["task=registration"],
+}
+CALLER = {
+    # What code, not YAML, gives: see fit.make_experiment and fit.make_trainer.
+    "PointNetVanilla": {"num_classes"},
+    "Classification": {"net", "num_classes"},
+    "Registration": {"net"},
+    "quaternion_loss": {"predicted", "true", "source", "target"},
+    "frobenius_chamfer_loss": {"predicted", "true", "source", "target"},
+    "Adam": {"params"},
+    "one_cycle": {"optimizer", "total_steps"},
+    "exponential": {"optimizer", "total_steps"},
+    "step_decay": {"optimizer", "total_steps"},
+    "TensorBoardLogger": {"save_dir"},
+    "CSVLogger": {"save_dir"},
+}
+
+
+def nodes(cfg):
+    if isinstance(cfg, DictConfig):
+        if cfg.get("_target_") is not None:
+            yield cfg
+        for key in cfg:
+            if not OmegaConf.is_missing(cfg, key):
+                yield from nodes(cfg[key])
+
+
+@pytest.mark.parametrize("override", list(choices()))
+def test_every_yaml_composes_resolves_and_fits_its_constructors(override):
+    cfg = compose([override, *EXTRA.get(override, [])])
+    OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+    check(cfg)
+    for node in nodes(cfg):
+        target = get_object(node["_target_"])
+        parameters = signature(node["_target_"], override)
+        given = {key for key in node if not str(key).startswith("_")}
+        assert given <= set(parameters), node["_target_"]
+        needed = {
+            name
+            for name, p in parameters.items()
+            if p.default is p.empty and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
+        }
+        missing = needed - given - CALLER.get(target.__name__, set())
+        assert not missing, f"{node['_target_']} would lack {missing}"
+
+
+def test_every_run_level_key_is_known_and_explained_by_help():
+    cfg = compose()
+    own = {str(key) for key in cfg} - set(GROUPS)
+    assert own == set(RUN_KEYS)
+    page = OmegaConf.load(conf_dir() / "hydra" / "help" / "mops.yaml")
+    plain: Any = OmegaConf.to_container(page, resolve=False)
+    template = plain["template"]
+    section = template.split("== Run-level keys")[1].split("== Every setting")[0]
+    lines = section.splitlines()[1:]
+    explained = {line.split()[0] for line in lines if line and not line.startswith(" " * 9)}
+    assert explained == set(RUN_KEYS)
+
+
+def test_the_main_job_is_what_the_readme_says():
+    cfg = compose()
+    assert dict(cfg.names) == {
+        "task": "classification",
+        "net": "pointnet",
+        "dataset": "shapes",
+        "sampler": "mops",
+    }
+    assert (cfg.m, cfg.learn, cfg.weights) == (32, "sampler", "auto")
+
+
+def test_the_paper_s_settings():
+    cfg = compose(["experiment=classification_paper"])
+    assert (cfg.sampler.tau_min, cfg.sampler.alpha) == (0.1, 30.0)
+    assert cfg.optimizer.optimizer.lr == 5e-4
+    assert cfg.optimizer.schedule.end_lr == 1e-5
+    assert cfg.trainer.max_epochs == 250
+    assert cfg.names.dataset == "modelnet40"
+    assert cfg.val_fraction == 0
+
+
+def test_the_rivals_settings():
+    cfg = compose(["experiment=classification_snet", "sampler=samplenet"])
+    assert (cfg.sampler.k, cfg.sampler.beta, cfg.sampler.alpha, cfg.sampler.sigma_min) == (
+        7,
+        1,
+        30,
+        0,
+    )
+    assert (cfg.sampler.coverage, cfg.sampler.coverage_per_point) == (1, 0)
+    assert cfg.optimizer.optimizer.lr == 0.01
+    assert cfg.optimizer.schedule.every * cfg.batch_size == 600_000
+    assert (cfg.trainer.max_epochs, cfg.val_fraction) == (500, 0)
+    cfg = compose(["sampler=snet"])
+    assert (cfg.optimizer.optimizer.lr, cfg.pretrain.optimizer.optimizer.lr) == (0.01, 0.001)
+    assert compose(["sampler=snet", "learn=joint"]).optimizer.optimizer.lr == 0.001
+    assert compose(["sampler=snet", "optimizer=exponential"]).optimizer.optimizer.lr == 5e-4
+    assert compose(["sampler=fmops"]).optimizer.optimizer.lr == 0.001
+    cfg = compose(["sampler=snet_progressive"])
+    assert (cfg.sampler.m_max, cfg.sampler.least, cfg.sampler.over_sizes) == (1024, 2, "sum")
+    assert (cfg.sampler.coverage, cfg.sampler.coverage_per_point) == (0.5, pytest.approx(1 / 30))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["m=0"], "m must be a whole number of at least 1, got 0"),
+        (["m=2.5"], "m must be a whole number"),
+        (["m=2000"], r"m must be at most dataset.n_points=1024, got m=2000"),
+        (
+            ["sampler=fmops", "sampler.prefixes=1.5"],
+            "sampler.prefixes must be a whole number, got 1.5",
+        ),
+        (
+            ["sampler=fmops", "sampler.m_max=0"],
+            "sampler.m_max must be a whole number of at least 1",
+        ),
+        (["sampler=samplenet", "sampler.k=null"], "sampler.k must be a whole number, got None"),
+        (["sampler=snet", "sampler.head_channels=[a]"], "must be a list of whole numbers, got"),
+        (["sizes=[8,x]"], "sizes must be auto or a list of whole numbers"),
+        (["weights=run"], "weights=run means the run named by evaluate"),
+        (["learn=smapler"], "Did you mean 'sampler'"),
+        (["+sampler.alhpa=3"], "Did you mean 'alpha'"),
+        (["+bacth_size=3"], "Did you mean 'batch_size'"),
+        (["+dataset.clases=[a]"], "Did you mean 'classes'"),
+        (["epochs.task=0"], "pretrain.max_epochs must be a whole number"),
+        (["batch_size=1"], "batch_size must be a whole number of at least 2"),
+        (["trainer.devices=0"], "trainer.devices must be a number of devices"),
+        (["trainer.devices=[]"], "trainer.devices must be a number of devices"),
+        (["trainer=cpu", "trainer.devices=-1"], "trainer.devices=-1 means all GPUs"),
+        (["trainer=ddp", "trainer.num_nodes=0"], "trainer.num_nodes must be a number of hosts"),
+        (["trainer=ddp", "trainer.strategy=fsdp"], "trainer.strategy: several devices work with"),
+        (["trainer=ddp", "+trainer.sync_batchnorm=true"], "trainer.sync_batchnorm: cannot be"),
+        (["sampler.alpha=abc"], r"sampler\.alpha must be a number, got 'abc'"),
+        (["optimizer.optimizer.lr=abc"], r"optimizer\.lr must be a number, got 'abc'"),
+        (["dataset=meshes", "dataset.root=x", "dataset.skip_broken=maybe"], "true or false"),
+        (["~pretrain"], "pretrain cannot be removed"),
+        (["dataset.n_points=abc"], r"dataset\.n_points must be a whole number"),
+        (["trainer.max_epochs=0"], "trainer.max_epochs must be a whole number"),
+        (["val_fraction=1.0"], r"val_fraction must be in \[0, 1\)"),
+        (["dataset=meshes"], "dataset.root must be set"),
+        (["sampler._target_=mops_lightning.samplers.mops.MOPSNett"], "cannot import"),
+    ],
+)
+def test_mistakes_are_named_before_any_work(overrides, said):
+    with pytest.raises(UserError, match=said):
+        check(compose(overrides))
+
+
+def test_build_passes_a_user_error_on_unwrapped():
+    with pytest.raises(UserError, match=r"sampler\.tau_min"):
+        build(compose(["sampler.tau_min=0"]).sampler)

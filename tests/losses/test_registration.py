@@ -1,0 +1,79 @@
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from mops_lightning.losses.registration import (
+    frobenius_chamfer_loss,
+    frobenius_distance,
+    quaternion_distance,
+    quaternion_loss,
+)
+from mops_lightning.ops.rigid import Motion, rotation_angle
+
+
+def quaternions(seed, number=50):
+    drawn = Rotation.random(number, random_state=seed).as_quat()
+    return torch.from_numpy(np.roll(drawn, 1, axis=1).copy())
+
+
+def test_quaternion_distance_is_the_smaller_of_both_signs():
+    a, b = quaternions(1), quaternions(2)
+    plain = torch.minimum((a - b).norm(dim=1), (a + b).norm(dim=1)).mean()
+    torch.testing.assert_close(quaternion_distance(a, b), plain)
+    torch.testing.assert_close(quaternion_distance(-a, b), plain)
+    angle = rotation_angle(a, b)
+    torch.testing.assert_close(quaternion_distance(a, b), (2 * (angle / 4).sin()).mean())
+
+
+def test_quaternion_distance_has_gradients_towards_the_nearer_sign():
+    true = quaternions(3)
+    predicted = (-true + 1e-2).requires_grad_()
+    (gradient,) = torch.autograd.grad(quaternion_distance(predicted, true), predicted)
+    assert ((predicted - gradient + true).norm(dim=1) < (predicted + true).norm(dim=1)).all()
+    same = true.clone().requires_grad_()
+    assert torch.isfinite(torch.autograd.grad(quaternion_distance(same, true), same)[0]).all()
+
+
+def test_frobenius_distance_is_the_matrix_norm():
+    a, b = quaternions(1), quaternions(2)
+    relative = [
+        np.square(one.as_matrix() - np.eye(3)).sum()
+        for one in Rotation.from_quat(np.roll(a.numpy(), -1, 1))
+        * Rotation.from_quat(np.roll(b.numpy(), -1, 1)).inv()
+    ]
+    torch.testing.assert_close(frobenius_distance(a, b).item(), float(np.mean(relative)))
+
+
+@pytest.mark.parametrize("loss", [quaternion_loss, frobenius_chamfer_loss])
+def test_losses_vanish_at_the_true_motion_only(loss, rng):
+    source = torch.randn(50, 30, 3, dtype=torch.float64, generator=rng)
+    true = Motion(quaternions(1), torch.randn(50, 3, dtype=torch.float64, generator=rng))
+    target = Motion(true.quaternion, true.translation).apply(source)
+    assert sum(loss(true, true, source, target).values()) < 1e-12
+    other = Motion(quaternions(2), true.translation)
+    assert sum(loss(other, true, source, target).values()) > 0.1
+    shifted = Motion(true.quaternion, true.translation + 1)
+    assert sum(loss(shifted, true, source, target).values()) > 0.1
+
+
+def test_weights_of_the_terms():
+    true, other = (
+        Motion(quaternions(1), torch.zeros(50, 3)),
+        Motion(quaternions(1), torch.ones(50, 3)),
+    )
+    cloud = torch.zeros(50, 4, 3).double()
+    one, two = (
+        quaternion_loss(other, true, cloud, cloud, translation_weight=w)["translation"]
+        for w in (1.0, 2.0)
+    )
+    torch.testing.assert_close(one, torch.tensor(3.0).sqrt())
+    torch.testing.assert_close(two, 2 * one)
+    one, two = (
+        frobenius_chamfer_loss(
+            other._replace(translation=other.translation.double()), true, cloud, cloud, w
+        )["chamfer"]
+        for w in (1.0, 2.0)
+    )
+    torch.testing.assert_close(one, torch.tensor(6.0).double())
+    torch.testing.assert_close(two, 2 * one)

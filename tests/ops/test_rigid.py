@@ -1,0 +1,123 @@
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from mops_lightning.ops.rigid import (
+    Motion,
+    identity_motion,
+    quaternion_conjugate,
+    quaternion_from_euler,
+    quaternion_from_matrix,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    random_motion,
+    rotation_angle,
+)
+from mops_lightning.seeding import generator
+
+
+def rotations(number=200, seed=0):
+    """Random rotations, and those at which formulas break: none, tiny, half turns and almost."""
+    axes = np.concatenate([np.eye(3), np.random.default_rng(seed).normal(size=(7, 3))])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    angles = (0.0, 1e-12, 1e-7, 1e-3, np.pi / 2, np.pi - 1e-7, np.pi)
+    special = Rotation.from_rotvec(np.concatenate([axes * angle for angle in angles]))
+    return Rotation.concatenate([Rotation.random(number, random_state=seed), special])
+
+
+def quaternions(rotation):
+    return torch.from_numpy(np.roll(rotation.as_quat(), 1, axis=-1).copy())  # scipy: scalar last
+
+
+def same_rotation(got, want, tolerance=1e-12):
+    sign = torch.where((got * want).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    torch.testing.assert_close(got * sign, want, atol=tolerance, rtol=0)
+
+
+def test_matrices_are_scipys():
+    given = rotations()
+    got = quaternion_to_matrix(quaternions(given))
+    torch.testing.assert_close(got, torch.from_numpy(given.as_matrix()), atol=1e-12, rtol=0)
+
+
+def test_quaternions_of_matrices_are_scipys():
+    given = rotations()
+    got = quaternion_from_matrix(torch.from_numpy(given.as_matrix()))
+    same_rotation(got, quaternions(given), 1e-8)
+    assert (got[:, 0] >= 0).all()
+
+
+def test_products_and_inverses_are_scipys():
+    first, second = rotations(seed=1), rotations(seed=2)
+    same_rotation(
+        quaternion_multiply(quaternions(first), quaternions(second)), quaternions(first * second)
+    )
+    same_rotation(quaternion_conjugate(quaternions(first)), quaternions(first.inv()))
+
+
+def test_euler_angles_are_about_fixed_axes_in_the_order_x_y_z():
+    angles = np.random.default_rng(3).uniform(-np.pi, np.pi, (100, 3))
+    want = Rotation.from_euler("xyz", angles)
+    same_rotation(quaternion_from_euler(torch.from_numpy(angles)), quaternions(want))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_angles_are_scipys_at_none_and_at_half_turns_too(dtype):
+    first, second = rotations(seed=1), rotations(seed=1)[::-1]
+    pairs = [(first, second), (first, first)]
+    for angle in (0.0, 1e-6, 1e-4, 1.0, np.pi - 1e-6, np.pi):
+        pairs.append((first, first * Rotation.from_rotvec([0, 0, angle])))
+    for a, b in pairs:
+        got = rotation_angle(quaternions(a).to(dtype), quaternions(b).to(dtype))
+        want = torch.from_numpy((a.inv() * b).magnitude()).to(dtype)
+        assert torch.isfinite(got).all()
+        tolerance = 1e-7 if dtype == torch.float64 else 2e-6
+        torch.testing.assert_close(got, want, atol=tolerance, rtol=0)
+
+
+def test_the_angle_does_not_mind_sign_or_length():
+    a, b = quaternions(rotations(seed=1)), quaternions(rotations(seed=2))
+    torch.testing.assert_close(rotation_angle(-3 * a, b), rotation_angle(a, b))
+
+
+def motion(seed, number=5):
+    return random_motion(180.0, 2.0, [generator(seed, i) for i in range(number)])
+
+
+def test_motions_compose_invert_and_keep_distances(rng):
+    points = torch.randn(5, 40, 3, generator=rng)
+    first, second = motion(1), motion(2)
+    torch.testing.assert_close(
+        second.after(first).apply(points), second.apply(first.apply(points)), atol=1e-5, rtol=0
+    )
+    torch.testing.assert_close(
+        first.inverse().apply(first.apply(points)), points, atol=1e-5, rtol=0
+    )
+    still = identity_motion(points)
+    torch.testing.assert_close(still.apply(points), points)
+    moved = first.apply(points)
+    torch.testing.assert_close(
+        (moved[:, 1:] - moved[:, :-1]).norm(dim=2), (points[:, 1:] - points[:, :-1]).norm(dim=2)
+    )
+
+
+def test_random_motions_stay_in_their_range_and_fill_it():
+    drawn = random_motion(45.0, 0.5, [generator(i) for i in range(2000)])
+    assert drawn.translation.abs().max() <= 0.5
+    assert drawn.translation.abs().max() > 0.49
+    angles = Rotation.from_quat(np.roll(drawn.quaternion.numpy(), -1, 1)).as_euler("xyz", True)
+    assert np.abs(angles).max() <= 45.001
+    assert (np.abs(angles).max(0) > 44).all()
+    # What answering "no motion" scores: about 42.8 degrees.
+    still = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    mean = torch.rad2deg(rotation_angle(drawn.quaternion, still.expand(2000, 4))).mean()
+    assert 41.5 < mean < 44
+
+
+def test_random_motions_hang_on_their_own_generator_only():
+    both = random_motion(45.0, 1.0, [generator(1), generator(2)])
+    alone = random_motion(45.0, 1.0, [generator(2)])
+    assert torch.equal(both.quaternion[1:], alone.quaternion)
+    assert torch.equal(both.translation[1:], alone.translation)
+    assert isinstance(both, Motion)

@@ -1,0 +1,88 @@
+from io import StringIO
+from pathlib import Path
+
+from rich.console import Console
+
+from mops_lightning.records.summary import closing_lines, readout_rows
+from tests.records.test_run_record import record
+
+NAMES = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": "mops"}
+
+
+def printed(metrics, score, shown=(), **config):
+    console = Console(width=80, record=True, file=StringIO())
+    config = {"m": 32, "learn": "sampler", "names": NAMES, **config}
+    notes = {"score": score, "shown": list(shown)}
+    closing_lines(Path("run"), record(config=config, metrics=metrics, notes=notes), console)
+    return console.export_text()
+
+
+def cells(text):
+    lines = [line for line in text.splitlines() if line.startswith(("│", "┃"))]
+    return [[cell.strip() for cell in line[1:-1].replace("┃", "│").split("│")] for line in lines]
+
+
+def test_one_size_is_shown_by_metric():
+    metrics = {
+        "test/generated/accuracy": 0.5,
+        "test/generated/subset_distance": 0.1,
+        "test/full/accuracy": 0.875,
+        "test/fps/accuracy": 0.25,
+        "test/matrix/nonzero_percent": 3.0,
+        "test/loss/cross_entropy": 1.0,
+    }
+    text = printed(metrics, "test/generated/accuracy")
+    assert "m=32" in text
+    assert cells(text) == [
+        ["sampled by", "accuracy (%)"],
+        ["fps", "25.00"],
+        ["mops generated", "50.00"],
+        ["all points", "87.50"],
+    ]
+
+
+def test_a_task_says_which_metrics_are_shown_and_in_which_order():
+    metrics = {f"test/{readout}/{name}": 1.5 for readout in ("generated", "full") for name in "abc"}
+    text = printed(metrics, "test/generated/c", ["c", "a"])
+    assert cells(text)[0] == ["sampled by", "c", "a"]
+
+
+def test_index_samplers_have_no_empty_rows():
+    metrics = {
+        "test/sampled/accuracy": 0.5,
+        "test/full/accuracy": 0.875,
+        "test/generated/subset_distance": 0.0,
+        "test/matched/unique_points": 32.0,
+    }
+    assert [row[0] for row in cells(printed(metrics, "test/sampled/accuracy"))] == [
+        "sampled by",
+        "mops sampled",
+        "all points",
+    ]
+
+
+def test_seven_sizes_fit_into_eighty_columns():
+    metrics = {"test/full/accuracy": 0.875, "test/full/mean_class_accuracy": 0.8}
+    sizes = (8, 16, 32, 64, 128, 256, 512)
+    for m in sizes:
+        metrics[f"test/m{m}/completed/accuracy"] = m / 1000
+        metrics[f"test/m{m}/completed/mean_class_accuracy"] = m / 2000
+    text = printed(metrics, "test/m32/generated/accuracy")
+    assert "accuracy (%)" in text
+    assert cells(text) == [
+        ["sampled by", *(f"m={m}" for m in sizes)],
+        ["mops completed", *(f"{m / 10:.2f}" for m in sizes)],
+        ["all points", *["87.50"] * 7],
+    ]
+
+
+def test_a_task_net_alone_has_no_size():
+    text = printed({"test/full/accuracy": 0.5}, "test/full/accuracy", learn="task")
+    assert "all points, test" in text
+    assert "m=32" not in text
+
+
+def test_rows_come_baselines_first_full_clouds_last():
+    names = ("full", "matched", "fps", "generated", "random")
+    rows = readout_rows({f"test/{name}/accuracy": 0.5 for name in names})
+    assert list(rows) == ["fps", "random", "generated", "matched", "full"]

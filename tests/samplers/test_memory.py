@@ -1,0 +1,92 @@
+"""4,096 of 40,960 points fit into 1 GB (paper section "Complexity Analysis"); more in chunks."""
+
+import subprocess
+import sys
+
+import pytest
+
+PEAK = """
+import re
+import sys
+from pathlib import Path
+
+import torch
+
+torch.manual_seed(0)
+torch.set_num_threads(1)
+
+
+def status(name):
+    text = Path("/proc/self/status").read_text()
+    return int(re.search(name + ":[^0-9]*([0-9]+)", text)[1]) * 1024
+
+
+def forget_peak():  # getrusage would know that of the process that started this one, too
+    Path("/proc/self/clear_refs").write_text("5")
+"""
+
+LARGE = """
+from mops_lightning.nets.foldingnet import MFoldingNet
+from mops_lightning.ops.readout import complete, match
+from mops_lightning.samplers.mops import MOPSNet
+
+training = sys.argv[1] == "training"
+sampler = MOPSNet(4096, alpha=0.2, tau_min=0.5).train(training)
+forget_peak()
+before = status("VmRSS")
+net = MFoldingNet(40960, pieces=128, codeword=2048).eval().requires_grad_(False)
+points = torch.rand(1, 40960, 3)
+with torch.set_grad_enabled(training):
+    sample = sampler(points)
+    built = net(sample.points)
+    if training:
+        (built.square().mean() + sum(sample.losses.values())).backward()
+        assert all(p.grad.isfinite().all() for p in sampler.parameters())
+    else:
+        complete(match(sample.points, points), points)
+print(status("VmHWM") - before)
+"""
+
+IN_CHUNKS = """
+import numpy as np
+
+from mops_lightning.downsample.large import by_chunks
+from mops_lightning.samplers.mops import MOPSNet
+
+sampler = MOPSNet(16, feature_channels=(8, 8), rho_channels=(8, 8)).eval()
+sizes, peaks = (200_000, 4_000_000), []
+for number in sizes:
+    path = Path(sys.argv[1]) / f"{number}.npy"
+    file = np.lib.format.open_memmap(path, "w+", np.float32, (number, 3))
+    for start in range(0, number, 100_000):
+        file[start : start + 100_000] = np.random.default_rng(start).random((100_000, 3))
+        file.flush()
+    del file
+for number in sizes:
+    path = Path(sys.argv[1]) / f"{number}.npy"
+    forget_peak()
+    by_chunks(path, sampler, 16, 20_000, "matched", False)
+    peaks.append(status("VmHWM"))
+print(peaks[1] - peaks[0])
+"""
+
+
+def measured(script: str, argument: str) -> int:
+    """Return the number of bytes that a script prints, run in a process of its own."""
+    command = [sys.executable, "-c", PEAK + script, argument]
+    return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux", reason="memory is measured as Linux counts it"
+)
+
+
+@pytest.mark.parametrize("phase", ["training", "test"])
+def test_large_clouds_fit_into_a_gigabyte_above_the_interpreter(phase):
+    assert 5e7 < measured(LARGE, phase) < 1e9, "less would mean that nothing was measured"
+
+
+def test_memory_does_not_grow_with_a_file_that_is_read_in_chunks(tmp_path):
+    # The allocator alone makes up to 10 MB of difference.
+    assert measured(IN_CHUNKS, str(tmp_path)) < 20e6, "the larger file has 45 MB more"

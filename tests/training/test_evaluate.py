@@ -1,0 +1,220 @@
+import json
+
+import pytest
+
+from mops_lightning.config.validate import compose
+from mops_lightning.errors import UserError
+from mops_lightning.training.evaluate import command_line
+from mops_lightning.training.run import run
+
+TINY = [
+    "trainer=cpu",
+    "trainer.max_epochs=1",
+    "epochs.task=1",
+    "dataset.train_per_class=4",
+    "dataset.test_per_class=3",
+    "dataset.n_points=64",
+    "dataset.classes=[chair,vase,lamp]",
+    "batch_size=4",
+    "m=8",
+    "pictures=0",
+    "logger=none",
+]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A small FMOPS-Net run: its folder, its record and its cache."""
+    folder = tmp_path_factory.mktemp("evaluate")
+    overrides = [*TINY, "sampler=fmops", "sampler.m_max=32", f"cache={folder}/cache"]
+    return folder / "run", run(compose(overrides), folder / "run", overrides)
+
+
+def evaluated(trained, tmp_path, *arguments):
+    chosen = command_line([f"evaluate={trained[0]}", "pictures=0", "logger=none", *arguments])
+    return run(compose(chosen), tmp_path / "new", chosen)
+
+
+def test_the_run_s_own_figures_come_again(trained, tmp_path):
+    folder, record = trained
+    again = evaluated(trained, tmp_path)
+    assert again["metrics"] == record["metrics"]
+    assert again["notes"]["evaluated"]["run"] == str(folder)
+    assert again["notes"]["task_weights_sha256"] == record["notes"]["task_weights_sha256"]
+    assert "fit" not in again["seconds"]
+    assert again["config"]["learn"] == "nothing"
+    assert not (tmp_path / "new" / "weights.pt").exists()
+
+
+def test_other_sizes_and_other_data(trained, tmp_path):
+    record = evaluated(trained, tmp_path, "sizes=[5,20]", "dataset.n_points=100")
+    sizes = {name.split("/")[1] for name in record["metrics"] if name.endswith("matched/accuracy")}
+    assert sizes == {"m5", "m8", "m20"}
+    assert record["config"]["dataset"]["n_points"] == 100
+    assert record["config"]["dataset"]["classes"] == ["chair", "vase", "lamp"]
+
+
+def test_noise_is_added_to_test_clouds_alone(trained, tmp_path):
+    _, record = trained
+    noisy = evaluated(trained, tmp_path, "noise=0.5")
+    key = "test/m8/generated/subset_distance"
+    assert noisy["metrics"][key] != record["metrics"][key]
+    for note in ("dataset_fingerprint", "task_weights_sha256"):
+        assert noisy["notes"][note] == record["notes"][note]
+
+
+def test_another_task_net(trained, tmp_path):
+    overrides = [*TINY, "learn=task", "seed=5", "dataset.seed=0"]
+    run(compose(overrides), tmp_path / "task", overrides)
+    record = evaluated(trained, tmp_path, f"weights={tmp_path}/task/weights.pt")
+    ours = trained[1]["notes"]["task_weights_sha256"]
+    assert record["notes"]["task_weights_sha256"] not in (None, ours)
+
+
+def test_joint_runs_bring_their_task_net(tmp_path):
+    overrides = [*TINY, "learn=joint", f"cache={tmp_path}/cache"]
+    record = run(compose(overrides), tmp_path / "run", overrides)
+    again = evaluated((tmp_path / "run", record), tmp_path)
+    assert again["metrics"] == record["metrics"]
+
+
+@pytest.mark.parametrize(
+    ("argument", "named"),
+    [
+        ("sampler.tau_min=0.2", "sampler.tau_min is 0.2 here and was 0.1 when"),
+        ("sampler=mops", "trained with sampler=fmops, got sampler=mops"),
+        ("dataset.classes=[chair,vase]", "tells apart 3 classes .* those of the data .2."),
+        ("dataset.classes=[vase,chair,bed]", "classes that are not those of the data"),
+        ("learn=sampler", "trains nothing, got learn=sampler"),
+        ("sizes=[33]", "at most sampler.m_max=32"),
+        ("ckpt_path=last", "give evaluate=RUN"),
+    ],
+)
+def test_mismatches_are_refused(trained, tmp_path, argument, named):
+    with pytest.raises(UserError, match=named):
+        evaluated(trained, tmp_path, argument)
+
+
+def test_a_task_net_of_other_classes_is_refused_wherever_it_is_given(tmp_path):
+    overrides = [*TINY, "learn=task"]
+    run(compose(overrides), tmp_path / "task", overrides)
+    swapped = [*TINY, "sampler=fps", f"weights={tmp_path}/task/weights.pt"]
+    swapped.append("dataset.classes=[vase,chair,bed]")
+    with pytest.raises(UserError, match="classes that are not those of the data"):
+        run(compose(swapped), tmp_path / "new", swapped)
+
+
+def test_what_cannot_be_evaluated_is_refused(trained, tmp_path):
+    with pytest.raises(UserError, match="no folder"):
+        command_line([f"evaluate={tmp_path}/none"])
+    record = dict(trained[1])
+    path = tmp_path / "result.json"
+    for change, named in (
+        ({"status": "interrupted"}, "is interrupted, not completed"),
+        ({"files": {}}, "trained nothing"),
+    ):
+        path.write_text(json.dumps({**record, **change}))
+        with pytest.raises(UserError, match=named):
+            command_line([f"evaluate={tmp_path}"])
+    untrained = [*TINY, "learn=nothing", f"cache={trained[0].parent}/cache"]
+    with pytest.raises(UserError, match="give its run with evaluate=RUN"):
+        run(compose(untrained), tmp_path / "new", untrained)
+
+
+def test_a_task_net_alone_is_tested_on_other_data(tmp_path):
+    overrides = [*TINY, "task=reconstruction", "task/net=mfoldingnet", "learn=task"]
+    overrides += ["+task.net.fold_channels=[16,8]"]
+    made = run(compose(overrides), tmp_path / "made", overrides)
+    folder = (tmp_path / "made", made)
+    again = evaluated(folder, tmp_path / "same")
+    assert again["metrics"] == made["metrics"]
+    assert "fit" not in again["seconds"]
+    assert not (tmp_path / "same" / "new" / "weights.pt").exists()
+    more = evaluated(folder, tmp_path / "more", "dataset.n_points=90", "noise=0.01")
+    assert more["config"]["task"]["net"]["n_points"] == 90
+    assert more["score"] != made["score"]
+    with pytest.raises(UserError, match="is a task net itself; leave weights out"):
+        evaluated(folder, tmp_path / "a", "weights=null")
+    with pytest.raises(UserError, match=r"made with learn=task.*weights=.*/weights.pt"):
+        evaluated(folder, tmp_path / "b", "learn=nothing")
+
+
+def test_an_auto_encoder_says_why_it_does_not_fit_more_points(tmp_path):
+    overrides = [*TINY, "task=reconstruction", "sampler=mops", f"cache={tmp_path}/cache"]
+    made = run(compose(overrides), tmp_path / "made", overrides)
+    with pytest.raises(UserError, match=r"task.net.n_points is 90 here and was 64"):
+        evaluated((tmp_path / "made", made), tmp_path, "dataset.n_points=90")
+
+
+def overrides_after(trained, *arguments):
+    return [a for a in command_line(list(arguments)) if not a.startswith("evaluate=")]
+
+
+def test_flags_may_stand_before_or_behind(trained):
+    folder, _ = trained
+    assert overrides_after(trained, "-m", "m=4,8", f"evaluate={folder}")[:2] == ["-m", "m=4,8"]
+    assert overrides_after(trained, "--cfg", "job", f"evaluate={folder}")[:2] == ["--cfg", "job"]
+    assert overrides_after(trained, f"evaluate={folder}", "m=4", "-m")[-2:] == ["m=4", "-m"]
+
+
+def test_naming_what_the_run_has_changes_nothing(trained):
+    folder, _ = trained
+    plain = set(overrides_after(trained, f"evaluate={folder}"))
+    named = overrides_after(trained, f"evaluate={folder}", "dataset=shapes", "sampler=fmops")
+    assert set(named) == plain
+    assert len(named) == len(plain)
+    other = overrides_after(trained, f"evaluate={folder}", "dataset=meshes")
+    assert "dataset=meshes" in other
+    assert not any(a.startswith(("dataset.", "dataset=shapes")) for a in other)
+
+
+def test_the_run_may_be_named_in_several_ways(trained, tmp_path):
+    folder, _ = trained
+    first = command_line([f"evaluate={folder}"])
+    for name in (f"evaluate='{folder}'", f"+evaluate={folder}", f"evaluate={folder}/"):
+        assert command_line([name]) == first
+    strange = tmp_path / "it's (1), a run"
+    strange.symlink_to(folder)
+    assert compose(command_line([f"evaluate={strange}"])).evaluate == str(strange)
+    with pytest.raises(UserError, match="takes one run"):
+        command_line([f"evaluate={folder},{folder}"])
+
+
+def test_data_that_are_not_here_are_asked_for(trained, tmp_path):
+    record = {**trained[1], "overrides": ["dataset=meshes", "dataset.root=meshes"]}
+    (tmp_path / "result.json").write_text(json.dumps(record))
+    with pytest.raises(
+        UserError, match=r"had its data in dataset\.root=meshes, which is not there"
+    ):
+        command_line([f"evaluate={tmp_path}"])
+    assert "dataset.root=." in command_line([f"evaluate={tmp_path}", "dataset.root=."])
+
+
+def test_a_task_net_of_other_classes_and_their_data(trained, tmp_path):
+    folder, _ = trained
+    classes = "dataset.classes=[bed,vase]"
+    record = evaluated(trained, tmp_path, classes, "weights=auto", f"cache={folder.parent}/cache")
+    assert record["notes"]["class_names"] == ["bed", "vase"]
+
+
+def test_a_lost_sampler_is_named(trained, tmp_path):
+    record = trained[1]
+    (tmp_path / "result.json").write_text(json.dumps(record))
+    with pytest.raises(UserError, match=r"evaluate: the sampler of .* cannot be had"):
+        evaluated((tmp_path, record), tmp_path, "weights=null")
+
+
+def test_other_command_lines_are_left_alone():
+    assert command_line(["m=8", "evaluate=null"]) == ["m=8", "evaluate=null"]
+    assert command_line(["--help"]) == ["--help"]
+
+
+def test_another_net_or_loss_takes_the_place_of_all_its_settings(tmp_path):
+    overrides = [*TINY, "task=registration", "task.net.iterations=2", f"cache={tmp_path}/cache"]
+    overrides += ["sampler=mops", "task/loss=frobenius_chamfer", "task.loss.chamfer_weight=0.5"]
+    run(compose(overrides), tmp_path / "run", overrides)
+    for other in (["task/net=icp"], ["task/loss=quaternion"]):
+        chosen = command_line([f"evaluate={tmp_path}/run", "pictures=0", "logger=none", *other])
+        cfg = compose(chosen)
+        record = run(cfg, tmp_path / other[0].replace("/", "-"), chosen)
+        assert record["status"] == "completed"

@@ -1,0 +1,158 @@
+import copy
+
+import pytest
+import torch
+
+from mops_lightning.data.loader import CloudLoader
+from mops_lightning.errors import UserError
+from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.random import RandomSampler
+from mops_lightning.samplers.voxel import VoxelSampler
+from mops_lightning.tasks.classification import Classification
+from mops_lightning.training.experiment import Experiment
+from tests.conftest import quiet_trainer, small_dataset
+
+
+def experiment(learn="sampler", sampler=True, **extra):
+    torch.manual_seed(0)
+    net = MOPSNet(8, feature_channels=(8, 8), rho_channels=(16, 8)) if sampler is True else sampler
+    return Experiment(
+        Classification(PointNetVanilla(3), 3),
+        net,
+        learn=learn,
+        make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
+        baselines={"random": RandomSampler(8), "fps": FPSSampler(8)},
+        **extra,
+    )
+
+
+def fit(module, epochs=2):
+    data = small_dataset()
+    quiet_trainer(epochs).fit(
+        module,
+        CloudLoader(data.train, 6, shuffle=True, drop_last=True),
+        CloudLoader(data.test, 6),
+    )
+    return module
+
+
+def changed(before, module):
+    after = module.state_dict()
+    return {name for name in before if not torch.equal(before[name], after[name])}
+
+
+def state(module):
+    return copy.deepcopy(module.state_dict())
+
+
+def test_learning_the_sampler_leaves_the_task_bit_identical():
+    module = experiment("sampler")
+    before = state(module)
+    names = changed(before, fit(module))
+    assert names
+    # Running statistics are part of the state, so BatchNorm drift would show here.
+    assert all(name.startswith("sampler.") for name in names)
+    assert {"sampler.queries.weight", "sampler.rho_first.0.running_mean"} <= names
+
+
+@pytest.mark.parametrize(("learn", "rates"), [("joint", [1e-2, 1e-3]), ("sampler", [1e-2])])
+def test_a_jointly_trained_task_net_may_learn_more_slowly(learn, rates):
+    module = fit(experiment(learn, task_rate=0.1), epochs=1)
+    groups = module.optimizers().param_groups
+    assert [group["lr"] for group in groups] == pytest.approx(rates)
+    parts = (module.sampler, module.task)[: len(rates)]
+    for group, part in zip(groups, parts, strict=True):
+        assert {id(p) for p in group["params"]} == {id(p) for p in part.parameters()}
+
+
+def test_learning_jointly_changes_both():
+    module = experiment("joint")
+    before = state(module)
+    names = changed(before, fit(module))
+    assert any(name.startswith("sampler.") for name in names)
+    assert {"task.net.pool.linear.weight", "task.net.pool.norm.running_var"} <= names
+
+
+def test_learning_the_task_needs_no_sampler_and_changes_every_layer():
+    module = experiment("task", sampler=None)
+    before = state(module)
+    names = changed(before, fit(module))
+    assert {f"task.{name}" for name, _ in module.task.named_parameters()} <= names
+
+
+def test_frozen_parts_stay_in_evaluation_mode_whatever_is_asked():
+    module = experiment("sampler").train()
+    assert not any(m.training for m in module.task.modules())
+    assert module.sampler.training
+    assert not any(p.requires_grad for p in module.task.parameters())
+
+
+def test_test_scores_every_readout_and_the_whole_set():
+    data = small_dataset()
+    run = quiet_trainer(2)
+    run.test(experiment(), CloudLoader(data.test, 4), verbose=False)
+    metrics = run.callback_metrics
+    for readout in ("generated", "matched", "completed", "random", "fps", "full"):
+        assert 0 <= metrics[f"test/{readout}/accuracy"] <= 1
+        assert f"test/{readout}/mean_class_accuracy" in metrics
+    assert 1 <= metrics["test/matched/unique_points"] <= 8
+    assert metrics["test/generated/subset_distance"] >= 0
+    assert 0 <= metrics["test/matrix/nonzero_percent"] <= 100
+    assert metrics["test/matrix/orthogonality_error"] >= 0
+
+
+def test_scores_are_those_of_a_plain_loop():
+    data = small_dataset()
+    module = experiment().eval()
+    run = quiet_trainer(2)
+    run.test(module, CloudLoader(data.test, 4), verbose=False)
+    got = {name: value.item() for name, value in run.callback_metrics.items()}
+    module.eval()
+    per_class: list[list[bool]]
+    hits, full, per_class = 0, 0, [[], [], []]
+    with torch.no_grad():
+        for points, label in zip(data.test.points, data.test.labels, strict=True):
+            sampled = module.sampler(points[None]).points
+            hit = module.task.net(sampled).argmax().item() == label.item()
+            hits += hit
+            per_class[int(label)].append(hit)
+            full += module.task.net(points[None]).argmax().item() == label.item()
+    assert got["test/generated/accuracy"] == pytest.approx(hits / len(data.test.labels))
+    assert got["test/full/accuracy"] == pytest.approx(full / len(data.test.labels))
+    means = [sum(v) / len(v) for v in per_class]
+    assert got["test/generated/mean_class_accuracy"] == pytest.approx(sum(means) / 3)
+
+
+def test_an_index_sampler_has_one_readout():
+    data = small_dataset()
+    run = quiet_trainer(2)
+    module = experiment(sampler=RandomSampler(8))
+    assert not module.trainable
+    run.test(module, CloudLoader(data.test, 4), verbose=False)
+    assert run.callback_metrics["test/matched/unique_points"] == 8
+    assert "test/generated/accuracy" not in run.callback_metrics
+    assert "test/sampled/accuracy" in run.callback_metrics
+
+
+def test_an_unlearned_sampler_that_makes_points_has_three_readouts():
+    data = small_dataset()
+    run = quiet_trainer(2)
+    module = experiment(sampler=VoxelSampler(8, "centroid"))
+    run.test(module, CloudLoader(data.test, 4), verbose=False)
+    for readout in ("generated", "matched", "completed"):
+        assert f"test/{readout}/accuracy" in run.callback_metrics
+    assert run.callback_metrics["test/generated/subset_distance"] > 0
+
+
+def test_two_runs_of_one_seed_agree_exactly():
+    first, second = (fit(experiment("joint")).state_dict() for _ in range(2))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_unknown_learn_and_missing_sampler_are_named():
+    with pytest.raises(UserError, match="Did you mean 'sampler'"):
+        experiment("samplr")
+    with pytest.raises(UserError, match="needs a sampler"):
+        experiment("joint", sampler=None)

@@ -1,0 +1,55 @@
+"""Loggers other than TensorBoard."""
+
+import csv
+from importlib.util import find_spec
+
+import pytest
+
+from mops_lightning.config.validate import check, compose
+from mops_lightning.errors import UserError
+from mops_lightning.training.run import run
+from tests.training.test_evaluate import TINY
+
+CURVES = ["sampler=mops", "weights=null", "val_fraction=0.2", "trainer.log_every_n_steps=1"]
+
+
+def logged(tmp_path, *arguments):
+    plain = [one for one in TINY if not one.startswith("logger")]
+    overrides = [*plain, *CURVES, f"cache={tmp_path}/cache", *arguments]
+    return run(compose(overrides), tmp_path / "run", overrides)
+
+
+def test_csv(tmp_path):
+    record = logged(tmp_path, "logger=csv")
+    with (tmp_path / "run" / "csv" / "metrics.csv").open() as file:
+        values = [line["test/generated/accuracy"] for line in csv.DictReader(file)]
+    assert float(next(filter(None, values))) == pytest.approx(
+        record["metrics"]["test/generated/accuracy"]
+    )
+
+
+def test_mlflow_keeps_settings_and_curves_in_a_folder(tmp_path, monkeypatch):
+    mlflow = pytest.importorskip("mlflow", reason="the extra 'mlflow' is not installed")
+    monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
+    store = f"file:{tmp_path}/mlruns"
+    record = logged(tmp_path, "logger=mlflow", f"logger.tracking_uri={store}")
+    client = mlflow.MlflowClient(store)
+    (experiment,) = client.search_experiments(filter_string="name = 'mops_lightning'")
+    (found,) = client.search_runs([experiment.experiment_id])
+    assert found.data.params["sampler.tau_min"] == "0.1"
+    score = record["metrics"]["test/generated/accuracy"]
+    assert found.data.metrics["test/generated/accuracy"] == pytest.approx(score)
+    assert found.info.status == "FINISHED"
+
+
+@pytest.mark.parametrize("name", ["mlflow", "wandb"])
+def test_a_missing_package_is_named(name, tmp_path):
+    if find_spec(name):
+        pytest.skip(f"{name} is installed")
+    with pytest.raises(UserError, match=f"needs a package that is not here: .*{name}"):
+        logged(tmp_path, f"logger={name}")
+
+
+@pytest.mark.parametrize("name", ["csv", "mlflow", "none", "tensorboard", "wandb"])
+def test_every_logger_s_settings_fit_it(name):
+    check(compose([f"logger={name}"]))

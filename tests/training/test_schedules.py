@@ -1,0 +1,48 @@
+import pytest
+import torch
+
+from mops_lightning.errors import UserError
+from mops_lightning.training.schedules import exponential, one_cycle, step_decay
+
+
+def rates(make, steps, lr=1.0, **settings):
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=lr)
+    schedule = make(optimizer, steps, **settings)
+    seen = []
+    for _ in range(steps):
+        seen.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    return seen
+
+
+def test_exponential_runs_from_first_to_last_rate():
+    seen = rates(exponential, 101, lr=5e-4, end_lr=1e-5)
+    assert seen[0] == pytest.approx(5e-4)
+    assert seen[-1] == pytest.approx(1e-5)
+    assert seen[50] == pytest.approx((5e-4 * 1e-5) ** 0.5)
+
+
+def test_one_cycle_equals_torch_s_own():
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+    reference = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, max_lr=1.0, total_steps=51, pct_start=0.3, cycle_momentum=False
+    )
+    want = []
+    for _ in range(51):
+        want.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        if len(want) < 51:
+            reference.step()
+    seen = rates(one_cycle, 51, start_factor=1 / 25, end_factor=1 / 25 / 1e4)
+    assert seen == pytest.approx(want)
+
+
+def test_step_decay_falls_in_steps_to_its_floor():
+    seen = rates(step_decay, 10, every=2, factor=0.5, floor_lr=0.2)
+    assert seen == pytest.approx([1, 1, 0.5, 0.5, 0.25, 0.25, 0.2, 0.2, 0.2, 0.2])
+
+
+def test_exponential_refuses_an_end_of_zero():
+    with pytest.raises(UserError, match="end_lr"):
+        rates(exponential, 3, end_lr=0.0)

@@ -1,0 +1,107 @@
+import pytest
+import torch
+
+from mops_lightning.data.loader import CloudLoader
+from mops_lightning.errors import UserError
+from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.poisson import PoissonSampler
+from mops_lightning.samplers.snet import ProgressiveSNet
+from mops_lightning.samplers.voxel import VoxelSampler
+from mops_lightning.tasks.classification import Classification
+from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.sizes import sizes_to_test
+from tests.conftest import quiet_trainer, small_dataset
+
+SEVEN = (1, 2, 3, 5, 8, 13, 20)
+
+
+def trained(sampler):
+    """A sampler after some steps, so that its running statistics are not those it began with."""
+    data = small_dataset()
+    torch.manual_seed(0)
+    module = Experiment(
+        Classification(PointNetVanilla(3), 3),
+        sampler,
+        make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
+    )
+    loader = CloudLoader(data.test, 6)
+    quiet_trainer(2).fit(module, CloudLoader(data.train, 6, shuffle=True, drop_last=True), loader)
+    return module
+
+
+def metrics_of(module, sizes, m=None, baselines=None):
+    fresh = Experiment(
+        module.task, module.sampler, "nothing", sizes=sizes, m=m, baselines=baselines
+    )
+    trainer = quiet_trainer(1)
+    trainer.test(fresh, CloudLoader(small_dataset().test, 4), verbose=False)
+    return {name: float(value) for name, value in trainer.callback_metrics.items()}
+
+
+def fmops():
+    torch.manual_seed(0)
+    return FMOPSNet(20, feature_channels=(8, 8), rho_channels=(16, 8))
+
+
+def progressive():
+    torch.manual_seed(0)
+    return ProgressiveSNet(20, feature_channels=(8, 8), head_channels=(16,))
+
+
+@pytest.mark.parametrize("make", [fmops, progressive])
+def test_seven_sizes_at_once_equal_seven_tests(make):
+    module = trained(make())
+
+    def baselines():
+        return {"fps": FPSSampler(20), "voxel": VoxelSampler(20), "poisson": PoissonSampler(20)}
+
+    together = metrics_of(module, SEVEN, baselines=baselines())
+    readouts = {"generated", "matched", "completed", "fps", "voxel", "poisson"}
+    for m in SEVEN:
+        alone = metrics_of(module, (m,), m, baselines())
+        scored = {name.split("/")[1] for name in alone if name.endswith("/accuracy")}
+        assert scored == {*readouts, "full"}
+        for name, value in alone.items():
+            within = name if "/full/" in name else name.replace("test/", f"test/m{m}/")
+            assert together[within] == pytest.approx(value, abs=1e-6), within
+
+
+def test_the_run_s_own_size_gives_its_score():
+    module = Experiment(Classification(PointNetVanilla(3), 3), fmops(), sizes=(5, 8), m=8)
+    assert module.score_name == "test/m8/generated/accuracy"
+    assert Experiment(module.task, fmops(), m=8).score_name == "test/generated/accuracy"
+
+
+@pytest.mark.parametrize(
+    ("sizes", "m", "sampler", "expected"),
+    [
+        ("auto", 32, FMOPSNet(512), (8, 16, 32, 64, 128, 256, 512)),
+        ("auto", 20, FMOPSNet(100), (8, 16, 20, 32, 64)),
+        ("auto", 32, MOPSNet(32), (32,)),
+        ("auto", 32, FPSSampler(32), (32,)),
+        ([64, 8], 32, FPSSampler(32), (8, 32, 64)),
+        ([64, 8, 8], 8, FMOPSNet(100), (8, 64)),
+        ([32], 32, MOPSNet(32), (32,)),
+        ("auto", 32, None, ()),
+    ],
+)
+def test_sizes_that_are_tested(sizes, m, sampler, expected):
+    assert sizes_to_test(sizes, m, sampler, 1024) == expected
+
+
+@pytest.mark.parametrize(
+    ("sizes", "m", "sampler", "named"),
+    [
+        ([8], 32, MOPSNet(32), r"returns 32 points only, got sizes=\[8\]"),
+        ([101], 32, FMOPSNet(100), r"at most sampler.m_max=100, .* got \[101\]"),
+        ([201], 32, FPSSampler(32), "from 1 to the 200 points"),
+        ("auto", 101, FMOPSNet(100), "m must be at most sampler.m_max=100, got m=101"),
+        ("auto", 32, FMOPSNet(512), "sampler.m_max must be at most the 200 points .* got 512"),
+    ],
+)
+def test_sizes_out_of_range_are_refused(sizes, m, sampler, named):
+    with pytest.raises(UserError, match=named):
+        sizes_to_test(sizes, m, sampler, 200)

@@ -1,0 +1,45 @@
+import matplotlib.image
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from mops_lightning.viz.clouds import COLOURS, cloud_grid, matrix_figure, save_figure
+
+
+def pixels(figure, tmp_path):
+    return matplotlib.image.imread(save_figure(figure, tmp_path / "figure.png"))[..., :3]
+
+
+def test_every_readout_is_drawn_in_its_colour(tmp_path, rng):
+    points = torch.rand(2, 300, 3, generator=rng)
+    readouts = dict.fromkeys(("generated", "matched", "completed"), points[:, :20])
+    figure = cloud_grid(points, readouts, ["chair", "vase"])
+    image = pixels(figure, tmp_path)
+    width = image.shape[1] // 4
+    for column, name in enumerate(readouts, start=1):
+        part = image[:, column * width : (column + 1) * width].reshape(-1, 3)
+        colour = np.array(COLOURS[name]) / 255
+        assert (np.abs(part - colour).max(1) < 0.02).sum() > 200
+    texts = {t.get_text() for axes in figure.axes for t in (*axes.texts, axes.title)}
+    assert {"chair", "vase", "input", "generated", "matched", "completed"} <= texts
+
+
+def test_an_ideal_matrix_is_drawn_as_a_diagonal():
+    dense = torch.zeros(30, 4)
+    dense[torch.tensor([11, 3, 20, 7]), torch.arange(4)] = 1.0
+    figure = matrix_figure(dense, dense.T @ dense, "chair")
+    left, right = (axes.images[0].get_array() for axes in figure.axes[:2])
+    rows = np.asarray(left).argmax(0)
+    assert (np.diff(rows) > 0).all()
+    np.testing.assert_array_equal(np.asarray(right), np.eye(4))
+
+
+def test_samples_lie_above_a_dense_cloud(tmp_path, rng):
+    """As many pixels show them as without the cloud."""
+    points = F.normalize(torch.randn(8192, 3, generator=rng), dim=1)
+    far = points[points[:, 0] < -0.3][:100]
+    shown = []
+    for cloud in (points, far):
+        image = pixels(cloud_grid(cloud[None], {"matched": far[None]}, [""]), tmp_path)
+        shown.append((np.abs(image - np.array(COLOURS["matched"]) / 255).max(2) < 0.02).sum())
+    assert shown[0] > 0.2 * shown[1]  # which is larger, for its frame is tighter

@@ -1,0 +1,61 @@
+import pytest
+import torch
+from torch import nn
+
+from mops_lightning.errors import UserError
+from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.zoo import weights
+
+
+@pytest.fixture
+def saved(tmp_path):
+    torch.manual_seed(0)
+    net = PointNetVanilla(4)
+    weights.save(tmp_path / "weights.pt", net, {"seed": 1}, {"accuracy": 0.5})
+    return net, tmp_path / "weights.pt"
+
+
+def test_round_trip_is_exact_and_carries_its_facts(saved):
+    net, path = saved
+    other = PointNetVanilla(4)
+    content = weights.load_into(other, path)
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(net.state_dict().values(), other.state_dict().values(), strict=True)
+    )
+    assert content["config"] == {"seed": 1}
+    assert content["metrics"] == {"accuracy": 0.5}
+    assert content["sha256"] == weights.digest(net.state_dict())
+
+
+def test_another_net_s_weights_are_refused_by_name(saved):
+    _, path = saved
+    with pytest.raises(UserError, match=r"another net's weights: head.7.weight is \(4, 256\)"):
+        weights.load_into(PointNetVanilla(5), path)
+    with pytest.raises(UserError, match=r"weight is missing.*is unknown"):
+        weights.load_into(nn.Linear(2, 2, bias=False), path)
+
+
+@pytest.mark.parametrize("cut", [0, 10, 1000])
+def test_truncated_files_are_refused(saved, cut):
+    _, path = saved
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(UserError, match="cannot be read"):
+        weights.load(path)
+
+
+def test_changed_tensors_are_noticed(saved):
+    _, path = saved
+    content = torch.load(path, weights_only=True)
+    content["state"]["head.0.weight"][0, 0] += 1
+    torch.save(content, path)
+    with pytest.raises(UserError, match="damaged"):
+        weights.load(path)
+
+
+def test_missing_files_and_lightning_checkpoints_are_refused(tmp_path):
+    with pytest.raises(UserError, match="no file"):
+        weights.load(tmp_path / "nowhere.pt")
+    torch.save({"state_dict": {}}, tmp_path / "last.ckpt")
+    with pytest.raises(UserError, match="ckpt_path"):
+        weights.load(tmp_path / "last.ckpt")
