@@ -13,10 +13,9 @@ from twins import PlainMOPS, plain_farthest_point_sample
 
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.ops.nearest import nearest_distances
-from mops_lightning.ops.points import farthest_point_sample, nearest
+from mops_lightning.ops.fps import farthest_point_sample
+from mops_lightning.ops.nearest import nearest, nearest_distances
 from mops_lightning.ops.sampling_matrix import attend
-from mops_lightning.samplers.folded import fold
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.random import RandomSampler
@@ -133,7 +132,7 @@ class Parts:
 
     def __init__(self, points: Tensor, m: int) -> None:
         self.points = points
-        self.net = fold(MOPSNet(m).eval())
+        self.net = MOPSNet(m).eval().fused()
         self.local = self.net.local_features(points)
         self.peak = self.local.amax(0)
         self.keys = self.net.keys(self.local, self.peak)

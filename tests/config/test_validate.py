@@ -127,7 +127,7 @@ def test_the_rivals_settings():
     assert compose(["sampler=snet", "optimizer=exponential"]).optimizer.optimizer.lr == 5e-4
     assert compose(["sampler=fmops"]).optimizer.optimizer.lr == 0.001
     cfg = compose(["sampler=snet_progressive"])
-    assert (cfg.sampler.m_max, cfg.sampler.least, cfg.sampler.over_sizes) == (1024, 2, "sum")
+    assert (cfg.sampler.m_max, cfg.sampler.min_size, cfg.sampler.size_reduction) == (1024, 2, "sum")
     assert (cfg.sampler.coverage, cfg.sampler.coverage_per_point) == (0.5, pytest.approx(1 / 30))
 
 
@@ -138,8 +138,8 @@ def test_the_rivals_settings():
         (["m=2.5"], "m must be a whole number"),
         (["m=2000"], r"m must be at most dataset.n_points=1024, got m=2000"),
         (
-            ["sampler=fmops", "sampler.prefixes=1.5"],
-            "sampler.prefixes must be a whole number, got 1.5",
+            ["sampler=fmops", "sampler.num_sizes=1.5"],
+            "sampler.num_sizes must be a whole number, got 1.5",
         ),
         (
             ["sampler=fmops", "sampler.m_max=0"],

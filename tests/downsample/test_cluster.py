@@ -69,8 +69,8 @@ def test_a_worker_that_is_killed_does_not_change_the_result(client, scan):
     engine, killed = engine_of(client), []
     whole, *_ = by_chunks(scan[0], scan[1], 24, 300, "matched", True, engine)
 
-    def killing(title, function, cloud, stretches, *common):
-        for done, result in enumerate(engine(title, function, cloud, stretches, *common)):
+    def killing(title, function, cloud, row_ranges, *common):
+        for done, result in enumerate(engine(title, function, cloud, row_ranges, *common)):
             if title in ("sampling", "matching") and done == 3:
                 pids = client.run(os.getpid)
                 os.kill(next(iter(pids.values())), signal.SIGKILL)
@@ -249,7 +249,7 @@ def test_any_stretch_of_a_file_can_be_read_alone(suffix, tmp_path):
     WRITERS[suffix](path, Table(points, {"intensity": np.arange(500, dtype=np.uint16)}))
     cloud = stored(path)
     assert cloud.number == 500
-    assert [len(rows) for rows in cloud.stretches(200)] == [200, 200, 100]
+    assert [len(rows) for rows in cloud.row_ranges(200)] == [200, 200, 100]
     whole = cloud.read(range(500))
     np.testing.assert_allclose(whole.points, points, atol=1e-6)
     for rows in (range(0, 3), range(200, 400), range(499, 500)):

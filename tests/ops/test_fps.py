@@ -4,9 +4,8 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from mops_lightning.ops import fps
-from mops_lightning.ops import points as geometry
-from mops_lightning.ops.points import farthest_point_fill, farthest_point_sample
+from mops_lightning.ops import fps, fps_cpu
+from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample
 
 KINDS = ["sphere", "normal", "grid", "line", "copies", "one point", "far away", "tiny", "huge"]
 
@@ -40,9 +39,9 @@ def both_ways(request, monkeypatch):
         results = []
         for special in (True, False):
             groups, table = (special and request.param == way for way in ("groups", "table"))
-            monkeypatch.setattr(geometry, "MANY_POINTS", 1 if groups else 10**9)
-            monkeypatch.setattr(geometry, "MANY_STEPS", 1)
-            monkeypatch.setattr(geometry, "FEW_POINTS", 10**9 if table else 0)
+            monkeypatch.setattr(fps, "MANY_POINTS", 1 if groups else 10**9)
+            monkeypatch.setattr(fps, "MANY_STEPS", 1)
+            monkeypatch.setattr(fps, "FEW_POINTS", 10**9 if table else 0)
             results.append(function(*arguments, **options))
         return results
 
@@ -89,9 +88,9 @@ def test_half_precision_is_searched_in_float32(rng, both_ways):
 
 
 def test_large_clouds_are_taken_by_groups(rng, monkeypatch):
-    points, m = torch.rand(1, geometry.MANY_POINTS, 3, generator=rng), geometry.MANY_STEPS
+    points, m = torch.rand(1, fps.MANY_POINTS, 3, generator=rng), fps.MANY_STEPS
     taken = farthest_point_sample(points, m, start=5)
-    monkeypatch.setattr(geometry, "MANY_STEPS", m + 1)
+    monkeypatch.setattr(fps, "MANY_STEPS", m + 1)
     assert torch.equal(taken, farthest_point_sample(points, m, start=5))
 
 
@@ -104,11 +103,11 @@ def test_few_small_clouds_are_taken_from_a_table(clouds, n, m, tables, rng, monk
 
     def counted(points, distances, steps):
         sizes.append(len(points))
-        return fps.take_farthest_by_table(points, distances, steps)
+        return fps_cpu.take_farthest_by_table(points, distances, steps)
 
-    monkeypatch.setattr(geometry, "take_farthest_by_table", counted)
+    monkeypatch.setattr(fps, "take_farthest_by_table", counted)
     points = torch.rand(clouds, n, 3, generator=rng)
     taken = farthest_point_sample(points, m)
     assert sizes == [n] * tables
-    monkeypatch.setattr(geometry, "FEW_POINTS", 0)
+    monkeypatch.setattr(fps, "FEW_POINTS", 0)
     assert torch.equal(taken, farthest_point_sample(points, m))

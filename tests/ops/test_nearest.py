@@ -4,9 +4,8 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from mops_lightning.ops import nearest as neighbours
-from mops_lightning.ops.nearest import nearest_distances
-from mops_lightning.ops.points import nearest
+from mops_lightning.ops import nearest as search
+from mops_lightning.ops.nearest import nearest, nearest_distances
 
 
 @pytest.fixture
@@ -18,9 +17,9 @@ def counted(monkeypatch):
         built.append(len(points))
         return KDTree(points)
 
-    KDTree = neighbours.cKDTree
-    monkeypatch.setattr(neighbours, "cKDTree", tree)
-    monkeypatch.setattr(neighbours, "MANY_PAIRS", 1)
+    KDTree = search.cKDTree
+    monkeypatch.setattr(search, "cKDTree", tree)
+    monkeypatch.setattr(search, "MANY_PAIRS", 1)
     return built
 
 
@@ -66,6 +65,6 @@ def test_coincident_points_are_near(rng, counted):
 
 
 def test_small_clouds_are_searched_as_before(rng, monkeypatch):
-    monkeypatch.setattr(neighbours, "cKDTree", None)
+    monkeypatch.setattr(search, "cKDTree", None)
     points = sphere(300, rng)
     assert torch.equal(nearest_distances(points, points), nearest(points, points)[0])

@@ -4,22 +4,18 @@ from scipy.spatial import cKDTree
 
 from mops_lightning.errors import UserError
 from mops_lightning.losses.subset import subset_loss
-from mops_lightning.ops import points as geometry
-from mops_lightning.ops.points import (
-    farthest_point_fill,
-    farthest_point_sample,
-    first_extreme,
-    gather_points,
-    nearest,
-    normalize_unit_sphere,
-)
+from mops_lightning.ops import extreme, nearest as search
+from mops_lightning.ops.extreme import blocked_argextreme
+from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample
+from mops_lightning.ops.nearest import nearest
+from mops_lightning.ops.points import gather_points, normalize_unit_sphere
 
 FLOATS = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
 
-@pytest.fixture(params=[0, geometry.FEW], ids=["in groups", "few"])
+@pytest.fixture(params=[0, extreme.FEW], ids=["in groups", "few"])
 def few(request, monkeypatch):
-    monkeypatch.setattr(geometry, "FEW", request.param)
+    monkeypatch.setattr(extreme, "FEW", request.param)
 
 
 BOTH = pytest.mark.usefixtures("few")
@@ -91,7 +87,7 @@ def test_nearest_in_blocks(block, rng, monkeypatch):
     queries = torch.randn(3, 11, 3, generator=rng)
     points = torch.randn(3, 40, 3, generator=rng)
     whole = nearest(queries, points)
-    monkeypatch.setitem(geometry.BLOCK, "cpu", block)
+    monkeypatch.setitem(search.BLOCK, "cpu", block)
     for part, expected in zip(nearest(queries, points), whole, strict=True):
         assert torch.equal(part, expected)
 
@@ -187,10 +183,10 @@ def test_fill_equals_the_double_loop(rng):
 @BOTH
 @pytest.mark.parametrize("largest", [True, False])
 def test_first_extreme_is_the_lowest_position(largest, rng):
-    values = torch.randint(0, 9, (50, 3 * geometry.GROUP), generator=rng).float()
+    values = torch.randint(0, 9, (50, 3 * extreme.GROUP), generator=rng).float()
     rows = values.tolist()
     expected = [row.index(max(row) if largest else min(row)) for row in rows]
-    assert first_extreme(values, largest).squeeze(1).tolist() == expected
+    assert blocked_argextreme(values, largest).squeeze(1).tolist() == expected
 
 
 def test_gather_points_equals_the_double_loop(rng):

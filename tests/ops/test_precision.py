@@ -10,7 +10,7 @@ from mops_lightning.config.validate import compose
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import FEW_POINTS, PointMaxPool, PointMLP
-from mops_lightning.ops.precision import full_precision, wide_layers_mixed
+from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
 from mops_lightning.ops.rigid import Motion
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.training.run import run
@@ -24,7 +24,7 @@ NETS = {
 
 
 def mixed(function, *arguments):
-    with torch.autocast("cpu", torch.bfloat16), wide_layers_mixed("cpu"):
+    with torch.autocast("cpu", torch.bfloat16), restrict_autocast_to_pointwise("cpu"):
         return function(*arguments)
 
 

@@ -53,16 +53,16 @@ def drawn(number, **settings):
 
 
 def test_sizes_are_drawn_as_described():
-    uniform = torch.tensor(drawn(4000, sizes_per_step="uniform")).flatten().double()
+    uniform = torch.tensor(drawn(4000, size_sampling="uniform")).flatten().double()
     assert (uniform.min(), uniform.max()) == (1, 512)
     assert uniform.mean() == pytest.approx(256.5, rel=0.03)
-    log = torch.tensor(drawn(4000, sizes_per_step="log_uniform")).flatten()
+    log = torch.tensor(drawn(4000, size_sampling="log_uniform")).flatten()
     assert log.min() == 1
     assert 500 <= log.max() <= 512
     # floor(513^u) is m with the probability log((m + 1) / m) / log 513.
     assert (log == 1).double().mean() == pytest.approx(0.1111, abs=0.02)
     assert (log <= 22).double().mean() == pytest.approx(0.5025, abs=0.03)
-    nested = drawn(300, prefixes=4)
+    nested = drawn(300, num_sizes=4)
     assert all(list(sizes) == sorted(set(sizes)) for sizes in nested)
     assert all(1 <= sizes[0] <= 4 and 107 <= sizes[-1] <= 512 for sizes in nested)
     # Two parts share the size at which one ends and the next begins.
@@ -76,14 +76,14 @@ def test_sizes_follow_the_seed():
 
 def test_all_sizes_of_tiny_nets_can_be_drawn():
     assert set(small(1).training_sizes()) == {1}
-    assert {size for _ in range(99) for size in small(3, prefixes=1).training_sizes()} <= {1, 2, 3}
+    assert {size for _ in range(99) for size in small(3, num_sizes=1).training_sizes()} <= {1, 2, 3}
 
 
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
-        ({"sizes_per_step": "nestd"}, "sampler.sizes_per_step: unknown 'nestd'.*nested"),
-        ({"prefixes": 0}, "sampler.prefixes must be at least 1, got 0"),
+        ({"size_sampling": "nestd"}, "sampler.size_sampling: unknown 'nestd'.*nested"),
+        ({"num_sizes": 0}, "sampler.num_sizes must be at least 1, got 0"),
         ({"tau_min": 0.0}, "sampler.tau_min must"),
     ],
 )

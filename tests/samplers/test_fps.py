@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import farthest_point_sample
+from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.ordering import seeded_order
 from tests.ops.test_points import plain_farthest

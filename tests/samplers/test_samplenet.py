@@ -5,7 +5,7 @@ import torch
 
 from mops_lightning.errors import UserError
 from mops_lightning.losses.subset import simplification_loss
-from mops_lightning.ops.points import k_nearest, nearest
+from mops_lightning.ops.nearest import k_nearest, nearest
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet, soft_projection
 
 

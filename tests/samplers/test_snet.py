@@ -89,7 +89,7 @@ def test_its_loss_is_weighted_and_there_in_training_only(rng):
 
 def test_progressive_sizes_are_the_powers_of_two():
     assert ProgressiveSNet().training_sizes() == (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
-    assert ProgressiveSNet(100, least=16).training_sizes() == (16, 32, 64, 100)
+    assert ProgressiveSNet(100, min_size=16).training_sizes() == (16, 32, 64, 100)
     assert ProgressiveSNet(1).training_sizes() == (1,)
 
 
@@ -114,7 +114,7 @@ def test_progressive_samples_are_nested_each_with_the_loss_of_its_size(rng):
         ({"feature_channels": (8,)}, "feature_channels must be sizes of at least 2 layers"),
         ({"head_channels": (0,)}, "head_channels must be .* each at least 1, got .0."),
         ({"least": 0}, "sampler.least must be at least 1, got 0"),
-        ({"over_sizes": "summ"}, "sampler.over_sizes: unknown 'summ'.*sum"),
+        ({"size_reduction": "summ"}, "sampler.size_reduction: unknown 'summ'.*sum"),
     ],
 )
 def test_wrong_settings_are_refused(settings, named):

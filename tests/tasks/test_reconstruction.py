@@ -3,10 +3,10 @@ import torch
 
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
-from mops_lightning.losses.subset import chamfer_distance
 from mops_lightning.metrics.reconstruction import Distances, MeanDistance, NormalizedError
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
+from mops_lightning.ops.chamfer import chamfer_distance
 from mops_lightning.ops.emd import earth_mover_distance
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet

@@ -129,7 +129,7 @@ LEARNED = {
     "fmops": lambda: FMOPSNet(16, **MOPS),
     "snet": lambda: SNet(8, **RIVAL),
     "samplenet": lambda: SampleNet(8, k=4, **RIVAL),
-    "snet_progressive": lambda: ProgressiveSNet(16, least=4, **RIVAL),
+    "snet_progressive": lambda: ProgressiveSNet(16, min_size=4, **RIVAL),
 }
 
 

@@ -68,7 +68,7 @@ def _job(cfg: "DictConfig") -> float | None:
         # Ended here, Hydra does not add lines of its own.
         _end(str(error), USER_ERROR)
     except Interrupted as stop:
-        if distributed.follows(cfg):
+        if distributed.is_worker_rank(cfg):
             sys.exit(INTERRUPTED)  # the first process says it for all
         # To Hydra, this is an error like any other.
         again = "The same command with hydra.sweep.dir={} goes on with the sweep."

@@ -17,16 +17,16 @@ STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true")
 """Those of Lightning's that start each process as this program."""
 
 
-def asked_for(cfg: DictConfig) -> bool:
+def is_distributed(cfg: DictConfig) -> bool:
     """Return whether the settings ask for more than one device or host."""
     devices = cfg.trainer.get("devices")
     one = len(devices) == 1 if OmegaConf.is_list(devices) else devices == 1
     return not (one and cfg.trainer.get("num_nodes", 1) == 1)
 
 
-def follows(cfg: DictConfig) -> bool:
+def is_worker_rank(cfg: DictConfig) -> bool:
     """Return whether this process is one of several and not the first of them."""
-    return asked_for(cfg) and any(_number(name) for name in RANKS)
+    return is_distributed(cfg) and any(_number(name) for name in RANKS)
 
 
 def check_start(cfg: DictConfig, hydra_overrides: Sequence[str]) -> None:
@@ -40,7 +40,7 @@ def check_start(cfg: DictConfig, hydra_overrides: Sequence[str]) -> None:
         UserError: the settings ask for one process, or every process would have its own folder.
     """
     number = _number("WORLD_SIZE")
-    if number > 1 and not asked_for(cfg):
+    if number > 1 and not is_distributed(cfg):
         raise UserError(
             f"{number} processes were started (WORLD_SIZE), but trainer.devices=1. Give "
             "trainer=ddp trainer.devices=N, as many as on this host, or start one process."
@@ -55,7 +55,7 @@ def check_start(cfg: DictConfig, hydra_overrides: Sequence[str]) -> None:
 
 def started_together(cfg: DictConfig) -> bool:
     """Return whether a launcher such as torchrun started all processes, not this program."""
-    return asked_for(cfg) and _number("WORLD_SIZE") + _number("SLURM_NTASKS") > 1
+    return is_distributed(cfg) and _number("WORLD_SIZE") + _number("SLURM_NTASKS") > 1
 
 
 def check(cfg: DictConfig) -> None:
@@ -85,7 +85,7 @@ def check(cfg: DictConfig) -> None:
             "step, each process over its share of the batch. Leave it out."
         )
     strategy = cfg.trainer.get("strategy", "auto")
-    if asked_for(cfg) and strategy not in STRATEGIES:
+    if is_distributed(cfg) and strategy not in STRATEGIES:
         raise UserError(
             f"trainer.strategy: several devices work with {', '.join(STRATEGIES)}, got "
             f"{strategy!r}. Try trainer=ddp."
@@ -98,7 +98,7 @@ def check_multirun(cfg: DictConfig) -> None:
     Raises:
         UserError: they do; the processes of one cell would run the whole sweep.
     """
-    if asked_for(cfg):
+    if is_distributed(cfg):
         raise UserError(
             f"trainer.devices={cfg.trainer.get('devices')}, trainer.num_nodes="
             f"{cfg.trainer.get('num_nodes', 1)}: a sweep (-m) gives each cell one device. Run "

@@ -114,9 +114,9 @@ def _run(chosen: argparse.Namespace) -> int:
 def _file(source: Path, target: Path, settings: Any, engine: Any) -> int:
     from mops_lightning.downsample.files import attempt
 
-    def with_bar(title: str, function: Any, cloud: Any, stretches: Any, *common: Any) -> Any:
-        results = engine(title, function, cloud, stretches, *common)
-        total, hidden = len(stretches), not sys.stdout.isatty()
+    def with_bar(title: str, function: Any, cloud: Any, row_ranges: Any, *common: Any) -> Any:
+        results = engine(title, function, cloud, row_ranges, *common)
+        total, hidden = len(row_ranges), not sys.stdout.isatty()
         return track(results, title, total=total, disable=hidden, transient=True)
 
     start = time.perf_counter()

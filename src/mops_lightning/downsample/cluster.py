@@ -1,7 +1,7 @@
-"""Dask as the engine: stretches of a file read and worked on by several processes or machines.
+"""Dask as the engine: row_ranges of a file read and worked on by several processes or machines.
 
 Dask was taken rather than Ray because it is plain Python, small, and runs wherever torch does; what
-it has to do here is little: hand out stretches, and hand them out again when a worker dies.
+it has to do here is little: hand out row_ranges, and hand them out again when a worker dies.
 """
 
 import logging
@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from mops_lightning.downsample.formats.chunks import Stored
+from mops_lightning.downsample.formats.chunks import CloudFile
 from mops_lightning.downsample.large import Engine
 from mops_lightning.errors import UserError
 
@@ -123,14 +123,14 @@ def engine_of(client: Any) -> Engine:
     def engine(
         title: str,
         function: Callable[..., Any],
-        cloud: Stored,
-        stretches: list[range],
+        cloud: CloudFile,
+        row_ranges: list[range],
         *common: Any,
     ) -> Iterator[Any]:
         # Workers may have another working directory.
         cloud = replace(cloud, path=cloud.path.absolute())
         futures: deque[Any] = deque()
-        rest = iter(stretches)
+        rest = iter(row_ranges)
         try:
             # As tasks, not scattered: they are done again when the worker that has them dies.
             shared = [client.submit(_same, value, pure=False) for value in common]

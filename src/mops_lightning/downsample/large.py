@@ -1,4 +1,4 @@
-"""One file that need not fit in memory: several passes over stretches of it.
+"""One file that need not fit in memory: several passes over row_ranges of it.
 
 What a pass wants of a stretch does not depend on the others, so an engine may have several
 processes or machines do them; the results are put together in the order of the file, so that the
@@ -16,17 +16,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.downsample.formats.chunks import Stored, stored
+from mops_lightning.downsample.formats.chunks import CloudFile, stored
 from mops_lightning.downsample.formats.table import Table, check_enough, radius_of, reach, total
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import nearest
+from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.sampling_matrix import Partial
-from mops_lightning.samplers.folded import FoldedMOPS, fold
+from mops_lightning.samplers.fused import FusedMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.streaming import global_part, sum_part
 
 Engine = Callable[..., Iterable[Any]]
-"""``engine(title, function, cloud, stretches, *common)`` gives ``function(cloud, rows, *common)``
+"""``engine(title, function, cloud, row_ranges, *common)`` gives ``function(cloud, rows, *common)``
 for the rows of every stretch, in order."""
 
 
@@ -59,10 +59,14 @@ class Nearest(NamedTuple):
 
 
 def in_turn(
-    title: str, function: Callable[..., Any], cloud: Stored, stretches: list[range], *common: Any
+    title: str,
+    function: Callable[..., Any],
+    cloud: CloudFile,
+    row_ranges: list[range],
+    *common: Any,
 ) -> Iterable[Any]:
     """Do one stretch after the other here: the plainest engine."""
-    return (function(cloud, rows, *common) for rows in stretches)
+    return (function(cloud, rows, *common) for rows in row_ranges)
 
 
 def by_chunks(
@@ -82,7 +86,7 @@ def by_chunks(
         source: of a format of ``chunks.FORMATS``.
         sampler: trained.
         m: how many points.
-        size: of the stretches; with m it bounds the memory.
+        size: of the row_ranges; with m it bounds the memory.
         readout: generated or matched.
         keep_attributes: keep the columns of matched points.
         engine: does the work.
@@ -94,10 +98,10 @@ def by_chunks(
         raise UserError(f"--chunk works with MOPS-Net and FMOPS-Net, not {type(sampler).__name__}.")
     sampler._check_m(m)
     whole = stored(source)
-    cloud, stretches = replace(whole, head=None), whole.stretches(size)
+    cloud, row_ranges = replace(whole, head=None), whole.row_ranges(size)
 
     def over(title: str, function: Callable[..., Any], *common: Any) -> Iterable[Any]:
-        results = engine(title, function, cloud, stretches, *common)
+        results = engine(title, function, cloud, row_ranges, *common)
         return (result for result in results if result is not None)
 
     number, summed = 0, np.zeros(3)
@@ -107,7 +111,7 @@ def by_chunks(
     check_enough(source, number, m)
     centre = summed / number
     unit = Unit(centre, radius_of(max(over("radius", _reach, centre)), source))
-    net = fold(sampler)
+    net = sampler.fused()
     global_ = reduce(torch.maximum, over("global feature", _global, unit, net))
     sums: Partial = reduce(Partial.merge, over("sampling", _sum, unit, net, global_, m))
     generated = sums.result()
@@ -122,28 +126,28 @@ def by_chunks(
     return (kept if keep_attributes else kept.bare()), number, whole.number - number
 
 
-def _count_and_sum(cloud: Stored, rows: range) -> tuple[int, NDArray[np.float64]]:
+def _count_and_sum(cloud: CloudFile, rows: range) -> tuple[int, NDArray[np.float64]]:
     table = cloud.read(rows)
     return len(table.points), total(table.points)
 
 
-def _reach(cloud: Stored, rows: range, centre: NDArray[np.float64]) -> float:
+def _reach(cloud: CloudFile, rows: range, centre: NDArray[np.float64]) -> float:
     return reach(cloud.read(rows).points, centre)
 
 
-def _global(cloud: Stored, rows: range, unit: Unit, net: FoldedMOPS) -> Tensor | None:
+def _global(cloud: CloudFile, rows: range, unit: Unit, net: FusedMOPSNet) -> Tensor | None:
     points = unit.points(cloud.read(rows))
     return global_part(net, points) if len(points) else None
 
 
 def _sum(
-    cloud: Stored, rows: range, unit: Unit, net: FoldedMOPS, global_: Tensor, m: int
+    cloud: CloudFile, rows: range, unit: Unit, net: FusedMOPSNet, global_: Tensor, m: int
 ) -> Partial | None:
     points = unit.points(cloud.read(rows))
     return sum_part(net, points, global_, m) if len(points) else None
 
 
-def _nearest(cloud: Stored, rows: range, unit: Unit, generated: Tensor) -> Nearest | None:
+def _nearest(cloud: CloudFile, rows: range, unit: Unit, generated: Tensor) -> Nearest | None:
     table = cloud.read(rows)
     if not len(table.points):
         return None

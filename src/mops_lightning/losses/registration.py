@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.losses.subset import chamfer_distance
+from mops_lightning.ops.chamfer import chamfer_distance
 from mops_lightning.ops.rigid import Motion, quaternion_to_matrix
 
 

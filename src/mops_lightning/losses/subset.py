@@ -75,19 +75,3 @@ def simplification_losses(
         weight = coverage + coverage_per_point * m
         losses[m] = (there + weight * from_cloud.mean(1)).mean()
     return losses
-
-
-def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
-    """Return the squared chamfer distance of two clouds, both directions, each a mean over points.
-
-    CD(P, Q) = 1/|P| Σ_p min_q ‖p − q‖² + 1/|Q| Σ_q min_p ‖q − p‖². Memory does not grow with
-    |P|·|Q|; gradients flow to both clouds through the nearest points.
-
-    Args:
-        points: ``(B, N, 3)`` the clouds P.
-        others: ``(B, M, 3)`` the clouds Q.
-
-    Returns:
-        ``(B,)`` in squared units of the coordinates.
-    """
-    return nearest_distances(points, others).mean(1) + nearest_distances(others, points).mean(1)

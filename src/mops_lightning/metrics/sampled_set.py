@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from mops_lightning.ops.points import nearest
+from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.readout import match, unique_count
 from mops_lightning.types import SampleOutput
 

@@ -15,7 +15,8 @@ from mops_lightning.errors import UserError
 from mops_lightning.nets.autoencoder import PointEncoder
 from mops_lightning.nets.folding import Fold
 from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, check_channels, linear_norm_relu
-from mops_lightning.ops.points import gather_points, k_nearest
+from mops_lightning.ops.nearest import k_nearest
+from mops_lightning.ops.points import gather_points
 
 REACH = 0.3
 """The grid covers [-0.3, 0.3]², as FoldingNet's."""

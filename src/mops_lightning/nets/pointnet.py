@@ -15,28 +15,28 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import GROUP, first_extreme
-from mops_lightning.ops.precision import wide_dtype, wide_layers
+from mops_lightning.ops.extreme import GROUP, blocked_argextreme
+from mops_lightning.ops.precision import pointwise_autocast, pointwise_autocast_dtype
 
 FEW_POINTS = 32
 """Up to here ``PointMaxPool`` computes the plain layers; on a CPU both ways are equal around it."""
 
 
-def check_channels(setting: str, channels: Sequence[int], least: int = 1) -> None:
+def check_channels(setting: str, channels: Sequence[int], min_layers: int = 1) -> None:
     """Refuse layers that cannot be built.
 
     Args:
         setting: its name, for the error.
         channels: sizes of layers.
-        least: how many there must be.
+        min_layers: how many there must be.
 
     Raises:
         UserError: there are fewer, or one has no channels.
     """
-    if len(channels) < least or min(channels) < 1:
-        layers = "layer" if least == 1 else "layers"
+    if len(channels) < min_layers or min(channels) < 1:
+        layers = "layer" if min_layers == 1 else "layers"
         raise UserError(
-            f"{setting} must be sizes of at least {least} {layers}, each at least 1, "
+            f"{setting} must be sizes of at least {min_layers} {layers}, each at least 1, "
             f"got {list(channels)}."
         )
 
@@ -78,11 +78,11 @@ class PointMLP(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, N, channels[0])`` to ``(B, N, channels[-1])``."""
         rows = features.flatten(0, 1)
-        if wide_dtype() is None:
+        if pointwise_autocast_dtype() is None:
             return self.layers(rows).unflatten(0, features.shape[:2])
         first, *others = self.layers.children()
         rows = first(rows.to(next(first.parameters())))
-        with wide_layers(rows.device.type):
+        with pointwise_autocast(rows.device.type):
             for layer in others:
                 rows = layer(rows)
         return rows.unflatten(0, features.shape[:2])
@@ -176,7 +176,7 @@ class _MaxOverPoints(Function):
             winners = torch.empty(clouds, len(weight), dtype=torch.int64)
             for cloud, values, rows in zip(filled, peaks, winners, strict=True):
                 product = weight @ cloud.mT
-                place = first_extreme(product, largest=True)
+                place = blocked_argextreme(product, largest=True)
                 values.copy_(product.gather(1, place)[:, 0])
                 rows.copy_(place[:, 0])
             # A copy may beat the first point itself by a rounding error of the product.

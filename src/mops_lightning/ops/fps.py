@@ -1,142 +1,115 @@
-"""Farthest point sampling on a CPU by fewer operations than looking at all points at each step.
+"""Farthest point sampling (Eldar et al., IEEE TIP 1997), from scratch or from a chosen set."""
 
-Of small clouds all distances are taken at once, and a step has no more to do than to compare.
-
-In large clouds most points are far from the new one. Neighbouring points form groups. A group that
-is farther from the new point than all its points are from the chosen ones keeps its distances, so
-that a step looks at a few groups only. (Han et al., "QuickFPS", IEEE TCAD 2023, and others before
-them do so in trees.)
-"""
-
-import math
-
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
+from torch import Generator, Tensor
+from torch.nn import functional as F
 
-SIZE = 128
-"""Points in a group: fewer make the groups many, more make each step look at more points."""
+from mops_lightning.errors import UserError
+from mops_lightning.ops.extreme import blocked_argextreme
+from mops_lightning.ops.fps_cpu import (
+    squared_lengths_,
+    take_farthest_by_groups,
+    take_farthest_by_table,
+)
+from mops_lightning.ops.nearest import nearest
+from mops_lightning.ops.points import distance_dtype, gather_points, to_planes
 
-SAFE = 1 - 1e-6
-"""Bounds are lowered by it, for sums of squares are rounded in another way than distances are."""
+MANY_POINTS, MANY_STEPS = 65536, 256
+"""From both on, farthest points of a cloud are faster taken by groups than from all points."""
 
-
-def squared_lengths_(planes: Tensor) -> Tensor:
-    """Sum the squares of planes ``(C, ...)``, in place of the first one.
-
-    All ways to farthest points do it here: some processors multiply and add in one rounding, others
-    in two, and all ways must come to the same bits.
-    """
-    total, *others = planes.unbind(0)
-    total.mul_(total)
-    for other in others:
-        total.addcmul_(other, other)
-    return total
+FEW_CLOUDS, FEW_POINTS = 4, 1024
+"""Up to both, many farthest points of a cloud are faster taken from a table of all distances."""
 
 
-def take_farthest_by_table(points: Tensor, distances: Tensor, steps: int) -> Tensor:
-    """Do what ``take_farthest_by_groups`` does, from a table of all distances.
+def farthest_point_sample(
+    points: Tensor,
+    m: int,
+    start: int | Tensor | None = None,
+    generator: Generator | None = None,
+) -> Tensor:
+    """Choose m points, each as far as possible from those chosen before it.
 
     Args:
-        points: ``(N, C)`` on the CPU, finite; N² distances are held.
-        distances: as there.
-        steps: as there.
+        points: ``(B, N, C)``.
+        m: how many, 1 ≤ m ≤ N.
+        start: index of the first point, one for all clouds or ``(B,)``.
+        generator: draws the first points where ``start`` is None; without either it is point 0.
 
     Returns:
-        As there.
+        ``(B, m)`` int64, in the order of choice; the first k are the choice for m = k. All differ,
+        in coincident points too. The lowest of equally far points is taken.
+
+    Raises:
+        UserError: ``m`` or ``start`` is out of range.
     """
-    planes = points.to(distances.dtype).mT.contiguous()
-    table = squared_lengths_(planes[:, :, None] - planes[:, None])
-    rows, far = table.numpy(), distances.numpy().copy()
-    taken = np.empty(steps, np.int64)
-    for step in range(steps):
-        row = far.argmax()
-        taken[step] = row
-        far[row] = -1
-        np.minimum(far, rows[row], out=far)
-    return torch.from_numpy(taken)
+    clouds, n = points.shape[:2]
+    if not 1 <= m <= n:
+        raise UserError(f"m must be between 1 and the number of points N={n}, got {m}.")
+    if start is None and generator is not None:
+        start = torch.randint(n, (clouds,), generator=generator, device=generator.device)
+    first = torch.as_tensor(0 if start is None else start, device=points.device).expand(clouds)
+    if bool(((first < 0) | (first >= n)).any()):
+        raise UserError(f"start must be between 0 and N-1={n - 1}, got {start}.")
+    dtype = distance_dtype(points)
+    distances = points.new_full((clouds, n), torch.finfo(dtype).max, dtype=dtype)
+    return _take_farthest(points, distances.scatter_(1, first[:, None], torch.inf), m)
 
 
-def take_farthest_by_groups(points: Tensor, distances: Tensor, steps: int) -> Tensor:
+def farthest_point_fill(points: Tensor, indices: Tensor, given: Tensor) -> Tensor:
+    """Fill up rows of chosen points by farthest point sampling from the chosen ones.
+
+    Args:
+        points: ``(B, N, C)``.
+        indices: ``(B, M)`` int64, M ≤ N; the first ``given[b]`` entries of row b are chosen points,
+            all different; what stands behind them is replaced.
+        given: ``(B,)`` int64, 1 ≤ given ≤ M.
+
+    Returns:
+        ``(B, M)`` int64, all different: the chosen points, then each time the point farthest from
+        all before it.
+    """
+    wanted = indices.shape[1]
+    missing = wanted - int(given.min())
+    if missing == 0:
+        return indices
+    slot = torch.arange(wanted, device=indices.device)
+    chosen = torch.where(slot < given[:, None], indices, indices[:, :1])
+    distances, _ = nearest(points.detach(), gather_points(points.detach(), chosen))
+    distances = distances.to(distance_dtype(points)).scatter_(1, chosen, -1.0)
+    more = _take_farthest(points, distances, missing)
+    # Clouds that lack fewer points write their surplus behind column M, which is cut off.
+    room = torch.cat([chosen, more], 1)
+    return room.scatter_(1, given[:, None] + slot[:missing], more)[:, :wanted]
+
+
+@torch.no_grad()
+def _take_farthest(points: Tensor, distances: Tensor, steps: int) -> Tensor:
     """Take the point with the largest distance, lower the distances to it, and so on.
 
     Args:
-        points: ``(N, C)`` on the CPU, finite, C up to 4.
-        distances: ``(N,)`` squared distances to start from, of at least float32; what is taken
-            stands at -1.
-        steps: how many points to take, at most as many as are not taken.
+        points: ``(B, N, C)``.
+        distances: ``(B, N)`` squared distances to start from; what is taken stands at -1, below
+            all distances, so that nothing is taken twice.
+        steps: how many points to take.
 
     Returns:
-        ``(steps,)`` int64, the lowest row of equally far ones; bit for bit what looking at all
-        points gives.
+        ``(B, steps)`` int64.
     """
-    n = len(points)
-    array = points.to(distances.dtype).numpy()
-    # Rows stand in order within a group, so that its first maximum is that of the lowest row; the
-    # last group is filled up with copies that count as taken.
-    rows = np.full(math.ceil(n / SIZE) * SIZE, n)
-    rows[:n] = np.argsort(_places_on_curve(array), kind="stable")
-    rows = np.sort(rows.reshape(-1, SIZE), axis=1)
-    filled = np.minimum(rows, n - 1)
-    filled = np.where(rows < n, filled, filled[:, :1])
-    planes = np.ascontiguousarray(array[filled].transpose(2, 0, 1))
-    far = np.where(rows < n, distances.numpy()[filled], -1).astype(array.dtype)
-    low, high = planes.min(2), planes.max(2)
-    places = far.argmax(1)
-    every = np.arange(len(rows))
-    peaks, peak_rows = far[every, places], rows[every, places]
-    taken = np.empty(steps, np.int64)
-    for step in range(steps):
-        equal = np.flatnonzero(peaks == peaks.max())
-        group = equal[peak_rows[equal].argmin()]
-        place = places[group]
-        taken[step] = rows[group, place]
-        far[group, place] = -1
-        new = planes[:, group, place]
-        bound = _distances_to_boxes(low, high, new) * SAFE
-        near = bound < peaks
-        near[group] = True
-        touched = np.flatnonzero(near)
-        lowered = _lowered(planes.take(touched, 1), new, far.take(touched, 0))
-        far[touched] = lowered
-        inside = lowered.argmax(1)
-        places[touched] = inside
-        peaks[touched] = lowered[every[: len(touched)], inside]
-        peak_rows[touched] = rows[touched, inside]
-    return torch.from_numpy(taken)
-
-
-def _lowered(
-    planes: NDArray[np.floating], new: NDArray[np.floating], far: NDArray[np.floating]
-) -> NDArray[np.floating]:
-    """Return the lower of old distances and those to a new point."""
-    differences = torch.from_numpy(planes).sub_(torch.from_numpy(new)[:, None, None])
-    return torch.minimum(torch.from_numpy(far), squared_lengths_(differences)).numpy()
-
-
-def _distances_to_boxes(
-    low: NDArray[np.floating], high: NDArray[np.floating], point: NDArray[np.floating]
-) -> NDArray[np.floating]:
-    """Return the squared distances from a point ``(C,)`` to boxes with corners ``(C, G)``."""
-    with np.errstate(over="ignore"):
-        away = np.maximum(low - point[:, None], point[:, None] - high)
-        np.maximum(away, 0, out=away)
-        away *= away
-        return away.sum(0)
-
-
-def _places_on_curve(points: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return where points ``(N, C)`` lie on a Z-order curve: near on it is near in space."""
-    bits = 30 // points.shape[1]
-    low = points.min(0).astype(np.float64)
-    with np.errstate(all="ignore"):
-        scale = (2**bits - 1) / (points.max(0) - low).max()
-        if not 0 < scale < np.inf:  # all coincide, or too far apart to be told
-            return np.zeros(len(points), np.int64)
-        cells = ((points - low) * scale).astype(np.int64)
-    code = np.zeros(len(points), np.int64)
-    for bit in range(bits):
-        for axis in range(points.shape[1]):
-            code |= (cells[:, axis] >> bit & 1) << (points.shape[1] * bit + axis)
-    return code
+    _, n, channels = points.shape
+    few = len(points) <= FEW_CLOUDS and n <= FEW_POINTS and 8 * steps >= n
+    many = n >= MANY_POINTS and steps >= MANY_STEPS and channels <= 4
+    if points.device.type == "cpu" and (few or many) and bool(points.isfinite().all()):
+        take = take_farthest_by_table if few else take_farthest_by_groups
+        clouds = zip(points, distances, strict=True)
+        return torch.stack([take(*cloud, steps) for cloud in clouds])
+    planes = to_planes(points.to(distances.dtype), padding=0.0)
+    distances = F.pad(distances, (0, planes.shape[2] - n), value=-1.0)
+    differences = torch.empty_like(planes)
+    taken = []
+    for _ in range(steps):
+        index = blocked_argextreme(distances, largest=True)
+        taken.append(index)
+        distances.scatter_(1, index, -1.0)
+        torch.sub(planes, planes.gather(2, index.expand(channels, -1, -1)), out=differences)
+        torch.minimum(distances, squared_lengths_(differences), out=distances)
+    return torch.cat(taken, 1)

@@ -25,8 +25,8 @@ def full_precision(device: str) -> torch.autocast:
 
 
 @contextmanager
-def wide_layers_mixed(device: str) -> Iterator[None]:
-    """Leave autocast but for ``wide_layers``, which take over its precision; for training.
+def restrict_autocast_to_pointwise(device: str) -> Iterator[None]:
+    """Leave autocast but for ``pointwise_autocast``, which take over its precision; for training.
 
     Args:
         device: type of the device, such as ``cuda``.
@@ -40,12 +40,12 @@ def wide_layers_mixed(device: str) -> Iterator[None]:
         _WIDE.reset(token)
 
 
-def wide_dtype() -> torch.dtype | None:
-    """Return the precision of ``wide_layers``, None outside of ``wide_layers_mixed``."""
+def pointwise_autocast_dtype() -> torch.dtype | None:
+    """Return the precision of ``pointwise_autocast``; None where autocast is off."""
     return _WIDE.get()
 
 
-def wide_layers(device: str) -> AbstractContextManager[Any]:
+def pointwise_autocast(device: str) -> AbstractContextManager[Any]:
     """Run layers that every point goes through, in mixed precision where that is asked for.
 
     Args:

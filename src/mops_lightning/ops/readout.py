@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import farthest_point_fill, nearest
+from mops_lightning.ops.fps import farthest_point_fill
+from mops_lightning.ops.nearest import nearest
 
 
 def match(generated: Tensor, points: Tensor) -> Tensor:

@@ -108,8 +108,8 @@ def _by_column(table: Cells, names: dict[str, str], layout: Axes) -> Grid:
     size = "" if layout == Axes() else f", m={names['m']},"
     title = (
         f"Test {metric_format.title(table.metric)}: {names['task']} on {names['dataset']}{size} "
-        f"under {names['net']}; generated / matched / completed sets, or one figure for samplers that "
-        "choose input points."
+        f"under {names['net']}; generated / matched / completed sets, or one figure for "
+        "samplers that choose input points."
     )
     return Grid(title, ["sampled by", *(f"{layout.column}={one}" for one in columns)], rows)
 
@@ -127,7 +127,8 @@ def _planes(table: Cells, names: dict[str, str], layout: Axes) -> list[Grid]:
         ]
         title = (
             f"Test {metric_format.title(table.metric)} of {name}: {names['task']} on "
-            f"{names['dataset']}, m={names['m']}, under {names['net']}; generated / matched / completed sets."
+            f"{names['dataset']}, m={names['m']}, "
+            f"under {names['net']}; generated / matched / completed sets."
         )
         head = [f"{down.split('.')[-1]} \\ {across.split('.')[-1]}", *map(str, columns)]
         grids.append(Grid(title, head, rows, [spread(table, name)]))

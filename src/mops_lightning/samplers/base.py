@@ -30,7 +30,7 @@ class Sampler(nn.Module):
     nested: bool = False
     """Whether the answer for a smaller m is the first m points of the answer for a larger one."""
 
-    over_sizes: Literal["mean", "sum"] = "mean"
+    size_reduction: Literal["mean", "sum"] = "mean"
     """How the losses at several ``training_sizes`` become one."""
 
     def __init__(self, m: int) -> None:

@@ -17,12 +17,12 @@ class FMOPSNet(MOPSNet):
 
     Args:
         m_max: largest number of points.
-        sizes_per_step: from which m a training step learns. ``uniform`` draws one m from 1 to m_max
+        size_sampling: from which m a training step learns. ``uniform`` draws one m from 1 to m_max
             (the paper); ``log_uniform`` draws one whose logarithm is uniform, so that small sizes
-            come as often as large ones; ``nested`` cuts the range of logarithms into ``prefixes``
+            come as often as large ones; ``nested`` cuts the range of logarithms into ``num_sizes``
             equal parts and draws one m from each: they share one forward pass of the sampler, and
             the mean of their losses counts.
-        prefixes: how many sizes ``nested`` takes.
+        num_sizes: how many sizes ``nested`` takes.
         **settings: as for ``MOPSNet``.
 
     Raises:
@@ -35,24 +35,24 @@ class FMOPSNet(MOPSNet):
     def __init__(
         self,
         m_max: int = 512,
-        sizes_per_step: Literal["nested", "uniform", "log_uniform"] = "nested",
-        prefixes: int = 4,
+        size_sampling: Literal["nested", "uniform", "log_uniform"] = "nested",
+        num_sizes: int = 4,
         **settings: Any,
     ) -> None:
         super().__init__(m_max, **settings)
-        if sizes_per_step not in DISTRIBUTIONS:
-            hint = did_you_mean(sizes_per_step, DISTRIBUTIONS)
-            raise UserError(f"sampler.sizes_per_step: unknown {sizes_per_step!r}.{hint}")
-        if prefixes < 1:
-            raise UserError(f"sampler.prefixes must be at least 1, got {prefixes}.")
-        self.sizes_per_step = sizes_per_step
-        self.prefixes = prefixes
+        if size_sampling not in DISTRIBUTIONS:
+            hint = did_you_mean(size_sampling, DISTRIBUTIONS)
+            raise UserError(f"sampler.size_sampling: unknown {size_sampling!r}.{hint}")
+        if num_sizes < 1:
+            raise UserError(f"sampler.num_sizes must be at least 1, got {num_sizes}.")
+        self.size_sampling = size_sampling
+        self.num_sizes = num_sizes
 
     def training_sizes(self) -> tuple[int, ...]:
         """Draw the sizes of one training step, ascending, from torch's global generator."""
-        if self.sizes_per_step == "uniform":
+        if self.size_sampling == "uniform":
             return (int(torch.randint(1, self.m + 1, ())),)
-        parts = self.prefixes if self.sizes_per_step == "nested" else 1
+        parts = self.num_sizes if self.size_sampling == "nested" else 1
         places = (torch.arange(parts) + torch.rand(parts)).double() / parts
         # floor((m_max + 1)^u) takes every m from 1 to m_max, m with a share of log(1 + 1/m).
         sizes = ((self.m + 1) ** places).floor().long().clamp(1, self.m)

@@ -9,10 +9,10 @@ from torch import Tensor, nn
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.losses.subset import subset_losses
 from mops_lightning.nets.pointnet import PointFeatures, check_channels, linear_norm_relu
-from mops_lightning.ops.precision import wide_layers
+from mops_lightning.ops.precision import pointwise_autocast
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.folded import fold
+from mops_lightning.samplers.fused import FusedMOPSNet, fuse
 from mops_lightning.types import SampleOutput
 
 ANNEALINGS = ("exponential", "linear")
@@ -94,16 +94,24 @@ class MOPSNet(Sampler):
         if not plain and not torch.is_autocast_enabled(points.device.type):
             return self._evaluated(points)
         local, global_ = self.features(points)
-        with wide_layers(points.device.type):
+        with pointwise_autocast(points.device.type):
             hidden = self.rho_local(local).add_(self.rho_global(global_)[:, None])
             rows = self.rho(self.rho_first(hidden.flatten(0, 1)))
         queries = self.queries.weight
         keys = rows.to(queries).unflatten(0, points.shape[:2])
         return SamplingMatrix(queries, keys, self.tau)
 
+    def fused(self) -> FusedMOPSNet:
+        """Return the network in evaluation with BatchNorm fused; weights are copied as they are."""
+        norm = self.rho_first[0]
+        assert isinstance(norm, nn.BatchNorm1d)
+        queries = self.queries.weight.detach() / self.tau_min
+        layers = self.features.mlp.layers
+        return fuse(layers, self.rho_local, self.rho_global, norm, self.rho, queries)
+
     def _evaluated(self, points: Tensor) -> SamplingMatrix:
-        """Return S without gradients, by folded layers."""
-        net = fold(self)
+        """Return S without gradients, by fused layers."""
+        net = self.fused()
         local = net.local_features(points.flatten(0, 1)).unflatten(0, points.shape[:2])
         keys = local.new_empty(*local.shape[:2], net.queries.shape[1])
         for cloud, peak, into in zip(local, local.amax(1), keys, strict=True):

@@ -58,18 +58,18 @@ def point_hashes(points: Tensor, seed: int) -> Tensor:
     bits = (points.double() + 0.0).view(torch.int64)
     keys = torch.full_like(bits[..., 0], _signed(seed * STEP + 1))
     for axis in range(points.shape[2]):
-        keys = _fold(keys.bitwise_xor_(bits[..., axis]).mul_(_signed(FIRST)), 32)
-    return _scramble(keys.add_(_fold(keys, 29).mul_(_signed(SECOND)).sum(1, keepdim=True)))
+        keys = _xor_shift(keys.bitwise_xor_(bits[..., axis]).mul_(_signed(FIRST)), 32)
+    return _scramble(keys.add_(_xor_shift(keys, 29).mul_(_signed(SECOND)).sum(1, keepdim=True)))
 
 
 def _scramble(keys: Tensor) -> Tensor:
     """Let every bit of a key change every bit of the result (the finish of SplitMix64)."""
-    keys = _fold(keys, 30).mul_(_signed(FIRST))
-    keys = _fold(keys, 27).mul_(_signed(SECOND))
-    return _fold(keys, 31)
+    keys = _xor_shift(keys, 30).mul_(_signed(FIRST))
+    keys = _xor_shift(keys, 27).mul_(_signed(SECOND))
+    return _xor_shift(keys, 31)
 
 
-def _fold(keys: Tensor, shift: int) -> Tensor:
+def _xor_shift(keys: Tensor, shift: int) -> Tensor:
     """Return ``keys ^ (keys >> shift)`` with the zeros of an unsigned shift."""
     return (keys >> shift).bitwise_and_(2 ** (64 - shift) - 1).bitwise_xor_(keys)
 

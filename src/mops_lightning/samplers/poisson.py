@@ -6,7 +6,8 @@ Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets", Computer G
 import torch
 from torch import Tensor
 
-from mops_lightning.ops.points import farthest_point_sample, gather_points
+from mops_lightning.ops.fps import farthest_point_sample
+from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import seeded_order
 from mops_lightning.types import SampleOutput

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import gather_points, k_nearest
+from mops_lightning.ops.nearest import k_nearest
+from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.snet import Progressive, SNet
 from mops_lightning.types import SampleOutput
 

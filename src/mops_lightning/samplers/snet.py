@@ -86,9 +86,9 @@ class Progressive(Sampler):
 
     Args:
         m_max: largest number of points, 1,024 in the publication.
-        least: smallest size that is trained (m_max where that is smaller): 2 for classification,
+        min_size: smallest size that is trained (m_max where that is smaller): 2 for classification,
             16 for reconstruction.
-        over_sizes: whether the losses at all sizes are summed (classification) or averaged
+        size_reduction: whether the losses at all sizes are summed (classification) or averaged
             (reconstruction).
         **settings: as for the net.
 
@@ -102,23 +102,23 @@ class Progressive(Sampler):
     def __init__(
         self,
         m_max: int = 1024,
-        least: int = 2,
-        over_sizes: Literal["sum", "mean"] = "sum",
+        min_size: int = 2,
+        size_reduction: Literal["sum", "mean"] = "sum",
         **settings: Any,
     ) -> None:
         super().__init__(m_max, **settings)
-        if least < 1:
-            raise UserError(f"sampler.least must be at least 1, got {least}.")
-        if over_sizes not in ("sum", "mean"):
-            hint = did_you_mean(over_sizes, ("sum", "mean"))
-            raise UserError(f"sampler.over_sizes: unknown {over_sizes!r}.{hint}")
-        self.least = least
-        self.over_sizes = over_sizes
+        if min_size < 1:
+            raise UserError(f"sampler.min_size must be at least 1, got {min_size}.")
+        if size_reduction not in ("sum", "mean"):
+            hint = did_you_mean(size_reduction, ("sum", "mean"))
+            raise UserError(f"sampler.size_reduction: unknown {size_reduction!r}.{hint}")
+        self.min_size = min_size
+        self.size_reduction = size_reduction
 
     def training_sizes(self) -> tuple[int, ...]:
-        """Return ``least``, twice of it and so on below the largest size, and this one."""
+        """Return ``min_size``, twice of it and so on below the largest size, and this one."""
         sizes = {self.m}
-        size = self.least
+        size = self.min_size
         while size < self.m:
             sizes.add(size)
             size *= 2

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import nearest
+from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.sampling_matrix import Partial, attend
 from mops_lightning.samplers.base import check_points
-from mops_lightning.samplers.folded import FoldedMOPS, fold
+from mops_lightning.samplers.fused import FusedMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 
 Chunks = Callable[[], Iterable[Tensor]]
@@ -43,18 +43,18 @@ def stream_sample(sampler: MOPSNet, chunks: Chunks, m: int | None = None) -> Ten
         )
     m = sampler.m if m is None else m
     sampler._check_m(m)
-    net = fold(sampler)
+    net = sampler.fused()
     peaks = (global_part(net, chunk) for chunk in _checked(chunks, m))
     global_ = reduce(torch.maximum, peaks)
     return reduce(Partial.merge, (sum_part(net, chunk, global_, m) for chunk in chunks())).result()
 
 
-def global_part(net: FoldedMOPS, points: Tensor) -> Tensor:
+def global_part(net: FusedMOPSNet, points: Tensor) -> Tensor:
     """Return what some points ``(n, 3)`` contribute to the global feature; the maximum merges."""
     return net.local_features(points).amax(0)
 
 
-def sum_part(net: FoldedMOPS, points: Tensor, global_: Tensor, m: int) -> Partial:
+def sum_part(net: FusedMOPSNet, points: Tensor, global_: Tensor, m: int) -> Partial:
     """Return what some points ``(n, 3)`` contribute to the m generated ones; ``Partial.merge``."""
     with torch.no_grad():
         keys = net.keys(net.local_features(points), global_)

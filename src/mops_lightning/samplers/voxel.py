@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.ops.points import farthest_point_fill, gather_points
+from mops_lightning.ops.fps import farthest_point_fill
+from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import seeded_order
 from mops_lightning.types import SampleOutput

@@ -36,7 +36,7 @@ class Task(nn.Module):
     shown: tuple[str, ...] = ()
     """The metrics in the table that a run ends with, in order; empty: all."""
 
-    tells_classes: bool = False
+    requires_same_classes: bool = False
     """Whether the net's outputs are the data's classes, so that it fits no others."""
 
     net_takes: tuple[str, ...] = ("points",)

@@ -23,7 +23,7 @@ class Classification(Task):
 
     score = "accuracy"
     """The metric shown in tables; a higher one is better."""
-    tells_classes = True
+    requires_same_classes = True
 
     def __init__(self, net: nn.Module, num_classes: int) -> None:
         super().__init__(net)

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torchmetrics import Metric, MetricCollection
 
 from mops_lightning.errors import UserError
-from mops_lightning.losses.subset import chamfer_distance
 from mops_lightning.metrics.reconstruction import Distances, MeanDistance, NormalizedError
+from mops_lightning.ops.chamfer import chamfer_distance
 from mops_lightning.ops.emd import earth_mover_distance
 from mops_lightning.tasks.base import Sample, Task
 from mops_lightning.types import Batch, TaskOutput
@@ -114,7 +114,7 @@ class Reconstruction(Task):
             samples: what the net is to see, by readout.
             titles: one per cloud.
         """
-        from mops_lightning.viz.reconstruction import Rebuilt, rebuilt_grid
+        from mops_lightning.viz.reconstruction import ReconstructionResult, rebuilt_grid
 
         n = batch.points.shape[1]
         full = self.net(batch.points, n)
@@ -126,7 +126,7 @@ class Reconstruction(Task):
                 continue  # all points have a column of their own
             built = self.net(chosen, n)
             ratios = chamfer_distance(built, batch.points) / reference
-            columns[name] = Rebuilt(chosen, built, ratios.tolist())
+            columns[name] = ReconstructionResult(chosen, built, ratios.tolist())
         return {"reconstructions": rebuilt_grid(batch.points, full, columns, titles)}
 
     def metrics(self, training: bool = False) -> MetricCollection:

@@ -114,7 +114,7 @@ class Registration(Task):
             samples: what the net is to see, by readout.
             titles: one per pair.
         """
-        from mops_lightning.viz.pairs import Aligned, pair_grid
+        from mops_lightning.viz.pairs import RegistrationResult, pair_grid
 
         source, target = batch.points.chunk(2)
         columns = {}
@@ -123,7 +123,7 @@ class Registration(Task):
             motion = self._centred(batch, sample)
             chosen = sample(batch.points).points.chunk(2)
             errors = RotationError.of(result.predictions, result.targets)
-            columns[name] = Aligned(
+            columns[name] = RegistrationResult(
                 motion.apply(source), motion.apply(chosen[0]), chosen[1], errors.tolist()
             )
         true = Motion(batch.quaternion, batch.translation)

@@ -118,7 +118,7 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
     folder = Path(cfg.evaluate.removesuffix(run_record.FILE))
     _same_settings(cfg, record, folder, experiment.task)
     notes = record["notes"]
-    told = experiment.task.tells_classes
+    told = experiment.task.requires_same_classes
     if told and cfg.weights == OF_RUN and notes.get("dataset_fingerprint") != dataset.fingerprint:
         same_classes(notes.get("class_names"), dataset, f"{KEY}: {folder}")
     learned = experiment.task if cfg.learn == "task" else experiment.sampler

@@ -13,7 +13,7 @@ from torchmetrics import MeanMetric
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics.sampled_set import SET_METRICS
-from mops_lightning.ops.precision import full_precision, wide_layers_mixed
+from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
 from mops_lightning.records.readout_names import FULL, SOFT_PROJECTED, size_prefix
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
@@ -173,7 +173,7 @@ class Experiment(L.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the task loss plus the sampler's losses, over all sizes of this step."""
-        with wide_layers_mixed(self.device.type):
+        with restrict_autocast_to_pointwise(self.device.type):
             return self._training_step(batch, batch_idx)
 
     def _training_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -195,7 +195,7 @@ class Experiment(L.LightningModule):
                 for name, value in output.losses.items():
                     terms[name].append(value / len(outputs))
         share = 1.0
-        if self.sampler is not None and self.sampler.over_sizes == "mean":
+        if self.sampler is not None and self.sampler.size_reduction == "mean":
             share = 1 / len(sizes)
         losses = {name: torch.stack(values).sum() * share for name, values in terms.items()}
         total = torch.stack(list(losses.values())).sum()

@@ -56,7 +56,7 @@ def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> di
         UserError: a mistake in settings or files.
     """
     check(cfg)
-    follows = distributed.follows(cfg)
+    follows = distributed.is_worker_rank(cfg)
     if not follows:
         _begin(folder)
     with recorded(cfg, folder, overrides or []) as record:
@@ -121,7 +121,7 @@ def fit_and_test(
     if task_weights is not None:
         content = weights.load_into(task, task_weights)
         record["notes"]["weights_loaded"] = content["sha256"]
-        if task.tells_classes and content.get("classes"):
+        if task.requires_same_classes and content.get("classes"):
             evaluate.same_classes(content["classes"], dataset, f"weights: {task_weights}")
     if cfg.evaluate:
         record["notes"]["evaluated"] = evaluate.load(cfg, experiment, dataset)
@@ -165,7 +165,7 @@ def fit_and_test(
     learned["joint"] = {**learned["sampler"], "task_weights.pt": task}
     if trains:
         for name, module in learned[cfg.learn].items():
-            classes = dataset.class_names if module is task and task.tells_classes else ()
+            classes = dataset.class_names if module is task and task.requires_same_classes else ()
             weights.save(folder / name, module, record["config"], record["metrics"], classes)
             record["files"][Path(name).stem] = name
     # Each of several devices has BatchNorm's statistics of its own share.
@@ -198,7 +198,7 @@ def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[di
         "error": None,
         "notes": {},
     }
-    write = (lambda *_: None) if distributed.follows(cfg) else run_record.write
+    write = (lambda *_: None) if distributed.is_worker_rank(cfg) else run_record.write
     write(folder, record)
     try:
         with timed(record, "total"):

@@ -26,7 +26,7 @@ from mops_lightning.training import callbacks
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.malloc import keep_freed_memory
 from mops_lightning.training.sizes import sizes_to_test
-from mops_lightning.training.visualization import DrawClouds
+from mops_lightning.training.visualization import CloudVisualization
 
 HARMLESS = (
     ".*does not have many workers.*",  # the data lie in memory; workers would only copy them
@@ -165,7 +165,7 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset, task: Tas
     drawing = []
     if titles:
         batch = _scored(dataset.test, cfg.batch_size, task).batch_of(rows)
-        drawing = [DrawClouds(batch, titles, folder / "pictures")]
+        drawing = [CloudVisualization(batch, titles, folder / "pictures")]
     trainer: L.Trainer = build(
         cfg.trainer,
         logger=logger,

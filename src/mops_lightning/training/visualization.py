@@ -26,7 +26,7 @@ DENSE_PIXELS = 2**20
 """Largest S that is drawn: 1,024 points by 1,024 columns."""
 
 
-class DrawClouds(Callback):
+class CloudVisualization(Callback):
     """Draws a fixed set of clouds with every readout, S with SᵀS, and what the task draws.
 
     TensorBoard gets them about ten times in a run and after the test; the run's folder gets PNGs

@@ -14,7 +14,7 @@ SOURCE_COLOUR, TARGET_COLOUR = (0.12, 0.47, 0.86), (0.84, 0.3, 0.05)
 KEY_POINT_SIZE = 14
 
 
-class Aligned(NamedTuple):
+class RegistrationResult(NamedTuple):
     """What one readout made of the pairs.
 
     Attributes:
@@ -34,7 +34,7 @@ def pair_grid(
     source: Tensor,
     target: Tensor,
     before: Sequence[float],
-    aligned: Mapping[str, Aligned],
+    aligned: Mapping[str, RegistrationResult],
     titles: Sequence[str],
 ) -> Figure:
     """Draw pairs as rows: as they came, then aligned by every readout, sampled points ringed.

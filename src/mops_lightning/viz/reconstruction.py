@@ -15,7 +15,7 @@ DRAWN = 8192
 """Most points drawn of a cloud: more cannot be told apart, and take minutes."""
 
 
-class Rebuilt(NamedTuple):
+class ReconstructionResult(NamedTuple):
     """What one readout made of the clouds.
 
     Attributes:
@@ -30,7 +30,7 @@ class Rebuilt(NamedTuple):
 
 
 def rebuilt_grid(
-    points: Tensor, full: Tensor, rebuilt: Mapping[str, Rebuilt], titles: Sequence[str]
+    points: Tensor, full: Tensor, rebuilt: Mapping[str, ReconstructionResult], titles: Sequence[str]
 ) -> Figure:
     """Draw every cloud in two rows: the input and what was sampled, and what was rebuilt of them.
 

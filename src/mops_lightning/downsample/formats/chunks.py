@@ -28,7 +28,7 @@ LONGEST_LINE, MOST_LINES = 4096, 1000
 
 
 @dataclass(frozen=True)
-class Stored:
+class CloudFile:
     """Where the points of a file lie in it.
 
     Attributes:
@@ -45,8 +45,8 @@ class Stored:
     offset: int = 0
     head: Any = None
 
-    def stretches(self, size: int) -> list[range]:
-        """Cut the rows into stretches of up to ``size``."""
+    def row_ranges(self, size: int) -> list[range]:
+        """Cut the rows into row_ranges of up to ``size``."""
         starts = range(0, self.number, size)
         return [range(start, min(start + size, self.number)) for start in starts]
 
@@ -79,7 +79,7 @@ class Stored:
         return table
 
 
-def stored(path: Path) -> Stored:
+def stored(path: Path) -> CloudFile:
     """Find out where the points of a file lie.
 
     Raises:
@@ -94,17 +94,17 @@ def stored(path: Path) -> Stored:
         return FORMATS[suffix](path)
 
 
-def _npy(path: Path) -> Stored:
+def _npy(path: Path) -> CloudFile:
     array = np.load(path, mmap_mode="r", allow_pickle=False)
     names, kind = column_names(array, path), array.dtype
     if kind.names is None:
         if not array.flags.c_contiguous:
             raise BadCloudError(f"{path}: --chunk needs an array in C order, not in Fortran's.")
         kind = np.dtype([(name, kind) for name in names])
-    return Stored(path, array.shape[0], kind, array.offset)
+    return CloudFile(path, array.shape[0], kind, array.offset)
 
 
-def kitti(path: Path) -> Stored:
+def kitti(path: Path) -> CloudFile:
     """Find the rows of one of KITTI's scans: float32 x, y, z, intensity.
 
     Raises:
@@ -114,10 +114,10 @@ def kitti(path: Path) -> Stored:
     if not length or length % 16:
         raise BadCloudError(f"{path} is no KITTI scan: {length} bytes are no rows of four floats.")
     kind = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
-    return Stored(path, length // 16, kind)
+    return CloudFile(path, length // 16, kind)
 
 
-def _ply(path: Path) -> Stored:
+def _ply(path: Path) -> CloudFile:
     with path.open("rb") as file:
         lines: list[list[str]] = []
         while (line := file.readline(LONGEST_LINE)).split() != [b"end_header"]:
@@ -140,15 +140,15 @@ def _ply(path: Path) -> Stored:
     if any(field[1] not in PLY_KINDS for field in fields):
         raise BadCloudError(f"{path}: --chunk needs vertices without lists.")
     kind = np.dtype([(name, order[form[1]] + PLY_KINDS[typed]) for _, typed, name in fields])
-    return Stored(path, int(first[2]), kind, offset)
+    return CloudFile(path, int(first[2]), kind, offset)
 
 
-def _las(path: Path) -> Stored:
+def _las(path: Path) -> CloudFile:
     with laspy_for(path).open(path) as file:
-        return Stored(path, file.header.point_count, None, head=file.header)
+        return CloudFile(path, file.header.point_count, None, head=file.header)
 
 
-FORMATS: dict[str, Callable[[Path], Stored]] = {
+FORMATS: dict[str, Callable[[Path], CloudFile]] = {
     ".npy": _npy,
     ".bin": kitti,
     ".ply": _ply,

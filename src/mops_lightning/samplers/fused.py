@@ -1,14 +1,11 @@
-"""MOPS-Net in evaluation as plain matrix products: BatchNorm folded in, points in blocks."""
+"""MOPS-Net in evaluation as plain matrix products: BatchNorm fused, points in blocks."""
 
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_linear_bn_weights
-
-if TYPE_CHECKING:
-    from mops_lightning.samplers.mops import MOPSNet
 
 BLOCK_ROWS = {"cpu": 2048, "cuda": 2**18}
 """Points that pass all layers together: on a CPU their widest layer should stay in the cache."""
@@ -25,7 +22,7 @@ class Layer(NamedTuple):
         return torch.addmm(self.bias, rows, self.weight.mT).relu_()
 
 
-class FoldedMOPS(NamedTuple):
+class FusedMOPSNet(NamedTuple):
     """What a trained MOPS-Net computes, in three functions of chunks of a cloud.
 
     Attributes:
@@ -69,40 +66,44 @@ class FoldedMOPS(NamedTuple):
         return result
 
 
-def fold(sampler: "MOPSNet") -> FoldedMOPS:
-    """Fold the running statistics of BatchNorm into the layers before them.
+def fuse(
+    features: nn.Sequential,
+    rho_local: nn.Linear,
+    rho_global: nn.Linear,
+    rho_norm: nn.BatchNorm1d,
+    rho: nn.Sequential,
+    queries: Tensor,
+) -> FusedMOPSNet:
+    """Fuse the running statistics of BatchNorm into the layers before them.
 
     Args:
-        sampler: trained; its weights are copied as they are now.
+        features: the per-point layers.
+        rho_local: the part of ρ's first layer that acts on local features.
+        rho_global: the part that acts on the global feature.
+        rho_norm: the normalisation after the sum of both.
+        rho: ρ's other hidden layers.
+        queries: ``(M, C)``, ρ's last layer over the temperature.
 
     Returns:
-        What gives its evaluation, for chunks of a cloud.
+        The network in evaluation, for chunks of a cloud; weights are copied.
     """
-    first_norm = sampler.rho_first[0]
-    assert isinstance(first_norm, nn.BatchNorm1d)
-    # The norm's shift belongs to the sum of both halves and is given to one of them.
-    local = _folded(sampler.rho_local, first_norm)
-    both = _folded(sampler.rho_global, first_norm)
-    return FoldedMOPS(
-        _layers(sampler.features.mlp.layers),
-        local,
-        both.weight,
-        _layers(sampler.rho),
-        sampler.queries.weight.detach() / sampler.tau_min,
-    )
+    # The norm's shift belongs to the sum of both parts and is given to one of them.
+    local = _fused(rho_local, rho_norm)
+    both = _fused(rho_global, rho_norm)
+    return FusedMOPSNet(_layers(features), local, both.weight, _layers(rho), queries)
 
 
 def _layers(stack: nn.Sequential) -> tuple[Layer, ...]:
     modules = list(stack)
     pairs = pairwise(modules)
     return tuple(
-        _folded(linear, norm)
+        _fused(linear, norm)
         for linear, norm in pairs
         if isinstance(linear, nn.Linear) and isinstance(norm, nn.BatchNorm1d)
     )
 
 
-def _folded(linear: nn.Linear, norm: nn.BatchNorm1d) -> Layer:
+def _fused(linear: nn.Linear, norm: nn.BatchNorm1d) -> Layer:
     assert norm.running_mean is not None
     assert norm.running_var is not None
     weight, bias = fuse_linear_bn_weights(

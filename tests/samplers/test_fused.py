@@ -7,7 +7,6 @@ from mops_lightning.errors import UserError
 from mops_lightning.ops.readout import match
 from mops_lightning.ops.sampling_matrix import Partial, attend
 from mops_lightning.samplers.fmops import FMOPSNet
-from mops_lightning.samplers.folded import fold
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.snet import SNet
 from mops_lightning.samplers.streaming import global_part, stream_match, stream_sample, sum_part
@@ -61,7 +60,7 @@ def test_chunks_give_what_the_whole_cloud_gives(sampler, size, rng):
 def test_parts_merge_in_any_order_to_the_same_points(sampler, rng):
     points = torch.randn(1000, 3, generator=rng)
     parts = points.split([1, 400, 99, 500])
-    net = fold(sampler)
+    net = sampler.fused()
     global_ = torch.stack([global_part(net, part) for part in parts]).amax(0)
     sums = [sum_part(net, part, global_, 24) for part in parts]
     forwards = sums[0].merge(sums[1]).merge(sums[2]).merge(sums[3]).result()
