@@ -4,7 +4,8 @@ from scipy.spatial import cKDTree
 
 from mops_lightning.errors import UserError
 from mops_lightning.losses.subset import subset_loss
-from mops_lightning.ops import extreme, nearest as search
+from mops_lightning.ops import extreme
+from mops_lightning.ops import nearest as search
 from mops_lightning.ops.extreme import blocked_argextreme
 from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample
 from mops_lightning.ops.nearest import nearest
