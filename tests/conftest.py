@@ -9,11 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import lightning as L
 import pytest
 import torch
-
-from mops_lightning.data.clouds import CloudDataset, Clouds
 
 if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(2)
@@ -31,32 +28,6 @@ def real_data() -> Path:
 @pytest.fixture
 def rng() -> torch.Generator:
     return torch.Generator().manual_seed(0)
-
-
-def quiet_trainer(epochs: int, **extra: Any) -> L.Trainer:
-    """A CPU trainer that writes and prints nothing."""
-    return L.Trainer(
-        max_epochs=epochs,
-        accelerator="cpu",
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        **extra,
-    )
-
-
-def small_dataset(train: int = 24, test: int = 10, points: int = 48) -> CloudDataset:
-    """Three kinds of Gaussian blobs: enough to run every code path, too easy to measure with."""
-    rng = torch.Generator().manual_seed(3)
-
-    def clouds(number: int) -> Clouds:
-        labels = torch.arange(number) % 3
-        scale = torch.tensor([[1.0, 0.1, 0.1], [0.1, 1.0, 0.1], [0.3, 0.3, 0.3]])[labels]
-        return Clouds(torch.randn(number, points, 3, generator=rng) * scale[:, None], labels)
-
-    return CloudDataset(("long", "tall", "round"), clouds(train), clouds(test), "blobs")
 
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")

@@ -13,14 +13,14 @@ import torch
 
 from mops_lightning.records import run_record
 from mops_lightning.zoo import weights
-from tests.command_line import TINY, call, call_anew, runs, start
+from tests.support.command_line import TINY_WITH_PICTURES, call, call_anew, runs, start
 
 
 @pytest.fixture(scope="module")
 def main_job(tmp_path_factory):
     """The main job, small, once: its folder, its run's folder and what it printed."""
     folder = tmp_path_factory.mktemp("main")
-    status, out, err = call_anew(TINY, folder)
+    status, out, err = call_anew(TINY_WITH_PICTURES, folder)
     assert status == 0, err
     (run,) = runs(folder)
     return folder, run, out, err
@@ -42,7 +42,7 @@ def test_the_main_job_leaves_a_complete_record(main_job):
     folder, run, *_ = main_job
     record = run_record.read(run)
     assert record["status"] == "completed"
-    assert record["overrides"] == TINY
+    assert record["overrides"] == TINY_WITH_PICTURES
     for readout in ("random", "voxel", "fps", "generated", "matched", "completed", "full"):
         assert 0 <= record["metrics"][f"test/{readout}/accuracy"] <= 1
     assert record["score"] == record["metrics"]["test/generated/accuracy"]
@@ -83,7 +83,7 @@ def test_weights_pictures_and_curves_are_real_files(main_job):
 
 def test_the_cached_task_net_serves_the_next_run(main_job):
     folder, *_ = main_job
-    status, out, err = call([*TINY, "sampler=fps", "m=4"], folder)
+    status, out, err = call([*TINY_WITH_PICTURES, "sampler=fps", "m=4"], folder)
     assert status == 0, err
     assert "training it first" not in out
     record = run_record.read(runs(folder)[-1 if "fps" in str(runs(folder)[-1]) else 0])
@@ -95,7 +95,9 @@ def test_the_cached_task_net_serves_the_next_run(main_job):
 def test_a_sweep_leaves_one_record_per_job_and_goes_on_after_a_failure(main_job):
     folder, *_ = main_job
     fixed = ["out=sweep", "hydra.sweep.dir=sweep/cells"]
-    status, out, err = call(["-m", *TINY, "sampler=random", "m=4,65,8", *fixed], folder)
+    status, out, err = call(
+        ["-m", *TINY_WITH_PICTURES, "sampler=random", "m=4,65,8", *fixed], folder
+    )
     assert status == 1
     assert "sweep/cells/1 failed: m must be at most dataset.n_points=64, got m=65" in out
     assert "3 cells: 2 completed, 1 failed; in sweep/cells" in out
@@ -103,14 +105,14 @@ def test_a_sweep_leaves_one_record_per_job_and_goes_on_after_a_failure(main_job)
     found = sorted((folder / "sweep").rglob("result.json"))
     assert [json.loads(p.read_text())["config"]["m"] for p in found] == [4, 8]
     # Only the cells of this start count, not what an earlier one has left.
-    status, out, err = call(["-m", *TINY, "sampler=random", "m=4", *fixed], folder)
+    status, out, err = call(["-m", *TINY_WITH_PICTURES, "sampler=random", "m=4", *fixed], folder)
     assert status == 0, out + err
     assert "1 cells: 1 completed; in sweep/cells" in out
 
 
 def test_joint_training_starts_from_the_pretrained_task(main_job):
     folder, *_ = main_job
-    status, out, err = call([*TINY, "learn=joint", "out=joint"], folder)
+    status, out, err = call([*TINY_WITH_PICTURES, "learn=joint", "out=joint"], folder)
     assert status == 0, err
     assert "training it first" not in out
     (path,) = (folder / "joint").rglob("result.json")
@@ -120,7 +122,13 @@ def test_joint_training_starts_from_the_pretrained_task(main_job):
 
 
 def test_registration_pretrains_trains_jointly_tests_and_is_evaluated_under_icp(tmp_path):
-    settings = [*TINY, "task=registration", "sampler=fmops", "sampler.m_max=16", "pictures=1"]
+    settings = [
+        *TINY_WITH_PICTURES,
+        "task=registration",
+        "sampler=fmops",
+        "sampler.m_max=16",
+        "pictures=1",
+    ]
     status, out, err = call([*settings, "learn=joint"], tmp_path)
     assert status == 0, err
     assert "training it first" in out
@@ -141,7 +149,7 @@ def test_registration_pretrains_trains_jointly_tests_and_is_evaluated_under_icp(
     )
     assert status == 0, err
     assert "registration by icp" in out
-    status, _, err = call(["task=registration", "task/net=icp", *TINY], tmp_path)
+    status, _, err = call(["task=registration", "task/net=icp", *TINY_WITH_PICTURES], tmp_path)
     assert status == 2
     assert "learn=sampler: ICP has no weights" in err
 
@@ -172,13 +180,13 @@ def test_cfg_job_shows_the_config(tmp_path):
         (["sampler.feature_channels=[8]"], "write +sampler.feature_channels=..."),
         (["learn=smapler"], "Did you mean 'sampler'"),
         (["m=4096"], "dataset.n_points=4096"),
-        (["trainer=gpu", *TINY[1:]], "Try trainer=auto or trainer=cpu"),
+        (["trainer=gpu", *TINY_WITH_PICTURES[1:]], "Try trainer=auto or trainer=cpu"),
         (["m=abc"], "m must be a whole number"),
         (["dataset=modelnet40", "dataset.root=nowhere"], "dataset.root"),
         (["dataset.classes=[chiar]"], "chair"),
-        (["ckpt_path=last", *TINY], "ckpt_path=last"),
-        (["dataset.classes=[chair]", *TINY], "at least two classes"),
-        (["weights=nowhere.pt", *TINY], "weights: no file nowhere.pt"),
+        (["ckpt_path=last", *TINY_WITH_PICTURES], "ckpt_path=last"),
+        (["dataset.classes=[chair]", *TINY_WITH_PICTURES], "at least two classes"),
+        (["weights=nowhere.pt", *TINY_WITH_PICTURES], "weights: no file nowhere.pt"),
     ],
 )
 def test_mistakes_end_in_one_clear_error(arguments, said, tmp_path):
@@ -215,7 +223,7 @@ def test_real_modelnet40_runs_from_any_folder(real_data, tmp_path):
     root = (real_data / "modelnet40_hdf5_1024").resolve()
     if not root.is_dir():
         pytest.skip(f"no modelnet40_hdf5_1024 in {real_data}")
-    settings = [s for s in TINY if "per_class" not in s]
+    settings = [s for s in TINY_WITH_PICTURES if "per_class" not in s]
     data = ["dataset=modelnet40", f"dataset.root={root}", "dataset.classes=[cup,bowl]"]
     status, out, err = call([*settings, *data, "sampler.alpha=10", "sampler.tau_min=0.2"], tmp_path)
     assert status == 0, err
@@ -233,7 +241,7 @@ def test_a_folder_of_meshes_runs(tmp_path):
             folder.mkdir(parents=True)
             for i in range(number):
                 mesh.export(folder / f"{i}.off")
-    settings = [s for s in TINY if "per_class" not in s]
+    settings = [s for s in TINY_WITH_PICTURES if "per_class" not in s]
     status, out, err = call([*settings, "dataset=meshes", "dataset.root=mine"], tmp_path)
     assert status == 0, err
     (run,) = runs(tmp_path)
@@ -243,7 +251,12 @@ def test_a_folder_of_meshes_runs(tmp_path):
 def test_another_net_s_weights_are_refused(main_job):
     folder, run, *_ = main_job
     other = next((folder / "cache" / "weights").rglob("weights.pt"))
-    settings = [*TINY, f"weights={other}", "dataset.classes=[chair,table]", "out=other"]
+    settings = [
+        *TINY_WITH_PICTURES,
+        f"weights={other}",
+        "dataset.classes=[chair,table]",
+        "out=other",
+    ]
     status, out, err = call(settings, folder)
     assert status == 2
     assert "holds another net's weights" in err
@@ -253,7 +266,12 @@ def final_state(run):
     return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
 
 
-LONGER = [*TINY[:1], "trainer.max_epochs=6", *TINY[2:], "dataset.train_per_class=12"]
+LONGER = [
+    *TINY_WITH_PICTURES[:1],
+    "trainer.max_epochs=6",
+    *TINY_WITH_PICTURES[2:],
+    "dataset.train_per_class=12",
+]
 
 
 @pytest.fixture(scope="module")
@@ -299,7 +317,7 @@ def test_a_run_stopped_in_mid_epoch_resumes_to_the_same_weights(unbroken, number
 def test_a_checkpoint_of_other_settings_is_refused(main_job):
     folder, run, *_ = main_job
     path = run.relative_to(folder)
-    settings = [s if s != "m=8" else "m=4" for s in TINY]
+    settings = [s if s != "m=8" else "m=4" for s in TINY_WITH_PICTURES]
     status, out, err = call([*settings, f"ckpt_path={path}", "out=wrong"], folder)
     assert status == 2
     assert "other settings (sampler" in err
@@ -307,7 +325,7 @@ def test_a_checkpoint_of_other_settings_is_refused(main_job):
 
 def test_one_net_for_many_sizes_is_tested_at_once_and_evaluated_anew(main_job):
     folder, *_ = main_job
-    status, out, err = call([*TINY, "sampler=fmops", "sampler.m_max=32"], folder)
+    status, out, err = call([*TINY_WITH_PICTURES, "sampler=fmops", "sampler.m_max=32"], folder)
     assert status == 0, err
     for word in ("m=8", "m=16", "m=32", "fmops completed", "all points"):
         assert word in out

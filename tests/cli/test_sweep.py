@@ -10,7 +10,7 @@ from mops_lightning.cli.sweep import run_cell
 from mops_lightning.config.validate import compose
 from mops_lightning.records import run_record
 from mops_lightning.records.attempts import ASIDE, FAILED
-from tests.training.test_evaluate import TINY
+from tests.support.command_line import TINY
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from mops_lightning.config.validate import compose
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
-from tests.command_line import TINY, call, call_anew
+from tests.support.command_line import TINY_WITH_PICTURES, call, call_anew
 
 
 def clouds(number):
@@ -78,13 +78,19 @@ def test_processes_of_a_launcher_must_be_meant_and_share_a_folder(monkeypatch):
 
 def test_a_wrong_batch_is_refused_before_the_task_net_is_trained(tmp_path):
     devices = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "batch_size=15"]
-    status, out, err = call([*TINY[1:], *devices], tmp_path)
+    status, out, err = call([*TINY_WITH_PICTURES[1:], *devices], tmp_path)
     assert status == 2
     assert "Try batch_size=16" in err
     assert "training it first" not in out
 
 
-REGISTRATION = [*TINY, "task=registration", "learn=task", "trainer.max_epochs=2", "batch_size=8"]
+REGISTRATION = [
+    *TINY_WITH_PICTURES,
+    "task=registration",
+    "learn=task",
+    "trainer.max_epochs=2",
+    "batch_size=8",
+]
 
 
 def test_two_processes_give_the_metrics_of_one_and_only_the_first_writes(tmp_path):
@@ -110,6 +116,6 @@ def test_two_processes_give_the_metrics_of_one_and_only_the_first_writes(tmp_pat
 
 
 def test_a_sweep_over_several_devices_is_refused_with_the_way_out(tmp_path):
-    status, _, err = call(["-m", *TINY, "trainer.devices=2", "m=4,8"], tmp_path)
+    status, _, err = call(["-m", *TINY_WITH_PICTURES, "trainer.devices=2", "m=4,8"], tmp_path)
     assert status == 2
     assert "hydra/launcher=joblib" in err

@@ -7,7 +7,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.ops.rigid import Motion
 from mops_lightning.seeding import generator
 from mops_lightning.types import Batch
-from tests.conftest import small_dataset
+from tests.support.training import small_dataset
 
 
 def generators(number, key=0):

@@ -19,7 +19,7 @@ from mops_lightning.downsample.large import by_chunks
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.zoo import weights
-from tests.downsample.test_downsample import call
+from tests.support.downsample import call
 
 
 @pytest.fixture(scope="module")

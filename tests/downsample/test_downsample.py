@@ -1,29 +1,17 @@
 """The command as a user types it."""
 
-import contextlib
-import io
 import os
 
 import numpy as np
 import pytest
 import torch
 
-from mops_lightning.downsample.cli import main
 from mops_lightning.downsample.formats.registry import WRITERS
 from mops_lightning.downsample.formats.table import Table
 from mops_lightning.downsample.job import read
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
-
-
-def call(*arguments):
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            main([str(argument) for argument in arguments])
-        except SystemExit as stop:
-            return stop.code, out.getvalue(), err.getvalue()
-    raise AssertionError("it ends by an exit status")
+from tests.support.downsample import call
 
 
 @pytest.fixture(scope="module")

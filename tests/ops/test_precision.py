@@ -14,7 +14,7 @@ from mops_lightning.ops.precision import full_precision, restrict_autocast_to_po
 from mops_lightning.ops.rigid import Motion
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.training.run import run
-from tests.command_line import TINY, call
+from tests.support.command_line import TINY_WITH_PICTURES, call
 
 NETS = {
     "classification": ("pointnet",),
@@ -105,7 +105,13 @@ def test_the_pooled_maximum_and_its_gradients_stay_near(n, norm, rng):
 @pytest.mark.parametrize("task", NETS)
 def test_every_net_trains_in_mixed_precision(task, tmp_path):
     for net in NETS[task]:
-        common = [*TINY, f"task={task}", f"task/net={net}", "pictures=0", "logger=none"]
+        common = [
+            *TINY_WITH_PICTURES,
+            f"task={task}",
+            f"task/net={net}",
+            "pictures=0",
+            "logger=none",
+        ]
         common += ["task.net.encoder=graph"] if net == "foldingnet" else []
         common += ["learn=joint", "weights=null", f"cache={tmp_path}/cache"]
         found = {}
@@ -119,7 +125,7 @@ def test_every_net_trains_in_mixed_precision(task, tmp_path):
 
 
 def test_one_net_has_the_same_scores_whatever_the_precision(tmp_path):
-    overrides = [*TINY, "pictures=0", "logger=none", f"cache={tmp_path}/cache"]
+    overrides = [*TINY_WITH_PICTURES, "pictures=0", "logger=none", f"cache={tmp_path}/cache"]
     status, _, err = call([*overrides, "hydra.run.dir=run"], tmp_path)
     assert status == 0, err
     for name, precision in (("single", "32-true"), ("half", "bf16-mixed")):
@@ -148,14 +154,14 @@ def test_nets_alone_can_be_put_under_autocast(net, rng):
 
 
 def test_a_precision_that_only_gpus_have_is_refused_on_a_cpu(tmp_path):
-    status, _, err = call([*TINY, "trainer.precision=16-mixed"], tmp_path)
+    status, _, err = call([*TINY_WITH_PICTURES, "trainer.precision=16-mixed"], tmp_path)
     assert status != 0
     assert "take bf16-mixed" in err
 
 
 @pytest.mark.parametrize("precision", ["bf16-true", "64-true", "transformer-engine", "half"])
 def test_precisions_that_round_coordinates_are_refused(precision, tmp_path):
-    status, _, err = call([*TINY, f"trainer.precision={precision}"], tmp_path)
+    status, _, err = call([*TINY_WITH_PICTURES, f"trainer.precision={precision}"], tmp_path)
     assert status != 0
     assert "trainer.precision must be one of 32-true, bf16-mixed, 16-mixed" in err
     assert precision in err

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.readout import complete, match, unique_count
-from tests.ops.test_points import plain_farthest
+from tests.support.plain import plain_farthest
 
 
 def tree_match(generated, points):

@@ -15,6 +15,7 @@ from mops_lightning.ops.rigid import (
     rotation_angle,
 )
 from mops_lightning.seeding import generator
+from tests.support.rigid import motion
 
 
 def rotations(number=200, seed=0):
@@ -79,10 +80,6 @@ def test_angles_are_scipys_at_none_and_at_half_turns_too(dtype):
 def test_the_angle_does_not_mind_sign_or_length():
     a, b = quaternions(rotations(seed=1)), quaternions(rotations(seed=2))
     torch.testing.assert_close(rotation_angle(-3 * a, b), rotation_angle(a, b))
-
-
-def motion(seed, number=5):
-    return random_motion(180.0, 2.0, [generator(seed, i) for i in range(number)])
 
 
 def test_motions_compose_invert_and_keep_distances(rng):

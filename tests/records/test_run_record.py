@@ -6,26 +6,7 @@ import pytest
 
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-
-
-def record(**changes):
-    return {
-        "schema": run_record.SCHEMA,
-        "status": "completed",
-        "config": {"m": 32},
-        "overrides": ["m=32"],
-        "metrics": {"test/generated/accuracy": 0.5},
-        "score": 0.5,
-        "seconds": {"total": 1.0},
-        "seed": 0,
-        "started": "2026-01-01T00:00:00+00:00",
-        **run_record.environment(),
-        "device": "cpu",
-        "files": {},
-        "error": None,
-        "notes": {},
-        **changes,
-    }
+from tests.support.records import record
 
 
 def test_round_trip(tmp_path):

@@ -4,7 +4,7 @@ from pathlib import Path
 from rich.console import Console
 
 from mops_lightning.records.summary import closing_lines, readout_rows
-from tests.records.test_run_record import record
+from tests.support.records import record
 
 NAMES = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": "mops"}
 

@@ -14,33 +14,7 @@ from mops_lightning.report.build import build
 from mops_lightning.report.cli import main
 from mops_lightning.report.plots import plots
 from mops_lightning.viz.snapshots import save_clouds
-from tests.records.test_run_record import record
-from tests.report.test_tables import put, rows, table
-
-
-def put_cell(folder, name, sampler, values, seed=0, **settings):
-    """A run of a sweep, whose settings beside the size are given dotted."""
-    config = {
-        "m": settings.pop("m", 32),
-        "learn": "sampler",
-        "names": {
-            "task": "reconstruction",
-            "net": "autoencoder",
-            "dataset": "shapes",
-            "sampler": sampler,
-        },
-        "trainer": {"max_epochs": 3},
-        "task": {"emd_weight": 1.0},
-        "sampler": {"m": 32, **settings.pop("of", {})},
-        **settings,
-    }
-    metrics = {f"test/{readout}/nre_cd": value for readout, value in values.items()}
-    notes = {"dataset_fingerprint": "d", "score": "test/generated/nre_cd"}
-    (folder / name).mkdir(parents=True)
-    seconds = {"total": 1.0, "fit": 0.5}
-    content = record(config=config, metrics=metrics, notes=notes, seed=seed, seconds=seconds)
-    run_record.write(folder / name, content)
-    return folder / name / run_record.FILE
+from tests.support.reports import put, put_cell, put_planes, rows, table
 
 
 def test_seeds_are_summed_up_with_their_count(tmp_path):
@@ -92,23 +66,6 @@ def test_sizes_of_different_kinds_stand_beside_each_other_if_asked(tmp_path):
         ["sampled by", "m=32", "m=8"],
         ["mops", "1", "2"],
     ]
-
-
-def put_planes(folder):
-    for number, alpha in enumerate((0.1, 1.0)):
-        for tau in (0.5, 0.9):
-            values = {"generated": 1 + number * tau, "matched": 2.0}
-            put_cell(folder, f"a{alpha}{tau}", "mops", values, of={"alpha": alpha, "tau": tau})
-        for gamma in (1e-5, 1e-3, 0.1):
-            beta = 10.0**-number
-            values = {"generated": gamma + beta, "matched": 3.0}
-            put_cell(
-                folder,
-                f"b{beta}{gamma}",
-                "samplenet",
-                values,
-                of={"beta": beta, "gamma": gamma},
-            )
 
 
 @pytest.mark.parametrize(("far", "kind"), [(3.0, Normalize), (12000.0, LogNorm)])

@@ -8,8 +8,7 @@ import torch
 from mops_lightning.records import run_record
 from mops_lightning.report.cli import main
 from mops_lightning.viz.snapshots import load_clouds, save_clouds
-from tests.report.test_layouts import put_planes
-from tests.report.test_tables import put
+from tests.support.reports import put, put_planes
 
 
 def cells(page, table=0):

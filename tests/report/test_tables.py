@@ -5,38 +5,9 @@ import pytest
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.report import paper
-from mops_lightning.report.build import build
 from mops_lightning.report.cli import main
-from mops_lightning.report.text import markdown
-from tests.records.test_run_record import record
-
-
-def table(folder, *metrics, mixed=False):
-    report = build(folder, metrics, mixed)
-    return markdown(report.grids, report.remarks)
-
-
-def put(folder, sampler, m, metrics, task="classification", net="pointnet", **changes):
-    names = {"task": task, "net": net, "dataset": "modelnet40", "sampler": sampler}
-    config = {
-        "m": m,
-        "learn": "sampler",
-        "names": names,
-        "trainer": {"max_epochs": 3},
-        "task": changes.pop("settings", {}),
-    }
-    notes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **changes.pop("notes", {})}
-    target = folder / f"{sampler}-{m}-{net}"
-    target.mkdir()
-    run_record.write(target, record(config=config, metrics=metrics, notes=notes, **changes))
-
-
-def rows(text):
-    return [
-        [cell.strip() for cell in line.strip()[1:-1].split("|")]
-        for line in text.splitlines()
-        if line.startswith("| ")
-    ]
+from tests.support.records import record
+from tests.support.reports import put, rows, table
 
 
 def test_cells_are_the_records_figures_beside_the_paper_s(tmp_path):

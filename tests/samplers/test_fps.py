@@ -5,7 +5,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.ordering import seeded_order
-from tests.ops.test_points import plain_farthest
+from tests.support.plain import plain_farthest
 
 
 def test_equals_the_double_loop_from_the_seed_s_point(rng):

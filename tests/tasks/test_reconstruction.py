@@ -14,8 +14,7 @@ from mops_lightning.tasks.reconstruction import Reconstruction
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.readouts import full_cloud
 from mops_lightning.types import Batch
-from tests.conftest import quiet_trainer, small_dataset
-from tests.training.test_experiment import changed, state
+from tests.support.training import changed, quiet_trainer, small_dataset, state
 
 
 def task(**extra):

@@ -19,9 +19,8 @@ from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.tasks.registration import Registration
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.readouts import full_cloud
-from tests.conftest import quiet_trainer, small_dataset
-from tests.ops.test_rigid import motion
-from tests.training.test_experiment import changed, state
+from tests.support.rigid import motion
+from tests.support.training import changed, quiet_trainer, small_dataset, state
 
 
 class Kabsch(torch.nn.Module):

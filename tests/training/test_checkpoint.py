@@ -11,7 +11,7 @@ from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.callbacks import StopBetweenSteps
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.schedules import one_cycle
-from tests.conftest import quiet_trainer, small_dataset
+from tests.support.training import quiet_trainer, small_dataset
 
 EPOCHS = 3
 

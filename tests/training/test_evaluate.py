@@ -6,20 +6,7 @@ from mops_lightning.config.validate import compose
 from mops_lightning.errors import UserError
 from mops_lightning.training.evaluate import command_line
 from mops_lightning.training.run import run
-
-TINY = [
-    "trainer=cpu",
-    "trainer.max_epochs=1",
-    "epochs.task=1",
-    "dataset.train_per_class=4",
-    "dataset.test_per_class=3",
-    "dataset.n_points=64",
-    "dataset.classes=[chair,vase,lamp]",
-    "batch_size=4",
-    "m=8",
-    "pictures=0",
-    "logger=none",
-]
+from tests.support.command_line import TINY
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,3 @@
-import copy
-
 import pytest
 import torch
 
@@ -12,7 +10,7 @@ from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.experiment import Experiment
-from tests.conftest import quiet_trainer, small_dataset
+from tests.support.training import changed, quiet_trainer, small_dataset, state
 
 
 def experiment(learn="sampler", sampler=True, **extra):
@@ -36,15 +34,6 @@ def fit(module, epochs=2):
         CloudLoader(data.test, 6),
     )
     return module
-
-
-def changed(before, module):
-    after = module.state_dict()
-    return {name for name in before if not torch.equal(before[name], after[name])}
-
-
-def state(module):
-    return copy.deepcopy(module.state_dict())
 
 
 def test_learning_the_sampler_leaves_the_task_bit_identical():

@@ -8,7 +8,7 @@ import pytest
 from mops_lightning.config.validate import check, compose
 from mops_lightning.errors import UserError
 from mops_lightning.training.run import run
-from tests.training.test_evaluate import TINY
+from tests.support.command_line import TINY
 
 CURVES = ["sampler=mops", "weights=null", "val_fraction=0.2", "trainer.log_every_n_steps=1"]
 

@@ -7,7 +7,7 @@ from mops_lightning.config.validate import compose
 from mops_lightning.errors import UserError
 from mops_lightning.training.run import run
 from mops_lightning.zoo import weights
-from tests.training.test_evaluate import TINY
+from tests.support.command_line import TINY
 
 
 def train(folder, *arguments):

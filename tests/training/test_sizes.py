@@ -13,7 +13,7 @@ from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.sizes import sizes_to_test
-from tests.conftest import quiet_trainer, small_dataset
+from tests.support.training import quiet_trainer, small_dataset
 
 SEVEN = (1, 2, 3, 5, 8, 13, 20)
 

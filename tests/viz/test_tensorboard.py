@@ -11,7 +11,7 @@ import pytest
 
 from mops_lightning.config.validate import compose
 from mops_lightning.training.run import run
-from tests.training.test_evaluate import TINY
+from tests.support.command_line import TINY
 
 
 @pytest.fixture(scope="module")

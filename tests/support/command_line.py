@@ -19,12 +19,17 @@ TINY = [
     "trainer.max_epochs=1",
     "epochs.task=1",
     "dataset.train_per_class=4",
-    "dataset.test_per_class=2",
+    "dataset.test_per_class=3",
     "dataset.n_points=64",
-    "batch_size=16",
+    "dataset.classes=[chair,vase,lamp]",
+    "batch_size=4",
     "m=8",
-    "pictures=2",
+    "pictures=0",
+    "logger=none",
 ]
+"""The smallest job that runs every stage."""
+
+TINY_WITH_PICTURES = [*TINY, "pictures=2", "logger=tensorboard"]
 
 
 def start(arguments, folder, **extra):

@@ -1,0 +1,1 @@
+"""What several tests share: small data, plain twins, the command line, records."""

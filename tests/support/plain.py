@@ -1,0 +1,33 @@
+"""Plain twins of fast operations, which several tests compare with."""
+
+import torch
+
+
+def squared(a, b):
+    return sum((x - y) ** 2 for x, y in zip(a, b, strict=True))
+
+
+def plain_nearest(queries, points):
+    distances, indices = [], []
+    for cloud_q, cloud_p in zip(queries, points, strict=True):
+        for q in cloud_q:
+            best, place = torch.tensor(torch.inf), -1
+            for i, p in enumerate(cloud_p):
+                d = squared(q, p)
+                if d < best:
+                    best, place = d, i
+            distances.append(best)
+            indices.append(place)
+    shape = queries.shape[:2]
+    return torch.stack(distances).view(shape), torch.tensor(indices).view(shape)
+
+
+def plain_farthest(cloud, chosen, m):
+    cloud, chosen = cloud.tolist(), list(chosen)
+    while len(chosen) < m:
+        best, place = -1.0, -1
+        for i, p in enumerate(cloud):
+            if i not in chosen and (d := min(squared(p, cloud[j]) for j in chosen)) > best:
+                best, place = d, i
+        chosen.append(place)
+    return chosen

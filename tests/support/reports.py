@@ -1,0 +1,76 @@
+"""Folders of made-up runs, and their tables."""
+
+from mops_lightning.records import run_record
+from mops_lightning.report.build import build
+from mops_lightning.report.text import markdown
+from tests.support.records import record
+
+
+def table(folder, *metrics, mixed=False):
+    report = build(folder, metrics, mixed)
+    return markdown(report.grids, report.remarks)
+
+
+def put(folder, sampler, m, metrics, task="classification", net="pointnet", **changes):
+    names = {"task": task, "net": net, "dataset": "modelnet40", "sampler": sampler}
+    config = {
+        "m": m,
+        "learn": "sampler",
+        "names": names,
+        "trainer": {"max_epochs": 3},
+        "task": changes.pop("settings", {}),
+    }
+    notes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **changes.pop("notes", {})}
+    target = folder / f"{sampler}-{m}-{net}"
+    target.mkdir()
+    run_record.write(target, record(config=config, metrics=metrics, notes=notes, **changes))
+
+
+def rows(text):
+    return [
+        [cell.strip() for cell in line.strip()[1:-1].split("|")]
+        for line in text.splitlines()
+        if line.startswith("| ")
+    ]
+
+
+def put_cell(folder, name, sampler, values, seed=0, **settings):
+    """A run of a sweep, whose settings beside the size are given dotted."""
+    config = {
+        "m": settings.pop("m", 32),
+        "learn": "sampler",
+        "names": {
+            "task": "reconstruction",
+            "net": "autoencoder",
+            "dataset": "shapes",
+            "sampler": sampler,
+        },
+        "trainer": {"max_epochs": 3},
+        "task": {"emd_weight": 1.0},
+        "sampler": {"m": 32, **settings.pop("of", {})},
+        **settings,
+    }
+    metrics = {f"test/{readout}/nre_cd": value for readout, value in values.items()}
+    notes = {"dataset_fingerprint": "d", "score": "test/generated/nre_cd"}
+    (folder / name).mkdir(parents=True)
+    seconds = {"total": 1.0, "fit": 0.5}
+    content = record(config=config, metrics=metrics, notes=notes, seed=seed, seconds=seconds)
+    run_record.write(folder / name, content)
+    return folder / name / run_record.FILE
+
+
+def put_planes(folder):
+    for number, alpha in enumerate((0.1, 1.0)):
+        for tau in (0.5, 0.9):
+            values = {"generated": 1 + number * tau, "matched": 2.0}
+            put_cell(folder, f"a{alpha}{tau}", "mops", values, of={"alpha": alpha, "tau": tau})
+        for gamma in (1e-5, 1e-3, 0.1):
+            beta = 10.0**-number
+            values = {"generated": gamma + beta, "matched": 3.0}
+            put_cell(
+                folder,
+                f"b{beta}{gamma}",
+                "samplenet",
+                values,
+                of={"beta": beta, "gamma": gamma},
+            )

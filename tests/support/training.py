@@ -1,0 +1,44 @@
+"""A quiet trainer, small data, and what changed in a module."""
+
+import copy
+from typing import Any
+
+import lightning as L
+import torch
+
+from mops_lightning.data.clouds import CloudDataset, Clouds
+
+
+def quiet_trainer(epochs: int, **extra: Any) -> L.Trainer:
+    """A CPU trainer that writes and prints nothing."""
+    return L.Trainer(
+        max_epochs=epochs,
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        **extra,
+    )
+
+
+def small_dataset(train: int = 24, test: int = 10, points: int = 48) -> CloudDataset:
+    """Three kinds of Gaussian blobs: enough to run every code path, too easy to measure with."""
+    rng = torch.Generator().manual_seed(3)
+
+    def clouds(number: int) -> Clouds:
+        labels = torch.arange(number) % 3
+        scale = torch.tensor([[1.0, 0.1, 0.1], [0.1, 1.0, 0.1], [0.3, 0.3, 0.3]])[labels]
+        return Clouds(torch.randn(number, points, 3, generator=rng) * scale[:, None], labels)
+
+    return CloudDataset(("long", "tall", "round"), clouds(train), clouds(test), "blobs")
+
+
+def changed(before, module):
+    after = module.state_dict()
+    return {name for name in before if not torch.equal(before[name], after[name])}
+
+
+def state(module):
+    return copy.deepcopy(module.state_dict())
