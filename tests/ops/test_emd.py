@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import wasserstein_distance
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.emd import earth_mover_distance, matching
+from mops_lightning.ops.emd import earth_movers_distance, matching
 
 
 def plain(points, others):
@@ -32,7 +32,7 @@ def clouds(rng, *shape):
 @pytest.mark.parametrize("n", [1, 2, 5, 6])
 def test_exact_distance_is_the_best_of_all_bijections(n, rng):
     points, others = clouds(rng, 3, n)
-    torch.testing.assert_close(earth_mover_distance(points, others), plain(points, others))
+    torch.testing.assert_close(earth_movers_distance(points, others), plain(points, others))
 
 
 def test_on_a_line_it_is_the_wasserstein_distance_of_scipy(rng):
@@ -43,7 +43,7 @@ def test_on_a_line_it_is_the_wasserstein_distance_of_scipy(rng):
         for p, q in zip(points, others, strict=True)
     ]
     torch.testing.assert_close(
-        earth_mover_distance(points, others), torch.tensor(want, dtype=torch.float64)
+        earth_movers_distance(points, others), torch.tensor(want, dtype=torch.float64)
     )
 
 
@@ -65,18 +65,18 @@ def kinds(n, rng):
 @pytest.mark.parametrize(("block", "rounds", "bound"), [(64, 2, 1.17), (128, 8, 1.08)])
 def test_distance_by_blocks_is_an_upper_bound_near_the_exact_one(kind, block, rounds, bound, rng):
     points, others = kinds(512, rng)[kind]
-    exact = earth_mover_distance(points, others).item()
-    near = earth_mover_distance(points, others, block, rounds).item()
+    exact = earth_movers_distance(points, others).item()
+    near = earth_movers_distance(points, others, block, rounds).item()
     assert exact * (1 - 1e-9) <= near < bound * exact
 
 
 def test_more_rounds_are_never_worse_and_one_block_is_exact(rng):
     points, others = kinds(300, rng)["surface"]
-    values = [earth_mover_distance(points, others, 32, rounds).item() for rounds in range(6)]
+    values = [earth_movers_distance(points, others, 32, rounds).item() for rounds in range(6)]
     assert values == sorted(values, reverse=True)
     assert values[5] < values[0]
-    one = earth_mover_distance(points, others, block=300)
-    torch.testing.assert_close(one, earth_mover_distance(points, others))
+    one = earth_movers_distance(points, others, block=300)
+    torch.testing.assert_close(one, earth_movers_distance(points, others))
 
 
 @pytest.mark.parametrize("block", [None, 7])
@@ -88,30 +88,30 @@ def test_matchings_are_bijections_of_odd_and_coincident_clouds_too(block, rng):
     assert torch.equal(match.sort(1).values, torch.arange(61).expand(3, -1))
     assert torch.equal(matching(points, others, block), match)
     if block is None:
-        assert earth_mover_distance(points, others)[2] == 0
+        assert earth_movers_distance(points, others)[2] == 0
 
 
 @pytest.mark.parametrize("block", [None, 4])
 def test_gradients(block, rng):
     points, others = (cloud.requires_grad_() for cloud in clouds(rng, 2, 9))
     assert torch.autograd.gradcheck(
-        lambda a, b: earth_mover_distance(a, b, block), (points, others), eps=1e-7
+        lambda a, b: earth_movers_distance(a, b, block), (points, others), eps=1e-7
     )
     same = points.detach().clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(earth_mover_distance(same, points).sum(), same)
+    (gradient,) = torch.autograd.grad(earth_movers_distance(same, points).sum(), same)
     assert torch.isfinite(gradient).all()
 
 
 def test_half_precision_and_float32_are_taken(rng):
     points, others = clouds(rng, 2, 20)
-    exact = earth_mover_distance(points, others)
-    torch.testing.assert_close(earth_mover_distance(points.float(), others.float()), exact.float())
-    assert earth_mover_distance(points.half(), others.half()).dtype == torch.float16
+    exact = earth_movers_distance(points, others)
+    torch.testing.assert_close(earth_movers_distance(points.float(), others.float()), exact.float())
+    assert earth_movers_distance(points.half(), others.half()).dtype == torch.float16
 
 
 def test_ten_thousand_points_take_little_memory_and_time(rng):
     points, others = kinds(10_000, rng)["surface"]
-    value = earth_mover_distance(points, others, block=64, rounds=2).item()
+    value = earth_movers_distance(points, others, block=64, rounds=2).item()
     # What no bijection can beat: every point to the nearest one.
     from scipy.spatial import cKDTree
 
@@ -132,7 +132,7 @@ def test_ten_thousand_points_take_little_memory_and_time(rng):
 def test_bad_input_is_named(change, said):
     given = {"points": torch.zeros(2, 5, 3), "others": torch.zeros(2, 5, 3), **change}
     with pytest.raises(UserError, match=said):
-        earth_mover_distance(**given)
+        earth_movers_distance(**given)
 
 
 def test_workers_give_the_same_matching_and_end_with_the_process_that_asked(tmp_path, rng):
@@ -141,7 +141,7 @@ def test_workers_give_the_same_matching_and_end_with_the_process_that_asked(tmp_
         "import sys\n"
         "if __name__ == '__main__':\n"
         "    import torch\n"
-        "    from mops_lightning import workers\n"
+        "    from mops_lightning.ops import workers\n"
         "    from mops_lightning.ops.emd import matching\n"
         "    points, others = torch.load(sys.argv[1])\n"
         "    for block in (None, 64):\n"
@@ -176,7 +176,7 @@ def test_many_points_are_matched_as_well_by_pot_as_by_scipy(rng):
     for points, others in kinds(1024, rng).values():
         cost = torch.cdist(points, others)[0].numpy()
         want = cost[linear_sum_assignment(cost)].mean()
-        assert earth_mover_distance(points, others).item() == pytest.approx(want, rel=1e-9)
+        assert earth_movers_distance(points, others).item() == pytest.approx(want, rel=1e-9)
 
 
 @pytest.mark.parametrize("n", [30, 200])
@@ -184,4 +184,4 @@ def test_the_exact_distance_is_that_of_pot(n, rng):
     points, others = kinds(n, rng)["surface"]
     cost = torch.cdist(points, others)[0].numpy()
     want = ot.emd2(np.full(n, 1 / n), np.full(n, 1 / n), cost)
-    assert earth_mover_distance(points, others).item() == pytest.approx(want, rel=1e-9)
+    assert earth_movers_distance(points, others).item() == pytest.approx(want, rel=1e-9)

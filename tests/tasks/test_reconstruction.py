@@ -7,7 +7,7 @@ from mops_lightning.metrics.reconstruction import Distances, MeanDistance, Norma
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.ops.chamfer import chamfer_distance
-from mops_lightning.ops.emd import earth_mover_distance
+from mops_lightning.ops.emd import earth_movers_distance
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.reconstruction import Reconstruction
@@ -35,7 +35,7 @@ def test_the_loss_is_chamfer_plus_weighted_emd(rng):
         torch.testing.assert_close(losses["chamfer"], chamfer_distance(built, given.points).mean())
         assert set(losses) == {"chamfer", *(["emd"] if weight else [])}
         if weight:
-            emd = earth_mover_distance(built, given.points).mean()
+            emd = earth_movers_distance(built, given.points).mean()
             torch.testing.assert_close(losses["emd"], weight * emd)
 
 
@@ -58,7 +58,7 @@ def test_all_points_have_an_error_of_one_and_a_sample_of_the_same_codeword_too(r
     )
     torch.testing.assert_close(values["nre_cd"], ratio.mean())
     torch.testing.assert_close(values["chamfer"], chamfer_distance(built, given.points).mean())
-    exact = earth_mover_distance(built, given.points).mean()
+    exact = earth_movers_distance(built, given.points).mean()
     torch.testing.assert_close(values["emd"], exact)
 
 

@@ -12,7 +12,7 @@ class Distances(NamedTuple):
 
     Attributes:
         chamfer: ``(B,)``, see ``losses.chamfer_distance``.
-        emd: ``(B,)``, see ``emd.earth_mover_distance``.
+        emd: ``(B,)``, see ``emd.earth_movers_distance``.
     """
 
     chamfer: Tensor

@@ -20,7 +20,7 @@ WORTHWHILE = 8192
 """Points of a batch from which on other processes are asked; starting them takes a second."""
 
 
-def earth_mover_distance(
+def earth_movers_distance(
     points: Tensor,
     others: Tensor,
     block: int | None = None,
@@ -57,7 +57,7 @@ def matching(
     rounds: int = 4,
     workers: int | None = 1,
 ) -> Tensor:
-    """Return the bijection behind ``earth_mover_distance``: ``(B, N)`` int64 rows of ``others``."""
+    """Return the bijection of ``earth_movers_distance``: ``(B, N)`` int64 rows of ``others``."""
     if points.shape != others.shape or points.ndim != 3:
         raise UserError(
             "points and others must both be (B, N, 3) with the same N, got "

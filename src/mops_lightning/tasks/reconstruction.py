@@ -11,7 +11,7 @@ from torchmetrics import Metric, MetricCollection
 from mops_lightning.errors import UserError
 from mops_lightning.metrics.reconstruction import Distances, MeanDistance, NormalizedError
 from mops_lightning.ops.chamfer import chamfer_distance
-from mops_lightning.ops.emd import earth_mover_distance
+from mops_lightning.ops.emd import earth_movers_distance
 from mops_lightning.tasks.base import Sample, Task
 from mops_lightning.types import Batch, TaskOutput
 
@@ -102,7 +102,7 @@ class Reconstruction(Task):
         return Distances(chamfer_distance(built, points), emd)
 
     def _emd(self, built: Tensor, points: Tensor, block: int | None, rounds: int) -> Tensor:
-        return earth_mover_distance(built, points, block, rounds, self.emd_workers)
+        return earth_movers_distance(built, points, block, rounds, self.emd_workers)
 
     def figures(
         self, batch: Batch, samples: Mapping[str, Sample], titles: Sequence[str]
