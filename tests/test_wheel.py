@@ -91,7 +91,7 @@ def test_the_wheel_declares_the_console_script_and_carries_the_licence(wheel: Pa
 
 def test_the_installed_copy_is_what_these_tests_import(installed: Path, tmp_path: Path) -> None:
     code = (
-        "import mops_lightning, mops_lightning.config.validate as c; print(mops_lightning.__file__)"
+        "import mops_lightning, mops_lightning.config.compose as c; print(mops_lightning.__file__)"
     )
     lines = python("-c", f"{code}; print(c.conf_dir())", cwd=tmp_path, path=installed).split("\n")
     assert Path(lines[0]) == installed / "mops_lightning" / "__init__.py"

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from mops_lightning.cli.sweep import run_cell
-from mops_lightning.config.validate import compose
+from mops_lightning.config.compose import compose
 from mops_lightning.records import run_record
 from mops_lightning.records.attempts import ASIDE, FAILED
 from tests.support.command_line import TINY

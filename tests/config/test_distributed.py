@@ -5,8 +5,8 @@ import json
 import pytest
 import torch
 
+from mops_lightning.config.compose import compose
 from mops_lightning.config.distributed import check_shares, check_start
-from mops_lightning.config.validate import compose
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError

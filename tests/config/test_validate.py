@@ -4,15 +4,9 @@ import pytest
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
-from mops_lightning.config.validate import (
-    GROUPS,
-    RUN_KEYS,
-    build,
-    check,
-    compose,
-    conf_dir,
-    signature,
-)
+from mops_lightning.config.build import signature
+from mops_lightning.config.compose import compose, conf_dir
+from mops_lightning.config.validate import GROUPS, RUN_KEYS, check
 from mops_lightning.errors import UserError
 
 
@@ -175,8 +169,3 @@ def test_the_rivals_settings():
 def test_mistakes_are_named_before_any_work(overrides, said):
     with pytest.raises(UserError, match=said):
         check(compose(overrides))
-
-
-def test_build_passes_a_user_error_on_unwrapped():
-    with pytest.raises(UserError, match=r"sampler\.tau_min"):
-        build(compose(["sampler.tau_min=0"]).sampler)

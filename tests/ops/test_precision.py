@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from mops_lightning.config.validate import compose
+from mops_lightning.config.compose import compose
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import FEW_POINTS, PointMaxPool, PointMLP

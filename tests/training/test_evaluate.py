@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from mops_lightning.config.validate import compose
+from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.training.evaluate import command_line
 from mops_lightning.training.run import run

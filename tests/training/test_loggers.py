@@ -5,7 +5,8 @@ from importlib.util import find_spec
 
 import pytest
 
-from mops_lightning.config.validate import check, compose
+from mops_lightning.config.compose import compose
+from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.training.run import run
 from tests.support.command_line import TINY
@@ -46,7 +47,7 @@ def test_mlflow_keeps_settings_and_curves_in_a_folder(tmp_path, monkeypatch):
 def test_a_missing_package_is_named(name, tmp_path):
     if find_spec(name):
         pytest.skip(f"{name} is installed")
-    with pytest.raises(UserError, match=f"needs a package that is not here: .*{name}"):
+    with pytest.raises(UserError, match=f"needs a package that is not installed: .*{name}"):
         logged(tmp_path, f"logger={name}")
 
 

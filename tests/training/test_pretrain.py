@@ -3,7 +3,7 @@ import json
 import pytest
 import torch
 
-from mops_lightning.config.validate import compose
+from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.training.run import run
 from mops_lightning.zoo import weights

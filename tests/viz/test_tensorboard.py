@@ -9,7 +9,7 @@ from urllib.parse import urlparse
 
 import pytest
 
-from mops_lightning.config.validate import compose
+from mops_lightning.config.compose import compose
 from mops_lightning.training.run import run
 from tests.support.command_line import TINY
 

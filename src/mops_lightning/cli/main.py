@@ -5,7 +5,8 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from mops_lightning.config.validate import GROUPS, LEARN, RUN_KEYS, conf_dir
+from mops_lightning.config.compose import conf_dir
+from mops_lightning.config.validate import GROUPS, LEARN, RUN_KEYS
 from mops_lightning.errors import Interrupted, UserError, did_you_mean
 
 if TYPE_CHECKING:
@@ -125,7 +126,7 @@ def _no_such_setting(key: str) -> str:
     """Say what was meant by a key: a group, a setting, or one that YAML leaves at its default."""
     from omegaconf import OmegaConf
 
-    from mops_lightning.config.validate import signature
+    from mops_lightning.config.build import signature
 
     root = conf_dir()
     paths = [str(path.relative_to(root)) for path in root.rglob("*") if path.is_dir()]
@@ -143,7 +144,7 @@ def _no_such_setting(key: str) -> str:
 
 def _composed(groups: Sequence[str]) -> "DictConfig":
     """Compose what the command line chooses from groups, without what else it sets."""
-    from mops_lightning.config.validate import compose
+    from mops_lightning.config.compose import compose
 
     try:
         return compose([part for part in sys.argv[1:] if part.split("=")[0] in groups])

@@ -1,14 +1,13 @@
-"""Where conf/ is, what the run-level keys mean, and how nodes become objects."""
+"""Finding mistakes in a configuration before any heavy work."""
 
-import inspect
 import math
-from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config import distributed
 from mops_lightning.config.annotations import misfit
+from mops_lightning.config.build import signature
 from mops_lightning.errors import UserError, did_you_mean
 
 RUN_KEYS = (
@@ -43,77 +42,6 @@ PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 
 GROUPS = ("task", "dataset", "sampler", "optimizer", "trainer", "logger")
 LEARN = ("task", "sampler", "joint", "nothing")
-
-
-def conf_dir() -> Path:
-    """Return the folder with the Hydra groups: in the wheel, or at the top of a checkout.
-
-    Raises:
-        UserError: neither is there; the installation is broken.
-    """
-    here = Path(__file__).resolve().parents[1]
-    for folder in (here / "conf", here.parents[1] / "conf"):
-        if (folder / "config.yaml").is_file():
-            return folder
-    raise UserError(
-        f"conf/ is neither in {here} nor beside src/: reinstall with "
-        "pip install --force-reinstall mops-lightning."
-    )
-
-
-def compose(overrides: list[str] | None = None) -> DictConfig:
-    """Compose a configuration as the command line does, for notebooks and tests.
-
-    Args:
-        overrides: such as ``["m=64", "sampler=fps"]``.
-    """
-    from hydra import compose as hydra_compose
-    from hydra import initialize_config_dir
-    from hydra.core.hydra_config import HydraConfig
-
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = hydra_compose("config", overrides=overrides or [], return_hydra_config=True)
-    HydraConfig.instance().set_config(cfg)
-    plain = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
-    # Names come from Hydra's choices; resolved here they outlive the global HydraConfig.
-    plain.names = OmegaConf.to_container(cfg.names, resolve=True)
-    return plain
-
-
-def build(node: Any, **extra: Any) -> Any:
-    """Make the object that a node describes; the only caller of Hydra's instantiate.
-
-    Args:
-        node: a configuration with ``_target_``.
-        **extra: further arguments of the constructor, which no YAML could know.
-
-    Raises:
-        UserError: what the constructor itself found wrong, without Hydra's wrapping.
-    """
-    from hydra.errors import InstantiationException
-    from hydra.utils import instantiate
-
-    try:
-        return instantiate(node, **extra, _convert_="all")
-    except InstantiationException as error:
-        cause: BaseException | None = error
-        while cause is not None:
-            if isinstance(cause, UserError):
-                raise cause from None
-            if isinstance(cause, ModuleNotFoundError):
-                target = node.get("_target_", node)
-                raise UserError(f"{target} needs a package that is not here: {cause}") from None
-            if type(cause).__name__ == "MisconfigurationException":
-                # Lightning's word for a trainer that this machine cannot run, such as trainer=gpu.
-                raise UserError(f"trainer: {cause} Try trainer=auto or trainer=cpu.") from None
-            cause = cause.__cause__
-        raise
-
-
-def accepted(node: DictConfig, offered: dict[str, Any]) -> dict[str, Any]:
-    """Return those of the offered arguments that a node's constructor takes."""
-    parameters = signature(str(node["_target_"]), "")
-    return {name: value for name, value in offered.items() if name in parameters}
 
 
 def check(cfg: DictConfig) -> None:
@@ -220,38 +148,3 @@ def _check_node(node: Any, where: str) -> None:
     for key in node:
         if not OmegaConf.is_missing(node, key):
             _check_node(node[key], f"{where}.{key!s}")
-
-
-def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
-    """Return the parameters of a target; what a class hands on to its bases belongs to them."""
-    from hydra.utils import get_object
-
-    try:
-        found = get_object(target)
-    except Exception as error:
-        raise UserError(
-            f"{where}._target_: cannot import {target!r}: {str(error).splitlines()[0]}"
-        ) from None
-    if not inspect.isclass(found):
-        return _own_signature(found)
-    parameters: dict[str, inspect.Parameter] = {}
-    for cls in found.__mro__:
-        if "__init__" not in vars(cls):
-            continue
-        own = _own_signature(vars(cls)["__init__"])
-        own.pop("self", None)
-        rest = [name for name, p in own.items() if p.kind is p.VAR_KEYWORD]
-        named = {name: p for name, p in own.items() if name not in rest}
-        if parameters:  # what a base must be given, the class above gives it
-            named = {name: p for name, p in named.items() if p.default is not p.empty}
-        parameters = {**named, **parameters}
-        if not rest:
-            return parameters
-    return {**parameters, **own}  # nobody says what else is allowed
-
-
-def _own_signature(function: Any) -> dict[str, inspect.Parameter]:
-    try:
-        return dict(inspect.signature(function, eval_str=True).parameters)
-    except NameError:  # an annotation that exists for type checkers only
-        return dict(inspect.signature(function).parameters)

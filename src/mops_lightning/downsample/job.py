@@ -122,7 +122,7 @@ def sampler_of(settings: Settings) -> Sampler:
         raise UserError(f"--weights: {path} holds a task net; give a sampler's run.")
     from omegaconf import OmegaConf
 
-    from mops_lightning.config.validate import build
+    from mops_lightning.config.build import build
 
     sampler: Sampler = build(OmegaConf.create(content["config"]["sampler"]))
     weights.fit_state(sampler, content["state"], path)

@@ -11,7 +11,9 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mops_lightning.config.validate import build, check, distributed
+from mops_lightning.config import distributed
+from mops_lightning.config.build import build
+from mops_lightning.config.validate import check
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.noise import noisy
 from mops_lightning.errors import Interrupted, UserError
@@ -61,7 +63,7 @@ def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> di
         _begin(folder)
     with recorded(cfg, folder, overrides or []) as record:
         with timed(record, "data"):
-            dataset = build(cfg.dataset)
+            dataset = build(cfg.dataset, "dataset")
             test_points = noisy(dataset.test.points, cfg.noise)
             dataset = replace(dataset, test=dataset.test._replace(points=test_points))
         points = dataset.train.points.shape[1]

@@ -14,7 +14,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from mops_lightning.config.validate import accepted, build
+from mops_lightning.config.build import accepted, build
 from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import Interrupted, UserError
@@ -122,25 +122,27 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     classes = len(dataset.class_names)
     L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
     offered = {"num_classes": classes}
-    net = build(cfg.task.net, **accepted(cfg.task.net, offered))
-    task: Task = build(cfg.task, net=net, **accepted(cfg.task, offered))
+    net = build(cfg.task.net, "task.net", **accepted(cfg.task.net, offered))
+    task: Task = build(cfg.task, "task", net=net, **accepted(cfg.task, offered))
     # A seed of its own: the sampler's first weights must not hang on the size of the task net.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
-    sampler = build(cfg.sampler) if cfg.learn != "task" else None
+    sampler = build(cfg.sampler, "sampler") if cfg.learn != "task" else None
     points = task.points_of(dataset.test.points.shape[1])
     sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, points, training=cfg.learn != "nothing")
     baselines = {}
     if sampler is not None and sampler.learned:
         nodes = {str(name): node for name, node in cfg.baselines.items() if node}
-        baselines = {name: build(node, m=max(sizes)) for name, node in nodes.items()}
+        baselines = {
+            name: build(node, f"baselines.{name}", m=max(sizes)) for name, node in nodes.items()
+        }
     elif sampler is not None and sampler.flexible:
-        sampler = build(cfg.sampler, m=max(sizes))
+        sampler = build(cfg.sampler, "sampler", m=max(sizes))
     return Experiment(
         task,
         sampler,
         learn=cfg.learn,
-        make_optimizer=build(cfg.optimizer.optimizer),
-        make_schedule=build(cfg.optimizer.schedule),
+        make_optimizer=build(cfg.optimizer.optimizer, "optimizer.optimizer"),
+        make_schedule=build(cfg.optimizer.schedule, "optimizer.schedule"),
         baselines=baselines,
         seed=cfg.seed,
         identity=identity,
@@ -159,7 +161,7 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset, task: Tas
     for message in HARMLESS:
         warnings.filterwarnings("ignore", message=message)
     keep_freed_memory()
-    logger = build(cfg.logger, save_dir=str(folder)) if cfg.get("logger") else False
+    logger = build(cfg.logger, "logger", save_dir=str(folder)) if cfg.get("logger") else False
     score = task.score if cfg.learn != "task" else task.full_score or task.score
     rows, titles = choose_shown(dataset, cfg.pictures)
     drawing = []
@@ -168,6 +170,7 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset, task: Tas
         drawing = [CloudVisualization(batch, titles, folder / "pictures")]
     trainer: L.Trainer = build(
         cfg.trainer,
+        "trainer",
         logger=logger,
         callbacks=[
             *callbacks.standard(folder, logged=bool(logger), score=score),

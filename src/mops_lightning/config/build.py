@@ -1,0 +1,146 @@
+"""Turning configuration nodes into objects: the only place that calls Hydra's instantiate."""
+
+import inspect
+import re
+from functools import partial
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from mops_lightning.errors import UserError
+
+
+def build(node: Any, where: str = "", **extra: Any) -> Any:
+    """Make the object that a node describes, with the objects of the nodes below it.
+
+    Constructors name their arguments in errors (``tau_min must be ...``), for they know nothing of
+    settings. Where such an error starts with an argument that the node sets, the setting takes its
+    place: ``sampler.tau_min must be ...`` for ``where="sampler"``, and ``m must be ...`` for an
+    argument that the node takes from the setting ``m`` (``m: ${m}``). The same holds for errors
+    from later calls of a ``_partial_`` function. Any other error is passed on unchanged.
+
+    Args:
+        node: a configuration with ``_target_``.
+        where: the dotted path of the node in the configuration.
+        **extra: further arguments of the constructor, which no YAML could know.
+
+    Raises:
+        UserError: the constructor rejects an argument, or the target needs a package that is not
+            installed.
+    """
+    from hydra.errors import InstantiationException
+    from hydra.utils import instantiate
+
+    below = {
+        str(key): build(child, f"{where}.{key!s}" if where else str(key))
+        for key, child in _children(node)
+        if key not in extra
+    }
+    try:
+        made = instantiate(node, **below, **extra, _convert_="all")
+    except InstantiationException as error:
+        known = _known_cause(error, node, where)
+        if known is None:
+            raise
+        raise _with_path(known, node, where, tuple(extra)) from None
+    if isinstance(node, DictConfig) and node.get("_partial_"):
+        return partial(_call, made, node, where)
+    return made
+
+
+def _children(node: Any) -> list[tuple[Any, DictConfig]]:
+    """Return the nodes directly below ``node`` that describe objects themselves."""
+    if not isinstance(node, DictConfig):
+        return []
+    found = [(key, node[key]) for key in node if not OmegaConf.is_missing(node, key)]
+    return [
+        (key, child)
+        for key, child in found
+        if isinstance(child, DictConfig) and child.get("_target_") is not None
+    ]
+
+
+def _known_cause(error: BaseException, node: Any, where: str) -> UserError | None:
+    """Return the user's mistake behind an error of Hydra's, if it is one."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, UserError):
+            return cause
+        if isinstance(cause, ModuleNotFoundError):
+            target = node.get("_target_", node)
+            return UserError(f"{target} needs a package that is not installed: {cause}")
+        if type(cause).__name__ == "MisconfigurationException":
+            # Lightning's word for a trainer that this machine cannot run, such as trainer=gpu.
+            return UserError(f"trainer: {cause} Try trainer=auto or trainer=cpu.")
+        cause = cause.__cause__
+    return None
+
+
+def _call(function: Any, node: DictConfig, where: str, /, *args: Any, **kwargs: Any) -> Any:
+    try:
+        return function(*args, **kwargs)
+    except UserError as error:
+        named = list(signature(str(node["_target_"]), where))[: len(args)]
+        raise _with_path(error, node, where, (*named, *kwargs)) from error.__cause__
+
+
+def _with_path(error: UserError, node: Any, where: str, extra: tuple[str, ...]) -> UserError:
+    """Put the setting's path in place of the argument that an error starts with.
+
+    Args:
+        error: as the constructor raised it.
+        node: the configuration of the object.
+        where: its dotted path.
+        extra: arguments that code gave, not the configuration.
+    """
+    found = re.match(r"([A-Za-z_]\w*)(?![\w.])", str(error))
+    name = found.group(1) if found else ""
+    from_code = name in extra and name not in node
+    if not (where and name) or from_code or name not in signature(str(node["_target_"]), where):
+        return error
+    raw = OmegaConf.to_container(node, resolve=False)
+    value = raw.get(name) if isinstance(raw, dict) else None
+    shared = re.fullmatch(r"\$\{(\w+)\}", value) if isinstance(value, str) else None
+    setting = shared.group(1) if shared else f"{where}.{name}"
+    return UserError(setting + str(error)[len(name) :])
+
+
+def accepted(node: DictConfig, offered: dict[str, Any]) -> dict[str, Any]:
+    """Return those of the offered arguments that a node's constructor takes."""
+    parameters = signature(str(node["_target_"]), "")
+    return {name: value for name, value in offered.items() if name in parameters}
+
+
+def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
+    """Return the parameters of a target; what a class hands on to its bases belongs to them."""
+    from hydra.utils import get_object
+
+    try:
+        found = get_object(target)
+    except Exception as error:
+        raise UserError(
+            f"{where}._target_: cannot import {target!r}: {str(error).splitlines()[0]}"
+        ) from None
+    if not inspect.isclass(found):
+        return _own_signature(found)
+    parameters: dict[str, inspect.Parameter] = {}
+    for cls in found.__mro__:
+        if "__init__" not in vars(cls):
+            continue
+        own = _own_signature(vars(cls)["__init__"])
+        own.pop("self", None)
+        rest = [name for name, p in own.items() if p.kind is p.VAR_KEYWORD]
+        named = {name: p for name, p in own.items() if name not in rest}
+        if parameters:  # what a base must be given, the class above gives it
+            named = {name: p for name, p in named.items() if p.default is not p.empty}
+        parameters = {**named, **parameters}
+        if not rest:
+            return parameters
+    return {**parameters, **own}  # nobody says what else is allowed
+
+
+def _own_signature(function: Any) -> dict[str, inspect.Parameter]:
+    try:
+        return dict(inspect.signature(function, eval_str=True).parameters)
+    except NameError:  # an annotation that exists for type checkers only
+        return dict(inspect.signature(function).parameters)
