@@ -1,7 +1,17 @@
-"""The one error that a user's mistake ends in, and the words that it is made of."""
+"""The errors that users see, and how a command ends: one line on stderr and an exit status."""
 
-from collections.abc import Iterable
+import os
+import select
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
+from typing import NoReturn, TextIO
+
+USER_ERROR = 2
+INTERRUPTED = 130
+CLOSED_PIPE = 141
+"""128 + SIGPIPE, which is what shells report of other programs."""
 
 
 class UserError(ValueError):
@@ -30,3 +40,44 @@ def did_you_mean(name: str, allowed: Iterable[str]) -> str:
     hint = f" Did you mean {' or '.join(repr(c) for c in close)}?" if close else ""
     listed = f" Allowed: {', '.join(names)}." if len(names) <= 40 else ""
     return hint + listed
+
+
+def end(name: str, message: str, status: int) -> NoReturn:
+    """Print ``name: message`` on stderr and exit.
+
+    Raises:
+        SystemExit: always, with ``status``.
+    """
+    print(f"{name}: {message}", file=sys.stderr)
+    sys.exit(status)
+
+
+@contextmanager
+def quiet_on_closed_pipe() -> Iterator[None]:
+    """Exit without a traceback when the reader of the output has gone, as ``| head`` does.
+
+    Raises:
+        SystemExit: with ``CLOSED_PIPE``, when stdout or stderr is a pipe that nobody reads.
+    """
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        closed = [stream for stream in (sys.stdout, sys.stderr) if _is_closed_pipe(stream)]
+        if not closed:
+            raise  # a socket or a worker's pipe
+        null = os.open(os.devnull, os.O_WRONLY)
+        for stream in closed:
+            os.dup2(null, stream.fileno())  # Python flushes both again at its exit
+        sys.exit(CLOSED_PIPE)
+
+
+def _is_closed_pipe(stream: TextIO) -> bool:
+    try:
+        poll = select.poll()
+        poll.register(stream.fileno(), 0)
+    except (AttributeError, OSError):  # no poll on Windows, no file behind the stream
+        return False
+    return any(state & (select.POLLERR | select.POLLHUP) for _, state in poll.poll(0))

@@ -1,169 +1,43 @@
-"""The command line. Heavy imports wait until a run starts, so that --help is quick."""
+"""The program: trains, or hands over to a subcommand.
 
-import os
+Nothing heavy is imported before the command is known, so that ``--help`` is quick.
+"""
+
+import re
 import sys
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NoReturn
+from importlib import import_module
+from pathlib import Path
 
-from mops_lightning.config.compose import conf_dir
-from mops_lightning.config.validate import GROUPS, LEARN, RUN_KEYS
-from mops_lightning.errors import Interrupted, UserError, did_you_mean
+from mops_lightning.errors import USER_ERROR, did_you_mean, end, quiet_on_closed_pipe
 
-if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
-USER_ERROR = 2
-INTERRUPTED = 130
+COMMANDS = {
+    "report": "mops_lightning.report.cli",
+    "downsample": "mops_lightning.downsample.cli",
+}
+"""Subcommands and their modules, each with ``main(arguments, prog)``."""
 
 
 def main() -> None:
-    """Run one job or a sweep; a user's mistake ends in one line and exit status 2."""
-    try:
-        _main()
-    except (KeyboardInterrupt, Interrupted) as stop:
-        _end(f"interrupted. {stop}".rstrip(), INTERRUPTED)
+    """Run the subcommand that is the first argument; without one, train."""
+    first = sys.argv[1] if len(sys.argv) > 1 else ""
+    with quiet_on_closed_pipe():
+        if first in COMMANDS:
+            command = import_module(COMMANDS[first])
+            command.main(sys.argv[2:], f"{program()} {first}")
+        elif re.match("[^-+~=][^=]*$", first):
+            hint = did_you_mean(first, COMMANDS)
+            end(
+                "mops_lightning",
+                f"{first!r} is neither a subcommand nor a setting.{hint} Settings are KEY=VALUE.",
+                USER_ERROR,
+            )
+        else:
+            from mops_lightning.cli import train
+
+            train.main()
 
 
-def _main() -> None:
-    import hydra
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
-
-    show_traceback = bool(os.environ.get("HYDRA_FULL_ERROR"))
-    # Makes Hydra raise instead of printing its own shortened traceback.
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    try:
-        if any(argument.lstrip("+").startswith("evaluate=") for argument in sys.argv):
-            from mops_lightning.training.evaluate import command_line
-
-            sys.argv[1:] = command_line(sys.argv[1:])
-        app = hydra.main(config_path=str(conf_dir()), config_name="config", version_base="1.3")
-        app(_job)()
-    except (UserError, HydraException, OmegaConfBaseException) as error:
-        if show_traceback:
-            raise
-        _end(_explain(error), USER_ERROR)
-
-
-def _job(cfg: "DictConfig") -> float | None:
-    """Run one job; the returned score is what an optimising sweeper looks at."""
-    from pathlib import Path
-
-    from hydra.core.hydra_config import HydraConfig
-    from hydra.types import RunMode
-
-    from mops_lightning.cli.sweep import run_cell
-    from mops_lightning.config import distributed
-    from mops_lightning.training.run import run
-
-    hydra_cfg = HydraConfig.get()
-    folder = Path(os.path.relpath(hydra_cfg.runtime.output_dir))
-    overrides = list(hydra_cfg.overrides.task)
-    try:
-        if hydra_cfg.mode == RunMode.MULTIRUN:
-            distributed.check_multirun(cfg)
-            return run_cell(cfg, folder, overrides)
-        distributed.check_start(cfg, hydra_cfg.overrides.hydra)
-        return run(cfg, folder, overrides)["score"]
-    except UserError as error:
-        # Ended here, Hydra does not add lines of its own.
-        _end(str(error), USER_ERROR)
-    except Interrupted as stop:
-        if distributed.is_worker_rank(cfg):
-            sys.exit(INTERRUPTED)  # the first process says it for all
-        # To Hydra, this is an error like any other.
-        again = "The same command with hydra.sweep.dir={} goes on with the sweep."
-        swept = hydra_cfg.mode == RunMode.MULTIRUN
-        text = again.format(os.path.relpath(hydra_cfg.sweep.dir)) if swept else str(stop)
-        raise KeyboardInterrupt(text) from None
-
-
-def _end(message: str, status: int) -> NoReturn:
-    print(f"mops_lightning: {message}", file=sys.stderr)
-    sys.exit(status)
-
-
-def _explain(error: BaseException) -> str:
-    """Turn an error into one line that names the setting and the nearest known one."""
-    from hydra.errors import MissingConfigException
-
-    texts = []
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
-            if not cause.options:
-                return f"no file {cause.missing_cfg_file} in --config-dir.{_names_there(cause)}"
-            group, _, choice = cause.missing_cfg_file.rpartition("/")
-            return f"{group}={choice}: no such choice.{did_you_mean(choice, cause.options or ())}"
-        texts.append(str(cause).strip())
-        cause = cause.__cause__
-    if isinstance(error, UserError):
-        return texts[0]
-    for text in texts:
-        if "Interpolation key 'labels." in text:
-            # labels.${learn} names the run's folder, so Hydra meets a wrong learn before we do.
-            value = text.split("'labels.")[1].split("'")[0]
-            return f"learn: unknown value {value!r}.{did_you_mean(value, LEARN)}"
-        if "Could not override '" in text:
-            key = text.split("Could not override '")[1].split("'")[0]
-            return _no_such_setting(key)
-    # What Hydra and OmegaConf say themselves, without their notes for developers.
-    lines = [line for text in texts for line in text.splitlines() if line.strip()]
-    return " ".join(dict.fromkeys(line.strip() for line in lines if line[0] != " "))
-
-
-def _names_there(cause: Any) -> str:
-    """Say which configurations the folder behind --config-dir has."""
-    from pathlib import Path
-
-    places = [i for i, a in enumerate(sys.argv) if a in ("--config-dir", "-cd")]
-    root = Path(sys.argv[places[-1] + 1]) if places else conf_dir()
-    names = [str(path.relative_to(root).with_suffix("")) for path in root.rglob("*.yaml")]
-    return did_you_mean(cause.missing_cfg_file, names)
-
-
-def _no_such_setting(key: str) -> str:
-    """Say what was meant by a key: a group, a setting, or one that YAML leaves at its default."""
-    from omegaconf import OmegaConf
-
-    from mops_lightning.config.build import signature
-
-    root = conf_dir()
-    paths = [str(path.relative_to(root)) for path in root.rglob("*") if path.is_dir()]
-    groups = [path for path in paths if not path.startswith("hydra")]
-    if "/" in key:
-        return f"{key}: no such group of choices.{did_you_mean(key, groups)}"
-    cfg = _composed(groups)
-    node, _, name = key.rpartition(".")
-    target = OmegaConf.select(cfg, f"{node}._target_")
-    if target and name in signature(target, node):
-        return f"{key}: {target} takes it, but no file sets it: write +{key}=..."
-    hint = did_you_mean(key, [known for known in _known_keys(cfg) if known != key])
-    return f"{key}: no such setting.{hint} --cfg job shows all of them."
-
-
-def _composed(groups: Sequence[str]) -> "DictConfig":
-    """Compose what the command line chooses from groups, without what else it sets."""
-    from mops_lightning.config.compose import compose
-
-    try:
-        return compose([part for part in sys.argv[1:] if part.split("=")[0] in groups])
-    except Exception:  # the mistake may be among them
-        return compose()
-
-
-def _known_keys(cfg: "DictConfig") -> list[str]:
-    """List every key of a configuration, dotted."""
-    from omegaconf import DictConfig
-
-    keys = [*RUN_KEYS, *GROUPS]
-
-    def walk(node: DictConfig, prefix: str) -> None:
-        for key in node:
-            keys.append(prefix + str(key))
-            value = node._get_node(key)
-            if isinstance(value, DictConfig) and value._is_none() is False:
-                walk(value, f"{prefix}{key!s}.")
-
-    walk(cfg, "")
-    return sorted({key for key in keys if not key.split(".")[-1].startswith("_")})
+def program() -> str:
+    """Return what the user typed to start this program."""
+    name = Path(sys.argv[0]).name
+    return "python -m mops_lightning" if name == "__main__.py" else name

@@ -13,7 +13,7 @@ from typing import Any
 
 from rich.progress import track
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import INTERRUPTED, USER_ERROR, UserError, end, quiet_on_closed_pipe
 from mops_lightning.ops.workers import pool
 
 DESCRIPTION = """Downsample clouds and meshes from files.
@@ -24,26 +24,29 @@ unit sphere, as in training, sampled by a trained sampler (--weights) or an untr
 (--method), and mapped back. From meshes, points are sampled on the surface first."""
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Do all files; a bad one is named at the end and makes the exit status 1."""
-    parser = _parser()
-    chosen = parser.parse_args(arguments)
-    try:
-        sys.exit(_run(chosen))
-    except UserError as error:
-        print(f"mops_lightning.downsample: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print(
-            "mops_lightning.downsample: interrupted. The same command goes on with the rest.",
-            file=sys.stderr,
-        )
-        sys.exit(130)
+def main(
+    arguments: list[str] | None = None, prog: str = "python -m mops_lightning.downsample"
+) -> None:
+    """Do all files; a bad one is named at the end and makes the exit status 1.
+
+    Args:
+        arguments: those of the command line; None: ``sys.argv``.
+        prog: what the user typed to start this command.
+    """
+    name = prog.removeprefix("python -m ")
+    with quiet_on_closed_pipe():
+        chosen = _parser(prog).parse_args(arguments)
+        try:
+            sys.exit(_run(chosen))
+        except UserError as error:
+            end(name, str(error), USER_ERROR)
+        except KeyboardInterrupt:
+            end(name, "interrupted. Run the same command to do the rest.", INTERRUPTED)
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(prog: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m mops_lightning.downsample",
+        prog=prog,
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -1,10 +1,9 @@
 """The command behind ``python -m mops_lightning.report``."""
 
 import argparse
-import sys
 from pathlib import Path
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import USER_ERROR, UserError, end, quiet_on_closed_pipe
 from mops_lightning.files import atomic_write
 from mops_lightning.report.build import Report, build
 from mops_lightning.report.text import latex, long_csv, markdown
@@ -21,10 +20,20 @@ the paper has them too, its figures stand beside ours. A folder of task nets alo
 nets."""
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Write the tables, the plots and the page into the folder."""
+def main(arguments: list[str] | None = None, prog: str = "python -m mops_lightning.report") -> None:
+    """Write the tables, the plots and the page into the folder.
+
+    Args:
+        arguments: those of the command line; None: ``sys.argv``.
+        prog: what the user typed to start this command.
+    """
+    with quiet_on_closed_pipe():
+        _run(arguments, prog)
+
+
+def _run(arguments: list[str] | None, prog: str) -> None:
     parser = argparse.ArgumentParser(
-        prog="python -m mops_lightning.report",
+        prog=prog,
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -42,8 +51,7 @@ def main(arguments: list[str] | None = None) -> None:
         report = build(chosen.folder, chosen.metric, chosen.mixed)
         written = write(report, chosen.folder)
     except UserError as error:
-        print(f"mops_lightning.report: {error}", file=sys.stderr)
-        sys.exit(2)
+        end(prog.removeprefix("python -m "), str(error), USER_ERROR)
     print(markdown(report.grids, report.remarks))
     print(f"in {chosen.folder}/ lie {', '.join(written)}")
 

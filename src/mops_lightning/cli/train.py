@@ -1,0 +1,78 @@
+"""Training from the command line: one run, or a sweep, composed by Hydra."""
+
+import os
+import sys
+from typing import TYPE_CHECKING
+
+from mops_lightning.config.compose import conf_dir
+from mops_lightning.errors import INTERRUPTED, USER_ERROR, Interrupted, UserError, end
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+NAME = "mops_lightning"
+"""What error messages start with."""
+
+
+def main() -> None:
+    """Run one job or a sweep; a user's mistake ends in one line and exit status 2."""
+    try:
+        _run()
+    except (KeyboardInterrupt, Interrupted) as stop:
+        end(NAME, f"interrupted. {stop}".rstrip(), INTERRUPTED)
+
+
+def _run() -> None:
+    import hydra
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    show_traceback = bool(os.environ.get("HYDRA_FULL_ERROR"))
+    # Makes Hydra raise instead of printing its own shortened traceback.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        if any(argument.lstrip("+").startswith("evaluate=") for argument in sys.argv):
+            from mops_lightning.training.evaluate import command_line
+
+            sys.argv[1:] = command_line(sys.argv[1:])
+        app = hydra.main(config_path=str(conf_dir()), config_name="config", version_base="1.3")
+        app(_job)()
+    except (UserError, HydraException, OmegaConfBaseException) as error:
+        if show_traceback:
+            raise
+        from mops_lightning.cli.explain import explain
+
+        end(NAME, explain(error), USER_ERROR)
+
+
+def _job(cfg: "DictConfig") -> float | None:
+    """Run one job; the returned score is what an optimising sweeper looks at."""
+    from pathlib import Path
+
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    from mops_lightning.cli.sweep import run_cell
+    from mops_lightning.config import distributed
+    from mops_lightning.training.run import run
+
+    hydra_cfg = HydraConfig.get()
+    folder = Path(os.path.relpath(hydra_cfg.runtime.output_dir))
+    overrides = list(hydra_cfg.overrides.task)
+    try:
+        if hydra_cfg.mode == RunMode.MULTIRUN:
+            distributed.check_multirun(cfg)
+            return run_cell(cfg, folder, overrides)
+        distributed.check_start(cfg, hydra_cfg.overrides.hydra)
+        return run(cfg, folder, overrides)["score"]
+    except UserError as error:
+        # Ended here, Hydra does not add lines of its own.
+        end(NAME, str(error), USER_ERROR)
+    except Interrupted as stop:
+        if distributed.is_worker_rank(cfg):
+            sys.exit(INTERRUPTED)  # the first process says it for all
+        # To Hydra, this is an error like any other.
+        again = "The same command with hydra.sweep.dir={} goes on with the sweep."
+        swept = hydra_cfg.mode == RunMode.MULTIRUN
+        text = again.format(os.path.relpath(hydra_cfg.sweep.dir)) if swept else str(stop)
+        raise KeyboardInterrupt(text) from None

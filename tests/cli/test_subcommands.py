@@ -1,0 +1,66 @@
+"""The program and its subcommands: help, wrong names, and readers of the output that go away."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from mops_lightning.cli.main import COMMANDS
+from tests.support.command_line import call
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_subcommand_help_names_the_subcommand(name, tmp_path):
+    status, out, err = call([name, "--help"], tmp_path)
+    assert (status, err) == (0, "")
+    assert out.startswith(f"usage: mops_lightning {name} [-h]")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_subcommand_module_help_names_the_module(name):
+    command = [sys.executable, "-m", f"mops_lightning.{name}", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(f"usage: python -m mops_lightning.{name} [-h]")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["report", "nowhere"], ["downsample", "nowhere", "out", "--method=fps", "--m=4"]],
+    ids=COMMANDS,
+)
+def test_subcommand_error_names_the_subcommand(arguments, tmp_path):
+    status, _, err = call(arguments, tmp_path)
+    assert status == 2
+    assert err.startswith(f"mops_lightning {arguments[0]}: nowhere: no such")
+
+
+@pytest.mark.parametrize(
+    ("typed", "near"), [("reprot", "'report'"), ("down-sample", "'downsample'")]
+)
+def test_unknown_subcommand_names_the_nearest(typed, near, tmp_path):
+    status, out, err = call([typed, "results"], tmp_path)
+    assert (status, out) == (2, "")
+    assert f"Did you mean {near}?" in err
+    assert "KEY=VALUE" in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["mops_lightning", "--help"],
+        ["mops_lightning", "--cfg", "job"],
+        ["mops_lightning", "report", "--help"],
+        ["mops_lightning.report", "--help"],
+        ["mops_lightning.downsample", "--help"],
+    ],
+)
+def test_closed_pipe_ends_quietly(arguments, tmp_path):
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", *arguments]
+    done = subprocess.run(command, cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+    assert done.stderr == b""
+    assert done.returncode in (141, 0)  # argparse ignores the error when it prints help
