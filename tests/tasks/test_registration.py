@@ -18,7 +18,6 @@ from mops_lightning.samplers.samplenet import SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.tasks.registration import Registration
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.readouts import full_cloud
 from tests.support.rigid import motion
 from tests.support.training import changed, quiet_trainer, small_dataset, state
 
@@ -45,12 +44,12 @@ def task(net=None, loss=quaternion_loss, **pairs):
     return Registration(net or small_net(), Pairs(**pairs), loss)
 
 
-def test_an_exact_net_recovers_hand_made_motions_exactly(rng):
+def test_step_exact_net_recovers_motions(rng):
     source = torch.randn(5, 40, 3, generator=rng) + 3  # far from its centroid
     true = motion(1)
     batch = pair_batch(source, true.apply(source), true)
     for loss in (quaternion_loss, frobenius_chamfer_loss):
-        result = task(Kabsch(), loss).step(batch, full_cloud)
+        result = task(Kabsch(), loss).step(batch, batch.points)
         assert RotationError.of(result.predictions, true).max() < 1e-2
         torch.testing.assert_close(
             result.predictions.translation, true.translation, atol=1e-4, rtol=0
@@ -58,14 +57,15 @@ def test_an_exact_net_recovers_hand_made_motions_exactly(rng):
         assert sum(result.losses.values()) < 1e-3
 
 
-def test_shifting_a_cloud_changes_the_answer_by_just_that(rng):
+def test_step_shifted_cloud_shifts_translation(rng):
     source, target = torch.randn(2, 5, 40, 3, generator=rng)
     module = task().eval()
     true = motion(1)
     shift = torch.tensor([1.0, -2.0, 3.0])
 
     def answer(a, b):
-        return module.step(pair_batch(a, b, true), full_cloud).predictions
+        batch = pair_batch(a, b, true)
+        return module.step(batch, batch.points).predictions
 
     plain = answer(source, target)
     by_target = answer(source, target + shift)
@@ -77,48 +77,36 @@ def test_shifting_a_cloud_changes_the_answer_by_just_that(rng):
     torch.testing.assert_close(by_source.apply(source + shift), still, atol=1e-4, rtol=0)
 
 
-def test_moving_both_clouds_changes_an_exact_answer_accordingly(rng):
+def test_step_both_clouds_moved_conjugates_motion(rng):
     source = torch.randn(5, 40, 3, generator=rng)
     true, both = motion(1), motion(2)
     target = true.apply(source)
     module = task(Kabsch())
     batch = pair_batch(both.apply(source), both.apply(target), true)
-    found = module.step(batch, full_cloud).predictions
+    found = module.step(batch, batch.points).predictions
     expected = both.after(true).after(both.inverse())
     assert RotationError.of(found, expected).max() < 1e-2
     torch.testing.assert_close(found.translation, expected.translation, atol=1e-4, rtol=0)
 
 
-def test_the_order_of_points_does_not_matter(rng):
+def test_step_permuted_points_give_same_motion(rng):
     source, target = torch.randn(2, 5, 40, 3, generator=rng)
     module = task().eval()
     order = torch.randperm(40, generator=rng)
-    answers = [
-        module.step(pair_batch(a, b, motion(1)), full_cloud).predictions
+    batches = [
+        pair_batch(a, b, motion(1))
         for a, b in ((source, target), (source[:, order], target[:, order.flip(0)]))
     ]
+    answers = [module.step(batch, batch.points).predictions for batch in batches]
     torch.testing.assert_close(*answers, atol=1e-5, rtol=1e-5)
 
 
-def test_the_scored_translation_is_that_of_the_clouds_as_they_came(rng):
+def test_step_targets_are_motions_before_centring(rng):
     source = torch.randn(5, 40, 3, generator=rng)
     true = motion(1)
     batch = pair_batch(source, true.apply(source), true)
-    result = task(Kabsch()).step(batch, full_cloud)
+    result = task(Kabsch()).step(batch, batch.points)
     torch.testing.assert_close(result.targets.translation, true.translation)
-
-
-def test_both_clouds_are_sampled_by_one_call_of_the_sampler(rng):
-    batch = Pairs()(torch.randn(5, 40, 3, generator=rng), [torch.Generator() for _ in range(5)])
-    seen = []
-
-    def sample(points):
-        seen.append(points)
-        return FPSSampler(8)(points)
-
-    task().eval().step(batch, sample)
-    assert len(seen) == 1
-    assert seen[0] is batch.points
 
 
 MOPS: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
@@ -153,7 +141,7 @@ def trained(learn, sampler, **extra):
 
 
 @pytest.mark.parametrize("name", LEARNED)
-def test_frozen_and_joint_training_change_exactly_what_they_should(name):
+def test_fit_changes_only_what_learns(name):
     _, frozen = trained("sampler", LEARNED[name]())
     assert frozen
     assert all(key.startswith("sampler.") for key in frozen)
@@ -162,14 +150,14 @@ def test_frozen_and_joint_training_change_exactly_what_they_should(name):
     assert {key.split(".")[0] for key in joint} == {"sampler", "task"}
 
 
-def test_training_the_task_uses_full_clouds_and_changes_it_alone():
+def test_fit_learn_task_changes_task_only():
     module, names = trained("task", None)
     assert module.sampler is None
     assert names
     assert all(name.startswith("task.") for name in names)
 
 
-def test_a_test_scores_every_readout_by_every_metric():
+def test_test_scores_every_readout_by_every_metric():
     module, _ = trained("sampler", MOPSNet(8, **MOPS), baselines={"fps": FPSSampler(8)})
     run = quiet_trainer(1)
     loader = CloudLoader(small_dataset().test, 4, make_batch=module.task.make_batch)
@@ -186,7 +174,25 @@ def test_a_test_scores_every_readout_by_every_metric():
     assert module.score_name == "test/generated/rotation_error_deg"
 
 
-def test_nothing_can_be_trained_under_icp_but_anything_tested():
+class RecordingSampler(FPSSampler):
+    def __init__(self, m):
+        super().__init__(m)
+        self.shapes = []
+
+    def sample(self, points, m):
+        self.shapes.append(tuple(points.shape))
+        return super().sample(points, m)
+
+
+def test_test_samples_sources_and_targets_in_one_call():
+    sampler = RecordingSampler(8)
+    module = Experiment(task(resample=40), sampler, sizes=(4, 8))
+    loader = CloudLoader(small_dataset(test=4).test, 4, make_batch=module.task.make_batch)
+    quiet_trainer(1).test(module, loader, verbose=False)
+    assert sampler.shapes == [(8, 40, 3)]
+
+
+def test_icp_tests_but_never_trains():
     icp = task(ICP())
     with pytest.raises(UserError, match=r"learn=sampler: ICP has no weights .*evaluate=RUN"):
         Experiment(icp, MOPSNet(8, **MOPS))
@@ -205,12 +211,12 @@ def test_nothing_can_be_trained_under_icp_but_anything_tested():
 def test_figures_show_every_readout_and_its_error(rng):
     data = CloudLoader(small_dataset().test, 4, make_batch=(module := task()).make_batch)
     batch = data.batch_of(torch.tensor([0, 1]))
-    sampler = FPSSampler(8)
-    figures = module.figures(batch, {"sampled": sampler, "full": full_cloud}, ["long", "tall"])
+    samples = {"sampled": FPSSampler(8)(batch.points).points, "full": batch.points}
+    figures = module.figures(batch, samples, ["long", "tall"])
     axes = figures["pairs"].axes
     assert len(axes) == 6
     assert [one.get_title() for one in axes[:3]] == ["before (centred)", "by sampled", "by full"]
-    result = module.step(batch, full_cloud)
+    result = module.step(batch, batch.points)
     error = RotationError.of(result.predictions, result.targets)[1]
     assert axes[5].texts[0].get_text() == f"rotation error {error:.1f}°"
     angle = RotationError.of(result.targets, identity_motion(batch.points[:2]))[1]

@@ -8,13 +8,10 @@ from torch import Generator, Tensor, nn
 from torchmetrics import MetricCollection
 
 from mops_lightning.errors import UserError
-from mops_lightning.types import Batch, SampleOutput, TaskOutput
+from mops_lightning.types import Batch, TaskOutput
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Sample = Callable[[Tensor], SampleOutput]
-"""From ``(B, N, 3)`` points to what is sampled of them."""
 
 
 class Task(nn.Module):
@@ -72,13 +69,34 @@ class Task(nn.Module):
         """Return how many points the clouds have that are sampled, from the dataset's number."""
         return n_points
 
-    def step(self, batch: Any, sample: Sample) -> TaskOutput:
-        """Return losses, predictions and targets of one batch."""
+    def step(self, batch: Any, points: Tensor) -> TaskOutput:
+        """Run the net on sampled points, for training.
+
+        Args:
+            batch: from ``make_batch``.
+            points: ``(B', M, 3)`` sampled from ``batch.points``, in the same order.
+
+        Returns:
+            Loss terms, predictions and targets.
+        """
         raise NotImplementedError
 
-    def scored(self, batch: Any, sample: Sample) -> TaskOutput:
-        """Return what ``step`` does, for scores instead of training; the same by default."""
-        return self.step(batch, sample)
+    def reference(self, batch: Any) -> Any:
+        """Return what all scores of a batch are compared with; None by default."""
+        return None
+
+    def scored(self, batch: Any, points: Tensor, reference: Any = None) -> TaskOutput:
+        """Run the net on sampled points, for scores; the same as ``step`` by default.
+
+        Args:
+            batch: from ``make_batch``.
+            points: as for ``step``.
+            reference: from ``reference(batch)``, which is the same for all readouts of a batch.
+
+        Returns:
+            Loss terms, predictions and targets.
+        """
+        return self.step(batch, points)
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return new metrics that take predictions and targets of ``scored``.
@@ -93,13 +111,13 @@ class Task(nn.Module):
         return list(titles)
 
     def figures(
-        self, batch: Any, samples: Mapping[str, Sample], titles: Sequence[str]
+        self, batch: Any, samples: Mapping[str, Tensor], titles: Sequence[str]
     ) -> "dict[str, Figure]":
         """Draw what the task makes of a few clouds, by name; nothing by default.
 
         Args:
             batch: as for ``step``.
-            samples: what the net is to see, by readout.
+            samples: sampled points ``(B', M, 3)`` by readout.
             titles: one per cloud of the dataset.
         """
         return {}

@@ -1,12 +1,12 @@
 """Classification of sampled clouds (paper section "Classification-oriented Downsampling")."""
 
-from torch import nn
+from torch import Tensor, nn
 from torch.nn import functional as F
 from torchmetrics import Metric, MetricCollection
 from torchmetrics.classification import MulticlassAccuracy
 
 from mops_lightning.errors import UserError
-from mops_lightning.tasks.base import Sample, Task
+from mops_lightning.tasks.base import Task
 from mops_lightning.types import Batch, TaskOutput
 
 
@@ -33,17 +33,17 @@ class Classification(Task):
             )
         self.num_classes = num_classes
 
-    def step(self, batch: Batch, sample: Sample) -> TaskOutput:
+    def step(self, batch: Batch, points: Tensor) -> TaskOutput:
         """Classify one batch.
 
         Args:
-            batch: points ``(B, N, 3)`` and labels ``(B,)``.
-            sample: turns points into what the net is to see.
+            batch: the clouds and their labels ``(B,)``.
+            points: ``(B, M, 3)`` sampled from the clouds.
 
         Returns:
             The cross entropy, logits ``(B, num_classes)`` and labels.
         """
-        logits = self.net(sample(batch.points).points)
+        logits = self.net(points)
         loss = F.cross_entropy(logits, batch.labels)
         return TaskOutput({"cross_entropy": loss}, logits, batch.labels)
 

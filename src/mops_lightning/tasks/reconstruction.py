@@ -12,7 +12,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.metrics.reconstruction import Distances, MeanDistance, NormalizedError
 from mops_lightning.ops.chamfer import chamfer_distance
 from mops_lightning.ops.emd import earth_movers_distance
-from mops_lightning.tasks.base import Sample, Task
+from mops_lightning.tasks.base import Task
 from mops_lightning.types import Batch, TaskOutput
 
 if TYPE_CHECKING:
@@ -66,19 +66,18 @@ class Reconstruction(Task):
         self.emd_rounds = emd_rounds
         self.exact_up_to = exact_up_to
         self.emd_workers = emd_workers
-        self._reference: tuple[Tensor, Distances] | None = None
 
-    def step(self, batch: Batch, sample: Sample) -> TaskOutput:
+    def step(self, batch: Batch, points: Tensor) -> TaskOutput:
         """Reconstruct one batch for training.
 
         Args:
-            batch: clouds.
-            sample: turns points into what the net is to see.
+            batch: the clouds ``(B, N, 3)``.
+            points: ``(B, M, 3)`` sampled from the clouds.
 
         Returns:
             The loss terms, and the distances of the reconstructions without a reference.
         """
-        built = self.net(sample(batch.points).points, batch.points.shape[1])
+        built = self.net(points, batch.points.shape[1])
         chamfer = chamfer_distance(built, batch.points)
         losses = {"chamfer": chamfer.mean()}
         emd = torch.zeros_like(chamfer)
@@ -87,31 +86,47 @@ class Reconstruction(Task):
             losses["emd"] = self.emd_weight * emd.mean()
         return TaskOutput(losses, Distances(chamfer, emd), None)
 
-    def scored(self, batch: Batch, sample: Sample) -> TaskOutput:
-        """Reconstruct one batch for scores, from sampled and, once for all readouts, all points."""
-        if self._reference is None or self._reference[0] is not batch.points:
-            self._reference = (batch.points, self._distances(batch.points, batch.points))
-        found = self._distances(batch.points, sample(batch.points).points)
-        losses = {"chamfer": found.chamfer.mean(), "emd": self.emd_weight * found.emd.mean()}
-        return TaskOutput(losses, found, self._reference[1])
+    def reference(self, batch: Batch) -> Distances:
+        """Return the distances of the reconstructions from all points, for normalized errors."""
+        return self._distances(batch, batch.points)
 
-    def _distances(self, points: Tensor, seen: Tensor) -> Distances:
-        built = self.net(seen, points.shape[1])
-        exact = points.shape[1] <= self.exact_up_to
-        emd = self._emd(built, points, None if exact else SCORED_BLOCK, SCORED_ROUNDS)
-        return Distances(chamfer_distance(built, points), emd)
+    def scored(
+        self, batch: Batch, points: Tensor, reference: Distances | None = None
+    ) -> TaskOutput:
+        """Reconstruct one batch for scores.
+
+        Args:
+            batch: the clouds ``(B, N, 3)``.
+            points: ``(B, M, 3)`` sampled from the clouds.
+            reference: from ``reference(batch)``; None computes it.
+
+        Returns:
+            The loss terms, the distances of the reconstructions and the reference.
+        """
+        found = self._distances(batch, points)
+        losses = {"chamfer": found.chamfer.mean(), "emd": self.emd_weight * found.emd.mean()}
+        if reference is None:
+            reference = self.reference(batch)
+        return TaskOutput(losses, found, reference)
+
+    def _distances(self, batch: Batch, points: Tensor) -> Distances:
+        clouds = batch.points
+        built = self.net(points, clouds.shape[1])
+        exact = clouds.shape[1] <= self.exact_up_to
+        emd = self._emd(built, clouds, None if exact else SCORED_BLOCK, SCORED_ROUNDS)
+        return Distances(chamfer_distance(built, clouds), emd)
 
     def _emd(self, built: Tensor, points: Tensor, block: int | None, rounds: int) -> Tensor:
         return earth_movers_distance(built, points, block, rounds, self.emd_workers)
 
     def figures(
-        self, batch: Batch, samples: Mapping[str, Sample], titles: Sequence[str]
+        self, batch: Batch, samples: Mapping[str, Tensor], titles: Sequence[str]
     ) -> "dict[str, Figure]":
         """Draw input, sampled points and reconstructions side by side.
 
         Args:
             batch: the clouds to draw.
-            samples: what the net is to see, by readout.
+            samples: sampled points ``(B, M, 3)`` by readout.
             titles: one per cloud.
         """
         from mops_lightning.viz.reconstruction import ReconstructionResult, rebuilt_grid
@@ -120,8 +135,7 @@ class Reconstruction(Task):
         full = self.net(batch.points, n)
         reference = chamfer_distance(full, batch.points)
         columns = {}
-        for name, sample in samples.items():
-            chosen = sample(batch.points).points
+        for name, chosen in samples.items():
             if chosen.shape == batch.points.shape:
                 continue  # all points have a column of their own
             built = self.net(chosen, n)

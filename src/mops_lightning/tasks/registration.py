@@ -10,7 +10,7 @@ from mops_lightning.data.pairs import Pairs
 from mops_lightning.errors import UserError
 from mops_lightning.metrics.registration import RotationError, RotationRecall, TranslationError
 from mops_lightning.ops.rigid import Motion, identity_motion
-from mops_lightning.tasks.base import Sample, Task
+from mops_lightning.tasks.base import Task
 from mops_lightning.types import Batch, PairBatch, TaskOutput
 
 if TYPE_CHECKING:
@@ -64,17 +64,17 @@ class Registration(Task):
         """Return how many points the clouds have that are sampled."""
         return self.pairs.points_of(n_points)
 
-    def step(self, batch: PairBatch, sample: Sample) -> TaskOutput:
+    def step(self, batch: PairBatch, points: Tensor) -> TaskOutput:
         """Register one batch.
 
         Args:
             batch: pairs.
-            sample: turns points into what the net is to see.
+            points: ``(2B, M, 3)`` sampled from ``batch.points``: sources, then targets.
 
         Returns:
             The loss terms, the predicted motions and the true ones.
         """
-        found = self._centred(batch, sample)
+        found = self.net(*points.chunk(2))
         true = Motion(batch.quaternion, batch.translation)
         from_source, from_target = batch.centroids.chunk(2)
         # The true motion seen between the centred clouds: R·(p + c) + t = R·p + (R·c + t).
@@ -83,10 +83,6 @@ class Registration(Task):
         turned = found._replace(translation=from_target).apply(-from_source[:, None])[:, 0]
         predicted = Motion(found.quaternion, found.translation + turned)
         return TaskOutput(losses, predicted, true)
-
-    def _centred(self, batch: PairBatch, sample: Sample) -> Motion:
-        source, target = sample(batch.points).points.chunk(2)
-        return self.net(source, target)
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Rotation errors in degrees, recalls in [0, 1], translation error in coordinate units."""
@@ -105,23 +101,23 @@ class Registration(Task):
         return [f"{title}_{side}" for side in ("source", "target") for title in titles]
 
     def figures(
-        self, batch: PairBatch, samples: Mapping[str, Sample], titles: Sequence[str]
+        self, batch: PairBatch, samples: Mapping[str, Tensor], titles: Sequence[str]
     ) -> "dict[str, Figure]":
         """Draw the pairs before and after alignment, one column for each readout.
 
         Args:
             batch: the pairs to draw.
-            samples: what the net is to see, by readout.
+            samples: sampled points ``(2B, M, 3)`` by readout.
             titles: one per pair.
         """
         from mops_lightning.viz.pairs import RegistrationResult, pair_grid
 
         source, target = batch.points.chunk(2)
         columns = {}
-        for name, sample in samples.items():
-            result = self.step(batch, sample)
-            motion = self._centred(batch, sample)
-            chosen = sample(batch.points).points.chunk(2)
+        for name, points in samples.items():
+            result = self.step(batch, points)
+            chosen = points.chunk(2)
+            motion = self.net(*chosen)
             errors = RotationError.of(result.predictions, result.targets)
             columns[name] = RegistrationResult(
                 motion.apply(source), motion.apply(chosen[0]), chosen[1], errors.tolist()

@@ -18,8 +18,8 @@ from mops_lightning.records.readout_names import FULL, SOFT_PROJECTED, size_pref
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
-from mops_lightning.training.readouts import BatchReadouts, full_cloud, readout_names
-from mops_lightning.types import Batch
+from mops_lightning.training.readouts import readout_names, readouts
+from mops_lightning.types import Batch, SampleOutput
 
 CHECKPOINT_KEY = "mops_lightning"
 """Where a checkpoint keeps the identity of its run."""
@@ -182,28 +182,25 @@ class Experiment(L.LightningModule):
             torch.manual_seed(
                 derive_seed(self.seed, self.current_epoch, batch_idx, self.global_rank)
             )
-        readouts = BatchReadouts(self.sampler, {}, sizes)
+        outputs = {} if self.sampler is None else self.sampler.sample_sizes(batch.points, sizes)
         terms: dict[str, list[Tensor]] = defaultdict(list)
         for m in sizes:
-            sample = full_cloud if self.sampler is None else readouts.as_trained_on(m)
-            result = self.task.step(batch, sample)
+            output = outputs.get(m) or SampleOutput(batch.points, None, {})
+            soft = output.soft_projected
+            result = self.task.step(batch, output.points if soft is None else soft)
             self.train_scores.update(result.predictions, result.targets)
-            for name, value in result.losses.items():
+            for name, value in (*result.losses.items(), *output.losses.items()):
                 terms[name].append(value)
-            outputs = [output for _, output in readouts.outputs(m)]
-            for output in outputs:
-                for name, value in output.losses.items():
-                    terms[name].append(value / len(outputs))
         share = 1.0
         if self.sampler is not None and self.sampler.size_reduction == "mean":
             share = 1 / len(sizes)
         losses = {name: torch.stack(values).sum() * share for name, values in terms.items()}
         total = torch.stack(list(losses.values())).sum()
-        self._log_training(losses, total, readouts, len(batch.points))
+        self._log_training(losses, total, soft is not None, len(batch.points))
         return total
 
     def _log_training(
-        self, losses: dict[str, Tensor], total: Tensor, readouts: BatchReadouts, size: int
+        self, losses: dict[str, Tensor], total: Tensor, soft: bool, size: int
     ) -> None:
         for name, value in {**losses, "total": total}.items():
             self.log(f"train/loss/{name}", value.detach(), batch_size=size, sync_dist=True)
@@ -215,9 +212,6 @@ class Experiment(L.LightningModule):
         tau: Any = getattr(self.sampler, "tau", None)
         if tau is not None:
             self.log("train/tau", tau, batch_size=size)
-        soft = any(
-            output.soft_projected is not None for _, output in readouts.outputs(max(readouts.sizes))
-        )
         seen = SOFT_PROJECTED if soft else self.own_readouts[0]
         for name, metric in self.train_scores.items(keep_base=True, copy_state=False):
             self.log(f"train/{seen}/{name}", metric, on_step=False, on_epoch=True, batch_size=size)
@@ -225,9 +219,10 @@ class Experiment(L.LightningModule):
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Score the learned readouts on held-out training clouds, at one size."""
         with full_precision(self.device.type):
-            readouts = BatchReadouts(self.sampler, {}, (self.m,))
-            self._score(batch, "val/", readouts, self.m, self.own_readouts)
-            self._score_sets(readouts, {self.m: "val/"}, len(batch.points))
+            outputs, samples = self._sampled(batch.points, (self.m,))
+            own = samples[self.m] or {FULL: batch.points}
+            self._score(batch, "val/", own, self.task.reference(batch))
+            self._score_sets(batch.points, outputs, {self.m: "val/"})
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         """Score the learned readouts and the baselines at every size, and the full clouds."""
@@ -235,26 +230,38 @@ class Experiment(L.LightningModule):
             self._test_step(batch)
 
     def _test_step(self, batch: Batch) -> None:
-        baselines: Any = dict(self.baselines.items())
-        readouts = BatchReadouts(self.sampler, baselines, self.sizes)
-        names = [name for name in (*self.own_readouts, *baselines) if name != FULL]
+        outputs, samples = self._sampled(batch.points, self.sizes)
+        for name, baseline in self.baselines.items():
+            sampler: Any = baseline
+            for m, output in sampler.sample_sizes(batch.points, self.sizes).items():
+                samples[m].setdefault(name, output.points)
+        reference = self.task.reference(batch)
         prefixes = {m: f"test/{self._prefix(m)}" for m in self.sizes}
         for m, prefix in prefixes.items():
-            self._score(batch, prefix, readouts, m, names)
-        self._score(batch, "test/", readouts, self.m, [FULL])
-        self._score_sets(readouts, prefixes, len(batch.points))
+            self._score(batch, prefix, samples[m], reference)
+        self._score(batch, "test/", {FULL: batch.points}, reference)
+        self._score_sets(batch.points, outputs, prefixes)
+
+    def _sampled(
+        self, points: Tensor, sizes: Sequence[int]
+    ) -> tuple[dict[int, SampleOutput], dict[int, dict[str, Tensor]]]:
+        """Return the sampler's outputs and all their readouts, by size; empty without a sampler."""
+        if self.sampler is None:
+            return {}, {m: {} for m in sizes}
+        outputs = self.sampler.sample_sizes(points, sizes)
+        return outputs, readouts(points, outputs, self.sampler)
 
     def _prefix(self, m: int) -> str:
         return size_prefix(m) if len(self.sizes) > 1 else ""
 
     def _score(
-        self, batch: Batch, prefix: str, readouts: BatchReadouts, m: int, names: Sequence[str]
+        self, batch: Batch, prefix: str, samples: Mapping[str, Tensor], reference: Any
     ) -> None:
-        """Update and log the metrics of some readouts at one size; ``prefix`` names both."""
+        """Update and log the metrics of readouts at one size; ``prefix`` is of stage and size."""
         size = len(batch.points)
         within = prefix.split("/", 1)[1]
-        for readout in names:
-            result = self.task.scored(batch, readouts.sample_as(readout, m))
+        for readout, points in samples.items():
+            result = self.task.scored(batch, points, reference)
             metrics: Any = self.scores[f"{within}{readout}"]
             metrics.update(result.predictions, result.targets)
             for name, metric in metrics.items(keep_base=True, copy_state=False):
@@ -271,11 +278,19 @@ class Experiment(L.LightningModule):
         mean.update(value, size)
         self.log(key, mean, batch_size=size, metric_attribute=f"loss_means.{key}")
 
-    def _score_sets(self, readouts: BatchReadouts, prefixes: dict[int, str], size: int) -> None:
+    def _score_sets(
+        self, points: Tensor, outputs: dict[int, SampleOutput], prefixes: dict[int, str]
+    ) -> None:
         """Update and log what is measured of the sampled sets themselves, at every size."""
-        for points, output, sizes in readouts.wholes():
+        if self.sampler is None:
+            return
+        # Of a nested sampler the largest set is measured, for it contains the smaller ones.
+        groups: dict[int, tuple[int, ...]] = {m: (m,) for m in outputs}
+        if self.sampler.nested:
+            groups = {max(outputs): tuple(outputs)}
+        for largest, sizes in groups.items():
             for name, measure in SET_METRICS.items():
-                for m, values in (measure(points, output, sizes) or {}).items():
+                for m, values in (measure(points, outputs[largest], sizes) or {}).items():
                     mean: Any = self.set_metrics[f"{prefixes[m].split('/', 1)[1]}{name}"]
                     mean.update(values)
-                    self.log(f"{prefixes[m]}{name}", mean, batch_size=size)
+                    self.log(f"{prefixes[m]}{name}", mean, batch_size=len(points))

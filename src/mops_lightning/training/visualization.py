@@ -12,7 +12,8 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
-from mops_lightning.training.readouts import BatchReadouts, readout_names
+from mops_lightning.records.readout_names import FULL
+from mops_lightning.training.readouts import readouts
 from mops_lightning.viz.clouds import (
     COLOURS,
     INPUT_COLOUR,
@@ -69,21 +70,20 @@ class CloudVisualization(Callback):
         beside: Any = module.baselines
         # The baselines do not change in training: they are drawn once, at the end.
         baselines = dict(beside.items()) if folder is not None else {}
-        readouts = BatchReadouts(sampler, baselines, (m,))
-        samples = {name: readouts.sample_as(name, m) for name in readout_names(sampler)}
-        methods = {name: readouts.sample_as(name, m) for name in baselines}
-        figures = task.figures(batch, {**methods, **samples}, self.titles)
+        points = batch.points
+        methods = {name: baseline(points, m).points for name, baseline in baselines.items()}
+        output = None if sampler is None else sampler(points, m)
+        sampled = {} if output is None else readouts(points, {m: output}, sampler)[m]
+        figures = task.figures(batch, {**methods, **(sampled or {FULL: points})}, self.titles)
         titles = task.cloud_titles(self.titles)
-        sampled = {}
-        if sampler is not None:
-            sampled = {name: sample(batch.points).points for name, sample in samples.items()}
-            figures["clouds"] = cloud_grid(batch.points, sampled, titles)
-            matrix = readouts.outputs(m)[0][1].matrix
-            if matrix is not None and batch.points.shape[1] * len(matrix.queries) <= DENSE_PIXELS:
+        if output is not None:
+            figures["clouds"] = cloud_grid(points, sampled, titles)
+            matrix = output.matrix
+            if matrix is not None and points.shape[1] * len(matrix.queries) <= DENSE_PIXELS:
                 first = matrix._replace(keys=matrix.keys[:1])
                 figures["matrix"] = matrix_figure(first.dense()[0], first.gram()[0], titles[0])
         if folder is not None and sampled:
-            save_clouds(folder / CLOUDS, batch.points, sampled, titles)
+            save_clouds(folder / CLOUDS, points, sampled, titles)
         module.train(training)
         step = trainer.global_step
         for name, figure in figures.items():
@@ -94,7 +94,7 @@ class CloudVisualization(Callback):
         if board is not None:
             for name, chosen in sampled.items():
                 for number, title in enumerate(titles):
-                    vertices, colours = _coloured(batch.points[number], chosen[number], name)
+                    vertices, colours = _coloured(points[number], chosen[number], name)
                     board.experiment.add_mesh(
                         f"{name}/{number}_{title}",
                         vertices=vertices,
