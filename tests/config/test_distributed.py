@@ -77,8 +77,9 @@ def test_processes_of_a_launcher_must_be_meant_and_share_a_folder(monkeypatch):
 
 
 def test_a_wrong_batch_is_refused_before_the_task_net_is_trained(tmp_path):
-    devices = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "batch_size=15"]
-    status, out, err = call([*TINY_WITH_PICTURES[1:], *devices], tmp_path)
+    devices = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
+    arguments = [*TINY_WITH_PICTURES[1:], *devices, "val_fraction=0", "batch_size=15"]
+    status, out, err = call(arguments, tmp_path)
     assert status == 2
     assert "Try batch_size=16" in err
     assert "training it first" not in out
@@ -90,6 +91,8 @@ REGISTRATION = [
     "learn=task",
     "trainer.max_epochs=2",
     "batch_size=8",
+    "val_fraction=0.2",
+    "dataset.test_per_class=8",
 ]
 
 
