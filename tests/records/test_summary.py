@@ -1,6 +1,7 @@
 from io import StringIO
 from pathlib import Path
 
+import pytest
 from rich.console import Console
 
 from mops_lightning.records.summary import closing_lines, readout_rows
@@ -9,10 +10,10 @@ from tests.support.records import record
 NAMES = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": "mops"}
 
 
-def printed(metrics, score, shown=(), **config):
+def printed(metrics, score, chosen=(), key="summary_metrics", **config):
     console = Console(width=80, record=True, file=StringIO())
     config = {"m": 32, "learn": "sampler", "names": NAMES, **config}
-    notes = {"score": score, "shown": list(shown)}
+    notes = {"score": score, key: list(chosen)}
     closing_lines(Path("run"), record(config=config, metrics=metrics, notes=notes), console)
     return console.export_text()
 
@@ -41,9 +42,10 @@ def test_one_size_is_shown_by_metric():
     ]
 
 
-def test_a_task_says_which_metrics_are_shown_and_in_which_order():
+@pytest.mark.parametrize("key", ["summary_metrics", "shown"])  # "shown" in older records
+def test_closing_lines_summary_metrics_select_and_order_columns(key):
     metrics = {f"test/{readout}/{name}": 1.5 for readout in ("generated", "full") for name in "abc"}
-    text = printed(metrics, "test/generated/c", ["c", "a"])
+    text = printed(metrics, "test/generated/c", ["c", "a"], key)
     assert cells(text)[0] == ["sampled by", "c", "a"]
 
 

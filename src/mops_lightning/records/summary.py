@@ -8,7 +8,7 @@ from rich.table import Table
 
 from mops_lightning.records import metric_format
 from mops_lightning.records.readout_names import FULL, ROWS, parse
-from mops_lightning.records.run_record import FILE
+from mops_lightning.records.run_record import FILE, summary_metrics
 
 Rows = dict[str, dict[str, float | None]]
 """Readout → metric, or m=SIZE where several are tested → value."""
@@ -66,7 +66,7 @@ def results_table(record: dict[str, Any]) -> tuple[str, Table]:
     rows = readout_rows(record["metrics"], several)
     # The task's own scores; figures of the sampled set stay in the record.
     columns = list(rows.get(FULL, {}))
-    columns = [name for name in record["notes"].get("shown", ()) if name in columns] or columns
+    columns = [name for name in summary_metrics(record) if name in columns] or columns
     what = "all points" if config.get("learn") == "task" else f"m={config['m']}"
     if several:
         columns = list(next(iter(rows.values())))

@@ -6,6 +6,7 @@ from typing import Any
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.records import metric_format
 from mops_lightning.records.readout_names import FULL
+from mops_lightning.records.run_record import summary_metrics
 from mops_lightning.report import paper
 from mops_lightning.report.axes import varying
 from mops_lightning.report.cells import over_seeds
@@ -102,7 +103,7 @@ def _metrics(found: list[Record], asked: Sequence[str]) -> list[str]:
     for name in asked:
         if name not in there:
             raise UserError(f"--metric: no run has {name!r}.{did_you_mean(name, there)}")
-    shown = [name for name in found[0]["notes"].get("shown", ()) if name in there]
+    shown = [name for name in summary_metrics(found[0]) if name in there]
     # Errors normalized by those of all points are 1 here.
     usual = [name for name in shown or sorted(there) if not name.startswith("nre_")]
     return list(asked) or usual

@@ -30,8 +30,8 @@ class Task(nn.Module):
     full_score: str | None = None
     """The metric that tells how good the net is by itself; None: the same."""
 
-    shown: tuple[str, ...] = ()
-    """The metrics in the table that a run ends with, in order; empty: all."""
+    summary_metrics: tuple[str, ...] = ()
+    """Metrics in the table that a run ends with, in order; empty means all."""
 
     requires_same_classes: bool = False
     """Whether the net's outputs are the data's classes, so that it fits no others."""

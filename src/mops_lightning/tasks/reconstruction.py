@@ -46,7 +46,7 @@ class Reconstruction(Task):
     score = "nre_cd"
     """The metric shown in tables; 1 is as good as all points, a lower one is better."""
     full_score = "chamfer"
-    shown = ("nre_cd", "nre_emd", "chamfer", "emd")
+    summary_metrics = ("nre_cd", "nre_emd", "chamfer", "emd")
     net_takes = ("points", "n_points")
 
     def __init__(

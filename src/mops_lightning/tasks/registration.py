@@ -34,7 +34,7 @@ class Registration(Task):
 
     score = "rotation_error_deg"
     """The metric shown in tables; a lower one is better."""
-    shown = (
+    summary_metrics = (
         "rotation_error_deg",
         "rotation_error_p90_deg",
         "rotation_recall_5deg",

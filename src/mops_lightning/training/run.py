@@ -147,7 +147,7 @@ def fit_and_test(
     record["score"] = record["metrics"][experiment.score_name]
     record["notes"] |= {
         "score": experiment.score_name,
-        "shown": list(task.shown),
+        "summary_metrics": list(task.summary_metrics),
         "processes": trainer.world_size,
         "parameters": {
             name: sum(parameter.numel() for parameter in module.parameters())
