@@ -177,7 +177,11 @@ def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):
         "task": {"net": {"_target_": net, "n_points": points, **settings}},
         "dataset": {"n_points": points},
     }
-    notes = {"score": next(iter(metrics)), "summary_metrics": shown, "parameters": {"task": 1_025_000}}
+    notes = {
+        "score": next(iter(metrics)),
+        "summary_metrics": shown,
+        "parameters": {"task": 1_025_000},
+    }
     return run_record.write(target, record(config=config, metrics=metrics, notes=notes))
 
 
