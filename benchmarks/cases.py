@@ -13,9 +13,9 @@ from twins import PlainMOPS, plain_farthest_point_sample
 
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.ops.attention import attend
 from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.ops.nearest import nearest, nearest_distances
-from mops_lightning.ops.sampling_matrix import attend
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.random import RandomSampler

@@ -1,4 +1,4 @@
-"""The chamfer distance beside its plain form, scipy's KD-tree and finite differences."""
+"""The chamfer distance against its plain form, SciPy's KD-tree and finite differences."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def pair(kind, rng):
 @pytest.mark.parametrize(
     "kind", ["random", "one point", "tiny", "coincident", "repeated", "line", "plane"]
 )
-def test_distance_is_that_of_scipy(kind, rng):
+def test_chamfer_equals_scipy(kind, rng):
     points, others = pair(kind, rng)
     want = []
     for ours, theirs in zip(points.numpy(), others.numpy(), strict=True):
@@ -40,13 +40,13 @@ def test_distance_is_that_of_scipy(kind, rng):
     )
 
 
-def test_gradcheck(rng):
+def test_chamfer_gradcheck(rng):
     leaves = [cloud[:2, :9].clone().requires_grad_() for cloud in pair("random", rng)]
     assert torch.autograd.gradcheck(chamfer_distance, leaves)
 
 
 @pytest.mark.parametrize("kind", ["coincident", "repeated", "line"])
-def test_gradients_of_degenerate_clouds_are_finite(kind, rng):
+def test_chamfer_degenerate_clouds_have_finite_gradients(kind, rng):
     leaves = [cloud.clone().requires_grad_() for cloud in pair(kind, rng)]
     for gradient in torch.autograd.grad(chamfer_distance(*leaves).sum(), leaves):
         assert gradient.isfinite().all()
@@ -58,7 +58,7 @@ def plain_chamfer(points, others):
 
 
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 7), (40, 25), (300, 900)])
-def test_chamfer_distance_equals_its_plain_twin(n, m, rng):
+def test_chamfer_equals_plain_form(n, m, rng):
     points = torch.randn(3, n, 3, dtype=torch.float64, generator=rng, requires_grad=True)
     others = torch.randn(3, m, 3, dtype=torch.float64, generator=rng, requires_grad=True)
     got, want = chamfer_distance(points, others), plain_chamfer(points, others)
@@ -67,7 +67,7 @@ def test_chamfer_distance_equals_its_plain_twin(n, m, rng):
     torch.testing.assert_close(*gradients)
 
 
-def test_chamfer_distance_is_zero_for_the_same_points_in_any_order(rng):
+def test_chamfer_of_permuted_points_is_zero(rng):
     points = torch.randn(2, 20, 3, generator=rng)
     order = torch.randperm(20, generator=rng)
     assert not chamfer_distance(points, points[:, order]).any()

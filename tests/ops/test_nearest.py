@@ -1,16 +1,112 @@
-"""Distances by a tree beside those from all points."""
-
 import pytest
 import torch
+from scipy.spatial import cKDTree
 from torch.nn import functional as F
 
+from mops_lightning.errors import UserError
 from mops_lightning.ops import nearest as search
-from mops_lightning.ops.nearest import nearest, nearest_distances
+from mops_lightning.ops.nearest import k_nearest, nearest, nearest_distances
+from mops_lightning.ops.points import gather_points
+from tests.support.plain import plain_nearest
+
+
+@pytest.mark.usefixtures("argextreme_path")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("n", [5, 32, 75])
+def test_nearest_equals_double_loop(n, dtype, rng):
+    queries = torch.randn(2, 6, 3, dtype=dtype, generator=rng)
+    points = torch.randn(2, n, 3, dtype=dtype, generator=rng)
+    distances, indices = nearest(queries, points)
+    expected, places = plain_nearest(queries, points)
+    assert distances.dtype == dtype
+    assert torch.equal(indices, places)
+    torch.testing.assert_close(distances, expected)
+
+
+def test_nearest_gradients_equal_double_loop(rng):
+    def gradients(function):
+        leaves = [values.clone().requires_grad_() for values in (queries, points)]
+        (function(*leaves)[0] * weights).sum().backward()
+        return [leaf.grad for leaf in leaves]
+
+    queries, points = torch.randn(2, 2, 9, 3, dtype=torch.float64, generator=rng)
+    weights = torch.randn(2, 9, generator=rng)
+    torch.testing.assert_close(gradients(nearest), gradients(plain_nearest))
+
+
+def test_nearest_gradcheck(rng):
+    queries, points = torch.randn(2, 2, 4, 3, dtype=torch.float64, generator=rng)
+    leaves = (queries.requires_grad_(), points.requires_grad_())
+    assert torch.autograd.gradcheck(lambda q, p: nearest(q, p)[0], leaves)
+
+
+@pytest.mark.parametrize("block", [1, 100, 1000])
+def test_nearest_block_size_changes_nothing(block, rng, monkeypatch):
+    queries = torch.randn(3, 11, 3, generator=rng)
+    points = torch.randn(3, 40, 3, generator=rng)
+    whole = nearest(queries, points)
+    monkeypatch.setitem(search.BLOCK, "cpu", block)
+    for part, expected in zip(nearest(queries, points), whole, strict=True):
+        assert torch.equal(part, expected)
+
+
+@pytest.mark.parametrize("offset", [0.0, 30.0])
+def test_nearest_far_from_origin_has_no_cancellation(offset, rng):
+    """Close points far from the origin, where |a|² + |b|² − 2⟨a, b⟩ in float32 goes wrong."""
+    points = offset + 0.01 * torch.rand(2, 1500, 3, generator=rng)
+    queries = points[:, :400] + 1e-4 * torch.randn(2, 400, 3, generator=rng)
+    distances, indices = nearest(queries, points)
+    for b in range(2):
+        expected, _ = cKDTree(points[b].double().numpy()).query(queries[b].double().numpy())
+        found = gather_points(points, indices)[b].double()
+        exact = (queries[b].double() - found).norm(dim=1)
+        torch.testing.assert_close(exact, torch.from_numpy(expected), rtol=1e-6, atol=0)
+        torch.testing.assert_close(distances[b].double().sqrt(), exact, rtol=1e-5, atol=0)
+
+
+@pytest.mark.usefixtures("argextreme_path")
+def test_nearest_of_ties_is_lowest_index():
+    points = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0]]]).repeat(1, 20, 1)
+    assert nearest(torch.zeros(1, 1, 3), points)[1].item() == 2
+    assert nearest(torch.tensor([[[1.0, 1, 0]]]), points)[1].item() == 0
+
+
+def test_nearest_half_precision_compares_in_float32(rng):
+    points = torch.randn(1, 50, 3, generator=rng).half()
+    queries = torch.randn(1, 20, 3, generator=rng).half()
+    distances, indices = nearest(queries, points)
+    assert distances.dtype == torch.half
+    assert torch.equal(indices, nearest(queries.float(), points.float())[1])
+
+
+@pytest.mark.parametrize(
+    ("queries", "points"), [((1, 4, 3), (2, 5, 3)), ((1, 4, 2), (1, 5, 3)), ((1, 4, 3), (1, 0, 3))]
+)
+def test_nearest_shape_mismatch_raises(queries, points):
+    for search_ in (nearest, nearest_distances, lambda q, p: k_nearest(q, p, 1)):
+        with pytest.raises(UserError, match="points"):
+            search_(torch.zeros(queries), torch.zeros(points))
+
+
+@pytest.mark.parametrize("k", [1, 4, 30])
+def test_k_nearest_equals_sorted_distances(k, rng):
+    queries = torch.randn(2, 8, 3, dtype=torch.float64, generator=rng)
+    points = torch.randn(2, 30, 3, dtype=torch.float64, generator=rng)
+    distances, indices = k_nearest(queries, points, k)
+    expected, places = torch.cdist(queries, points).square().sort(2)
+    assert torch.equal(indices, places[..., :k])
+    torch.testing.assert_close(distances, expected[..., :k])
+
+
+@pytest.mark.parametrize("k", [0, 6])
+def test_k_nearest_out_of_range_raises(k):
+    with pytest.raises(UserError, match=rf"k must be from 1 .*N=5, got {k}"):
+        k_nearest(torch.zeros(1, 2, 3), torch.zeros(1, 5, 3), k)
 
 
 @pytest.fixture
-def counted(monkeypatch):
-    """Trees for small clouds too, and a list that grows with each."""
+def trees(monkeypatch):
+    """Allow KD-trees for small clouds; return a list of the sizes of the trees built."""
     built = []
 
     def tree(points):
@@ -19,7 +115,7 @@ def counted(monkeypatch):
 
     KDTree = search.cKDTree
     monkeypatch.setattr(search, "cKDTree", tree)
-    monkeypatch.setattr(search, "MANY_PAIRS", 1)
+    monkeypatch.setattr(search, "KD_TREE_MIN_PAIRS", 1)
     return built
 
 
@@ -29,13 +125,13 @@ def sphere(n, rng, dtype=torch.float32):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("m", "n"), [(600, 800), (30, 900), (900, 700)])
-def test_a_tree_gives_the_distances_and_gradients_of_all_points(m, n, dtype, rng, counted):
+def test_nearest_distances_with_tree_equals_exhaustive_search(m, n, dtype, rng, trees):
     points = sphere(n, rng, dtype).requires_grad_()
     noise = 0.02 * torch.randn(2, m, 3, generator=rng, dtype=dtype)
     queries = (sphere(m, rng, dtype) + noise).requires_grad_()
     weight = torch.rand(2, m, generator=rng, dtype=dtype)
     found = nearest_distances(queries, points)
-    assert counted == [n, n]
+    assert trees == [n, n]
     plain = nearest(queries, points)[0]
     torch.testing.assert_close(found, plain, rtol=1e-6, atol=0)
     for got, wanted in zip(
@@ -50,21 +146,21 @@ def test_a_tree_gives_the_distances_and_gradients_of_all_points(m, n, dtype, rng
     "queries",
     [torch.zeros(2, 500, 3), torch.full((2, 500, 3), torch.nan), torch.full((2, 500, 3), 1e30)],
 )
-def test_no_tree_where_it_would_look_at_everything(queries, rng, counted):
+def test_nearest_distances_equidistant_queries_build_no_tree(queries, rng, trees):
     points = sphere(800, rng)
     found = nearest_distances(queries, points)
-    assert counted == []
+    assert trees == []
     torch.testing.assert_close(found, nearest(queries, points)[0], equal_nan=True)
 
 
-def test_coincident_points_are_near(rng, counted):
+def test_nearest_distances_of_coincident_points_are_zero(rng, trees):
     points = sphere(800, rng)
     points[:, 400:] = points[:, :400]
     assert not nearest_distances(points, points).any()
-    assert counted == [800, 800]
+    assert trees == [800, 800]
 
 
-def test_small_clouds_are_searched_as_before(rng, monkeypatch):
+def test_nearest_distances_small_clouds_build_no_tree(rng, monkeypatch):
     monkeypatch.setattr(search, "cKDTree", None)
     points = sphere(300, rng)
     assert torch.equal(nearest_distances(points, points), nearest(points, points)[0])

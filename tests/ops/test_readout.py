@@ -15,14 +15,14 @@ def tree_match(generated, points):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_match_equals_the_kd_tree(dtype, rng):
+def test_match_equals_kd_tree(dtype, rng):
     points = torch.randn(4, 700, 3, dtype=dtype, generator=rng)
     generated = 0.7 * torch.randn(4, 90, 3, dtype=dtype, generator=rng)
     assert torch.equal(match(generated, points), tree_match(generated, points)[1])
 
 
-def test_match_equals_the_kd_tree_on_real_clouds(real_data, rng):
-    """Coordinates on a grid: ties are common, so distances are compared."""
+def test_match_real_clouds_equals_kd_tree(real_data, rng):
+    """Coordinates are on a grid, where ties are common, so distances are compared."""
     with h5py.File(real_data / "modelnet40_hdf5_1024" / "ply_data_test0.h5") as file:
         points = torch.from_numpy(file["data"][:16, :1024])
     generated = points[:, :128] + 1e-3 * torch.randn(16, 128, 3, generator=rng)
@@ -31,13 +31,13 @@ def test_match_equals_the_kd_tree_on_real_clouds(real_data, rng):
     torch.testing.assert_close(distances, tree_match(generated, points)[0], rtol=1e-6, atol=0)
 
 
-def test_match_of_input_points_is_themselves(rng):
+def test_match_of_input_points_is_identity(rng):
     points = torch.randn(2, 60, 3, generator=rng)
     indices = torch.stack([torch.randperm(60, generator=rng)[:20] for _ in range(2)])
     assert torch.equal(match(gather_points(points, indices), points), indices)
 
 
-def test_match_keeps_no_graph(rng):
+def test_match_has_no_gradients(rng):
     points = torch.randn(1, 9, 3, generator=rng, requires_grad=True)
     assert not match(points, points).requires_grad
 
@@ -55,7 +55,7 @@ def plain_complete(indices, cloud):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_complete_equals_the_sequential_definition(dtype, rng):
+def test_complete_equals_sequential_form(dtype, rng):
     points = torch.randn(6, 50, 3, dtype=dtype, generator=rng)
     indices = torch.randint(18, (6, 20), generator=rng)
     indices[0] = 7  # all matched to one point
@@ -67,7 +67,7 @@ def test_complete_equals_the_sequential_definition(dtype, rng):
     assert torch.equal(completed[1], indices[1])
 
 
-def test_complete_does_not_depend_on_the_rest_of_the_batch(rng):
+def test_complete_is_independent_of_batch(rng):
     points = torch.randn(4, 40, 3, generator=rng)
     indices = torch.randint(40, (4, 30), generator=rng)
     together = complete(indices, points)
@@ -75,11 +75,11 @@ def test_complete_does_not_depend_on_the_rest_of_the_batch(rng):
         assert torch.equal(complete(indices[b : b + 1], points[b : b + 1])[0], together[b])
 
 
-def test_complete_is_distinct_where_points_coincide():
+def test_complete_of_coincident_points_is_distinct():
     indices = torch.tensor([[4, 4, 2, 4, 2, 0, 0, 0]])
     assert sorted(complete(indices, torch.ones(1, 8, 3))[0].tolist()) == list(range(8))
 
 
-def test_complete_refuses_more_rows_than_points():
+def test_complete_more_rows_than_points_raises():
     with pytest.raises(UserError, match=r"N=3.*M=4"):
         complete(torch.zeros(1, 4, dtype=torch.int64), torch.zeros(1, 3, 3))

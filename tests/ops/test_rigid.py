@@ -19,7 +19,7 @@ from tests.support.rigid import motion
 
 
 def rotations(number=200, seed=0):
-    """Random rotations, and those at which formulas break: none, tiny, half turns and almost."""
+    """Return random and special rotations: none, tiny, and half turns, exact and almost."""
     axes = np.concatenate([np.eye(3), np.random.default_rng(seed).normal(size=(7, 3))])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     angles = (0.0, 1e-12, 1e-7, 1e-3, np.pi / 2, np.pi - 1e-7, np.pi)
@@ -36,20 +36,20 @@ def same_rotation(got, want, tolerance=1e-12):
     torch.testing.assert_close(got * sign, want, atol=tolerance, rtol=0)
 
 
-def test_matrices_are_scipys():
+def test_quaternion_to_matrix_equals_scipy():
     given = rotations()
     got = quaternion_to_matrix(quaternions(given))
     torch.testing.assert_close(got, torch.from_numpy(given.as_matrix()), atol=1e-12, rtol=0)
 
 
-def test_quaternions_of_matrices_are_scipys():
+def test_quaternion_from_matrix_equals_scipy():
     given = rotations()
     got = quaternion_from_matrix(torch.from_numpy(given.as_matrix()))
     same_rotation(got, quaternions(given), 1e-8)
     assert (got[:, 0] >= 0).all()
 
 
-def test_products_and_inverses_are_scipys():
+def test_multiply_and_conjugate_equal_scipy():
     first, second = rotations(seed=1), rotations(seed=2)
     same_rotation(
         quaternion_multiply(quaternions(first), quaternions(second)), quaternions(first * second)
@@ -57,14 +57,14 @@ def test_products_and_inverses_are_scipys():
     same_rotation(quaternion_conjugate(quaternions(first)), quaternions(first.inv()))
 
 
-def test_euler_angles_are_about_fixed_axes_in_the_order_x_y_z():
+def test_quaternion_from_euler_uses_fixed_axes_xyz():
     angles = np.random.default_rng(3).uniform(-np.pi, np.pi, (100, 3))
     want = Rotation.from_euler("xyz", angles)
     same_rotation(quaternion_from_euler(torch.from_numpy(angles)), quaternions(want))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_angles_are_scipys_at_none_and_at_half_turns_too(dtype):
+def test_rotation_angle_equals_scipy(dtype):
     first, second = rotations(seed=1), rotations(seed=1)[::-1]
     pairs = [(first, second), (first, first)]
     for angle in (0.0, 1e-6, 1e-4, 1.0, np.pi - 1e-6, np.pi):
@@ -77,12 +77,12 @@ def test_angles_are_scipys_at_none_and_at_half_turns_too(dtype):
         torch.testing.assert_close(got, want, atol=tolerance, rtol=0)
 
 
-def test_the_angle_does_not_mind_sign_or_length():
+def test_rotation_angle_is_independent_of_sign_and_norm():
     a, b = quaternions(rotations(seed=1)), quaternions(rotations(seed=2))
     torch.testing.assert_close(rotation_angle(-3 * a, b), rotation_angle(a, b))
 
 
-def test_motions_compose_invert_and_keep_distances(rng):
+def test_motion_composition_and_inverse(rng):
     points = torch.randn(5, 40, 3, generator=rng)
     first, second = motion(1), motion(2)
     torch.testing.assert_close(
@@ -99,20 +99,20 @@ def test_motions_compose_invert_and_keep_distances(rng):
     )
 
 
-def test_random_motions_stay_in_their_range_and_fill_it():
+def test_random_motion_covers_its_range():
     drawn = random_motion(45.0, 0.5, [generator(i) for i in range(2000)])
     assert drawn.translation.abs().max() <= 0.5
     assert drawn.translation.abs().max() > 0.49
     angles = Rotation.from_quat(np.roll(drawn.quaternion.numpy(), -1, 1)).as_euler("xyz", True)
     assert np.abs(angles).max() <= 45.001
     assert (np.abs(angles).max(0) > 44).all()
-    # What answering "no motion" scores: about 42.8 degrees.
+    # The mean error of always predicting the identity is about 42.8 degrees.
     still = torch.tensor([1.0, 0.0, 0.0, 0.0])
     mean = torch.rad2deg(rotation_angle(drawn.quaternion, still.expand(2000, 4))).mean()
     assert 41.5 < mean < 44
 
 
-def test_random_motions_hang_on_their_own_generator_only():
+def test_random_motion_depends_on_own_generator_only():
     both = random_motion(45.0, 1.0, [generator(1), generator(2)])
     alone = random_motion(45.0, 1.0, [generator(2)])
     assert torch.equal(both.quaternion[1:], alone.quaternion)

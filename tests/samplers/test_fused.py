@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
+from mops_lightning.ops.attention import Partial, attend
 from mops_lightning.ops.readout import match
-from mops_lightning.ops.sampling_matrix import Partial, attend
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.snet import SNet

@@ -19,8 +19,8 @@ from torch import Tensor
 from mops_lightning.downsample.formats.chunks import CloudFile, stored
 from mops_lightning.downsample.formats.table import Table, check_enough, radius_of, reach, total
 from mops_lightning.errors import UserError
+from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.nearest import nearest
-from mops_lightning.ops.sampling_matrix import Partial
 from mops_lightning.samplers.fused import FusedMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.streaming import global_part, sum_part

@@ -1,1 +1,1 @@
-"""Pure functions on point clouds."""
+"""Pure functions on tensors of point clouds."""

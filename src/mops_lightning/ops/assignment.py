@@ -1,6 +1,7 @@
-"""Bijections of two clouds with a small sum of distances: the best one, or a good one by blocks.
+"""Assignment of one point cloud to another: the bijection with the smallest sum of distances.
 
-NumPy and scipy only: worker processes import this module, and start faster without torch.
+``solve_assignment`` is exact; ``approximate_assignment`` splits large clouds into blocks. The
+module uses NumPy and SciPy only: worker processes import it, and start faster without torch.
 """
 
 import numpy as np
@@ -8,79 +9,97 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-MANY = 1024
-"""Points from which on the best bijection is found by POT."""
+NETWORK_SIMPLEX_MIN_POINTS = 1024
+"""Minimum number of points for solving the assignment with POT's network simplex."""
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 
-def block_matching(p: Array, q: Array, block: int, rounds: int) -> Rows:
-    """Return a good bijection of two clouds ``(N, 3)``, in time N·block² and memory N + block².
+def approximate_assignment(p: Array, q: Array, block: int, rounds: int) -> Rows:
+    """Return an assignment of low cost, in O(N·block²) time and O(N + block²) memory.
 
-    Both clouds are halved at their medians along the same axis again and again; halves are matched
-    with halves, and what has at most ``block`` points exactly. Then, in every round, the pairs are
-    cut into blocks anew, along axes turned at random (always the same ones) and by the places of
-    their points or of their partners in turn, and the pairs of a block are matched anew, exactly.
-    A round never makes the bijection worse. Above the exact distance of 512 and 1,024 points by at
-    most (measured; see the tests): 8 % with blocks of 128 and 8 rounds, 17 % with 64 and 2.
+    First, both clouds are split recursively at their medians along a common axis, and parts of at
+    most ``block`` points are assigned exactly. Then every round splits the pairs into new blocks,
+    along randomly rotated axes (with a fixed seed) and by the positions of ``p`` and ``q`` in turn,
+    and solves each block exactly. The cost never increases from round to round. For 512 and 1,024
+    points, the measured cost exceeds the exact one by at most 8 % with block=128 and rounds=8, and
+    by at most 17 % with block=64 and rounds=2.
+
+    Args:
+        p: ``(N, 3)``.
+        q: ``(N, 3)``.
+        block: largest number of points in a block.
+        rounds: number of improvement rounds.
+
+    Returns:
+        ``(N,)`` rows of ``q``; row i is assigned to ``p[i]``.
     """
-    match = _halved(p, q, block)
+    assigned = _assign_by_bisection(p, q, block)
     rng = np.random.default_rng(0)
     for number in range(rounds if len(p) > block else 0):
-        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        places = (q[match] if number % 2 else p) @ turn
-        for part in _blocks(places, block):
-            match[part] = match[part[best_matching(p[part], q[match[part]])]]
-    return match
+        rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        positions = (q[assigned] if number % 2 else p) @ rotation
+        for rows in _split_into_blocks(positions, block):
+            assigned[rows] = assigned[rows[solve_assignment(p[rows], q[assigned[rows]])]]
+    return assigned
 
 
-def best_matching(p: Array, q: Array) -> Rows:
-    """Return the best bijection of two clouds.
+def solve_assignment(p: Array, q: Array) -> Rows:
+    """Return the assignment with the smallest sum of Euclidean distances.
 
-    POT's network simplex takes over where scipy's shortest augmenting paths may become slow:
-    2,048 points against a heap took 4.7 seconds by the one and 1.2 by the other, on one core.
+    Small problems use SciPy's shortest augmenting paths, large ones POT's network simplex: for
+    2,048 points against a dense cluster, SciPy took 4.7 s and POT 1.2 s on one core.
+
+    Args:
+        p: ``(N, 3)``.
+        q: ``(N, 3)``.
+
+    Returns:
+        ``(N,)`` rows of ``q``; row i is assigned to ``p[i]``.
     """
     cost = cdist(p, q)
-    if len(p) >= MANY:
+    if len(p) >= NETWORK_SIMPLEX_MIN_POINTS:
         from ot import emd
 
-        equal = np.full(len(p), 1 / len(p))
-        rows = np.asarray(emd(equal, equal, cost, numItermax=10**8)).argmax(1)
-        # A vertex of the polytope of plans is a bijection, unless rounding got in the way.
+        weights = np.full(len(p), 1 / len(p))
+        rows = np.asarray(emd(weights, weights, cost, numItermax=10**8)).argmax(1)
+        # A vertex of the transport polytope is a bijection, except for rounding errors.
         if len(np.unique(rows)) == len(p):
             return rows.astype(np.int64)
     return np.asarray(linear_sum_assignment(cost)[1], np.int64)
 
 
-def _halved(p: Array, q: Array, block: int) -> Rows:
-    match = np.empty(len(p), np.int64)
-    open_ = [(np.arange(len(p)), np.arange(len(q)))]
-    while open_:
-        mine, theirs = open_.pop()
-        if len(mine) <= block:
-            match[mine] = theirs[best_matching(p[mine], q[theirs])]
+def _assign_by_bisection(p: Array, q: Array, block: int) -> Rows:
+    """Split both clouds at their medians until parts have at most ``block`` points; solve these."""
+    assigned = np.empty(len(p), np.int64)
+    stack = [(np.arange(len(p)), np.arange(len(q)))]
+    while stack:
+        p_rows, q_rows = stack.pop()
+        if len(p_rows) <= block:
+            assigned[p_rows] = q_rows[solve_assignment(p[p_rows], q[q_rows])]
             continue
-        axis = int(np.concatenate([p[mine], q[theirs]]).var(0).argmax())
-        halves = (_halve(p[:, axis], mine), _halve(q[:, axis], theirs))
-        open_ += zip(*halves, strict=True)
-    return match
+        axis = int(np.concatenate([p[p_rows], q[q_rows]]).var(0).argmax())
+        halves = (_split_at_median(p[:, axis], p_rows), _split_at_median(q[:, axis], q_rows))
+        stack += zip(*halves, strict=True)
+    return assigned
 
 
-def _blocks(places: Array, block: int) -> list[Rows]:
-    """Cut ``(N, 3)`` points into boxes of at most ``block``, each across its longest side."""
-    done, open_ = [], [np.arange(len(places))]
-    while open_:
-        part = open_.pop()
-        if len(part) <= block:
-            done.append(part)
+def _split_into_blocks(positions: Array, block: int) -> list[Rows]:
+    """Split ``(N, 3)`` points across their longest sides into sets of at most ``block`` rows."""
+    blocks, stack = [], [np.arange(len(positions))]
+    while stack:
+        rows = stack.pop()
+        if len(rows) <= block:
+            blocks.append(rows)
         else:
-            open_ += _halve(places[:, int(np.ptp(places[part], axis=0).argmax())], part)
-    return done
+            axis = int(np.ptp(positions[rows], axis=0).argmax())
+            stack += _split_at_median(positions[:, axis], rows)
+    return blocks
 
 
-def _halve(values: Array, rows: Rows) -> tuple[Rows, Rows]:
-    """Part rows at the median of their values; of an odd number the second half has one more."""
+def _split_at_median(values: Array, rows: Rows) -> tuple[Rows, Rows]:
+    """Split rows at the median of their values; the second half has the odd row."""
     half = len(rows) // 2
     order = rows[np.argpartition(values[rows], half)]
     return order[:half], order[half:]

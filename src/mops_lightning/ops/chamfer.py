@@ -1,4 +1,4 @@
-"""The chamfer distance of two clouds."""
+"""Chamfer distance between point clouds."""
 
 from torch import Tensor
 
@@ -6,16 +6,19 @@ from mops_lightning.ops.nearest import nearest_distances
 
 
 def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
-    """Return the squared chamfer distance of two clouds, both directions, each a mean over points.
+    """Return the squared chamfer distance: the sum of the mean over both directions.
 
     CD(P, Q) = 1/|P| Σ_p min_q ‖p − q‖² + 1/|Q| Σ_q min_p ‖q − p‖². Memory does not grow with
     |P|·|Q|; gradients flow to both clouds through the nearest points.
 
     Args:
-        points: ``(B, N, 3)`` the clouds P.
-        others: ``(B, M, 3)`` the clouds Q.
+        points: ``(B, N, 3)`` clouds P.
+        others: ``(B, M, 3)`` clouds Q.
 
     Returns:
         ``(B,)`` in squared units of the coordinates.
+
+    Raises:
+        UserError: the shapes do not match, or a cloud is empty.
     """
     return nearest_distances(points, others).mean(1) + nearest_distances(others, points).mean(1)

@@ -1,7 +1,7 @@
-"""Earth mover's distance of clouds: exact, and by blocks where that would take too long.
+"""Earth mover's distance between point clouds, exact or approximated in blocks.
 
-EMD(P, Q) = min over bijections φ of 1/N Σ_i ‖p_i − q_φ(i)‖. The search for the bijection runs on
-the CPU, without gradients; distances and gradients are then torch's, on any device.
+EMD(P, Q) = min over bijections φ of 1/N Σ_i ‖p_i − q_φ(i)‖. The assignment φ is solved on the CPU,
+without gradients; torch computes the distances and their gradients on any device.
 """
 
 from concurrent.futures.process import BrokenProcessPool
@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.assignment import Rows, best_matching, block_matching
+from mops_lightning.ops.assignment import Rows, approximate_assignment, solve_assignment
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.workers import pool
 
-WORTHWHILE = 8192
-"""Points of a batch from which on other processes are asked; starting them takes a second."""
+WORKERS_MIN_POINTS = 8192
+"""Minimum number of points in a batch for using worker processes, which start in a second."""
 
 
 def earth_movers_distance(
@@ -27,61 +27,77 @@ def earth_movers_distance(
     rounds: int = 4,
     workers: int | None = 1,
 ) -> Tensor:
-    """Return the earth mover's distance of two clouds with equally many points.
+    """Return the earth mover's distance between clouds with the same number of points.
 
     Args:
-        points: ``(B, N, 3)`` the clouds P.
-        others: ``(B, N, 3)`` the clouds Q.
-        block: None finds the best of all bijections, in time that grows with N³ at worst; a number
-            finds a good one by blocks of so many points, see ``matchings.block_matching``.
-        rounds: how often the blocks are cut anew.
-        workers: processes that share the clouds of a batch; None: as many as torch has threads.
-            The result does not depend on it. A script that asks for more than one needs an
-            ``if __name__ == "__main__":``.
+        points: ``(B, N, 3)`` clouds P.
+        others: ``(B, N, 3)`` clouds Q.
+        block: None solves the assignment exactly, in O(N³) time at worst; a number approximates it
+            in blocks of at most this many points, see ``assignment.approximate_assignment``.
+        rounds: number of improvement rounds of the approximation.
+        workers: worker processes that share the clouds of a batch; None means one per thread of
+            torch. The result does not depend on it. A script that uses more than one needs an
+            ``if __name__ == "__main__":`` guard.
 
     Returns:
-        ``(B,)`` in units of the coordinates; by blocks it is an upper bound of the exact value.
-        Gradients flow to both clouds along the bijection.
+        ``(B,)`` in units of the coordinates; the approximation is an upper bound. Gradients flow
+        to both clouds through the assigned pairs.
 
     Raises:
-        UserError: the shapes differ, a number is out of range, or a worker died.
+        UserError: the shapes differ, an argument is out of range, or a worker process died.
     """
-    match = matching(points, others, block, rounds, workers)
-    return torch.linalg.vector_norm(points - gather_points(others, match), dim=2).mean(1)
+    rows = assignment(points, others, block, rounds, workers)
+    return torch.linalg.vector_norm(points - gather_points(others, rows), dim=2).mean(1)
 
 
-def matching(
+def assignment(
     points: Tensor,
     others: Tensor,
     block: int | None = None,
     rounds: int = 4,
     workers: int | None = 1,
 ) -> Tensor:
-    """Return the bijection of ``earth_movers_distance``: ``(B, N)`` int64 rows of ``others``."""
+    """Return the assignment whose mean distance is the earth mover's distance.
+
+    Args:
+        points: ``(B, N, 3)`` clouds P.
+        others: ``(B, N, 3)`` clouds Q.
+        block: see ``earth_movers_distance``.
+        rounds: see there.
+        workers: see there.
+
+    Returns:
+        ``(B, N)`` int64 rows of ``others``, a permutation for every cloud.
+
+    Raises:
+        UserError: see ``earth_movers_distance``.
+    """
     if points.shape != others.shape or points.ndim != 3:
         raise UserError(
             "points and others must both be (B, N, 3) with the same N, got "
-            f"{tuple(points.shape)} and {tuple(others.shape)}: only then is there a bijection."
+            f"{tuple(points.shape)} and {tuple(others.shape)}."
         )
     if block is not None and block < 2:
         raise UserError(f"block must be at least 2 points, got {block}.")
     if rounds < 0:
-        raise UserError(f"rounds must not be negative, got {rounds}.")
+        raise UserError(f"rounds must be at least 0, got {rounds}.")
     if workers is not None and workers < 1:
-        raise UserError(f"workers must be at least 1, or null for all cores, got {workers}.")
+        raise UserError(f"workers must be at least 1, or None for one per thread, got {workers}.")
     p, q = (cloud.detach().double().cpu().numpy() for cloud in (points, others))
-    find = partial(block_matching, block=block, rounds=rounds) if block else best_matching
+    solve = (
+        partial(approximate_assignment, block=block, rounds=rounds) if block else solve_assignment
+    )
     workers = min(workers or torch.get_num_threads(), len(p))
-    if workers < 2 or points[..., 0].numel() < WORTHWHILE:
-        rows: list[Rows] = list(map(find, p, q))
+    if workers < 2 or points[..., 0].numel() < WORKERS_MIN_POINTS:
+        rows: list[Rows] = list(map(solve, p, q))
     else:
         try:
-            rows = list(pool(workers).map(find, p, q))
+            rows = list(pool(workers).map(solve, p, q))
         except BrokenProcessPool as error:
             pool.cache_clear()
             raise UserError(
-                "emd_workers: a process that matched points died, perhaps for want of memory, or "
-                "because the script that started it has no 'if __name__ == \"__main__\":'. "
-                "Try emd_workers=1 (task.emd_workers=1 on the command line)."
+                "workers: a process that solved assignments died. Either memory ran out, "
+                "or the calling script has no 'if __name__ == \"__main__\":' guard. Try workers=1 "
+                "(task.emd_workers=1 on the command line)."
             ) from error
     return torch.from_numpy(np.stack(rows)).to(points.device)

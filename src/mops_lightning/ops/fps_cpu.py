@@ -1,11 +1,11 @@
-"""Farthest point sampling on a CPU by fewer operations than looking at all points at each step.
+"""Faster farthest point sampling on a CPU, for small and for large clouds.
 
-Of small clouds all distances are taken at once, and a step has no more to do than to compare.
+Small clouds: all pairwise distances are computed once, and a step only compares them.
 
-In large clouds most points are far from the new one. Neighbouring points form groups. A group that
-is farther from the new point than all its points are from the chosen ones keeps its distances, so
-that a step looks at a few groups only. (Han et al., "QuickFPS", IEEE TCAD 2023, and others before
-them do so in trees.)
+Large clouds: neighbouring points form groups. If a new point is farther from a group's bounding
+box than all points of the group are from the chosen points, the distances in the group do not
+change. A step therefore updates only a few groups, as QuickFPS does with trees (Han et al., IEEE
+TCAD 2023).
 """
 
 import math
@@ -15,18 +15,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-SIZE = 128
-"""Points in a group: fewer make the groups many, more make each step look at more points."""
+GROUP_SIZE = 128
+"""Points in a group: smaller groups are more numerous, larger ones cost more per update."""
 
-SAFE = 1 - 1e-6
-"""Bounds are lowered by it, for sums of squares are rounded in another way than distances are."""
+MARGIN = 1 - 1e-6
+"""Factor that lowers bounds, because they are rounded differently from the distances."""
 
 
-def squared_lengths_(planes: Tensor) -> Tensor:
-    """Sum the squares of planes ``(C, ...)``, in place of the first one.
+def sum_of_squares_(planes: Tensor) -> Tensor:
+    """Sum the squares of the planes of ``(C, ...)``, in place of the first plane.
 
-    All ways to farthest points do it here: some processors multiply and add in one rounding, others
-    in two, and all ways must come to the same bits.
+    All variants of farthest point sampling use this function: fused multiply-add rounds once
+    instead of twice on some processors, and all variants must give identical distances.
     """
     total, *others = planes.unbind(0)
     total.mul_(total)
@@ -35,84 +35,93 @@ def squared_lengths_(planes: Tensor) -> Tensor:
     return total
 
 
-def take_farthest_by_table(points: Tensor, distances: Tensor, steps: int) -> Tensor:
-    """Do what ``take_farthest_by_groups`` does, from a table of all distances.
+def farthest_by_distance_table(points: Tensor, distances: Tensor, steps: int) -> Tensor:
+    """Do the same as ``farthest_by_groups`` with a table of all N² pairwise distances.
 
     Args:
-        points: ``(N, C)`` on the CPU, finite; N² distances are held.
-        distances: as there.
-        steps: as there.
+        points: ``(N, C)`` on the CPU, finite.
+        distances: ``(N,)`` initial squared distances; -1 marks chosen points.
+        steps: number of points to choose.
 
     Returns:
-        As there.
+        ``(steps,)`` int64, the lowest row in case of ties.
     """
     planes = points.to(distances.dtype).mT.contiguous()
-    table = squared_lengths_(planes[:, :, None] - planes[:, None])
-    rows, far = table.numpy(), distances.numpy().copy()
-    taken = np.empty(steps, np.int64)
+    table = sum_of_squares_(planes[:, :, None] - planes[:, None]).numpy()
+    remaining = distances.numpy().copy()
+    chosen = np.empty(steps, np.int64)
     for step in range(steps):
-        row = far.argmax()
-        taken[step] = row
-        far[row] = -1
-        np.minimum(far, rows[row], out=far)
-    return torch.from_numpy(taken)
+        row = remaining.argmax()
+        chosen[step] = row
+        remaining[row] = -1
+        np.minimum(remaining, table[row], out=remaining)
+    return torch.from_numpy(chosen)
 
 
-def take_farthest_by_groups(points: Tensor, distances: Tensor, steps: int) -> Tensor:
-    """Take the point with the largest distance, lower the distances to it, and so on.
+def farthest_by_groups(points: Tensor, distances: Tensor, steps: int) -> Tensor:
+    """Repeatedly choose the point with the largest distance and update the distances.
 
     Args:
         points: ``(N, C)`` on the CPU, finite, C up to 4.
-        distances: ``(N,)`` squared distances to start from, of at least float32; what is taken
-            stands at -1.
-        steps: how many points to take, at most as many as are not taken.
+        distances: ``(N,)`` initial squared distances, at least float32; -1 marks chosen points.
+        steps: number of points to choose, at most the number of points that are not chosen.
 
     Returns:
-        ``(steps,)`` int64, the lowest row of equally far ones; bit for bit what looking at all
-        points gives.
+        ``(steps,)`` int64, the lowest row in case of ties; identical to exhaustive search.
     """
-    n = len(points)
     array = points.to(distances.dtype).numpy()
-    # Rows stand in order within a group, so that its first maximum is that of the lowest row; the
-    # last group is filled up with copies that count as taken.
-    rows = np.full(math.ceil(n / SIZE) * SIZE, n)
-    rows[:n] = np.argsort(_places_on_curve(array), kind="stable")
-    rows = np.sort(rows.reshape(-1, SIZE), axis=1)
-    filled = np.minimum(rows, n - 1)
-    filled = np.where(rows < n, filled, filled[:, :1])
-    planes = np.ascontiguousarray(array[filled].transpose(2, 0, 1))
-    far = np.where(rows < n, distances.numpy()[filled], -1).astype(array.dtype)
+    rows, planes, remaining = _grouped(array, distances.numpy())
     low, high = planes.min(2), planes.max(2)
-    places = far.argmax(1)
-    every = np.arange(len(rows))
-    peaks, peak_rows = far[every, places], rows[every, places]
-    taken = np.empty(steps, np.int64)
+    best = remaining.argmax(1)
+    numbers = np.arange(len(rows))
+    peaks, peak_rows = remaining[numbers, best], rows[numbers, best]
+    chosen = np.empty(steps, np.int64)
     for step in range(steps):
-        equal = np.flatnonzero(peaks == peaks.max())
-        group = equal[peak_rows[equal].argmin()]
-        place = places[group]
-        taken[step] = rows[group, place]
-        far[group, place] = -1
+        ties = np.flatnonzero(peaks == peaks.max())
+        group = ties[peak_rows[ties].argmin()]
+        place = best[group]
+        chosen[step] = rows[group, place]
+        remaining[group, place] = -1
         new = planes[:, group, place]
-        bound = _distances_to_boxes(low, high, new) * SAFE
-        near = bound < peaks
-        near[group] = True
-        touched = np.flatnonzero(near)
-        lowered = _lowered(planes.take(touched, 1), new, far.take(touched, 0))
-        far[touched] = lowered
-        inside = lowered.argmax(1)
-        places[touched] = inside
-        peaks[touched] = lowered[every[: len(touched)], inside]
-        peak_rows[touched] = rows[touched, inside]
-    return torch.from_numpy(taken)
+        affected = _distances_to_boxes(low, high, new) * MARGIN < peaks
+        affected[group] = True
+        groups = np.flatnonzero(affected)
+        updated = _updated(planes.take(groups, 1), new, remaining.take(groups, 0))
+        remaining[groups] = updated
+        places = updated.argmax(1)
+        best[groups] = places
+        peaks[groups] = updated[numbers[: len(groups)], places]
+        peak_rows[groups] = rows[groups, places]
+    return torch.from_numpy(chosen)
 
 
-def _lowered(
-    planes: NDArray[np.floating], new: NDArray[np.floating], far: NDArray[np.floating]
+def _grouped(
+    points: NDArray[np.floating], distances: NDArray[np.floating]
+) -> tuple[NDArray[np.int64], NDArray[np.floating], NDArray[np.floating]]:
+    """Group neighbouring points.
+
+    Returns:
+        Rows ``(G, GROUP_SIZE)``, coordinates ``(C, G, GROUP_SIZE)`` and distances
+        ``(G, GROUP_SIZE)``.
+    """
+    # Rows are sorted within a group, so that the first maximum is the one with the lowest row. The
+    # last group is padded with copies of its first point that count as chosen.
+    n = len(points)
+    rows = np.full(math.ceil(n / GROUP_SIZE) * GROUP_SIZE, n)
+    rows[:n] = np.argsort(_z_order(points), kind="stable")
+    rows = np.sort(rows.reshape(-1, GROUP_SIZE), axis=1)
+    padded = np.minimum(rows, n - 1)
+    padded = np.where(rows < n, padded, padded[:, :1])
+    planes = np.ascontiguousarray(points[padded].transpose(2, 0, 1))
+    return rows, planes, np.where(rows < n, distances[padded], -1).astype(points.dtype)
+
+
+def _updated(
+    planes: NDArray[np.floating], new: NDArray[np.floating], distances: NDArray[np.floating]
 ) -> NDArray[np.floating]:
-    """Return the lower of old distances and those to a new point."""
+    """Return the minimum of the old distances and the distances to a new point."""
     differences = torch.from_numpy(planes).sub_(torch.from_numpy(new)[:, None, None])
-    return torch.minimum(torch.from_numpy(far), squared_lengths_(differences)).numpy()
+    return torch.minimum(torch.from_numpy(distances), sum_of_squares_(differences)).numpy()
 
 
 def _distances_to_boxes(
@@ -120,19 +129,19 @@ def _distances_to_boxes(
 ) -> NDArray[np.floating]:
     """Return the squared distances from a point ``(C,)`` to boxes with corners ``(C, G)``."""
     with np.errstate(over="ignore"):
-        away = np.maximum(low - point[:, None], point[:, None] - high)
-        np.maximum(away, 0, out=away)
-        away *= away
-        return away.sum(0)
+        outside = np.maximum(low - point[:, None], point[:, None] - high)
+        np.maximum(outside, 0, out=outside)
+        outside *= outside
+        return outside.sum(0)
 
 
-def _places_on_curve(points: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return where points ``(N, C)`` lie on a Z-order curve: near on it is near in space."""
+def _z_order(points: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Return the positions of points ``(N, C)`` on a Z-order curve."""
     bits = 30 // points.shape[1]
     low = points.min(0).astype(np.float64)
     with np.errstate(all="ignore"):
         scale = (2**bits - 1) / (points.max(0) - low).max()
-        if not 0 < scale < np.inf:  # all coincide, or too far apart to be told
+        if not 0 < scale < np.inf:  # all points coincide, or their extent overflows
             return np.zeros(len(points), np.int64)
         cells = ((points - low) * scale).astype(np.int64)
     code = np.zeros(len(points), np.int64)

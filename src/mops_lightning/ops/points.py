@@ -1,4 +1,4 @@
-"""Gathering, normalising and laying out batches of points."""
+"""Gathering, normalisation and memory layout of batched point clouds."""
 
 import torch
 from torch import Tensor
@@ -8,7 +8,7 @@ from mops_lightning.ops.extreme import GROUP
 
 
 def gather_points(points: Tensor, indices: Tensor) -> Tensor:
-    """Take rows of every cloud.
+    """Select rows of every cloud.
 
     Args:
         points: ``(B, N, C)``.
@@ -21,7 +21,7 @@ def gather_points(points: Tensor, indices: Tensor) -> Tensor:
 
 
 def normalize_unit_sphere(points: Tensor) -> Tensor:
-    """Move every centroid to the origin and scale every cloud to a largest norm of 1.
+    """Centre every cloud at the origin and scale its largest norm to 1.
 
     Args:
         points: ``(B, N, C)``.
@@ -31,18 +31,26 @@ def normalize_unit_sphere(points: Tensor) -> Tensor:
     """
     centred = points - points.mean(1, keepdim=True)
     radius = torch.linalg.vector_norm(centred, dim=2, keepdim=True).amax(1, keepdim=True)
-    # The mean of equal numbers may be off by a rounding error, which must not be blown up.
+    # The mean of equal numbers can have a rounding error, which must not be scaled up.
     flat = (points == points[:, :1]).all(2, keepdim=True).all(1, keepdim=True) | (radius == 0)
     return torch.where(flat, 0.0, centred / torch.where(flat, 1.0, radius))
 
 
 def distance_dtype(points: Tensor) -> torch.dtype:
-    """Half precision is too coarse to compare distances in."""
+    """Return the dtype for comparing distances: at least float32, as half is too coarse."""
     return torch.promote_types(points.dtype, torch.float32)
 
 
 def to_planes(points: Tensor, padding: float | None = None) -> Tensor:
-    """Turn ``(B, N, C)`` into contiguous ``(C, B, N)``, N padded to whole groups if asked."""
+    """Convert ``(B, N, C)`` to contiguous ``(C, B, N)``, one plane per coordinate.
+
+    Args:
+        points: ``(B, N, C)``.
+        padding: value that pads N to a multiple of ``GROUP``; None adds no padding.
+
+    Returns:
+        ``(C, B, N)``, or ``(C, B, N')`` with padding.
+    """
     planes = points.permute(2, 0, 1)
     if padding is not None:
         planes = F.pad(planes, (0, -points.shape[1] % GROUP), value=padding)

@@ -1,8 +1,8 @@
-"""Mixed precision, where it does no harm: in the wide layers that every point goes through.
+"""Mixed precision for the pointwise layers only.
 
-Coordinates, distances, statistics and the sampling matrix need more than the three digits of
-bfloat16, and cost little beside those layers. So a step leaves autocast, and the wide layers alone
-go back into it.
+Coordinates, distances, statistics and the sampling matrix need more than the three significant
+digits of bfloat16, and cost little compared with the wide layers that process every point. A step
+therefore disables autocast, and only the pointwise layers enable it again.
 """
 
 from collections.abc import Iterator
@@ -12,44 +12,44 @@ from typing import Any
 
 import torch
 
-_WIDE: ContextVar[torch.dtype | None] = ContextVar("wide", default=None)
+_POINTWISE: ContextVar[torch.dtype | None] = ContextVar("pointwise", default=None)
 
 
 def full_precision(device: str) -> torch.autocast:
-    """Leave autocast altogether, for scores.
+    """Disable autocast, for scoring.
 
     Args:
-        device: type of the device, such as ``cuda``.
+        device: device type, such as ``cuda``.
     """
     return torch.autocast(device, enabled=False)
 
 
 @contextmanager
 def restrict_autocast_to_pointwise(device: str) -> Iterator[None]:
-    """Leave autocast but for ``pointwise_autocast``, which take over its precision; for training.
+    """Disable autocast except in ``pointwise_autocast``, which keeps its dtype; for training.
 
     Args:
-        device: type of the device, such as ``cuda``.
+        device: device type, such as ``cuda``.
     """
     mixed = torch.is_autocast_enabled(device)
-    token = _WIDE.set(torch.get_autocast_dtype(device) if mixed else None)
+    token = _POINTWISE.set(torch.get_autocast_dtype(device) if mixed else None)
     try:
         with full_precision(device):
             yield
     finally:
-        _WIDE.reset(token)
+        _POINTWISE.reset(token)
 
 
 def pointwise_autocast_dtype() -> torch.dtype | None:
-    """Return the precision of ``pointwise_autocast``; None where autocast is off."""
-    return _WIDE.get()
+    """Return the dtype of ``pointwise_autocast``, or None without mixed precision."""
+    return _POINTWISE.get()
 
 
 def pointwise_autocast(device: str) -> AbstractContextManager[Any]:
-    """Run layers that every point goes through, in mixed precision where that is asked for.
+    """Run pointwise layers in mixed precision if the training uses it.
 
     Args:
-        device: type of the device, such as ``cuda``.
+        device: device type, such as ``cuda``.
     """
-    dtype = _WIDE.get()
+    dtype = _POINTWISE.get()
     return nullcontext() if dtype is None else torch.autocast(device, dtype=dtype)

@@ -1,6 +1,6 @@
-"""From generated points to input points: matched and completed sets.
+"""Readouts of generated points: the matched and the completed set.
 
-Paper, end of section "Efficient Regression of the Sampled Set".
+Paper section "Efficient Regression of the Sampled Set", last paragraph.
 """
 
 import torch
@@ -12,24 +12,27 @@ from mops_lightning.ops.nearest import nearest
 
 
 def match(generated: Tensor, points: Tensor) -> Tensor:
-    """Replace every generated point by its nearest input point.
+    """Match every generated point to its nearest input point.
 
     Args:
         generated: ``(B, M, 3)``.
         points: ``(B, N, 3)``.
 
     Returns:
-        ``(B, M)`` int64 rows of ``points``; several may be equal. Where several input points are
-        equally near, the lowest row.
+        ``(B, M)`` int64 rows of ``points``, possibly with repetitions; the lowest row in case of
+        ties.
+
+    Raises:
+        UserError: the shapes do not match, or a cloud is empty.
     """
     return nearest(generated.detach(), points.detach())[1]
 
 
 def unique_count(indices: Tensor) -> Tensor:
-    """Count the different indices of every cloud.
+    """Count the distinct indices of every cloud.
 
     Args:
-        indices: ``(B, M)`` int64, not negative.
+        indices: ``(B, M)`` int64, non-negative.
 
     Returns:
         ``(B,)`` int64, from 1 to M.
@@ -38,32 +41,32 @@ def unique_count(indices: Tensor) -> Tensor:
 
 
 def complete(indices: Tensor, points: Tensor) -> Tensor:
-    """Make matched points unique and fill them up by farthest point sampling from them.
+    """Remove repeated matches and fill up by farthest point sampling from the matched points.
 
     Args:
         indices: ``(B, M)`` int64 rows of ``points``, from ``match``.
         points: ``(B, N, 3)``, N ≥ M.
 
     Returns:
-        ``(B, M)`` int64, all different: the matched rows in the order of their first occurrence,
-        then each time the input point that is farthest from all rows before it.
+        ``(B, M)`` int64, all distinct: the matched rows in the order of their first occurrence,
+        followed by rows from farthest point sampling.
 
     Raises:
-        UserError: there are fewer points than rows to fill.
+        UserError: M is larger than N.
     """
     if indices.shape[1] > points.shape[1]:
         raise UserError(
             f"indices must have at most as many columns as there are points, N={points.shape[1]}, "
-            f"got M={indices.shape[1]}: a set of M different points cannot be had."
+            f"got M={indices.shape[1]}."
         )
     first = _is_first(indices)
-    # A stable sort of "seen before" keeps the first occurrences in their order, and in front.
+    # A stable sort moves first occurrences to the front and keeps their order.
     order = first.logical_not().byte().argsort(dim=1, stable=True)
     return farthest_point_fill(points, indices.gather(1, order), first.sum(1))
 
 
 def _is_first(indices: Tensor) -> Tensor:
-    """Mark, in ``(B, M)``, every index that no column before it holds."""
+    """Return a ``(B, M)`` mask of the first occurrence of every index."""
     value, order = indices.sort(dim=1, stable=True)
     new = torch.ones_like(indices, dtype=torch.bool)
     new[:, 1:] = value[:, 1:] != value[:, :-1]

@@ -1,7 +1,7 @@
-"""Rigid motions as quaternion and translation: pure functions on batches.
+"""Rigid motions, represented by a unit quaternion and a translation.
 
-Quaternions are ``(w, x, y, z)``, scalar first, of norm 1; q and −q are one rotation. A motion takes
-a point p to R·p + t. Angles are radians unless a name says degrees.
+Quaternions are ``(w, x, y, z)``, scalar first; q and −q are the same rotation. A motion maps a
+point p to R·p + t. Angles are in radians unless stated otherwise.
 """
 
 from collections.abc import Sequence
@@ -23,24 +23,24 @@ class Motion(NamedTuple):
     translation: Tensor
 
     def apply(self, points: Tensor) -> Tensor:
-        """Move ``(B, N, 3)`` points."""
+        """Apply the motion to ``(B, N, 3)`` points."""
         rotation = quaternion_to_matrix(self.quaternion).to(points.dtype)
         return points @ rotation.mT + self.translation[:, None]
 
     def after(self, first: "Motion") -> "Motion":
-        """Return the motion that does ``first``, then this one."""
+        """Return the composition: ``first``, then this motion."""
         moved = self.apply(first.translation[:, None])[:, 0]
         return Motion(quaternion_multiply(self.quaternion, first.quaternion), moved)
 
     def inverse(self) -> "Motion":
-        """Return the motion that undoes this one."""
+        """Return the inverse motion."""
         back = quaternion_conjugate(self.quaternion)
         turned = Motion(back, torch.zeros_like(self.translation)).apply(self.translation[:, None])
         return Motion(back, -turned[:, 0])
 
 
 def identity_motion(points: Tensor) -> Motion:
-    """Return the motion that leaves ``(B, N, 3)`` points where they are."""
+    """Return the identity for every cloud of ``(B, N, 3)`` points."""
     zero = torch.zeros_like(points[:, 0])
     return Motion(torch.cat([torch.ones_like(zero[:, :1]), zero], 1), zero)
 
@@ -51,7 +51,7 @@ def quaternion_conjugate(quaternion: Tensor) -> Tensor:
 
 
 def quaternion_multiply(left: Tensor, right: Tensor) -> Tensor:
-    """Return Hamilton's product ``(..., 4)``: the rotation ``right``, then ``left``."""
+    """Return the Hamilton product ``(..., 4)``: the rotation ``right``, then ``left``."""
     a, u = left[..., :1], left[..., 1:]
     b, v = right[..., :1], right[..., 1:]
     scalar = a * b - (u * v).sum(-1, keepdim=True)
@@ -59,7 +59,7 @@ def quaternion_multiply(left: Tensor, right: Tensor) -> Tensor:
 
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
-    """Turn ``(..., 4)`` unit quaternions into ``(..., 3, 3)`` rotation matrices."""
+    """Convert ``(..., 4)`` unit quaternions to ``(..., 3, 3)`` rotation matrices."""
     w, x, y, z = quaternion.unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z),
@@ -76,9 +76,9 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
 
 
 def quaternion_from_matrix(matrix: Tensor) -> Tensor:
-    """Turn ``(..., 3, 3)`` rotation matrices into ``(..., 4)`` unit quaternions with w ≥ 0.
+    """Convert ``(..., 3, 3)`` rotation matrices to ``(..., 4)`` unit quaternions with w ≥ 0.
 
-    Of the four ways to get them, the one that divides by the largest number.
+    Of the four equivalent formulas, the one with the largest divisor is used, for accuracy.
     """
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
     x, y, z = diagonal.unbind(-1)
@@ -104,30 +104,30 @@ def quaternion_from_matrix(matrix: Tensor) -> Tensor:
 
 
 def quaternion_from_euler(angles: Tensor) -> Tensor:
-    """Turn ``(..., 3)`` angles about the fixed axes x, then y, then z into quaternions."""
+    """Convert ``(..., 3)`` angles about the fixed axes x, then y, then z to quaternions."""
     half = angles / 2
     result = None
     for axis in range(3):
-        turn = torch.zeros(*angles.shape[:-1], 4, dtype=angles.dtype, device=angles.device)
-        turn[..., 0] = half[..., axis].cos()
-        turn[..., 1 + axis] = half[..., axis].sin()
-        result = turn if result is None else quaternion_multiply(turn, result)
+        rotation = torch.zeros(*angles.shape[:-1], 4, dtype=angles.dtype, device=angles.device)
+        rotation[..., 0] = half[..., axis].cos()
+        rotation[..., 1 + axis] = half[..., axis].sin()
+        result = rotation if result is None else quaternion_multiply(rotation, result)
     assert result is not None
     return result
 
 
 def rotation_angle(first: Tensor, second: Tensor) -> Tensor:
-    """Return the geodesic angle between two rotations, in radians from 0 to π.
+    """Return the geodesic angle between two rotations.
 
-    2·atan2(‖v‖, |w|) of the relative rotation (w, v) is accurate at 0 and at π, where the acos of
-    a rounded cosine loses half its digits or answers NaN.
+    The formula 2·atan2(‖v‖, |w|) for the relative rotation (w, v) is accurate near 0 and π, where
+    the arc cosine of a rounded cosine loses half of its digits or returns NaN.
 
     Args:
-        first: ``(..., 4)`` quaternions; their length and sign do not matter.
-        second: the same.
+        first: ``(..., 4)`` quaternions of any norm and sign.
+        second: ``(..., 4)``, the same.
 
     Returns:
-        ``(...)``.
+        ``(...)``, in radians from 0 to π.
     """
     between = quaternion_multiply(quaternion_conjugate(first), second)
     vector = torch.linalg.vector_norm(between[..., 1:], dim=-1)
@@ -135,12 +135,15 @@ def rotation_angle(first: Tensor, second: Tensor) -> Tensor:
 
 
 def random_motion(rotation: float, translation: float, generators: Sequence[Generator]) -> Motion:
-    """Draw one motion from each generator.
+    """Draw one random motion from each generator.
 
     Args:
-        rotation: largest turn about each fixed axis in degrees; angles are uniform up to it.
-        translation: largest shift along each axis; uniform too.
-        generators: one for each motion, ``(B,)``.
+        rotation: largest angle about each fixed axis, in degrees; angles are uniform.
+        translation: largest translation along each axis, in units of the coordinates; uniform.
+        generators: B generators, one per motion.
+
+    Returns:
+        B motions in float32.
     """
     drawn = torch.stack([torch.rand(2, 3, generator=g, dtype=torch.float64) for g in generators])
     drawn = 2 * drawn - 1

@@ -1,4 +1,4 @@
-"""Processes that share work; without torch, so that they start fast."""
+"""A pool of worker processes that do not import torch, so that they start fast."""
 
 import os
 import signal
@@ -10,22 +10,23 @@ from multiprocessing import get_context, parent_process
 
 @cache
 def pool(workers: int) -> ProcessPoolExecutor:
-    """Return processes that stay for the next call.
+    """Return a pool of worker processes that is reused by later calls.
 
-    They are spawned, for forking a process in which torch has started threads can hang. A spawned
-    one imports the main module and that of its function, which therefore should do without torch.
+    The processes are spawned, because forking after torch has started threads can deadlock. A
+    spawned process imports the main module and the module of its function; the latter should
+    therefore not import torch.
     """
     return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_start)
 
 
 def _start() -> None:
-    """Leave Ctrl-C to the process that asks, and end when it ends, however it does."""
-    os.environ["POT_BACKEND_DISABLE_PYTORCH"] = "1"  # POT would import torch into every worker
+    """Ignore Ctrl-C, which the parent handles, and exit with the parent, even if it is killed."""
+    os.environ["POT_BACKEND_DISABLE_PYTORCH"] = "1"  # POT would import torch in every worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
 
 
-def _end_with_parent() -> None:
+def _exit_with_parent() -> None:
     if parent := parent_process():
         parent.join()
         os._exit(1)

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
+from mops_lightning.ops.attention import Partial, attend
 from mops_lightning.ops.nearest import nearest
-from mops_lightning.ops.sampling_matrix import Partial, attend
 from mops_lightning.samplers.base import check_points
 from mops_lightning.samplers.fused import FusedMOPSNet
 from mops_lightning.samplers.mops import MOPSNet

@@ -1,0 +1,216 @@
+"""Softmax attention over the points of a cloud without the full matrix of logits.
+
+A softmax over points can be reduced block by block (maximum, sum, weighted sum). Sums over parts of
+a cloud can be merged, so that clouds may be read in chunks, from disk or by several machines.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+LOG2_E = 1 / math.log(2)
+"""Logits in blocks are to the base 2, because exp2 is faster than exp."""
+
+PROBES = 64
+"""Approximate number of points from which the size of a column's logits is estimated."""
+
+
+class Blocks(NamedTuple):
+    """Block sizes of the sampling matrix S on a device.
+
+    Attributes:
+        dense: up to this number of entries of S per batch, a dense product is as fast as blocks.
+        queries: columns of S per block.
+        points: rows of S per block.
+    """
+
+    dense: int
+    queries: int
+    points: int
+
+
+BLOCKS = {"cpu": Blocks(2**22, 2048, 512), "cuda": Blocks(2**26, 4096, 2**14)}
+"""On a CPU, the logits of a block (4 MiB in float32) fit into the last-level cache, and its keys
+into the second-level cache. On a GPU, a block keeps the whole device busy."""
+
+
+def blocks_on(device: torch.device) -> Blocks:
+    """Return the block sizes for a device."""
+    return BLOCKS.get(device.type, BLOCKS["cuda"])
+
+
+def slices(total: int, size: int) -> list[slice]:
+    """Split ``range(total)`` into slices of at most ``size``."""
+    return [slice(start, min(start + size, total)) for start in range(0, total, size)]
+
+
+def softmax_weights(powers: Tensor, keys: Tensor, level: Tensor) -> Tensor:
+    """Return 2^(⟨power, key⟩ − level) for a block of columns and points.
+
+    Args:
+        powers: ``(M, C)``, queries times ``LOG2_E``.
+        keys: ``(N, C)``.
+        level: ``(M,)``, base-2 logarithms of the softmax denominators.
+
+    Returns:
+        ``(M, N)``.
+    """
+    return (powers @ keys.mT).sub_(level[:, None]).exp2_()
+
+
+class Partial(NamedTuple):
+    """Softmax-weighted sum over some points of a cloud; two such sums can be merged.
+
+    Logits and levels are to the base 2.
+
+    Attributes:
+        level: ``(M,)``, subtracted from a column's logits, so that their powers of 2 neither
+            overflow nor all underflow.
+        total: ``(M,)``, the sum of 2^(logit − level).
+        weighted: ``(M, V)``, the sum of 2^(logit − level) times the values of the points.
+    """
+
+    level: Tensor
+    total: Tensor
+    weighted: Tensor
+
+    def merge(self, other: "Partial") -> "Partial":
+        """Return the sum over the points of both; the order of merging affects rounding only."""
+        level = torch.maximum(self.level, other.level)
+        mine, theirs = (self.level - level).exp2(), (other.level - level).exp2()
+        return Partial(
+            level,
+            self.total * mine + other.total * theirs,
+            self.weighted * mine[:, None] + other.weighted * theirs[:, None],
+        )
+
+    def result(self) -> Tensor:
+        """Return the weighted mean ``(M, V)``."""
+        return self.weighted / self.total[:, None]
+
+
+@torch.no_grad()
+def attend(queries: Tensor, keys: Tensor, values: Tensor) -> Partial:
+    """Sum values over points with the weights exp⟨query, key⟩, with bounded memory.
+
+    The level of a column cancels in the result, so it need not be the maximum logit, which would
+    take a pass over all points: the maximum over a few points is almost always sufficient. Columns
+    for which it is not are computed again from their maximum, at up to three times the cost.
+
+    Args:
+        queries: ``(M, C)``, already divided by the temperature.
+        keys: ``(N, C)``, N ≥ 1.
+        values: ``(N, V)``.
+
+    Returns:
+        The sum over all N points; its ``result()`` is the softmax attention ``(M, V)``.
+    """
+    powers = queries * LOG2_E
+    # The column of ones gives the sum of the weights. Contiguous columns halve the product's time.
+    extended = torch.cat([values.mT, values.new_ones(1, len(values))]).mT
+    probes = keys[:: max(len(keys) // PROBES, 1)]
+    # Sums up to this limit can be merged, and multiplied by a value of the same size.
+    limit = math.sqrt(torch.finfo(extended.dtype).max)
+    level = powers.new_empty(len(powers))
+    sums = extended.new_empty(len(powers), extended.shape[1])
+    for columns in slices(len(powers), blocks_on(keys.device).queries):
+        here = powers[columns]
+        estimate = (here @ probes.mT).amax(1)
+        found = _sums(here, keys, extended, estimate)
+        unsure = ~((found[:, -1] > 0.5) & (found[:, -1] < limit))
+        if unsure.any():
+            estimate[unsure], found[unsure] = _sums_from_maxima(here[unsure], keys, extended)
+        level[columns], sums[columns] = estimate, found
+    return Partial(level, sums[:, -1], sums[:, :-1])
+
+
+def _sums(powers: Tensor, keys: Tensor, extended: Tensor, level: Tensor) -> Tensor:
+    """Return the sums of ``extended`` with the weights 2^(⟨power, key⟩ − level)."""
+    blocks = slices(len(keys), blocks_on(keys.device).points)
+    result = extended.new_zeros(len(powers), extended.shape[1])
+    buffer = keys.new_empty(len(powers) * (blocks[0].stop - blocks[0].start))
+    for rows in blocks:
+        shape = (len(powers), rows.stop - rows.start)
+        out = buffer[: math.prod(shape)].view(shape)
+        weights = torch.addmm(-level[:, None], powers, keys[rows].mT, out=out).exp2_()
+        # addmm_ would accumulate over all points one by one, which loses precision.
+        result += weights @ extended[rows]
+    return result
+
+
+def _sums_from_maxima(powers: Tensor, keys: Tensor, extended: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the maximum logits, and the sums with these as levels."""
+    whole: Partial | None = None
+    for rows in slices(len(keys), blocks_on(keys.device).points):
+        logits = powers @ keys[rows].mT
+        peak = logits.amax(1)
+        sums = logits.sub_(peak[:, None]).exp2_() @ extended[rows]
+        part = Partial(peak, sums[:, -1], sums)
+        whole = part if whole is None else whole.merge(part)
+    assert whole is not None
+    return whole.level, whole.weighted
+
+
+def attend_batch(queries: Tensor, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the softmax attention of every cloud and the logarithms of its denominators.
+
+    Args:
+        queries: ``(M, C)``, already divided by the temperature.
+        keys: ``(B, N, C)``.
+        values: ``(B, N, V)``.
+
+    Returns:
+        ``(B, M, V)``, and ``(B, M)`` to the base 2; without gradients.
+    """
+    sums = [attend(queries, *cloud) for cloud in zip(keys, values, strict=True)]
+    results = torch.stack([cloud.result() for cloud in sums])
+    return results, torch.stack([cloud.level + cloud.total.log2() for cloud in sums])
+
+
+def streamed_attention(queries: Tensor, keys: Tensor, values: Tensor) -> Tensor:
+    """Return the softmax attention of every cloud, computed in blocks in both passes.
+
+    Args:
+        queries: ``(M, C)``, already divided by the temperature.
+        keys: ``(B, N, C)``.
+        values: ``(B, N, V)``.
+
+    Returns:
+        ``(B, M, V)``; gradients flow to all arguments.
+    """
+    return _StreamedAttention.apply(queries, keys, values)
+
+
+class _StreamedAttention(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, queries: Tensor, keys: Tensor, values: Tensor) -> Tensor:
+        result, log_sum = attend_batch(queries, keys, values)
+        ctx.save_for_backward(queries, keys, values, result, log_sum)
+        return result
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        queries, keys, values, result, log_sum = ctx.saved_tensors
+        (grad,) = grads
+        grad_queries, grad_keys = torch.zeros_like(queries), torch.zeros_like(keys)
+        grad_values = torch.zeros_like(values)
+        # Backward pass of the softmax: dS = S ∘ (dA − ⟨dQ, Q⟩), with dA = dQ·Pᵀ.
+        inner = (grad * result).sum(-1)
+        powers, size = queries * LOG2_E, blocks_on(keys.device)
+        for cloud in range(len(keys)):
+            for columns in slices(len(queries), size.queries):
+                for rows in slices(keys.shape[1], size.points):
+                    key = keys[cloud, rows]
+                    weights = softmax_weights(powers[columns], key, log_sum[cloud, columns])
+                    if ctx.needs_input_grad[2]:
+                        # A few rows on the left are faster than a few columns on the right.
+                        grad_values[cloud, rows] += (grad[cloud, columns].mT @ weights).mT
+                    change = grad[cloud, columns] @ values[cloud, rows].mT
+                    change.sub_(inner[cloud, columns, None]).mul_(weights)
+                    grad_queries[columns] += change @ key
+                    grad_keys[cloud, rows] += change.mT @ queries[columns]
+        return grad_queries, grad_keys, grad_values

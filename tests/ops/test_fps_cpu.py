@@ -1,0 +1,113 @@
+"""The CPU variants of farthest point sampling give the same rows as exhaustive search."""
+
+import pytest
+import torch
+from torch.nn import functional as F
+
+from mops_lightning.ops import fps, fps_cpu
+from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample
+
+KINDS = ["sphere", "normal", "grid", "line", "copies", "one point", "offset", "tiny", "huge"]
+
+
+def cloud(kind, n, dtype, rng):
+    points = torch.randn(2, n, 3, dtype=dtype, generator=rng)
+    if kind == "sphere":
+        points = F.normalize(points, dim=2)
+    if kind == "grid":  # many ties
+        points = points.mul(3).round()
+    if kind == "line":
+        points[..., 1:] = 0
+    if kind == "copies":
+        points[:, n // 2 :] = points[:, : n - n // 2]
+    if kind == "one point":
+        points[:] = 0.25
+    if kind == "offset":
+        points = points + 1000
+    if kind == "tiny":
+        points = points * torch.finfo(dtype).tiny
+    if kind == "huge":  # squares of differences overflow, and some differences
+        points = points.clamp(-3, 3) / 3 * torch.finfo(dtype).max
+    return points
+
+
+@pytest.fixture(params=["groups", "table"])
+def both(request, monkeypatch):
+    """Return a function that calls another with groups or a table, and with neither."""
+
+    def call(function, *arguments, **options):
+        results = []
+        for fast in (True, False):
+            groups, table = (fast and request.param == variant for variant in ("groups", "table"))
+            monkeypatch.setattr(fps, "GROUPS_MIN_POINTS", 1 if groups else 10**9)
+            monkeypatch.setattr(fps, "GROUPS_MIN_STEPS", 1)
+            monkeypatch.setattr(fps, "TABLE_MAX_POINTS", 10**9 if table else 0)
+            results.append(function(*arguments, **options))
+        return results
+
+    return call
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (90, 90), (128, 60), (1500, 700)])
+def test_sample_equals_exhaustive_search(n, m, kind, dtype, rng, both):
+    points = cloud(kind, n, dtype, rng)
+    start = torch.randint(n, (2,), generator=rng)
+    fast, plain = both(farthest_point_sample, points, m, start=start)
+    assert torch.equal(fast, plain)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fill_equals_exhaustive_search(kind, rng, both):
+    points = cloud(kind, 700, torch.float32, rng)
+    indices = torch.stack([torch.randperm(700, generator=rng)[:200] for _ in range(2)])
+    fast, plain = both(farthest_point_fill, points, indices, torch.tensor([1, 150]))
+    assert torch.equal(fast, plain)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 4])
+def test_sample_other_dimensions_equals_exhaustive_search(channels, rng, both):
+    points = torch.rand(1, 600, channels, generator=rng)
+    fast, plain = both(farthest_point_sample, points, 300)
+    assert torch.equal(fast, plain)
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
+def test_sample_non_finite_equals_exhaustive_search(wrong, rng, both):
+    points = torch.rand(1, 600, 3, generator=rng)
+    points[0, 7, 0] = wrong
+    fast, plain = both(farthest_point_sample, points, 300)
+    assert torch.equal(fast, plain)
+
+
+def test_sample_half_precision_equals_exhaustive_search(rng, both):
+    points = torch.rand(1, 600, 3, generator=rng).half()
+    fast, plain = both(farthest_point_sample, points, 300)
+    assert torch.equal(fast, plain)
+
+
+def test_sample_large_cloud_equals_exhaustive_search(rng, monkeypatch):
+    points, m = torch.rand(1, fps.GROUPS_MIN_POINTS, 3, generator=rng), fps.GROUPS_MIN_STEPS
+    taken = farthest_point_sample(points, m, start=5)
+    monkeypatch.setattr(fps, "GROUPS_MIN_STEPS", m + 1)
+    assert torch.equal(taken, farthest_point_sample(points, m, start=5))
+
+
+@pytest.mark.parametrize(
+    ("clouds", "n", "m", "tables"),
+    [(4, 1024, 128, 4), (4, 1024, 127, 0), (5, 1024, 128, 0), (1, 1025, 900, 0), (1, 8, 8, 1)],
+)
+def test_sample_uses_table_for_few_small_clouds(clouds, n, m, tables, rng, monkeypatch):
+    sizes = []
+
+    def counted(points, distances, steps):
+        sizes.append(len(points))
+        return fps_cpu.farthest_by_distance_table(points, distances, steps)
+
+    monkeypatch.setattr(fps, "farthest_by_distance_table", counted)
+    points = torch.rand(clouds, n, 3, generator=rng)
+    taken = farthest_point_sample(points, m)
+    assert sizes == [n] * tables
+    monkeypatch.setattr(fps, "TABLE_MAX_POINTS", 0)
+    assert torch.equal(taken, farthest_point_sample(points, m))
