@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from mops_lightning.cli.main import COMMANDS
+from mops_lightning.cli.commands import COMMANDS
 from tests.support.command_line import call
 
 

@@ -3,28 +3,31 @@
 Nothing heavy is imported before the command is known, so that ``--help`` is quick.
 """
 
+import os
 import re
 import sys
 from importlib import import_module
 from pathlib import Path
 
+from mops_lightning.cli.commands import COMMANDS
+from mops_lightning.cli.completion import complete, is_query
 from mops_lightning.errors import USER_ERROR, did_you_mean, end, quiet_on_closed_pipe
 
-COMMANDS = {
-    "report": "mops_lightning.report.cli",
-    "downsample": "mops_lightning.downsample.cli",
-}
-"""Subcommands and their modules, each with ``main(arguments, prog)``."""
+WORD = re.compile(r"[^-+~=][^=]*")
+"""An argument that is neither an option nor an override."""
 
 
 def main() -> None:
     """Run the subcommand that is the first argument; without one, train."""
-    first = sys.argv[1] if len(sys.argv) > 1 else ""
+    arguments = sys.argv[1:]
+    first = arguments[0] if arguments else ""
     with quiet_on_closed_pipe():
+        if is_query(arguments) and complete(os.environ.get("COMP_LINE", "")):
+            return
         if first in COMMANDS:
-            command = import_module(COMMANDS[first])
-            command.main(sys.argv[2:], f"{program()} {first}")
-        elif re.match("[^-+~=][^=]*$", first):
+            command = import_module(COMMANDS[first].module)
+            command.main(arguments[1:], f"{program()} {first}")
+        elif WORD.fullmatch(first):
             hint = did_you_mean(first, COMMANDS)
             end(
                 "mops_lightning",

@@ -4,6 +4,7 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
+from mops_lightning.cli.commands import help_lines
 from mops_lightning.config.compose import conf_dir
 from mops_lightning.errors import INTERRUPTED, USER_ERROR, Interrupted, UserError, end
 
@@ -25,8 +26,10 @@ def main() -> None:
 def _run() -> None:
     import hydra
     from hydra.errors import HydraException
+    from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
+    OmegaConf.register_new_resolver("subcommands", help_lines, replace=True)
     show_traceback = bool(os.environ.get("HYDRA_FULL_ERROR"))
     # Makes Hydra raise instead of printing its own shortened traceback.
     os.environ["HYDRA_FULL_ERROR"] = "1"

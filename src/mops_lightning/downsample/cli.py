@@ -35,7 +35,7 @@ def main(
     """
     name = prog.removeprefix("python -m ")
     with quiet_on_closed_pipe():
-        chosen = _parser(prog).parse_args(arguments)
+        chosen = make_parser(prog).parse_args(arguments)
         try:
             sys.exit(_run(chosen))
         except UserError as error:
@@ -44,7 +44,8 @@ def main(
             end(name, "interrupted. Run the same command to do the rest.", INTERRUPTED)
 
 
-def _parser(prog: str) -> argparse.ArgumentParser:
+def make_parser(prog: str) -> argparse.ArgumentParser:
+    """Return the parser of this command's arguments."""
     parser = argparse.ArgumentParser(
         prog=prog,
         description=DESCRIPTION,

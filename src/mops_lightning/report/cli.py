@@ -28,10 +28,18 @@ def main(arguments: list[str] | None = None, prog: str = "python -m mops_lightni
         prog: what the user typed to start this command.
     """
     with quiet_on_closed_pipe():
-        _run(arguments, prog)
+        chosen = make_parser(prog).parse_args(arguments)
+        try:
+            report = build(chosen.folder, chosen.metric, chosen.mixed)
+            written = write(report, chosen.folder)
+        except UserError as error:
+            end(prog.removeprefix("python -m "), str(error), USER_ERROR)
+        print(markdown(report.grids, report.remarks))
+        print(f"in {chosen.folder}/ lie {', '.join(written)}")
 
 
-def _run(arguments: list[str] | None, prog: str) -> None:
+def make_parser(prog: str) -> argparse.ArgumentParser:
+    """Return the parser of this command's arguments."""
     parser = argparse.ArgumentParser(
         prog=prog,
         description=DESCRIPTION,
@@ -46,14 +54,7 @@ def _run(arguments: list[str] | None, prog: str) -> None:
         action="store_true",
         help="allow runs of different commits or settings in one table",
     )
-    chosen = parser.parse_args(arguments)
-    try:
-        report = build(chosen.folder, chosen.metric, chosen.mixed)
-        written = write(report, chosen.folder)
-    except UserError as error:
-        end(prog.removeprefix("python -m "), str(error), USER_ERROR)
-    print(markdown(report.grids, report.remarks))
-    print(f"in {chosen.folder}/ lie {', '.join(written)}")
+    return parser
 
 
 def write(report: Report, folder: Path) -> list[str]:

@@ -1,0 +1,31 @@
+"""The subcommands of the program."""
+
+from typing import NamedTuple
+
+
+class Command(NamedTuple):
+    """A subcommand.
+
+    Attributes:
+        module: has ``main(arguments, prog)`` and ``make_parser(prog)``; imported when it is used.
+        summary: its line in ``--help``.
+    """
+
+    module: str
+    summary: str
+
+
+COMMANDS = {
+    "report": Command(
+        "mops_lightning.report.cli", "tables, plots and a page from the records of runs"
+    ),
+    "downsample": Command(
+        "mops_lightning.downsample.cli", "downsample clouds and meshes from files"
+    ),
+}
+
+
+def help_lines() -> str:
+    """Return one line of help for each subcommand."""
+    width = max(map(len, COMMANDS)) + 2
+    return "\n".join(f"{name:<{width}}{command.summary}" for name, command in COMMANDS.items())
