@@ -40,7 +40,7 @@ RUN_KEYS = (
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 """What ``trainer.precision`` may be; Lightning has more."""
 
-GROUPS = ("task", "dataset", "sampler", "optimizer", "trainer", "logger")
+GROUPS = ("task", "dataset", "sampler", "optimizer", "trainer", "callbacks", "logger")
 LEARN = ("task", "sampler", "joint", "nothing")
 
 

@@ -1,4 +1,4 @@
-"""Lightning callbacks of a run: stopping cleanly, progress without a terminal."""
+"""Lightning callbacks of a run: checkpoints, clean stops, progress."""
 
 import signal
 import sys
@@ -9,14 +9,18 @@ from typing import Any
 import lightning as L
 from lightning.pytorch.callbacks import (
     Callback,
-    LearningRateMonitor,
     ModelCheckpoint,
     RichProgressBar,
 )
+from omegaconf import DictConfig, OmegaConf
 
-from mops_lightning.errors import Interrupted
+from mops_lightning.config.build import accepted, build
+from mops_lightning.errors import Interrupted, UserError
 
 CHECKPOINT = "last.ckpt"
+
+STANDARD = ("learning_rate", "checkpoint", "stop", "progress", "pictures")
+"""Names in ``conf/callbacks/default.yaml``. None of them changes what is learned."""
 
 
 class StopBetweenSteps(Callback):
@@ -97,26 +101,60 @@ class EpochLines(Callback):
         print(f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}  {shown}", flush=True)
 
 
-def standard(folder: Path, logged: bool, score: str) -> list[Callback]:
-    """Return the callbacks of every run.
+def last_checkpoint(checkpoint: Path) -> ModelCheckpoint:
+    """Return the callback that writes a checkpoint after every epoch over the last one.
 
     Args:
-        folder: the run's folder; checkpoints go to ``checkpoints/last.ckpt`` below it.
-        logged: whether there is a logger for the learning rate.
-        score: the task's metric.
+        checkpoint: where to write.
     """
-    checkpoints = folder / "checkpoints"
-    progress: Callback = RichProgressBar(leave=False) if sys.stdout.isatty() else EpochLines(score)
-    rate = [LearningRateMonitor("step")] if logged else []
-    return [
-        *rate,
-        ModelCheckpoint(
-            dirpath=checkpoints,
-            filename=Path(CHECKPOINT).stem,
-            save_top_k=1,
-            enable_version_counter=False,
-            save_on_train_epoch_end=True,
-        ),
-        StopBetweenSteps(checkpoints / CHECKPOINT),
-        progress,
-    ]
+    return ModelCheckpoint(
+        dirpath=checkpoint.parent,
+        filename=checkpoint.stem,
+        save_top_k=1,
+        enable_version_counter=False,
+        save_on_train_epoch_end=True,
+    )
+
+
+def progress(score: str) -> Callback:
+    """Return a progress bar for a terminal, printed lines for anything else.
+
+    Args:
+        score: see ``EpochLines``.
+    """
+    return RichProgressBar(leave=False) if sys.stdout.isatty() else EpochLines(score)
+
+
+def added(nodes: DictConfig) -> dict[str, Any]:
+    """Return the callbacks that a user added, which may change what is learned, as plain data."""
+    plain: Any = OmegaConf.to_container(nodes, resolve=True)
+    return {name: node for name, node in plain.items() if name not in STANDARD and node}
+
+
+def build_callbacks(nodes: DictConfig, offered: dict[str, Any], logged: bool) -> list[Callback]:
+    """Build the callbacks that a configuration lists.
+
+    Args:
+        nodes: by name; null for one that is left out.
+        offered: what only the run knows, by argument name. Without a ``batch``, no pictures.
+        logged: whether there is a logger for the learning rate.
+
+    Raises:
+        UserError: a node describes no callback.
+    """
+    chosen = {str(name): node for name, node in nodes.items() if node is not None}
+    if not logged:
+        chosen.pop("learning_rate", None)
+    if "batch" not in offered:
+        chosen.pop("pictures", None)
+    made = []
+    for name, node in chosen.items():
+        where = f"callbacks.{name}"
+        callback = build(node, where, **accepted(node, offered)) if "_target_" in node else None
+        if not isinstance(callback, Callback):
+            raise UserError(
+                f"{where} must be a Lightning callback, got {node.get('_target_')!r}. "
+                f"Give its class as {where}._target_=MODULE.CLASS."
+            )
+        made.append(callback)
+    return made

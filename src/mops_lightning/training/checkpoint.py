@@ -7,7 +7,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.errors import UserError
-from mops_lightning.training.callbacks import CHECKPOINT
+from mops_lightning.training.callbacks import CHECKPOINT, added
 from mops_lightning.training.experiment import CHECKPOINT_KEY
 from mops_lightning.zoo.weights import load, read_plain
 
@@ -34,6 +34,7 @@ def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
         "dataset": fingerprint,
         "epochs": cfg.trainer.max_epochs,
         **_given_weights(cfg),
+        **({"callbacks": added(cfg.callbacks)} if added(cfg.callbacks) else {}),
     }
     return {
         name: json.dumps(

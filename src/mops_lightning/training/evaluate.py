@@ -22,7 +22,17 @@ from mops_lightning.zoo import weights
 KEY = "evaluate"
 OF_RUN = "run"
 """``weights=run``: the task net that the evaluated run was trained with."""
-NOT_REPEATED = ("ckpt_path", "weights", "learn", "trainer", "optimizer", "out", "pictures", KEY)
+NOT_REPEATED = (
+    "ckpt_path",
+    "weights",
+    "learn",
+    "trainer",
+    "callbacks",
+    "optimizer",
+    "out",
+    "pictures",
+    KEY,
+)
 """What a run was told about its training and its folders does not matter to its evaluation."""
 
 

@@ -13,7 +13,7 @@ from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.files import atomic_write
 from mops_lightning.training import checkpoint
-from mops_lightning.training.callbacks import CHECKPOINT
+from mops_lightning.training.callbacks import CHECKPOINT, added
 from mops_lightning.training.evaluate import OF_RUN
 from mops_lightning.zoo.weights import FILE
 
@@ -58,6 +58,8 @@ def task_config(cfg: DictConfig) -> DictConfig:
             own.trainer.max_epochs = cfg.pretrain.max_epochs
             own.optimizer = cfg.pretrain.optimizer
             own.weights = "auto"
+            for name in added(cfg.callbacks):  # such as early stopping on a readout's score
+                del own.callbacks[name]
         own.learn = "task"
         own.trainer.devices, own.trainer.num_nodes, own.trainer.strategy = 1, 1, "auto"
         own.ckpt_path = None

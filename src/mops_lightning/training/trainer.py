@@ -1,7 +1,6 @@
 """Build what a configuration describes, fit it and test it."""
 
 import logging
-import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +9,7 @@ from typing import Any
 
 import lightning as L
 import torch
+from lightning.pytorch.callbacks import Checkpoint, ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
@@ -22,11 +22,10 @@ from mops_lightning.records.readout_names import parse
 from mops_lightning.records.run_record import dotted
 from mops_lightning.seeding import derive_seed, generator
 from mops_lightning.tasks.base import Task
-from mops_lightning.training import callbacks
+from mops_lightning.training.callbacks import CHECKPOINT, build_callbacks
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.malloc import keep_freed_memory
 from mops_lightning.training.sizes import sizes_to_test
-from mops_lightning.training.visualization import CloudVisualization
 
 HARMLESS = (
     ".*does not have many workers.*",  # the data lie in memory; workers would only copy them
@@ -163,23 +162,22 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset, task: Tas
     keep_freed_memory()
     logger = build(cfg.logger, "logger", save_dir=str(folder)) if cfg.get("logger") else False
     score = task.score if cfg.learn != "task" else task.full_score or task.score
+    offered = {"folder": folder, "checkpoint": folder / "checkpoints" / CHECKPOINT, "score": score}
     rows, titles = choose_shown(dataset, cfg.pictures)
-    drawing = []
     if titles:
         batch = _scored(dataset.test, cfg.batch_size, task).batch_of(rows)
-        drawing = [CloudVisualization(batch, titles, folder / "pictures")]
+        offered |= {"batch": batch, "titles": titles}
+    callbacks = build_callbacks(cfg.callbacks, offered, logged=bool(logger))
     trainer: L.Trainer = build(
         cfg.trainer,
         "trainer",
         logger=logger,
-        callbacks=[
-            *callbacks.standard(folder, logged=bool(logger), score=score),
-            *drawing,
-        ],
+        callbacks=callbacks,
         default_root_dir=str(folder),
         num_sanity_val_steps=0,
         enable_model_summary=False,
-        enable_progress_bar=sys.stdout.isatty(),
+        enable_checkpointing=any(isinstance(callback, Checkpoint) for callback in callbacks),
+        enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
     )
     if cfg.trainer.get("precision") == "16-mixed" and trainer.precision != "16-mixed":
         raise UserError(

@@ -36,13 +36,13 @@ class CloudVisualization(Callback):
     Args:
         batch: the test clouds to draw, as the task takes them.
         titles: one per cloud of the dataset.
-        folder: where the PNGs go.
+        folder: the run's folder; PNGs go to ``pictures`` below it.
     """
 
     def __init__(self, batch: Any, titles: Sequence[str], folder: Path) -> None:
         self.batch = batch
         self.titles = list(titles)
-        self.folder = folder
+        self.folder = folder / "pictures"
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Draw into TensorBoard every tenth of the run."""

@@ -1,0 +1,69 @@
+"""The callbacks group: standard ones, one left out, one added."""
+
+import pytest
+from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+
+from mops_lightning.config.compose import compose
+from mops_lightning.errors import UserError
+from mops_lightning.training.callbacks import (
+    STANDARD,
+    EpochLines,
+    StopBetweenSteps,
+    added,
+    build_callbacks,
+)
+from tests.support.command_line import TINY, call, runs
+
+STOPPING = [
+    "+callbacks.early._target_=lightning.pytorch.callbacks.EarlyStopping",
+    "+callbacks.early.monitor=train/mean_loss",
+    "+callbacks.early.divergence_threshold=-1",  # stops after the first epoch
+    "+callbacks.early.check_on_train_epoch_end=true",
+]
+
+
+def build_from(overrides, tmp_path):
+    nodes = compose(overrides).callbacks
+    offered = {"folder": tmp_path, "checkpoint": tmp_path / "last.ckpt", "score": "accuracy"}
+    return build_callbacks(nodes, offered, logged=False)
+
+
+def test_standard_names_are_those_of_the_yaml():
+    assert set(compose().callbacks) == set(STANDARD)
+    assert added(compose().callbacks) == {}
+
+
+def test_without_logger_and_pictures_three_are_built(tmp_path):
+    made = build_from([], tmp_path)
+    assert [type(one) for one in made] == [ModelCheckpoint, StopBetweenSteps, EpochLines]
+
+
+def test_null_leaves_a_callback_out(tmp_path):
+    made = build_from(["callbacks.checkpoint=null", "callbacks.progress=null"], tmp_path)
+    assert [type(one) for one in made] == [StopBetweenSteps]
+
+
+def test_added_callback_is_built_with_its_settings(tmp_path):
+    made = build_from(STOPPING, tmp_path)
+    assert isinstance(made[-1], EarlyStopping)
+    assert made[-1].monitor == "train/mean_loss"
+    assert list(added(compose(STOPPING).callbacks)) == ["early"]
+
+
+@pytest.mark.parametrize("target", ["torch.nn.ReLU", None])
+def test_node_of_no_callback_is_refused(target, tmp_path):
+    given = [] if target is None else [f"+callbacks.mine._target_={target}"]
+    with pytest.raises(UserError, match=r"callbacks\.mine must be .* callbacks\.mine\._target_="):
+        build_from([*given, "+callbacks.mine.inplace=true"], tmp_path)
+
+
+def test_early_stopping_ends_the_run_but_not_the_pretraining(tmp_path):
+    settings = ["trainer.max_epochs=3", "epochs.task=2", "callbacks.checkpoint=null"]
+    tiny = [one for one in TINY if "epochs" not in one]
+    status, out, err = call([*tiny, *settings, *STOPPING], tmp_path)
+    assert status == 0, err
+    assert out.count("epoch 2/2") == 1
+    assert out.count("epoch 1/3") == 1
+    assert "epoch 2/3" not in out
+    (run,) = runs(tmp_path)
+    assert not (run / "checkpoints").exists()
