@@ -38,6 +38,10 @@ CALLER = {
     "step_decay": {"optimizer", "total_steps"},
     "TensorBoardLogger": {"save_dir"},
     "CSVLogger": {"save_dir"},
+    "last_checkpoint": {"checkpoint"},
+    "StopBetweenSteps": {"checkpoint"},
+    "progress": {"score"},
+    "CloudVisualization": {"batch", "titles", "folder"},
 }
 
 
