@@ -9,12 +9,12 @@ from mops_lightning.types import SampleOutput
 
 
 def values(name, points, output):
-    """The metric of the whole set, once its head is found to be measured as a set of its own."""
+    """The metric of all m samples; that of the first 2 must equal a set of 2."""
     m = output.points.shape[1]
-    found = SET_METRICS[name](points, output, (m, 2))
+    found = SET_METRICS[name].measure(points, output, (m, 2))
     if found is None:
         return None
-    head = SET_METRICS[name](points, output.first(2), (2,)) or {}
+    head = SET_METRICS[name].measure(points, output.first(2), (2,)) or {}
     torch.testing.assert_close(found[2], head[2])
     return found[m]
 
@@ -24,7 +24,7 @@ def clouds(rng):
     return torch.randn(3, 40, 3, generator=rng)
 
 
-def test_subset_distance_equals_a_kd_tree_s(clouds, rng):
+def test_subset_distance_matches_kd_tree(clouds, rng):
     samples = torch.randn(3, 7, 3, generator=rng)
     got = values("generated/subset_distance", clouds, SampleOutput(samples, None, {}))
     want = [
@@ -34,35 +34,35 @@ def test_subset_distance_equals_a_kd_tree_s(clouds, rng):
     torch.testing.assert_close(got, torch.tensor(want, dtype=torch.float32))
 
 
-def test_unique_points_counts_matches_once(clouds):
+def test_unique_points_counts_each_match_once(clouds):
     samples = torch.stack([clouds[:, 4], clouds[:, 4], clouds[:, 9] + 1e-4], 1)
     got = values("matched/unique_points", clouds, SampleOutput(samples, None, {}))
     assert got.tolist() == [2, 2, 2]
 
 
-def test_unique_points_takes_the_indices_of_index_samplers(clouds):
+def test_unique_points_of_index_sampler_uses_indices(clouds):
     indices = torch.tensor([[0, 1, 1, 2]] * 3)
     output = SampleOutput(clouds[:, indices[0]], indices, {})
     assert values("matched/unique_points", clouds, output).tolist() == [3, 3, 3]
 
 
-def test_matrix_metrics_of_an_ideal_and_of_an_even_matrix(clouds):
+def test_matrix_metrics_match_ideal_and_uniform_matrix(clouds):
     keys = torch.eye(40).expand(3, 40, 40)
     ideal = SamplingMatrix(torch.eye(40)[:5], keys, 1e-3)
-    even = SamplingMatrix(torch.zeros(5, 40), keys, 1.0)
+    uniform = SamplingMatrix(torch.zeros(5, 40), keys, 1.0)
     samples = clouds[:, :5]
-    for matrix, percent, error in ((ideal, 100 / 40, 0.0), (even, 100.0, None)):
+    for matrix, percent, error in ((ideal, 100 / 40, 0.0), (uniform, 100.0, None)):
         output = SampleOutput(samples, None, {}, matrix)
         assert values("matrix/nonzero_percent", clouds, output).tolist() == pytest.approx(
             [percent] * 3
         )
-        # SᵀS of the even matrix is 1/40 everywhere.
+        # SᵀS of the uniform matrix is 1/40 everywhere.
         want = error if error is not None else (5 * (1 - 1 / 40) ** 2 + 20 / 40**2) ** 0.5
         got = values("matrix/orthogonality_error", clouds, output)
         torch.testing.assert_close(got, torch.full((3,), want), atol=1e-5, rtol=1e-5)
 
 
-def test_matrix_metrics_are_absent_without_a_matrix(clouds):
+def test_matrix_metrics_without_matrix_are_none(clouds):
     output = SampleOutput(clouds[:, :5], None, {})
     assert values("matrix/nonzero_percent", clouds, output) is None
     assert values("matrix/orthogonality_error", clouds, output) is None

@@ -1,7 +1,6 @@
 from io import StringIO
 from pathlib import Path
 
-import pytest
 from rich.console import Console
 
 from mops_lightning.records.summary import closing_lines, readout_rows
@@ -10,10 +9,10 @@ from tests.support.records import record
 NAMES = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": "mops"}
 
 
-def printed(metrics, score, chosen=(), key="summary_metrics", **config):
+def printed(metrics, score, infos=None, **config):
     console = Console(width=80, record=True, file=StringIO())
     config = {"m": 32, "learn": "sampler", "names": NAMES, **config}
-    notes = {"score": score, key: list(chosen)}
+    notes = {"score": score, "metrics": infos or {}}
     closing_lines(Path("run"), record(config=config, metrics=metrics, notes=notes), console)
     return console.export_text()
 
@@ -23,7 +22,7 @@ def cells(text):
     return [[cell.strip() for cell in line[1:-1].replace("┃", "│").split("│")] for line in lines]
 
 
-def test_one_size_is_shown_by_metric():
+def test_one_size_gives_column_per_metric():
     metrics = {
         "test/generated/accuracy": 0.5,
         "test/generated/subset_distance": 0.1,
@@ -42,14 +41,14 @@ def test_one_size_is_shown_by_metric():
     ]
 
 
-@pytest.mark.parametrize("key", ["summary_metrics", "shown"])  # "shown" in older records
-def test_closing_lines_summary_metrics_select_and_order_columns(key):
+def test_columns_follow_declared_order_and_hide_the_rest():
     metrics = {f"test/{readout}/{name}": 1.5 for readout in ("generated", "full") for name in "abc"}
-    text = printed(metrics, "test/generated/c", ["c", "a"], key)
+    infos = {"a": {"summary_order": 2}, "b": {"summary_order": None}, "c": {"summary_order": 1}}
+    text = printed(metrics, "test/generated/c", infos)
     assert cells(text)[0] == ["sampled by", "c", "a"]
 
 
-def test_index_samplers_have_no_empty_rows():
+def test_readout_without_task_metrics_has_no_row():
     metrics = {
         "test/sampled/accuracy": 0.5,
         "test/full/accuracy": 0.875,
@@ -63,7 +62,7 @@ def test_index_samplers_have_no_empty_rows():
     ]
 
 
-def test_seven_sizes_fit_into_eighty_columns():
+def test_seven_sizes_fit_eighty_columns():
     metrics = {"test/full/accuracy": 0.875, "test/full/mean_class_accuracy": 0.8}
     sizes = (8, 16, 32, 64, 128, 256, 512)
     for m in sizes:
@@ -78,13 +77,13 @@ def test_seven_sizes_fit_into_eighty_columns():
     ]
 
 
-def test_a_task_net_alone_has_no_size():
+def test_task_net_alone_has_no_size():
     text = printed({"test/full/accuracy": 0.5}, "test/full/accuracy", learn="task")
     assert "all points, test" in text
     assert "m=32" not in text
 
 
-def test_rows_come_baselines_first_full_clouds_last():
+def test_rows_are_baselines_readouts_full():
     names = ("full", "matched", "fps", "generated", "random")
     rows = readout_rows({f"test/{name}/accuracy": 0.5 for name in names})
     assert list(rows) == ["fps", "random", "generated", "matched", "full"]

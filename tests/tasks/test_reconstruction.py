@@ -3,7 +3,6 @@ import torch
 
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
-from mops_lightning.metrics.reconstruction import Distances, MeanDistance, NormalizedError
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.ops.chamfer import chamfer_distance
@@ -76,15 +75,6 @@ def test_scored_given_reference_equals_computed_one(rng):
         result = module.scored(given, chosen, module.reference(given))
         for found, expected in zip(result.targets, computed.targets, strict=True):
             assert torch.equal(found, expected)
-
-
-def test_normalized_error_averages_ratios_or_means():
-    found = Distances(torch.tensor([2.0, 3.0, 0.0]), torch.tensor([1.0, 1.0, 0.0]))
-    full = Distances(torch.tensor([1.0, 6.0, 0.0]), torch.tensor([0.5, 1.0, 0.0]))
-    assert NormalizedError("chamfer")(found, full).item() == pytest.approx((2 + 0.5 + 1) / 3)
-    assert NormalizedError("chamfer", of_means=True)(found, full).item() == pytest.approx(5 / 7)
-    assert NormalizedError("emd")(found, full).item() == pytest.approx((2 + 1 + 1) / 3)
-    assert MeanDistance("emd")(found, None).item() == pytest.approx(2 / 3)
 
 
 def trained(learn, sampler, **extra):

@@ -1,18 +1,19 @@
-"""How well clouds are reconstructed, over all shapes of a test."""
+"""Distances between clouds and their reconstructions, over all shapes of a test."""
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric
+
+from mops_lightning.metrics.base import TableMetric
 
 
 class Distances(NamedTuple):
     """Distances of reconstructions from their clouds, one of each kind per cloud.
 
     Attributes:
-        chamfer: ``(B,)``, see ``losses.chamfer_distance``.
-        emd: ``(B,)``, see ``emd.earth_movers_distance``.
+        chamfer: ``(B,)``, see ``ops.chamfer.chamfer_distance``.
+        emd: ``(B,)``, see ``ops.emd.earth_mover_distance``.
     """
 
     chamfer: Tensor
@@ -22,27 +23,25 @@ class Distances(NamedTuple):
 Kind = Literal["chamfer", "emd"]
 
 
-class MeanDistance(Metric):
+class MeanDistance(TableMetric):
     """Mean over all clouds of the distance between a cloud and its reconstruction.
 
-    Args:
+    Attributes:
         kind: which distance.
     """
 
-    is_differentiable = False
+    kind: ClassVar[Kind]
     higher_is_better = False
-    full_state_update = False
     total: Tensor
     clouds: Tensor
 
-    def __init__(self, kind: Kind, **extra: Any) -> None:
+    def __init__(self, **extra: Any) -> None:
         super().__init__(**extra)
-        self.kind = kind
         self.add_state("total", default=torch.tensor(0.0), dist_reduce_fx="sum")
         self.add_state("clouds", default=torch.tensor(0), dist_reduce_fx="sum")
 
     def update(self, found: Distances, reference: Distances | None) -> None:
-        """Take in a batch; the reference does not matter."""
+        """Add a batch; the reference is not used."""
         values = getattr(found, self.kind).detach()
         self.total += values.sum()
         self.clouds += len(values)
@@ -52,38 +51,52 @@ class MeanDistance(Metric):
         return self.total / self.clouds
 
 
-class NormalizedError(Metric):
-    """Normalized reconstruction error: a distance against that of the full cloud's reconstruction.
+class MeanChamfer(MeanDistance):
+    """Mean chamfer distance, in squared units of the coordinates."""
+
+    name = "chamfer"
+    kind = "chamfer"
+    summary_order = 3
+
+
+class MeanEMD(MeanDistance):
+    """Mean earth mover's distance, in units of the coordinates."""
+
+    name = "emd"
+    kind = "emd"
+    summary_order = 4
+
+
+class NormalizedError(TableMetric):
+    """Normalized reconstruction error: a distance divided by that of the full cloud's result.
 
     NRE(Q, P) = D(P, F(Q)) / D(P, F(P)), paper section "Reconstruction of small-scale point clouds".
     1 means that the sampled points serve the net as well as all points.
 
-    Args:
+    Attributes:
         kind: which distance D is.
         of_means: False takes the mean over clouds of their ratios, as the paper does; True the
-            ratio of the mean distances, which one cloud that is reconstructed very well cannot
+            ratio of the mean distances, which a single cloud with a tiny D(P, F(P)) cannot
             dominate.
     """
 
-    is_differentiable = False
+    kind: ClassVar[Kind]
+    of_means: ClassVar[bool] = False
     higher_is_better = False
-    full_state_update = False
     ratios: Tensor
     found: Tensor
     wanted: Tensor
     clouds: Tensor
 
-    def __init__(self, kind: Kind, of_means: bool = False, **extra: Any) -> None:
+    def __init__(self, **extra: Any) -> None:
         super().__init__(**extra)
-        self.kind = kind
-        self.of_means = of_means
-        for name in ("ratios", "found", "wanted", "clouds"):
-            self.add_state(name, default=torch.tensor(0.0).double(), dist_reduce_fx="sum")
+        for state in ("ratios", "found", "wanted", "clouds"):
+            self.add_state(state, default=torch.tensor(0.0).double(), dist_reduce_fx="sum")
 
     def update(self, found: Distances, reference: Distances) -> None:
-        """Take in a batch of distances and those of the full clouds' reconstructions."""
+        """Add a batch of distances and those of the full clouds' reconstructions."""
         mine, full = (getattr(one, self.kind).detach().double() for one in (found, reference))
-        # A cloud that is reconstructed exactly, from sampled points too, has a ratio of 1.
+        # 0/0, an exact reconstruction from sampled points too, counts as 1.
         self.ratios += torch.where(mine == full, 1.0, mine / full).sum()
         self.found += mine.sum()
         self.wanted += full.sum()
@@ -93,3 +106,37 @@ class NormalizedError(Metric):
         """Return the mean ratio or the ratio of means over all clouds so far."""
         value = self.found / self.wanted if self.of_means else self.ratios / self.clouds
         return value.float()
+
+
+class NormalizedChamfer(NormalizedError):
+    """NRE by the chamfer distance."""
+
+    name = "nre_cd"
+    kind = "chamfer"
+    summary_order: ClassVar[int | None] = 1
+    full_cloud_metric = MeanChamfer.name
+
+
+class NormalizedEMD(NormalizedError):
+    """NRE by the earth mover's distance."""
+
+    name = "nre_emd"
+    kind = "emd"
+    summary_order: ClassVar[int | None] = 2
+    full_cloud_metric = MeanEMD.name
+
+
+class NormalizedChamferOfMeans(NormalizedChamfer):
+    """NRE by the chamfer distance, as a ratio of means."""
+
+    name = "nre_cd_of_means"
+    of_means = True
+    summary_order = None
+
+
+class NormalizedEMDOfMeans(NormalizedEMD):
+    """NRE by the earth mover's distance, as a ratio of means."""
+
+    name = "nre_emd_of_means"
+    of_means = True
+    summary_order = None

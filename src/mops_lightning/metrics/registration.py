@@ -1,26 +1,21 @@
-"""How far predicted rigid motions are from the true ones, over all pairs of a test."""
+"""Errors of predicted rigid motions, over all pairs of a test."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
-from mops_lightning.errors import UserError
+from mops_lightning.metrics.base import TableMetric
 from mops_lightning.ops.rigid import Motion, rotation_angle
 
 
-class RotationError(Metric):
-    """Mean or a quantile of the geodesic angle between predicted and true rotations, in degrees.
+class RotationError(TableMetric):
+    """Mean geodesic angle between predicted and true rotations, in degrees.
 
-    Args:
+    Attributes:
         quantile: between 0 and 1; None takes the mean.
-        factor: what the angles are multiplied by. The code of PCRNet and SampleNet reports
-            2·acos(2⟨q₁, q₂⟩² − 1), twice the geodesic angle: ``factor=2`` gives its figure.
-
-    Raises:
-        UserError: ``quantile`` is out of range.
+        factor: multiplies the angles.
 
     Example:
         >>> from mops_lightning.ops.rigid import Motion
@@ -30,17 +25,17 @@ class RotationError(Metric):
         tensor(180.)
     """
 
-    is_differentiable = False
+    name = "rotation_error_deg"
+    label = "rotation error"
+    unit = "°"
     higher_is_better = False
-    full_state_update = False
+    summary_order: ClassVar[int | None] = 1
+    quantile: ClassVar[float | None] = None
+    factor: ClassVar[float] = 1.0
     angles: list[Tensor]
 
-    def __init__(self, quantile: float | None = None, factor: float = 1.0, **extra: Any) -> None:
+    def __init__(self, **extra: Any) -> None:
         super().__init__(**extra)
-        if quantile is not None and not 0 <= quantile <= 1:
-            raise UserError(f"quantile must be between 0 and 1, got {quantile}.")
-        self.quantile = quantile
-        self.factor = factor
         self.add_state("angles", default=[], dist_reduce_fx="cat")
 
     @staticmethod
@@ -49,7 +44,7 @@ class RotationError(Metric):
         return torch.rad2deg(rotation_angle(predicted.quaternion.detach(), true.quaternion))
 
     def update(self, predicted: Motion, true: Motion) -> None:
-        """Take in a batch of motions."""
+        """Add a batch of motions."""
         self.angles.append(self.of(predicted, true))
 
     def compute(self) -> Tensor:
@@ -59,42 +54,79 @@ class RotationError(Metric):
         return value.float()
 
 
-class RotationRecall(Metric):
-    """Share of pairs whose geodesic rotation error is at most ``degrees``.
+class RotationErrorP90(RotationError):
+    """90th percentile of the rotation errors, in degrees."""
 
-    Args:
+    name = "rotation_error_p90_deg"
+    label = "rotation error p90"
+    summary_order = 2
+    quantile = 0.9
+
+
+class DoubledRotationError(RotationError):
+    """Twice the mean rotation error, in degrees.
+
+    The code of PCRNet and SampleNet reports it: 2·acos(2⟨q₁, q₂⟩² − 1).
+    """
+
+    name = "rotation_error_doubled_deg"
+    label = "rotation error doubled"
+    summary_order = None
+    factor = 2.0
+
+
+class RotationRecall(TableMetric):
+    """Fraction of pairs whose geodesic rotation error is at most ``degrees``.
+
+    Attributes:
         degrees: the limit.
     """
 
-    is_differentiable = False
+    unit = "%"
+    scale = 100.0
     higher_is_better = True
-    full_state_update = False
+    degrees: ClassVar[float]
     within: Tensor
     pairs: Tensor
 
-    def __init__(self, degrees: float, **extra: Any) -> None:
+    def __init__(self, **extra: Any) -> None:
         super().__init__(**extra)
-        self.degrees = degrees
         self.add_state("within", default=torch.tensor(0), dist_reduce_fx="sum")
         self.add_state("pairs", default=torch.tensor(0), dist_reduce_fx="sum")
 
     def update(self, predicted: Motion, true: Motion) -> None:
-        """Take in a batch of motions."""
+        """Add a batch of motions."""
         angles = RotationError.of(predicted, true)
         self.within += (angles <= self.degrees).sum()
         self.pairs += len(angles)
 
     def compute(self) -> Tensor:
-        """Return the share over all pairs so far."""
+        """Return the fraction of all pairs so far."""
         return self.within / self.pairs
 
 
-class TranslationError(Metric):
+class RotationRecall5(RotationRecall):
+    """Recall at 5 degrees."""
+
+    name = "rotation_recall_5deg"
+    summary_order = 3
+    degrees = 5.0
+
+
+class RotationRecall10(RotationRecall):
+    """Recall at 10 degrees."""
+
+    name = "rotation_recall_10deg"
+    summary_order = 4
+    degrees = 10.0
+
+
+class TranslationError(TableMetric):
     """Mean Euclidean distance of predicted and true translations, in units of the coordinates."""
 
-    is_differentiable = False
+    name = "translation_error"
     higher_is_better = False
-    full_state_update = False
+    summary_order = 5
     total: Tensor
     pairs: Tensor
 
@@ -104,7 +136,7 @@ class TranslationError(Metric):
         self.add_state("pairs", default=torch.tensor(0), dist_reduce_fx="sum")
 
     def update(self, predicted: Motion, true: Motion) -> None:
-        """Take in a batch of motions."""
+        """Add a batch of motions."""
         difference = predicted.translation.detach() - true.translation
         self.total += torch.linalg.vector_norm(difference, dim=1).sum()
         self.pairs += len(difference)

@@ -1,14 +1,17 @@
-"""Metrics of the sampled set itself, whatever the task: one number per cloud, to be averaged.
+"""Metrics of the sampled set itself, for every task: one number per cloud, averaged over clouds.
 
-Each takes the points ``(B, N, 3)``, what a sampler made of them, and the sizes of interest: for
-size m the first m samples count. It returns ``(B,)`` numbers by size, None where it has no meaning.
+``measure`` takes the points ``(B, N, 3)``, the sampler's output and sizes; for size m the first m
+samples count. It returns ``(B,)`` numbers by size, or None if the metric is undefined.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
+from torchmetrics import MeanMetric
 
+from mops_lightning.metrics.base import TableMetric
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.readout import match, unique_count
 from mops_lightning.types import SampleOutput
@@ -19,43 +22,94 @@ NONZERO_THRESHOLD = 0.01
 BySize = dict[int, Tensor]
 
 
-def subset_distance(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize:
-    """Return (1/m) Σ_j min_i ‖q_j − p_i‖²: the paper's L_subset without its weight.
+class SetMetric(TableMetric, MeanMetric):  # type: ignore[misc]  # MeanMetric types them None
+    """Mean over clouds of a number that ``measure`` gives for each.
 
-    In squared units of the input.
+    Attributes:
+        group: the part of the log key before the name: a readout, or ``matrix``.
     """
-    distances = nearest(output.points, points)[0]
-    return {m: distances[:, :m].mean(1) for m in sizes}
+
+    group: ClassVar[str]
+    higher_is_better: bool | None = None  # type: ignore[assignment]
+    summary_order = None
+
+    def __init__(self, **extra: Any) -> None:
+        super().__init__(nan_strategy="disable", **extra)
+
+    @staticmethod
+    def measure(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize | None:
+        """Return ``(B,)`` numbers by size; None where the metric is undefined."""
+        raise NotImplementedError
 
 
-def unique_points(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize:
-    """Return how many different input points are matched, at most m."""
-    indices = match(output.points, points) if output.indices is None else output.indices
-    return {m: unique_count(indices[:, :m]).to(points.dtype) for m in sizes}
+class SubsetDistance(SetMetric):
+    """(1/m) Σ_j min_i ‖q_j − p_i‖²: the paper's L_subset without its weight.
+
+    In squared units of the coordinates.
+    """
+
+    name = "subset_distance"
+    group = "generated"
+    higher_is_better = False
+
+    @staticmethod
+    def measure(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize:
+        """Return the mean squared distance to the nearest input points."""
+        distances = nearest(output.points, points)[0]
+        return {m: distances[:, :m].mean(1) for m in sizes}
 
 
-def nonzero_percent(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize | None:
-    """Return the entries of S that reach 0.01, in percent; None without S."""
-    if output.matrix is None:
-        return None
-    counts = output.matrix.nonzero_counts(NONZERO_THRESHOLD)
-    return {m: 100 * counts[:, :m].mean(1) / points.shape[1] for m in sizes}
+class UniquePoints(SetMetric):
+    """Number of distinct input points that are matched, at most m."""
+
+    name = "unique_points"
+    group = "matched"
+    higher_is_better = True
+
+    @staticmethod
+    def measure(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize:
+        """Return the numbers of distinct matches."""
+        indices = match(output.points, points) if output.indices is None else output.indices
+        return {m: unique_count(indices[:, :m]).to(points.dtype) for m in sizes}
 
 
-def orthogonality_error(
-    points: Tensor, output: SampleOutput, sizes: Sequence[int]
-) -> BySize | None:
-    """Return ‖SᵀS − I‖_F, which the paper's Eq. (3) wants small; None without S."""
-    if output.matrix is None:
-        return None
-    gram = output.matrix.gram()
-    error = gram - torch.eye(gram.shape[-1]).to(gram)
-    return {m: torch.linalg.matrix_norm(error[:, :m, :m]) for m in sizes}
+class NonzeroPercent(SetMetric):
+    """Entries of S that reach 0.01, in percent; undefined without S."""
+
+    name = "nonzero_percent"
+    label = "non-zero entries of S"
+    group = "matrix"
+    unit = "%"
+    higher_is_better = False
+
+    @staticmethod
+    def measure(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize | None:
+        """Return the percentages; None without S."""
+        if output.matrix is None:
+            return None
+        counts = output.matrix.nonzero_counts(NONZERO_THRESHOLD)
+        return {m: 100 * counts[:, :m].mean(1) / points.shape[1] for m in sizes}
 
 
-SET_METRICS: dict[str, Callable[[Tensor, SampleOutput, Sequence[int]], BySize | None]] = {
-    "generated/subset_distance": subset_distance,
-    "matched/unique_points": unique_points,
-    "matrix/nonzero_percent": nonzero_percent,
-    "matrix/orthogonality_error": orthogonality_error,
+class OrthogonalityError(SetMetric):
+    """‖SᵀS − I‖_F, which the paper's Eq. (3) makes small; undefined without S."""
+
+    name = "orthogonality_error"
+    group = "matrix"
+    higher_is_better = False
+
+    @staticmethod
+    def measure(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize | None:
+        """Return the Frobenius norms; None without S."""
+        if output.matrix is None:
+            return None
+        gram = output.matrix.gram()
+        error = gram - torch.eye(gram.shape[-1]).to(gram)
+        return {m: torch.linalg.matrix_norm(error[:, :m, :m]) for m in sizes}
+
+
+SET_METRICS: dict[str, type[SetMetric]] = {
+    f"{metric.group}/{metric.name}": metric
+    for metric in (SubsetDistance, UniquePoints, NonzeroPercent, OrthogonalityError)
 }
+"""By log key, without stage and size."""

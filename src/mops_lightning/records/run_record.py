@@ -72,12 +72,6 @@ def read(folder: Path) -> dict[str, Any]:
     return record
 
 
-def summary_metrics(record: dict[str, Any]) -> list[str]:
-    """Return the metrics of a run's closing table, in order; empty means all."""
-    notes = record["notes"]
-    return list(notes.get("summary_metrics", notes.get("shown", ())))  # "shown" in older records
-
-
 def dotted(tree: Any, prefix: str = "") -> dict[str, Any]:
     """Return the leaves of nested settings under dotted keys; lists are leaves."""
     if not isinstance(tree, dict):

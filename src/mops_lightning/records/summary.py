@@ -1,4 +1,4 @@
-"""How a run ends on the screen: one table and one line."""
+"""What a run prints at its end: a table of its test results and the paths of its files."""
 
 from pathlib import Path
 from typing import Any
@@ -6,12 +6,12 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from mops_lightning.records import metric_format
+from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL, ROWS, parse
-from mops_lightning.records.run_record import FILE, summary_metrics
+from mops_lightning.records.run_record import FILE
 
 Rows = dict[str, dict[str, float | None]]
-"""Readout → metric, or m=SIZE where several are tested → value."""
+"""Readout → metric, or m=SIZE if several sizes are tested → value."""
 
 
 def readout_rows(metrics: dict[str, float | None], score: str | None = None) -> Rows:
@@ -19,11 +19,11 @@ def readout_rows(metrics: dict[str, float | None], score: str | None = None) -> 
 
     Args:
         metrics: such as ``{"test/generated/accuracy": 0.8}``.
-        score: the metric to show where several sizes are tested; None: the only one.
+        score: the metric to show if several sizes are tested; None: the only one.
 
     Returns:
-        ``{"generated": {"accuracy": 0.8}}``, or ``{"generated": {"m=32": 0.8}}`` where several
-        sizes are tested: baselines first, full clouds last, which count for every size.
+        ``{"generated": {"accuracy": 0.8}}``, or ``{"generated": {"m=32": 0.8}}`` if several sizes
+        are tested. Baselines come first, full clouds last; the latter hold for every size.
     """
     parts = {name: parse(name) for name in metrics}
     several = any(part and part.m for part in parts.values())
@@ -38,12 +38,12 @@ def readout_rows(metrics: dict[str, float | None], score: str | None = None) -> 
 
 
 def closing_lines(folder: Path, record: dict[str, Any], console: Console | None = None) -> None:
-    """Print the table of test results and where everything lies.
+    """Print the table of test results and the output paths.
 
     Args:
         folder: the run's folder.
         record: the run's record.
-        console: where to print; the standard output by default.
+        console: where to print; standard output by default.
     """
     console = console or Console()
     title, table = results_table(record)
@@ -52,38 +52,40 @@ def closing_lines(folder: Path, record: dict[str, Any], console: Console | None 
     files = ", ".join([FILE, *sorted(record["files"].values())])
     seconds = record["seconds"]["total"]
     console.print(
-        f"{record['status']} in {seconds:.0f} s; in {folder}/ lie {files}",
+        f"{record['status']} in {seconds:.0f} s; files in {folder}/: {files}",
         soft_wrap=True,
         highlight=False,
     )
 
 
 def results_table(record: dict[str, Any]) -> tuple[str, Table]:
-    """Return a title and what every readout scored: by metric, or by size if there are several."""
+    """Return a title and the test results of every readout, by metric or by size."""
     config = record["config"]
     names, score = config["names"], parse(record["notes"].get("score", ""))
-    several = score.metric if score and score.m else None
-    rows = readout_rows(record["metrics"], several)
-    # The task's own scores; figures of the sampled set stay in the record.
-    columns = list(rows.get(FULL, {}))
-    columns = [name for name in summary_metrics(record) if name in columns] or columns
-    what = "all points" if config.get("learn") == "task" else f"m={config['m']}"
-    if several:
-        columns = list(next(iter(rows.values())))
+    by_size = score.metric if score and score.m else None
+    rows = readout_rows(record["metrics"], by_size)
+    if by_size:
+        info = metric_info(by_size, [record])
+        columns = {size: (size, info) for size in next(iter(rows.values()))}
         rows[FULL] = dict.fromkeys(columns, next(iter(rows[FULL].values())))
-        what = metric_format.title(several)
+        what = info.title
+    else:
+        # Metrics of the task; those of the sampled set exist for no full cloud.
+        infos = in_summary_order(metric_info(name, [record]) for name in rows.get(FULL, {}))
+        columns = {info.name: (info.title, info) for info in infos}
+        what = "all points" if config.get("learn") == "task" else f"m={config['m']}"
     table = Table()
     table.add_column("sampled by")
-    for column in columns:
-        table.add_column(column if several else metric_format.title(column), justify="right")
+    for head, _ in columns.values():
+        table.add_column(head, justify="right")
     for readout, row in rows.items():
-        values = [row.get(column) for column in columns]
-        if all(value is None for value in values):
-            continue  # figures of the set alone
+        values = {column: row.get(column) for column in columns}
+        if all(value is None for value in values.values()):
+            continue  # metrics of the sampled set only
         label = f"{names['sampler']} {readout}" if readout in ROWS[:-1] else readout
         cells = [
-            "" if value is None else metric_format.figure(several or column, value)
-            for column, value in zip(columns, values, strict=True)
+            "" if value is None else columns[column][1].format(value)
+            for column, value in values.items()
         ]
         table.add_row("all points" if readout == FULL else label, *cells)
     return f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test", table

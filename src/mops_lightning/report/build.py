@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mops_lightning.records import metric_format
+from mops_lightning.metrics.info import MetricInfo
+from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import FULL, GENERATED_READOUTS
 from mops_lightning.report import paper
 from mops_lightning.report.axes import Axes, axes, value
@@ -22,9 +23,6 @@ from mops_lightning.report.collect import (
 )
 from mops_lightning.report.nets import nets_grid
 from mops_lightning.report.text import PAPER, Grid
-
-NORMALIZED = {"nre_cd": "chamfer", "nre_emd": "emd"}
-"""Errors that are 1 on all points, and what they are normalized by, which is shown instead."""
 
 NAMED = 8
 """Runs that were made in one way are named up to this number."""
@@ -95,7 +93,7 @@ def _by_column(table: Cells, names: dict[str, str], layout: Axes) -> Grid:
     if layout.column != "m":
         columns = columns[::-1]
     published = paper.table(
-        names["task"], names["dataset"], table.metric, names["learned"] == "joint"
+        names["task"], names["dataset"], table.metric.name, names["learned"] == "joint"
     )
     rows = []
     for name in table.rows():
@@ -107,7 +105,7 @@ def _by_column(table: Cells, names: dict[str, str], layout: Axes) -> Grid:
             rows.append([PAPER, *texts])
     size = "" if layout == Axes() else f", m={names['m']},"
     title = (
-        f"Test {metric_format.title(table.metric)}: {names['task']} on {names['dataset']}{size} "
+        f"Test {table.metric.title}: {names['task']} on {names['dataset']}{size} "
         f"under {names['net']}; generated / matched / completed sets, or one figure for "
         "samplers that choose input points."
     )
@@ -126,7 +124,7 @@ def _planes(table: Cells, names: dict[str, str], layout: Axes) -> list[Grid]:
             for left in sorted({column[0] for column in table.figures[name]})
         ]
         title = (
-            f"Test {metric_format.title(table.metric)} of {name}: {names['task']} on "
+            f"Test {table.metric.title} of {name}: {names['task']} on "
             f"{names['dataset']}, m={names['m']}, "
             f"under {names['net']}; generated / matched / completed sets."
         )
@@ -140,7 +138,7 @@ def spread(table: Cells, name: str) -> str:
     parts = []
     for readout, values in plane(table, name).items():
         low, high = min(values.values()), max(values.values())
-        ends = [metric_format.figure(table.metric, end) for end in (low, high)]
+        ends = [table.metric.format(end) for end in (low, high)]
         span = " to ".join(ends)
         times = f" (factor {high / low:.3g})" if low > 0 else ""
         parts.append(f"{readout} {span}{times}")
@@ -160,30 +158,30 @@ def _full_row(found: list[Record], table: Cells, layout: Axes) -> list[str]:
     """Return what the task net scores on all points at every value of the setting."""
     shown = {}
     for record in found:
-        figure = record["metrics"].get(f"test/{FULL}/{table.metric}")
+        figure = record["metrics"].get(f"test/{FULL}/{table.metric.name}")
         if figure is not None:
-            shown[value(record, layout.column)] = metric_format.figure(table.metric, figure)
+            shown[value(record, layout.column)] = table.metric.format(figure)
     return ["all points", *(shown.get(column, "") for column in table.columns()[::-1])]
 
 
-def _full(found: list[Record], names: dict[str, str], metric: str) -> list[str]:
+def _full(found: list[Record], names: dict[str, str], metric: MetricInfo) -> list[str]:
     """Say what the task nets score on all points."""
     joint = names["learned"] == "joint"
-    theirs = paper.table(names["task"], names["dataset"], metric, joint)
+    theirs = paper.table(names["task"], names["dataset"], metric.name, joint)
     published = f" (the paper: {theirs['full']:.2f})" if "full" in theirs else ""
     lines: dict[str, None] = {}
-    metric = NORMALIZED.get(metric, metric)
+    other = metric.full_cloud_metric
+    if other:
+        metric = metric_info(other, found)
     for record in found:
-        figure = record["metrics"].get(f"test/{FULL}/{metric}")
+        figure = record["metrics"].get(f"test/{FULL}/{metric.name}")
         config = record["config"]["names"]
         with_ = (
             f" after joint training with {config['sampler']}" if learned(record) == "joint" else ""
         )
         if figure is not None:
-            shown = metric_format.figure(metric, figure)
-            shown = (
-                f"{metric_format.title(metric)} {shown}" if metric in NORMALIZED.values() else shown
-            )
+            shown = metric.format(figure)
+            shown = f"{metric.title} {shown}" if other else shown
             shown += published if config["net"] == names["net"] else ""
             lines[f"{config['net']} on all points{with_}: {shown}."] = None
     return list(lines)

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.records import metric_format
+from mops_lightning.metrics.info import MetricInfo
+from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT, parse
 from mops_lightning.report.axes import Axes, row, value
 from mops_lightning.report.collect import Record, learned, seed
@@ -19,13 +20,13 @@ class Cells:
     """The figures of one metric.
 
     Attributes:
-        metric: its name.
+        metric: its name, unit and label.
         figures: row → column → readout → seed → value.
         own: rows and columns that come from runs of the sampler itself, not from a baseline that
             was tested beside another sampler.
     """
 
-    metric: str
+    metric: MetricInfo
     figures: dict[str, dict[Column, dict[str, dict[int, float]]]] = field(default_factory=dict)
     own: set[tuple[str, Column]] = field(default_factory=set)
 
@@ -58,7 +59,7 @@ def cells(found: list[Record], metric: str, net: str, axes: Axes) -> Cells:
     Raises:
         UserError: no record has the metric, or two runs of one seed would stand in one cell.
     """
-    table = Cells(metric)
+    table = Cells(metric_info(metric, found))
     for record in found:
         _add(table, record, net, axes)
     if not table.figures:
@@ -72,7 +73,9 @@ def _add(table: Cells, record: Record, net: str, axes: Axes) -> None:
     other = mine.removesuffix(record["config"]["names"]["sampler"])
     for name, figure in record["metrics"].items():
         parts = parse(name)
-        if parts is None or parts.metric != table.metric or figure is None or parts.readout == FULL:
+        if parts is None or parts.metric != table.metric.name or parts.readout == FULL:
+            continue
+        if figure is None:
             continue
         if axes != Axes() and parts.m not in (None, record["config"]["m"]):
             continue  # one size in a table of something else: the one that the run is about
@@ -102,14 +105,14 @@ def _add(table: Cells, record: Record, net: str, axes: Axes) -> None:
         values[seed(record)] = figure
 
 
-def over_seeds(metric: str, values: list[float]) -> str:
+def over_seeds(metric: MetricInfo, values: list[float]) -> str:
     """Return a value, or mean ± standard deviation of several, in the metric's unit."""
-    mean = metric_format.figure(metric, statistics.fmean(values))
+    mean = metric.format(statistics.fmean(values))
     if len(values) == 1:
         return mean
     # To the mean's last place: more would be noise.
     places = len(mean.partition(".")[2]) if "e" not in mean else 0
-    deviation = metric_format.scale(metric) * statistics.stdev(values)
+    deviation = metric.scale * statistics.stdev(values)
     return f"{mean} ± {deviation:.{max(places, 2)}f}"
 
 

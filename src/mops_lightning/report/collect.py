@@ -8,6 +8,7 @@ from typing import Any
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.records.attempts import ASIDE, FAILED
+from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import parse
 
 Record = dict[str, Any]
@@ -152,9 +153,16 @@ def epochs(record: Record) -> int | None:
 
 
 def score(found: list[Record]) -> str:
-    """Return the metric that the records' tasks are scored by."""
-    scores = [parse(record["notes"].get("score", "")) for record in found]
-    return next((parts.metric for parts in scores if parts), "accuracy")
+    """Return the name of the records' main metric.
+
+    Early records do not name it; it is the first one of the closing table.
+    """
+    for record in found:
+        if parts := parse(record["notes"].get("score", "")):
+            return parts.metric
+    names = {parts.metric for record in found for parts in map(parse, record["metrics"]) if parts}
+    infos = in_summary_order(metric_info(name, found) for name in names)
+    return infos[0].name if infos else ""
 
 
 def seed(record: Record) -> int:

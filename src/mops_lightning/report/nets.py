@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.records import metric_format
+from mops_lightning.metrics.info import MetricInfo
+from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL
-from mops_lightning.records.run_record import summary_metrics
 from mops_lightning.report import paper
 from mops_lightning.report.axes import varying
 from mops_lightning.report.cells import over_seeds
@@ -65,20 +65,20 @@ def nets_grid(found: list[Record], metrics: Sequence[str] = (), mixed: bool = Fa
             )
         groups[place][seed(record)] = record
     rows = [_row(list(groups[place].values()), keys, shown) for place in sorted(groups)]
-    head = ["net", *keys, "points", *map(metric_format.title, shown), "MB", PAPER]
+    head = ["net", *keys, "points", *(info.title for info in shown), "MB", PAPER]
     if not any(row[-1] for row in rows):
         head, rows = head[:-1], [row[:-1] for row in rows]
     title = f"No sampler was tested; {names['task']} on {names['dataset']} from all points."
     return Grid(title, head, rows)
 
 
-def _row(records: list[Record], keys: list[str], metrics: list[str]) -> list[str]:
+def _row(records: list[Record], keys: list[str], metrics: list[MetricInfo]) -> list[str]:
     """Return the cells of one net, over all its seeds."""
     first = records[0]
     label = [first["config"]["names"]["net"], *map(_net(first).get, keys), _points(first)]
     figures = []
     for metric in metrics:
-        values = [record["metrics"].get(f"test/{FULL}/{metric}") for record in records]
+        values = [record["metrics"].get(f"test/{FULL}/{metric.name}") for record in records]
         there = [value for value in values if value is not None]
         count = f" (n={len(there)})" if len(there) > 1 else ""
         figures.append(over_seeds(metric, there) + count if there else "")
@@ -96,17 +96,17 @@ def _points(record: Record) -> int | None:
     return record["config"].get("dataset", {}).get("n_points")
 
 
-def _metrics(found: list[Record], asked: Sequence[str]) -> list[str]:
-    """Return the metrics of all points: those asked for, those that the task shows, or all."""
+def _metrics(found: list[Record], asked: Sequence[str]) -> list[MetricInfo]:
+    """Return the metrics of full clouds: those asked for, or those in the closing table."""
     names = {name for record in found for name in record["metrics"]}
     there = {name.rsplit("/", 1)[1] for name in names if name.startswith(f"test/{FULL}/")}
     for name in asked:
         if name not in there:
             raise UserError(f"--metric: no run has {name!r}.{did_you_mean(name, there)}")
-    shown = [name for name in summary_metrics(found[0]) if name in there]
-    # Errors normalized by those of all points are 1 here.
-    usual = [name for name in shown or sorted(there) if not name.startswith("nre_")]
-    return list(asked) or usual
+    if asked:
+        return [metric_info(name, found) for name in asked]
+    infos = in_summary_order(metric_info(name, found) for name in there)
+    return [info for info in infos if info.full_cloud_metric is None]  # the rest is 1 here
 
 
 def _paper(record: Record) -> str:

@@ -8,7 +8,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from mops_lightning.records import metric_format
 from mops_lightning.records.readout_names import GENERATED_READOUTS, INDEX_READOUT
 from mops_lightning.report.axes import Axes, row, value
 from mops_lightning.report.build import Report, plane
@@ -25,9 +24,9 @@ def plots(report: Report) -> dict[str, Figure]:
     figures = {}
     for table in report.tables:
         if report.axes.planes:
-            figures[f"{table.metric}_planes"] = heat_maps(table, report.axes)
+            figures[f"{table.metric.name}_planes"] = heat_maps(table, report.axes)
         elif len(table.columns()) > 1:
-            figures[f"{table.metric}_curves"] = curves(table, report.axes)
+            figures[f"{table.metric.name}_curves"] = curves(table, report.axes)
     if report.axes.column != "m" and (figure := clouds_by_column(report)):
         figures["clouds"] = figure
     return figures
@@ -73,7 +72,7 @@ def curves(table: Cells, axes: Axes) -> Figure:
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, len(GENERATED_READOUTS), sharey=True)
     columns = table.columns()[::-1]
-    scale = metric_format.scale(table.metric)
+    scale = table.metric.scale
     for axis, readout in zip(panels, GENERATED_READOUTS, strict=True):
         for number, name in enumerate(table.rows()):
             cells = table.figures[name]
@@ -99,7 +98,7 @@ def curves(table: Cells, axes: Axes) -> Figure:
         axis.set_xlabel(axes.column)
         axis.set_xticks(range(len(columns)), [f"{column:g}" for column in columns])
         axis.grid(alpha=0.3)
-    panels[0].set_ylabel(metric_format.title(table.metric))
+    panels[0].set_ylabel(table.metric.title)
     panels[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
@@ -116,7 +115,7 @@ def heat_maps(table: Cells, axes: Axes) -> Figure:
     names = sorted(axes.planes, key=place)
     found = {name: plane(table, name) for name in names}
     everything = [one for by in found.values() for values in by.values() for one in values.values()]
-    scale = metric_format.scale(table.metric)
+    scale = table.metric.scale
     low, high = scale * min(everything), scale * max(everything)
     shades = _shades(low, high)
     width = max(len(by) for by in found.values())
@@ -142,5 +141,5 @@ def heat_maps(table: Cells, axes: Axes) -> Figure:
             axis.set_xlabel(across.split(".")[-1])
             axis.set_ylabel(down.split(".")[-1])
             axis.set_title(f"{name}, {readout}")
-    figure.colorbar(image, ax=panels, label=metric_format.title(table.metric))
+    figure.colorbar(image, ax=panels, label=table.metric.title)
     return figure

@@ -25,13 +25,10 @@ class Task(nn.Module):
     """
 
     score: str
-    """The metric shown in tables."""
+    """Name of the metric that tables show by default; see ``metrics.info.MetricInfo``."""
 
     full_score: str | None = None
-    """The metric that tells how good the net is by itself; None: the same."""
-
-    summary_metrics: tuple[str, ...] = ()
-    """Metrics in the table that a run ends with, in order; empty means all."""
+    """Name of the metric that scores the task net on full clouds; None: ``score``."""
 
     requires_same_classes: bool = False
     """Whether the net's outputs are the data's classes, so that it fits no others."""

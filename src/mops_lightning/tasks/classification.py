@@ -2,10 +2,11 @@
 
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torchmetrics import Metric, MetricCollection
-from torchmetrics.classification import MulticlassAccuracy
+from torchmetrics import MetricCollection
 
 from mops_lightning.errors import UserError
+from mops_lightning.metrics.base import collection
+from mops_lightning.metrics.classification import Accuracy, MeanClassAccuracy
 from mops_lightning.tasks.base import Task
 from mops_lightning.types import Batch, TaskOutput
 
@@ -21,8 +22,7 @@ class Classification(Task):
         UserError: there are fewer than two classes.
     """
 
-    score = "accuracy"
-    """The metric shown in tables; a higher one is better."""
+    score = Accuracy.name
     requires_same_classes = True
 
     def __init__(self, net: nn.Module, num_classes: int) -> None:
@@ -48,9 +48,5 @@ class Classification(Task):
         return TaskOutput({"cross_entropy": loss}, logits, batch.labels)
 
     def metrics(self, training: bool = False) -> MetricCollection:
-        """Overall accuracy and the mean of the classes' accuracies, both in [0, 1]."""
-        metrics: dict[str, Metric | MetricCollection] = {
-            "accuracy": MulticlassAccuracy(self.num_classes, average="micro"),
-            "mean_class_accuracy": MulticlassAccuracy(self.num_classes, average="macro"),
-        }
-        return MetricCollection(metrics, compute_groups=False)
+        """Return overall and mean class accuracy, both in [0, 1]."""
+        return collection(Accuracy(self.num_classes), MeanClassAccuracy(self.num_classes))

@@ -6,10 +6,19 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
-from torchmetrics import Metric, MetricCollection
+from torchmetrics import MetricCollection
 
 from mops_lightning.errors import UserError
-from mops_lightning.metrics.reconstruction import Distances, MeanDistance, NormalizedError
+from mops_lightning.metrics.base import TableMetric, collection
+from mops_lightning.metrics.reconstruction import (
+    Distances,
+    MeanChamfer,
+    MeanEMD,
+    NormalizedChamfer,
+    NormalizedChamferOfMeans,
+    NormalizedEMD,
+    NormalizedEMDOfMeans,
+)
 from mops_lightning.ops.chamfer import chamfer_distance
 from mops_lightning.ops.emd import earth_movers_distance
 from mops_lightning.tasks.base import Task
@@ -43,10 +52,8 @@ class Reconstruction(Task):
         UserError: the weight is negative.
     """
 
-    score = "nre_cd"
-    """The metric shown in tables; 1 is as good as all points, a lower one is better."""
-    full_score = "chamfer"
-    summary_metrics = ("nre_cd", "nre_emd", "chamfer", "emd")
+    score = NormalizedChamfer.name
+    full_score = NormalizedChamfer.full_cloud_metric
     net_takes = ("points", "n_points")
 
     def __init__(
@@ -144,16 +151,13 @@ class Reconstruction(Task):
         return {"reconstructions": rebuilt_grid(batch.points, full, columns, titles)}
 
     def metrics(self, training: bool = False) -> MetricCollection:
-        """Distances in (squared) units of the coordinates, and NRE; training has no reference."""
-        metrics: dict[str, Metric | MetricCollection] = {
-            "chamfer": MeanDistance("chamfer"),
-            "emd": MeanDistance("emd"),
-        }
+        """Return mean distances and, except in training, which has no reference, NRE."""
+        metrics: list[TableMetric] = [MeanChamfer(), MeanEMD()]
         if not training:
-            metrics |= {
-                "nre_cd": NormalizedError("chamfer"),
-                "nre_emd": NormalizedError("emd"),
-                "nre_cd_of_means": NormalizedError("chamfer", of_means=True),
-                "nre_emd_of_means": NormalizedError("emd", of_means=True),
-            }
-        return MetricCollection(metrics, compute_groups=False)
+            metrics += [
+                NormalizedChamfer(),
+                NormalizedEMD(),
+                NormalizedChamferOfMeans(),
+                NormalizedEMDOfMeans(),
+            ]
+        return collection(*metrics)

@@ -4,11 +4,19 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from torch import Generator, Tensor, nn
-from torchmetrics import Metric, MetricCollection
+from torchmetrics import MetricCollection
 
 from mops_lightning.data.pairs import Pairs
 from mops_lightning.errors import UserError
-from mops_lightning.metrics.registration import RotationError, RotationRecall, TranslationError
+from mops_lightning.metrics.base import collection
+from mops_lightning.metrics.registration import (
+    DoubledRotationError,
+    RotationError,
+    RotationErrorP90,
+    RotationRecall5,
+    RotationRecall10,
+    TranslationError,
+)
 from mops_lightning.ops.rigid import Motion, identity_motion
 from mops_lightning.tasks.base import Task
 from mops_lightning.types import Batch, PairBatch, TaskOutput
@@ -32,15 +40,7 @@ class Registration(Task):
             returns its terms by name.
     """
 
-    score = "rotation_error_deg"
-    """The metric shown in tables; a lower one is better."""
-    summary_metrics = (
-        "rotation_error_deg",
-        "rotation_error_p90_deg",
-        "rotation_recall_5deg",
-        "rotation_recall_10deg",
-        "translation_error",
-    )
+    score = RotationError.name
     net_takes = ("source", "target")
 
     def __init__(
@@ -85,16 +85,15 @@ class Registration(Task):
         return TaskOutput(losses, predicted, true)
 
     def metrics(self, training: bool = False) -> MetricCollection:
-        """Rotation errors in degrees, recalls in [0, 1], translation error in coordinate units."""
-        metrics: dict[str, Metric | MetricCollection] = {
-            "rotation_error_deg": RotationError(),
-            "rotation_error_p90_deg": RotationError(quantile=0.9),
-            "rotation_error_doubled_deg": RotationError(factor=2.0),
-            "rotation_recall_5deg": RotationRecall(5.0),
-            "rotation_recall_10deg": RotationRecall(10.0),
-            "translation_error": TranslationError(),
-        }
-        return MetricCollection(metrics, compute_groups=False)
+        """Return rotation errors in degrees, recalls in [0, 1] and the translation error."""
+        return collection(
+            RotationError(),
+            RotationErrorP90(),
+            DoubledRotationError(),
+            RotationRecall5(),
+            RotationRecall10(),
+            TranslationError(),
+        )
 
     def cloud_titles(self, titles: Sequence[str]) -> list[str]:
         """Tell sources and targets apart."""

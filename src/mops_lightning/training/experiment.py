@@ -101,8 +101,8 @@ class Experiment(L.LightningModule):
         self.loss_means = nn.ModuleDict()  # the task says their names with its first result
         self.set_metrics = nn.ModuleDict(
             {
-                f"{prefix}{name}": MeanMetric(nan_strategy="disable")
-                for name in SET_METRICS
+                f"{prefix}{name}": metric()
+                for name, metric in SET_METRICS.items()
                 for prefix in {"", *map(self._prefix, self.sizes)}
             }
         )
@@ -289,8 +289,8 @@ class Experiment(L.LightningModule):
         if self.sampler.nested:
             groups = {max(outputs): tuple(outputs)}
         for largest, sizes in groups.items():
-            for name, measure in SET_METRICS.items():
-                for m, values in (measure(points, outputs[largest], sizes) or {}).items():
+            for name, metric in SET_METRICS.items():
+                for m, values in (metric.measure(points, outputs[largest], sizes) or {}).items():
                     mean: Any = self.set_metrics[f"{prefixes[m].split('/', 1)[1]}{name}"]
                     mean.update(values)
                     self.log(f"{prefixes[m]}{name}", mean, batch_size=len(points))

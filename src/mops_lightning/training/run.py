@@ -18,6 +18,7 @@ from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.noise import noisy
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records import run_record
+from mops_lightning.records.metric_info import described
 from mops_lightning.records.summary import closing_lines
 from mops_lightning.training import checkpoint, evaluate, pretrain
 from mops_lightning.training.trainer import (
@@ -147,7 +148,7 @@ def fit_and_test(
     record["score"] = record["metrics"][experiment.score_name]
     record["notes"] |= {
         "score": experiment.score_name,
-        "summary_metrics": list(task.summary_metrics),
+        "metrics": described(task.metrics().items()),
         "processes": trainer.world_size,
         "parameters": {
             name: sum(parameter.numel() for parameter in module.parameters())

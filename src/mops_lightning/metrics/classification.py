@@ -1,0 +1,39 @@
+"""Accuracy of predicted classes over all clouds of a test."""
+
+from typing import Any
+
+from torchmetrics.classification import MulticlassAccuracy
+
+from mops_lightning.metrics.base import TableMetric
+
+
+class Accuracy(TableMetric, MulticlassAccuracy):
+    """Fraction of clouds that are assigned to their class.
+
+    Args:
+        num_classes: number of classes.
+    """
+
+    name = "accuracy"
+    unit = "%"
+    scale = 100.0
+    summary_order = 1
+
+    def __init__(self, num_classes: int, **extra: Any) -> None:
+        super().__init__(num_classes, average="micro", **extra)
+
+
+class MeanClassAccuracy(TableMetric, MulticlassAccuracy):
+    """Mean over classes of the fraction of their clouds that are assigned to them.
+
+    Args:
+        num_classes: number of classes.
+    """
+
+    name = "mean_class_accuracy"
+    unit = "%"
+    scale = 100.0
+    summary_order = 2
+
+    def __init__(self, num_classes: int, **extra: Any) -> None:
+        super().__init__(num_classes, average="macro", **extra)

@@ -1,0 +1,72 @@
+"""What tables and reports know about a metric; imports no torch, so that ``--help`` stays quick."""
+
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, dataclass, fields
+from typing import Any, Self
+
+DEFAULT_ORDER = 10
+"""Place in the closing table of metrics that declare none: after those that do."""
+
+
+@dataclass(frozen=True)
+class MetricInfo:
+    """How a metric is named, formatted and ordered. Metric classes declare it; see ``of``.
+
+    Attributes:
+        name: the last part of its log key, such as ``accuracy``.
+        label: its name in tables, without the unit; empty: made from ``name``.
+        unit: such as ``%`` or ``°``; empty for none. Values with a unit are shown with two
+            decimals, values without with four significant digits.
+        scale: factor from the computed value to its unit: 100 for a fraction shown in percent.
+        higher_is_better: direction; None if there is none.
+        summary_order: position in the table that ends a run, lowest first, ties by name. None:
+            in the record only.
+        full_cloud_metric: name of the metric shown for full clouds instead, for errors that are
+            normalized by those of full clouds and therefore 1 there.
+    """
+
+    name: str
+    label: str = ""
+    unit: str = ""
+    scale: float = 1.0
+    higher_is_better: bool | None = None
+    summary_order: int | None = DEFAULT_ORDER
+    full_cloud_metric: str | None = None
+
+    @classmethod
+    def of(cls, name: str, metric: object) -> Self:
+        """Read a metric's class attributes. Any torchmetrics class will do; missing ones default.
+
+        Args:
+            name: the metric's key in its collection.
+            metric: the metric or its class.
+        """
+        return cls.from_dict(
+            name, {f.name: getattr(metric, f.name) for f in fields(cls) if hasattr(metric, f.name)}
+        )
+
+    @classmethod
+    def from_dict(cls, name: str, values: Mapping[str, Any]) -> Self:
+        """Build from the content of a record; keys of other versions are ignored."""
+        known = {field.name for field in fields(cls)} - {"name"}
+        return cls(name, **{key: value for key, value in values.items() if key in known})
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what differs from the defaults, without the name, as plain data."""
+        values = asdict(self)
+        return {
+            field.name: values[field.name]
+            for field in fields(self)
+            if field.default is not MISSING and values[field.name] != field.default
+        }
+
+    @property
+    def title(self) -> str:
+        """The label with the unit in brackets."""
+        label = self.label or self.name.replace("_", " ")
+        return f"{label} ({self.unit})" if self.unit else label
+
+    def format(self, value: float) -> str:
+        """Return a value in the metric's unit, without the unit."""
+        value *= self.scale
+        return f"{value:.2f}" if self.unit else f"{value:.4g}"

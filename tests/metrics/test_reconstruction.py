@@ -1,0 +1,33 @@
+import pytest
+import torch
+
+from mops_lightning.metrics.reconstruction import (
+    Distances,
+    MeanChamfer,
+    MeanEMD,
+    NormalizedChamfer,
+    NormalizedChamferOfMeans,
+    NormalizedEMD,
+    NormalizedEMDOfMeans,
+)
+
+FOUND = Distances(torch.tensor([2.0, 3.0, 0.0]), torch.tensor([1.0, 1.0, 0.0]))
+FULL = Distances(torch.tensor([1.0, 6.0, 0.0]), torch.tensor([0.5, 1.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("metric", "value"),
+    [
+        (MeanChamfer, 5 / 3),
+        (MeanEMD, 2 / 3),
+        (NormalizedChamfer, (2 + 0.5 + 1) / 3),
+        (NormalizedEMD, (2 + 1 + 1) / 3),
+        (NormalizedChamferOfMeans, 5 / 7),
+        (NormalizedEMDOfMeans, 2 / 1.5),
+    ],
+)
+def test_metric_over_batches_matches_hand_computed_value(metric, value):
+    module = metric()
+    for part in (slice(0, 1), slice(1, 3)):
+        module.update(*(Distances(one.chamfer[part], one.emd[part]) for one in (FOUND, FULL)))
+    assert module.compute().item() == pytest.approx(value)
