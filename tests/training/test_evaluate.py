@@ -1,9 +1,11 @@
 import json
+import shutil
 
 import pytest
 
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
+from mops_lightning.records import run_record
 from mops_lightning.training.evaluate import command_line
 from mops_lightning.training.run import run
 from tests.support.command_line import TINY
@@ -31,6 +33,19 @@ def test_the_run_s_own_figures_come_again(trained, tmp_path):
     assert "fit" not in again["seconds"]
     assert again["config"]["learn"] == "nothing"
     assert not (tmp_path / "new" / "weights.pt").exists()
+
+
+def test_weights_kept_elsewhere_are_found_by_the_record(trained, tmp_path):
+    folder, record = trained
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "run").mkdir()
+    shutil.copy(folder / "weights.pt", tmp_path / "kept" / "sampler.pt")
+    (cached,) = (folder.parent / "cache" / "weights").rglob("weights.pt")
+    shutil.copy(cached, tmp_path / "kept" / "net.pt")
+    files = {"weights": "../kept/sampler.pt", "task_weights": "../kept/net.pt"}
+    run_record.write(tmp_path / "run", {**record, "files": files})
+    again = evaluated((tmp_path / "run", record), tmp_path)
+    assert again["metrics"] == record["metrics"]
 
 
 def test_other_sizes_and_other_data(trained, tmp_path):

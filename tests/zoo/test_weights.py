@@ -4,7 +4,9 @@ from torch import nn
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.records import run_record
 from mops_lightning.zoo import weights
+from tests.support.records import record
 
 
 @pytest.fixture
@@ -59,3 +61,28 @@ def test_missing_files_and_lightning_checkpoints_are_refused(tmp_path):
     torch.save({"state_dict": {}}, tmp_path / "last.ckpt")
     with pytest.raises(UserError, match="ckpt_path"):
         weights.load(tmp_path / "last.ckpt")
+
+
+def test_half_precision_tensors_are_cast_to_the_modules_dtype(saved):
+    _, path = saved
+    content = torch.load(path, weights_only=True)
+    state = content["state"]
+    state["head.0.weight"] = state["head.0.weight"].half()
+    state["head.3.weight"] = state["head.3.weight"].bfloat16()
+    content["sha256"] = weights.digest(state)
+    torch.save(content, path)
+    net = PointNetVanilla(4)
+    weights.load_into(net, path)
+    loaded = net.state_dict()
+    assert {value.dtype for value in net.parameters()} == {torch.float32}
+    for name in ("head.0.weight", "head.3.weight"):
+        assert state[name].dtype != torch.float32
+        assert torch.equal(loaded[name], state[name].float())
+
+
+def test_of_run_prefers_the_file_that_the_record_names(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    assert weights.of_run(run) == run / "weights.pt"
+    run_record.write(run, record(files={"weights": "../kept/net.pt"}))
+    assert weights.of_run(run).resolve() == tmp_path / "kept" / "net.pt"

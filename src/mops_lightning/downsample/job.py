@@ -114,7 +114,7 @@ def sampler_of(settings: Settings) -> Sampler:
         return classes[settings.method](settings.m, **own)
     assert settings.weights is not None
     path = settings.weights.expanduser()
-    path = path / weights.FILE if path.is_dir() else path
+    path = weights.of_run(path) if path.is_dir() else path
     if not path.is_file():
         raise UserError(f"--weights: no file {path}. Give a weights.pt, or the folder of its run.")
     content = weights.load(path)

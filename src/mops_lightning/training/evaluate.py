@@ -108,9 +108,10 @@ def trained_run(folder: Path) -> dict[str, Any]:
         if (folder / "checkpoints" / CHECKPOINT).is_file():
             hint = f"Finish it with its own command and ckpt_path={folder}."
         raise UserError(f"{KEY}: {folder} is {record['status']}, not completed. {hint}")
-    if weights.FILE not in record["files"].values():
+    if "weights" not in record["files"]:
         raise UserError(
-            f"{KEY}: {folder} trained nothing; run its own command with other settings."
+            f"{KEY}: {folder} trained nothing, or its weights were not kept; "
+            "run its own command with other settings."
         )
     return record
 
@@ -135,7 +136,7 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
     what = "task net" if cfg.learn == "task" else "sampler"
     assert learned is not None  # learn=nothing builds a sampler
     try:
-        content = weights.load_into(learned, folder / weights.FILE)
+        content = weights.load_into(learned, weights.of_run(folder))
     except UserError as error:
         raise UserError(f"{KEY}: the {what} of {folder} cannot be had: {error}") from None
     has_weights = any(True for _ in experiment.task.parameters())

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
 from mops_lightning.files import atomic_write
+from mops_lightning.records import run_record
 
 SCHEMA = "mops_lightning/weights/1"
 FILE = "weights.pt"
@@ -78,6 +79,20 @@ def read_plain(path: Path, setting: str, what: str) -> Any:
     except Exception as error:
         first = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise UserError(f"{setting}: {path} cannot be read as {what}: {first}") from None
+
+
+def of_run(folder: Path) -> Path:
+    """Return the weights file of a run: the one its record names, otherwise ``weights.pt``.
+
+    Args:
+        folder: the run's folder; its record gives the path relative to this folder.
+
+    Raises:
+        UserError: the folder contains a ``result.json`` that is not a run record.
+    """
+    has_record = (folder / run_record.FILE).is_file()
+    files = run_record.read(folder)["files"] if has_record else {}
+    return folder / files.get("weights", FILE)
 
 
 def load_into(module: nn.Module, path: str | Path) -> dict[str, Any]:
