@@ -3,14 +3,15 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from mops_lightning.viz.clouds import COLOURS, cloud_grid, matrix_figure, save_figure
+from mops_lightning.viz.clouds import COLOURS, cloud_grid, matrix_figure
+from mops_lightning.viz.figures import save_figure
 
 
 def pixels(figure, tmp_path):
     return matplotlib.image.imread(save_figure(figure, tmp_path / "figure.png"))[..., :3]
 
 
-def test_every_readout_is_drawn_in_its_colour(tmp_path, rng):
+def test_cloud_grid_draws_readout_in_its_colour(tmp_path, rng):
     points = torch.rand(2, 300, 3, generator=rng)
     readouts = dict.fromkeys(("generated", "matched", "completed"), points[:, :20])
     figure = cloud_grid(points, readouts, ["chair", "vase"])
@@ -24,7 +25,7 @@ def test_every_readout_is_drawn_in_its_colour(tmp_path, rng):
     assert {"chair", "vase", "input", "generated", "matched", "completed"} <= texts
 
 
-def test_an_ideal_matrix_is_drawn_as_a_diagonal():
+def test_matrix_figure_shows_ideal_matrix_as_diagonal():
     dense = torch.zeros(30, 4)
     dense[torch.tensor([11, 3, 20, 7]), torch.arange(4)] = 1.0
     figure = matrix_figure(dense, dense.T @ dense, "chair")
@@ -34,12 +35,14 @@ def test_an_ideal_matrix_is_drawn_as_a_diagonal():
     np.testing.assert_array_equal(np.asarray(right), np.eye(4))
 
 
-def test_samples_lie_above_a_dense_cloud(tmp_path, rng):
-    """As many pixels show them as without the cloud."""
+def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, rng):
     points = F.normalize(torch.randn(8192, 3, generator=rng), dim=1)
     far = points[points[:, 0] < -0.3][:100]
-    shown = []
+    pixel_counts = []
     for cloud in (points, far):
         image = pixels(cloud_grid(cloud[None], {"matched": far[None]}, [""]), tmp_path)
-        shown.append((np.abs(image - np.array(COLOURS["matched"]) / 255).max(2) < 0.02).sum())
-    assert shown[0] > 0.2 * shown[1]  # which is larger, for its frame is tighter
+        pixel_counts.append(
+            (np.abs(image - np.array(COLOURS["matched"]) / 255).max(2) < 0.02).sum()
+        )
+    # Without the hiding cloud the frame is tighter, hence markers cover more pixels.
+    assert pixel_counts[0] > 0.2 * pixel_counts[1]

@@ -136,7 +136,7 @@ class Reconstruction(Task):
             samples: sampled points ``(B, M, 3)`` by readout.
             titles: one per cloud.
         """
-        from mops_lightning.viz.reconstruction import ReconstructionResult, rebuilt_grid
+        from mops_lightning.viz.reconstruction import ReconstructionResult, reconstruction_grid
 
         n = batch.points.shape[1]
         full = self.net(batch.points, n)
@@ -148,7 +148,7 @@ class Reconstruction(Task):
             built = self.net(chosen, n)
             ratios = chamfer_distance(built, batch.points) / reference
             columns[name] = ReconstructionResult(chosen, built, ratios.tolist())
-        return {"reconstructions": rebuilt_grid(batch.points, full, columns, titles)}
+        return {"reconstructions": reconstruction_grid(batch.points, full, columns, titles)}
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return mean distances and, except in training, which has no reference, NRE."""

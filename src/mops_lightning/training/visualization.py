@@ -19,8 +19,8 @@ from mops_lightning.viz.clouds import (
     INPUT_COLOUR,
     cloud_grid,
     matrix_figure,
-    save_figure,
 )
+from mops_lightning.viz.figures import save_figure
 from mops_lightning.viz.snapshots import CLOUDS, save_clouds
 
 DENSE_PIXELS = 2**20

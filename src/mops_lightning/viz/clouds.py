@@ -1,15 +1,13 @@
-"""Figures of sampled clouds and of the sampling matrix; matplotlib objects, no global state."""
+"""Figures of sampled clouds and of the sampling matrix."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
-from mops_lightning.files import atomic_write
+from mops_lightning.viz.figures import cloud_axes, new_figure
 
 COLOURS = {
     "generated": (31, 119, 220),
@@ -19,8 +17,8 @@ COLOURS = {
 }
 """RGB, 0 to 255. Blue, red and orange as in the paper; green for index samplers."""
 INPUT_COLOUR = (190, 190, 190)
-FEW = 256
-"""Up to so many samples are drawn large."""
+LARGE_MARKER_SAMPLES = 256
+"""Above this number of samples, markers shrink."""
 
 
 def cloud_grid(points: Tensor, readouts: Mapping[str, Tensor], titles: Sequence[str]) -> Figure:
@@ -28,35 +26,35 @@ def cloud_grid(points: Tensor, readouts: Mapping[str, Tensor], titles: Sequence[
 
     Args:
         points: ``(K, N, 3)`` input, y up.
-        readouts: ``(K, M, 3)`` by name; names outside ``COLOURS`` are drawn green.
+        readouts: ``(K, M, 3)`` by name; names that are not in ``COLOURS`` are drawn green.
         titles: one per cloud.
 
     Returns:
         A figure; the first column is the input alone.
     """
     columns = {"input": None, **readouts}
-    figure = Figure(figsize=(2.6 * len(columns), 2.6 * len(points)), layout="tight")
-    FigureCanvasAgg(figure)
+    figure = new_figure(2.6 * len(columns), 2.6 * len(points), "tight")
     for row, cloud in enumerate(upright(points)):
         for column, (name, samples) in enumerate(columns.items()):
-            axes = figure.add_subplot(
-                len(points), len(columns), row * len(columns) + column + 1, projection="3d"
-            )
+            title = name if row == 0 else ""
+            below = titles[row] if column == 0 else ""
+            axes = cloud_axes(figure, len(points), len(columns), row, column, title, below)
             draw_cloud(axes, cloud, None if samples is None else upright(samples)[row], name)
-            if row == 0:
-                axes.set_title(name, fontsize=11)
-            if column == 0:
-                axes.text2D(0.02, 0.04, titles[row], transform=axes.transAxes, fontsize=9)
     return figure
 
 
 def draw_cloud(
     axes: Axes3D, cloud: np.ndarray, samples: np.ndarray | None, readout: str, size: float = 22
 ) -> None:
-    """Draw one cloud ``(N, 3)``, z up, faint where there are samples ``(M, 3)`` to be seen.
+    """Draw a cloud, faintly if samples are drawn over it.
 
-    Samples lie above all of the cloud: a dense one would hide what is not on its outline. ``size``
-    is that of up to ``FEW`` samples; more are drawn smaller, to be told apart.
+    Args:
+        axes: where to draw.
+        cloud: ``(N, 3)``, z up.
+        samples: ``(M, 3)`` or None. They are drawn over the whole cloud, because a dense cloud
+            would hide all samples in front of which it has points.
+        readout: gives the samples' colour.
+        size: marker area of up to ``LARGE_MARKER_SAMPLES`` samples; more get smaller markers.
     """
     axes.computed_zorder = False
     faint = samples is not None
@@ -66,11 +64,11 @@ def draw_cloud(
         color=np.array(INPUT_COLOUR) / 255 if faint else "0.35",
         alpha=0.35 if faint else 1.0,
         depthshade=False,
-        rasterized=True,  # thousands of points make an SVG of megabytes
+        rasterized=True,  # thousands of points would make an SVG of megabytes
     )
     if samples is not None:
         colour = np.array(COLOURS.get(readout, COLOURS["sampled"])) / 255
-        size = max(size * min(1, FEW / max(len(samples), 1)), 1.5)
+        size = max(size * min(1, LARGE_MARKER_SAMPLES / max(len(samples), 1)), 1.5)
         axes.scatter(*samples.T, s=size, color=colour, depthshade=False, zorder=2)
     frame_cloud(axes, cloud)
 
@@ -79,32 +77,24 @@ def matrix_figure(dense: Tensor, gram: Tensor, title: str) -> Figure:
     """Draw S and SᵀS as heat maps on one colour scale (the paper's figure of S).
 
     Args:
-        dense: ``(N, M)``. Rows are put in order of their strongest column, so that an ideal matrix
+        dense: ``(N, M)``. Rows are sorted by their strongest column, so that an ideal matrix
             shows as a diagonal.
         gram: ``(M, M)``.
-        title: what the matrix belongs to.
+        title: the cloud and sampler of the matrix.
     """
     values = dense.detach().cpu()
     order = values.argmax(1).mul(2.0).sub(values.amax(1)).argsort()
-    figure = Figure(figsize=(9, 4.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9, 4.4)
     left, right = figure.subplots(1, 2)
     images = [
         left.imshow(values[order].numpy(), aspect="auto", vmin=0, vmax=1, cmap="viridis"),
         right.imshow(gram.detach().cpu().numpy(), vmin=0, vmax=1, cmap="viridis"),
     ]
-    left.set(title="S (points in order of their column)", xlabel="column", ylabel="point")
+    left.set(title="S (points sorted by strongest column)", xlabel="column", ylabel="point")
     right.set(title="SᵀS", xlabel="column", ylabel="column")
     figure.colorbar(images[1], ax=[left, right], shrink=0.8)
     figure.suptitle(title, fontsize=10)
     return figure
-
-
-def save_figure(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG, whole or not at all."""
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
-    return path
 
 
 def upright(points: Tensor | np.ndarray) -> np.ndarray:
@@ -113,11 +103,11 @@ def upright(points: Tensor | np.ndarray) -> np.ndarray:
     return np.stack([array[..., 0], -array[..., 2], array[..., 1]], -1)
 
 
-def frame_cloud(axes: object, cloud: np.ndarray) -> None:
-    """Show equal scales and nothing but the points."""
+def frame_cloud(axes: Axes3D, cloud: np.ndarray) -> None:
+    """Fit the axes to a cloud with equal scales, and hide them."""
     centre, reach = (cloud.max(0) + cloud.min(0)) / 2, np.ptp(cloud, axis=0).max() / 2 or 1.0
     for name, middle in zip("xyz", centre, strict=True):
         getattr(axes, f"set_{name}lim")(middle - reach, middle + reach)
-    axes.set_box_aspect((1, 1, 1), zoom=1.3)  # type: ignore[attr-defined]
-    axes.set_axis_off()  # type: ignore[attr-defined]
-    axes.view_init(elev=18, azim=-60)  # type: ignore[attr-defined]
+    axes.set_box_aspect((1, 1, 1), zoom=1.3)
+    axes.set_axis_off()
+    axes.view_init(elev=18, azim=-60)

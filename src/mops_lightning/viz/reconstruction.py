@@ -1,22 +1,22 @@
 """Figures of reconstructed clouds (after the paper's figures of reconstruction)."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d import Axes3D
+from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
 from mops_lightning.viz.clouds import draw_cloud, frame_cloud, upright
+from mops_lightning.viz.figures import cloud_axes, new_figure
 
-DRAWN = 8192
-"""Most points drawn of a cloud: more cannot be told apart, and take minutes."""
+MAX_POINTS = 8192
+"""Most points drawn of a cloud: more are indistinguishable and take minutes."""
 
 
 class ReconstructionResult(NamedTuple):
-    """What one readout made of the clouds.
+    """Clouds reconstructed from the points of one readout.
 
     Attributes:
         samples: ``(K, M, 3)`` the sampled points.
@@ -29,36 +29,33 @@ class ReconstructionResult(NamedTuple):
     ratios: Sequence[float]
 
 
-def rebuilt_grid(
-    points: Tensor, full: Tensor, rebuilt: Mapping[str, ReconstructionResult], titles: Sequence[str]
+def reconstruction_grid(
+    points: Tensor, full: Tensor, results: Mapping[str, ReconstructionResult], titles: Sequence[str]
 ) -> Figure:
-    """Draw every cloud in two rows: the input and what was sampled, and what was rebuilt of them.
+    """Draw every cloud in two rows: the input and its samples above, their reconstructions below.
 
     Input and reconstructions are coloured by depth, as the paper's scans are.
 
     Args:
         points: ``(K, N, 3)`` input, y up.
-        full: ``(K, n, 3)`` what all points give.
-        rebuilt: by readout or method, one column for each.
+        full: ``(K, n, 3)`` reconstructions from all points.
+        results: by readout or sampler, one column each.
         titles: one per cloud.
     """
-    columns, rows = 1 + len(rebuilt), 2 * len(points)
-    figure = Figure(figsize=(2.4 * columns, 2.4 * rows), layout="tight")
-    FigureCanvasAgg(figure)
+    columns, rows = 1 + len(results), 2 * len(points)
+    figure = new_figure(2.4 * columns, 2.4 * rows, "tight")
 
     def cell(row: int, column: int, title: str, below: str) -> Axes3D:
-        axes: Any = figure.add_subplot(rows, columns, row * columns + column + 1, projection="3d")
-        if row % 2 == 1 or row == 0:
-            axes.set_title(title, fontsize=10)
-        axes.text2D(0.02, 0.02, below, transform=axes.transAxes, fontsize=8)
-        return axes
+        # Titles of later clouds would repeat those of the first row.
+        shown = title if row % 2 == 1 or row == 0 else ""
+        return cloud_axes(figure, rows, columns, row, column, shown, below)
 
     for number, cloud in enumerate(map(_thinned, upright(points))):
         above, under = 2 * number, 2 * number + 1
         _draw_depth(cell(above, 0, "input", titles[number]), cloud, cloud)
         whole = _thinned(upright(full)[number])
         _draw_depth(cell(under, 0, "from all points", ""), whole, cloud)
-        for column, (name, result) in enumerate(rebuilt.items(), start=1):
+        for column, (name, result) in enumerate(results.items(), start=1):
             samples = upright(result.samples)[number]
             axes = cell(above, column, name, f"{len(samples)} points")
             draw_cloud(axes, cloud, samples, name, size=16)
@@ -68,11 +65,11 @@ def rebuilt_grid(
 
 
 def _draw_depth(axes: Axes3D, drawn: np.ndarray, cloud: np.ndarray) -> None:
-    """Draw points coloured by depth, in the frame of ``cloud``."""
+    """Draw points coloured by depth, framed as ``cloud``."""
     axes.scatter(*drawn.T, s=2, c=drawn[:, 1], cmap="viridis", depthshade=False)
     frame_cloud(axes, cloud)
 
 
 def _thinned(cloud: np.ndarray) -> np.ndarray:
-    """Leave out points evenly above ``DRAWN``."""
-    return cloud[:: -(-len(cloud) // DRAWN)]
+    """Keep every k-th point of clouds above ``MAX_POINTS``."""
+    return cloud[:: -(-len(cloud) // MAX_POINTS)]

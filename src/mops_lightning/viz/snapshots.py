@@ -1,4 +1,4 @@
-"""The few test clouds that a run keeps beside its pictures, for 3-D views in reports."""
+"""The few test clouds that a run saves with its pictures, for 3-D views in reports."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,14 +13,14 @@ from mops_lightning.files import atomic_write
 CLOUDS = "clouds.npz"
 INPUT = "input"
 TITLES = "titles"
-KEPT = 8192
-"""Most input points that are kept of a cloud; samples are kept whole."""
+MAX_INPUT_POINTS = 8192
+"""Most input points saved of a cloud; all samples are saved."""
 
 
 def save_clouds(
     path: Path, points: Tensor, sampled: Mapping[str, Tensor], titles: Sequence[str]
 ) -> None:
-    """Write clouds and what was sampled of them.
+    """Write clouds and their samples.
 
     Args:
         path: the file.
@@ -28,7 +28,7 @@ def save_clouds(
         sampled: ``(K, M, 3)`` by readout.
         titles: one per cloud.
     """
-    thinned = points[:, :: -(-points.shape[1] // KEPT)]
+    thinned = points[:, :: -(-points.shape[1] // MAX_INPUT_POINTS)]
     clouds = {INPUT: thinned, **sampled}
     arrays = {name: cloud.detach().cpu().float().numpy() for name, cloud in clouds.items()}
     with atomic_write(path) as temporary, temporary.open("wb") as file:
@@ -36,17 +36,17 @@ def save_clouds(
 
 
 def load_clouds(path: Path) -> tuple[list[str], dict[str, NDArray[np.float32]]]:
-    """Read such a file.
+    """Read a file of ``save_clouds``.
 
     Returns:
         The titles, and ``(K, points, 3)`` by name, ``input`` first.
 
     Raises:
-        UserError: it is not such a file.
+        UserError: the file is missing or not of this format.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         return [str(title) for title in arrays.pop(TITLES)], arrays
     except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"{path}: not a file of clouds: {error}") from None
+        raise UserError(f"{path}: cannot read saved clouds: {error}") from None

@@ -1,0 +1,21 @@
+import pytest
+import torch
+
+from mops_lightning.errors import UserError
+from mops_lightning.viz.snapshots import MAX_INPUT_POINTS, load_clouds, save_clouds
+
+
+def test_save_clouds_large_thins_input_and_keeps_samples(tmp_path, rng):
+    points = torch.rand(2, 20_000, 3, generator=rng)
+    save_clouds(tmp_path / "clouds.npz", points, {"generated": points[:, :4096]}, ["a", "b"])
+    titles, arrays = load_clouds(tmp_path / "clouds.npz")
+    assert titles == ["a", "b"]
+    assert list(arrays) == ["input", "generated"]
+    assert arrays["input"].shape[1] <= MAX_INPUT_POINTS
+    assert torch.equal(torch.from_numpy(arrays["generated"]), points[:, :4096])
+
+
+def test_load_clouds_other_file_is_refused(tmp_path):
+    (tmp_path / "clouds.npz").write_text("text")
+    with pytest.raises(UserError, match=r"clouds\.npz: cannot read saved clouds"):
+        load_clouds(tmp_path / "clouds.npz")
