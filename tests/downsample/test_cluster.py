@@ -11,10 +11,8 @@ import pytest
 import torch
 
 from mops_lightning.downsample.cluster import cluster, engine_of, environment_kept
-from mops_lightning.downsample.formats.chunks import stored
-from mops_lightning.downsample.formats.registry import WRITERS
+from mops_lightning.downsample.formats.registry import WRITERS, open_cloud_file, read
 from mops_lightning.downsample.formats.table import Table
-from mops_lightning.downsample.job import read
 from mops_lightning.downsample.large import by_chunks
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.mops import MOPSNet
@@ -189,7 +187,7 @@ def test_a_head_of_ply_may_be_written_in_other_ways(kind, tmp_path):
     WRITERS[".ply"](path, Table(points, {"red": np.arange(50, dtype=np.uint8)}))
     head, end, rows = path.read_bytes().partition(b"end_header\n")
     path.write_bytes((head + end).decode().replace(*HEADS[kind]).encode() + rows)
-    table = stored(path).read(range(10, 50))
+    table = open_cloud_file(path).read(range(10, 50))
     np.testing.assert_array_equal(table.points, points[10:])
     np.testing.assert_array_equal(table.columns["red"], np.arange(10, 50))
 
@@ -199,7 +197,7 @@ def test_vertices_with_lists_are_refused(tmp_path):
     head = "element vertex 1\nproperty float x\nproperty list uchar int seen\n"
     path.write_text(f"ply\nformat binary_little_endian 1.0\n{head}end_header\n")
     with pytest.raises(UserError, match="without lists"):
-        stored(path)
+        open_cloud_file(path)
 
 
 @pytest.mark.parametrize("chunked", [True, False])
@@ -211,7 +209,7 @@ def test_a_las_file_that_is_cut_between_points_is_broken(chunked, tmp_path):
         length = file.header.point_format.size
     path.write_bytes(path.read_bytes()[: -30 * length])
     with pytest.raises(UserError, match="ends after 60 points"):
-        stored(path).read(range(90)) if chunked else read(path, 9, 0)
+        open_cloud_file(path).read(range(90)) if chunked else read(path, 9, 0)
 
 
 @pytest.mark.parametrize("chunked", [True, False])
@@ -219,8 +217,8 @@ def test_a_las_file_that_is_cut_between_points_is_broken(chunked, tmp_path):
 def test_named_fields_need_one_row_a_point(shape, chunked, tmp_path):
     path = tmp_path / "a.npy"
     np.save(path, np.zeros(shape, [("x", "f4"), ("y", "f4"), ("z", "f4")]))
-    with pytest.raises(UserError, match="one row of fields a point"):
-        stored(path) if chunked else read(path, 9, 0)
+    with pytest.raises(UserError, match="one row of fields per point"):
+        open_cloud_file(path) if chunked else read(path, 9, 0)
 
 
 @pytest.mark.parametrize("chunked", [True, False])
@@ -228,7 +226,7 @@ def test_named_coordinates_must_be_numbers(chunked, tmp_path):
     path = tmp_path / "a.npy"
     np.save(path, np.zeros(20, [("x", "f4"), ("y", "c8"), ("z", "f4")]))
     with pytest.raises(UserError, match="y must be numbers, got complex64"):
-        stored(path).read(range(9)) if chunked else read(path, 9, 0)
+        open_cloud_file(path).read(range(9)) if chunked else read(path, 9, 0)
 
 
 @pytest.mark.parametrize("size", [500, 3000])
@@ -239,7 +237,7 @@ def test_what_a_damaged_laz_file_gives_is_no_cloud(size, tmp_path):
     content[600:1500] = bytes(np.random.default_rng(2).integers(0, 256, 900, np.uint8))
     path.write_bytes(content)
     with pytest.raises(UserError, match=r"a\.laz is broken"):
-        stored(path).read(range(size))
+        open_cloud_file(path).read(range(size))
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".npy", ".bin", ".las", ".laz"])
@@ -247,7 +245,7 @@ def test_any_stretch_of_a_file_can_be_read_alone(suffix, tmp_path):
     points = np.random.default_rng(1).normal(size=(500, 3)).astype(np.float32).astype(float)
     path = tmp_path / f"in{suffix}"
     WRITERS[suffix](path, Table(points, {"intensity": np.arange(500, dtype=np.uint16)}))
-    cloud = stored(path)
+    cloud = open_cloud_file(path)
     assert cloud.number == 500
     assert [len(rows) for rows in cloud.row_ranges(200)] == [200, 200, 100]
     whole = cloud.read(range(500))

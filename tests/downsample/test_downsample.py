@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from mops_lightning.downsample.formats.registry import WRITERS
+from mops_lightning.downsample.formats.registry import WRITERS, read
 from mops_lightning.downsample.formats.table import Table
-from mops_lightning.downsample.job import read
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
 from tests.support.downsample import call
@@ -179,7 +178,7 @@ def test_chunks_of_a_file_give_what_the_whole_file_gives(suffix, readout, folder
     ("name", "content", "said"),
     [
         ("a.xyz", b"1 2 3", "--chunk works with .npy"),
-        ("a.bin", b"123", "no KITTI scan"),
+        ("a.bin", b"123", "not a KITTI scan"),
         ("a.npy", b"123", "a.npy is broken"),
         ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n", "does not end"),
         ("a.ply", b"\n" * 10_000, "does not end"),

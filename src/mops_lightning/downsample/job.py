@@ -1,31 +1,19 @@
 """One file: read, normalised as in training, sampled, mapped back, written."""
 
-import re
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-import trimesh
-from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.data.mesh_io import parse_mesh
-from mops_lightning.downsample.formats.registry import READABLE, READERS, WRITERS
-from mops_lightning.downsample.formats.table import (
-    BadCloudError,
-    Table,
-    check_enough,
-    naming,
-    radius_of,
-    reach,
-    total,
-)
-from mops_lightning.downsample.large import Engine, by_chunks, in_turn
+from mops_lightning.downsample.formats.errors import check_size
+from mops_lightning.downsample.formats.registry import read, write
+from mops_lightning.downsample.formats.table import Table
+from mops_lightning.downsample.large import Engine, Kept, by_chunks, in_turn
+from mops_lightning.downsample.unit_sphere import largest_distance, sum_of, unit_sphere
 from mops_lightning.errors import UserError
-from mops_lightning.files import atomic_write
 from mops_lightning.ops.readout import complete
 from mops_lightning.records.readout_names import GENERATED_READOUTS
 from mops_lightning.samplers.base import Sampler
@@ -142,74 +130,39 @@ def run(
     """Downsample one file into another.
 
     Returns:
-        How many points were written, how many the cloud had, and how many more were left out for
-        not being finite.
+        How many points were written, how many points with finite coordinates the cloud has, and how
+        many without.
 
     Raises:
-        UserError: the file holds no cloud, or too small a one.
+        UserError: the file holds no cloud, or one of too few points.
     """
     sampler = sampler_of(settings)
     m = settings.m or sampler.m
     if settings.chunk:
-        kept, number, dropped = by_chunks(
+        kept = by_chunks(
             source, sampler, m, settings.chunk, settings.readout, settings.keep_attributes, engine
         )
-        _write(target, kept)
-        return len(kept.points), number, dropped
-    table = read(source, settings.surface or max(10_000, 8 * m), settings.seed)
-    finite = table.finite()
-    number = len(finite.points)
-    check_enough(source, number, m)
-    kept = sampled(source, finite, sampler, m, settings)
-    _write(target, kept)
-    return len(kept.points), number, len(table.points) - number
-
-
-def _write(target: Path, table: Table) -> None:
-    with atomic_write(target) as temporary:
-        WRITERS[target.suffix.lower()](temporary, table)
-
-
-def read(path: Path, surface: int, seed: int) -> Table:
-    """Read a cloud, or sample ``surface`` points from a mesh.
-
-    Raises:
-        UserError: naming the file and what is wrong with it.
-    """
-    suffix = path.suffix.lower()
-    if suffix not in READABLE:
-        raise BadCloudError(f"{path} must end in {', '.join(READABLE)}.")
-    if not path.is_file():
-        raise BadCloudError(f"{path}: no such file.")
-    with naming(path):
-        table = READERS[suffix](path) if suffix in READERS else None
-        data = path.read_bytes() if table is None else b""
-    if table is not None:
-        return table
-    if suffix == ".obj" and not re.search(rb"^f\s", data, re.M):
-        words = [line.split()[1:4] for line in data.splitlines() if line[:2] in (b"v ", b"v\t")]
-        if not words:
-            raise BadCloudError(f"{path} holds no vertices.")
-        return Table(np.array(words, np.float64))
-    mesh = parse_mesh(data, path)
-    points, faces = trimesh.sample.sample_surface(mesh, surface, seed=seed)
-    normals = np.asarray(mesh.face_normals)[faces].T
-    columns = dict(zip(("nx", "ny", "nz"), normals.astype(np.float32), strict=True))
-    return Table(np.asarray(points, np.float64), columns)
+    else:
+        table = read(source, settings.surface or max(10_000, 8 * m), settings.seed)
+        finite = table.finite()
+        number = len(finite.points)
+        check_size(source, number, m)
+        chosen = sampled(source, finite, sampler, m, settings)
+        kept = Kept(chosen, number, len(table.points) - number)
+    write(target, kept.table)
+    return len(kept.table.points), kept.number, kept.dropped
 
 
 def sampled(source: Path, table: Table, sampler: Sampler, m: int, settings: Settings) -> Table:
-    """Return the kept points of a table, with their attributes if asked for."""
-    centre = total(table.points) / len(table.points)
-    radius = radius_of(reach(table.points, centre), source)
-    points = torch.from_numpy(((table.points - centre) / radius).astype(np.float32))
+    """Return the sampled points of a table, with their attributes if ``keep_attributes``."""
+    centre = sum_of(table.points) / len(table.points)
+    sphere = unit_sphere(centre, largest_distance(table.points, centre), source)
     with torch.no_grad():
-        rows, generated = _chosen(points, sampler, m, settings)
+        rows, generated = _chosen(sphere.normalize(table.points), sampler, m, settings)
     if rows is None:
-        made: NDArray[np.float64] = generated.double().numpy() * radius + centre
-        return Table(made, {}, table.head)
+        return Table(sphere.restore(generated), {}, table.header)
     kept = table.take(rows.numpy())
-    return kept if settings.keep_attributes else kept.bare()
+    return kept if settings.keep_attributes else kept.without_attributes()
 
 
 def _chosen(

@@ -1,8 +1,7 @@
-"""One file that need not fit in memory: several passes over row_ranges of it.
+"""Files that need not fit in memory: several passes over ranges of their rows.
 
-What a pass wants of a stretch does not depend on the others, so an engine may have several
-processes or machines do them; the results are put together in the order of the file, so that the
-outcome does not depend on who did what.
+The ranges of a pass are independent, so an engine may distribute them over processes or machines.
+Results are merged in the order of the file, so they do not depend on the distribution.
 """
 
 from collections.abc import Callable, Iterable
@@ -16,8 +15,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.downsample.formats.chunks import CloudFile, stored
-from mops_lightning.downsample.formats.table import Table, check_enough, radius_of, reach, total
+from mops_lightning.downsample.formats.cloud_file import CloudFile
+from mops_lightning.downsample.formats.errors import check_size
+from mops_lightning.downsample.formats.registry import open_cloud_file
+from mops_lightning.downsample.formats.table import Table
+from mops_lightning.downsample.unit_sphere import (
+    UnitSphere,
+    largest_distance,
+    sum_of,
+    unit_sphere,
+)
 from mops_lightning.errors import UserError
 from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.nearest import nearest
@@ -26,29 +33,18 @@ from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.streaming import global_part, sum_part
 
 Engine = Callable[..., Iterable[Any]]
-"""``engine(title, function, cloud, row_ranges, *common)`` gives ``function(cloud, rows, *common)``
-for the rows of every stretch, in order."""
-
-
-class Unit(NamedTuple):
-    """How a cloud is put into the unit sphere: its centre ``(3,)`` and largest distance from it."""
-
-    centre: NDArray[np.float64]
-    radius: float
-
-    def points(self, table: Table) -> Tensor:
-        """Return the normalised points ``(n, 3)``."""
-        return torch.from_numpy(((table.points - self.centre) / self.radius).astype(np.float32))
+"""``engine(title, function, cloud, row_ranges, *common)`` yields ``function(cloud, rows, *common)``
+for every range of rows, in order."""
 
 
 class Nearest(NamedTuple):
-    """The nearest points so far: their squared distances ``(m,)`` and their rows of the file."""
+    """The nearest points so far: their squared distances ``(m,)`` and their table of m rows."""
 
     distance: NDArray[np.float32]
     table: Table
 
     def merge(self, other: "Nearest") -> "Nearest":
-        """Keep the nearer ones; where they are equally near, those of the earlier stretch."""
+        """Keep the nearer points; of equally near ones those of the earlier range."""
         nearer = other.distance < self.distance
         columns = {
             name: np.where(nearer, other.table.columns[name], column)
@@ -65,8 +61,22 @@ def in_turn(
     row_ranges: list[range],
     *common: Any,
 ) -> Iterable[Any]:
-    """Do one stretch after the other here: the plainest engine."""
+    """Process one range after the other in this process; see ``Engine``."""
     return (function(cloud, rows, *common) for rows in row_ranges)
+
+
+class Kept(NamedTuple):
+    """What is kept of a file.
+
+    Attributes:
+        table: the sampled points.
+        number: how many points with finite coordinates the file has.
+        dropped: how many it has without.
+    """
+
+    table: Table
+    number: int
+    dropped: int
 
 
 def by_chunks(
@@ -77,28 +87,26 @@ def by_chunks(
     readout: str,
     keep_attributes: bool,
     engine: Engine = in_turn,
-) -> tuple[Table, int, int]:
-    """Return what a trained MOPS-Net keeps of a file, how many points it has, and how many more.
-
-    What more there are is left out for not being finite.
+) -> Kept:
+    """Sample a file by a trained MOPS-Net without reading it as a whole.
 
     Args:
-        source: of a format of ``chunks.FORMATS``.
+        source: of a format in ``registry.CHUNKED``.
         sampler: trained.
-        m: how many points.
-        size: of the row_ranges; with m it bounds the memory.
+        m: number of points to keep.
+        size: number of rows in a range; with m it bounds the memory.
         readout: generated or matched.
         keep_attributes: keep the columns of matched points.
-        engine: does the work.
+        engine: processes the ranges.
 
     Raises:
-        UserError: the file is broken or too small, or the sampler cannot work by chunks.
+        UserError: the file is broken or too small, or the sampler cannot work in chunks.
     """
     if not isinstance(sampler, MOPSNet):
         raise UserError(f"--chunk works with MOPS-Net and FMOPS-Net, not {type(sampler).__name__}.")
     sampler._check_m(m)
-    whole = stored(source)
-    cloud, row_ranges = replace(whole, head=None), whole.row_ranges(size)
+    whole = open_cloud_file(source)
+    cloud, row_ranges = replace(whole, header=None), whole.row_ranges(size)
 
     def over(title: str, function: Callable[..., Any], *common: Any) -> Iterable[Any]:
         results = engine(title, function, cloud, row_ranges, *common)
@@ -108,48 +116,47 @@ def by_chunks(
     for count, part in over("centre", _count_and_sum):
         number += count
         summed += part
-    check_enough(source, number, m)
+    check_size(source, number, m)
     centre = summed / number
-    unit = Unit(centre, radius_of(max(over("radius", _reach, centre)), source))
+    sphere = unit_sphere(centre, max(over("radius", _largest_distance, centre)), source)
     net = sampler.fused()
-    global_ = reduce(torch.maximum, over("global feature", _global, unit, net))
-    sums: Partial = reduce(Partial.merge, over("sampling", _sum, unit, net, global_, m))
+    global_ = reduce(torch.maximum, over("global feature", _global, sphere, net))
+    sums: Partial = reduce(Partial.merge, over("sampling", _sum, sphere, net, global_, m))
     generated = sums.result()
+    dropped = whole.number - number
     if readout == "generated":
-        return (
-            Table(generated.double().numpy() * unit.radius + centre),
-            number,
-            whole.number - number,
-        )
-    found: Nearest = reduce(Nearest.merge, over("matching", _nearest, unit, generated))
-    kept = replace(found.table, head=whole.head)
-    return (kept if keep_attributes else kept.bare()), number, whole.number - number
+        return Kept(Table(sphere.restore(generated)), number, dropped)
+    found: Nearest = reduce(Nearest.merge, over("matching", _nearest, sphere, generated))
+    kept = replace(found.table, header=whole.header)
+    return Kept(kept if keep_attributes else kept.without_attributes(), number, dropped)
 
 
 def _count_and_sum(cloud: CloudFile, rows: range) -> tuple[int, NDArray[np.float64]]:
     table = cloud.read(rows)
-    return len(table.points), total(table.points)
+    return len(table.points), sum_of(table.points)
 
 
-def _reach(cloud: CloudFile, rows: range, centre: NDArray[np.float64]) -> float:
-    return reach(cloud.read(rows).points, centre)
+def _largest_distance(cloud: CloudFile, rows: range, centre: NDArray[np.float64]) -> float:
+    return largest_distance(cloud.read(rows).points, centre)
 
 
-def _global(cloud: CloudFile, rows: range, unit: Unit, net: FusedMOPSNet) -> Tensor | None:
-    points = unit.points(cloud.read(rows))
+def _global(cloud: CloudFile, rows: range, sphere: UnitSphere, net: FusedMOPSNet) -> Tensor | None:
+    points = sphere.normalize(cloud.read(rows).points)
     return global_part(net, points) if len(points) else None
 
 
 def _sum(
-    cloud: CloudFile, rows: range, unit: Unit, net: FusedMOPSNet, global_: Tensor, m: int
+    cloud: CloudFile, rows: range, sphere: UnitSphere, net: FusedMOPSNet, global_: Tensor, m: int
 ) -> Partial | None:
-    points = unit.points(cloud.read(rows))
+    points = sphere.normalize(cloud.read(rows).points)
     return sum_part(net, points, global_, m) if len(points) else None
 
 
-def _nearest(cloud: CloudFile, rows: range, unit: Unit, generated: Tensor) -> Nearest | None:
+def _nearest(
+    cloud: CloudFile, rows: range, sphere: UnitSphere, generated: Tensor
+) -> Nearest | None:
     table = cloud.read(rows)
     if not len(table.points):
         return None
-    distance, row = nearest(generated[None], unit.points(table)[None])
+    distance, row = nearest(generated[None], sphere.normalize(table.points)[None])
     return Nearest(distance[0].numpy(), table.take(row[0].numpy()))

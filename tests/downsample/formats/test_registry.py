@@ -8,9 +8,8 @@ import pytest
 import trimesh
 
 from mops_lightning.downsample.formats import pcd
-from mops_lightning.downsample.formats.registry import WRITERS
+from mops_lightning.downsample.formats.registry import WRITERS, read
 from mops_lightning.downsample.formats.table import Table
-from mops_lightning.downsample.job import read
 from mops_lightning.errors import UserError
 
 
@@ -241,9 +240,9 @@ def test_ascii_ply_and_a_mesh(tmp_path):
         ("a.xyz", b"1 2 3\n4 5\n", "a.xyz is broken"),
         ("a.txt", b"1 2\n3 4\n", "rows of x, y, z"),
         ("a.npy", b"no", "a.npy is broken"),
-        ("a.bin", b"12345678" * 3, "no KITTI scan"),
+        ("a.bin", b"12345678" * 3, "not a KITTI scan"),
         ("a.txt", b"1 2 abc\n3 4 5\n", "a.txt is broken"),
-        ("a.ply", ASCII.encode() + b"1 2 3\n", "announces 2 points, not 1"),
+        ("a.ply", ASCII.encode() + b"1 2 3\n", "declares 2 points"),
         ("a.pcd", b"VERSION 7", "no DATA line"),
         ("a.pcd", HEAD.encode() + b"DATA binary\n123", "a.pcd is broken"),
         ("a.pcd", HEAD.encode() + b"DATA binary_compressed\n\x03\0\0\0\x80\x02\0\0123", "broken"),

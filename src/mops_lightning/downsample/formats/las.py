@@ -1,48 +1,63 @@
-"""LAS and LAZ files by laspy, an extra."""
+"""LAS and LAZ files, read and written by laspy, an extra."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mops_lightning.downsample.formats.table import (
-    BadCloudError,
-    Column,
-    Table,
-    ends_early,
-    unique_names,
-)
+from mops_lightning.downsample.formats.cloud_file import CloudFile
+from mops_lightning.downsample.formats.errors import BadCloudError, ends_early
+from mops_lightning.downsample.formats.table import Column, Table, unique_names
 from mops_lightning.errors import UserError
 
 
 def read(path: Path) -> Table:
     """Read all points with all their dimensions; coordinates are scaled and shifted."""
-    laspy = laspy_for(path)
+    laspy = _laspy(path)
     with laspy.open(path) as file:
-        announced = file.header.point_count
+        declared = file.header.point_count
         try:
             cloud = file.read()
         except ValueError as error:
             raise BadCloudError(f"{path} is broken: it ends too early ({error}).") from None
-    table = table_of(cloud, cloud.header)
-    if len(table.points) < announced:
+    table = _table(cloud, cloud.header)
+    if len(table.points) < declared:
         raise ends_early(path, len(table.points))
     return table
 
 
-def check_bounds(path: Path, table: Table, header: Any) -> None:
-    """Refuse what cannot be the file's points: a broken LAZ may give any before its end is read.
+@dataclass(frozen=True, kw_only=True)
+class LasFile(CloudFile):
+    """A file that laspy reads in ranges of rows."""
+
+    def _parse(self, rows: range) -> Table:
+        with _laspy(self.path).open(self.path) as file:
+            file.seek(rows.start)
+            table = _table(file.read_points(len(rows)), None)
+            _check_bounds(self.path, table, file.header)
+        return table
+
+
+def locate(path: Path) -> LasFile:
+    """Open a file to read ranges of its rows."""
+    with _laspy(path).open(path) as file:
+        return LasFile(path=path, number=file.header.point_count, header=file.header)
+
+
+def _check_bounds(path: Path, table: Table, header: Any) -> None:
+    """Reject points far outside of the header's bounds: a damaged LAZ file may give any numbers.
 
     Raises:
-        BadCloudError: a point lies far outside of the bounds that the head gives, if it gives any.
+        BadCloudError: there is such a point.
     """
     low, high = np.asarray(header.mins), np.asarray(header.maxs)
     far = (high - low).max()
     if far > 0 and ((table.points < low - far) | (table.points > high + far)).any():
-        raise BadCloudError(f"{path} is broken: points lie far outside of the bounds in its head.")
+        raise BadCloudError(f"{path} is broken: it has points far outside of its header's bounds.")
 
 
-def table_of(cloud: Any, header: Any) -> Table:
+def _table(cloud: Any, header: Any) -> Table:
     """Make a table of laspy's points, with all dimensions of one number each."""
     points = np.stack([np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"], 1)
     names = [name for name in cloud.point_format.dimension_names if name not in "XYZ"]
@@ -52,24 +67,12 @@ def table_of(cloud: Any, header: Any) -> Table:
 
 def write(path: Path, table: Table) -> None:
     """Write a LAS or LAZ file like the one that was read, or one of plain coordinates."""
-    laspy = laspy_for(path)
-    header: Any
-    if table.head is None:
-        header = laspy.LasHeader(point_format=3, version="1.2")
-        spread = float(np.ptp(table.points, axis=0).max())
-        header.offsets = table.points.min(0)
-        header.scales = np.full(3, max(spread, 1e-9) / 2**30)
-    else:
-        header = laspy.LasHeader(
-            point_format=table.head.point_format, version=str(table.head.version)
-        )
-        header.offsets, header.scales = table.head.offsets, table.head.scales
-        header.vlrs = table.head.vlrs
-    cloud = laspy.LasData(header)
+    laspy = _laspy(path)
+    cloud = laspy.LasData(_header(laspy, table))
     cloud.x, cloud.y, cloud.z = table.points.T
     known = set(cloud.point_format.dimension_names)
     for name, column in unique_names(table).items():
-        if name in known and _kept_exactly(cloud, name, column):
+        if name in known and _stored_exactly(cloud, name, column):
             continue
         kind = np.dtype("u1") if column.dtype.kind == "b" else column.dtype.newbyteorder("=")
         kind = np.dtype("f4") if kind == np.dtype("f2") else kind
@@ -79,8 +82,22 @@ def write(path: Path, table: Table) -> None:
     cloud.write(path)
 
 
-def _kept_exactly(cloud: Any, name: str, column: Column) -> bool:
-    """Put a column into a dimension of LAS, if that has room for its numbers."""
+def _header(laspy: Any, table: Table) -> Any:
+    """Return a header with the format, scales and offsets of the file that was read."""
+    if table.header is None:
+        header = laspy.LasHeader(point_format=3, version="1.2")
+        extent = float(np.ptp(table.points, axis=0).max())
+        header.offsets = table.points.min(0)
+        header.scales = np.full(3, max(extent, 1e-9) / 2**30)
+        return header
+    source = table.header
+    header = laspy.LasHeader(point_format=source.point_format, version=str(source.version))
+    header.offsets, header.scales, header.vlrs = source.offsets, source.scales, source.vlrs
+    return header
+
+
+def _stored_exactly(cloud: Any, name: str, column: Column) -> bool:
+    """Store a column in a dimension of LAS, if the dimension's type holds its numbers."""
     try:
         with np.errstate(all="ignore"):
             cloud[name] = column
@@ -92,17 +109,16 @@ def _kept_exactly(cloud: Any, name: str, column: Column) -> bool:
     return exact
 
 
-def laspy_for(path: Path) -> Any:
-    """Return laspy, which need not be installed.
+def _laspy(path: Path) -> Any:
+    """Return laspy.
 
     Raises:
-        UserError: it is not.
+        UserError: it is not installed.
     """
     try:
         import laspy
     except ModuleNotFoundError:
         raise UserError(
-            f"{path}: LAS and LAZ need a package that is not here: "
-            "pip install 'mops-lightning[las]'."
+            f"{path}: LAS and LAZ need laspy: pip install 'mops-lightning[las]'."
         ) from None
     return laspy

@@ -1,0 +1,41 @@
+"""Errors of cloud files, which name the file."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from mops_lightning.errors import UserError
+
+
+class BadCloudError(UserError):
+    """A file that holds no usable cloud; the other files of its folder are processed."""
+
+
+@contextmanager
+def naming_file(path: Path) -> Iterator[None]:
+    """Turn any error of a parser into one that names the file.
+
+    Raises:
+        BadCloudError: in place of every error except ``UserError``.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise BadCloudError(f"{path} is broken: {type(error).__name__}: {error}.") from None
+
+
+def ends_early(path: Path, number: int) -> BadCloudError:
+    """Return the error of a file that holds fewer points than its header declares."""
+    return BadCloudError(f"{path} is broken: it ends after {number} points.")
+
+
+def check_size(path: Path, number: int, m: int) -> None:
+    """Reject a cloud of fewer points than are to be kept.
+
+    Raises:
+        BadCloudError: it has fewer.
+    """
+    if number < m:
+        raise BadCloudError(f"{path} holds {number} points, fewer than --m {m}.")

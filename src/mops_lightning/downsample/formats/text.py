@@ -1,0 +1,67 @@
+"""Text files (.xyz, .txt): one point per line."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from mops_lightning.downsample.formats.errors import BadCloudError
+from mops_lightning.downsample.formats.table import (
+    Column,
+    Table,
+    columns_to_rows,
+    compact_coordinates,
+    from_array,
+    from_unnamed,
+    unique_names,
+)
+
+
+def read(path: Path) -> Table:
+    """Read rows of numbers separated by spaces, commas or semicolons, with or without a header."""
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    lines = [re.split("#|//", line)[0].strip() for line in text.splitlines()]
+    lines = [line for line in lines if line]
+    if not lines:
+        raise BadCloudError(f"{path} is empty.")
+    separator = next((mark for mark in ",;" if mark in lines[-1]), None)
+    if len(lines) > 1 and len(lines[0].split(separator)) == 1 and lines[0].isdigit():
+        lines.pop(0)  # the number of points
+    if not any(map(_is_number, lines[0].split(separator))):
+        lines.pop(0)  # a header
+    try:
+        array = np.loadtxt(lines, delimiter=separator, ndmin=2)
+    except ValueError as error:
+        raise BadCloudError(f"{path} is broken: {str(error).rstrip('.')}.") from None
+    # A header may be a comment: as many words as there are columns, x, y and z among them.
+    for line in text.lstrip("\ufeff").splitlines()[:20]:
+        words = [word.strip() for word in line.strip().lstrip("#/ ").split(separator)]
+        if len(words) == array.shape[1] and {"x", "y", "z"} <= {word.lower() for word in words}:
+            return from_array(array, words, path)
+    return from_unnamed(array, path)
+
+
+def write(path: Path, table: Table) -> None:
+    """Write ``x y z`` and the columns, separated by spaces, without loss of digits."""
+    named = unique_names(table)
+    columns = [*compact_coordinates(table).T, *named.values()]
+    unnamed = all(name.startswith("column_") for name in named)
+    header = "" if unnamed else " ".join(["x", "y", "z", *named])
+    formats = [number_format(column) for column in columns]
+    np.savetxt(path, columns_to_rows(columns), fmt=formats, header=header, comments="# ")
+
+
+def number_format(column: Column) -> str:
+    """Return the shortest ``%`` format that keeps every number of a column."""
+    if column.dtype.kind != "f":
+        return "%d"
+    short = column.dtype.itemsize <= 4 or np.array_equal(column.astype("f4"), column)
+    return "%.9g" if short else "%.17g"
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
