@@ -3,6 +3,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from mops_lightning.errors import UserError
 from mops_lightning.losses.registration import (
     frobenius_chamfer_loss,
     frobenius_distance,
@@ -17,7 +18,7 @@ def quaternions(seed, number=50):
     return torch.from_numpy(np.roll(drawn, 1, axis=1).copy())
 
 
-def test_quaternion_distance_is_the_smaller_of_both_signs():
+def test_quaternion_distance_is_minimum_over_signs():
     a, b = quaternions(1), quaternions(2)
     plain = torch.minimum((a - b).norm(dim=1), (a + b).norm(dim=1)).mean()
     torch.testing.assert_close(quaternion_distance(a, b), plain)
@@ -26,7 +27,7 @@ def test_quaternion_distance_is_the_smaller_of_both_signs():
     torch.testing.assert_close(quaternion_distance(a, b), (2 * (angle / 4).sin()).mean())
 
 
-def test_quaternion_distance_has_gradients_towards_the_nearer_sign():
+def test_quaternion_distance_gradient_points_to_nearer_sign():
     true = quaternions(3)
     predicted = (-true + 1e-2).requires_grad_()
     (gradient,) = torch.autograd.grad(quaternion_distance(predicted, true), predicted)
@@ -35,7 +36,7 @@ def test_quaternion_distance_has_gradients_towards_the_nearer_sign():
     assert torch.isfinite(torch.autograd.grad(quaternion_distance(same, true), same)[0]).all()
 
 
-def test_frobenius_distance_is_the_matrix_norm():
+def test_frobenius_distance_equals_matrix_norm():
     a, b = quaternions(1), quaternions(2)
     relative = [
         np.square(one.as_matrix() - np.eye(3)).sum()
@@ -46,7 +47,7 @@ def test_frobenius_distance_is_the_matrix_norm():
 
 
 @pytest.mark.parametrize("loss", [quaternion_loss, frobenius_chamfer_loss])
-def test_losses_vanish_at_the_true_motion_only(loss, rng):
+def test_registration_loss_is_zero_at_true_motion_only(loss, rng):
     source = torch.randn(50, 30, 3, dtype=torch.float64, generator=rng)
     true = Motion(quaternions(1), torch.randn(50, 3, dtype=torch.float64, generator=rng))
     target = Motion(true.quaternion, true.translation).apply(source)
@@ -57,7 +58,7 @@ def test_losses_vanish_at_the_true_motion_only(loss, rng):
     assert sum(loss(shifted, true, source, target).values()) > 0.1
 
 
-def test_weights_of_the_terms():
+def test_registration_loss_weights_scale_terms():
     true, other = (
         Motion(quaternions(1), torch.zeros(50, 3)),
         Motion(quaternions(1), torch.ones(50, 3)),
@@ -77,3 +78,15 @@ def test_weights_of_the_terms():
     )
     torch.testing.assert_close(one, torch.tensor(6.0).double())
     torch.testing.assert_close(two, 2 * one)
+
+
+@pytest.mark.parametrize(
+    ("loss", "name"),
+    [(quaternion_loss, "translation_weight"), (frobenius_chamfer_loss, "chamfer_weight")],
+)
+@pytest.mark.parametrize("value", [-1.0, float("inf"), float("nan")])
+def test_registration_loss_invalid_weight_raises(loss, name, value):
+    motion = Motion(torch.zeros(1, 4), torch.zeros(1, 3))
+    cloud = torch.zeros(1, 4, 3)
+    with pytest.raises(UserError, match=rf"^{name} must be a number of at least 0, got {value}"):
+        loss(motion, motion, cloud, cloud, **{name: value})

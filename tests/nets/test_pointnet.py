@@ -1,84 +1,11 @@
-import copy
 from itertools import pairwise
 
-import pytest
 import torch
-from torch.nn import functional as F
 
-from mops_lightning.nets.pointnet import (
-    FEW_POINTS,
-    PointFeatures,
-    PointMaxPool,
-    PointNetVanilla,
-)
+from mops_lightning.nets.pointnet import PointNetVanilla
 
 
-class PlainMaxPool(PointMaxPool):
-    """The same layers, one after the other, with the whole (B, N, C) tensor."""
-
-    def forward(self, features):
-        rows = self.linear(features.flatten(0, 1))
-        rows = F.relu(rows if self.norm is None else self.norm(rows))
-        return rows.unflatten(0, features.shape[:2]).amax(1)
-
-
-def pools(channels_in=6, channels_out=20, norm=True):
-    torch.manual_seed(1)
-    fast = PointMaxPool(channels_in, channels_out, norm).double()
-    if fast.norm is not None:
-        with torch.no_grad():
-            # A negative gamma turns the maximum into a minimum.
-            fast.norm.weight.copy_(torch.randn(channels_out))
-            fast.norm.bias.copy_(torch.randn(channels_out))
-    plain = PlainMaxPool(channels_in, channels_out, norm).double()
-    plain.load_state_dict(fast.state_dict())
-    return fast, plain
-
-
-@pytest.mark.parametrize("norm", [True, False])
-@pytest.mark.parametrize("training", [True, False])
-@pytest.mark.parametrize("points", [4, FEW_POINTS, FEW_POINTS + 1, 50, 100])
-def test_max_pool_equals_its_plain_twin(points, training, norm, rng):
-    fast, plain = pools(norm=norm)
-    outputs, gradients = [], []
-    features = torch.randn(3, points, 6, dtype=torch.float64, generator=rng)
-    weight = torch.randn(3, 20, dtype=torch.float64, generator=rng)
-    for net in (fast, plain):
-        net.train()
-        net(features + 1)  # running statistics that are not the initial ones
-        net.train(training)
-        x = features.clone().requires_grad_()
-        out = net(x)
-        outputs.append(out)
-        gradients.append(torch.autograd.grad((out * weight).sum(), [x, *net.parameters()]))
-        with torch.no_grad():  # nothing has to be kept for gradients here
-            net.eval()
-            outputs.append(net(features))
-    torch.testing.assert_close(outputs[:2], outputs[2:])
-    for got, want in zip(*gradients, strict=True):
-        torch.testing.assert_close(got, want)
-    for (name, got), want in zip(fast.named_buffers(), plain.buffers(), strict=True):
-        torch.testing.assert_close(got, want, msg=name)
-
-
-@pytest.mark.parametrize("norm", [True, False])
-def test_max_pool_gradcheck(norm, rng):
-    net = copy.deepcopy(pools(3, 5, norm)[0])
-    size = (2, FEW_POINTS + 3, 3)
-    features = torch.randn(size, dtype=torch.float64, generator=rng, requires_grad=True)
-    assert torch.autograd.gradcheck(net, (features,))
-
-
-def test_max_pool_gives_a_frozen_layer_no_gradient_and_its_input_all(rng):
-    fast, plain = pools()
-    for net in (fast, plain):
-        net.requires_grad_(False).eval()
-    features = torch.randn(2, 60, 6, dtype=torch.float64, generator=rng, requires_grad=True)
-    got, want = (torch.autograd.grad(net(features).sum(), features)[0] for net in (fast, plain))
-    torch.testing.assert_close(got, want)
-
-
-def test_classifier_does_not_mind_order_or_batch(rng):
+def test_pointnet_is_independent_of_order_and_batch(rng):
     torch.manual_seed(0)
     net = PointNetVanilla(5).eval()
     points = torch.randn(3, 200, 3, generator=rng)
@@ -88,7 +15,7 @@ def test_classifier_does_not_mind_order_or_batch(rng):
     torch.testing.assert_close(net(points[1:2]), logits[1:2], atol=1e-5, rtol=1e-5)
 
 
-def test_classifier_has_the_published_layers():
+def test_pointnet_has_published_layers():
     sizes = [
         tuple(module.weight.shape)
         for module in PointNetVanilla(40).modules()
@@ -96,24 +23,3 @@ def test_classifier_has_the_published_layers():
     ]
     channels = [3, 64, 64, 64, 128, 1024, 512, 256, 40]
     assert sizes == [(b, a) for a, b in pairwise(channels)]
-
-
-def test_features_are_local_and_their_maximum(rng):
-    torch.manual_seed(0)
-    net = PointFeatures((8, 6)).eval()
-    points = torch.randn(2, 30, 3, generator=rng)
-    local, global_ = net(points)
-    assert local.shape == (2, 30, 6)
-    torch.testing.assert_close(global_, local.max(1).values)
-
-
-def test_pooling_never_takes_a_copy_that_only_fills_up(rng):
-    # Copies of the first point may differ from it by a rounding error: many tries hit such a case.
-    for number in range(FEW_POINTS + 1, FEW_POINTS + 40):
-        pool = PlainMaxPool(6, 40).double().eval()
-        features = torch.randn(2, number, 6, dtype=torch.float64, generator=rng)
-        features[:, 0] *= 5
-        fast = PointMaxPool(6, 40).double().eval()
-        fast.load_state_dict(pool.state_dict())
-        features.requires_grad_()
-        torch.testing.assert_close(fast(features), pool(features))

@@ -5,8 +5,9 @@ import torch
 from torch.nn import functional as F
 
 from mops_lightning.nets.foldingnet import MFoldingNet
+from mops_lightning.nets.layers import PointMLP
+from mops_lightning.nets.max_pool import PLAIN_MAX_POINTS, PointMaxPool
 from mops_lightning.nets.pcrnet import PCRNet
-from mops_lightning.nets.pointnet import FEW_POINTS, PointMaxPool, PointMLP
 from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
 from mops_lightning.ops.rigid import Motion
 from mops_lightning.samplers.mops import MOPSNet
@@ -70,7 +71,7 @@ def test_mops_net_sampling_matrix_is_float32(training, rng):
     assert 0 < (half.points - single.points).abs().max() < 0.02
 
 
-@pytest.mark.parametrize("n", [FEW_POINTS, 100])
+@pytest.mark.parametrize("n", [PLAIN_MAX_POINTS, 100])
 @pytest.mark.parametrize("norm", [True, False])
 def test_max_pool_half_precision_is_close(n, norm, rng):
     features = torch.randn(3, n, 16, generator=rng).bfloat16()
@@ -91,8 +92,14 @@ def test_max_pool_half_precision_is_close(n, norm, rng):
         assert F.cosine_similarity(half.flatten(), single.flatten(), dim=0) > 0.95
 
 
-@pytest.mark.parametrize("net", [PCRNet(), MFoldingNet(64, 4, 64), MFoldingNet(64, 1, 64, "graph")])
-def test_nets_under_plain_autocast_are_close(net, rng):
+@pytest.mark.parametrize(
+    "make",
+    [PCRNet, lambda: MFoldingNet(64, 4, 64), lambda: MFoldingNet(64, 1, 64, "graph")],
+    ids=["pcrnet", "mfoldingnet", "foldingnet"],
+)
+def test_nets_under_plain_autocast_are_close(make, rng):
+    torch.manual_seed(0)
+    net = make()
     points = torch.randn(4, 60, 3, generator=rng)
     arguments = (points, points + 0.1) if isinstance(net, PCRNet) else (points,)
     results = []

@@ -4,7 +4,7 @@ from torch import nn
 
 from mops_lightning.errors import UserError
 from mops_lightning.losses.subset import subset_loss
-from mops_lightning.nets.pointnet import linear_norm_relu
+from mops_lightning.nets.layers import linear_norm_relu
 from mops_lightning.samplers.mops import MOPSNet
 
 

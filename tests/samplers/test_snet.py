@@ -3,52 +3,8 @@ import torch
 from torch import nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.losses import subset as losses
 from mops_lightning.losses.subset import simplification_loss
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
-
-
-def double_loop(points, samples, coverage, per_point):
-    """The publication's loss word for word, one number at a time."""
-    total = 0.0
-    for cloud, sample in zip(points, samples, strict=True):
-        there = [min(float((q - p).square().sum()) for p in cloud) for q in sample]
-        back = [min(float((q - p).square().sum()) for q in sample) for p in cloud]
-        mean = sum(there) / len(there)
-        total += mean + max(there) + (coverage + per_point * len(there)) * sum(back) / len(back)
-    return total / len(points)
-
-
-@pytest.mark.parametrize(("coverage", "per_point"), [(1.0, 0.0), (0.5, 1 / 30), (0.0, 1 / 64)])
-def test_simplification_loss_equals_a_double_loop(coverage, per_point, rng):
-    points = torch.randn(3, 17, 3, generator=rng)
-    samples = torch.randn(3, 5, 3, generator=rng)
-    value = float(simplification_loss(points, samples, coverage, per_point))
-    assert value == pytest.approx(double_loop(points, samples, coverage, per_point), rel=1e-5)
-
-
-def test_simplification_loss_has_right_gradients(rng):
-    points = torch.randn(2, 9, 3, generator=rng, dtype=torch.float64)
-    samples = torch.randn(2, 4, 3, generator=rng, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda q: simplification_loss(points, q, 0.5, 0.1), (samples,))
-    assert simplification_loss(points, points) == 0
-
-
-@pytest.mark.parametrize("name", ["subset", "simplification"])
-def test_losses_of_many_sizes_are_those_of_each(name, rng):
-    points = torch.randn(3, 30, 3, generator=rng, dtype=torch.float64)
-    samples = torch.randn(3, 12, 3, generator=rng, dtype=torch.float64, requires_grad=True)
-    extra = (0.5, 0.1) if name == "simplification" else ()
-    many, one = getattr(losses, f"{name}_losses"), getattr(losses, f"{name}_loss")
-    sizes = (12, 1, 5)
-    together = many(points, samples, sizes, *extra)
-    assert set(together) == set(sizes)
-    for m in sizes:
-        alone = one(points, samples[:, :m].clone(), *extra)
-        torch.testing.assert_close(together[m], alone)
-        (got,) = torch.autograd.grad(together[m], samples, retain_graph=True)
-        (want,) = torch.autograd.grad(alone, samples)
-        torch.testing.assert_close(got, want)
 
 
 def layers(net):
@@ -113,7 +69,7 @@ def test_progressive_samples_are_nested_each_with_the_loss_of_its_size(rng):
         ({"coverage": -1.0}, "sampler.coverage must not"),
         ({"feature_channels": (8,)}, "feature_channels must be sizes of at least 2 layers"),
         ({"head_channels": (0,)}, "head_channels must be .* each at least 1, got .0."),
-        ({"least": 0}, "sampler.least must be at least 1, got 0"),
+        ({"min_size": 0}, "sampler.min_size must be at least 1, got 0"),
         ({"size_reduction": "summ"}, "sampler.size_reduction: unknown 'summ'.*sum"),
     ],
 )

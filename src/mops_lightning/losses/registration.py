@@ -1,4 +1,4 @@
-"""Losses between rigid motions; each returns its weighted terms by name."""
+"""Losses between rigid motions, and the registration losses, as weighted terms by name."""
 
 import math
 
@@ -11,17 +11,32 @@ from mops_lightning.ops.rigid import Motion, quaternion_to_matrix
 
 
 def quaternion_distance(predicted: Tensor, true: Tensor) -> Tensor:
-    """Return the L2 distance of ``(B, 4)`` unit quaternions up to sign, mean over the batch.
+    """Return the L2 distance between unit quaternions up to sign.
 
-    min(‖q̂ − q‖, ‖q̂ + q‖) = 2·sin(θ/4) at the geodesic angle θ: both signs are one rotation, so an
-    answer must not be pushed to the far one. Paper section "Registration-oriented Downsampling".
+    min(‖q̂ − q‖, ‖q̂ + q‖) = 2·sin(θ/4) for the geodesic angle θ. Both signs are the same rotation,
+    so the nearer one is the target. Paper section "Registration-oriented Downsampling".
+
+    Args:
+        predicted: ``(B, 4)``.
+        true: ``(B, 4)``.
+
+    Returns:
+        A scalar, the mean over the batch.
     """
     sign = torch.where((predicted * true).sum(1, keepdim=True) < 0, -1.0, 1.0)
     return torch.linalg.vector_norm(predicted - sign * true, dim=1).mean()
 
 
 def frobenius_distance(predicted: Tensor, true: Tensor) -> Tensor:
-    """Return ‖R̂Rᵀ − I‖²_F of ``(B, 4)`` unit quaternions, mean over the batch."""
+    """Return ‖R̂Rᵀ − I‖²_F for the rotation matrices of unit quaternions.
+
+    Args:
+        predicted: ``(B, 4)``.
+        true: ``(B, 4)``.
+
+    Returns:
+        A scalar, the mean over the batch.
+    """
     between = quaternion_to_matrix(predicted) @ quaternion_to_matrix(true).mT
     return (between - torch.eye(3).to(between)).square().sum((1, 2)).mean()
 
@@ -33,15 +48,23 @@ def quaternion_loss(
     target: Tensor,
     translation_weight: float = 1.0,
 ) -> dict[str, Tensor]:
-    """The paper's loss, the distance of the quaternions, with one for the translation beside it.
+    """Return the paper's quaternion loss and a translation loss.
+
+    Paper section "Registration-oriented Downsampling".
 
     Args:
-        predicted: the answer, for clouds with their centroids at the origin.
-        true: the same motion as it should be.
-        source: ``(B, N, 3)`` the centred source; not needed.
-        target: ``(B, N, 3)`` the centred target; not needed.
-        translation_weight: weight of the L2 distance of the translations, which the paper leaves
-            out; without it nothing would train that part of the answer.
+        predicted: the predicted motion between centred clouds.
+        true: the true motion between centred clouds.
+        source: ``(B, N, 3)`` the centred source; unused.
+        target: ``(B, N, 3)`` the centred target; unused.
+        translation_weight: weight of the L2 distance between translations. The paper does not
+            mention this term, but without it the predicted translation would not be trained.
+
+    Returns:
+        The terms ``quaternion`` and ``translation``, scalars.
+
+    Raises:
+        UserError: the weight is out of range.
     """
     _check_weight("translation_weight", translation_weight)
     shift = torch.linalg.vector_norm(predicted.translation - true.translation, dim=1).mean()
@@ -58,14 +81,20 @@ def frobenius_chamfer_loss(
     target: Tensor,
     chamfer_weight: float = 1.0,
 ) -> dict[str, Tensor]:
-    """SampleNet's loss for registration: ‖R̂Rᵀ − I‖²_F, and the chamfer distance after the motion.
+    """Return SampleNet's registration loss: ‖R̂Rᵀ − I‖²_F and a chamfer distance.
 
     Args:
-        predicted: the answer, for clouds with their centroids at the origin.
-        true: the same motion as it should be.
+        predicted: the predicted motion between centred clouds.
+        true: the true motion between centred clouds.
         source: ``(B, N, 3)`` the centred source, all points.
         target: ``(B, N, 3)`` the centred target, all points.
-        chamfer_weight: weight of the chamfer distance.
+        chamfer_weight: weight of the chamfer distance between moved source and target.
+
+    Returns:
+        The terms ``frobenius`` and ``chamfer``, scalars.
+
+    Raises:
+        UserError: the weight is out of range.
     """
     _check_weight("chamfer_weight", chamfer_weight)
     chamfer = chamfer_distance(predicted.apply(source), target).mean()
@@ -77,4 +106,4 @@ def frobenius_chamfer_loss(
 
 def _check_weight(name: str, value: float) -> None:
     if not 0 <= value < math.inf:
-        raise UserError(f"task.loss.{name} must be a number of at least 0, got {value}.")
+        raise UserError(f"{name} must be a number of at least 0, got {value}.")

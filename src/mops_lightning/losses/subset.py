@@ -1,7 +1,8 @@
-"""Losses that are no part of a task, and distances of clouds: pure functions.
+"""Losses between generated points and the input cloud: subset and simplification loss.
 
-Nested samplers are trained at several sizes of one sample, whose first m points count for size m.
-The functions in the plural give the losses of all sizes for little more than the largest costs.
+Nested samplers are trained at several sizes: the first m points are the sample of size m.
+``subset_losses`` and ``simplification_losses`` compute the losses of all sizes at little more than
+the cost of the largest.
 """
 
 from collections.abc import Sequence
@@ -13,23 +14,32 @@ from mops_lightning.ops.nearest import nearest_distances
 
 
 def subset_loss(points: Tensor, samples: Tensor) -> Tensor:
-    """Measure how far generated points are from being a subset of the cloud.
+    """Return the subset loss: the mean squared distance of samples to their nearest input point.
 
-    L_subset(P, Q) = 1/m Σ_j min_i ‖q_j − p_i‖², paper section "Joint Training Loss"; here its mean
-    over the clouds.
+    L_subset(P, Q) = 1/m Σ_j min_i ‖q_j − p_i‖² (paper section "Joint Training Loss", Eq. 10),
+    averaged over the clouds.
 
     Args:
-        points: ``(B, N, 3)`` the clouds P.
-        samples: ``(B, M, 3)`` the generated points Q.
+        points: ``(B, N, 3)`` clouds P.
+        samples: ``(B, M, 3)`` generated points Q.
 
     Returns:
-        A scalar in squared units of the coordinates; 0 where every sample is an input point.
+        A scalar in squared units of the coordinates; 0 if every sample is an input point.
     """
     return subset_losses(points, samples, (samples.shape[1],))[samples.shape[1]]
 
 
 def subset_losses(points: Tensor, samples: Tensor, sizes: Sequence[int]) -> dict[int, Tensor]:
-    """Return, by size m, the ``subset_loss`` of the first m samples."""
+    """Return ``subset_loss`` of the first m samples for several sizes m.
+
+    Args:
+        points: ``(B, N, 3)`` clouds P.
+        samples: ``(B, M, 3)`` generated points Q.
+        sizes: sizes m, each from 1 to M.
+
+    Returns:
+        Scalars by size.
+    """
     distances = nearest_distances(samples, points)
     return {m: distances[:, :m].mean() for m in sizes}
 
@@ -37,15 +47,15 @@ def subset_losses(points: Tensor, samples: Tensor, sizes: Sequence[int]) -> dict
 def simplification_loss(
     points: Tensor, samples: Tensor, coverage: float = 1.0, coverage_per_point: float = 0.0
 ) -> Tensor:
-    """Measure how far generated points are from the cloud, and the cloud from them.
+    """Return the simplification loss of S-Net and SampleNet.
 
-    L_simplify(Q, P) = mean_q d²(q, P) + max_q d²(q, P) + (γ + δ·M)·mean_p d²(p, Q), with d² the
-    squared distance to the nearest point of the other set; its mean over the clouds. S-Net (Dovrat
-    et al., CVPR 2019, section "Loss") and SampleNet (Lang et al., CVPR 2020) train with it.
+    L_simplify(Q, P) = mean_q d²(q, P) + max_q d²(q, P) + (γ + δ·M)·mean_p d²(p, Q), where d² is the
+    squared distance to the nearest point of the other set, averaged over the clouds (Dovrat et al.,
+    CVPR 2019, section "Loss"; Lang et al., CVPR 2020).
 
     Args:
-        points: ``(B, N, 3)`` the clouds P.
-        samples: ``(B, M, 3)`` the generated points Q.
+        points: ``(B, N, 3)`` clouds P.
+        samples: ``(B, M, 3)`` generated points Q.
         coverage: γ.
         coverage_per_point: δ.
 
@@ -63,15 +73,26 @@ def simplification_losses(
     coverage: float = 1.0,
     coverage_per_point: float = 0.0,
 ) -> dict[int, Tensor]:
-    """Return, by size m, the ``simplification_loss`` of the first m samples."""
+    """Return ``simplification_loss`` of the first m samples for several sizes m.
+
+    Args:
+        points: ``(B, N, 3)`` clouds P.
+        samples: ``(B, M, 3)`` generated points Q.
+        sizes: sizes m, each from 1 to M.
+        coverage: γ.
+        coverage_per_point: δ.
+
+    Returns:
+        Scalars by size.
+    """
     to_cloud = nearest_distances(samples, points)
     losses, begin, from_cloud = {}, 0, None
     for m in sorted(set(sizes)):
-        # Nearest among the first m: nearest among the smaller size, or among what is added to it.
+        # The nearest of the first m is the nearest of the previous size or of the added points.
         added = nearest_distances(points, samples[:, begin:m])
         from_cloud = added if from_cloud is None else torch.minimum(from_cloud, added)
         begin = m
-        there = to_cloud[:, :m].mean(1) + to_cloud[:, :m].amax(1)
+        sample_terms = to_cloud[:, :m].mean(1) + to_cloud[:, :m].amax(1)
         weight = coverage + coverage_per_point * m
-        losses[m] = (there + weight * from_cloud.mean(1)).mean()
+        losses[m] = (sample_terms + weight * from_cloud.mean(1)).mean()
     return losses

@@ -1,1 +1,1 @@
-"""Networks: plain torch modules in (B·N, C) layout."""
+"""Task nets and their layers: plain torch modules."""

@@ -1,7 +1,7 @@
-"""AtlasNet: many independent decoders, one surface patch each.
+"""AtlasNet: independent decoders, one per surface patch.
 
-Groueix et al., "A Papier-Mâché Approach to Learning 3D Surface Generation", CVPR 2018; compared
-with in the paper's section "Reconstruction of large-scale point clouds".
+Groueix et al., "A Papier-Mâché Approach to Learning 3D Surface Generation", CVPR 2018; a baseline
+in the paper's section "Reconstruction of large-scale point clouds".
 """
 
 from collections.abc import Sequence
@@ -12,15 +12,15 @@ from torch import Tensor, nn
 from mops_lightning.errors import UserError
 from mops_lightning.nets.autoencoder import PointEncoder
 from mops_lightning.nets.foldingnet import REACH, square_grid
-from mops_lightning.nets.pointnet import check_channels, linear_norm_relu
+from mops_lightning.nets.layers import check_channels, linear_norm_relu
 
 
 class Patch(nn.Module):
-    """One decoder: lifts 2-D points, adds the codeword, and maps the sum to 3-D.
+    """Decoder of one patch: lifts 2-D points, adds the codeword, and maps the sum to 3-D.
 
     Args:
         codeword: size d of the codeword.
-        channels: sizes of the layers behind the lifting, with BatchNorm and ReLU.
+        channels: sizes of the layers after the lifting, with BatchNorm and ReLU.
     """
 
     def __init__(self, codeword: int, channels: Sequence[int]) -> None:
@@ -37,18 +37,18 @@ class Patch(nn.Module):
 
 
 class AtlasNet(nn.Module):
-    """The paper's encoder, and M patches that share nothing.
+    """The paper's encoder, and M patches without shared weights.
 
-    Training draws random points of the square, tests take a regular grid.
+    Patches map random points of a square in training, and a regular grid in evaluation.
 
     Args:
-        n_points: how many points are emitted when the call does not say; may change at any time.
+        n_points: default number of output points; the attribute may be changed at any time.
         pieces: M, the number of patches.
         codeword: size d of the codeword.
         patch_channels: sizes of the layers of every patch.
 
     Raises:
-        UserError: a number is out of range.
+        UserError: an argument is out of range.
     """
 
     def __init__(
@@ -59,18 +59,22 @@ class AtlasNet(nn.Module):
         patch_channels: Sequence[int] = (1024, 512, 512),
     ) -> None:
         super().__init__()
-        if pieces < 1 or n_points < pieces:
-            raise UserError(
-                "task.net.pieces must be at least 1, and task.net.n_points at least as many, got "
-                f"{pieces} and {n_points}."
-            )
-        check_channels("task.net.patch_channels", patch_channels)
+        if pieces < 1:
+            raise UserError(f"pieces must be at least 1, got {pieces}.")
+        if n_points < pieces:
+            raise UserError(f"n_points must be at least pieces={pieces}, got {n_points}.")
+        check_channels("patch_channels", patch_channels)
         self.n_points = n_points
         self.encoder = PointEncoder(codeword)
         self.patches = nn.ModuleList(Patch(codeword, patch_channels) for _ in range(pieces))
 
     def forward(self, points: Tensor, n_points: int | None = None) -> Tensor:
-        """Map ``(B, N, 3)`` points, any N, to ``(B, n, 3)``; see ``n_points`` above."""
+        """Map ``(B, N, 3)`` points, any N, to ``(B, n, 3)``.
+
+        Args:
+            points: the sampled or the full cloud.
+            n_points: n; None means the attribute ``n_points``.
+        """
         n = n_points or self.n_points
         size = -(-n // len(self.patches))
         codeword = self.encoder(points)

@@ -1,4 +1,4 @@
-"""The auto-encoder that the paper reconstructs small clouds with, and its encoder for all others.
+"""The auto-encoder for small clouds, and the encoder of all reconstruction nets.
 
 Achlioptas et al., "Learning Representations and Generative Models for 3D Point Clouds", ICML 2018;
 the task net of the paper's section "Reconstruction of small-scale point clouds".
@@ -9,14 +9,15 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, check_channels, linear_norm_relu
+from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
+from mops_lightning.nets.max_pool import PointMaxPool
 
 
 class PointEncoder(nn.Module):
-    """Per-point layers with BatchNorm and ReLU, and the maximum over points: the codeword.
+    """Pointwise layers with BatchNorm and ReLU, then the maximum over points: the codeword.
 
     Args:
-        codeword: its size d, the last layer's.
+        codeword: size d of the codeword, the last layer.
         channels: sizes of the layers before it.
 
     Raises:
@@ -25,11 +26,9 @@ class PointEncoder(nn.Module):
 
     def __init__(self, codeword: int = 128, channels: Sequence[int] = (64, 128, 128, 256)) -> None:
         super().__init__()
-        if not channels or min(codeword, *channels) < 1:
-            raise UserError(
-                "task.net.encoder: codeword and channels must be at least 1, got "
-                f"{codeword} and {list(channels)}."
-            )
+        if codeword < 1:
+            raise UserError(f"codeword must be at least 1, got {codeword}.")
+        check_channels("channels", channels)
         self.codeword = codeword
         self.features = PointMLP([3, *channels])
         self.pool = PointMaxPool(channels[-1], codeword)
@@ -40,16 +39,16 @@ class PointEncoder(nn.Module):
 
 
 class AutoEncoder(nn.Module):
-    """Encoder, and a decoder of linear layers that emits all coordinates of n points at once.
+    """Encoder, and a decoder of linear layers with all 3n coordinates as output.
 
     Args:
-        n_points: n, how many points are emitted; fixed once and for all.
+        n_points: n, the fixed number of output points.
         codeword: size d of the codeword.
-        encoder_channels: sizes of the encoder's layers before it.
+        encoder_channels: sizes of the encoder's layers before the codeword.
         decoder_channels: sizes of the decoder's hidden layers, with ReLU and without BatchNorm.
 
     Raises:
-        UserError: a layer has no channels, or there are no points.
+        UserError: an argument is out of range.
     """
 
     def __init__(
@@ -61,8 +60,9 @@ class AutoEncoder(nn.Module):
     ) -> None:
         super().__init__()
         if n_points < 1:
-            raise UserError(f"task.net.n_points must be at least 1, got {n_points}.")
-        check_channels("task.net.decoder_channels", decoder_channels)
+            raise UserError(f"n_points must be at least 1, got {n_points}.")
+        check_channels("encoder_channels", encoder_channels)
+        check_channels("decoder_channels", decoder_channels)
         self.n_points = n_points
         self.encoder = PointEncoder(codeword, encoder_channels)
         self.decoder = nn.Sequential(
@@ -75,15 +75,15 @@ class AutoEncoder(nn.Module):
 
         Args:
             points: the sampled or the full cloud.
-            n_points: None or the net's own number.
+            n_points: n, or None.
 
         Raises:
-            UserError: another number of points is asked for.
+            UserError: ``n_points`` is neither None nor n.
         """
         if n_points not in (None, self.n_points):
             raise UserError(
-                f"task/net=autoencoder emits the {self.n_points} points that it was trained for, "
-                f"not {n_points}. Train one with task.net.n_points={n_points}, or take "
-                "task/net=mfoldingnet, whose number of points can change."
+                f"n_points must be {self.n_points}, the size this AutoEncoder was made for, got "
+                f"{n_points}. Train one for {n_points} points, or use MFoldingNet "
+                "(task/net=mfoldingnet), which has a variable number of points."
             )
         return self.decoder(self.encoder(points)).unflatten(1, (-1, 3))

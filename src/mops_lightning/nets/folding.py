@@ -1,4 +1,4 @@
-"""The folding operator: a small MLP on [codeword piece, coordinates], block by block.
+"""The folding operation: a small MLP on [piece of the codeword, coordinates].
 
 Yang et al., "FoldingNet: Point Cloud Auto-Encoder via Deep Grid Deformation", CVPR 2018.
 """
@@ -13,19 +13,20 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
 BLOCK_ROWS = {"cpu": 1024}
-"""Grid points whose wide hidden layer is held at a time; on a CPU it then stays in the cache."""
-MANY_ROWS = 2**16
-"""The same for all other devices, where one large product is the fastest."""
+"""Grid points per block on a CPU, where the wide hidden layer of a block stays in the cache."""
+
+DEFAULT_BLOCK_ROWS = 2**16
+"""Grid points per block on other devices, where a large product is the fastest."""
 
 
 class Fold(nn.Module):
-    """One folding: linear layers on [codeword piece, coordinates], the last one to 3-D.
+    """One folding: linear layers on [piece of the codeword, coordinates], with a 3-D output.
 
-    The piece is multiplied once, not once per grid point, and the first hidden layer, by far the
-    widest, is never held for all grid points: the way back computes it anew.
+    The product with the piece is computed once, not for every grid point. The first hidden layer,
+    by far the widest, is computed block by block, and again in the backward pass.
 
     Args:
-        piece: size of the codeword piece.
+        piece: size of a piece of the codeword.
         coordinates: 2 for a grid, 3 for points.
         channels: sizes of the hidden layers, with ReLU.
     """
@@ -40,19 +41,19 @@ class Fold(nn.Module):
         self.rest = nn.Sequential(*rest)
 
     def forward(self, pieces: Tensor, coordinates: Tensor) -> Tensor:
-        """Fold ``(P, piece)`` and ``(P or 1, g, coordinates)`` to ``(P, g, 3)``."""
+        """Map ``(P, piece)`` and ``(P or 1, g, coordinates)`` to ``(P, g, 3)``."""
         narrow, offsets = self.narrow, self.from_piece(pieces)
         others = (coordinates, self.from_coordinates.weight, narrow.weight, narrow.bias)
-        # Under autocast the offsets alone would be of half precision.
+        # Under autocast, only the offsets would be in half precision.
         return self.rest(_WideLayer.apply(offsets, *(other.to(offsets) for other in others)))
 
 
 class _WideLayer(Function):
-    """relu(o_p + C_pg·Wᵀ)·Vᵀ + b by blocks of P and g, without the wide hidden layer in memory.
+    """relu(o_p + C_pg·Wᵀ)·Vᵀ + b in blocks of P and g, without the full hidden layer in memory.
 
     o is ``(P, w)``, C ``(P or 1, g, c)``, W ``(w, c)``, V ``(v, w)``, b ``(v,)``; the result is
-    ``(P, g, v)``. The backward pass makes the hidden layer anew, which costs c + 1 products per
-    number against the v of the rest.
+    ``(P, g, v)``. The backward pass recomputes the hidden layer, at c + 1 products per entry,
+    compared with v products for the rest.
     """
 
     @staticmethod
@@ -82,7 +83,7 @@ class _WideLayer(Function):
             d_outer.addmm_(rows.T, hidden.flatten(0, 1))
             d_hidden = (rows @ outer).view_as(hidden)
             d_hidden = torch.ops.aten.threshold_backward(d_hidden, hidden, 0)
-            # One product for the sum over the grid and the gradient of W: skinny ones are slow.
+            # One product gives the sum over the grid and the gradient of W; narrow ones are slow.
             ones = places.new_ones(*places.shape[:2], 1)
             both = torch.cat([places, ones], 2).mT.expand(len(d_hidden), -1, -1) @ d_hidden
             d_inner += both[:, :-1].sum(0)
@@ -96,8 +97,8 @@ class _WideLayer(Function):
 
 
 def _blocks(result: Tensor) -> Iterator[tuple[slice, slice]]:
-    """Yield slices of pieces and of grid points, whose product is a block."""
-    rows = BLOCK_ROWS.get(result.device.type, MANY_ROWS)
+    """Yield slices of pieces and of grid points for every block."""
+    rows = BLOCK_ROWS.get(result.device.type, DEFAULT_BLOCK_ROWS)
     pieces, grid = result.shape[:2]
     per_grid = min(grid, rows)
     per_piece = max(1, rows // per_grid)
@@ -107,10 +108,10 @@ def _blocks(result: Tensor) -> Iterator[tuple[slice, slice]]:
 
 
 def _part(coordinates: Tensor, pieces: slice, grid: slice) -> Tensor:
-    """Cut a block out of coordinates that may be shared by all pieces."""
+    """Return a block of coordinates, which all pieces may share."""
     return coordinates[:, grid] if len(coordinates) == 1 else coordinates[pieces, grid]
 
 
 def _hidden(offsets: Tensor, coordinates: Tensor, inner: Tensor) -> Tensor:
-    """Return the wide layer of one block, ``(p, g, w)``."""
+    """Return the wide hidden layer of a block, ``(p, g, w)``."""
     return (coordinates @ inner.T).add(offsets[:, None]).relu_()

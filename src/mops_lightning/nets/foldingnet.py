@@ -1,4 +1,4 @@
-"""FoldingNet and M-FoldingNet: 2-D grids folded to surfaces.
+"""FoldingNet and M-FoldingNet: decoders that fold 2-D grids to surfaces.
 
 Yang et al., "FoldingNet: Point Cloud Auto-Encoder via Deep Grid Deformation", CVPR 2018, and the
 paper's section "Reconstruction of large-scale point clouds".
@@ -14,19 +14,26 @@ from torch import Tensor, nn
 from mops_lightning.errors import UserError
 from mops_lightning.nets.autoencoder import PointEncoder
 from mops_lightning.nets.folding import Fold
-from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, check_channels, linear_norm_relu
+from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
+from mops_lightning.nets.max_pool import PointMaxPool
 from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.ops.points import gather_points
 
 REACH = 0.3
-"""The grid covers [-0.3, 0.3]², as FoldingNet's."""
+"""The grid covers [-0.3, 0.3]², as in FoldingNet."""
 
 
 def square_grid(n: int) -> Tensor:
-    """Return n points ``(n, 2)`` of a regular grid over [-0.3, 0.3]², row by row.
+    """Return n points of a regular grid over [-0.3, 0.3]², row by row.
 
-    The sides are the divisors of n that are nearest to each other; where one would be more than
-    four times the other, the first n points of the next larger square are taken.
+    The grid has the most nearly square shape with n points. If its sides differ by more than a
+    factor of four, the first n points of the next larger square grid are returned.
+
+    Args:
+        n: number of points.
+
+    Returns:
+        ``(n, 2)`` float32.
     """
     rows = math.isqrt(n)
     while n % rows:
@@ -39,43 +46,39 @@ def square_grid(n: int) -> Tensor:
 
 
 class FoldingDecoder(nn.Module):
-    """Cuts the codeword into M pieces and folds a grid with each, all by one folding operator.
+    """Splits the codeword into M pieces and folds a grid with each, with shared weights.
 
-    M = 1 is FoldingNet's decoder.
+    With M = 1 it is FoldingNet's decoder.
 
     Args:
-        codeword: its size d, a multiple of M.
+        codeword: size d of the codeword, a multiple of M.
         pieces: M.
-        channels: sizes of the hidden layers of both foldings.
+        fold_channels: sizes of the hidden layers of both foldings.
 
     Raises:
-        UserError: the codeword cannot be cut so.
+        UserError: an argument is out of range.
     """
 
-    def __init__(self, codeword: int, pieces: int, channels: Sequence[int]) -> None:
+    def __init__(self, codeword: int, pieces: int, fold_channels: Sequence[int]) -> None:
         super().__init__()
         if pieces < 1 or codeword % pieces:
-            raise UserError(
-                f"task.net.pieces must divide the codeword's {codeword} numbers, got {pieces}."
-            )
-        check_channels("task.net.fold_channels", channels)
+            raise UserError(f"pieces must be a divisor of codeword={codeword}, got {pieces}.")
+        check_channels("fold_channels", fold_channels)
         self.pieces = pieces
-        self.first = Fold(codeword // pieces, 2, channels)
-        self.second = Fold(codeword // pieces, 3, channels)
+        self.first = Fold(codeword // pieces, 2, fold_channels)
+        self.second = Fold(codeword // pieces, 3, fold_channels)
 
     def forward(self, codeword: Tensor, n_points: int) -> Tensor:
         """Map ``(B, d)`` codewords to ``(B, n, 3)``.
 
-        Every piece folds the same grid of n/M points; where that is no whole number, it is rounded
-        up and the last pieces do without the last grid point.
+        Every piece folds the same grid of ⌈n/M⌉ points; surplus points are dropped from the last
+        pieces.
 
         Raises:
-            UserError: there are fewer points than pieces.
+            UserError: n is smaller than M.
         """
         if n_points < self.pieces:
-            raise UserError(
-                f"task.net.n_points must be at least task.net.pieces={self.pieces}, got {n_points}."
-            )
+            raise UserError(f"n_points must be at least pieces={self.pieces}, got {n_points}.")
         grid = square_grid(-(-n_points // self.pieces)).to(codeword)
         pieces = codeword.reshape(len(codeword) * self.pieces, -1)
         folded = self.second(pieces, self.first(pieces, grid[None]))
@@ -84,20 +87,22 @@ class FoldingDecoder(nn.Module):
 
 
 class GraphEncoder(nn.Module):
-    """FoldingNet's own encoder: local covariances, and two layers that look at the neighbours.
+    """FoldingNet's graph-based encoder: local covariances, and two graph layers.
 
     Args:
-        codeword: size of the codeword.
-        k: neighbours of a point, itself included.
+        codeword: size d of the codeword.
+        k: neighbours of a point, including itself.
 
     Raises:
-        UserError: a number is below 1.
+        UserError: an argument is below 1.
     """
 
     def __init__(self, codeword: int = 512, k: int = 16) -> None:
         super().__init__()
-        if min(codeword, k) < 1:
-            raise UserError(f"task.net: codeword and k must be at least 1, got {codeword} and {k}.")
+        if codeword < 1:
+            raise UserError(f"codeword must be at least 1, got {codeword}.")
+        if k < 1:
+            raise UserError(f"k must be at least 1, got {k}.")
         self.codeword = codeword
         self.k = k
         self.features = PointMLP([12, 64, 64, 64])
@@ -108,40 +113,40 @@ class GraphEncoder(nn.Module):
         )
 
     def forward(self, points: Tensor) -> Tensor:
-        """Map ``(B, N, 3)`` points to ``(B, d)`` codewords; with fewer points than k, all count."""
+        """Map ``(B, N, 3)`` points, any N, to ``(B, d)`` codewords."""
         k = min(self.k, points.shape[1])
         with torch.no_grad():
             indices = k_nearest(points, points, k)[1]
-        around = gather_points(points, indices.flatten(1)).unflatten(1, indices.shape[1:])
-        around = around - around.mean(2, keepdim=True)
-        covariance = around.mT @ around / k
+        neighbours = gather_points(points, indices.flatten(1)).unflatten(1, indices.shape[1:])
+        centred = neighbours - neighbours.mean(2, keepdim=True)
+        covariance = centred.mT @ centred / k
         local = self.features(torch.cat([points, covariance.flatten(2)], 2))
-        local = self.graph(_largest_around(local, indices))
-        return self.head(self.pool(_largest_around(local, indices)))
+        local = self.graph(_neighbour_max(local, indices))
+        return self.head(self.pool(_neighbour_max(local, indices)))
 
 
-def _largest_around(features: Tensor, indices: Tensor) -> Tensor:
-    """Take, per channel, the maximum of ``(B, N, C)`` over a point's ``(B, N, k)`` neighbours."""
+def _neighbour_max(features: Tensor, indices: Tensor) -> Tensor:
+    """Return the maximum of ``(B, N, C)`` features over the ``(B, N, k)`` neighbours of points."""
     rows = gather_points(features, indices.flatten(1)).unflatten(1, indices.shape[1:])
     return rows.amax(2)
 
 
 class MFoldingNet(nn.Module):
-    """An encoder, and a decoder that folds one grid per piece of the codeword, all in one way.
+    """M-FoldingNet: an encoder, and a decoder that folds one grid per piece of the codeword.
 
-    With one piece it is FoldingNet. The hidden layers of a folding are not given by the paper;
-    2048 and 144 meet its model sizes best (see the tests): 4.9, 3.3, 3.1, 2.9, 2.9, 2.8, 2.8 MB for
-    M = 1, 4, 8, 16, 32, 64, 128 at d = 128, against 4.7, 3.1, 2.9, 2.8, 2.8, 2.8, 2.8.
+    With one piece it is FoldingNet. The paper does not give the hidden layers of a folding; 2048
+    and 144 match its model sizes best: 4.9, 3.3, 3.1, 2.9, 2.9, 2.8, 2.8 MB for M = 1, 4, 8, 16,
+    32, 64, 128 at d = 128, compared with 4.7, 3.1, 2.9, 2.8, 2.8, 2.8, 2.8 MB in the paper.
 
     Args:
-        n_points: how many points are emitted when the call does not say; may change at any time.
+        n_points: default number of output points; the attribute may be changed at any time.
         pieces: M.
-        codeword: its size d, a multiple of M.
-        encoder: ``mlp``, the paper's for all its nets, or ``graph``, FoldingNet's own.
+        codeword: size d of the codeword, a multiple of M.
+        encoder: ``mlp``, the encoder of all nets in the paper, or ``graph``, FoldingNet's own.
         fold_channels: sizes of the hidden layers of each of the two foldings.
 
     Raises:
-        UserError: a number is out of range.
+        UserError: an argument is out of range.
     """
 
     def __init__(
@@ -154,14 +159,17 @@ class MFoldingNet(nn.Module):
     ) -> None:
         super().__init__()
         if n_points < pieces:
-            raise UserError(
-                f"task.net.n_points must be at least task.net.pieces={pieces}, got {n_points}."
-            )
+            raise UserError(f"n_points must be at least pieces={pieces}, got {n_points}.")
         self.n_points = n_points
         make_encoder = GraphEncoder if encoder == "graph" else PointEncoder
         self.encoder = make_encoder(codeword)
         self.decoder = FoldingDecoder(codeword, pieces, fold_channels)
 
     def forward(self, points: Tensor, n_points: int | None = None) -> Tensor:
-        """Map ``(B, N, 3)`` points, any N, to ``(B, n, 3)``; see ``n_points`` above."""
+        """Map ``(B, N, 3)`` points, any N, to ``(B, n, 3)``.
+
+        Args:
+            points: the sampled or the full cloud.
+            n_points: n; None means the attribute ``n_points``.
+        """
         return self.decoder(self.encoder(points), n_points or self.n_points)

@@ -1,4 +1,4 @@
-"""Iterative closest points: the classical yardstick that learned registration is measured by."""
+"""Iterative closest point (ICP), the classical baseline for registration."""
 
 import numpy as np
 import torch
@@ -9,17 +9,17 @@ from mops_lightning.ops.rigid import Motion, quaternion_from_matrix
 
 
 class ICP(nn.Module):
-    """Point-to-point ICP (Besl and McKay, 1992) by trimesh, from the identity.
+    """Point-to-point ICP (Besl and McKay, 1992) from trimesh, starting at the identity.
 
-    It has no weights and lets no gradient through: nothing can be trained under it, but any sampler
-    can be tested with it.
+    It has no weights and passes no gradients: it cannot train a sampler, but test any.
 
     Args:
-        max_iterations: of closest points and best motion, 1 or more.
-        threshold: stop where the mean squared distance improves by less than this.
+        max_iterations: largest number of iterations, at least 1.
+        threshold: ICP stops when the mean squared distance improves by less than this value, in
+            squared units of the coordinates.
 
     Raises:
-        UserError: a number is out of range.
+        UserError: an argument is out of range.
     """
 
     differentiable = False
@@ -27,15 +27,15 @@ class ICP(nn.Module):
     def __init__(self, max_iterations: int = 20, threshold: float = 1e-5) -> None:
         super().__init__()
         if max_iterations < 1:
-            raise UserError(f"task.net.max_iterations must be at least 1, got {max_iterations}.")
+            raise UserError(f"max_iterations must be at least 1, got {max_iterations}.")
         if not 0 <= threshold < np.inf:
-            raise UserError(f"task.net.threshold must not be negative, got {threshold}.")
+            raise UserError(f"threshold must be a number of at least 0, got {threshold}.")
         self.max_iterations = max_iterations
         self.threshold = threshold
 
     @torch.no_grad()
     def forward(self, source: Tensor, target: Tensor) -> Motion:
-        """Return the motion that takes ``(B, M, 3)`` sources to ``(B, M', 3)`` targets."""
+        """Return the motion from ``(B, M, 3)`` sources to ``(B, M', 3)`` targets."""
         pairs = zip(_numpy(source), _numpy(target), strict=True)
         matrices = torch.from_numpy(np.stack([self._align(a, b) for a, b in pairs]))
         rotation, translation = matrices[:, :3, :3], matrices[:, :3, 3]

@@ -1,4 +1,4 @@
-"""PCRNet: a rigid motion from the global features of two clouds.
+"""PCRNet: registration from the global features of two clouds.
 
 Sarode et al., "PCRNet: Point Cloud Registration Network using PointNet Encoding", 2019; the task
 net of the paper's section "Registration-oriented Downsampling".
@@ -11,28 +11,30 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, check_channels, linear_norm_relu
+from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
+from mops_lightning.nets.max_pool import PointMaxPool
 from mops_lightning.ops.rigid import Motion, identity_motion
 
 
 class PCRNet(nn.Module):
-    """Two clouds through one PointNet, and a head that answers quaternion and translation.
+    """A PointNet shared by both clouds, and a head that predicts quaternion and translation.
 
-    Layers 64, 64, 64, 128, 1024 per point, maximum over points, both results side by side through
-    1024, 1024, 512, 512, 256 to 7 numbers. There is no BatchNorm.
+    Pointwise layers of 64, 64, 64, 128 and 1024 channels and the maximum over points; then both
+    global features are concatenated and pass layers of 1024, 1024, 512, 512, 256 and 7. There is no
+    BatchNorm.
 
-    Weights start as He et al. (ICCV 2015) draw them: without BatchNorm the usual smaller ones let
-    the signal fade on its way through eleven layers, and training does not get off the ground. The
-    last bias starts at the identity.
+    Weights are initialised as by He et al. (ICCV 2015): without BatchNorm, the signal vanishes in
+    eleven layers with PyTorch's smaller default weights, and the training stalls. The bias of the
+    last layer starts at the identity.
 
     Args:
-        iterations: passes; each moves the source by what the ones before it found, and the motions
-            add up. 1 is the paper's, 8 the authors' own.
-        feature_channels: sizes of the per-point layers.
+        iterations: number of passes. Each pass registers the source as moved by the passes before
+            it, and the motions are composed. The paper uses 1, PCRNet's authors 8.
+        feature_channels: sizes of the pointwise layers.
         head_channels: sizes of the hidden layers of the head.
 
     Raises:
-        UserError: there is no pass, or a layer has no channels.
+        UserError: an argument is out of range.
     """
 
     def __init__(
@@ -43,9 +45,9 @@ class PCRNet(nn.Module):
     ) -> None:
         super().__init__()
         if iterations < 1:
-            raise UserError(f"task.net.iterations must be at least 1, got {iterations}.")
-        check_channels("task.net.feature_channels", feature_channels, 2)
-        check_channels("task.net.head_channels", head_channels)
+            raise UserError(f"iterations must be at least 1, got {iterations}.")
+        check_channels("feature_channels", feature_channels, 2)
+        check_channels("head_channels", head_channels)
         self.iterations = iterations
         self.features = PointMLP([3, *feature_channels[:-1]], norm=False)
         self.pool = PointMaxPool(feature_channels[-2], feature_channels[-1], norm=False)
@@ -59,23 +61,23 @@ class PCRNet(nn.Module):
             self.motion.bias.copy_(torch.eye(7)[0])
 
     def forward(self, source: Tensor, target: Tensor) -> Motion:
-        """Return the motion that takes the source to the target.
+        """Return the motion from the source to the target.
 
         Args:
-            source: ``(B, M, 3)``, centroid near the origin.
-            target: ``(B, M', 3)``, the same.
+            source: ``(B, M, 3)``, with the centroid near the origin.
+            target: ``(B, M', 3)``, with the centroid near the origin.
         """
         total = identity_motion(source)
-        aim = None
+        of_target = None
         for _ in range(self.iterations):
-            moved = total.apply(source) if aim is not None else source
-            if aim is None and source.shape == target.shape:
-                mine, aim = self._global(torch.cat([moved, target])).chunk(2)
+            moved = total.apply(source) if of_target is not None else source
+            if of_target is None and source.shape == target.shape:
+                of_source, of_target = self._global(torch.cat([moved, target])).chunk(2)
             else:
-                mine = self._global(moved)
-                aim = self._global(target) if aim is None else aim
-            answer = self.motion(self.head(torch.cat([mine, aim], 1))).to(source)
-            step = Motion(F.normalize(answer[:, :4], dim=1), answer[:, 4:])
+                of_source = self._global(moved)
+                of_target = self._global(target) if of_target is None else of_target
+            predicted = self.motion(self.head(torch.cat([of_source, of_target], 1))).to(source)
+            step = Motion(F.normalize(predicted[:, :4], dim=1), predicted[:, 4:])
             total = step.after(total)
         return total
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.losses.subset import subset_losses
-from mops_lightning.nets.pointnet import PointFeatures, check_channels, linear_norm_relu
+from mops_lightning.nets.layers import PointFeatures, check_channels, linear_norm_relu
 from mops_lightning.ops.precision import pointwise_autocast
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.base import Sampler

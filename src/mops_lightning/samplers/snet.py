@@ -10,7 +10,8 @@ from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.losses.subset import simplification_losses
-from mops_lightning.nets.pointnet import PointMaxPool, PointMLP, check_channels, linear_norm_relu
+from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
+from mops_lightning.nets.max_pool import PointMaxPool
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.types import SampleOutput
 

@@ -1,0 +1,146 @@
+"""A linear layer with BatchNorm, ReLU and the maximum over points, without its wide output."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+from torch.nn import functional as F
+
+from mops_lightning.ops.extreme import GROUP, blocked_argextreme
+
+PLAIN_MAX_POINTS = 32
+"""Up to this number of points, ``PointMaxPool`` computes the plain layers."""
+
+
+class PointMaxPool(nn.Module):
+    """Linear layer, BatchNorm, ReLU and maximum over points, without the (B, N, C) tensor.
+
+    The maximum commutes with the increasing map x ↦ relu(a·x + b), a ≥ 0; for a < 0, the minimum
+    takes its place. The wide product is therefore needed only to find the winning point of every
+    channel. The mean and variance of the product, for BatchNorm, follow from the mean and
+    covariance of the narrower input: mean(Wx) = W·mean(x), var(Wx) = diag(W·cov(x)·Wᵀ). Values and
+    gradients are those of the plain layers; gradients flow through the winning points only.
+
+    Args:
+        channels_in: channels of the input.
+        channels_out: channels of the result.
+        norm: whether there is a BatchNorm; without it, the linear layer has a bias.
+    """
+
+    def __init__(self, channels_in: int, channels_out: int, norm: bool = True) -> None:
+        super().__init__()
+        self.linear = nn.Linear(channels_in, channels_out, bias=not norm)
+        self.norm = nn.BatchNorm1d(channels_out) if norm else None
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map ``(B, N, channels_in)`` to ``(B, channels_out)`` in the dtype of the weights."""
+        if features.shape[1] <= PLAIN_MAX_POINTS:
+            features = features.to(self.linear.weight)
+            rows = self.linear(features.flatten(0, 1))  # faster than finding the winners
+            rows = rows if self.norm is None else self.norm(rows)
+            return F.relu(rows.unflatten(0, features.shape[:2]).amax(1))
+        if self.norm is None:
+            increasing = torch.zeros_like(self.linear.bias, dtype=torch.bool)
+            return F.relu(self._extremes(features, increasing) + self.linear.bias)
+        mean, scale = self._mean_and_scale(self.norm, features)
+        extremes = self._extremes(features, (scale < 0).detach())
+        assert self.norm.bias is not None
+        return F.relu((extremes - mean) * scale + self.norm.bias)
+
+    def _mean_and_scale(self, norm: nn.BatchNorm1d, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and gamma/std of the wide product, and update the running statistics."""
+        weight = self.linear.weight
+        assert norm.running_mean is not None
+        assert norm.running_var is not None
+        if not self.training:
+            mean, variance = norm.running_mean, norm.running_var
+        else:
+            rows = features.flatten(0, 1).to(weight)
+            centre = rows.mean(0)
+            centred = rows - centre
+            covariance = centred.mT @ centred / rows.shape[0]
+            mean = weight @ centre
+            variance = ((weight @ covariance) * weight).sum(1)
+            with torch.no_grad():
+                momentum = 0.1 if norm.momentum is None else norm.momentum
+                unbiased = variance * (rows.shape[0] / max(rows.shape[0] - 1, 1))
+                norm.running_mean.lerp_(mean.to(norm.running_mean.dtype), momentum)
+                norm.running_var.lerp_(unbiased.to(norm.running_var.dtype), momentum)
+                if norm.num_batches_tracked is not None:
+                    norm.num_batches_tracked += 1
+        return mean, norm.weight * torch.rsqrt(variance + norm.eps)
+
+    def _extremes(self, features: Tensor, decreasing: Tensor) -> Tensor:
+        """Return the maximum, or for decreasing channels the minimum, of the product ``(B, C)``."""
+        weight = self.linear.weight
+        sign = torch.where(decreasing, -1.0, 1.0).to(weight)
+        signed = (sign[:, None] * weight).to(features)
+        return sign * _MaxOverPoints.apply(features, signed).to(weight)
+
+
+class _MaxOverPoints(Function):
+    """The maximum over points of a linear map: ``(B, N, D)`` and ``(C, D)`` to ``(B, C)``.
+
+    One point per cloud and channel wins. Both gradients are therefore sums of few weighted rows,
+    which ``embedding_bag`` adds without a (B, C, D) tensor: the gradient of the weight sums over
+    the winners of a channel, that of the features over the channels that a point wins.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, weight: Tensor) -> Tensor:
+        clouds, n, _ = features.shape
+        if not any(ctx.needs_input_grad):
+            return torch.stack([(weight @ cloud.mT).amax(1) for cloud in features])
+        if features.is_cuda:
+            extremes, winners = (weight @ features.mT).max(2)
+        else:  # cloud by cloud, the product stays in the cache
+            padded = torch.cat([features, features[:, :1].expand(-1, -n % GROUP, -1)], 1)
+            extremes = features.new_empty(clouds, len(weight))
+            winners = torch.empty(clouds, len(weight), dtype=torch.int64)
+            for cloud, values, rows in zip(padded, extremes, winners, strict=True):
+                product = weight @ cloud.mT
+                place = blocked_argextreme(product, largest=True)
+                values.copy_(product.gather(1, place)[:, 0])
+                rows.copy_(place[:, 0])
+            # A padding copy can exceed the first point by a rounding error of the product.
+            winners.masked_fill_(winners >= n, 0)
+        ctx.save_for_backward(features, weight, winners)
+        return extremes
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        features, weight, winners = ctx.saved_tensors
+        (gradient,) = gradients
+        dtype = features.dtype
+        if dtype.itemsize < 4:  # sums of few rows: float32 costs little here
+            features, weight, gradient = features.float(), weight.float(), gradient.float()
+        clouds, n, _ = features.shape
+        channels = len(weight)
+        to_features = to_weight = None
+        places = winners + torch.arange(clouds, device=winners.device)[:, None] * n
+        if ctx.needs_input_grad[0]:
+            places_sorted, order = places.flatten().sort()
+            starts = torch.searchsorted(
+                places_sorted, torch.arange(clouds * n, device=places.device)
+            )
+            to_features = F.embedding_bag(
+                order % channels,
+                weight,
+                starts,
+                mode="sum",
+                per_sample_weights=gradient.flatten()[order],
+            ).view_as(features)
+        if ctx.needs_input_grad[1]:
+            to_weight = F.embedding_bag(
+                places.T.contiguous(),
+                features.flatten(0, 1),
+                mode="sum",
+                per_sample_weights=gradient.T.contiguous(),
+            )
+        return (
+            None if to_features is None else to_features.to(dtype),
+            None if to_weight is None else to_weight.to(dtype),
+        )

@@ -1,0 +1,48 @@
+"""What every reconstruction net guarantees. A new net adds one line to NETS."""
+
+import pytest
+import torch
+
+from mops_lightning.nets.atlasnet import AtlasNet
+from mops_lightning.nets.autoencoder import AutoEncoder
+from mops_lightning.nets.foldingnet import MFoldingNet
+
+NETS = {
+    "autoencoder": lambda n: AutoEncoder(n, 16, (8, 8), (16,)),
+    "foldingnet": lambda n: MFoldingNet(n, 1, 16, fold_channels=(32, 8)),
+    "mfoldingnet": lambda n: MFoldingNet(n, 4, 16, fold_channels=(32, 8)),
+    "graph": lambda n: MFoldingNet(n, 4, 16, "graph", fold_channels=(32, 8)),
+    "atlasnet": lambda n: AtlasNet(n, 3, 16, (32, 8)),
+}
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_output_is_independent_of_order_and_batch(name, rng):
+    torch.manual_seed(0)
+    net = NETS[name](50).eval()
+    points = torch.randn(3, 40, 3, generator=rng)
+    out = net(points)
+    assert out.shape == (3, 50, 3)
+    order = torch.randperm(40, generator=rng)
+    torch.testing.assert_close(net(points[:, order]), out, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(net(points[1:2]), out[1:2], atol=1e-5, rtol=1e-4)
+    assert net(points[:, :7]).shape == (3, 50, 3)
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_all_parameters_have_gradients(name, rng):
+    torch.manual_seed(0)
+    net = NETS[name](50)
+    net(torch.randn(3, 40, 3, generator=rng)).square().sum().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in net.parameters())
+
+
+@pytest.mark.parametrize("name", ["foldingnet", "mfoldingnet", "graph", "atlasnet"])
+@pytest.mark.parametrize("n", [4, 7, 50, 101, 300])
+def test_number_of_points_is_variable(name, n, rng):
+    torch.manual_seed(0)
+    net = NETS[name](50).eval()
+    points = torch.randn(2, 40, 3, generator=rng)
+    assert net(points, n).shape == (2, n, 3)
+    net.n_points = n
+    torch.testing.assert_close(net(points), net(points, n))

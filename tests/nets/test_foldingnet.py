@@ -1,0 +1,101 @@
+import pytest
+import torch
+from torch.nn import functional as F
+
+from mops_lightning.errors import UserError
+from mops_lightning.nets.foldingnet import (
+    REACH,
+    FoldingDecoder,
+    GraphEncoder,
+    MFoldingNet,
+    square_grid,
+)
+
+
+def test_square_grid_is_regular_and_nearly_square():
+    for n in (1, 2, 7, 12, 79, 256, 313, 1024):
+        grid = square_grid(n)
+        assert grid.shape == (n, 2)
+        assert grid.abs().max() <= REACH
+        assert len({tuple(row) for row in grid.tolist()}) == n
+        sides = sorted(len(set(grid[:, axis].tolist())) for axis in (0, 1))
+        assert sides[1] <= 4 * sides[0]
+
+
+def plain_folding(decoder, codeword, n):
+    """FoldingNet's decoder as published, with the codeword repeated for every grid point."""
+    grid = square_grid(n).expand(len(codeword), -1, -1)
+    points = grid
+    for fold in (decoder.first, decoder.second):
+        rows = torch.cat([codeword[:, None].expand(-1, n, -1), points], 2)
+        weight = torch.cat([fold.from_piece.weight, fold.from_coordinates.weight], 1)
+        hidden = F.relu(F.linear(rows, weight, fold.from_piece.bias))
+        points = fold.rest(fold.narrow(hidden))
+    return points
+
+
+def test_decoder_with_one_piece_equals_foldingnet(rng):
+    torch.manual_seed(0)
+    decoder = FoldingDecoder(16, 1, (32, 8))
+    codeword = torch.randn(3, 16, generator=rng)
+    torch.testing.assert_close(
+        decoder(codeword, 48), plain_folding(decoder, codeword, 48), atol=1e-5, rtol=1e-4
+    )
+
+
+def test_decoder_pieces_share_weights(rng):
+    torch.manual_seed(0)
+    decoder = FoldingDecoder(16, 4, (32, 8))
+    codeword = torch.randn(2, 16, generator=rng)
+    out = decoder(codeword, 48).unflatten(1, (12, 4))
+    one = FoldingDecoder(4, 1, (32, 8))
+    one.load_state_dict(decoder.state_dict())
+    for piece in range(4):
+        alone = one(codeword[:, 4 * piece : 4 * piece + 4], 12)
+        torch.testing.assert_close(out[:, :, piece], alone, atol=1e-5, rtol=1e-4)
+
+
+def test_mfoldingnet_size_by_pieces():
+    width = 2048
+    whole = sum(p.numel() for p in MFoldingNet(pieces=1).parameters())
+    for pieces in (4, 8, 16, 32, 64, 128):
+        cut = sum(p.numel() for p in MFoldingNet(pieces=pieces).parameters())
+        assert whole - cut == 2 * width * (128 - 128 // pieces)
+
+
+@pytest.mark.parametrize(
+    ("codeword", "published", "tolerance"),
+    [
+        (128, (4.7, 3.1, 2.9, 2.8, 2.8, 2.8, 2.8), 0.22),
+        (512, (12, 5.4, 4.4, 3.9, 3.6, 3.5, 3.5), 0.45),
+    ],
+)
+def test_mfoldingnet_has_published_size(codeword, published, tolerance):
+    for pieces, size in zip((1, 4, 8, 16, 32, 64, 128), published, strict=True):
+        net = MFoldingNet(10_000, pieces, codeword)
+        megabytes = 4e-6 * sum(p.numel() for p in net.parameters())
+        assert megabytes == pytest.approx(size, abs=tolerance)
+
+
+def test_graph_encoder_accepts_fewer_points_than_neighbours(rng):
+    torch.manual_seed(0)
+    net = GraphEncoder(16, k=4).eval()
+    points = torch.randn(2, 30, 3, generator=rng)
+    assert net(points).shape == (2, 16)
+    assert net(points[:, :2]).shape == (2, 16)  # fewer points than k
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: MFoldingNet(pieces=3), r"^pieces must be a divisor of codeword=128, got 3"),
+        (lambda: MFoldingNet(n_points=2), r"^n_points must be at least pieces=4, got 2"),
+        (lambda: MFoldingNet(fold_channels=[]), r"^fold_channels must be .*got \[\]"),
+        (lambda: MFoldingNet()(torch.randn(2, 9, 3), 3), r"^n_points must .* pieces=4, got 3"),
+        (lambda: GraphEncoder(0), "^codeword must be at least 1, got 0"),
+        (lambda: GraphEncoder(8, 0), "^k must be at least 1, got 0"),
+    ],
+)
+def test_foldingnet_invalid_argument_raises(make, message):
+    with pytest.raises(UserError, match=message):
+        make()

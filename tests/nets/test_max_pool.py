@@ -1,0 +1,84 @@
+import copy
+
+import pytest
+import torch
+from torch.nn import functional as F
+
+from mops_lightning.nets.max_pool import PLAIN_MAX_POINTS, PointMaxPool
+
+
+class PlainMaxPool(PointMaxPool):
+    """The same layers one after the other, with the full (B, N, C) tensor."""
+
+    def forward(self, features):
+        rows = self.linear(features.flatten(0, 1))
+        rows = F.relu(rows if self.norm is None else self.norm(rows))
+        return rows.unflatten(0, features.shape[:2]).amax(1)
+
+
+def pools(channels_in=6, channels_out=20, norm=True):
+    torch.manual_seed(1)
+    fast = PointMaxPool(channels_in, channels_out, norm).double()
+    if fast.norm is not None:
+        with torch.no_grad():
+            # A negative gamma turns the maximum into a minimum.
+            fast.norm.weight.copy_(torch.randn(channels_out))
+            fast.norm.bias.copy_(torch.randn(channels_out))
+    plain = PlainMaxPool(channels_in, channels_out, norm).double()
+    plain.load_state_dict(fast.state_dict())
+    return fast, plain
+
+
+@pytest.mark.parametrize("norm", [True, False])
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("points", [4, PLAIN_MAX_POINTS, PLAIN_MAX_POINTS + 1, 50, 100])
+def test_max_pool_equals_plain_layers(points, training, norm, rng):
+    fast, plain = pools(norm=norm)
+    outputs, gradients = [], []
+    features = torch.randn(3, points, 6, dtype=torch.float64, generator=rng)
+    weight = torch.randn(3, 20, dtype=torch.float64, generator=rng)
+    for net in (fast, plain):
+        net.train()
+        net(features + 1)  # running statistics that differ from the initial ones
+        net.train(training)
+        x = features.clone().requires_grad_()
+        out = net(x)
+        outputs.append(out)
+        gradients.append(torch.autograd.grad((out * weight).sum(), [x, *net.parameters()]))
+        with torch.no_grad():  # the path without saved tensors
+            net.eval()
+            outputs.append(net(features))
+    torch.testing.assert_close(outputs[:2], outputs[2:])
+    for got, want in zip(*gradients, strict=True):
+        torch.testing.assert_close(got, want)
+    for (name, got), want in zip(fast.named_buffers(), plain.buffers(), strict=True):
+        torch.testing.assert_close(got, want, msg=name)
+
+
+@pytest.mark.parametrize("norm", [True, False])
+def test_max_pool_gradcheck(norm, rng):
+    net = copy.deepcopy(pools(3, 5, norm)[0])
+    size = (2, PLAIN_MAX_POINTS + 3, 3)
+    features = torch.randn(size, dtype=torch.float64, generator=rng, requires_grad=True)
+    assert torch.autograd.gradcheck(net, (features,))
+
+
+def test_max_pool_frozen_passes_gradients_to_input(rng):
+    fast, plain = pools()
+    for net in (fast, plain):
+        net.requires_grad_(False).eval()
+    features = torch.randn(2, 60, 6, dtype=torch.float64, generator=rng, requires_grad=True)
+    got, want = (torch.autograd.grad(net(features).sum(), features)[0] for net in (fast, plain))
+    torch.testing.assert_close(got, want)
+
+
+def test_max_pool_ignores_padding(rng):
+    # Padding copies of the first point can exceed it by a rounding error; many sizes hit this case.
+    for number in range(PLAIN_MAX_POINTS + 1, PLAIN_MAX_POINTS + 40):
+        pool = PlainMaxPool(6, 40).double().eval()
+        features = torch.randn(2, number, 6, dtype=torch.float64, generator=rng)
+        features[:, 0] *= 5
+        fast = PointMaxPool(6, 40).double().eval()
+        fast.load_state_dict(pool.state_dict())
+        features.requires_grad_()
+        torch.testing.assert_close(fast(features), pool(features))
