@@ -51,6 +51,13 @@ class SampleOutput(NamedTuple):
         matrix: the sampling matrix S behind the points, or None.
         soft_projected: ``(B, M, 3)`` what the task net is trained on in place of ``points``, or
             None; exists in training only and is never a test result.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import SampleOutput
+        >>> points = torch.rand(2, 8, 3)
+        >>> SampleOutput(points, torch.arange(8).expand(2, 8), {}).first(5).points.shape
+        torch.Size([2, 5, 3])
     """
 
     points: Tensor

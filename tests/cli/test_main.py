@@ -59,7 +59,7 @@ def _classes(record):
 
 def test_weights_pictures_and_curves_are_real_files(main_job):
     folder, run, *_ = main_job
-    content = weights.load(run / "weights.pt")
+    content = weights.read(run / "weights.pt")
     assert content["state"]["queries.weight"].shape[0] == 8
     for name in ("clouds.png", "matrix.png"):
         assert (run / "pictures" / name).read_bytes().startswith(b"\x89PNG")
@@ -117,8 +117,8 @@ def test_joint_training_starts_from_the_pretrained_task(main_job):
     assert "training it first" not in out
     (path,) = (folder / "joint").rglob("result.json")
     before = next((folder / "cache" / "weights").rglob("weights.pt"))
-    after = weights.load(path.parent / "task_weights.pt")
-    assert after["sha256"] != weights.load(before)["sha256"]
+    after = weights.read(path.parent / "task_weights.pt")
+    assert after["sha256"] != weights.read(before)["sha256"]
 
 
 def test_registration_pretrains_trains_jointly_tests_and_is_evaluated_under_icp(tmp_path):
@@ -199,7 +199,7 @@ def test_cfg_job_shows_the_config(tmp_path):
         (["dataset.classes=[chiar]"], "chair"),
         (["ckpt_path=last", *TINY_WITH_PICTURES], "ckpt_path=last"),
         ([*TINY_WITH_PICTURES, "dataset.classes=[chair]"], "at least two classes"),
-        (["weights=nowhere.pt", *TINY_WITH_PICTURES], "weights: no file nowhere.pt"),
+        (["weights=nowhere.pt", *TINY_WITH_PICTURES], "no file nowhere.pt"),
     ],
 )
 def test_mistakes_end_in_one_clear_error(arguments, said, tmp_path):

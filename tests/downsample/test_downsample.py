@@ -99,7 +99,7 @@ def test_a_folder_is_done_again_only_where_something_is_missing_or_bad(folder, t
         (["--m", 0, "--method", "fps"], "--m must be"),
         (["--m", 41, "--weights", "weights.pt"], "trained for up to 40 points, got 41"),
         (["--weights", "task.pt"], "holds a task net"),
-        (["--weights", "nowhere.pt"], "--weights: no file nowhere.pt"),
+        (["--weights", "nowhere.pt"], "no file nowhere.pt"),
         (["--weights", "weights.pt", "--keep-attributes", "--readout", "generated"], "are new"),
         (["--m", 500, "--method", "fps"], "holds 299 points, fewer than --m 500"),
         (["--m", 5, "--method", "fps", "--chunk", 9], "--chunk goes with --weights"),

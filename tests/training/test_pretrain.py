@@ -16,7 +16,7 @@ def train(folder, *arguments):
 
 
 def files(folder, pattern):
-    return [weights.load(path) for path in sorted(folder.rglob(pattern))]
+    return [weights.read(path) for path in sorted(folder.rglob(pattern))]
 
 
 def test_a_task_net_can_be_trained_on_from_a_file_and_is_not_taken_for_a_new_one(tmp_path):
@@ -27,7 +27,7 @@ def test_a_task_net_can_be_trained_on_from_a_file_and_is_not_taken_for_a_new_one
         tmp_path, "learn=task", "task=registration", f"weights={first}", "optimizer.optimizer.lr=0"
     )
     assert record["notes"]["weights_loaded"] == published["sha256"]
-    own, again = (weights.load(path)["state"] for path in sorted(tmp_path.glob("run*/weights.pt")))
+    own, again = (weights.read(path)["state"] for path in sorted(tmp_path.glob("run*/weights.pt")))
     assert all(torch.equal(own[name], again[name]) for name in own)  # at a rate of 0 nothing moves
     assert len(files(tmp_path, "cache/weights/*/weights.pt")) == 1
 

@@ -17,7 +17,7 @@ def saved(tmp_path):
     return net, tmp_path / "weights.pt"
 
 
-def test_round_trip_is_exact_and_carries_its_facts(saved):
+def test_save_and_load_into_returns_equal_tensors_and_config(saved):
     net, path = saved
     other = PointNetVanilla(4)
     content = weights.load_into(other, path)
@@ -30,7 +30,7 @@ def test_round_trip_is_exact_and_carries_its_facts(saved):
     assert content["sha256"] == weights.digest(net.state_dict())
 
 
-def test_another_net_s_weights_are_refused_by_name(saved):
+def test_load_into_other_net_names_the_tensors(saved):
     _, path = saved
     with pytest.raises(UserError, match=r"another net's weights: head.7.weight is \(4, 256\)"):
         weights.load_into(PointNetVanilla(5), path)
@@ -39,28 +39,28 @@ def test_another_net_s_weights_are_refused_by_name(saved):
 
 
 @pytest.mark.parametrize("cut", [0, 10, 1000])
-def test_truncated_files_are_refused(saved, cut):
+def test_read_truncated_file_is_refused(saved, cut):
     _, path = saved
     path.write_bytes(path.read_bytes()[:cut])
     with pytest.raises(UserError, match="cannot be read"):
-        weights.load(path)
+        weights.read(path)
 
 
-def test_changed_tensors_are_noticed(saved):
+def test_read_changed_tensors_are_refused(saved):
     _, path = saved
     content = torch.load(path, weights_only=True)
     content["state"]["head.0.weight"][0, 0] += 1
     torch.save(content, path)
     with pytest.raises(UserError, match="damaged"):
-        weights.load(path)
+        weights.read(path)
 
 
-def test_missing_files_and_lightning_checkpoints_are_refused(tmp_path):
+def test_read_missing_file_or_checkpoint_is_refused(tmp_path):
     with pytest.raises(UserError, match="no file"):
-        weights.load(tmp_path / "nowhere.pt")
+        weights.read(tmp_path / "nowhere.pt")
     torch.save({"state_dict": {}}, tmp_path / "last.ckpt")
     with pytest.raises(UserError, match="ckpt_path"):
-        weights.load(tmp_path / "last.ckpt")
+        weights.read(tmp_path / "last.ckpt")
 
 
 def test_half_precision_tensors_are_cast_to_the_modules_dtype(saved):

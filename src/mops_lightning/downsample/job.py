@@ -23,7 +23,7 @@ from mops_lightning.samplers.poisson import PoissonSampler
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.streaming import stream_match, stream_sample
 from mops_lightning.samplers.voxel import VoxelSampler
-from mops_lightning.zoo import weights
+from mops_lightning.zoo.load import load
 
 CHUNK = 65536
 """Points that a learned sampler sees at a time; it bounds the memory that its features take."""
@@ -88,7 +88,7 @@ def sampler_of(settings: Settings) -> Sampler:
     """Build the sampler that the settings name.
 
     Raises:
-        UserError: the weights are no sampler's, or were trained for another number of points.
+        UserError: the weights are not a sampler's, or were trained for another number of points.
     """
     torch.manual_seed(settings.seed)
     if settings.method:
@@ -101,27 +101,15 @@ def sampler_of(settings: Settings) -> Sampler:
         own = {} if settings.method == "voxel" else {"seed": settings.seed}
         return classes[settings.method](settings.m, **own)
     assert settings.weights is not None
-    path = settings.weights.expanduser()
-    path = weights.of_run(path) if path.is_dir() else path
-    if not path.is_file():
-        raise UserError(f"--weights: no file {path}. Give a weights.pt, or the folder of its run.")
-    content = weights.load(path)
-    if content["config"]["learn"] == "task":
-        raise UserError(f"--weights: {path} holds a task net; give a sampler's run.")
-    from omegaconf import OmegaConf
-
-    from mops_lightning.config.build import build
-
-    sampler: Sampler = build(OmegaConf.create(content["config"]["sampler"]))
-    weights.fit_state(sampler, content["state"], path)
+    sampler = load(settings.weights)
     m = settings.m
     if m is not None and (m > sampler.m or (m != sampler.m and not sampler.flexible)):
         allowed = f"up to {sampler.m}" if sampler.flexible else f"{sampler.m}"
         raise UserError(
-            f"--m: {path} was trained for {allowed} points, got {m}. Leave --m out, or train "
-            f"with m={m}."
+            f"--m: {settings.weights} was trained for {allowed} points, got {m}. "
+            f"Leave --m out, or train with m={m}."
         )
-    return sampler.eval()
+    return sampler
 
 
 def run(

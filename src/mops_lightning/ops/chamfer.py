@@ -20,5 +20,11 @@ def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
 
     Raises:
         UserError: the shapes do not match, or a cloud is empty.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import chamfer_distance
+        >>> chamfer_distance(torch.zeros(1, 4, 3), torch.ones(1, 2, 3))
+        tensor([6.])
     """
     return nearest_distances(points, others).mean(1) + nearest_distances(others, points).mean(1)

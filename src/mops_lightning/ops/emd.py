@@ -45,6 +45,13 @@ def earth_movers_distance(
 
     Raises:
         UserError: the shapes differ, an argument is out of range, or a worker process died.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import earth_movers_distance
+        >>> points = torch.rand(2, 16, 3)
+        >>> earth_movers_distance(points, points.flip(1))
+        tensor([0., 0.])
     """
     rows = assignment(points, others, block, rounds, workers)
     return torch.linalg.vector_norm(points - gather_points(others, rows), dim=2).mean(1)

@@ -41,6 +41,13 @@ def farthest_point_sample(
 
     Raises:
         UserError: ``m`` or ``start`` is out of range.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import farthest_point_sample
+        >>> line = torch.tensor([[[0.0], [1.0], [2.0], [9.0]]])  # (B, N, C)
+        >>> farthest_point_sample(line, 3)
+        tensor([[0, 3, 2]])
     """
     clouds, n = points.shape[:2]
     if not 1 <= m <= n:

@@ -40,6 +40,13 @@ def nearest(queries: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
 
     Raises:
         UserError: the shapes do not match, or N is 0.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import nearest
+        >>> queries, points = torch.tensor([[[0.0], [4.0]]]), torch.tensor([[[1.0], [6.0]]])
+        >>> nearest(queries, points)
+        (tensor([[1., 4.]]), tensor([[0, 1]]))
     """
     _check_shapes(queries, points)
     with torch.no_grad():

@@ -24,6 +24,13 @@ def match(generated: Tensor, points: Tensor) -> Tensor:
 
     Raises:
         UserError: the shapes do not match, or a cloud is empty.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import match
+        >>> points = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]])
+        >>> match(torch.tensor([[[0.9, 0, 0], [1.2, 0, 0]]]), points)
+        tensor([[1, 1]])
     """
     return nearest(generated.detach(), points.detach())[1]
 
@@ -53,6 +60,13 @@ def complete(indices: Tensor, points: Tensor) -> Tensor:
 
     Raises:
         UserError: M is larger than N.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import complete
+        >>> points = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]])
+        >>> complete(torch.tensor([[1, 1]]), points)
+        tensor([[1, 2]])
     """
     if indices.shape[1] > points.shape[1]:
         raise UserError(

@@ -33,6 +33,14 @@ class SamplingMatrix(NamedTuple):
         queries: ``(M, C)``, the weights of the last layer of ρ.
         keys: ``(B, N, C)``, the input of that layer.
         tau: temperature τ of the softmax.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import SamplingMatrix
+        >>> queries, keys = torch.rand(8, 16), torch.rand(2, 64, 16)
+        >>> matrix = SamplingMatrix(queries, keys, tau=0.1)
+        >>> matrix.sample(torch.rand(2, 64, 3)).shape, matrix.dense().shape
+        (torch.Size([2, 8, 3]), torch.Size([2, 64, 8]))
     """
 
     queries: Tensor

@@ -13,11 +13,23 @@ from mops_lightning.types import SampleOutput
 class Sampler(nn.Module):
     """Base of all samplers: checks the input, then calls ``sample``.
 
+    Maps points ``(B, N, 3)`` to a ``SampleOutput`` with points ``(B, M, 3)``.
+
     Args:
         m: number of points to return; for a flexible sampler the largest number it can return.
 
     A subclass implements ``sample(points, m)``; a learned one also ``losses``, and one for many
     sizes ``training_sizes``. ``anneal`` is there for what changes in the course of the training.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import SampleOutput, Sampler
+        >>> class FirstPoints(Sampler):
+        ...     def sample(self, points, m):
+        ...         rows = torch.arange(m).expand(len(points), m)
+        ...         return SampleOutput(points[:, :m], rows, {})
+        >>> FirstPoints(m=8)(torch.rand(2, 64, 3)).points.shape
+        torch.Size([2, 8, 3])
     """
 
     flexible: bool = False

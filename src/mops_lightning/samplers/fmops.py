@@ -27,6 +27,14 @@ class FMOPSNet(MOPSNet):
 
     Raises:
         UserError: a setting is out of its range.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import FMOPSNet
+        >>> sampler = FMOPSNet(m_max=32).eval()
+        >>> points = torch.rand(2, 64, 3)  # (B, N, 3)
+        >>> sampler(points, m=5).points.shape, sampler(points, m=20).points.shape  # (B, m, 3)
+        (torch.Size([2, 5, 3]), torch.Size([2, 20, 3]))
     """
 
     flexible = True

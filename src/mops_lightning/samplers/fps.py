@@ -24,6 +24,13 @@ class FPSSampler(Sampler):
 
     Raises:
         UserError: ``start`` is negative or, when called, at least N.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import FPSSampler
+        >>> line = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]]])  # (B, N, 3)
+        >>> FPSSampler(m=3, start=0)(line).indices  # (B, m)
+        tensor([[0, 3, 2]])
     """
 
     flexible = True

@@ -36,6 +36,16 @@ class MOPSNet(Sampler):
     Raises:
         UserError: tau_min is not in (0, 1], alpha is negative, annealing is unknown, or a layer has
             no channels.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import MOPSNet
+        >>> points = torch.rand(2, 64, 3)  # (B, N, 3)
+        >>> output = MOPSNet(m=8).eval()(points)
+        >>> output.points.shape  # (B, m, 3)
+        torch.Size([2, 8, 3])
+        >>> output.matrix.dense().shape  # (B, N, m)
+        torch.Size([2, 64, 8])
     """
 
     generates = True

@@ -32,6 +32,13 @@ class PoissonSampler(Sampler):
     Args:
         m: largest number of points to return.
         seed: another seed decides ties in another way.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import PoissonSampler
+        >>> output = PoissonSampler(m=8)(torch.rand(2, 64, 3))  # (B, N, 3)
+        >>> output.points.shape, output.indices.shape  # (B, m, 3), (B, m)
+        (torch.Size([2, 8, 3]), torch.Size([2, 8]))
     """
 
     flexible = True

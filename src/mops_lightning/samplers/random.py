@@ -17,6 +17,13 @@ class RandomSampler(Sampler):
     Args:
         m: largest number of points to return.
         seed: another seed chooses other points.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import RandomSampler
+        >>> output = RandomSampler(m=8)(torch.rand(2, 64, 3))  # (B, N, 3)
+        >>> output.points.shape, output.indices.shape  # (B, m, 3), (B, m)
+        (torch.Size([2, 8, 3]), torch.Size([2, 8]))
     """
 
     flexible = True

@@ -59,6 +59,13 @@ class SampleNet(SNet):
 
     Raises:
         UserError: a setting is out of its range.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import SampleNet
+        >>> output = SampleNet(m=8)(torch.rand(2, 64, 3))  # (B, N, 3), in training mode
+        >>> output.points.shape, output.soft_projected.shape  # (B, m, 3)
+        (torch.Size([2, 8, 3]), torch.Size([2, 8, 3]))
     """
 
     def __init__(
@@ -109,4 +116,12 @@ class SampleNet(SNet):
 
 
 class ProgressiveSampleNet(Progressive, SampleNet):
-    """SampleNet with nested samples; settings as for ``Progressive`` and ``SampleNet``."""
+    """SampleNet with nested samples; settings as for ``Progressive`` and ``SampleNet``.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import ProgressiveSampleNet
+        >>> sampler = ProgressiveSampleNet(m_max=32).eval()
+        >>> sampler(torch.rand(2, 64, 3), m=5).points.shape  # (B, N, 3) to (B, m, 3)
+        torch.Size([2, 5, 3])
+    """

@@ -31,6 +31,12 @@ class SNet(Sampler):
 
     Raises:
         UserError: a weight is negative, a layer has no channels or layers are missing.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import SNet
+        >>> SNet(m=8).eval()(torch.rand(2, 64, 3)).points.shape  # (B, N, 3) to (B, m, 3)
+        torch.Size([2, 8, 3])
     """
 
     generates = True
@@ -127,4 +133,14 @@ class Progressive(Sampler):
 
 
 class ProgressiveSNet(Progressive, SNet):
-    """S-Net with nested samples; settings as for ``Progressive`` and ``SNet``."""
+    """S-Net with nested samples; settings as for ``Progressive`` and ``SNet``.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import ProgressiveSNet
+        >>> sampler = ProgressiveSNet(m_max=32).eval()
+        >>> sampler(torch.rand(2, 64, 3), m=5).points.shape  # (B, N, 3) to (B, m, 3)
+        torch.Size([2, 5, 3])
+        >>> sampler.training_sizes()
+        (2, 4, 8, 16, 32)
+    """

@@ -51,6 +51,14 @@ class VoxelSampler(Sampler):
 
     Raises:
         UserError: ``pick`` is neither.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import VoxelSampler
+        >>> points = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [1, 1, 1]]])
+        >>> VoxelSampler(m=2, pick="centroid")(points).points  # (B, N, 3) to (B, m, 3)
+        tensor([[[0.0500, 0.0000, 0.0000],
+                 [1.0000, 1.0000, 1.0000]]])
     """
 
     flexible = True

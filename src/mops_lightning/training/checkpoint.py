@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from mops_lightning.errors import UserError
 from mops_lightning.training.callbacks import CHECKPOINT, added
 from mops_lightning.training.experiment import CHECKPOINT_KEY
-from mops_lightning.zoo.weights import load, read_plain
+from mops_lightning.zoo import weights
 
 
 def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
@@ -49,7 +49,7 @@ def _given_weights(cfg: DictConfig) -> dict[str, str]:
     """Return the hash of the weights file that the run begins with, if it is one of the user's."""
     if cfg.weights in (None, "auto", "run") or not Path(cfg.weights).expanduser().is_file():
         return {}
-    return {"weights": str(load(cfg.weights)["sha256"])}
+    return {"weights": str(weights.read(cfg.weights)["sha256"])}
 
 
 def lengthened(cfg: DictConfig, checkpoint: Path) -> bool:
@@ -114,7 +114,7 @@ def _different(theirs: dict[str, str], mine: dict[str, str]) -> list[str]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    content = read_plain(path, "ckpt_path", "a checkpoint")
+    content = weights.read_plain(path, "ckpt_path", "a checkpoint")
     if CHECKPOINT_KEY not in content:
         raise UserError(f"ckpt_path: {path} is not a checkpoint of this program.")
     return content[CHECKPOINT_KEY]

@@ -14,6 +14,7 @@ from mops_lightning.records import run_record
 
 SCHEMA = "mops_lightning/weights/1"
 FILE = "weights.pt"
+OTHER_NET = "Check task, task/net and dataset.classes, or use weights=auto."
 
 
 def save(
@@ -23,14 +24,14 @@ def save(
     metrics: dict[str, float],
     classes: Sequence[str] = (),
 ) -> None:
-    """Write a module's tensors with what made them.
+    """Write a module's tensors with the configuration and the metrics of their training.
 
     Args:
-        path: the file; replaced in one step.
-        module: whose state is kept.
-        config: plain data that says how the weights came about.
-        metrics: what they scored.
-        classes: names of the classes that were told apart, in order.
+        path: the file; an existing one is replaced atomically.
+        module: the module whose ``state_dict`` is written.
+        config: the run's configuration as plain data.
+        metrics: test metrics by name.
+        classes: class names in the order of the outputs of a classifier.
     """
     state = {name: value.detach().cpu().contiguous() for name, value in module.state_dict().items()}
     content = {
@@ -45,34 +46,39 @@ def save(
         torch.save(content, temporary)
 
 
-def load(path: str | Path) -> dict[str, Any]:
+def read(path: str | Path) -> dict[str, Any]:
     """Read a weights file and verify it.
 
     Returns:
-        The content as saved: ``config``, ``metrics``, ``sha256`` and ``state``.
+        The content as saved: ``config``, ``metrics``, ``classes``, ``sha256`` and ``state``.
 
     Raises:
-        UserError: the file is missing, damaged or no weights file.
+        UserError: the file is missing, damaged or not a weights file.
     """
     path = Path(path).expanduser()
     if not path.is_file():
-        raise UserError(f"weights: no file {path}. Give a weights.pt, or weights=auto.")
+        raise UserError(f"no file {path}. Give a weights.pt, or weights=auto.")
     content = read_plain(path, "weights", "a weights file")
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise UserError(
-            f"weights: {path} is not a {SCHEMA} file. "
-            "Lightning checkpoints are for ckpt_path; weights.pt lies beside them."
+            f"{path} is not a {SCHEMA} file. "
+            "Lightning checkpoints are for ckpt_path; weights.pt is in the run's folder."
         )
     if digest(content["state"]) != content["sha256"]:
-        raise UserError(f"weights: {path} is damaged (sha256 differs). Delete it and run again.")
+        raise UserError(f"{path} is damaged (sha256 differs). Delete it and run again.")
     return content
 
 
 def read_plain(path: Path, setting: str, what: str) -> Any:
-    """Read a file of plain tensors and plain data; ``setting`` and ``what`` name it in the error.
+    """Read a file of plain tensors and plain data; pickled code is refused, not executed.
+
+    Args:
+        path: the file.
+        setting: name of the setting that gave the path, for the error.
+        what: kind of file that was expected, for the error.
 
     Raises:
-        UserError: the file is damaged, or holds more than plain data.
+        UserError: the file is damaged, or contains more than plain data.
     """
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
@@ -99,41 +105,46 @@ def load_into(module: nn.Module, path: str | Path) -> dict[str, Any]:
     """Read a weights file into a module, strictly.
 
     Returns:
-        The file's content; see ``load``.
+        The file's content; see ``read``.
 
     Raises:
-        UserError: the file is unusable, or holds the weights of another net.
+        UserError: the file cannot be read, or its tensors do not match the module.
     """
-    content = load(path)
+    content = read(path)
     fit_state(module, content["state"], path)
     return content
 
 
-def fit_state(module: nn.Module, have: dict[str, Tensor], path: str | Path) -> None:
-    """Load tensors into a module, strictly; ``path`` names them in the error.
+def fit_state(
+    module: nn.Module, state: dict[str, Tensor], path: str | Path, hint: str = OTHER_NET
+) -> None:
+    """Load tensors into a module, strictly.
+
+    Args:
+        module: the module to fill.
+        state: its tensors by name.
+        path: the file that they come from, for the error.
+        hint: what to try next, for the error.
 
     Raises:
-        UserError: they are those of another net.
+        UserError: names or shapes differ from the module's.
     """
-    want = module.state_dict()
-    wrong = [f"{name} is missing" for name in want if name not in have]
-    wrong += [f"{name} is unknown" for name in have if name not in want]
+    expected = module.state_dict()
+    wrong = [f"{name} is missing" for name in expected if name not in state]
+    wrong += [f"{name} is unknown" for name in state if name not in expected]
     wrong += [
-        f"{name} is {tuple(have[name].shape)} instead of {tuple(want[name].shape)}"
-        for name in want
-        if name in have and have[name].shape != want[name].shape
+        f"{name} is {tuple(state[name].shape)} instead of {tuple(expected[name].shape)}"
+        for name in expected
+        if name in state and state[name].shape != expected[name].shape
     ]
     if wrong:
         more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
-        raise UserError(
-            f"weights: {path} holds another net's weights: {'; '.join(wrong[:3])}{more}. "
-            "Check task, task/net and dataset.classes, or use weights=auto."
-        )
-    module.load_state_dict(have, strict=True)
+        raise UserError(f"{path} holds another net's weights: {'; '.join(wrong[:3])}{more}. {hint}")
+    module.load_state_dict(state, strict=True)
 
 
 def digest(state: dict[str, Tensor]) -> str:
-    """Return the sha256 over names, shapes, types and bytes of tensors, whatever their order."""
+    """Return the sha256 of the names, shapes, types and bytes of tensors, in any order."""
     total = hashlib.sha256()
     for name in sorted(state):
         value = state[name].detach().cpu().contiguous()

@@ -1,0 +1,96 @@
+"""The public API."""
+
+import ast
+import doctest
+import inspect
+import subprocess
+import sys
+
+import pytest
+import torch
+
+import mops_lightning
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.zoo import weights
+
+NAMES = [
+    "FMOPSNet",
+    "FPSSampler",
+    "MOPSNet",
+    "PoissonSampler",
+    "ProgressiveSNet",
+    "ProgressiveSampleNet",
+    "RandomSampler",
+    "SNet",
+    "SampleNet",
+    "SampleOutput",
+    "Sampler",
+    "SamplingMatrix",
+    "VoxelSampler",
+    "chamfer_distance",
+    "complete",
+    "earth_movers_distance",
+    "farthest_point_sample",
+    "load",
+    "match",
+    "nearest",
+]
+
+
+def test_public_names_are_exactly_these():
+    assert mops_lightning.__all__ == NAMES
+    assert set(NAMES) <= set(dir(mops_lightning))
+    star: dict[str, object] = {}
+    exec("from mops_lightning import *", star)
+    assert {name for name in star if not name.startswith("__")} == set(NAMES)
+
+
+def test_type_checkers_see_the_same_names():
+    imports = [
+        (f"{node.module}", alias.name)
+        for block in ast.parse(inspect.getsource(mops_lightning)).body
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    ]
+    found = {(getattr(mops_lightning, name).__module__, name) for name in NAMES}
+    assert set(imports) == found
+
+
+def test_import_leaves_heavy_libraries_alone():
+    code = (
+        "import sys, mops_lightning\n"
+        "heavy = {'torch', 'numpy', 'scipy', 'lightning', 'hydra', 'omegaconf'}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
+        "for name in mops_lightning.__all__: getattr(mops_lightning, name)\n"
+        "assert 'torch' in sys.modules\n"
+        "assert not {'lightning', 'hydra', 'omegaconf'} & set(sys.modules)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_unknown_name_raises_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'MOPSNett'"):
+        _ = mops_lightning.MOPSNett  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def run_folder(tmp_path, monkeypatch):
+    """The folder of a run, below the current folder."""
+    node = {"_target_": "mops_lightning.samplers.mops.MOPSNet", "m": 8}
+    path = tmp_path / "outputs" / "my_run" / weights.FILE
+    weights.save(path, MOPSNet(8), {"learn": "sampler", "sampler": node}, {})
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_docstring_has_shapes_and_an_example_that_runs(name, run_folder):
+    torch.manual_seed(0)
+    text = inspect.getdoc(getattr(mops_lightning, name)) or ""
+    assert "(B, " in text
+    example = doctest.DocTestParser().get_doctest(text, {}, name, None, None)
+    assert example.examples
+    printed: list[str] = []
+    results = doctest.DocTestRunner().run(example, out=printed.append)
+    assert results.failed == 0, "".join(printed)

@@ -1,0 +1,130 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+import mops_lightning
+from mops_lightning import Sampler, load
+from mops_lightning.errors import UserError
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.samplers.samplenet import ProgressiveSampleNet
+from mops_lightning.zoo import weights
+from mops_lightning.zoo.load import SAMPLERS
+
+ROOT = Path(__file__).parents[2]
+FMOPS = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 16}
+
+
+@pytest.fixture
+def save(tmp_path):
+    """Write a weights file whose configuration has this sampler node."""
+
+    def written(node, module=None, learn="sampler"):
+        config = {"learn": learn, "sampler": node}
+        weights.save(tmp_path / weights.FILE, module or FMOPSNet(16), config, {})
+        return tmp_path / weights.FILE
+
+    return written
+
+
+def test_load_file_or_folder_gives_the_saved_sampler(save):
+    torch.manual_seed(0)
+    saved = FMOPSNet(16).eval()
+    path = save(FMOPS, saved)
+    points = torch.rand(2, 40, 3)
+    for given in (path, str(path), path.parent):
+        sampler = load(given)
+        assert isinstance(sampler, FMOPSNet)
+        assert not sampler.training
+        with torch.no_grad():
+            assert torch.equal(sampler(points, 5).points, saved(points, 5).points)
+
+
+def test_load_leaves_the_random_state_alone(save):
+    path = save(FMOPS)
+    before = torch.get_rng_state()
+    load(path)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_load_renamed_arguments_of_older_files(save):
+    sampler = load(save({**FMOPS, "sizes_per_step": "uniform", "prefixes": 2}))
+    assert isinstance(sampler, FMOPSNet)
+    assert (sampler.size_sampling, sampler.num_sizes) == ("uniform", 2)
+    node = {"_target_": "mops_lightning.samplers.samplenet.ProgressiveSampleNet", "m_max": 16}
+    older = {**node, "least": 4, "over_sizes": "mean"}
+    sampler = load(save(older, ProgressiveSampleNet(16)))
+    assert isinstance(sampler, ProgressiveSampleNet)
+    assert (sampler.min_size, sampler.size_reduction) == (4, "mean")
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system",
+        "torch.nn.Linear",
+        "mops_lightning.samplers.base.Sampler",
+        "mops_lightning.nets.pointnet.PointNetVanilla",
+        ["mops_lightning.samplers.mops.MOPSNet"],
+        None,
+    ],
+)
+def test_load_other_targets_are_refused(save, target):
+    with pytest.raises(UserError, match=r"_target_ must be a sampler of mops_lightning, got"):
+        load(save({**FMOPS, "_target_": target}))
+
+
+@pytest.mark.parametrize(
+    "value", [{"_target_": "os.getcwd"}, [{"_target_": "os.getcwd"}], [[None]]]
+)
+def test_load_nested_arguments_are_refused(save, value):
+    with pytest.raises(UserError, match=r"sampler\.feature_channels must be a number.*got"):
+        load(save({**FMOPS, "feature_channels": value}))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"colour": 3}, "colour"),
+        ({"m_max": -1}, "at least 1, got -1"),
+        ({"m_max": None}, "at least 1, got None"),
+        ({"tau_min": "low"}, "cannot build"),
+        ({"m_max": 17}, r"queries.weight is \(16, 128\) instead of \(17, 128\)"),
+    ],
+)
+def test_load_wrong_arguments_are_one_error(save, change, words):
+    path = save({**FMOPS, **change})
+    with pytest.raises(UserError, match=rf"(?s){path}.*{words}"):
+        load(path)
+
+
+def test_load_task_net_or_missing_file_is_refused(save, tmp_path):
+    with pytest.raises(UserError, match=r"task net.*learn=sampler"):
+        load(save(FMOPS, learn="task"))
+    with pytest.raises(UserError, match=r"no file .*nowhere\.pt.*weights\.pt"):
+        load(tmp_path / "nowhere.pt")
+
+
+@pytest.mark.parametrize(
+    ("name", "m"),
+    [("fmops-modelnet40", 512), ("mops-modelnet40-m32", 32), ("snet-modelnet40-m32", 32)],
+)
+def test_load_kept_weights_samples_points(name, m):
+    sampler = load(ROOT / "weights" / f"classification-{name}.pt")
+    assert sampler(torch.rand(1, 600, 3)).points.shape == (1, m, 3)
+
+
+def test_load_run_folder_follows_its_record():
+    assert load(ROOT / "results" / "classification" / "runs" / "fmops").m == 512
+
+
+def test_samplers_of_the_package_can_all_be_loaded():
+    public = {getattr(mops_lightning, name) for name in mops_lightning.__all__}
+    classes = {p for p in public if isinstance(p, type) and issubclass(p, Sampler)}
+    assert set(SAMPLERS) == classes - {Sampler}
+    known = {f"{cls.__module__}.{cls.__qualname__}" for cls in SAMPLERS}
+    for path in (ROOT / "conf" / "sampler").glob("*.yaml"):
+        node: Any = OmegaConf.load(path)
+        assert node.get("sampler", node)["_target_"] in known, path
