@@ -1,4 +1,4 @@
-"""What every sampler promises. A new sampler adds one line to SAMPLERS."""
+"""What every sampler guarantees. A new sampler adds one line to SAMPLERS."""
 
 from collections.abc import Callable
 from typing import Any
@@ -39,7 +39,7 @@ B, N, M = 3, 60, 8
 
 @pytest.fixture(params=SAMPLERS)
 def make(request):
-    """Builds the sampler in eval mode, learned ones with the same weights every time."""
+    """Return a function that builds the sampler in eval mode, with the same weights every time."""
 
     def build(m=M, dtype=torch.float32):
         with torch.random.fork_rng(devices=[]):
@@ -55,7 +55,7 @@ def clouds(rng):
 
 
 def lattice(rng):
-    """Distinct points with coordinates k/4: equal distances everywhere, to try the ties."""
+    """Distinct points with coordinates k/4, so that most distances are tied."""
     grid = torch.cartesian_prod(*[torch.arange(5) / 4] * 3)
     return torch.stack([grid[torch.randperm(125, generator=rng)[:N]] for _ in range(B)])
 
@@ -64,11 +64,11 @@ def as_sets(points):
     return [sorted(cloud) for cloud in points.tolist()]
 
 
-def test_other_types_are_refused_by_name(make, clouds):
+def test_input_of_wrong_type_raises(make, clouds):
     with pytest.raises(UserError, match=r"must be a torch\.Tensor, got ndarray"):
         make()(clouds.numpy())
     if make().learned:
-        with pytest.raises(UserError, match=r"must be torch\.float32 as the sampler's weights"):
+        with pytest.raises(UserError, match=r"must be torch\.float32 like the sampler's weights"):
             make()(clouds.half())
     with pytest.raises(UserError, match="m must be a whole number"):
         make(m=8.0)
@@ -76,7 +76,7 @@ def test_other_types_are_refused_by_name(make, clouds):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_shape_dtype_and_device(make, clouds, dtype, device):
+def test_output_has_shape_dtype_and_device(make, clouds, dtype, device):
     points = clouds.to(device, dtype)
     output = make(dtype=dtype).to(device)(points)
     assert output.points.shape == (B, M, 3)
@@ -91,7 +91,7 @@ def test_shape_dtype_and_device(make, clouds, dtype, device):
 
 
 @pytest.mark.parametrize("cloud", ["random", "lattice"])
-def test_indices_are_distinct_and_point_at_the_points(make, clouds, cloud, rng):
+def test_indices_are_distinct_rows_of_input(make, clouds, cloud, rng):
     points = clouds if cloud == "random" else lattice(rng)
     output = make()(points)
     if output.indices is None:
@@ -102,22 +102,22 @@ def test_indices_are_distinct_and_point_at_the_points(make, clouds, cloud, rng):
 
 
 @pytest.mark.parametrize("m", [0, -1, M + 1])
-def test_refuses_a_size_out_of_range(make, clouds, m):
+def test_size_out_of_range_raises(make, clouds, m):
     with pytest.raises(UserError, match=f"m must be .*{M}.* got {m}"):
         make()(clouds, m)
 
 
-def test_cannot_be_made_for_no_points(make):
+def test_constructor_without_points_raises(make):
     with pytest.raises(UserError, match="m must be a whole number of at least 1, got 0"):
         make(m=0)
 
 
-def test_refuses_more_points_than_there_are(make, clouds):
+def test_size_above_number_of_points_raises(make, clouds):
     with pytest.raises(UserError, match=f"N={M - 1}, got m={M}"):
         make()(clouds[:, : M - 1])
 
 
-def test_other_sizes_for_flexible_samplers_only(make, clouds):
+def test_other_size_needs_flexible_sampler(make, clouds):
     sampler = make()
     if not sampler.flexible:
         with pytest.raises(UserError, match=f"m must be {M}, .* got {M - 3}"):
@@ -141,13 +141,13 @@ def test_other_sizes_for_flexible_samplers_only(make, clouds):
         (torch.full((B, N, 3), -torch.inf), "finite"),
     ],
 )
-def test_refuses_wrong_input(make, points, named):
+def test_invalid_input_raises(make, points, named):
     with pytest.raises(UserError, match=f"points must .*{named}"):
         make()(points)
 
 
 @pytest.mark.parametrize("cloud", ["random", "lattice"])
-def test_does_not_depend_on_the_order_of_the_points(make, clouds, cloud, rng):
+def test_sample_is_permutation_invariant(make, clouds, cloud, rng):
     points = clouds if cloud == "random" else lattice(rng)
     sampler = make()
     permuted = points[:, torch.randperm(N, generator=rng)]
@@ -159,9 +159,9 @@ def test_does_not_depend_on_the_order_of_the_points(make, clouds, cloud, rng):
 
 
 @pytest.mark.parametrize("cloud", ["random", "lattice"])
-def test_does_not_depend_on_the_batch(make, clouds, cloud, rng):
+def test_sample_is_independent_of_batch(make, clouds, cloud, rng):
     points = clouds if cloud == "random" else lattice(rng)
-    points[1, 5:9] = points[1, 4]  # copies in one cloud must not show in another
+    points[1, 5:9] = points[1, 4]  # copies in one cloud must not affect another
     sampler = make()
     together = sampler(points)
     for b in range(B):
@@ -174,7 +174,7 @@ def test_does_not_depend_on_the_batch(make, clouds, cloud, rng):
             assert torch.equal(alone.indices[0], together.indices[b])
 
 
-def test_repeats_itself_and_leaves_input_and_global_generator_alone(make, clouds):
+def test_sample_is_deterministic_without_side_effects(make, clouds):
     before, state = clouds.clone(), torch.random.get_rng_state()
     sampler = make()
     first, second = sampler(clouds), sampler(clouds)
@@ -185,7 +185,7 @@ def test_repeats_itself_and_leaves_input_and_global_generator_alone(make, clouds
 
 
 @pytest.mark.parametrize("name", SEEDED)
-def test_another_seed_gives_another_sample(name, clouds):
+def test_seed_changes_sample(name, clouds):
     def sample(seed):
         return as_sets(SAMPLERS[name](M, seed=seed)(clouds).points)
 
@@ -193,7 +193,7 @@ def test_another_seed_gives_another_sample(name, clouds):
     assert all(one != other for one, other in zip(sample(1), sample(2), strict=True))
 
 
-def test_every_point_can_be_asked_for(make, clouds):
+def test_size_of_all_points_returns_all(make, clouds):
     output = make(m=N)(clouds)
     assert output.points.shape == (B, N, 3)
     if output.indices is not None:
@@ -201,32 +201,32 @@ def test_every_point_can_be_asked_for(make, clouds):
 
 
 @pytest.mark.parametrize("distinct", [1, 3])
-def test_coincident_points(make, distinct, rng):
+def test_coincident_points_give_valid_sample(make, distinct, rng):
     place = torch.arange(N) % distinct
     points = torch.randn(B, distinct, 3, generator=rng)[:, place]
     sampler = make()
     output = sampler(points)
     assert torch.isfinite(output.points).all()
     if isinstance(sampler, SNet):
-        return  # it emits coordinates, which may lie anywhere
+        return  # its points are not restricted to the convex hull
     assert (output.points <= points.amax(1, keepdim=True) + 1e-6).all()
     assert (output.points >= points.amin(1, keepdim=True) - 1e-6).all()
     if output.indices is not None:
         assert all(len(set(row)) == M for row in output.indices.tolist())
 
 
-def test_gradients(make, rng):
+def test_gradients_are_correct(make, rng):
     points = torch.randn(1, 9, 3, dtype=torch.float64, generator=rng, requires_grad=True)
     sampler = make(m=3, dtype=torch.float64)
     output = sampler(points)
-    if output.indices is not None:  # the choice is fixed; the chosen points pass gradients on
+    if output.indices is not None:  # gradients flow through the chosen points only
         (gradient,) = torch.autograd.grad(output.points.sum(), points)
         chosen = torch.zeros(1, 9, 1).index_fill(1, output.indices[0], 1.0)
         assert torch.equal(gradient, chosen.expand_as(gradient).to(gradient))
     if sampler.learned:
         assert torch.autograd.gradcheck(lambda p: sampler(p).points, (points,))
         total = output.points.square().sum()
-        # SampleNet's temperature matters in training only.
+        # SampleNet's temperature has an effect in training only.
         names = [name for name, _ in sampler.named_parameters() if name != "temperature"]
         gradients = torch.autograd.grad(total, [sampler.get_parameter(name) for name in names])
         assert all(torch.isfinite(g).all() for g in gradients)

@@ -12,7 +12,7 @@ def small(m_max=16, **settings):
     return FMOPSNet(m_max, feature_channels=(8, 6), rho_channels=(12, 10), **settings)
 
 
-def test_a_smaller_sample_is_the_head_of_a_larger_one(rng):
+def test_fmops_samples_are_nested(rng):
     points = torch.randn(3, 40, 3, generator=rng)
     net = small().eval()
     whole = net(points)
@@ -22,7 +22,7 @@ def test_a_smaller_sample_is_the_head_of_a_larger_one(rng):
         torch.testing.assert_close(part.matrix.dense(), whole.matrix.dense()[..., :m])
 
 
-def test_it_is_mops_net_s_network(rng):
+def test_fmops_equals_mops_with_sliced_weights(rng):
     points = torch.randn(3, 40, 3, generator=rng)
     flexible = small()
     fixed = MOPSNet(5, feature_channels=(8, 6), rho_channels=(12, 10))
@@ -32,7 +32,7 @@ def test_it_is_mops_net_s_network(rng):
     torch.testing.assert_close(fixed.eval()(points).points, flexible.eval()(points, 5).points)
 
 
-def test_one_forward_pass_gives_every_size_with_its_loss(rng):
+def test_fmops_sizes_share_one_forward_pass(rng):
     points = torch.randn(3, 40, 3, generator=rng)
     net = small(alpha=2.0).train()
     calls = []
@@ -52,7 +52,7 @@ def drawn(number, **settings):
     return [net.training_sizes() for _ in range(number)]
 
 
-def test_sizes_are_drawn_as_described():
+def test_training_sizes_have_documented_distribution():
     uniform = torch.tensor(drawn(4000, size_sampling="uniform")).flatten().double()
     assert (uniform.min(), uniform.max()) == (1, 512)
     assert uniform.mean() == pytest.approx(256.5, rel=0.03)
@@ -65,28 +65,28 @@ def test_sizes_are_drawn_as_described():
     nested = drawn(300, num_sizes=4)
     assert all(list(sizes) == sorted(set(sizes)) for sizes in nested)
     assert all(1 <= sizes[0] <= 4 and 107 <= sizes[-1] <= 512 for sizes in nested)
-    # Two parts share the size at which one ends and the next begins.
+    # Neighbouring parts share a size at their boundary, which is then drawn once.
     assert {len(sizes) for sizes in nested} <= {3, 4}
 
 
-def test_sizes_follow_the_seed():
+def test_training_sizes_depend_on_seed():
     assert drawn(20) == drawn(20)
     assert len(set(drawn(20))) > 15
 
 
-def test_all_sizes_of_tiny_nets_can_be_drawn():
+def test_training_sizes_of_tiny_net_are_valid():
     assert set(small(1).training_sizes()) == {1}
     assert {size for _ in range(99) for size in small(3, num_sizes=1).training_sizes()} <= {1, 2, 3}
 
 
 @pytest.mark.parametrize(
-    ("settings", "named"),
+    ("arguments", "message"),
     [
-        ({"size_sampling": "nestd"}, "sampler.size_sampling: unknown 'nestd'.*nested"),
-        ({"num_sizes": 0}, "sampler.num_sizes must be at least 1, got 0"),
-        ({"tau_min": 0.0}, "sampler.tau_min must"),
+        ({"size_sampling": "nestd"}, "^size_sampling: unknown 'nestd'.*nested"),
+        ({"num_sizes": 0}, "^num_sizes must be at least 1, got 0"),
+        ({"tau_min": 0.0}, "^tau_min must"),
     ],
 )
-def test_wrong_settings_are_refused(settings, named):
-    with pytest.raises(UserError, match=named):
-        small(**settings)
+def test_fmops_invalid_argument_raises(arguments, message):
+    with pytest.raises(UserError, match=message):
+        small(**arguments)

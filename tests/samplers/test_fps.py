@@ -8,7 +8,7 @@ from mops_lightning.samplers.ordering import seeded_order
 from tests.support.plain import plain_farthest
 
 
-def test_equals_the_double_loop_from_the_seed_s_point(rng):
+def test_fps_sampler_equals_double_loop(rng):
     points = torch.randn(3, 50, 3, generator=rng)
     chosen = FPSSampler(12, seed=5)(points).indices
     first = seeded_order(points, 5)[:, 0]
@@ -16,26 +16,26 @@ def test_equals_the_double_loop_from_the_seed_s_point(rng):
         assert chosen[b].tolist() == plain_farthest(points[b], [int(first[b])], 12)
 
 
-def test_start_is_kept(rng):
+def test_fps_sampler_uses_start(rng):
     points = torch.randn(3, 50, 3, generator=rng)
     chosen = FPSSampler(12, start=49)(points).indices
     assert torch.equal(chosen, farthest_point_sample(points, 12, start=49))
 
 
-def test_seeds_start_all_over_the_cloud(rng):
+def test_fps_sampler_seed_varies_start(rng):
     points = torch.randn(1, 50, 3, generator=rng)
     starts = {int(FPSSampler(1, seed)(points).indices) for seed in range(60)}
     assert len(starts) > 25  # 35 are expected of 60 uniform draws
 
 
-def test_smaller_samples_are_the_first_points_of_larger_ones(rng):
+def test_fps_sampler_is_nested(rng):
     points = torch.randn(2, 30, 3, generator=rng)
     sampler = FPSSampler(20)
     assert torch.equal(sampler(points, 5).indices, sampler(points).indices[:, :5])
 
 
-def test_refuses_a_start_outside_the_cloud():
-    with pytest.raises(UserError, match="start must be at least 0"):
+def test_fps_sampler_start_out_of_range_raises():
+    with pytest.raises(UserError, match=r"^start must be at least 0"):
         FPSSampler(4, start=-1)
-    with pytest.raises(UserError, match=r"start must be less than .* N=9, got 9"):
+    with pytest.raises(UserError, match=r"^start must be less than .* N=9, got 9"):
         FPSSampler(4, start=9)(torch.zeros(1, 9, 3))

@@ -1,4 +1,4 @@
-"""4,096 of 40,960 points fit into 1 GB (paper section "Complexity Analysis"); more in chunks."""
+"""Peak memory of large clouds (paper section "Complexity Analysis") and of files in chunks."""
 
 import subprocess
 import sys
@@ -21,7 +21,7 @@ def status(name):
     return int(re.search(name + ":[^0-9]*([0-9]+)", text)[1]) * 1024
 
 
-def forget_peak():  # getrusage would know that of the process that started this one, too
+def reset_peak():  # getrusage would include the peak of the parent process
     Path("/proc/self/clear_refs").write_text("5")
 """
 
@@ -32,7 +32,7 @@ from mops_lightning.samplers.mops import MOPSNet
 
 training = sys.argv[1] == "training"
 sampler = MOPSNet(4096, alpha=0.2, tau_min=0.5).train(training)
-forget_peak()
+reset_peak()
 before = status("VmRSS")
 net = MFoldingNet(40960, pieces=128, codeword=2048).eval().requires_grad_(False)
 points = torch.rand(1, 40960, 3)
@@ -64,7 +64,7 @@ for number in sizes:
     del file
 for number in sizes:
     path = Path(sys.argv[1]) / f"{number}.npy"
-    forget_peak()
+    reset_peak()
     by_chunks(path, sampler, 16, 20_000, "matched", False)
     peaks.append(status("VmHWM"))
 print(peaks[1] - peaks[0])
@@ -72,7 +72,7 @@ print(peaks[1] - peaks[0])
 
 
 def measured(script: str, argument: str) -> int:
-    """Return the number of bytes that a script prints, run in a process of its own."""
+    """Return the number of bytes that a script prints, run in a new process."""
     command = [sys.executable, "-c", PEAK + script, argument]
     return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
@@ -83,10 +83,10 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.mark.parametrize("phase", ["training", "test"])
-def test_large_clouds_fit_into_a_gigabyte_above_the_interpreter(phase):
+def test_large_cloud_fits_in_one_gigabyte(phase):
     assert 5e7 < measured(LARGE, phase) < 1e9, "less would mean that nothing was measured"
 
 
-def test_memory_does_not_grow_with_a_file_that_is_read_in_chunks(tmp_path):
+def test_memory_in_chunks_is_independent_of_file_size(tmp_path):
     # The allocator alone makes up to 10 MB of difference.
     assert measured(IN_CHUNKS, str(tmp_path)) < 20e6, "the larger file has 45 MB more"

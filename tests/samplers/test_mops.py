@@ -15,7 +15,7 @@ def small(m=5, **settings):
 
 
 class PlainMOPS(nn.Module):
-    """The paper's flow word for word: global feature repeated, one ρ with bias, S in full."""
+    """The network as published: repeated global feature, one ρ with bias, dense S."""
 
     def __init__(self, fast: MOPSNet) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ class PlainMOPS(nn.Module):
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_equals_the_paper_s_flow(training, rng):
+def test_mops_equals_published_form(training, rng):
     fast = small(tau_min=0.3).double().train(training)
     plain = PlainMOPS(fast).double().train(training)
     points = torch.randn(3, 20, 3, dtype=torch.float64, generator=rng)
@@ -56,14 +56,14 @@ def test_equals_the_paper_s_flow(training, rng):
     torch.testing.assert_close(output.matrix.dense(), matrix)
 
 
-def test_published_layers():
+def test_mops_has_published_layers():
     net = MOPSNet(32)
     sizes = [tuple(p.shape) for name, p in net.named_parameters() if p.ndim == 2]
     features = [(64, 3), (64, 64), (64, 64), (128, 64), (128, 128)]
     assert sizes == [*features, (512, 128), (512, 128), (256, 512), (128, 256), (32, 128)]
 
 
-def test_tau_falls_exponentially_from_one_to_its_end():
+def test_tau_exponential_annealing():
     net = small(tau_min=0.1).train()
     taus = []
     for progress in (0.0, 0.5, 1.0):
@@ -72,20 +72,20 @@ def test_tau_falls_exponentially_from_one_to_its_end():
     assert taus == pytest.approx([1.0, 0.1**0.5, 0.1])
 
 
-def test_tau_falls_linearly_on_request():
+def test_tau_linear_annealing():
     net = small(tau_min=0.2, annealing="linear").train()
     net.anneal(0.25)
     assert net.tau == pytest.approx(0.8)
 
 
-def test_tau_is_at_its_end_in_evaluation():
+def test_tau_in_evaluation_is_tau_min():
     net = small(tau_min=0.1).train()
     net.anneal(0.0)
     assert net.eval().tau == 0.1
     assert net.train().tau == 1.0
 
 
-def test_subset_loss_is_weighted_and_only_in_training(rng):
+def test_mops_loss_is_weighted_and_in_training_only(rng):
     net = small(alpha=7.0).train()
     points = torch.randn(2, 20, 3, generator=rng)
     output = net(points)
@@ -93,30 +93,30 @@ def test_subset_loss_is_weighted_and_only_in_training(rng):
     assert net.eval()(points).losses == {}
 
 
-def test_points_lie_in_the_convex_hull(rng):
+def test_mops_points_are_in_bounding_box(rng):
     points = torch.randn(2, 20, 3, generator=rng)
     sampled = small().eval()(points).points
     assert (sampled.amax(1) <= points.amax(1)).all()
     assert (sampled.amin(1) >= points.amin(1)).all()
 
 
-def test_gradcheck(rng):
+def test_mops_gradcheck(rng):
     net = small(m=3, tau_min=0.5).double().eval()
     points = torch.randn(1, 7, 3, dtype=torch.float64, generator=rng, requires_grad=True)
     assert torch.autograd.gradcheck(lambda p: net(p).points, (points,))
 
 
 @pytest.mark.parametrize(
-    ("settings", "named"),
+    ("arguments", "message"),
     [
-        ({"tau_min": 0.0}, "sampler.tau_min"),
-        ({"tau_min": 1.5}, "sampler.tau_min"),
-        ({"feature_channels": ()}, "sampler.feature_channels must be sizes of at least 1 layer,"),
-        ({"rho_channels": (8, 0)}, "sampler.rho_channels must be sizes"),
-        ({"alpha": -1.0}, "sampler.alpha"),
-        ({"annealing": "exponentail"}, "exponential"),
+        ({"tau_min": 0.0}, "^tau_min must be above 0 and at most 1, got 0.0"),
+        ({"tau_min": 1.5}, "^tau_min must be above 0 and at most 1, got 1.5"),
+        ({"feature_channels": ()}, "^feature_channels must be sizes of at least 1 layer,"),
+        ({"rho_channels": (8, 0)}, "^rho_channels must be sizes"),
+        ({"alpha": -1.0}, "^alpha must be at least 0, got -1.0"),
+        ({"annealing": "exponentail"}, "^annealing: unknown 'exponentail'.*exponential"),
     ],
 )
-def test_bad_settings_name_themselves(settings, named):
-    with pytest.raises(UserError, match=named):
-        small(**settings)
+def test_mops_invalid_argument_raises(arguments, message):
+    with pytest.raises(UserError, match=message):
+        small(**arguments)

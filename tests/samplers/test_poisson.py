@@ -6,8 +6,8 @@ from mops_lightning.samplers.poisson import PoissonSampler, eliminate, spacing_b
 from mops_lightning.samplers.random import RandomSampler
 
 
-def plain(cloud, m, reach):
-    """Sample elimination in two loops: sum all weights anew before each point that is dropped."""
+def plain_eliminate(cloud, m, reach):
+    """Sample elimination that sums all weights again before every removal."""
     kept = list(range(len(cloud)))
     while len(kept) > m:
         sums = []
@@ -18,16 +18,18 @@ def plain(cloud, m, reach):
     return kept
 
 
-@pytest.mark.parametrize("m", [2, 9, 23, 24])  # of the last two, both are equally crowded
-def test_equals_the_plain_form(m, rng):
+@pytest.mark.parametrize("m", [2, 9, 23, 24])  # the last two points are equally crowded
+def test_eliminate_equals_plain_form(m, rng):
     points = torch.randn(3, 24, 3, generator=rng, dtype=torch.float64)
     reach = spacing_bound(points, m)
-    expected = [plain(cloud, m, float(bound)) for cloud, bound in zip(points, reach, strict=True)]
+    expected = [
+        plain_eliminate(cloud, m, float(bound)) for cloud, bound in zip(points, reach, strict=True)
+    ]
     assert eliminate(points, m).tolist() == expected
 
 
 @pytest.mark.parametrize("m", [2, 5, 12])
-def test_no_sample_is_spaced_wider_than_the_bound(m, rng):
+def test_spacing_bound_is_upper_bound(m, rng):
     points = torch.randn(20, 30, 3, generator=rng, dtype=torch.float64)
     bound = spacing_bound(points, m)
     for _ in range(30):
@@ -43,7 +45,7 @@ def spacing(points):
     return distances.amin((1, 2)).mean()
 
 
-def test_points_are_spread_far_more_evenly_than_at_random(rng):
+def test_poisson_is_more_even_than_random(rng):
     flat = torch.rand(8, 600, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.0])
     poisson = spacing(PoissonSampler(60)(flat).points)
     assert poisson > 4 * spacing(RandomSampler(60)(flat).points)

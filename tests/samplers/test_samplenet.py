@@ -9,8 +9,8 @@ from mops_lightning.ops.nearest import k_nearest, nearest
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet, soft_projection
 
 
-def double_loop(queries, points, k, sigma):
-    """Every projected point by hand, differentiable."""
+def plain_projection(queries, points, k, sigma):
+    """Project every point in a double loop, differentiably."""
     projected = []
     for query_cloud, cloud in zip(queries, points, strict=True):
         rows = []
@@ -23,24 +23,24 @@ def double_loop(queries, points, k, sigma):
 
 
 @pytest.mark.parametrize("k", [1, 4, 11])
-def test_soft_projection_equals_a_double_loop(k, rng):
+def test_soft_projection_equals_double_loop(k, rng):
     points = torch.randn(2, 11, 3, generator=rng, dtype=torch.float64)
     queries = torch.randn(2, 5, 3, generator=rng, dtype=torch.float64)
     inputs = [queries, points, torch.tensor(0.7, dtype=torch.float64)]
     inputs = [x.requires_grad_() for x in inputs]
     weights = torch.randn(2, 5, 3, generator=rng, dtype=torch.float64)
     fast = soft_projection(inputs[0], inputs[1], k, inputs[2])
-    plain = double_loop(inputs[0], inputs[1], k, inputs[2])
+    plain = plain_projection(inputs[0], inputs[1], k, inputs[2])
     torch.testing.assert_close(fast, plain)
     if k == 1:
-        return  # the weight is 1 whatever query and sigma are
+        return  # the weight is 1 for any query and sigma
     got = torch.autograd.grad((fast * weights).sum(), inputs)
     want = torch.autograd.grad((plain * weights).sum(), inputs)
     for one, other in zip(got, want, strict=True):
         torch.testing.assert_close(one, other)
 
 
-def test_soft_projection_goes_to_the_nearest_point_and_to_the_mean(rng):
+def test_soft_projection_limits_are_nearest_point_and_mean(rng):
     points = torch.randn(3, 50, 3, generator=rng)
     queries = torch.randn(3, 9, 3, generator=rng)
     index = nearest(queries, points)[1]
@@ -52,22 +52,20 @@ def test_soft_projection_goes_to_the_nearest_point_and_to_the_mean(rng):
     torch.testing.assert_close(soft_projection(queries, points, 7, 1e9), neighbours.mean(2))
 
 
-def test_the_task_net_sees_the_projected_points_in_training_only(rng):
+def test_samplenet_projects_in_training_only(rng):
     net = SampleNet(6, k=4, beta=0.5, alpha=3.0).train()
     points = torch.randn(4, 20, 3, generator=rng)
     output = net(points)
     torch.testing.assert_close(
         output.soft_projected, soft_projection(output.points, points, 4, 1.0)
     )
-    torch.testing.assert_close(
-        output.losses["projection"], torch.tensor(0.5)
-    )  # sigma = 1² at first
+    torch.testing.assert_close(output.losses["projection"], torch.tensor(0.5))  # sigma starts at 1²
     expected = 3 * simplification_loss(points, output.points)
     torch.testing.assert_close(output.losses["simplification"], expected)
     assert net.eval()(points).soft_projected is None
 
 
-def test_both_namings_of_the_weights():
+def test_samplenet_gamma_replaces_alpha():
     assert SampleNet(6, alpha=30.0).alpha == 30
     assert SampleNet(6, alpha=30.0, gamma=5e-5).alpha == 5e-5
     assert SampleNet(6, gamma=0.0).alpha == 0
@@ -78,13 +76,13 @@ def test_both_namings_of_the_weights():
     ("sigma_min", "t", "sigma"),
     [(0.0, 0.001, 1e-6), (1e-2, 0.05, 1e-2), (1e-2, 0.5, 0.25), (1e-4, 0.001, 1e-4)],
 )
-def test_the_temperature_has_a_floor(sigma_min, t, sigma):
+def test_samplenet_sigma_has_lower_bound(sigma_min, t, sigma):
     net = SampleNet(6, sigma_min=sigma_min)
     torch.nn.init.constant_(net.temperature, t)
     assert math.isclose(net.sigma.item(), sigma, rel_tol=1e-5)
 
 
-def test_progressive_projections_are_nested(rng):
+def test_progressive_samplenet_is_nested(rng):
     net = ProgressiveSampleNet(8, k=3).train()
     points = torch.randn(4, 30, 3, generator=rng)
     whole = net(points)
@@ -94,7 +92,9 @@ def test_progressive_projections_are_nested(rng):
         assert set(output.losses) == {"simplification", "projection"}
 
 
-@pytest.mark.parametrize("settings", [{"k": 0}, {"beta": -1.0}, {"gamma": -1.0}, {"sigma_min": -1}])
-def test_wrong_settings_are_refused(settings):
-    with pytest.raises(UserError, match=f"sampler.{next(iter(settings))} must"):
-        SampleNet(8, **settings)
+@pytest.mark.parametrize(
+    "arguments", [{"k": 0}, {"beta": -1.0}, {"gamma": -1.0}, {"sigma_min": -1}]
+)
+def test_samplenet_invalid_argument_raises(arguments):
+    with pytest.raises(UserError, match=f"^{next(iter(arguments))} must be at least"):
+        SampleNet(8, **arguments)

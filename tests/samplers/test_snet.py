@@ -11,7 +11,7 @@ def layers(net):
     return [tuple(m.weight.shape) for m in net.modules() if isinstance(m, nn.Linear)]
 
 
-def test_published_layers_for_classification():
+def test_snet_has_published_layers_for_classification():
     net = SNet(32)
     assert layers(net) == [
         (64, 3), (64, 64), (64, 64), (128, 64), (128, 128),
@@ -20,7 +20,7 @@ def test_published_layers_for_classification():
     assert sum(isinstance(m, nn.BatchNorm1d) for m in net.modules()) == 9
 
 
-def test_published_layers_for_reconstruction():
+def test_snet_has_published_layers_for_reconstruction():
     net = SNet(
         32,
         feature_channels=(64, 128, 128, 256, 128),
@@ -34,7 +34,7 @@ def test_published_layers_for_reconstruction():
     assert sum(isinstance(m, nn.BatchNorm1d) for m in net.modules()) == 5
 
 
-def test_its_loss_is_weighted_and_there_in_training_only(rng):
+def test_snet_loss_is_weighted_and_in_training_only(rng):
     net = SNet(6, alpha=3.0, coverage=0.5, coverage_per_point=0.25).train()
     points = torch.randn(4, 20, 3, generator=rng)
     output = net(points)
@@ -43,16 +43,16 @@ def test_its_loss_is_weighted_and_there_in_training_only(rng):
     assert net.eval()(points).losses == {}
 
 
-def test_progressive_sizes_are_the_powers_of_two():
+def test_progressive_training_sizes_are_powers_of_two():
     assert ProgressiveSNet().training_sizes() == (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
     assert ProgressiveSNet(100, min_size=16).training_sizes() == (16, 32, 64, 100)
     assert ProgressiveSNet(1).training_sizes() == (1,)
 
 
-def test_progressive_samples_are_nested_each_with_the_loss_of_its_size(rng):
+def test_progressive_samples_are_nested(rng):
     net = ProgressiveSNet(16, coverage=0.5, coverage_per_point=1 / 30).train()
     points = torch.randn(4, 40, 3, generator=rng)
-    net(points)  # running statistics move with every call, the result does not
+    net(points)  # running statistics change with every call, the result does not
     whole = net(points).points
     outputs = net.sample_sizes(points, net.training_sizes())
     assert list(outputs) == [2, 4, 8, 16]
@@ -63,16 +63,16 @@ def test_progressive_samples_are_nested_each_with_the_loss_of_its_size(rng):
 
 
 @pytest.mark.parametrize(
-    ("settings", "named"),
+    ("arguments", "message"),
     [
-        ({"alpha": -1.0}, "sampler.alpha must not be negative, got -1.0"),
-        ({"coverage": -1.0}, "sampler.coverage must not"),
-        ({"feature_channels": (8,)}, "feature_channels must be sizes of at least 2 layers"),
-        ({"head_channels": (0,)}, "head_channels must be .* each at least 1, got .0."),
-        ({"min_size": 0}, "sampler.min_size must be at least 1, got 0"),
-        ({"size_reduction": "summ"}, "sampler.size_reduction: unknown 'summ'.*sum"),
+        ({"alpha": -1.0}, "^alpha must be at least 0, got -1.0"),
+        ({"coverage": -1.0}, "^coverage must be at least 0"),
+        ({"feature_channels": (8,)}, "^feature_channels must be sizes of at least 2 layers"),
+        ({"head_channels": (0,)}, "^head_channels must be .* each at least 1, got .0."),
+        ({"min_size": 0}, "^min_size must be at least 1, got 0"),
+        ({"size_reduction": "summ"}, "^size_reduction: unknown 'summ'.*sum"),
     ],
 )
-def test_wrong_settings_are_refused(settings, named):
-    with pytest.raises(UserError, match=named):
-        ProgressiveSNet(8, **settings)
+def test_snet_invalid_argument_raises(arguments, message):
+    with pytest.raises(UserError, match=message):
+        ProgressiveSNet(8, **arguments)

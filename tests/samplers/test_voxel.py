@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.samplers.voxel import COARSEST, FINEST, HALVINGS, VoxelSampler, group_voxels
+from mops_lightning.samplers.voxel import BISECTIONS, COARSEST, FINEST, VoxelSampler, group_voxels
 
 
 def plain_voxels(cloud, level):
-    """Which points lie in which voxel, cut 2^level times along the longest side."""
+    """Return the points of every voxel, with 2^level voxels along the longest side."""
     low = [min(p[k] for p in cloud) for k in range(3)]
     side = max(max(p[k] for p in cloud) - low[k] for k in range(3))
     voxels = defaultdict(list)
@@ -19,7 +19,7 @@ def plain_voxels(cloud, level):
 
 def plain_choice(cloud, m):
     coarse, fine = COARSEST, FINEST
-    for _ in range(HALVINGS):
+    for _ in range(BISECTIONS):
         middle = (coarse + fine) / 2
         if len(plain_voxels(cloud, middle)) >= m:
             fine = middle
@@ -32,7 +32,7 @@ def plain_choice(cloud, m):
 
 
 @pytest.mark.parametrize("m", [2, 13, 60])
-def test_equals_the_plain_search(m, rng):
+def test_voxel_equals_plain_search(m, rng):
     points = torch.randn(3, 100, 3, dtype=torch.float64, generator=rng)
     picked = VoxelSampler(m)(points)
     means = VoxelSampler(m, pick="centroid")(points)
@@ -48,7 +48,7 @@ def test_equals_the_plain_search(m, rng):
             assert distances[voxel.index(index)] <= distances.min() * (1 + 1e-6)
 
 
-def test_one_voxel_holds_everything(rng):
+def test_voxel_single_voxel_holds_all_points(rng):
     points = torch.randn(2, 40, 3, generator=rng)
     centroid = VoxelSampler(1, pick="centroid")(points).points
     torch.testing.assert_close(centroid, points.mean(1, keepdim=True))
@@ -56,8 +56,8 @@ def test_one_voxel_holds_everything(rng):
     assert VoxelSampler(1)(points).indices.squeeze(1).tolist() == nearest.tolist()
 
 
-def test_outliers_do_not_cost_the_others_their_voxels(rng):
-    """All points but one lie in a thousandth of the bounding box's side."""
+def test_group_voxels_outlier_leaves_enough_voxels(rng):
+    """All points but one are within a thousandth of the bounding box's side."""
     points = 1e-3 * torch.rand(1, 60, 3, generator=rng)
     points[0, 0] = 1.0
     voxels = group_voxels(points, 20)
@@ -66,23 +66,23 @@ def test_outliers_do_not_cost_the_others_their_voxels(rng):
 
 
 @pytest.mark.parametrize("pick", ["nearest", "centroid"])
-def test_filled_by_farthest_points_where_too_few_places_exist(pick):
+def test_voxel_fills_up_coincident_points(pick):
     places = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1.0, 0]])
     points = places.repeat_interleave(torch.tensor([5, 4, 3]), 0)[None]
     output = VoxelSampler(7, pick=pick)(points)
-    assert output.points[0, :3].tolist() == places.tolist()  # by falling population
+    assert output.points[0, :3].tolist() == places.tolist()  # in order of decreasing population
     rows = {tuple(p) for p in output.points[0].tolist()}
     assert rows == {tuple(p) for p in places.tolist()}
     if pick == "nearest":
         assert len(set(output.indices[0].tolist())) == 7
 
 
-def test_centroid_passes_gradients_to_all_points_of_the_voxel(rng):
+def test_voxel_centroid_has_gradients_of_all_points(rng):
     points = torch.randn(1, 30, 3, dtype=torch.float64, generator=rng, requires_grad=True)
     VoxelSampler(1, pick="centroid")(points).points.sum().backward()
     torch.testing.assert_close(points.grad, torch.full_like(points, 1 / 30))
 
 
-def test_unknown_pick_gets_the_nearest_known_one():
-    with pytest.raises(UserError, match="Did you mean 'centroid'"):
+def test_voxel_unknown_pick_raises():
+    with pytest.raises(UserError, match=r"^pick: unknown .* Did you mean 'centroid'"):
         VoxelSampler(4, pick="centriod")  # type: ignore[arg-type]

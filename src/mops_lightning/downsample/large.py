@@ -104,7 +104,7 @@ def by_chunks(
     """
     if not isinstance(sampler, MOPSNet):
         raise UserError(f"--chunk works with MOPS-Net and FMOPS-Net, not {type(sampler).__name__}.")
-    sampler._check_m(m)
+    sampler.check_m(m)
     whole = open_cloud_file(source)
     cloud, row_ranges = replace(whole, header=None), whole.row_ranges(size)
 

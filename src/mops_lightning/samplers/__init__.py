@@ -1,1 +1,1 @@
-"""Samplers: plain torch modules that turn ``(B, N, 3)`` points into ``(B, M, 3)``."""
+"""Samplers: plain torch modules from ``(B, N, 3)`` to ``(B, M, 3)`` points."""

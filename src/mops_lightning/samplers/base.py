@@ -1,4 +1,4 @@
-"""The contract that every sampler keeps."""
+"""Base class of all samplers."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -11,15 +11,17 @@ from mops_lightning.types import SampleOutput
 
 
 class Sampler(nn.Module):
-    """Base of all samplers: checks the input, then calls ``sample``.
+    """Base class of all samplers: checks the input, then calls ``sample``.
 
-    Maps points ``(B, N, 3)`` to a ``SampleOutput`` with points ``(B, M, 3)``.
+    Maps ``(B, N, 3)`` points to a ``SampleOutput`` with ``(B, M, 3)`` points. A subclass implements
+    ``sample(points, m)``. A learned sampler also implements ``losses``, a flexible one
+    ``training_sizes``, and one with a training schedule of its own ``anneal``.
 
     Args:
-        m: number of points to return; for a flexible sampler the largest number it can return.
+        m: number of points to return; for a flexible sampler, the largest number.
 
-    A subclass implements ``sample(points, m)``; a learned one also ``losses``, and one for many
-    sizes ``training_sizes``. ``anneal`` is there for what changes in the course of the training.
+    Raises:
+        UserError: ``m`` is not a whole number of at least 1.
 
     Example:
         >>> import torch
@@ -33,17 +35,17 @@ class Sampler(nn.Module):
     """
 
     flexible: bool = False
-    """Whether one instance takes any 1 ≤ m ≤ ``self.m``; others return ``self.m`` points only."""
+    """Whether one instance returns any 1 ≤ m ≤ ``self.m`` points; otherwise m is ``self.m``."""
 
     generates: bool = False
-    """Whether the points are made, so that matched and completed sets differ from them; the others
-    choose input points and return their indices."""
+    """Whether the points are generated, so that matched and completed sets differ from them;
+    otherwise they are input points, returned with their indices."""
 
     nested: bool = False
-    """Whether the answer for a smaller m is the first m points of the answer for a larger one."""
+    """Whether the sample of a smaller size is the first part of the sample of a larger one."""
 
     size_reduction: Literal["mean", "sum"] = "mean"
-    """How the losses at several ``training_sizes`` become one."""
+    """How the losses at several ``training_sizes`` are reduced to one."""
 
     def __init__(self, m: int) -> None:
         super().__init__()
@@ -56,66 +58,85 @@ class Sampler(nn.Module):
 
         Args:
             points: ``(B, N, 3)`` floating point, finite, N ≥ m.
-            m: how many points to return; None means ``self.m``.
+            m: number of points to return; None means ``self.m``.
 
         Returns:
             ``SampleOutput`` with ``(B, m, 3)`` points on the device and in the dtype of the input.
 
         Raises:
-            UserError: ``points`` or ``m`` is not as described.
+            UserError: ``points`` or ``m`` is invalid.
         """
         m = self.m if m is None else m
         return self.sample_sizes(points, (m,))[m]
 
     def _checked(self, points: Tensor, m: int) -> SampleOutput:
-        """Check the points, then sample, without losses."""
+        """Check the points and sample them, without losses."""
         check_points(points, at_least=m, finite=not (self.training and points.is_cuda))
-        own = next((p.dtype for p in self.parameters()), points.dtype)
-        if points.dtype != own and not torch.is_autocast_enabled(points.device.type):
-            raise UserError(f"points must be {own} as the sampler's weights, got {points.dtype}.")
+        dtype = next((p.dtype for p in self.parameters()), points.dtype)
+        if points.dtype != dtype and not torch.is_autocast_enabled(points.device.type):
+            raise UserError(
+                f"points must be {dtype} like the sampler's weights, got {points.dtype}."
+            )
         return self.sample(points, m)
 
     def sample_sizes(self, points: Tensor, sizes: Sequence[int]) -> dict[int, SampleOutput]:
-        """Sample at several sizes; a nested sampler works once, at the largest.
+        """Sample at several sizes; a nested sampler runs once, at the largest.
 
         Args:
             points: as for ``forward``.
             sizes: each as ``m`` for ``forward``.
 
         Returns:
-            By size, what ``forward`` returns for it.
+            The result of ``forward`` by size.
+
+        Raises:
+            UserError: ``points`` or a size is invalid.
         """
         if not self.nested and len(sizes) > 1:
             return {m: self(points, m) for m in sizes}
         for m in sizes:
-            self._check_m(m)
+            self.check_m(m)
         whole = self._checked(points, max(sizes))
         losses = self.losses(points, whole, sizes) if self.training else {}
         return {m: whole.first(m)._replace(losses=losses.get(m, {})) for m in sizes}
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
-        """Do the work on checked input; see ``forward``."""
+        """Sample checked input; arguments and result are those of ``forward``."""
         raise NotImplementedError
 
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]
     ) -> dict[int, dict[str, Tensor]]:
-        """Return, by size, the weighted loss terms of a training output's first points."""
+        """Return the weighted loss terms of the first points of a training output.
+
+        Args:
+            points: ``(B, N, 3)`` the input.
+            output: the sample of the largest size.
+            sizes: sizes to compute the losses for.
+
+        Returns:
+            Scalar terms by size and name; empty for a sampler without losses.
+        """
         return {}
 
     def training_sizes(self) -> tuple[int, ...]:
-        """Return the sizes that the next training step learns from; torch's seed draws them."""
+        """Return the sizes of the next training step; random ones use torch's global generator."""
         return (self.m,)
 
     def anneal(self, progress: float) -> None:
-        """Tell the sampler how much of the training is done, from 0 to 1; most do not mind."""
+        """Update schedules for the training progress, from 0 to 1; does nothing by default."""
 
     @property
     def learned(self) -> bool:
-        """Whether there is anything to train."""
+        """Whether the sampler has parameters to train."""
         return any(True for _ in self.parameters())
 
-    def _check_m(self, m: int) -> None:
+    def check_m(self, m: int) -> None:
+        """Check that the sampler returns samples of size m.
+
+        Raises:
+            UserError: it does not.
+        """
         if self.flexible and not 1 <= m <= self.m:
             raise UserError(f"m must be between 1 and {self.m}, got {m}.")
         if not self.flexible and m != self.m:
@@ -125,16 +146,16 @@ class Sampler(nn.Module):
 
 
 def check_points(points: Tensor, at_least: int = 1, finite: bool = True) -> None:
-    """Refuse what is not a batch of clouds with enough points.
+    """Check that an argument is a batch of clouds with enough points.
 
     Args:
-        points: should be ``(B, N, 3)``, floating point and finite.
+        points: must be ``(B, N, 3)``, floating point and finite.
         at_least: smallest N allowed.
-        finite: also look for NaN and infinity (on a GPU this waits for the device, so training
-            there leaves it to the data loading).
+        finite: whether to check for NaN and infinity. On a GPU this check waits for the device;
+            training there relies on the check in data loading.
 
     Raises:
-        UserError: naming what is allowed and what came.
+        UserError: the argument is invalid.
     """
     if not isinstance(points, Tensor):
         raise UserError(f"points must be a torch.Tensor, got {type(points).__name__}.")
@@ -144,7 +165,7 @@ def check_points(points: Tensor, at_least: int = 1, finite: bool = True) -> None
     if not points.is_floating_point():
         raise UserError(f"points must be floating point, got {points.dtype}.")
     if points.shape[0] == 0 or points.shape[1] == 0:
-        raise UserError(f"points must hold at least one cloud and one point, got shape {shape}.")
+        raise UserError(f"points must have at least one cloud and one point, got shape {shape}.")
     if points.shape[1] < at_least:
         raise UserError(
             f"m must be at most the number of points N={points.shape[1]}, got m={at_least}."

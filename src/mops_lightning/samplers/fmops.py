@@ -1,4 +1,7 @@
-"""FMOPS-Net: one training, any number of points (paper section "Flexible MOPS-Net")."""
+"""FMOPS-Net: one network for any number of points.
+
+Paper section "Flexible MOPS-Net for Arbitrary Ratios".
+"""
 
 from typing import Any, Literal
 
@@ -13,20 +16,21 @@ DISTRIBUTIONS = ("nested", "uniform", "log_uniform")
 class FMOPSNet(MOPSNet):
     """MOPS-Net whose left-most m columns of S are trained for every m.
 
-    One net for 1 ≤ m ≤ m_max: the first m points of the largest sample are the sample of size m.
+    One net serves all 1 ≤ m ≤ m_max: the first m points of the largest sample are the sample of
+    size m.
 
     Args:
         m_max: largest number of points.
-        size_sampling: from which m a training step learns. ``uniform`` draws one m from 1 to m_max
-            (the paper); ``log_uniform`` draws one whose logarithm is uniform, so that small sizes
-            come as often as large ones; ``nested`` cuts the range of logarithms into ``num_sizes``
-            equal parts and draws one m from each: they share one forward pass of the sampler, and
-            the mean of their losses counts.
-        num_sizes: how many sizes ``nested`` takes.
-        **settings: as for ``MOPSNet``.
+        size_sampling: how a training step chooses its sizes. ``uniform`` draws one m from 1 to
+            m_max, as in the paper; ``log_uniform`` draws one m with a uniform logarithm, which
+            favours small sizes; ``nested`` splits the range of logarithms into ``num_sizes`` equal
+            parts and draws one m from each. The sizes of a step share one forward pass of the
+            sampler, and their losses are averaged.
+        num_sizes: number of sizes with ``nested``.
+        **settings: arguments of ``MOPSNet``.
 
     Raises:
-        UserError: a setting is out of its range.
+        UserError: an argument is out of range.
 
     Example:
         >>> import torch
@@ -50,9 +54,9 @@ class FMOPSNet(MOPSNet):
         super().__init__(m_max, **settings)
         if size_sampling not in DISTRIBUTIONS:
             hint = did_you_mean(size_sampling, DISTRIBUTIONS)
-            raise UserError(f"sampler.size_sampling: unknown {size_sampling!r}.{hint}")
+            raise UserError(f"size_sampling: unknown {size_sampling!r}.{hint}")
         if num_sizes < 1:
-            raise UserError(f"sampler.num_sizes must be at least 1, got {num_sizes}.")
+            raise UserError(f"num_sizes must be at least 1, got {num_sizes}.")
         self.size_sampling = size_sampling
         self.num_sizes = num_sizes
 
@@ -61,7 +65,7 @@ class FMOPSNet(MOPSNet):
         if self.size_sampling == "uniform":
             return (int(torch.randint(1, self.m + 1, ())),)
         parts = self.num_sizes if self.size_sampling == "nested" else 1
-        places = (torch.arange(parts) + torch.rand(parts)).double() / parts
-        # floor((m_max + 1)^u) takes every m from 1 to m_max, m with a share of log(1 + 1/m).
-        sizes = ((self.m + 1) ** places).floor().long().clamp(1, self.m)
+        exponents = (torch.arange(parts) + torch.rand(parts)).double() / parts
+        # floor((m_max + 1)^u) ranges from 1 to m_max, with probabilities ∝ log(1 + 1/m).
+        sizes = ((self.m + 1) ** exponents).floor().long().clamp(1, self.m)
         return tuple(sizes.unique().tolist())

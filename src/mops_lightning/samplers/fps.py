@@ -1,4 +1,4 @@
-"""Farthest point sampling (FPS), a baseline of the paper's tables."""
+"""Farthest point sampling (FPS), a baseline in the paper's tables."""
 
 from torch import Tensor
 
@@ -11,19 +11,19 @@ from mops_lightning.types import SampleOutput
 
 
 class FPSSampler(Sampler):
-    """Choose input points, each as far as possible from those chosen before it.
+    """Choose input points, each as far as possible from the points chosen before it.
 
-    Flexible: the choice for a smaller m is the first m points of the choice for a larger one. First
-    point and ties follow the seeded order of the cloud (see ``ordering``), so the choice does not
-    change with batch, call or, unless ``start`` is given, order of the points.
+    Flexible and nested. The seeded order of the cloud (see ``ordering``) determines the first point
+    and breaks ties, so that the sample depends on the seed and the cloud only: neither on the rest
+    of the batch nor, unless ``start`` is given, on the order of the points.
 
     Args:
         m: largest number of points to return.
-        seed: another seed starts from another point.
-        start: index of the first point in every cloud; None means that the seed chooses it.
+        seed: determines the first point.
+        start: index of the first point in every cloud; None means that the seed determines it.
 
     Raises:
-        UserError: ``start`` is negative or, when called, at least N.
+        UserError: ``start`` is negative or, when sampling, at least N.
 
     Example:
         >>> import torch
@@ -40,7 +40,7 @@ class FPSSampler(Sampler):
         super().__init__(m)
         if start is not None and start < 0:
             raise UserError(
-                f"sampler.start must be at least 0, or null for a seeded one, got {start}."
+                f"start must be at least 0, or None to let the seed choose, got {start}."
             )
         self.seed = seed
         self.start = start
@@ -49,7 +49,7 @@ class FPSSampler(Sampler):
         """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice."""
         if self.start is not None and self.start >= points.shape[1]:
             raise UserError(
-                f"sampler.start must be less than the number of points N={points.shape[1]}, "
+                f"start must be less than the number of points N={points.shape[1]}, "
                 f"got {self.start}."
             )
         order = seeded_order(points, self.seed)

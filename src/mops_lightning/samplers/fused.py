@@ -1,4 +1,4 @@
-"""MOPS-Net in evaluation as plain matrix products: BatchNorm fused, points in blocks."""
+"""MOPS-Net for inference: BatchNorm fused into linear layers, points processed in blocks."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -8,11 +8,16 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_linear_bn_weights
 
 BLOCK_ROWS = {"cpu": 2048, "cuda": 2**18}
-"""Points that pass all layers together: on a CPU their widest layer should stay in the cache."""
+"""Points per block: on a CPU, the widest layer of a block stays in the cache."""
 
 
 class Layer(NamedTuple):
-    """A linear layer with ReLU, weights ``(out, in)``."""
+    """A linear layer with ReLU.
+
+    Attributes:
+        weight: ``(out, in)``.
+        bias: ``(out,)``.
+    """
 
     weight: Tensor
     bias: Tensor
@@ -23,14 +28,14 @@ class Layer(NamedTuple):
 
 
 class FusedMOPSNet(NamedTuple):
-    """What a trained MOPS-Net computes, in three functions of chunks of a cloud.
+    """A trained MOPS-Net as functions of chunks of a cloud.
 
     Attributes:
-        features: the per-point layers.
-        local: ρ's first layer, what of it acts on local features.
-        global_weight: what of it acts on the global feature, without bias.
-        rest: ρ's other hidden layers.
-        queries: ``(M, C)``, ρ's last layer over the temperature.
+        features: the pointwise layers of the feature extraction.
+        local: the first layer of ρ for local features.
+        global_weight: the weights of this layer for the global feature.
+        rest: the other hidden layers of ρ.
+        queries: ``(M, C)``, the last layer of ρ divided by the temperature.
     """
 
     features: tuple[Layer, ...]
@@ -50,12 +55,15 @@ class FusedMOPSNet(NamedTuple):
 
     @torch.no_grad()
     def keys(self, local: Tensor, global_: Tensor, into: Tensor | None = None) -> Tensor:
-        """Map local features ``(N, D)`` and a global one ``(D,)`` to the keys ``(N, C)`` of S.
+        """Return the keys of the sampling matrix.
 
         Args:
-            local: of some points of a cloud.
-            global_: of the whole cloud.
-            into: ``(N, C)``, where to write the keys; None: new memory.
+            local: ``(N, D)``, local features of some points of a cloud.
+            global_: ``(D,)``, the global feature of the whole cloud.
+            into: ``(N, C)``, a tensor for the result; None allocates one.
+
+        Returns:
+            ``(N, C)``.
         """
         bias = torch.addmv(self.local.bias, self.global_weight, global_)
         layers = (self.local._replace(bias=bias), *self.rest)
@@ -74,23 +82,23 @@ def fuse(
     rho: nn.Sequential,
     queries: Tensor,
 ) -> FusedMOPSNet:
-    """Fuse the running statistics of BatchNorm into the layers before them.
+    """Fuse BatchNorm with its running statistics into the preceding linear layers.
 
     Args:
-        features: the per-point layers.
-        rho_local: the part of ρ's first layer that acts on local features.
-        rho_global: the part that acts on the global feature.
-        rho_norm: the normalisation after the sum of both.
-        rho: ρ's other hidden layers.
-        queries: ``(M, C)``, ρ's last layer over the temperature.
+        features: the pointwise layers of the feature extraction.
+        rho_local: the first layer of ρ for local features.
+        rho_global: the first layer of ρ for the global feature.
+        rho_norm: BatchNorm after the sum of both.
+        rho: the other hidden layers of ρ.
+        queries: ``(M, C)``, the last layer of ρ divided by the temperature.
 
     Returns:
-        The network in evaluation, for chunks of a cloud; weights are copied.
+        The network for inference, with copies of the weights.
     """
-    # The norm's shift belongs to the sum of both parts and is given to one of them.
+    # The shift of BatchNorm applies to the sum once, so only one of the parts gets it.
     local = _fused(rho_local, rho_norm)
-    both = _fused(rho_global, rho_norm)
-    return FusedMOPSNet(_layers(features), local, both.weight, _layers(rho), queries)
+    of_global = _fused(rho_global, rho_norm)
+    return FusedMOPSNet(_layers(features), local, of_global.weight, _layers(rho), queries)
 
 
 def _layers(stack: nn.Sequential) -> tuple[Layer, ...]:

@@ -1,4 +1,4 @@
-"""MOPS-Net: the learned sampler of the paper."""
+"""MOPS-Net, the learned sampler of the paper."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -21,21 +21,21 @@ ANNEALINGS = ("exponential", "linear")
 class MOPSNet(Sampler):
     """MOPS-Net (paper sections "Feature Extraction" to "Joint Training Loss").
 
-    Every point's local feature, joined with the cloud's global one, goes through the MLP ρ; its m
-    outputs, divided by the temperature tau and turned into shares by a softmax over the points,
-    are the columns of the sampling matrix S; the sampled points are SᵀP.
+    The local feature of every point is concatenated with the global feature of the cloud and passed
+    through the MLP ρ with m outputs. Their softmax over the points, with temperature tau, gives the
+    columns of the sampling matrix S (Eq. 5). The sampled points are SᵀP (Eq. 6).
 
     Args:
         m: number of points to generate.
-        alpha: weight of the subset loss in the training loss.
-        tau_min: temperature at the end of training and in evaluation; it starts at 1.
-        annealing: how tau falls with the training's progress, ``exponential`` or ``linear``.
-        feature_channels: sizes of the per-point layers; local and global feature have the last.
-        rho_channels: sizes of ρ's hidden layers, before the m outputs.
+        alpha: weight α of the subset loss (Eq. 11).
+        tau_min: temperature at the end of training and in evaluation; training starts at 1.
+        annealing: how tau decreases with the training progress, ``exponential`` or ``linear``.
+        feature_channels: sizes of the pointwise layers; the last is that of the local and the
+            global feature.
+        rho_channels: sizes of the hidden layers of ρ.
 
     Raises:
-        UserError: tau_min is not in (0, 1], alpha is negative, annealing is unknown, or a layer has
-            no channels.
+        UserError: an argument is out of range.
 
     Example:
         >>> import torch
@@ -61,33 +61,32 @@ class MOPSNet(Sampler):
     ) -> None:
         super().__init__(m)
         if not 0 < tau_min <= 1:
-            raise UserError(f"sampler.tau_min must be above 0 and at most 1, got {tau_min}.")
+            raise UserError(f"tau_min must be above 0 and at most 1, got {tau_min}.")
         if alpha < 0:
-            raise UserError(f"sampler.alpha must not be negative, got {alpha}.")
+            raise UserError(f"alpha must be at least 0, got {alpha}.")
         if annealing not in ANNEALINGS:
-            raise UserError(
-                f"sampler.annealing: unknown {annealing!r}.{did_you_mean(annealing, ANNEALINGS)}"
-            )
-        check_channels("sampler.feature_channels", feature_channels)
-        check_channels("sampler.rho_channels", rho_channels)
+            hint = did_you_mean(annealing, ANNEALINGS)
+            raise UserError(f"annealing: unknown {annealing!r}.{hint}")
+        check_channels("feature_channels", feature_channels)
+        check_channels("rho_channels", rho_channels)
         self.alpha = alpha
         self.tau_min = tau_min
         self.annealing = annealing
         self.training_tau = 1.0
         local = feature_channels[-1]
         self.features = PointFeatures(feature_channels)
-        # ρ's first layer acts on [local, global]. The global half is the same for all points of a
-        # cloud, so it is multiplied once per cloud and added, never repeated N times.
+        # The first layer of ρ acts on [local, global]. The product with the global feature is the
+        # same for all points of a cloud, so it is computed once per cloud.
         self.rho_local = nn.Linear(local, rho_channels[0], bias=False)
         self.rho_global = nn.Linear(local, rho_channels[0], bias=False)
         self.rho_first = nn.Sequential(nn.BatchNorm1d(rho_channels[0]), nn.ReLU(inplace=True))
         self.rho = linear_norm_relu(rho_channels)
-        # Without bias: it would be constant down a column of S, where the softmax cancels it.
+        # A bias would be constant within a column of S, where the softmax cancels it.
         self.queries = nn.Linear(rho_channels[-1], m, bias=False)
 
     @property
     def tau(self) -> float:
-        """The temperature in force: annealed in training, tau_min in evaluation."""
+        """The current temperature: annealed in training, ``tau_min`` in evaluation."""
         return self.training_tau if self.training else self.tau_min
 
     def anneal(self, progress: float) -> None:
@@ -99,10 +98,10 @@ class MOPSNet(Sampler):
             self.training_tau = 1 + (self.tau_min - 1) * progress
 
     def sampling_matrix(self, points: Tensor) -> SamplingMatrix:
-        """Return S for ``(B, N, 3)`` points."""
+        """Return the sampling matrices S of ``(B, N, 3)`` points."""
         plain = self.training or torch.is_grad_enabled()
         if not plain and not torch.is_autocast_enabled(points.device.type):
-            return self._evaluated(points)
+            return self._fused_matrix(points)
         local, global_ = self.features(points)
         with pointwise_autocast(points.device.type):
             hidden = self.rho_local(local).add_(self.rho_global(global_)[:, None])
@@ -112,15 +111,15 @@ class MOPSNet(Sampler):
         return SamplingMatrix(queries, keys, self.tau)
 
     def fused(self) -> FusedMOPSNet:
-        """Return the network in evaluation with BatchNorm fused; weights are copied as they are."""
+        """Return the network for inference with BatchNorm fused, with copies of the weights."""
         norm = self.rho_first[0]
         assert isinstance(norm, nn.BatchNorm1d)
         queries = self.queries.weight.detach() / self.tau_min
         layers = self.features.mlp.layers
         return fuse(layers, self.rho_local, self.rho_global, norm, self.rho, queries)
 
-    def _evaluated(self, points: Tensor) -> SamplingMatrix:
-        """Return S without gradients, by fused layers."""
+    def _fused_matrix(self, points: Tensor) -> SamplingMatrix:
+        """Return S without gradients, with the fused network."""
         net = self.fused()
         local = net.local_features(points.flatten(0, 1)).unflatten(0, points.shape[:2])
         keys = local.new_empty(*local.shape[:2], net.queries.shape[1])
@@ -136,6 +135,6 @@ class MOPSNet(Sampler):
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]
     ) -> dict[int, dict[str, Tensor]]:
-        """Return α times the subset loss (paper section "Joint Training Loss") at every size."""
+        """Return α times the subset loss at every size (section "Joint Training Loss", Eq. 11)."""
         losses = subset_losses(points, output.points, sizes)
         return {m: {"subset": self.alpha * loss} for m, loss in losses.items()}

@@ -1,8 +1,8 @@
-"""A random order of a cloud's points that depends on the seed and the cloud alone.
+"""Random order of the points of a cloud that depends on the seed and the cloud only.
 
-A stream of random numbers would give a cloud another sample in another batch, in another epoch or
-with its points in another order. Here every point is numbered by a hash of its coordinates, the
-seed and the whole cloud, so its place in the order is the same wherever it stands.
+With a stream of random numbers, the sample of a cloud would depend on the batch, the epoch and the
+order of its points. Here, points are ordered by a hash of their coordinates, the seed and the whole
+cloud.
 """
 
 import torch
@@ -14,15 +14,15 @@ FIRST, SECOND = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB  # the multipliers of Spl
 
 
 def seeded_order(points: Tensor, seed: int) -> Tensor:
-    """Put the points of every cloud into random order.
+    """Return a random order of the points of every cloud.
 
-    Reordered clouds give the same points in the same order, a cloud in a batch what it gives
-    alone, and float32 what the same numbers give in float64. Copies of a point are numbered, so
-    that they do not stand together; which of them is which follows their place in the input.
+    The resulting sequence of points does not depend on the order of the input, on the other clouds
+    in the batch, or on whether the coordinates are given in float32 or float64. Copies of a point
+    get independent positions; the order among them follows the input.
 
     Args:
         points: ``(B, N, C)`` floating point.
-        seed: any integer; others give other orders.
+        seed: any integer.
 
     Returns:
         ``(B, N)`` int64 permutations.
@@ -35,7 +35,7 @@ def seeded_order(points: Tensor, seed: int) -> Tensor:
         begin = place.clone()
         begin[:, 1:].masked_fill_(equal, 0)
         copy = place - begin.cummax(1).values
-        # First ones keep their keys: clouds without copies must not notice their neighbours.
+        # First copies keep their keys, so that clouds without copies do not depend on the batch.
         values = torch.where(copy > 0, _scramble(values + copy * _signed(STEP)), values)
         order = order.gather(1, values.argsort(dim=1, stable=True))
     return order
@@ -44,17 +44,18 @@ def seeded_order(points: Tensor, seed: int) -> Tensor:
 def point_hashes(points: Tensor, seed: int) -> Tensor:
     """Hash every point with the seed and with its cloud.
 
-    The cloud enters as the sum of its points' first hashes, which no reordering changes: else
-    points that many clouds share, such as the origin, would be chosen in all of them or in none.
+    The cloud enters as the sum of the first hashes of its points, which is independent of their
+    order. Without it, points that many clouds share, such as the origin, would be chosen in all of
+    these clouds or in none.
 
     Args:
         points: ``(B, N, C)`` floating point.
         seed: any integer.
 
     Returns:
-        ``(B, N)`` int64, all 64 bits random; equal points of one cloud have equal hashes.
+        ``(B, N)`` int64 with 64 random bits; equal points of a cloud have equal hashes.
     """
-    # int64 products wrap on every device, which is what a hash wants; + 0.0 turns -0 into 0.
+    # int64 products wrap on every device, as the hash requires; + 0.0 turns -0 into 0.
     bits = (points.double() + 0.0).view(torch.int64)
     keys = torch.full_like(bits[..., 0], _signed(seed * STEP + 1))
     for axis in range(points.shape[2]):
@@ -63,14 +64,14 @@ def point_hashes(points: Tensor, seed: int) -> Tensor:
 
 
 def _scramble(keys: Tensor) -> Tensor:
-    """Let every bit of a key change every bit of the result (the finish of SplitMix64)."""
+    """Make every bit of the result depend on every bit of a key (the finalizer of SplitMix64)."""
     keys = _xor_shift(keys, 30).mul_(_signed(FIRST))
     keys = _xor_shift(keys, 27).mul_(_signed(SECOND))
     return _xor_shift(keys, 31)
 
 
 def _xor_shift(keys: Tensor, shift: int) -> Tensor:
-    """Return ``keys ^ (keys >> shift)`` with the zeros of an unsigned shift."""
+    """Return ``keys ^ (keys >> shift)`` with an unsigned shift."""
     return (keys >> shift).bitwise_and_(2 ** (64 - shift) - 1).bitwise_xor_(keys)
 
 

@@ -13,25 +13,24 @@ from mops_lightning.samplers.ordering import seeded_order
 from mops_lightning.types import SampleOutput
 
 BLOCK = 2**22
-"""Distances held at once while the weights are summed."""
+"""Distances in memory at a time while the weights are summed."""
 
 
 class PoissonSampler(Sampler):
-    """Start from all points and drop the most crowded one until m are left.
+    """Start from all points and remove the most crowded one until m points remain.
 
-    A point's crowding is Σ (1 − d/d_max)⁸ over the others that are still there and nearer than
-    d_max. The publication takes d_max from the area of the surface, which a cloud does not tell;
-    here it is twice the distance at which farthest point sampling takes its m-th point, the
-    smallest number that is known to bound the spacing of any m points of the cloud. The publication
-    also weighs points nearer than a lower bound as if they stood at it, which is left out here.
+    The crowding of a point is Σ (1 − d/d_max)⁸ over the remaining points nearer than d_max. The
+    publication computes d_max from the area of the surface, which is unknown for a cloud. Here,
+    d_max is twice the distance at which farthest point sampling chooses its m-th point, an upper
+    bound of the spacing of any m points of the cloud. The publication also has a lower bound for d,
+    which is omitted here.
 
-    Ties follow the seeded order of the cloud (see ``ordering``), so the choice does not change with
-    batch, call or order of the points. Flexible: any m up to the given one, but not nested. Takes
-    time proportional to N·(N − m) and memory to N.
+    The seeded order of the cloud (see ``ordering``) breaks ties, so that the sample depends on the
+    seed and the cloud only. Flexible, but not nested. Takes O(N·(N − m)) time and O(N) memory.
 
     Args:
         m: largest number of points to return.
-        seed: another seed decides ties in another way.
+        seed: determines how ties are broken.
 
     Example:
         >>> import torch
@@ -57,34 +56,41 @@ class PoissonSampler(Sampler):
 
 @torch.no_grad()
 def eliminate(points: Tensor, m: int) -> Tensor:
-    """Drop the most crowded point of every cloud, again and again; see ``PoissonSampler``.
+    """Remove the most crowded point of every cloud until m remain; see ``PoissonSampler``.
 
     Args:
-        points: ``(B, N, C)``; of equally crowded points the first is dropped.
-        m: how many stay, 1 ≤ m ≤ N.
+        points: ``(B, N, C)``; the first point is removed in case of ties.
+        m: number of points that remain, 1 ≤ m ≤ N.
 
     Returns:
         ``(B, m)`` int64 rows of ``points``, ascending.
     """
     batch, number, _ = points.shape
-    # Double precision: sums must not depend on how many numbers are added at once.
+    # In double precision, rounding does not depend on how many numbers are added at once.
     points = points.double()
     reach = spacing_bound(points, m)
     crowding = _crowding(points, reach)
-    planes = points.permute(2, 0, 1).contiguous()  # so that every step runs along memory
+    planes = points.permute(2, 0, 1).contiguous()  # every step runs along memory
     for _ in range(number - m):
         worst = crowding.argmax(1, keepdim=True)
-        dropped = planes.gather(2, worst.expand(len(planes), -1, -1))
-        crowding -= _weights((planes - dropped).square_().sum(0), reach)
+        removed = planes.gather(2, worst.expand(len(planes), -1, -1))
+        crowding -= _weights((planes - removed).square_().sum(0), reach)
         crowding.scatter_(1, worst, -torch.inf)
     return (crowding > -torch.inf).nonzero()[:, 1].view(batch, m)
 
 
 def spacing_bound(points: Tensor, m: int) -> Tensor:
-    """Return ``(B, 1)``: no m points of the cloud are all farther apart than this.
+    """Return an upper bound of the smallest distance among any m points of a cloud.
 
-    Each of m such points would have to lie within half of it of one of the m − 1 points that
-    farthest point sampling takes first, so two would share one.
+    Every point is within half of this bound of one of the first m − 1 points of farthest point
+    sampling. Of any m points, two therefore share the same one.
+
+    Args:
+        points: ``(B, N, C)``.
+        m: number of points.
+
+    Returns:
+        ``(B, 1)``.
     """
     if m == 1:
         spans = points.amax(1) - points.amin(1)
@@ -95,14 +101,14 @@ def spacing_bound(points: Tensor, m: int) -> Tensor:
 
 
 def _weights(squared: Tensor, reach: Tensor) -> Tensor:
-    """Weigh squared distances, which are overwritten: 1 at 0, falling to 0 at ``reach``."""
+    """Return weights of squared distances, in place: 1 at distance 0, and 0 from ``reach`` on."""
     tiny = torch.finfo(squared.dtype).tiny
     share = squared.sqrt_().div_(reach.clamp_min(tiny)).neg_().add_(1).clamp_min_(0)
-    return share.square_().square_().square_()  # to the eighth, as published
+    return share.square_().square_().square_()  # eighth power, as published
 
 
 def _crowding(points: Tensor, reach: Tensor) -> Tensor:
-    """Sum the weights of all other points for every point, ``(B, N)``, block by block."""
+    """Return the sum of the weights of all other points, ``(B, N)``, computed in blocks."""
     batch, number, _ = points.shape
     total = torch.empty(batch, number, dtype=points.dtype, device=points.device)
     height = max(1, BLOCK // number)
@@ -111,4 +117,4 @@ def _crowding(points: Tensor, reach: Tensor) -> Tensor:
             part = points[cloud, start : start + height]
             squared = (part[:, None] - points[cloud]).square().sum(2)
             total[cloud, start : start + height] = _weights(squared, reach[cloud]).sum(1)
-    return total - 1  # each point weighed itself
+    return total - 1  # the weight of the point itself

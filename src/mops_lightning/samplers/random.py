@@ -1,4 +1,4 @@
-"""Random sampling (RS), the first baseline of the paper's tables."""
+"""Random sampling (RS), a baseline in the paper's tables."""
 
 from torch import Tensor
 
@@ -9,14 +9,13 @@ from mops_lightning.types import SampleOutput
 
 
 class RandomSampler(Sampler):
-    """Choose input points uniformly and without repetition.
+    """Choose input points uniformly, without replacement.
 
-    Flexible: the choice for a smaller m is the first m points of the choice for a larger one. The
-    choice depends on the seed and the cloud alone, see ``ordering``.
+    Flexible and nested. The sample depends on the seed and the cloud only, see ``ordering``.
 
     Args:
         m: largest number of points to return.
-        seed: another seed chooses other points.
+        seed: determines the order in which points are chosen.
 
     Example:
         >>> import torch

@@ -1,7 +1,7 @@
-"""SampleNet and its progressive form: S-Net with a soft projection onto the cloud.
+"""SampleNet and its progressive variant: S-Net with a soft projection onto the cloud.
 
-Lang, Manor and Avidan, "SampleNet: Differentiable Point Cloud Sampling", CVPR 2020; a rival in the
-paper's tables.
+Lang, Manor and Avidan, "SampleNet: Differentiable Point Cloud Sampling", CVPR 2020; a baseline in
+the paper's tables.
 """
 
 from collections.abc import Sequence
@@ -20,45 +20,45 @@ from mops_lightning.types import SampleOutput
 def soft_projection(queries: Tensor, points: Tensor, k: int, sigma: Tensor | float) -> Tensor:
     """Replace every query by a weighted mean of its k nearest points.
 
-    Σ_i w_i·p_i with w = softmax(−d²(q, p_i)/σ) over the k nearest (SampleNet, section "Soft
-    projection"). For σ → 0 it is the nearest point.
+    The result is Σ_i w_i·p_i with w = softmax(−d²(q, p_i)/σ) over the k nearest points (SampleNet,
+    section "Soft projection"). For σ → 0 it is the nearest point.
 
     Args:
         queries: ``(B, M, 3)``.
         points: ``(B, N, 3)``, N ≥ k.
-        k: how many neighbours.
+        k: number of neighbours.
         sigma: σ > 0, in squared units of the coordinates.
 
     Returns:
         ``(B, M, 3)``; gradients flow to queries, points and σ.
 
     Raises:
-        UserError: k is out of its range.
+        UserError: k is out of range.
     """
     distances, indices = k_nearest(queries, points, k)
-    # The softmax does not mind the shift, and a tiny σ makes no infinity of the nearest one.
-    shares = ((distances[..., :1] - distances) / sigma).softmax(2)
+    # Softmax is shift-invariant; the shift keeps the nearest logit finite for tiny σ.
+    weights = ((distances[..., :1] - distances) / sigma).softmax(2)
     neighbours = gather_points(points, indices.flatten(1)).unflatten(1, indices.shape[1:])
-    return (shares[..., None] * neighbours).sum(2)
+    return (weights[..., None] * neighbours).sum(2)
 
 
 class SampleNet(SNet):
-    """S-Net whose points are softly projected onto the cloud for the task net in training.
+    """S-Net with a soft projection of its points onto the cloud during training.
 
-    In evaluation nothing is projected: the readouts *matched* and *completed* take the nearest
-    input points of the simplified ones, which are the readout *generated*.
+    In training, the task net receives the projected points. In evaluation nothing is projected: the
+    generated points are those of S-Net, matched and completed as usual.
 
     Args:
         m: number of points to generate.
-        k: how many neighbours the projection takes.
-        beta: weight of the projection loss, which is σ (β in the MOPS-Net paper).
-        gamma: weight of the simplification loss (γ in the MOPS-Net paper); None takes ``alpha``,
-            the name it has in SampleNet's own publication.
-        sigma_min: floor of σ = t², where t is learned and starts at 1.
-        **settings: as for ``SNet``; ``alpha`` is the weight of the simplification loss.
+        k: number of neighbours of the projection.
+        beta: weight of the projection loss σ (β in the MOPS-Net paper).
+        gamma: weight of the simplification loss (γ in the MOPS-Net paper); None means ``alpha``,
+            its name in SampleNet's publication.
+        sigma_min: lower bound of σ = t², where t is learned and starts at 1.
+        **settings: arguments of ``SNet``; ``alpha`` is the weight of the simplification loss.
 
     Raises:
-        UserError: a setting is out of its range.
+        UserError: an argument is out of range.
 
     Example:
         >>> import torch
@@ -80,9 +80,9 @@ class SampleNet(SNet):
         super().__init__(m, **settings)
         for name, value in {"beta": beta, "gamma": gamma or 0, "sigma_min": sigma_min}.items():
             if value < 0:
-                raise UserError(f"sampler.{name} must not be negative, got {value}.")
+                raise UserError(f"{name} must be at least 0, got {value}.")
         if k < 1:
-            raise UserError(f"sampler.k must be at least 1, got {k}.")
+            raise UserError(f"k must be at least 1, got {k}.")
         self.k = k
         self.beta = beta
         self.alpha = self.alpha if gamma is None else gamma
@@ -91,14 +91,14 @@ class SampleNet(SNet):
 
     @property
     def sigma(self) -> Tensor:
-        """The projection's temperature σ = t², at least ``sigma_min``."""
+        """The temperature σ = t² of the projection, at least ``sigma_min``."""
         return self.temperature.square().clamp(min=self.sigma_min)
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
-        """Generate points; in training their soft projection stands beside them."""
+        """Generate points, in training together with their soft projection."""
         if self.k > points.shape[1]:
             raise UserError(
-                f"sampler.k must be at most the number of points N={points.shape[1]}, got {self.k}."
+                f"k must be at most the number of points N={points.shape[1]}, got {self.k}."
             )
         output = super().sample(points, m)
         if not self.training:
@@ -116,7 +116,7 @@ class SampleNet(SNet):
 
 
 class ProgressiveSampleNet(Progressive, SampleNet):
-    """SampleNet with nested samples; settings as for ``Progressive`` and ``SampleNet``.
+    """SampleNet with nested samples; arguments are those of ``Progressive`` and ``SampleNet``.
 
     Example:
         >>> import torch

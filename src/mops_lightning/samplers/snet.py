@@ -1,6 +1,6 @@
-"""S-Net and its progressive form: points made from the global feature alone.
+"""S-Net and its progressive variant: points generated from the global feature.
 
-Dovrat, Lang and Avidan, "Learning to Sample", CVPR 2019; a rival in the paper's tables.
+Dovrat, Lang and Avidan, "Learning to Sample", CVPR 2019; a baseline in the paper's tables.
 """
 
 from collections.abc import Sequence
@@ -17,20 +17,20 @@ from mops_lightning.types import SampleOutput
 
 
 class SNet(Sampler):
-    """Per-point layers, maximum over points, and a head that emits all 3m coordinates.
+    """Pointwise layers, maximum over points, and a head with all 3m coordinates as output.
 
     Args:
         m: number of points to generate.
         alpha: weight of the simplification loss in the training loss.
         coverage: γ of the simplification loss.
         coverage_per_point: δ of the simplification loss.
-        feature_channels: sizes of the per-point layers, each with BatchNorm and ReLU.
+        feature_channels: sizes of the pointwise layers, each with BatchNorm and ReLU.
         head_channels: sizes of the head's hidden layers, each with ReLU.
-        head_norm: whether these have BatchNorm.
-        output_norm: whether the coordinates pass a BatchNorm too.
+        head_norm: whether the hidden layers have BatchNorm.
+        output_norm: whether the output layer has BatchNorm.
 
     Raises:
-        UserError: a weight is negative, a layer has no channels or layers are missing.
+        UserError: an argument is out of range.
 
     Example:
         >>> import torch
@@ -56,9 +56,9 @@ class SNet(Sampler):
         weights = {"alpha": alpha, "coverage": coverage, "coverage_per_point": coverage_per_point}
         for name, value in weights.items():
             if value < 0:
-                raise UserError(f"sampler.{name} must not be negative, got {value}.")
-        check_channels("sampler.feature_channels", feature_channels, 2)
-        check_channels("sampler.head_channels", head_channels)
+                raise UserError(f"{name} must be at least 0, got {value}.")
+        check_channels("feature_channels", feature_channels, 2)
+        check_channels("head_channels", head_channels)
         self.alpha = alpha
         self.coverage = coverage
         self.coverage_per_point = coverage_per_point
@@ -86,21 +86,21 @@ class SNet(Sampler):
 
 
 class Progressive(Sampler):
-    """What makes a net progressive: every power of two of its points is trained as a sample.
+    """Mixin for progressive training, in which every power of two is a training size.
 
-    The ProgressiveNet of the S-Net paper. Any m up to the largest can be asked for; the first m
-    points are returned. Stands before the net in a class's bases, whose settings it passes on.
+    This is ProgressiveNet of the S-Net paper: the first m points are the sample of size m, for any
+    m up to the largest. The mixin precedes the net in the bases of a class.
 
     Args:
-        m_max: largest number of points, 1,024 in the publication.
-        min_size: smallest size that is trained (m_max where that is smaller): 2 for classification,
-            16 for reconstruction.
+        m_max: largest number of points; 1,024 in the publication.
+        min_size: smallest training size, or m_max if that is smaller; in the publication 2 for
+            classification and 16 for reconstruction.
         size_reduction: whether the losses at all sizes are summed (classification) or averaged
             (reconstruction).
-        **settings: as for the net.
+        **settings: arguments of the net.
 
     Raises:
-        UserError: a setting is out of its range.
+        UserError: an argument is out of range.
     """
 
     flexible = True
@@ -115,15 +115,15 @@ class Progressive(Sampler):
     ) -> None:
         super().__init__(m_max, **settings)
         if min_size < 1:
-            raise UserError(f"sampler.min_size must be at least 1, got {min_size}.")
+            raise UserError(f"min_size must be at least 1, got {min_size}.")
         if size_reduction not in ("sum", "mean"):
             hint = did_you_mean(size_reduction, ("sum", "mean"))
-            raise UserError(f"sampler.size_reduction: unknown {size_reduction!r}.{hint}")
+            raise UserError(f"size_reduction: unknown {size_reduction!r}.{hint}")
         self.min_size = min_size
         self.size_reduction = size_reduction
 
     def training_sizes(self) -> tuple[int, ...]:
-        """Return ``min_size``, twice of it and so on below the largest size, and this one."""
+        """Return ``min_size``, its doubles below the largest size, and the largest size."""
         sizes = {self.m}
         size = self.min_size
         while size < self.m:
@@ -133,7 +133,7 @@ class Progressive(Sampler):
 
 
 class ProgressiveSNet(Progressive, SNet):
-    """S-Net with nested samples; settings as for ``Progressive`` and ``SNet``.
+    """S-Net with nested samples; arguments are those of ``Progressive`` and ``SNet``.
 
     Example:
         >>> import torch

@@ -1,9 +1,9 @@
 """Sampling clouds that do not fit in memory, in chunks and on several machines.
 
-MOPS-Net sees a cloud in two reductions over its points, a maximum (the global feature) and a
-softmax-weighted sum (paper section "Efficient Regression of the Sampled Set"). Both can be taken
-chunk by chunk, and parts of them merged in any order, so memory does not grow with N, and workers
-may share a cloud.
+MOPS-Net reduces the points of a cloud twice: to a maximum (the global feature) and to a
+softmax-weighted sum (paper section "Efficient Regression of the Sampled Set"). Both reductions are
+associative. They can be computed chunk by chunk and merged in any order, so that memory does not
+grow with N, and several workers can share a cloud.
 """
 
 from collections.abc import Callable, Iterable
@@ -20,29 +20,29 @@ from mops_lightning.samplers.fused import FusedMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 
 Chunks = Callable[[], Iterable[Tensor]]
-"""Gives a cloud's points anew at each call, as tensors ``(n, 3)`` in the same order."""
+"""Function that iterates over the chunks ``(n, 3)`` of a cloud, in the same order at every call."""
 
 
 def stream_sample(sampler: MOPSNet, chunks: Chunks, m: int | None = None) -> Tensor:
-    """Generate the points that ``sampler`` gives for the whole cloud, from chunks of it.
+    """Sample a cloud that is read in chunks.
 
     Args:
-        sampler: trained; it is used as in evaluation.
-        chunks: the cloud, gone through twice; memory is bounded by the largest chunk.
-        m: how many points; None: ``sampler.m``.
+        sampler: a trained sampler; it is used in evaluation mode.
+        chunks: the cloud, which is read twice; the largest chunk bounds the memory.
+        m: number of points; None means ``sampler.m``.
 
     Returns:
         ``(m, 3)``, equal to ``sampler(points, m).points`` up to the rounding of sums.
 
     Raises:
-        UserError: the sampler is of another kind, or a chunk is not a cloud of points.
+        UserError: the sampler is not a ``MOPSNet``, ``m`` is out of range, or a chunk is invalid.
     """
     if not isinstance(sampler, MOPSNet):
         raise UserError(
-            f"sampler: chunks can be sampled by MOPSNet and FMOPSNet, got {type(sampler).__name__}."
+            f"sampler must be a MOPSNet or FMOPSNet to sample chunks, got {type(sampler).__name__}."
         )
     m = sampler.m if m is None else m
-    sampler._check_m(m)
+    sampler.check_m(m)
     net = sampler.fused()
     peaks = (global_part(net, chunk) for chunk in _checked(chunks, m))
     global_ = reduce(torch.maximum, peaks)
@@ -50,21 +50,41 @@ def stream_sample(sampler: MOPSNet, chunks: Chunks, m: int | None = None) -> Ten
 
 
 def global_part(net: FusedMOPSNet, points: Tensor) -> Tensor:
-    """Return what some points ``(n, 3)`` contribute to the global feature; the maximum merges."""
+    """Return the contribution of a chunk to the global feature; contributions merge by maximum.
+
+    Args:
+        net: the network.
+        points: ``(n, 3)``.
+
+    Returns:
+        ``(D,)``.
+    """
     return net.local_features(points).amax(0)
 
 
 def sum_part(net: FusedMOPSNet, points: Tensor, global_: Tensor, m: int) -> Partial:
-    """Return what some points ``(n, 3)`` contribute to the m generated ones; ``Partial.merge``."""
+    """Return the contribution of a chunk to the generated points; ``Partial.merge`` merges them.
+
+    Args:
+        net: the network.
+        points: ``(n, 3)``.
+        global_: ``(D,)``, the global feature of the whole cloud.
+        m: number of points to generate.
+    """
     with torch.no_grad():
         keys = net.keys(net.local_features(points), global_)
         return attend(net.queries[:m], keys, points)
 
 
 def stream_match(generated: Tensor, chunks: Chunks) -> Tensor:
-    """Return, for every generated point ``(m, 3)``, the row of its nearest point of the cloud.
+    """Match generated points to their nearest points of a cloud in chunks, as ``readout.match``.
 
-    The same as ``readout.match``, the lowest row where several are equally near.
+    Args:
+        generated: ``(m, 3)``.
+        chunks: the cloud, which is read once.
+
+    Returns:
+        ``(m,)`` int64 rows of the cloud, the lowest row in case of ties.
     """
     best = torch.full((len(generated),), torch.inf)
     rows = torch.zeros(len(generated), dtype=torch.int64)

@@ -1,4 +1,4 @@
-"""Voxel sampling, a baseline of the paper's tables, with exactly m points."""
+"""Voxel sampling with exactly m points, a baseline in the paper's tables."""
 
 from typing import Literal, NamedTuple
 
@@ -14,18 +14,18 @@ from mops_lightning.samplers.ordering import seeded_order
 from mops_lightning.types import SampleOutput
 
 COARSEST, FINEST = -1.0, 20.0
-"""Range of log₂(longest side of the cloud / side of a voxel): one voxel; as far as float32 goes."""
-HALVINGS = 24
-"""Steps of the search: the voxel size is right to one part in a million."""
+"""Range of log₂(side of the cloud / side of a voxel): one voxel, and the precision of float32."""
+BISECTIONS = 24
+"""Bisection steps; the relative error of the voxel size is about one in a million."""
 
 
 class Voxels(NamedTuple):
-    """The occupied voxels of every cloud, in ascending (x, y, z) order; N slots, the last empty.
+    """The occupied voxels of every cloud in ascending (x, y, z) order, followed by empty slots.
 
     Attributes:
-        population: ``(B, N)`` int64 points in the voxel, 0 in an empty slot.
-        means: ``(B, N, 3)`` their mean.
-        nearest: ``(B, N)`` int64 the input point nearest to the mean.
+        population: ``(B, N)`` int64 number of points in the voxel; 0 for an empty slot.
+        means: ``(B, N, 3)`` mean of these points.
+        nearest: ``(B, N)`` int64 row of the input point nearest to the mean.
     """
 
     population: Tensor
@@ -34,23 +34,22 @@ class Voxels(NamedTuple):
 
 
 class VoxelSampler(Sampler):
-    """Lay a grid of cubes over the cloud and choose one point for each of m occupied ones.
+    """Divide space into cubic voxels and return one point for each of m occupied voxels.
 
-    The grid starts at the lowest corner of the cloud's bounding box. Its voxel size is the largest
-    with at least m occupied voxels, found for each cloud by bisection (the number of voxels can
-    rise and fall again within a narrow range of sizes; then it is one such size). Of the occupied
-    voxels the m with most points stay, among equals those that come first in (x, y, z) order, and
-    in this order they are returned. Where even voxels of 2⁻²⁰ of the cloud's longest side are less
-    than m, because points coincide, farthest point sampling from the chosen points fills up with
-    input points. Flexible: any m up to the given one.
+    The grid starts at the lowest corner of the cloud's bounding box. Bisection finds the largest
+    voxel size of each cloud with at least m occupied voxels; where the number of voxels is not
+    monotonic in the size, it finds one of several such sizes. The m voxels with the most points are
+    kept and returned in this order; ties are broken in (x, y, z) order. If there are fewer than m
+    voxels at the smallest size, 2⁻²⁰ of the cloud's longest side, because points coincide, farthest
+    point sampling adds input points. Flexible, but not nested.
 
     Args:
         m: largest number of points to return.
-        pick: ``nearest`` returns the input point nearest to the mean of its voxel's points, with
-            indices; ``centroid`` returns the mean itself, without.
+        pick: ``nearest`` returns the input point nearest to the mean of a voxel's points, with its
+            index; ``centroid`` returns the mean itself.
 
     Raises:
-        UserError: ``pick`` is neither.
+        UserError: ``pick`` is unknown.
 
     Example:
         >>> import torch
@@ -67,13 +66,13 @@ class VoxelSampler(Sampler):
         super().__init__(m)
         if pick not in ("nearest", "centroid"):
             hint = did_you_mean(pick, ("nearest", "centroid"))
-            raise UserError(f"sampler.pick: unknown {pick!r}.{hint}")
+            raise UserError(f"pick: unknown {pick!r}.{hint}")
         self.pick = pick
         self.generates = pick == "centroid"
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return one point for each of m voxels of ``(B, N, 3)`` points."""
-        order = seeded_order(points, seed=0)  # so that ties do not depend on the order given
+        order = seeded_order(points, seed=0)  # ties do not depend on the input order
         ordered = gather_points(points, order)
         voxels = group_voxels(ordered, m)
         fullest = voxels.population.argsort(dim=1, descending=True, stable=True)[:, :m]
@@ -89,11 +88,12 @@ class VoxelSampler(Sampler):
 
 
 def group_voxels(points: Tensor, m: int) -> Voxels:
-    """Sort points into the largest voxels of which at least m are occupied.
+    """Group points into voxels of the largest size with at least m occupied voxels.
 
     Args:
-        points: ``(B, N, 3)``; of points equally near to a mean the first is taken.
-        m: how many voxels, 1 ≤ m ≤ N; fewer only if the smallest size gives fewer.
+        points: ``(B, N, 3)``; the first of several points nearest to a mean is chosen.
+        m: smallest number of occupied voxels, 1 ≤ m ≤ N; there are fewer only if the smallest size
+            gives fewer.
 
     Returns:
         The voxels; gradients flow from the means to the points.
@@ -104,14 +104,14 @@ def group_voxels(points: Tensor, m: int) -> Voxels:
     slot = begins.cumsum(1) - 1
     slot3 = slot[..., None].expand(-1, -1, 3)
     population = torch.zeros_like(slot).scatter_add_(1, slot, torch.ones_like(slot))
-    # Two points are equally far from their mean: double precision, and a tolerance, keep them so.
+    # Two points are equally far from their mean; double precision and a tolerance preserve the tie.
     members = gather_points(points, perm).double()
     means = torch.zeros_like(members).scatter_add(1, slot3, members)
     means = means / population.clamp_min(1)[..., None]
     with torch.no_grad():
         distance = (members - means.gather(1, slot3)).square().sum(2)
-        least = torch.full_like(distance, torch.inf).scatter_reduce_(1, slot, distance, "amin")
-        near = distance <= least.gather(1, slot) * (1 + 1e-6)
+        smallest = torch.full_like(distance, torch.inf).scatter_reduce_(1, slot, distance, "amin")
+        near = distance <= smallest.gather(1, slot) * (1 + 1e-6)
         rank = torch.where(near, perm, points.shape[1] - 1)
         nearest = torch.full_like(slot, points.shape[1] - 1)
         nearest.scatter_reduce_(1, slot, rank, "amin")
@@ -120,29 +120,29 @@ def group_voxels(points: Tensor, m: int) -> Voxels:
 
 @torch.no_grad()
 def _voxel_keys(points: Tensor, m: int) -> Tensor:
-    """Return ``(B, N)`` int64 numbers of the voxels of the largest size, ascending in (x, y, z)."""
+    """Return the ``(B, N)`` int64 voxel keys at the largest size, ascending in (x, y, z)."""
     points = points.to(torch.promote_types(points.dtype, torch.float32)).permute(2, 0, 1)
     spans = points - points.amin(2, keepdim=True)
     side = spans.amax(2).amax(0)[:, None]
     spans = (spans / side.clamp_min(torch.finfo(points.dtype).tiny)).contiguous()  # (3, B, N)
     coarse = torch.full_like(side, COARSEST)
     fine = torch.full_like(side, FINEST)
-    for _ in range(HALVINGS):
+    for _ in range(BISECTIONS):
         middle = (coarse + fine) / 2
-        enough = _count_different(_keys(spans, middle)) >= m
+        enough = _count_distinct(_keys(spans, middle)) >= m
         fine = torch.where(enough, middle, fine)
         coarse = torch.where(enough, coarse, middle)
     return _keys(spans, fine)
 
 
 def _keys(spans: Tensor, level: Tensor) -> Tensor:
-    """Number the voxels for ``(3, B, N)`` places in the unit cube, cut 2^level times per side."""
+    """Return the voxel keys of ``(3, B, N)`` positions in the unit cube with 2^level per side."""
     x, y, z = (spans * level.exp2()).to(torch.int64)
     return x.mul_(2**42).add_(y, alpha=2**21).add_(z)
 
 
-def _count_different(keys: Tensor) -> Tensor:
-    """Count the different numbers in every row of ``(B, N)``, as ``(B, 1)``."""
-    # On a CPU NumPy's vectorised sort takes a tenth of the time of torch's.
+def _count_distinct(keys: Tensor) -> Tensor:
+    """Count the distinct keys of every row of ``(B, N)``, as ``(B, 1)``."""
+    # On a CPU, NumPy's vectorised sort is ten times faster than torch's.
     rows = torch.from_numpy(np.sort(keys.numpy(), 1)) if keys.is_cpu else keys.sort(1).values
     return (rows[:, 1:] != rows[:, :-1]).sum(1, keepdim=True) + 1

@@ -1,0 +1,19 @@
+import pytest
+import torch
+
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.samplers.mops import MOPSNet
+
+
+@pytest.fixture(params=[MOPSNet, FMOPSNet])
+def trained(request, rng):
+    """A sampler with running statistics from data and BatchNorm weights of both signs."""
+    torch.manual_seed(5)
+    made = request.param(24)
+    made.train()
+    for _ in range(3):
+        made(torch.randn(4, 100, 3, generator=rng) * 2 + 1)
+    for name, value in made.named_parameters():
+        if value.ndim == 1:
+            torch.nn.init.normal_(value, 0.5 if name.endswith("bias") else 0.0)
+    return made.eval()

@@ -1,0 +1,60 @@
+import pytest
+import torch
+
+from mops_lightning.errors import UserError
+from mops_lightning.ops.readout import match
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.snet import SNet
+from mops_lightning.samplers.streaming import global_part, stream_match, stream_sample, sum_part
+
+
+@pytest.mark.parametrize("size", [1, 7, 1000, 5000])
+def test_stream_sample_equals_whole_cloud(trained, size, rng):
+    points = torch.randn(1, 30 if size == 1 else 3000, 3, generator=rng)
+    with torch.no_grad():
+        whole = trained(points).points
+    streamed = stream_sample(trained, lambda: points[0].split(size))
+    torch.testing.assert_close(streamed, whole[0], rtol=0, atol=1e-5)
+    rows = stream_match(streamed, lambda: points[0].split(size))
+    assert torch.equal(rows, match(streamed[None], points)[0])
+
+
+def test_parts_merge_in_any_order(trained, rng):
+    points = torch.randn(1000, 3, generator=rng)
+    parts = points.split([1, 400, 99, 500])
+    net = trained.fused()
+    global_ = torch.stack([global_part(net, part) for part in parts]).amax(0)
+    sums = [sum_part(net, part, global_, 24) for part in parts]
+    forwards = sums[0].merge(sums[1]).merge(sums[2]).merge(sums[3]).result()
+    by_pairs = sums[3].merge(sums[1]).merge(sums[0].merge(sums[2])).result()
+    torch.testing.assert_close(forwards, by_pairs, rtol=0, atol=1e-6)
+    with torch.no_grad():
+        torch.testing.assert_close(forwards, trained(points[None]).points[0], rtol=0, atol=1e-5)
+
+
+def test_stream_sample_is_nested(rng):
+    torch.manual_seed(1)
+    sampler = FMOPSNet(24).eval()
+    points = torch.randn(200, 3, generator=rng)
+    few = stream_sample(sampler, lambda: points.split(64), 5)
+    torch.testing.assert_close(few, stream_sample(sampler, lambda: points.split(64))[:5])
+
+
+@pytest.mark.parametrize(
+    ("make", "chunks", "message"),
+    [
+        (
+            lambda: SNet(4),
+            [torch.zeros(9, 3)],
+            "^sampler must be a MOPSNet or FMOPSNet .* got SNet",
+        ),
+        (lambda: MOPSNet(4), [], "number of points N=0"),
+        (lambda: MOPSNet(4), [torch.zeros(2, 3), torch.zeros(1, 3)], "number of points N=3"),
+        (lambda: MOPSNet(4), [torch.zeros(9, 2)], "shape"),
+        (lambda: MOPSNet(4), [torch.zeros(9, 3) / 0], "finite"),
+    ],
+)
+def test_stream_sample_invalid_input_raises(make, chunks, message):
+    with pytest.raises(UserError, match=message):
+        stream_sample(make().eval(), lambda: chunks)
