@@ -1,1 +1,1 @@
-"""``python -m mops_lightning.downsample``: clouds and meshes from files, downsampled into files."""
+"""Downsampling clouds and meshes from files into files."""

@@ -1,7 +1,7 @@
-"""Dask as the engine: row_ranges of a file read and worked on by several processes or machines.
+"""Dask as the engine: ranges of a file's rows, distributed over processes or machines.
 
-Dask was taken rather than Ray because it is plain Python, small, and runs wherever torch does; what
-it has to do here is little: hand out row_ranges, and hand them out again when a worker dies.
+Dask instead of Ray, because it is plain Python, small, and runs wherever torch does, and little is
+needed here: distribute ranges, and distribute them again when a worker dies.
 """
 
 import logging
@@ -23,26 +23,26 @@ PATIENCE = 20
 """Seconds to wait for a scheduler and its first worker."""
 
 AHEAD = 4
-"""Stretches per thread that are handed out before the first of them is put together."""
+"""Ranges per thread that are submitted before the first result is used."""
 
 
 @contextmanager
 def cluster(address: str, workers: int) -> Iterator[Engine]:
-    """Give an engine whose work is done by Dask.
+    """Yield an engine that distributes its work by Dask.
 
     Args:
-        address: of a running scheduler, or ``local`` for processes of this machine.
-        workers: how many processes, if local.
+        address: of a running scheduler, or ``local`` for processes on this machine.
+        workers: number of local processes.
 
     Raises:
-        UserError: Dask is not installed, or there is no scheduler with workers at the address.
+        UserError: Dask is not installed, or no scheduler with workers answers at the address.
     """
     distributed = _distributed()
     import dask
 
-    # What is worth telling a user is told by errors.
+    # Errors say what a user needs to know.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    # The net is sent as part of a task's description, for workers that come later.
+    # The net is part of the task graph, so that workers that join later get it.
     with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}):
         if address != LOCAL:
             with _client(distributed, address) as client:
@@ -50,7 +50,7 @@ def cluster(address: str, workers: int) -> Iterator[Engine]:
             return
         with environment_kept():
             with _no_interrupts():
-                # So that Ctrl-C reaches this process alone, and not the workers that it starts.
+                # Workers inherit this, so Ctrl-C reaches this process only.
                 processes = distributed.LocalCluster(
                     n_workers=workers,
                     threads_per_worker=1,
@@ -63,7 +63,7 @@ def cluster(address: str, workers: int) -> Iterator[Engine]:
 
 @contextmanager
 def environment_kept() -> Iterator[None]:
-    """Undo what Dask sets for its workers: OMP_NUM_THREADS=1 would hold for what comes later."""
+    """Restore the environment: Dask sets OMP_NUM_THREADS=1 for its workers in this process too."""
     before = dict(os.environ)
     try:
         yield
@@ -88,9 +88,7 @@ def _distributed() -> Any:
     try:
         import distributed
     except ModuleNotFoundError:
-        raise UserError(
-            "--cluster needs a package that is not here: pip install 'mops-lightning[cluster]'."
-        ) from None
+        raise UserError("--cluster needs Dask: pip install 'mops-lightning[cluster]'.") from None
     return distributed
 
 
@@ -101,7 +99,7 @@ def _client(distributed: Any, address: str) -> Iterator[Any]:
     except (OSError, ValueError, TypeError) as error:
         raise UserError(
             f"--cluster: no Dask scheduler answers at {address} ({type(error).__name__}). Start "
-            "one with `dask scheduler`, and `dask worker ADDRESS` on every machine; or take "
+            "one with `dask scheduler`, and `dask worker ADDRESS` on every machine, or use "
             "--cluster local."
         ) from None
     with client:
@@ -116,7 +114,7 @@ def _client(distributed: Any, address: str) -> Iterator[Any]:
 
 
 def engine_of(client: Any) -> Engine:
-    """Make an engine of a client; see ``large.Engine``."""
+    """Return an engine that submits to a client; see ``large.Engine``."""
     from distributed import CancelledError, KilledWorker
     from distributed.comm import CommClosedError
 
@@ -127,12 +125,12 @@ def engine_of(client: Any) -> Engine:
         row_ranges: list[range],
         *common: Any,
     ) -> Iterator[Any]:
-        # Workers may have another working directory.
+        # Workers may have a different working directory.
         cloud = replace(cloud, path=cloud.path.absolute())
         futures: deque[Any] = deque()
         rest = iter(row_ranges)
         try:
-            # As tasks, not scattered: they are done again when the worker that has them dies.
+            # Tasks, not scattered data: Dask repeats them when the worker that holds them dies.
             shared = [client.submit(_same, value, pure=False) for value in common]
             ahead = AHEAD * max(sum(client.nthreads().values()), 1)
             while True:
@@ -143,16 +141,16 @@ def engine_of(client: Any) -> Engine:
                 yield futures.popleft().result()
         except KilledWorker:
             raise UserError(
-                f"--cluster: workers died again and again over {cloud.path} ({title}), perhaps for "
-                "want of memory: try a smaller --chunk."
+                f"--cluster: workers died repeatedly at {cloud.path} ({title}), perhaps for lack "
+                "of memory. Try a smaller --chunk."
             ) from None
-        except Exception as error:  # Dask has many ways to say so
+        except Exception as error:  # Dask raises several kinds when the connection is lost
             lost = isinstance(error, CancelledError | CommClosedError)
             if not lost and client.status == "running":
                 raise
             raise UserError(
-                f"--cluster: the scheduler has gone ({type(error).__name__}). Start it again, and "
-                "the same command."
+                f"--cluster: lost the connection to the scheduler ({type(error).__name__}). "
+                "Restart it and run the same command again."
             ) from None
 
     return engine

@@ -1,6 +1,5 @@
-"""One file: read, normalised as in training, sampled, mapped back, written."""
+"""Downsampling one file: read, normalise as in training, sample, map back, write."""
 
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,10 @@ from mops_lightning.downsample.formats.errors import check_size
 from mops_lightning.downsample.formats.registry import read, write
 from mops_lightning.downsample.formats.table import Table
 from mops_lightning.downsample.large import Engine, Kept, by_chunks, in_turn
+from mops_lightning.downsample.settings import Settings
 from mops_lightning.downsample.unit_sphere import largest_distance, sum_of, unit_sphere
 from mops_lightning.errors import UserError
 from mops_lightning.ops.readout import complete
-from mops_lightning.records.readout_names import GENERATED_READOUTS
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
@@ -26,61 +25,7 @@ from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.zoo.load import load
 
 CHUNK = 65536
-"""Points that a learned sampler sees at a time; it bounds the memory that its features take."""
-
-METHODS = ("fps", "random", "voxel", "poisson")
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What to do with every file.
-
-    Attributes:
-        m: points to keep; None: as many as the weights were trained for.
-        weights: of a learned sampler: a weights file, or the folder of its run.
-        method: one of ``METHODS``, in place of weights.
-        readout: of a learned sampler: generated, matched or completed.
-        keep_attributes: keep colours, normals and the like of the kept points.
-        surface: points to sample from a mesh's surface first.
-        seed: of what is random.
-        chunk: read so many points at a time; None: the whole file.
-    """
-
-    m: int | None
-    weights: Path | None = None
-    method: str | None = None
-    readout: str = "completed"
-    keep_attributes: bool = False
-    surface: int | None = None
-    seed: int = 0
-    chunk: int | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse what does not go together."""
-        if (self.weights is None) == (self.method is None):
-            raise UserError(
-                "give --weights FILE of a trained sampler or --method "
-                f"{'|'.join(METHODS)}, and not both."
-            )
-        if (self.m is not None and self.m < 1) or (self.m is None and self.method):
-            raise UserError(f"--m must be a whole number of at least 1, got {self.m}.")
-        whole = self.method or self.readout == "completed"
-        if self.chunk is not None and self.chunk < 1:
-            raise UserError(f"--chunk must be at least 1, got {self.chunk}.")
-        if self.chunk is not None and whole:
-            raise UserError(
-                "--chunk goes with --weights of MOPS-Net and --readout "
-                "generated or matched: everything else needs the whole cloud at once."
-            )
-        if self.surface is not None and self.surface < 1:
-            raise UserError(f"--surface must be at least 1, got {self.surface}.")
-        if self.readout not in GENERATED_READOUTS:
-            raise UserError(f"--readout must be one of {', '.join(GENERATED_READOUTS)}.")
-        if self.keep_attributes and self.weights and self.readout == "generated":
-            raise UserError(
-                "--keep-attributes: generated points are new and have none. Take "
-                "--readout completed or matched."
-            )
+"""Number of points that a learned sampler processes at a time; it bounds the memory of features."""
 
 
 @cache
@@ -101,7 +46,10 @@ def sampler_of(settings: Settings) -> Sampler:
         own = {} if settings.method == "voxel" else {"seed": settings.seed}
         return classes[settings.method](settings.m, **own)
     assert settings.weights is not None
-    sampler = load(settings.weights)
+    try:
+        sampler = load(settings.weights)
+    except UserError as error:
+        raise UserError(f"--weights: {error}") from None
     m = settings.m
     if m is not None and (m > sampler.m or (m != sampler.m and not sampler.flexible)):
         allowed = f"up to {sampler.m}" if sampler.flexible else f"{sampler.m}"
@@ -146,7 +94,7 @@ def sampled(source: Path, table: Table, sampler: Sampler, m: int, settings: Sett
     centre = sum_of(table.points) / len(table.points)
     sphere = unit_sphere(centre, largest_distance(table.points, centre), source)
     with torch.no_grad():
-        rows, generated = _chosen(sphere.normalize(table.points), sampler, m, settings)
+        rows, generated = _chosen(sphere.normalise(table.points), sampler, m, settings)
     if rows is None:
         return Table(sphere.restore(generated), {}, table.header)
     kept = table.take(rows.numpy())
@@ -156,7 +104,7 @@ def sampled(source: Path, table: Table, sampler: Sampler, m: int, settings: Sett
 def _chosen(
     points: Tensor, sampler: Sampler, m: int, settings: Settings
 ) -> tuple[Tensor | None, Tensor]:
-    """Return the rows of the points to keep, or None and the generated points."""
+    """Return the rows ``(m,)`` of the points to keep, or None, and the generated points."""
 
     def chunks() -> list[Tensor]:
         return list(points.split(CHUNK))
@@ -171,6 +119,6 @@ def _chosen(
     if settings.readout == "generated":
         return None, generated
     rows = stream_match(generated, chunks)
-    return (complete(rows[None], points[None])[0] if settings.readout == "completed" else rows), (
-        generated
-    )
+    if settings.readout == "completed":
+        rows = complete(rows[None], points[None])[0]
+    return rows, generated

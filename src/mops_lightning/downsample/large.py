@@ -141,14 +141,14 @@ def _largest_distance(cloud: CloudFile, rows: range, centre: NDArray[np.float64]
 
 
 def _global(cloud: CloudFile, rows: range, sphere: UnitSphere, net: FusedMOPSNet) -> Tensor | None:
-    points = sphere.normalize(cloud.read(rows).points)
+    points = sphere.normalise(cloud.read(rows).points)
     return global_part(net, points) if len(points) else None
 
 
 def _sum(
     cloud: CloudFile, rows: range, sphere: UnitSphere, net: FusedMOPSNet, global_: Tensor, m: int
 ) -> Partial | None:
-    points = sphere.normalize(cloud.read(rows).points)
+    points = sphere.normalise(cloud.read(rows).points)
     return sum_part(net, points, global_, m) if len(points) else None
 
 
@@ -158,5 +158,5 @@ def _nearest(
     table = cloud.read(rows)
     if not len(table.points):
         return None
-    distance, row = nearest(generated[None], sphere.normalize(table.points)[None])
+    distance, row = nearest(generated[None], sphere.normalise(table.points)[None])
     return Nearest(distance[0].numpy(), table.take(row[0].numpy()))

@@ -17,7 +17,7 @@ class UnitSphere(NamedTuple):
     centre: NDArray[np.float64]
     radius: float
 
-    def normalize(self, points: NDArray[np.float64]) -> Tensor:
+    def normalise(self, points: NDArray[np.float64]) -> Tensor:
         """Return points ``(n, 3)`` of the cloud in the unit sphere, float32."""
         return torch.from_numpy(((points - self.centre) / self.radius).astype(np.float32))
 

@@ -1,0 +1,139 @@
+"""Downsampling one file or a folder of files, with progress and a closing line.
+
+Worker processes import this module, so it imports torch only when there is a file to process.
+"""
+
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import Future, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.progress import track
+
+from mops_lightning.downsample.settings import Settings
+from mops_lightning.errors import UserError
+from mops_lightning.ops.workers import pool
+
+
+def attempt(
+    source: Path, target: Path, settings: Settings, workers: int | None, engine: Any = None
+) -> Any:
+    """Downsample one file and return the result of ``job.run``, or the error.
+
+    Args:
+        source: the file.
+        target: the file to write.
+        settings: what to do.
+        workers: number of processes that share the cores; None: leave torch's threads alone.
+        engine: processes the chunks of a file, see ``large.Engine``; None: this process.
+    """
+    from mops_lightning.downsample.job import run
+    from mops_lightning.downsample.large import in_turn
+
+    if workers:
+        import torch
+
+        torch.set_num_threads(max((os.cpu_count() or 1) // workers, 1))
+    try:
+        return run(source, target, settings, engine or in_turn)
+    except UserError as error:
+        return error
+    except Exception as error:
+        return UserError(f"{source}: {type(error).__name__}: {error}.")
+
+
+def process_file(source: Path, target: Path, settings: Settings, engine: Any) -> None:
+    """Downsample one file and print what was written.
+
+    Raises:
+        UserError: it failed.
+    """
+
+    def with_progress(title: str, function: Any, cloud: Any, row_ranges: Any, *common: Any) -> Any:
+        results = engine(title, function, cloud, row_ranges, *common)
+        total, hidden = len(row_ranges), not sys.stdout.isatty()
+        return track(results, title, total=total, disable=hidden, transient=True)
+
+    start = time.perf_counter()
+    result = attempt(source, target, settings, None, with_progress)
+    if isinstance(result, UserError):
+        raise result
+    written, number, dropped = result
+    more = f" ({dropped:,} more without finite coordinates left out)" if dropped else ""
+    seconds = time.perf_counter() - start
+    print(f"{target}: {written:,} of {number:,} points{more}, {seconds:.1f} s")
+
+
+def process_folder(
+    jobs: list[tuple[Path, Path]],
+    settings: Settings,
+    target: Path,
+    workers: int,
+    overwrite: bool,
+    engine: Any,
+) -> int:
+    """Downsample files, print errors and a closing line, and return how many files failed.
+
+    Args:
+        jobs: input and output files.
+        settings: what to do.
+        target: the folder of the output files, for the closing line.
+        workers: number of processes that share the files.
+        overwrite: replace existing output files; otherwise they are skipped.
+        engine: see ``large.Engine``.
+    """
+    done: Counter[str] = Counter()
+    todo = [job for job in jobs if overwrite or not job[1].exists()]
+    failures, dropped = {}, 0
+    with _results(todo, settings, workers, engine) as results:
+        for (source, _), result in track(
+            results, "downsampling", total=len(todo), disable=not sys.stdout.isatty()
+        ):
+            done["failed" if isinstance(result, UserError) else "done"] += 1
+            if isinstance(result, UserError):
+                failures[source] = result
+            else:
+                dropped += result[2]
+    if len(jobs) > len(todo):
+        done["skipped"] = len(jobs) - len(todo)
+    for source, error in sorted(failures.items()):
+        name = "" if str(source) in str(error) else f"{source}: "
+        print(f"failed: {name}{error}", file=sys.stderr)
+    counts = ", ".join(f"{number} {state}" for state, number in done.items())
+    left = f"; {dropped:,} points without finite coordinates left out" if dropped else ""
+    print(f"{len(jobs)} files: {counts}{left}; in {target}")
+    return len(failures)
+
+
+@contextmanager
+def _results(
+    jobs: list[tuple[Path, Path]], settings: Settings, workers: int, engine: Any
+) -> Iterator[Iterator[Any]]:
+    """Yield pairs of job and result, in the order of completion."""
+    if workers == 1 or len(jobs) < 2:
+        yield ((job, attempt(*job, settings, None, engine)) for job in jobs)
+        return
+    workers = min(workers, len(jobs))
+    futures = {pool(workers).submit(attempt, *job, settings, workers): job for job in jobs}
+    try:
+        yield ((futures[future], _result(future)) for future in as_completed(futures))
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _result(future: Future[Any]) -> Any:
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        pool.cache_clear()
+        return UserError(
+            "a worker process died, perhaps for lack of memory, before this file was done. Run the "
+            "same command again with fewer --workers."
+        )

@@ -1,0 +1,74 @@
+"""Which file is written for each input file."""
+
+from collections import Counter
+from pathlib import Path
+
+from mops_lightning.downsample.formats.registry import READABLE, WRITERS
+from mops_lightning.errors import UserError
+
+Job = tuple[Path, Path]
+"""An input file and its output file."""
+
+
+def jobs(source: Path, target: Path, file_format: str | None, keep_attributes: bool) -> list[Job]:
+    """Return the input files and their output files.
+
+    Args:
+        source: a file or a folder.
+        target: a file or a folder; a folder if ``source`` is one.
+        file_format: suffix of output files in a folder; None: as the input, or .ply for formats
+            that cannot be written.
+        keep_attributes: the output format must hold attributes.
+
+    Raises:
+        UserError: an input is missing, or an output is ambiguous or cannot be written.
+    """
+    wanted = f".{file_format.lstrip('.').lower()}" if file_format else None
+    if wanted and wanted not in WRITERS:
+        raise UserError(f"--format must be one of {', '.join(WRITERS)}, got {file_format}.")
+    if not source.exists():
+        raise UserError(f"{source}: no such file or folder.")
+    if keep_attributes and ".obj" in (wanted, target.suffix.lower()):
+        raise UserError("--keep-attributes: .obj holds coordinates only. Use .ply, .pcd or .npz.")
+    if target.resolve() == source.resolve():
+        raise UserError(f"OUT must differ from IN, got {source} for both.")
+    if blocking := next((p for p in target.parents if p.exists() and not p.is_dir()), None):
+        raise UserError(f"OUT: {blocking} is a file, not a folder. Give another OUT.")
+
+    def suffix(path: Path) -> str:
+        own = path.suffix.lower()
+        loses_attributes = own == ".obj" and keep_attributes
+        return wanted or (own if own in WRITERS and not loses_attributes else ".ply")
+
+    if source.is_dir():
+        goals = {path: path.relative_to(source) for path in _inputs(source, target)}
+        return _distinct([(p, target / g.with_suffix(suffix(p))) for p, g in goals.items()])
+    if target.is_dir():
+        target = target / f"{source.stem}{suffix(source)}"
+    if target.suffix.lower() not in WRITERS:
+        raise UserError(f"OUT must end in one of {', '.join(WRITERS)}, got {target}.")
+    return [(source, target)]
+
+
+def _inputs(source: Path, target: Path) -> list[Path]:
+    """Return the readable files below a folder, without those below ``target``."""
+    if target.is_file():
+        raise UserError(f"OUT must be a folder because IN is one, got the file {target}.")
+    files = sorted(p for p in source.rglob("*") if p.is_file() and p.suffix.lower() in READABLE)
+    outputs = target.resolve()
+    files = [p for p in files if outputs not in p.resolve().parents]
+    if not files:
+        raise UserError(f"{source} contains no file that ends in {', '.join(READABLE)}.")
+    return files
+
+
+def _distinct(found: list[Job]) -> list[Job]:
+    """Reject two input files with the same output file."""
+    targets = Counter(path for _, path in found)
+    twice = next((path for path, number in targets.items() if number > 1), None)
+    if twice:
+        both = " and ".join(str(source) for source, target in found if target == twice)
+        raise UserError(
+            f"{both} have the same output {twice}. Rename one, or give another --format."
+        )
+    return found

@@ -1,0 +1,29 @@
+"""Clouds and trained weights, as a user has them in a folder."""
+
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning.downsample.formats.registry import WRITERS
+from mops_lightning.downsample.formats.table import Table
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.zoo import weights
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two clouds far from the origin, one with a hole in its numbers, and trained weights."""
+    folder = tmp_path_factory.mktemp("clouds")
+    random = np.random.default_rng(0)
+    (folder / "in" / "deep").mkdir(parents=True)
+    for name, number in (("a.ply", 300), ("deep/b.npz", 200)):
+        points = random.normal(size=(number, 3)) * [5, 1, 1] + [1000, 0, 0]
+        points[7] = np.nan
+        table = Table(points, {"label": np.arange(number)})
+        WRITERS[f".{name.split('.')[1]}"](folder / "in" / name, table)
+    torch.manual_seed(0)
+    node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 40}
+    config = {"learn": "sampler", "sampler": node}
+    weights.save(folder / "weights.pt", FMOPSNet(40), config, {})
+    weights.save(folder / "task.pt", FMOPSNet(40), {**config, "learn": "task"}, {})
+    return folder

@@ -1,0 +1,67 @@
+"""PCD files."""
+
+import numpy as np
+
+from mops_lightning.downsample.formats import pcd
+
+
+def packed(data):
+    """Compress by LZF, a plain twin of what PCL writes: the longest match within 8 KiB."""
+    out, literal, place = bytearray(), bytearray(), 0
+
+    def flush():
+        for start in range(0, len(literal), 32):
+            piece = literal[start : start + 32]
+            out.append(len(piece) - 1)
+            out.extend(piece)
+        literal.clear()
+
+    while place < len(data):
+        best, where = 0, 0
+        for start in range(max(0, place - 8191), place):
+            length = 0
+            while length < 264 and place + length < len(data):
+                if data[start + length] != data[place + length]:
+                    break
+                length += 1
+            if length > best:
+                best, where = length, start
+        if best < 3:
+            literal.append(data[place])
+            place += 1
+            continue
+        flush()
+        back = place - where - 1
+        code = best - 2
+        out.append((min(code, 7) << 5) | (back >> 8))
+        if code >= 7:
+            out.append(code - 7)
+        out.append(back & 255)
+        place += best
+    flush()
+    return bytes(out)
+
+
+HEAD = (
+    "FIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 40\nHEIGHT 1\nPOINTS 40\n"
+)
+
+
+def test_pcd_every_encoding_is_read(tmp_path):
+    random = np.random.default_rng(1)
+    points = random.integers(0, 3, (40, 3)).astype("<f4")
+    colour = np.repeat(np.arange(4, dtype="<u4"), 10)
+    rows = np.empty(40, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
+    rows["x"], rows["y"], rows["z"], rows["rgb"] = *points.T, colour
+    fields = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in ["x", "y", "z", "rgb"])
+    small = packed(fields)
+    assert len(small) < len(fields)
+    sizes = np.array([len(small), len(fields)], "<u4").tobytes()
+    text = "\n".join(" ".join(str(value) for value in row) for row in rows.tolist())
+    bodies = {"ascii": text.encode(), "binary": rows.tobytes(), "binary_compressed": sizes + small}
+    for kind, body in bodies.items():
+        path = tmp_path / f"{kind}.pcd"
+        path.write_bytes(f"# comment\nVERSION .7\n{HEAD}DATA {kind}\n".encode() + body)
+        table = pcd.read(path)
+        np.testing.assert_array_equal(table.points, points)
+        np.testing.assert_array_equal(table.columns["rgb"], colour)

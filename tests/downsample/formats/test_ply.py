@@ -1,0 +1,54 @@
+"""PLY files."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from mops_lightning.downsample.formats.registry import WRITERS, open_cloud_file, read
+from mops_lightning.downsample.formats.table import Table
+from mops_lightning.errors import UserError
+
+
+def test_ply_ascii_cloud_and_binary_mesh_are_read(tmp_path):
+    path = tmp_path / "a.ply"
+    rows = "property float x\nproperty float y\nproperty float z\nproperty uchar red\n"
+    path.write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 2\n{rows}end_header\n1 2 3 9\n4 5 6 8\n"
+    )
+    table = read(path, 9, 0)
+    np.testing.assert_array_equal(table.points, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(table.columns["red"], [9, 8])
+    trimesh.creation.icosphere().export(tmp_path / "ball.ply")
+    surface = read(tmp_path / "ball.ply", 500, 0)
+    assert surface.points.shape == (500, 3)
+    outwards = np.stack([surface.columns[name] for name in ("nx", "ny", "nz")], 1)
+    assert ((outwards * surface.points).sum(1) > 0.9).all()
+
+
+HEADS = {
+    "comment between": ("property float z", "comment made by hand\nproperty float z"),
+    "obj_info between": ("property float z", "obj_info num_cols 4\nproperty float z"),
+    "blanks and tabs": ("property float z", "property \t float   z \t"),
+    "element in a comment": ("element vertex", "comment one element per scan\nelement vertex"),
+    "line ends of Windows": ("\n", "\r\n"),
+}
+
+
+@pytest.mark.parametrize("kind", HEADS)
+def test_ply_header_variant_is_read(kind, tmp_path):
+    points = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32).astype(float)
+    path = tmp_path / "a.ply"
+    WRITERS[".ply"](path, Table(points, {"red": np.arange(50, dtype=np.uint8)}))
+    head, end, rows = path.read_bytes().partition(b"end_header\n")
+    path.write_bytes((head + end).decode().replace(*HEADS[kind]).encode() + rows)
+    table = open_cloud_file(path).read(range(10, 50))
+    np.testing.assert_array_equal(table.points, points[10:])
+    np.testing.assert_array_equal(table.columns["red"], np.arange(10, 50))
+
+
+def test_ply_vertices_with_lists_are_rejected(tmp_path):
+    path = tmp_path / "a.ply"
+    head = "element vertex 1\nproperty float x\nproperty list uchar int seen\n"
+    path.write_text(f"ply\nformat binary_little_endian 1.0\n{head}end_header\n")
+    with pytest.raises(UserError, match="without lists"):
+        open_cloud_file(path)

@@ -1,0 +1,27 @@
+"""Text files."""
+
+import numpy as np
+import pytest
+
+from mops_lightning.downsample.formats.registry import read
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1 2 3\n4 5 6\n",
+        "1,2,3\n4,5,6\n",
+        "x;y;z\n1;2;3\n4;5;6\n",
+        "# a\n// b\n1\t2\t3\n4 5 6",
+        "\ufeff1 2 3\n4 5 6\n",
+        "1 2 3 # first\n4 5 6 # second\n",
+        "I X Y Z\n9 1 2 3\n9 4 5 6\n",
+        "//Z;X;Y\n3;1;2\n6;4;5\n",
+        "2\n1 2 3\n4 5 6\n",
+        "a b c\n1 2 3\n4 5 6\n",
+    ],
+)
+def test_text_dialect_is_read(text, tmp_path):
+    path = tmp_path / "a.xyz"
+    path.write_text(text, encoding="utf-8")
+    np.testing.assert_array_equal(read(path, 9, 0).points, [[1, 2, 3], [4, 5, 6]])

@@ -1,0 +1,46 @@
+"""Folders of files, and worker processes that share them."""
+
+import os
+
+from mops_lightning.downsample import batch
+from tests.support.downsample import call
+
+
+def test_folder_second_run_does_only_missing_files(folder, tmp_path):
+    target = tmp_path / "out"
+    bad = folder / "in" / "bad.xyz"
+    bad.write_text("not a cloud\n")
+    try:
+        settings = ["--weights", folder / "weights.pt", "--m", 8, "--format", "ply"]
+        status, out, err = call(folder / "in", target, *settings, "--workers", 2)
+        assert status == 1
+        assert "3 files: " in out
+        assert "2 done" in out
+        assert "1 failed" in out
+        assert err.startswith(f"failed: {bad}")
+        first = {path.name: path.read_bytes() for path in target.rglob("*.ply")}
+        assert set(first) == {"a.ply", "b.ply"}
+        assert (target / "deep" / "b.ply").is_file()
+        (target / "a.ply").unlink()
+    finally:
+        bad.unlink()
+    status, out, err = call(folder / "in", target, *settings)
+    assert (status, err) == (0, "")
+    assert "2 files: 1 done, 1 skipped" in out
+    again = {path.name: path.read_bytes() for path in target.rglob("*.ply")}
+    assert again == first, "one process gives what two gave"
+
+
+def test_dead_worker_is_reported_and_second_run_completes(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(batch, "attempt", die)
+    settings = ["--method", "random", "--m", 5]
+    status, out, err = call(folder / "in", tmp_path, *settings, "--workers", 2)
+    assert status == 1
+    assert err.count("a worker process died") == 2
+    assert "2 files: 2 failed" in out
+    monkeypatch.undo()
+    assert call(folder / "in", tmp_path, *settings, "--workers", 2)[0] == 0
+
+
+def die(*_):
+    os._exit(9)

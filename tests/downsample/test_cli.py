@@ -1,0 +1,64 @@
+"""The command as a user types it."""
+
+import pytest
+
+from mops_lightning.downsample.formats.registry import read
+from tests.support.downsample import call
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--m", 5], "either --weights FILE"),
+        (["--m", 5, "--method", "fps", "--weights", "w.pt"], "not both"),
+        (["--method", "fps"], "--m must be"),
+        (["--m", 0, "--method", "fps"], "--m must be"),
+        (["--m", 41, "--weights", "weights.pt"], "trained for up to 40 points, got 41"),
+        (["--weights", "task.pt"], "holds a task net"),
+        (["--weights", "nowhere.pt"], "--weights: no file nowhere.pt"),
+        (
+            ["--weights", "weights.pt", "--keep-attributes", "--readout", "generated"],
+            "no attributes",
+        ),
+        (["--m", 500, "--method", "fps"], "holds 299 points, fewer than --m 500"),
+        (["--m", 5, "--method", "fps", "--chunk", 9], "--chunk needs --weights"),
+        (["--weights", "weights.pt", "--chunk", 0], "--chunk must be at least 1, got 0"),
+        (["--weights", "weights.pt", "--chunk", 9], "--readout generated or matched"),
+        (["--m", 5, "--method", "fps", "--workers", 0], "--workers must be"),
+        (["--m", 5, "--method", "fps", "--readout", "matched"], "--readout needs --weights"),
+        (["--m", 5, "--method", "fps", "--surface", -5], "--surface must be"),
+        (["--m", 5, "--method", "fps", "--format", "stl"], "--format must be one of"),
+    ],
+)
+def test_mistake_ends_in_one_line(arguments, said, folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(folder)
+    status, out, err = call("in/a.ply", tmp_path / "out.ply", *arguments)
+    assert (status, out) == (2, "")
+    assert said in err
+    assert len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "out.ply").exists()
+
+
+def test_existing_output_needs_overwrite(folder, tmp_path):
+    source, target = folder / "in" / "a.ply", tmp_path / "out.ply"
+    target.write_text("mine")
+    settings = ["--method", "random", "--m", 5]
+    status, _, err = call(source, target, *settings)
+    assert status == 2
+    assert f"{target} exists" in err
+    assert target.read_text() == "mine"
+    assert call(source, target, *settings, "--overwrite")[0] == 0
+    assert len(read(target, 9, 0).points) == 5
+
+
+def test_real_scans_keep_attributes(real_data, tmp_path):
+    scans = real_data / "scans"
+    if not scans.is_dir():
+        pytest.skip(f"no scans in {real_data}")
+    status, out, err = call(scans, tmp_path, "--method", "random", "--m", 100, "--keep-attributes")
+    assert (status, err) == (0, "")
+    fragment = read(tmp_path / "fragment.pcd", 9, 0)
+    assert len(fragment.points) == 100
+    assert "normal_x" in fragment.columns
+    assert "nx" in read(tmp_path / "stanford-bunny.ply", 9, 0).columns  # .obj has no room
+    assert len(read(tmp_path / "kitti_000000.bin", 9, 0).columns["intensity"]) == 100

@@ -1,0 +1,40 @@
+"""One file: what is kept of it."""
+
+import numpy as np
+import pytest
+
+from mops_lightning.downsample.formats.registry import read
+from tests.support.downsample import call
+
+
+@pytest.mark.parametrize("method", ["fps", "random", "voxel", "poisson"])
+def test_untrained_method_keeps_rows_of_the_file(method, folder, tmp_path):
+    source, target = folder / "in" / "a.ply", tmp_path / "out.npz"
+    status, out, err = call(source, target, "--method", method, "--m", 20, "--keep-attributes")
+    assert (status, err) == (0, "")
+    assert "20 of 299 points (1 more without finite coordinates left out)" in out
+    kept, whole = read(target, 9, 0), read(source, 9, 0)
+    rows = kept.columns["label"].astype(int)
+    assert len(set(rows)) == 20
+    np.testing.assert_array_equal(kept.points, whole.points[rows])
+
+
+def test_matched_and_completed_readouts_keep_rows(folder, tmp_path):
+    source = folder / "in" / "a.ply"
+    whole = read(source, 9, 0).points
+    found = {}
+    for readout in ("generated", "matched", "completed"):
+        target = tmp_path / f"{readout}.npy"
+        settings = ["--weights", folder, "--readout", readout, "--m", 30]
+        assert call(source, target, *settings)[0] == 0
+        found[readout] = np.load(target)
+        assert found[readout].shape == (30, 3)
+    inside = {readout: {tuple(p) for p in points} for readout, points in found.items()}
+    all_points = {tuple(p) for p in whole}
+    assert not inside["generated"] & all_points
+    assert inside["matched"] <= inside["completed"] <= all_points
+    assert len(inside["completed"]) == 30
+    # Mapped back: among the points, not in the unit sphere.
+    finite = whole[np.isfinite(whole).all(1)]
+    assert (found["generated"] > finite.min(0)).all()
+    assert (found["generated"] < finite.max(0)).all()

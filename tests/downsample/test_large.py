@@ -1,0 +1,56 @@
+"""Files that are read in chunks."""
+
+import numpy as np
+import pytest
+
+from mops_lightning.downsample.formats.registry import WRITERS, read
+from mops_lightning.downsample.formats.table import Table
+from tests.support.downsample import call
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".npy", ".bin", ".laz"])
+@pytest.mark.parametrize("readout", ["generated", "matched"])
+def test_chunks_equal_whole_file(suffix, readout, folder, tmp_path):
+    points = np.random.default_rng(1).normal(size=(500, 3)).astype(np.float32).astype(float)
+    if suffix != ".laz":  # it holds whole numbers, NaN is none
+        points[100:160] = np.nan
+    source = tmp_path / f"in{suffix}"
+    WRITERS[suffix](source, Table(points, {"intensity": np.arange(500, dtype=np.uint16)}))
+    settings = ["--weights", folder, "--readout", readout]
+    settings += ["--keep-attributes"] if readout == "matched" else []
+    assert call(source, tmp_path / "whole.npz", *settings)[0] == 0
+    status, out, err = call(source, tmp_path / "parts.npz", *settings, "--chunk", 60)
+    assert (status, err) == (0, "")
+    assert ("40 of 500 points" if suffix == ".laz" else "40 of 440 points (60 more") in out
+    whole, parts = (read(tmp_path / f"{name}.npz", 9, 0) for name in ("whole", "parts"))
+    np.testing.assert_allclose(parts.points, whole.points, atol=1e-5)
+    assert list(parts.columns) == list(whole.columns)
+    for name, column in whole.columns.items():
+        np.testing.assert_array_equal(parts.columns[name], column)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.xyz", b"1 2 3", "--chunk works with .npy"),
+        ("a.bin", b"123", "not a KITTI scan"),
+        ("a.npy", b"123", "a.npy is broken"),
+        ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n", "does not end"),
+        ("a.ply", b"\n" * 10_000, "does not end"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 9\nend_header\n", "needs binary PLY"),
+    ],
+)
+def test_unsupported_file_says_why(name, content, said, folder, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    settings = ["--weights", folder, "--readout", "matched", "--chunk", 60]
+    status, _, err = call(tmp_path / name, tmp_path / "out.ply", *settings)
+    assert status == 2
+    assert said in err
+
+
+def test_truncated_file_is_reported(folder, tmp_path):
+    path = tmp_path / "a.ply"
+    WRITERS[".ply"](path, Table(np.ones((90, 3)) * np.arange(90)[:, None]))
+    path.write_bytes(path.read_bytes()[:-5])
+    settings = ["--weights", folder, "--readout", "matched", "--chunk", 60]
+    assert "ends after 89 points" in call(path, tmp_path / "out.ply", *settings)[2]

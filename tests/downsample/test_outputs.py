@@ -1,0 +1,54 @@
+"""Which file is written for each input file."""
+
+from pathlib import Path
+
+import pytest
+
+from mops_lightning.downsample.outputs import jobs
+from mops_lightning.errors import UserError
+
+
+@pytest.fixture
+def inputs(tmp_path, monkeypatch):
+    """Clouds, a mesh and another file, in the working directory."""
+    for name in ("in/a.npy", "in/deep/b.ply", "in/c.stl", "in/notes.md", "b.npy"):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "file_format", "expected"),
+    [
+        ("b.npy", "small.ply", None, ["small.ply"]),
+        ("b.npy", "in", None, ["in/b.npy"]),
+        ("in", "out", None, ["out/a.npy", "out/c.ply", "out/deep/b.ply"]),
+        ("in", "out", "LAS", ["out/a.las", "out/c.las", "out/deep/b.las"]),
+        ("in", "in/deep", None, ["in/deep/a.npy", "in/deep/c.ply"]),
+    ],
+)
+def test_outputs_follow_inputs(source, target, file_format, expected, inputs):
+    found = jobs(Path(source), Path(target), file_format, False)
+    assert [str(path) for _, path in found] == expected
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "file_format", "message"),
+    [
+        ("b.npy", "b.npy", None, "OUT must differ from IN"),
+        ("b.npy", "b.npy/below.ply", None, "b.npy is a file, not a folder"),
+        ("b.npy", "out.stl", None, "OUT must end in"),
+        ("b.npy", "out.obj", None, ".obj holds coordinates only"),
+        ("b.npy", "out", "stl", "--format must be one of .* got stl"),
+        ("nowhere", "out", None, "nowhere: no such file or folder"),
+        ("in", "b.npy", None, "OUT must be a folder"),
+        ("empty", "out", None, "empty contains no file"),
+        ("in", "out", "ply", "a.npy and in/a.ply have the same output out/a.ply"),
+    ],
+)
+def test_impossible_output_is_rejected(source, target, file_format, message, inputs):
+    Path("empty").mkdir()
+    Path("in/a.ply").touch()
+    with pytest.raises(UserError, match=message):
+        jobs(Path(source), Path(target), file_format, True)
