@@ -1,8 +1,15 @@
+import csv
 import json
+
+import pytest
 
 from mops_lightning.report.cli import main
 from tests.support.command_line import TINY, call, runs
-from tests.support.reports import rows
+from tests.support.reports import (
+    put,
+    put_planes,
+    rows,
+)
 
 
 def test_user_metric_appears_in_closing_table_and_report(tmp_path, capsys):
@@ -19,3 +26,44 @@ def test_user_metric_appears_in_closing_table_and_report(tmp_path, capsys):
     text = capsys.readouterr().out
     assert text.startswith("Test wrong answers (‰): classification")
     assert ["fps", f"{1000 * value:.2f}"] in rows(text)
+
+
+def test_report_of_folder_without_records_names_it(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([str(tmp_path)])
+    assert stop.value.code == 2
+    assert str(tmp_path) in capsys.readouterr().err
+
+
+def test_report_prints_written_table(tmp_path, capsys):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    main([str(tmp_path)])
+    text = (tmp_path / "table.md").read_text()
+    assert text in capsys.readouterr().out
+
+
+def test_report_writes_all_files(tmp_path, capsys):
+    put_planes(tmp_path)
+    main([str(tmp_path)])
+    assert "nre_cd_planes.png" in capsys.readouterr().out
+    assert (tmp_path / "nre_cd_planes.png").read_bytes()[:4] == b"\x89PNG"
+    svg = (tmp_path / "nre_cd_planes.svg").read_text()
+    assert "samplenet" in svg or "<path" in svg
+    tex = (tmp_path / "table.tex").read_text()
+    assert r"1.0 & 1.5 / 2 & 1.9 / 2 \\" in tex
+    assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 2
+    with (tmp_path / "table.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 20
+    (one,) = [
+        line
+        for line in lines
+        if (line["sampler.alpha"], line["sampler.tau"], line["readout"])
+        == ("1.0", "0.9", "generated")
+    ]
+    assert (one["sampler"], one["metric"], one["value"], one["m"]) == (
+        "mops",
+        "nre_cd",
+        "1.9",
+        "32",
+    )

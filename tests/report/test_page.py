@@ -1,4 +1,4 @@
-"""The page of a report, as a person sees it in a browser."""
+"""The page of a report, opened in a browser."""
 
 import json
 
@@ -6,13 +6,16 @@ import pytest
 import torch
 
 from mops_lightning.records import run_record
+from mops_lightning.report.build import build
 from mops_lightning.report.cli import main
-from mops_lightning.viz.snapshots import load_clouds, save_clouds
+from mops_lightning.report.page import page as page_text
+from mops_lightning.viz.figures import new_figure, save_figure
+from mops_lightning.viz.snapshots import save_clouds
 from tests.support.reports import put, put_planes
 
 
 def cells(page, table=0):
-    """What a reader sees in the body of a table."""
+    """The visible texts in the body of a table."""
     found = page.locator("table").nth(table).locator("tbody tr")
     return [row.locator("td").all_inner_texts() for row in found.all()]
 
@@ -42,7 +45,7 @@ def reported(tmp_path, rng):
     return tmp_path / "report.html"
 
 
-def test_tables_are_there_and_sort(reported, opened):
+def test_page_tables_sort_by_column(reported, opened):
     page, errors, requests = opened(f"file://{reported}")
     before = cells(page)
     assert names(page) == ["voxel", "fps", "mops"]
@@ -58,7 +61,7 @@ def test_tables_are_there_and_sort(reported, opened):
     assert {url.split(":")[0] for url in requests} <= {"file", "data", "blob"}
 
 
-def test_clouds_are_drawn_and_can_be_chosen(reported, opened):
+def test_page_clouds_can_be_selected(reported, opened):
     page, errors, requests = opened(f"file://{reported}")
     page.wait_for_selector("#view canvas")
     assert page.locator("#run option").all_inner_texts() == ["fps-32-pointnet", "mops-32-pointnet"]
@@ -71,26 +74,22 @@ def test_clouds_are_drawn_and_can_be_chosen(reported, opened):
     drawn = page.locator("#view").screenshot()
     page.evaluate("Plotly.restyle('view', {visible: false})")
     page.wait_for_timeout(300)
-    assert page.locator("#view").screenshot() != drawn, "the canvas shows the points"
+    assert page.locator("#view").screenshot() != drawn, "the canvas must show the points"
     assert errors == []
     assert {url.split(":")[0] for url in requests} <= {"file", "data", "blob"}
 
 
-def test_planes_are_shown_on_one_scale(tmp_path, opened):
+def test_page_planes_have_table_and_plot(tmp_path, opened):
     put_planes(tmp_path)
     main([str(tmp_path)])
     page, errors, _ = opened(f"file://{tmp_path}/report.html")
     assert cells(page, 1)[1] == ["1.0", "1.5 / 2", "1.9 / 2"]
     assert page.locator("img").evaluate("image => image.naturalWidth") > 300
-    assert page.locator("#view").count() == 0, "no run has kept clouds"
+    assert page.locator("#view").count() == 0, "no run has saved clouds"
     assert errors == []
 
 
-def test_clouds_are_kept_as_they_are_and_large_ones_thinned(tmp_path, rng):
-    points = torch.rand(2, 20_000, 3, generator=rng)
-    save_clouds(tmp_path / "clouds.npz", points, {"generated": points[:, :4096]}, ["a", "b"])
-    titles, arrays = load_clouds(tmp_path / "clouds.npz")
-    assert titles == ["a", "b"]
-    assert list(arrays) == ["input", "generated"]
-    assert arrays["input"].shape[1] <= 8192
-    assert torch.equal(torch.from_numpy(arrays["generated"]), points[:, :4096])
+def test_page_embeds_png_where_svg_is_missing(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    picture = save_figure(new_figure(1, 1), tmp_path / "curves.png")
+    assert 'src="data:image/png;base64,iVBOR' in page_text(build(tmp_path), tmp_path, [picture])

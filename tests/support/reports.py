@@ -1,5 +1,7 @@
 """Folders of made-up runs, and their tables."""
 
+import json
+
 from mops_lightning.records import run_record
 from mops_lightning.report.build import build
 from mops_lightning.report.text import markdown
@@ -74,3 +76,33 @@ def put_planes(folder):
                 values,
                 of={"beta": beta, "gamma": gamma},
             )
+
+
+DEGREES = "rotation_error_deg"
+
+
+def put_pairs(folder, sampler, m, value, net="pcrnet", rotation=45, **changes):
+    changes["notes"] = {"score": f"test/sampled/{DEGREES}", **changes.get("notes", {})}
+    metrics = {f"test/sampled/{DEGREES}": value, f"test/full/{DEGREES}": 7.5}
+    pairs = {"pairs": {"rotation": rotation}}
+    put(folder, sampler, m, metrics, "registration", net, settings=pairs, **changes)
+    if net == "icp":  # there are no weights to note
+        path = folder / f"{sampler}-{m}-icp" / "result.json"
+        content = json.loads(path.read_text())
+        del content["notes"]["task_weights_sha256"]
+        path.write_text(json.dumps(content))
+
+
+def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):
+    target = folder / f"{name}-{points}"
+    target.mkdir()
+    metrics = {f"test/full/{metric}": value for metric, value in metrics.items()}
+    config = {
+        "learn": "task",
+        "names": {"task": task, "net": net, "dataset": "modelnet40"},
+        "trainer": {"max_epochs": 3},
+        "task": {"net": {"_target_": net, "n_points": points, **settings}},
+        "dataset": {"n_points": points},
+    }
+    notes = {"score": next(iter(metrics)), "parameters": {"task": 1_025_000}}
+    return run_record.write(target, record(config=config, metrics=metrics, notes=notes))

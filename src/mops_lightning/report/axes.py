@@ -1,4 +1,4 @@
-"""In which settings the runs of one table differ, and what its columns therefore are."""
+"""Find the settings in which runs differ, and with them the layout of a table."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,19 +8,19 @@ from mops_lightning.records.run_record import dotted
 from mops_lightning.report.collect import Record, epochs
 
 CONSIDERED = ("sampler", "optimizer", "task", "augment", "batch_size", "noise", "task_rate")
-"""Settings that may change a figure and are not compared as a whole; see ``collect.common``."""
+"""Settings that may change a result and are not compared as a whole; see ``comparable``."""
 
 SIZES = ("sampler.m", "sampler.m_max", "sampler.seed")
-"""What differs between the cells of one row, or between seeds."""
+"""Settings that differ between the cells of one row, or between seeds."""
 
 
 @dataclass(frozen=True)
 class Axes:
-    """How a table is laid out.
+    """The layout of a table.
 
     Attributes:
-        column: the setting that columns stand for: ``m``, or another dotted key.
-        planes: sampler → the two settings of its heat map; empty for tables by column.
+        column: the setting that gives the columns: ``m``, or another dotted key.
+        planes: sampler → the two settings of its heat map; None for tables by column.
     """
 
     column: str = "m"
@@ -28,18 +28,18 @@ class Axes:
 
 
 def axes(found: list[Record], net: str, mixed: bool = False) -> Axes:
-    """Find out what a table of these records shows.
+    """Choose the layout of a table of these records.
 
-    Runs of one sampler that differ in nothing but size and seed make a table by size. One more
-    setting takes the place of the size; two make a heat map for each sampler.
+    If runs of one sampler differ in size and seed only, columns are sizes. If they differ in one
+    other setting, columns are its values; if in two, each sampler gets a heat map.
 
     Args:
-        found: completed records of samplers' tests.
+        found: completed records of tests of samplers.
         net: the table's task net.
-        mixed: whether runs that differ in other settings may stand in one table.
+        mixed: whether runs that differ in other settings are allowed in one table.
 
     Raises:
-        UserError: the records differ in too much; it says in what.
+        UserError: the runs differ in more settings, which the error names.
     """
     names = {row(record, net) for record in found}
     different = {name: varying([r for r in found if row(r, net) == name]) for name in sorted(names)}
@@ -55,8 +55,8 @@ def axes(found: list[Record], net: str, mixed: bool = False) -> Axes:
             return Axes()
         raise UserError(
             f"The runs differ in size (m={', m='.join(map(str, sizes))}) and in "
-            f"{', '.join(sorted(keys))}. Give a folder with runs of one size, or, if their figures "
-            "may stand in one table all the same, add --mixed."
+            f"{', '.join(sorted(keys))}. Give a folder with runs of one size, or add --mixed to "
+            "show them in one table."
         )
     if line:
         return Axes(column=min(keys))
@@ -67,7 +67,7 @@ def axes(found: list[Record], net: str, mixed: bool = False) -> Axes:
     listed = "; ".join(f"{name}: {', '.join(one)}" for name, one in different.items() if one)
     raise UserError(
         f"The runs of one sampler differ in their settings ({listed}). Give a folder with runs of "
-        "one kind, or, if their figures may stand in one table all the same, add --mixed."
+        "the same settings, or add --mixed to show them in one table."
     )
 
 
@@ -79,7 +79,7 @@ def varying(found: list[Record]) -> list[str]:
 
 
 def considered(record: Record) -> dict[str, Any]:
-    """Return the settings that count, dotted, and the epochs under their name."""
+    """Return the settings that are compared, with dotted keys, and the epochs trained."""
     config = record["config"]
     learn = (record["notes"].get("evaluated") or {}).get("learn", config["learn"])
     nodes = {key: config[key] for key in CONSIDERED if key in config}
@@ -98,7 +98,7 @@ def value(record: Record, key: str) -> Any:
 
 
 def row(record: Record, net: str) -> str:
-    """Return the row of a record's own figures; another net than the table's is named in it."""
+    """Return the row of a record's own results; it names a net that is not the table's."""
     names = record["config"]["names"]
     return names["sampler"] if names["net"] == net else f"{names['net']} on {names['sampler']}"
 

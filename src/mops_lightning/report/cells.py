@@ -1,4 +1,4 @@
-"""What stands in the cells of a table: figures by row, column, readout and seed."""
+"""The values of one metric, sorted into a table's cells by row, column, readout and seed."""
 
 import statistics
 from dataclasses import dataclass, field
@@ -9,68 +9,80 @@ from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT, parse
 from mops_lightning.report.axes import Axes, row, value
-from mops_lightning.report.collect import Record, learned, seed
+from mops_lightning.report.collect import Record, seed, trained_with
 
 Column = Any
-"""A size, another setting's value, or a pair of values in a heat map."""
+"""A size, a value of another setting, or a pair of values in a heat map."""
 
 
 @dataclass
 class Cells:
-    """The figures of one metric.
+    """The values of one metric.
 
     Attributes:
         metric: its name, unit and label.
-        figures: row → column → readout → seed → value.
+        values: row → column → readout → seed → value.
         own: rows and columns that come from runs of the sampler itself, not from a baseline that
-            was tested beside another sampler.
+            was tested in another sampler's run.
     """
 
     metric: MetricInfo
-    figures: dict[str, dict[Column, dict[str, dict[int, float]]]] = field(default_factory=dict)
+    values: dict[str, dict[Column, dict[str, dict[int, float]]]] = field(default_factory=dict)
     own: set[tuple[str, Column]] = field(default_factory=set)
 
     def columns(self) -> list[Column]:
         """Return all columns, the largest first."""
-        return sorted({one for row in self.figures.values() for one in row}, reverse=True)
+        return sorted({one for row in self.values.values() for one in row}, reverse=True)
 
     def rows(self) -> list[str]:
-        """Return all rows in the paper's order, other nets last."""
-        return sorted(self.figures, key=place)
+        """Return all rows in the paper's order, those of other nets last."""
+        return sorted(self.values, key=sort_key)
 
     def text(self, row: str, column: Column) -> str:
-        """Return generated / matched / completed figures, or one; over seeds mean ± deviation."""
-        cell = self.figures[row].get(column, {})
+        """Return the text of a cell.
+
+        It is one value, or the generated / matched / completed ones; with several seeds mean ±
+        standard deviation and their number.
+        """
+        cell = self.values[row].get(column, {})
         names = [name for name in (INDEX_READOUT, *GENERATED_READOUTS) if name in cell]
         texts = [over_seeds(self.metric, list(cell[name].values())) for name in names]
         count = max((len(cell[name]) for name in names), default=0)
         return " / ".join(texts) + (f" (n={count})" if count > 1 else "")
 
+    def plane(self, row: str) -> dict[str, dict[Column, float]]:
+        """Return readout → column → mean over seeds of one row."""
+        found: dict[str, dict[Column, float]] = {}
+        for column, readouts in self.values[row].items():
+            for readout, by_seed in readouts.items():
+                found.setdefault(readout, {})[column] = statistics.fmean(by_seed.values())
+        return {name: found[name] for name in (*GENERATED_READOUTS, *found) if name in found}
 
-def cells(found: list[Record], metric: str, net: str, axes: Axes) -> Cells:
-    """Sort the records' figures into a table.
+
+def make_cells(found: list[Record], metric: str, net: str, axes: Axes) -> Cells:
+    """Sort the records' values into a table.
 
     Args:
         found: completed records.
-        metric: the name behind the readout.
-        net: the task net of the table; what others made of a sampler's points are other rows.
-        axes: what the columns are.
+        metric: name of the metric.
+        net: the task net of the table; results under other nets get rows of their own.
+        axes: the meaning of the columns.
 
     Raises:
-        UserError: no record has the metric, or two runs of one seed would stand in one cell.
+        UserError: no record has the metric, or two runs of one seed belong in one cell.
     """
     table = Cells(metric_info(metric, found))
     for record in found:
         _add(table, record, net, axes)
-    if not table.figures:
+    if not table.values:
         known = {parts.metric for r in found for parts in map(parse, r["metrics"]) if parts}
         raise UserError(f"--metric: no run has {metric!r}.{did_you_mean(metric, known)}")
     return table
 
 
 def _add(table: Cells, record: Record, net: str, axes: Axes) -> None:
-    mine = row(record, net)
-    other = mine.removesuffix(record["config"]["names"]["sampler"])
+    own_row = row(record, net)
+    prefix = own_row.removesuffix(record["config"]["names"]["sampler"])  # such as "icp on "
     for name, figure in record["metrics"].items():
         parts = parse(name)
         if parts is None or parts.metric != table.metric.name or parts.readout == FULL:
@@ -78,30 +90,30 @@ def _add(table: Cells, record: Record, net: str, axes: Axes) -> None:
         if figure is None:
             continue
         if axes != Axes() and parts.m not in (None, record["config"]["m"]):
-            continue  # one size in a table of something else: the one that the run is about
+            continue  # tables by another setting show the run's own size only
         column: Column = value(record, axes.column)
         if axes.planes:
-            column = tuple(value(record, key) for key in axes.planes[mine])
+            column = tuple(value(record, key) for key in axes.planes[own_row])
         elif axes.column == "m":
             column = parts.m or column
         if parts.readout in (INDEX_READOUT, *GENERATED_READOUTS):
-            label, readout = mine, parts.readout
-            if (label, column) not in table.own:
-                table.figures.setdefault(label, {})[column] = {}
-                table.own.add((label, column))
-            values = table.figures[label][column].setdefault(readout, {})
+            place, readout = (own_row, column), parts.readout
+            if place not in table.own:  # replaces values of a baseline
+                table.values.setdefault(own_row, {})[column] = {}
+                table.own.add(place)
+            values = table.values[own_row][column].setdefault(readout, {})
             if seed(record) in values:
                 raise UserError(
-                    f"Two runs of {label} with {axes.column}={column} and seed={seed(record)} are "
-                    f"there, the second one in {record['folder']}; give a folder with one of each."
+                    f"Two runs of {own_row} have {axes.column}={column} and seed={seed(record)}; "
+                    f"the second is {record['folder']}. Give a folder with one of each."
                 )
         else:
-            # After joint training each run has a task net, and baselines under it, of its own.
-            label, readout = other + parts.readout, INDEX_READOUT
-            if axes.planes or (label, column) in table.own or learned(record) == "joint":
+            place, readout = (prefix + parts.readout, column), INDEX_READOUT
+            # Joint training gives each run its own task net, under which its baselines ran too.
+            if axes.planes or place in table.own or trained_with(record) == "joint":
                 continue
-            there = table.figures.setdefault(label, {}).setdefault(column, {})
-            values = there.setdefault(readout, {})
+            cell = table.values.setdefault(place[0], {}).setdefault(column, {})
+            values = cell.setdefault(readout, {})
         values[seed(record)] = figure
 
 
@@ -110,7 +122,7 @@ def over_seeds(metric: MetricInfo, values: list[float]) -> str:
     mean = metric.format(statistics.fmean(values))
     if len(values) == 1:
         return mean
-    # To the mean's last place: more would be noise.
+    # As many decimals as the mean has, at least two.
     places = len(mean.partition(".")[2]) if "e" not in mean else 0
     deviation = metric.scale * statistics.stdev(values)
     return f"{mean} ± {deviation:.{max(places, 2)}f}"
@@ -128,11 +140,11 @@ ORDER = (
     "mops",
     "fmops",
 )
-"""Samplers as in the paper's tables; others by name behind them."""
+"""Samplers in the order of the paper's tables; others follow by name."""
 
 
-def place(row: str) -> tuple[int, str]:
+def sort_key(row: str) -> tuple[int, str]:
     """Return a key that sorts rows as the paper's tables do."""
-    name = row.rsplit(" ", 1)[-1]  # behind "icp on"
+    name = row.rsplit(" ", 1)[-1]  # after "icp on"
     number = ORDER.index(name) if name in ORDER else len(ORDER)
     return number + len(ORDER) * (name != row) * 2, row

@@ -1,4 +1,4 @@
-"""The command behind ``python -m mops_lightning.report``."""
+"""The command ``mops-lightning report``."""
 
 import argparse
 from pathlib import Path
@@ -10,14 +10,13 @@ from mops_lightning.report.text import latex, long_csv, markdown
 
 PAGE = "report.html"
 
-DESCRIPTION = """Tables, plots and a page of all run records below a folder.
+DESCRIPTION = """Write tables, plots and an HTML page of all run records below a folder.
 
-Reads result.json files only. As in the paper's tables, columns are sizes, and a cell holds the
-figures of generated / matched / completed sets, or one figure for samplers that choose input
-points. Runs that differ in one other setting, such as noise, make columns of it; in two, as an
-ablation's, a heat map for each sampler. Several seeds make means and standard deviations. Where
-the paper has them too, its figures stand beside ours. A folder of task nets alone gives a table of
-nets."""
+Reads result.json files only. As in the paper's tables, columns are sizes, and a cell has the values
+of generated / matched / completed sets, or one value for samplers that choose input points. If the
+runs differ in one other setting, such as noise, columns are its values; if in two, as in an
+ablation, each sampler gets a heat map. Several seeds give means and standard deviations. The
+paper's values are shown next to ours. A folder of task nets only gives a table of nets."""
 
 
 def main(arguments: list[str] | None = None, prog: str = "python -m mops_lightning.report") -> None:
@@ -35,7 +34,7 @@ def main(arguments: list[str] | None = None, prog: str = "python -m mops_lightni
         except UserError as error:
             end(prog.removeprefix("python -m "), str(error), USER_ERROR)
         print(markdown(report.grids, report.remarks))
-        print(f"in {chosen.folder}/ lie {', '.join(written)}")
+        print(f"files in {chosen.folder}/: {', '.join(written)}")
 
 
 def make_parser(prog: str) -> argparse.ArgumentParser:
@@ -45,9 +44,9 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("folder", type=Path, help="a run, a sweep, or any folder above records")
+    parser.add_argument("folder", type=Path, help="folder of a run, of a sweep, or of several")
     parser.add_argument(
-        "--metric", nargs="+", default=[], help="names behind the readout; default: the score"
+        "--metric", nargs="+", default=[], help="names of metrics; default: the task's score"
     )
     parser.add_argument(
         "--mixed",
@@ -58,9 +57,10 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
 
 
 def write(report: Report, folder: Path) -> list[str]:
-    """Write all files of a report into its folder; return their names."""
+    """Write all files of a report into its folder and return their names."""
     from mops_lightning.report.page import page
     from mops_lightning.report.plots import plots
+    from mops_lightning.viz.figures import save_figure, save_svg
 
     layout = report.axes
     planes = layout.planes or {}
@@ -74,14 +74,13 @@ def write(report: Report, folder: Path) -> list[str]:
     for name, text in texts.items():
         with atomic_write(folder / name) as temporary:
             temporary.write_text(text)
-    written = list(texts)
-    drawn = []
+    drawn, shown = [], []
     for name, figure in plots(report).items():
-        for suffix, metadata in ((".png", {}), (".svg", {"Date": None})):
-            with atomic_write(folder / (name + suffix)) as temporary:
-                figure.savefig(temporary, dpi=150, metadata=metadata)
-            drawn.append(name + suffix)
-    vectors = [folder / name for name in drawn if name.endswith(".svg")]
+        png = save_figure(figure, folder / f"{name}.png", dpi=150)
+        svg = png.with_suffix(".svg")
+        small = save_svg(figure, svg)
+        drawn += [png.name, svg.name] if small else [png.name]
+        shown.append(svg if small else png)
     with atomic_write(folder / PAGE) as temporary:
-        temporary.write_text(page(report, folder, vectors))
-    return [*written, PAGE, *drawn]
+        temporary.write_text(page(report, folder, shown))
+    return [*texts, PAGE, *drawn]

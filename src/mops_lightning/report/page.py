@@ -1,4 +1,4 @@
-"""A report as one HTML page that needs nothing else: tables to sort, plots, clouds to turn."""
+"""A report as one self-contained HTML page: sortable tables, plots, clouds in 3-D."""
 
 import base64
 import html
@@ -14,19 +14,25 @@ from mops_lightning.report.text import PAPER, Grid
 from mops_lightning.viz.clouds import COLOURS, INPUT_COLOUR
 from mops_lightning.viz.snapshots import INPUT, load_clouds
 
-SHOWN = 24
-"""Most runs whose clouds are put into a page; more make it too large to open."""
+MAX_RUNS = 24
+"""Most runs whose clouds are in a page; more make it too large to open."""
 
 PLOTLY = "package_data/plotly.min.js"
+IMAGE_TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
+
+VIEW = """<h2>Sampled clouds</h2>
+<p><label>Run <select id="run"></select></label><label>Cloud <select id="shape"></select></label>
+Drag to rotate; click a name in the legend to hide it.</p>
+<div id="view"></div>"""
 
 
 def page(report: Report, folder: Path, plots: Sequence[Path]) -> str:
     """Return the page.
 
     Args:
-        report: what to show.
-        folder: what it is of; it gives the title.
-        plots: SVG files.
+        report: its content.
+        folder: the folder of the report; its name is the title.
+        plots: SVG or PNG files.
     """
     clouds = _clouds(report, folder)
     template = Template(files("mops_lightning.report").joinpath("page.html").read_text())
@@ -47,18 +53,12 @@ def _remark(line: str) -> str:
     return f"<li>{text}</li>" if line.startswith("- ") else f"</ul><p>{text}</p><ul>"
 
 
-VIEW = """<h2>Sampled clouds</h2>
-<p><label>Run <select id="run"></select></label><label>Cloud <select id="shape"></select></label>
-Turn with the mouse; a click on a name in the legend hides it.</p>
-<div id="view"></div>"""
-
-
 def _table(grid: Grid) -> str:
     rows: list[list[str]] = []
     for cells in grid.rows:
         texts = [html.escape(cell) for cell in cells]
         if cells[0] == PAPER:
-            # Below our figures in the same row, so that sorting keeps them together.
+            # Part of the row above, so that sorting keeps them together.
             rows[-1] = [
                 f"{ours}<small>{theirs.strip('*')}</small>" if theirs else ours
                 for ours, theirs in zip(rows[-1], texts, strict=True)
@@ -77,19 +77,20 @@ def _table(grid: Grid) -> str:
 
 def _image(path: Path) -> str:
     data = base64.b64encode(path.read_bytes()).decode()
-    return f'<img alt="{html.escape(path.stem)}" src="data:image/svg+xml;base64,{data}">'
+    source = f"data:{IMAGE_TYPES[path.suffix]};base64,{data}"
+    return f'<img alt="{html.escape(path.stem)}" src="{source}">'
 
 
 def _clouds(report: Report, folder: Path) -> list[dict[str, Any]]:
-    """Return the clouds that the runs have kept, as plain data."""
-    shown: list[dict[str, Any]] = []
+    """Return the clouds that the runs have saved, as plain data."""
+    found: list[dict[str, Any]] = []
+    colours = {INPUT: INPUT_COLOUR, **COLOURS}
     for record in report.found.done:
         path = Path(record["folder"]) / record["files"].get("clouds", "")
-        if not path.is_file() or len(shown) == SHOWN:
+        if not path.is_file() or len(found) == MAX_RUNS:
             continue
         titles, arrays = load_clouds(path)
-        colours = {INPUT: INPUT_COLOUR, **COLOURS}
-        shown.append(
+        found.append(
             {
                 "name": str(Path(record["folder"]).relative_to(folder)),
                 "titles": titles,
@@ -97,4 +98,4 @@ def _clouds(report: Report, folder: Path) -> list[dict[str, Any]]:
                 "colours": {name: f"rgb{colours.get(name, COLOURS['sampled'])}" for name in arrays},
             }
         )
-    return shown
+    return found

@@ -1,4 +1,4 @@
-"""The paper's figures, as its tables have them; they stand beside ours in reports."""
+"""The paper's results, which reports show next to ours."""
 
 import json
 from functools import cache
@@ -13,11 +13,11 @@ def tables() -> dict[str, dict[str, Any]]:
 
 
 def table(task: str, dataset: str, metric: str, joint: bool = False) -> dict[str, Any]:
-    """Return the paper's table for a task, data and a metric, or nothing if it has none.
+    """Return the paper's table for a task, dataset and metric; empty if it has none.
 
     Returns:
-        ``rows``: sampler → size → figures of generated, matched and completed sets, or one; and
-        where the paper has it ``full``, the figure on all points.
+        ``rows``: sampler → size → values of generated, matched and completed sets, or one value;
+        ``full``, if the paper gives it: the value on all points.
     """
     wanted = (task, dataset, metric, joint)
     for one in tables().values():
@@ -27,12 +27,12 @@ def table(task: str, dataset: str, metric: str, joint: bool = False) -> dict[str
 
 
 def net(name: str, pieces: int | None, n_points: int | None) -> list[float] | None:
-    """Return chamfer and earth mover's distance and size in MB of a net that reconstructs.
+    """Return chamfer distance, earth mover's distance and size in MB of a reconstruction net.
 
     Args:
         name: such as ``autoencoder``.
         pieces: M of M-FoldingNet; FoldingNet has 1.
-        n_points: of the clouds.
+        n_points: points of the clouds.
     """
     key = str(pieces) if name in ("foldingnet", "mfoldingnet") else name
     return tables()["frameworks"]["nets"].get(key, {}).get(str(n_points))

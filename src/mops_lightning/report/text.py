@@ -6,19 +6,19 @@ from dataclasses import dataclass, field
 
 from mops_lightning.records.readout_names import parse
 from mops_lightning.report.axes import row, value
-from mops_lightning.report.collect import Record, epochs, learned, seed
+from mops_lightning.report.collect import Record, epochs, seed, trained_with
 
 PAPER = "*the paper's*"
-"""Label of a row with the paper's figures, which belong to the row above."""
+"""Label of a row with the paper's values for the sampler in the row above."""
 
 
 @dataclass
 class Grid:
-    """A table of texts.
+    """A table as text.
 
     Attributes:
-        title: what it shows.
-        head: the columns' names, that of the rows first.
+        title: a caption.
+        head: names of the columns, starting with that of the row labels.
         rows: their cells.
         below: lines under the table.
     """
@@ -30,7 +30,7 @@ class Grid:
 
 
 def markdown(grids: list[Grid], remarks: list[str]) -> str:
-    """Return all tables, one below the other, and the remarks."""
+    """Return all tables and the remarks."""
     lines: list[str] = []
     for grid in grids:
         lines += [grid.title, "", _line(grid.head), "|---|" + "--:|" * (len(grid.head) - 1)]
@@ -67,12 +67,12 @@ def _tex(text: str) -> str:
 
 
 def long_csv(found: list[Record], net: str, keys: list[str]) -> str:
-    """Return every test figure of every record as a line of its own.
+    """Return one line for every test value of every record.
 
     Args:
         found: completed records.
         net: the table's task net.
-        keys: dotted settings that get a column.
+        keys: settings that get a column, dotted.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -87,7 +87,7 @@ def long_csv(found: list[Record], net: str, keys: list[str]) -> str:
                 [
                     record["folder"],
                     row(record, net),
-                    learned(record),
+                    trained_with(record),
                     seed(record),
                     epochs(record) or 0,
                     parts.m or record["config"].get("m"),

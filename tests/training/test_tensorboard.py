@@ -1,4 +1,4 @@
-"""TensorBoard, as a person sees it in a browser."""
+"""TensorBoard, opened in a browser."""
 
 import socket
 import subprocess
@@ -40,7 +40,7 @@ def board(tmp_path_factory):
         server.terminate()
 
 
-def test_curves_settings_clouds_and_pictures_are_there(board, opened):
+def test_tensorboard_shows_curves_settings_images_meshes(board, opened):
     def see(address, *what):
         page, errors, requests = opened("about:blank")
         page.goto(f"{board}/{address}")

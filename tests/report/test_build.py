@@ -1,0 +1,61 @@
+from tests.support.reports import put, put_pairs, rows, table
+
+
+def test_build_shows_records_and_paper(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3, "test/full/accuracy": 0.9})
+    put(tmp_path, "fps", 8, {"test/sampled/accuracy": 0.1})
+    learned = {"test/generated/accuracy": 0.8, "test/matched/accuracy": 0.77}
+    put(tmp_path, "mops", 32, {**learned, "test/random/accuracy": 0.2, "val/x/accuracy": 1.0})
+    assert rows(table(tmp_path)) == [
+        ["sampled by", "m=32", "m=8"],
+        ["random", "20.00", ""],
+        ["*the paper's*", "15.07", "4.70"],
+        ["fps", "30.00", "10.00"],
+        ["*the paper's*", "34.08", "11.02"],
+        ["mops", "80.00 / 77.00", ""],
+        ["*the paper's*", "84.28 / 79.01 / 79.74", "52.39 / 32.62 / 32.62"],
+    ]
+    assert "pointnet on all points: 90.00 (the paper: 87.10)." in table(tmp_path)
+
+
+def test_build_other_dataset_shows_no_paper(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    path = tmp_path / "fps-32-pointnet" / "result.json"
+    path.write_text(path.read_text().replace("modelnet40", "shapes"))
+    assert "paper" not in table(tmp_path)
+
+
+def test_build_several_metrics_give_several_tables(tmp_path):
+    metrics = {"test/sampled/nre_cd": 1.5, "test/sampled/nre_emd": 2.5}
+    metrics |= {"test/full/nre_cd": 1.0, "test/full/chamfer": 0.0025, "test/full/emd": 0.06}
+    put(tmp_path, "fps", 32, metrics, task="reconstruction")
+    text = table(tmp_path, "nre_cd", "nre_emd")
+    assert text.count("| sampled by |") == 2
+    assert text.index("Test nre cd") < text.index("| fps | 1.5 |") < text.index("Test nre emd")
+    assert text.count("seed 0") == 1
+    assert "pointnet on all points: chamfer 0.0025." in text
+    assert "pointnet on all points: emd 0.06." in text
+
+
+def test_build_registration_shows_degrees_and_icp_last(tmp_path):
+    put_pairs(tmp_path, "fps", 32, 12.345)
+    put_pairs(tmp_path, "fps", 32, 20.0, net="icp")
+    put_pairs(tmp_path, "mops", 8, 9.0)
+    text = table(tmp_path)
+    assert text.startswith("Test rotation error (°): registration on modelnet40 under pcrnet;")
+    assert rows(text) == [
+        ["sampled by", "m=32", "m=8"],
+        ["fps", "12.35", ""],
+        ["*the paper's*", "13.12", "33.28"],
+        ["mops", "", "9.00"],
+        ["*the paper's*", "7.97 / 8.53 / 8.54", "12.64 / 12.68 / 12.68"],
+        ["icp on fps", "20.00", ""],
+    ]
+    assert "pcrnet on all points: 7.50 (the paper: 7.21)." in text
+    assert "icp on all points: 7.50." in text
+
+
+def test_build_joint_registration_shows_paper_joint_table(tmp_path):
+    notes = {"task_weights_sha256": None, "evaluated": {"learn": "joint", "max_epochs": 9}}
+    put_pairs(tmp_path, "mops", 32, 6.0, notes=notes)
+    assert ["*the paper's*", "6.74 / 9.18 / 9.65"] in rows(table(tmp_path))

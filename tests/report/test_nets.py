@@ -1,0 +1,74 @@
+import json
+
+import pytest
+
+from mops_lightning.errors import UserError
+from tests.support.reports import DEGREES, put_net, rows, table
+
+
+def test_nets_grid_has_row_per_net(tmp_path):
+    put_net(tmp_path, "first", {DEGREES: 7.5}, "registration", iterations=1)
+    put_net(tmp_path, "second", {DEGREES: 6.5}, "registration", iterations=8)
+    text = table(tmp_path)
+    assert text.startswith("No sampler was tested; registration on modelnet40 from all points.")
+    assert rows(text) == [
+        ["net", "iterations", "points", "rotation error (°)", "MB", "*the paper's*"],
+        ["pcrnet", "1", "1024", "7.50", "4.1", "7.21"],
+        ["pcrnet", "8", "1024", "6.50", "4.1", "7.21"],
+    ]
+
+
+def test_nets_grid_unknown_metric_is_refused(tmp_path):
+    put_net(tmp_path, "first", {DEGREES: 7.5}, "registration", iterations=1)
+    with pytest.raises(UserError, match=r"--metric: no run has 'chamfr'"):
+        table(tmp_path, "chamfr")
+
+
+def test_nets_grid_of_two_seeds_shows_mean_and_deviation(tmp_path):
+    put_net(tmp_path, "first", {DEGREES: 6.5}, "registration")
+    path = put_net(tmp_path, "second", {DEGREES: 6.0}, "registration")
+    with pytest.raises(UserError, match=r"Two runs of registration .*same net and seed"):
+        table(tmp_path)
+    path.write_text(json.dumps({**json.loads(path.read_text()), "seed": 1}))
+    assert rows(table(tmp_path))[1][2] == "6.25 ± 0.35 (n=2)"
+
+
+def test_nets_grid_of_differing_settings_needs_mixed(tmp_path):
+    put_net(tmp_path, "first", {DEGREES: 6.5}, "registration", iterations=1)
+    path = put_net(tmp_path, "second", {DEGREES: 6.0}, "registration", iterations=8)
+    content = json.loads(path.read_text())
+    content["config"]["batch_size"] = 7
+    path.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=r"differ in their settings \(batch_size\).*--mixed"):
+        table(tmp_path)
+    assert [row[3] for row in rows(table(tmp_path, mixed=True))[1:]] == ["6.50", "6.00"]
+
+
+def test_nets_grid_of_two_tasks_is_refused(tmp_path):
+    put_net(tmp_path, "first", {DEGREES: 7.5}, "registration")
+    put_net(tmp_path, "second", {"accuracy": 0.5}, "classification", "pointnet")
+    with pytest.raises(UserError, match="differ in task: classification, registration"):
+        table(tmp_path)
+
+
+def test_nets_grid_reconstruction_shows_paper(tmp_path):
+    distances = {"nre_cd": 1.0, "chamfer": 0.00123, "emd": 0.05}
+    for points in (10000, 1024):
+        for pieces in (16, 1, 8):
+            net = "mfoldingnet" if pieces > 1 else "foldingnet"
+            given = ("reconstruction", net, points)
+            put_net(tmp_path, f"m{pieces}", distances, *given, pieces=pieces, encoder="mlp")
+    put_net(tmp_path, "mlp", distances, "reconstruction", "autoencoder")
+    found = rows(table(tmp_path))
+    assert found[0] == ["net", "pieces", "points", "chamfer", "emd", "MB", "*the paper's*"]
+    assert [row[:3] for row in found[1:]] == [
+        ["autoencoder", "", "1024"],
+        ["foldingnet", "1", "1024"],
+        ["mfoldingnet", "8", "1024"],
+        ["mfoldingnet", "16", "1024"],
+        ["foldingnet", "1", "10000"],
+        ["mfoldingnet", "8", "10000"],
+        ["mfoldingnet", "16", "10000"],
+    ]
+    assert found[3][3:] == ["0.00123", "0.05", "4.1", "12.69 / 209.13 / 2.9"]
+    assert found[5][-1] == "1.25 / 18.8 / 12"
