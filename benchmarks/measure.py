@@ -143,7 +143,7 @@ def peak_memory(setup: str, call: str) -> tuple[int, float]:
 
 def machine() -> dict[str, Any]:
     """Return what a record must say about where it was taken."""
-    from mops_lightning.records.run_record import environment
+    from mops_lightning.records.environment import environment
 
     name = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")

@@ -26,7 +26,7 @@ EXTRA = {
     "task/loss=frobenius_chamfer": ["task=registration"],
 }
 CALLER = {
-    # What code, not YAML, gives: see fit.make_experiment and fit.make_trainer.
+    # Arguments that code gives, not YAML: see training.factory and training.trainer.
     "PointNetVanilla": {"num_classes"},
     "Classification": {"net", "num_classes"},
     "Registration": {"net"},

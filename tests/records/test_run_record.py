@@ -6,16 +6,17 @@ import pytest
 
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
+from mops_lightning.records.run_record import RunRecord
 from tests.support.records import record
 
 
-def test_round_trip(tmp_path):
+def test_write_then_read_returns_same_record(tmp_path):
     run_record.write(tmp_path, record())
     assert run_record.read(tmp_path)["metrics"] == {"test/generated/accuracy": 0.5}
     assert [p.name for p in tmp_path.iterdir()] == ["result.json"]
 
 
-def test_numbers_that_are_not_finite_become_null(tmp_path):
+def test_write_nan_becomes_null(tmp_path):
     run_record.write(tmp_path, record(metrics={"a": math.nan, "b": math.inf}))
     text = (tmp_path / "result.json").read_text()
     assert json.loads(text)["metrics"] == {"a": None, "b": None}
@@ -31,13 +32,13 @@ def test_numbers_that_are_not_finite_become_null(tmp_path):
         {"device": 3},
     ],
 )
-def test_records_that_break_the_schema_are_not_written(tmp_path, changes):
+def test_write_schema_violation_raises_and_writes_nothing(tmp_path, changes):
     with pytest.raises(jsonschema.ValidationError):
         run_record.write(tmp_path, record(**changes))
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_no_record_is_refused(tmp_path):
+def test_read_no_record_raises(tmp_path):
     with pytest.raises(UserError, match="no run record"):
         run_record.read(tmp_path)
     (tmp_path / "result.json").write_text('{"schema": ')
@@ -48,6 +49,13 @@ def test_what_is_no_record_is_refused(tmp_path):
         run_record.read(tmp_path)
 
 
-def test_environment_names_versions():
-    found = run_record.environment()
-    assert {"python", "torch", "lightning", "mops-lightning"} <= set(found["versions"])
+def test_run_record_plain_matches_schema(tmp_path):
+    started = RunRecord.begin({"m": 32}, ["m=32"], seed=3)
+    with started.timed("fit"):
+        pass
+    run_record.write(tmp_path, started.plain())
+    found = run_record.read(tmp_path)
+    assert found == started.plain()
+    assert set(found) == set(run_record.schema()["properties"])
+    assert (found["status"], found["seed"]) == ("running", 3)
+    assert found["seconds"]["fit"] >= 0

@@ -1,6 +1,7 @@
 """Made-up run records."""
 
 from mops_lightning.records import run_record
+from mops_lightning.records.environment import environment
 
 
 def record(**changes):
@@ -14,7 +15,7 @@ def record(**changes):
         "seconds": {"total": 1.0},
         "seed": 0,
         "started": "2026-01-01T00:00:00+00:00",
-        **run_record.environment(),
+        **environment(),
         "device": "cpu",
         "files": {},
         "error": None,

@@ -27,11 +27,11 @@ def evaluated(trained, tmp_path, *arguments):
 def test_the_run_s_own_figures_come_again(trained, tmp_path):
     folder, record = trained
     again = evaluated(trained, tmp_path)
-    assert again["metrics"] == record["metrics"]
-    assert again["notes"]["evaluated"]["run"] == str(folder)
-    assert again["notes"]["task_weights_sha256"] == record["notes"]["task_weights_sha256"]
-    assert "fit" not in again["seconds"]
-    assert again["config"]["learn"] == "nothing"
+    assert again.metrics == record.metrics
+    assert again.notes["evaluated"]["run"] == str(folder)
+    assert again.notes["task_weights_sha256"] == record.notes["task_weights_sha256"]
+    assert "fit" not in again.seconds
+    assert again.config["learn"] == "nothing"
     assert not (tmp_path / "new" / "weights.pt").exists()
 
 
@@ -43,41 +43,41 @@ def test_weights_kept_elsewhere_are_found_by_the_record(trained, tmp_path):
     (cached,) = (folder.parent / "cache" / "weights").rglob("weights.pt")
     shutil.copy(cached, tmp_path / "kept" / "net.pt")
     files = {"weights": "../kept/sampler.pt", "task_weights": "../kept/net.pt"}
-    run_record.write(tmp_path / "run", {**record, "files": files})
+    run_record.write(tmp_path / "run", {**record.plain(), "files": files})
     again = evaluated((tmp_path / "run", record), tmp_path)
-    assert again["metrics"] == record["metrics"]
+    assert again.metrics == record.metrics
 
 
 def test_other_sizes_and_other_data(trained, tmp_path):
     record = evaluated(trained, tmp_path, "sizes=[5,20]", "dataset.n_points=100")
-    sizes = {name.split("/")[1] for name in record["metrics"] if name.endswith("matched/accuracy")}
+    sizes = {name.split("/")[1] for name in record.metrics if name.endswith("matched/accuracy")}
     assert sizes == {"m5", "m8", "m20"}
-    assert record["config"]["dataset"]["n_points"] == 100
-    assert record["config"]["dataset"]["classes"] == ["chair", "vase", "lamp"]
+    assert record.config["dataset"]["n_points"] == 100
+    assert record.config["dataset"]["classes"] == ["chair", "vase", "lamp"]
 
 
 def test_noise_is_added_to_test_clouds_alone(trained, tmp_path):
     _, record = trained
     noisy = evaluated(trained, tmp_path, "noise=0.5")
     key = "test/m8/generated/subset_distance"
-    assert noisy["metrics"][key] != record["metrics"][key]
+    assert noisy.metrics[key] != record.metrics[key]
     for note in ("dataset_fingerprint", "task_weights_sha256"):
-        assert noisy["notes"][note] == record["notes"][note]
+        assert noisy.notes[note] == record.notes[note]
 
 
 def test_another_task_net(trained, tmp_path):
     overrides = [*TINY, "learn=task", "seed=5", "dataset.seed=0"]
     run(compose(overrides), tmp_path / "task", overrides)
     record = evaluated(trained, tmp_path, f"weights={tmp_path}/task/weights.pt")
-    ours = trained[1]["notes"]["task_weights_sha256"]
-    assert record["notes"]["task_weights_sha256"] not in (None, ours)
+    ours = trained[1].notes["task_weights_sha256"]
+    assert record.notes["task_weights_sha256"] not in (None, ours)
 
 
 def test_joint_runs_bring_their_task_net(tmp_path):
     overrides = [*TINY, "learn=joint", f"cache={tmp_path}/cache"]
     record = run(compose(overrides), tmp_path / "run", overrides)
     again = evaluated((tmp_path / "run", record), tmp_path)
-    assert again["metrics"] == record["metrics"]
+    assert again.metrics == record.metrics
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_task_net_of_other_classes_is_refused_wherever_it_is_given(tmp_path):
 def test_what_cannot_be_evaluated_is_refused(trained, tmp_path):
     with pytest.raises(UserError, match="no folder"):
         command_line([f"evaluate={tmp_path}/none"])
-    record = dict(trained[1])
+    record = trained[1].plain()
     path = tmp_path / "result.json"
     for change, named in (
         ({"status": "interrupted"}, "is interrupted, not completed"),
@@ -129,12 +129,12 @@ def test_a_task_net_alone_is_tested_on_other_data(tmp_path):
     made = run(compose(overrides), tmp_path / "made", overrides)
     folder = (tmp_path / "made", made)
     again = evaluated(folder, tmp_path / "same")
-    assert again["metrics"] == made["metrics"]
-    assert "fit" not in again["seconds"]
+    assert again.metrics == made.metrics
+    assert "fit" not in again.seconds
     assert not (tmp_path / "same" / "new" / "weights.pt").exists()
     more = evaluated(folder, tmp_path / "more", "dataset.n_points=90", "noise=0.01")
-    assert more["config"]["task"]["net"]["n_points"] == 90
-    assert more["score"] != made["score"]
+    assert more.config["task"]["net"]["n_points"] == 90
+    assert more.score != made.score
     with pytest.raises(UserError, match="is a task net itself; leave weights out"):
         evaluated(folder, tmp_path / "a", "weights=null")
     with pytest.raises(UserError, match=r"made with learn=task.*weights=.*/weights.pt"):
@@ -183,7 +183,7 @@ def test_the_run_may_be_named_in_several_ways(trained, tmp_path):
 
 
 def test_data_that_are_not_here_are_asked_for(trained, tmp_path):
-    record = {**trained[1], "overrides": ["dataset=meshes", "dataset.root=meshes"]}
+    record = {**trained[1].plain(), "overrides": ["dataset=meshes", "dataset.root=meshes"]}
     (tmp_path / "result.json").write_text(json.dumps(record))
     with pytest.raises(
         UserError, match=r"had its data in dataset\.root=meshes, which is not there"
@@ -196,11 +196,11 @@ def test_a_task_net_of_other_classes_and_their_data(trained, tmp_path):
     folder, _ = trained
     classes = "dataset.classes=[bed,vase]"
     record = evaluated(trained, tmp_path, classes, "weights=auto", f"cache={folder.parent}/cache")
-    assert record["notes"]["class_names"] == ["bed", "vase"]
+    assert record.notes["class_names"] == ["bed", "vase"]
 
 
 def test_a_lost_sampler_is_named(trained, tmp_path):
-    record = trained[1]
+    record = trained[1].plain()
     (tmp_path / "result.json").write_text(json.dumps(record))
     with pytest.raises(UserError, match=r"evaluate: the sampler of .* cannot be had"):
         evaluated((tmp_path, record), tmp_path, "weights=null")
@@ -219,4 +219,4 @@ def test_another_net_or_loss_takes_the_place_of_all_its_settings(tmp_path):
         chosen = command_line([f"evaluate={tmp_path}/run", "pictures=0", "logger=none", *other])
         cfg = compose(chosen)
         record = run(cfg, tmp_path / other[0].replace("/", "-"), chosen)
-        assert record["status"] == "completed"
+        assert record.status == "completed"

@@ -25,7 +25,7 @@ def test_csv(tmp_path):
     with (tmp_path / "run" / "csv" / "metrics.csv").open() as file:
         values = [line["test/generated/accuracy"] for line in csv.DictReader(file)]
     assert float(next(filter(None, values))) == pytest.approx(
-        record["metrics"]["test/generated/accuracy"]
+        record.metrics["test/generated/accuracy"]
     )
 
 
@@ -38,7 +38,7 @@ def test_mlflow_keeps_settings_and_curves_in_a_folder(tmp_path, monkeypatch):
     (experiment,) = client.search_experiments(filter_string="name = 'mops_lightning'")
     (found,) = client.search_runs([experiment.experiment_id])
     assert found.data.params["sampler.tau_min"] == "0.1"
-    score = record["metrics"]["test/generated/accuracy"]
+    score = record.metrics["test/generated/accuracy"]
     assert found.data.metrics["test/generated/accuracy"] == pytest.approx(score)
     assert found.info.status == "FINISHED"
 

@@ -31,8 +31,8 @@ def test_train_mixed_precision_is_close(task, tmp_path):
         for precision in ("32-true", "bf16-mixed"):
             chosen = [*common, f"trainer.precision={precision}"]
             record = run(compose(chosen), tmp_path / net / precision, chosen)
-            found[precision] = record["metrics"]["test/generated/subset_distance"]
-            assert record["status"] == "completed"
+            found[precision] = record.metrics["test/generated/subset_distance"]
+            assert record.status == "completed"
         assert found["bf16-mixed"] == pytest.approx(found["32-true"], rel=0.2)
         assert found["bf16-mixed"] != found["32-true"]
 

@@ -26,14 +26,14 @@ def test_a_task_net_can_be_trained_on_from_a_file_and_is_not_taken_for_a_new_one
     record = train(
         tmp_path, "learn=task", "task=registration", f"weights={first}", "optimizer.optimizer.lr=0"
     )
-    assert record["notes"]["weights_loaded"] == published["sha256"]
+    assert record.notes["weights_loaded"] == published["sha256"]
     own, again = (weights.read(path)["state"] for path in sorted(tmp_path.glob("run*/weights.pt")))
     assert all(torch.equal(own[name], again[name]) for name in own)  # at a rate of 0 nothing moves
     assert len(files(tmp_path, "cache/weights/*/weights.pt")) == 1
 
 
 def test_a_net_without_weights_takes_no_file(tmp_path):
-    with pytest.raises(UserError, match=r"weights: icp has none to load, got some.pt"):
+    with pytest.raises(UserError, match=r"weights: icp.*got some.pt"):
         train(tmp_path, "task=registration", "task/net=icp", "sampler=fps", "weights=some.pt")
 
 
@@ -61,7 +61,7 @@ def test_a_run_is_not_resumed_under_other_weights(tmp_path):
 
 
 def test_training_that_goes_astray_fails_and_is_not_kept(tmp_path):
-    with pytest.raises(UserError, match=r"rotation_error_deg is nan: the training went astray"):
+    with pytest.raises(UserError, match=r"rotation_error_deg is nan: .*diverged"):
         train(tmp_path, "learn=task", "task=registration", "optimizer.optimizer.lr=1e30")
     assert not files(tmp_path, "**/weights.pt")
     record = json.loads((tmp_path / "run0" / "result.json").read_text())

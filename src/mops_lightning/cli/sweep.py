@@ -78,7 +78,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
                 )
             # A process that was killed at its very start left this, and no record.
             (folder / STARTED).unlink(missing_ok=True)
-            score = run(cfg, folder, overrides)["score"]
+            score = run(cfg, folder, overrides).score
             return math.nan if score is None else float(score)
     except Interrupted:
         raise

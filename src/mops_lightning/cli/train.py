@@ -67,7 +67,7 @@ def _job(cfg: "DictConfig") -> float | None:
             distributed.check_multirun(cfg)
             return run_cell(cfg, folder, overrides)
         distributed.check_start(cfg, hydra_cfg.overrides.hydra)
-        return run(cfg, folder, overrides)["score"]
+        return run(cfg, folder, overrides).score
     except UserError as error:
         # Ended here, Hydra does not add lines of its own.
         end(NAME, str(error), USER_ERROR)

@@ -2,28 +2,84 @@
 
 import json
 import math
-import platform
-import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from mops_lightning.errors import UserError
 from mops_lightning.files import atomic_write
+from mops_lightning.records.environment import environment
 
 SCHEMA = "mops_lightning/result/1"
 FILE = "result.json"
-PACKAGES = (
-    "mops-lightning",
-    "torch",
-    "lightning",
-    "hydra-core",
-    "torchmetrics",
-    "trimesh",
-    "numpy",
-)
+
+
+@dataclass(kw_only=True)
+class RunRecord:
+    """What a run records while its stages fill it in; the fields of ``result.json``.
+
+    Attributes:
+        schema: version of the schema.
+        status: ``running``, ``completed``, ``failed`` or ``interrupted``.
+        config: the composed configuration, interpolations resolved.
+        overrides: what the user changed.
+        metrics: test metrics by name.
+        score: the task's main metric on the first readout.
+        seconds: wall time by stage.
+        seed: of the run.
+        started: UTC, ISO 8601.
+        versions: of Python and the packages that matter.
+        platform: system and architecture.
+        threads: of torch.
+        git: commit of the code, and whether it was changed.
+        device: name of the GPU, or kind of device.
+        files: what the run wrote, by kind, relative to its folder.
+        error: why the run failed or stopped.
+        notes: further plain facts.
+    """
+
+    schema: str = SCHEMA
+    status: str = "running"
+    config: dict[str, Any]
+    overrides: list[str]
+    metrics: dict[str, float] = field(default_factory=dict)
+    score: float | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    seed: int
+    started: str
+    versions: dict[str, str]
+    platform: str
+    threads: int
+    git: dict[str, Any]
+    device: str | None = None
+    files: dict[str, str] = field(default_factory=dict)
+    error: str | None = None
+    notes: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def begin(cls, config: dict[str, Any], overrides: list[str], seed: int) -> "RunRecord":
+        """Return the record of a run that starts now, here."""
+        started = datetime.now(UTC).isoformat(timespec="seconds")
+        return cls(config=config, overrides=overrides, seed=seed, started=started, **environment())
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the wall time of the block to ``seconds``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = round(time.perf_counter() - start, 3)
+
+    def plain(self) -> dict[str, Any]:
+        """Return the record as plain data, as ``result.json`` holds it."""
+        return asdict(self)
 
 
 @cache
@@ -34,14 +90,14 @@ def schema() -> dict[str, Any]:
 
 
 def write(folder: Path, record: dict[str, Any]) -> Path:
-    """Validate a record and write it as ``result.json``; numbers that are not finite become null.
+    """Validate a record and write it as ``result.json``; NaN and infinity become null.
 
     Args:
         folder: the run's folder.
         record: see ``result.schema.json``.
 
     Raises:
-        jsonschema.ValidationError: the record does not fit the schema, which is a bug here.
+        jsonschema.ValidationError: the record does not fit the schema: a bug in this program.
     """
     import jsonschema
 
@@ -54,10 +110,10 @@ def write(folder: Path, record: dict[str, Any]) -> Path:
 
 
 def read(folder: Path) -> dict[str, Any]:
-    """Read and validate the record in ``folder``.
+    """Read and validate the record in ``folder``, as plain data.
 
     Raises:
-        UserError: there is none, or it is not one.
+        UserError: the folder has no ``result.json``, or it is not a run record.
     """
     import jsonschema
 
@@ -66,7 +122,7 @@ def read(folder: Path) -> dict[str, Any]:
         record = json.loads(path.read_text())
         jsonschema.validate(record, schema())
     except FileNotFoundError:
-        raise UserError(f"{path}: no run record there; give a run's folder.") from None
+        raise UserError(f"{path}: no run record. Give a run's folder.") from None
     except (json.JSONDecodeError, jsonschema.ValidationError) as error:
         raise UserError(f"{path}: not a run record: {str(error).splitlines()[0]}") from None
     return record
@@ -80,50 +136,6 @@ def dotted(tree: Any, prefix: str = "") -> dict[str, Any]:
     for key, below in tree.items():
         leaves |= dotted(below, f"{prefix}.{key}" if prefix else str(key))
     return leaves
-
-
-def environment() -> dict[str, Any]:
-    """Return versions, machine and the commit of the code, as plain data."""
-    import torch
-
-    return {
-        "versions": {"python": platform.python_version(), **_versions()},
-        "platform": f"{platform.system()} {platform.machine()}",
-        "threads": torch.get_num_threads(),
-        "git": git_state(),
-    }
-
-
-def git_state() -> dict[str, Any]:
-    """Return the commit of the checkout that this package runs from, and whether it was changed.
-
-    Both are None for an installed wheel.
-    """
-    here = Path(__file__).resolve().parent
-    top = here.parents[2]
-    if not (top / ".git").exists():
-        return {"commit": None, "dirty": None}
-    try:
-        commit = _git(top, "rev-parse", "HEAD")
-        dirty = _git(top, "status", "--porcelain", "--untracked-files=no")
-    except (OSError, subprocess.CalledProcessError):
-        return {"commit": None, "dirty": None}
-    return {"commit": commit, "dirty": bool(dirty)}
-
-
-def _git(top: Path, *arguments: str) -> str:
-    command = ["git", "-C", str(top), *arguments]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
 
 
 def _finite(value: Any) -> Any:

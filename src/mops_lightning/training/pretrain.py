@@ -12,9 +12,13 @@ from mops_lightning.config import distributed
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.files import atomic_write
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training import checkpoint
 from mops_lightning.training.callbacks import CHECKPOINT, added
 from mops_lightning.training.evaluate import OF_RUN
+from mops_lightning.training.job import Job, prepare
+from mops_lightning.training.recording import recorded
+from mops_lightning.training.stages import fit_and_test
 from mops_lightning.zoo.weights import FILE
 
 
@@ -89,27 +93,32 @@ def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
     return Path(cfg.cache).expanduser() / "weights" / name
 
 
-def publish(cfg: DictConfig, weights: Path, dataset: CloudDataset) -> None:
-    """Copy a task net trained with ``learn=task`` into the cache, unless one is there.
+def publish(job: Job, record: RunRecord) -> None:
+    """Copy a task net that was trained with ``learn=task`` into the cache, unless one is there.
 
-    Not for a run that was made longer by resuming it, for its learning rate went another way, and
-    not for one that began with given weights.
+    Not from a run that was lengthened by resuming it, whose learning rates differed, not from one
+    that started from given weights, and not from several devices, each of which has BatchNorm
+    statistics of its own share.
     """
-    target = cache_folder(cfg, dataset) / FILE
+    cfg = job.cfg
+    if cfg.learn != "task" or not job.trains or job.trainer.world_size > 1:
+        return
+    if record.notes["lengthened"] or cfg.weights not in (None, "auto"):
+        return
+    target = cache_folder(cfg, job.dataset) / FILE
     if not target.exists():
         with atomic_write(target) as temporary:
-            shutil.copyfile(weights, temporary)
+            shutil.copyfile(job.folder / FILE, temporary)
 
 
 def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
-    from mops_lightning.training.run import fit_and_test, recorded  # they call this module
-
     own = task_config(cfg)
     if (folder / "checkpoints" / CHECKPOINT).is_file():
         # An earlier pretraining was cut off: go on from there.
         own.ckpt_path = str(folder)
     try:
         with recorded(own, folder, []) as record:
-            fit_and_test(own, folder, dataset, record)
+            job = prepare(own, folder, dataset, record)
+            fit_and_test(job, record, None)
     except (KeyboardInterrupt, Interrupted):
         raise Interrupted("The task net was in training: the same command goes on there.") from None

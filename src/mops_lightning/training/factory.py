@@ -1,0 +1,61 @@
+"""Building the experiment that a configuration describes."""
+
+import lightning as L
+from omegaconf import DictConfig
+
+from mops_lightning.config.build import accepted, build
+from mops_lightning.data.clouds import CloudDataset
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.seeding import derive_seed
+from mops_lightning.tasks.base import Task
+from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.sizes import sizes_to_test
+
+
+def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, str]) -> Experiment:
+    """Build task, sampler and baselines.
+
+    Args:
+        cfg: a composed configuration.
+        dataset: says how many classes and points there are.
+        identity: see ``checkpoint.identity``.
+
+    Raises:
+        UserError: a setting that its part or the data do not allow.
+    """
+    task = _make_task(cfg, len(dataset.class_names))
+    # A seed of its own: the sampler's initial weights must not depend on the task net's size.
+    L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
+    sampler = build(cfg.sampler, "sampler") if cfg.learn != "task" else None
+    points = task.points_of(dataset.test.points.shape[1])
+    sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, points, training=cfg.learn != "nothing")
+    baselines: dict[str, Sampler] = {}
+    if sampler is not None and sampler.learned:
+        baselines = _make_baselines(cfg, max(sizes))
+    elif sampler is not None and sampler.flexible:
+        sampler = build(cfg.sampler, "sampler", m=max(sizes))
+    return Experiment(
+        task,
+        sampler,
+        learn=cfg.learn,
+        make_optimizer=build(cfg.optimizer.optimizer, "optimizer.optimizer"),
+        make_schedule=build(cfg.optimizer.schedule, "optimizer.schedule"),
+        baselines=baselines,
+        seed=cfg.seed,
+        identity=identity,
+        sizes=sizes,
+        m=cfg.m,
+        task_rate=cfg.task_rate,
+    )
+
+
+def _make_task(cfg: DictConfig, num_classes: int) -> Task:
+    L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
+    offered = {"num_classes": num_classes}
+    net = build(cfg.task.net, "task.net", **accepted(cfg.task.net, offered))
+    return build(cfg.task, "task", net=net, **accepted(cfg.task, offered))
+
+
+def _make_baselines(cfg: DictConfig, m: int) -> dict[str, Sampler]:
+    nodes = {str(name): node for name, node in cfg.baselines.items() if node}
+    return {name: build(node, f"baselines.{name}", m=m) for name, node in nodes.items()}

@@ -1,0 +1,91 @@
+"""Everything that a run needs before it trains, built and checked."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import lightning as L
+from omegaconf import DictConfig
+
+from mops_lightning.config import distributed
+from mops_lightning.data.clouds import CloudDataset
+from mops_lightning.errors import UserError
+from mops_lightning.records.run_record import RunRecord
+from mops_lightning.training import checkpoint, evaluate
+from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.factory import make_experiment
+from mops_lightning.training.loaders import num_held_out
+from mops_lightning.training.trainer import device_name, make_trainer
+
+
+@dataclass(frozen=True)
+class Job:
+    """What the stages of one run share.
+
+    Attributes:
+        cfg: the composed configuration.
+        folder: the run's folder.
+        dataset: the loaded data.
+        experiment: task, sampler and baselines.
+        trainer: Lightning's.
+        resumed: the checkpoint that training starts from; None starts at the beginning.
+    """
+
+    cfg: DictConfig
+    folder: Path
+    dataset: CloudDataset
+    experiment: Experiment
+    trainer: L.Trainer
+    resumed: Path | None
+
+    @property
+    def trains(self) -> bool:
+        """Whether anything is trained."""
+        return self.experiment.trainable and not self.cfg.evaluate
+
+    @property
+    def has_task_weights(self) -> bool:
+        """Whether the task net has weights; ICP has none."""
+        return any(True for _ in self.experiment.task.parameters())
+
+    @property
+    def part(self) -> tuple[int, int]:
+        """Rank of this process and number of processes."""
+        return self.trainer.global_rank, self.trainer.world_size
+
+
+def prepare(cfg: DictConfig, folder: Path, dataset: CloudDataset, record: RunRecord) -> Job:
+    """Build all parts of a run, so that mistakes in settings end it before anything is trained.
+
+    Raises:
+        UserError: settings that do not fit each other, the data or the checkpoint to resume.
+    """
+    identity = checkpoint.identity(cfg, dataset.fingerprint)
+    resumed = checkpoint.find(cfg, identity)
+    record.notes |= {
+        "dataset_fingerprint": dataset.fingerprint,
+        "train_clouds": len(dataset.train.labels),
+        "test_clouds": len(dataset.test.labels),
+        "class_names": list(dataset.class_names),
+        "resumed_from": None if resumed is None else str(resumed),
+        "lengthened": resumed is not None and checkpoint.lengthened(cfg, resumed),
+        **dataset.notes,
+    }
+    experiment = make_experiment(cfg, dataset, identity)
+    trainer = make_trainer(cfg, folder, dataset, experiment.task)
+    job = Job(cfg, folder, dataset, experiment, trainer, resumed)
+    distributed.check_shares(
+        cfg.batch_size,
+        len(dataset.test.labels),
+        num_held_out(dataset.train, cfg.val_fraction),
+        trainer.world_size,
+    )
+    if not job.has_task_weights and cfg.weights not in (None, "auto", evaluate.OF_RUN):
+        raise UserError(
+            f"weights: {cfg.names.net} has no weights to load, got {cfg.weights}. "
+            "Leave weights out."
+        )
+    learned = experiment.sampler is not None and experiment.sampler.learned
+    if cfg.learn == "nothing" and learned and not cfg.evaluate:
+        raise UserError("learn=nothing needs a trained sampler: give its run with evaluate=RUN.")
+    record.device = device_name(trainer)
+    return job

@@ -1,0 +1,160 @@
+"""The stages of a run once its job is prepared: load weights, fit, test, save."""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from torch import nn
+
+from mops_lightning.data.loader import Augmentation, CloudLoader
+from mops_lightning.errors import Interrupted, UserError
+from mops_lightning.records.metric_info import described
+from mops_lightning.records.readout_names import parse
+from mops_lightning.records.run_record import RunRecord
+from mops_lightning.training import evaluate
+from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.job import Job
+from mops_lightning.training.loaders import score_loader, split
+from mops_lightning.training.trainer import log_hparams
+from mops_lightning.viz.snapshots import CLOUDS
+from mops_lightning.zoo import weights
+
+OUTPUTS = {
+    "checkpoint": "checkpoints/last.ckpt",
+    "pictures": "pictures",
+    "clouds": f"pictures/{CLOUDS}",
+    "tensorboard": "tensorboard",
+}
+"""What callbacks and loggers may have written."""
+
+
+def fit_and_test(job: Job, record: RunRecord, task_weights: Path | None) -> None:
+    """Load weights, train what learns, score it, and save both.
+
+    Args:
+        job: from ``job.prepare``.
+        record: is filled.
+        task_weights: a file for the task net; None leaves it as initialised.
+
+    Raises:
+        UserError: weights that do not fit, too little data, or training that diverged.
+    """
+    _load_weights(job, record, task_weights)
+    if job.trains:
+        with record.timed("fit"):
+            _fit(job)
+    if job.cfg.learn in ("sampler", "nothing") and job.has_task_weights:
+        # A resumed run has its task net from the checkpoint, not from a weights file.
+        digest = weights.digest(job.experiment.task.state_dict())
+        record.notes["task_weights_sha256"] = digest
+    with record.timed("test"):
+        record.metrics = _test(job)
+    if job.trainer.is_global_zero:
+        _save(job, record)
+
+
+def _load_weights(job: Job, record: RunRecord, task_weights: Path | None) -> None:
+    task = job.experiment.task
+    if task_weights is not None:
+        content = weights.load_into(task, task_weights)
+        record.notes["weights_loaded"] = content["sha256"]
+        if task.requires_same_classes and content.get("classes"):
+            evaluate.same_classes(content["classes"], job.dataset, f"weights: {task_weights}")
+    if job.cfg.evaluate:
+        record.notes["evaluated"] = evaluate.load(job.cfg, job.experiment, job.dataset)
+
+
+def _fit(job: Job) -> None:
+    """Train what learns, from the checkpoint if the run is resumed."""
+    cfg, trainer, task = job.cfg, job.trainer, job.experiment.task
+    train, held_out = split(job.dataset.train, cfg.val_fraction, cfg.seed)
+    if len(train.labels) < 2 * trainer.world_size:
+        raise UserError(
+            f"val_fraction={cfg.val_fraction} leaves {len(train.labels)} training clouds; "
+            "at least two are needed for each device. Lower it, or give more data."
+        )
+    loader = CloudLoader(
+        train,
+        cfg.batch_size,
+        shuffle=True,
+        augment=Augmentation(**cfg.augment[cfg.learn]),
+        make_batch=task.make_batch,
+        drop_last=True,
+        seed=cfg.seed,
+        part=job.part,
+    )
+    validation = None
+    if len(held_out.labels):
+        validation = score_loader(held_out, cfg.batch_size, task, job.part)
+    # An epoch of a small data set may be shorter than the logging interval.
+    every = min(trainer.log_every_n_steps, len(loader))  # type: ignore[attr-defined]
+    trainer.log_every_n_steps = every  # type: ignore[attr-defined]
+    with _interruptible():
+        trainer.fit(job.experiment, loader, validation, ckpt_path=job.resumed)
+
+
+def _test(job: Job) -> dict[str, float]:
+    """Score all test clouds and return the metrics by name."""
+    experiment, trainer = job.experiment, job.trainer
+    with _interruptible():
+        loader = score_loader(job.dataset.test, job.cfg.batch_size, experiment.task, job.part)
+        trainer.test(experiment, loader, verbose=False)
+    metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
+    log_hparams(trainer, job.cfg, _scores_at_own_size(metrics, experiment))
+    return metrics
+
+
+def _scores_at_own_size(metrics: dict[str, float], experiment: Experiment) -> dict[str, float]:
+    """Select the task's score of every readout, at the run's own size."""
+    chosen = {}
+    for name, value in metrics.items():
+        parts = parse(name)
+        if parts and parts.metric == experiment.task.score and parts.m in (None, experiment.m):
+            chosen[name] = value
+    return chosen
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Raise ``Interrupted`` where Lightning turns Ctrl-C into ``SystemExit``."""
+    try:
+        yield
+    except SystemExit:
+        raise Interrupted("Go on with the same command and ckpt_path=last.") from None
+
+
+def _save(job: Job, record: RunRecord) -> None:
+    """Fill in what the run wrote and scored, and save what it trained."""
+    cfg, experiment = job.cfg, job.experiment
+    task, sampler = experiment.task, experiment.sampler
+    for kind, name in OUTPUTS.items():
+        if (job.folder / name).exists():
+            record.files[kind] = name
+    record.score = score = record.metrics[experiment.score_name]
+    parts: dict[str, nn.Module | None] = {"task": task, "sampler": sampler}
+    record.notes |= {
+        "score": experiment.score_name,
+        "metrics": described(task.metrics().items()),
+        "processes": job.trainer.world_size,
+        "parameters": {
+            name: sum(parameter.numel() for parameter in module.parameters())
+            for name, module in parts.items()
+            if module is not None
+        },
+    }
+    if not math.isfinite(score):
+        raise UserError(
+            f"{experiment.score_name} is {score}: training diverged; no weights were saved. "
+            "Try a lower learning rate (optimizer.optimizer.lr) or other weights of the losses."
+        )
+    if not job.trains:
+        return
+    files = {weights.FILE: task if cfg.learn == "task" else sampler}
+    if cfg.learn == "joint":
+        files["task_weights.pt"] = task
+    for name, module in files.items():
+        assert module is not None  # only learn=task has no sampler
+        classes = job.dataset.class_names if module is task and task.requires_same_classes else ()
+        weights.save(job.folder / name, module, record.config, record.metrics, classes)
+        record.files[Path(name).stem] = name
