@@ -8,6 +8,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.evaluate import command_line
 from mops_lightning.training.run import run
+from mops_lightning.zoo.load import RENAMED
 from tests.support.command_line import TINY
 
 
@@ -46,6 +47,18 @@ def test_weights_kept_elsewhere_are_found_by_the_record(trained, tmp_path):
     run_record.write(tmp_path / "run", {**record.plain(), "files": files})
     again = evaluated((tmp_path / "run", record), tmp_path)
     assert again.metrics == record.metrics
+
+
+def test_renamed_sampler_settings_of_an_old_record_are_accepted(trained, tmp_path):
+    folder, record = trained
+    shutil.copytree(folder, tmp_path / "run")
+    old_names = {new: old for old, new in RENAMED.items()}
+    sampler = {old_names.get(k, k): v for k, v in record["config"]["sampler"].items()}
+    assert "sizes_per_step" in sampler
+    config = {**record["config"], "sampler": sampler}
+    run_record.write(tmp_path / "run", {**record, "config": config})
+    again = evaluated((tmp_path / "run", record), tmp_path)
+    assert again["metrics"] == record["metrics"]
 
 
 def test_other_sizes_and_other_data(trained, tmp_path):

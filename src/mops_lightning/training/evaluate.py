@@ -18,6 +18,7 @@ from mops_lightning.records import run_record
 from mops_lightning.training.callbacks import CHECKPOINT
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.zoo import weights
+from mops_lightning.zoo.load import RENAMED
 
 KEY = "evaluate"
 OF_RUN = "run"
@@ -221,7 +222,7 @@ def _same_settings(
     if (cfg.learn == "task") != (there["learn"] == "task"):
         raise UserError(
             f"{KEY}: {folder} was made with learn={there['learn']}; leave learn out. Samplers are "
-            f"tested under a task net of your own with weights={folder}/{weights.FILE}."
+            f"tested under a task net of your own with weights={weights.of_run(folder)}."
         )
     if cfg.learn == "task" and cfg.weights != OF_RUN:
         raise UserError(f"{KEY}: {folder} is a task net itself; leave weights out.")
@@ -238,8 +239,9 @@ def _same_settings(
             f"{KEY}: the task net of {folder} is {there['names']['net']}; for "
             f"task/net={here['names']['net']} give its weights too: weights=auto or a file."
         )
-    for key in sorted({*there["sampler"], *here["sampler"]}) if cfg.learn != "task" else ():
-        old, new = there["sampler"].get(key), here["sampler"].get(key)
+    trained = {RENAMED.get(key, key): value for key, value in there["sampler"].items()}
+    for key in sorted({*trained, *here["sampler"]}) if cfg.learn != "task" else ():
+        old, new = trained.get(key), here["sampler"].get(key)
         if old != new:
             hint = "" if key != "m" else " Sizes of a net for many are chosen with sizes=[...]."
             raise UserError(
