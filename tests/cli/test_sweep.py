@@ -1,10 +1,10 @@
 """Cells of a sweep that is started again."""
 
-import fcntl
 import json
 import math
 
 import pytest
+from filelock import FileLock
 
 from mops_lightning.cli.sweep import run_cell
 from mops_lightning.config.compose import compose
@@ -85,8 +85,7 @@ def test_an_interrupted_cell_goes_on_to_the_same_result(start, tmp_path):
 def test_a_cell_that_another_process_runs_is_left_to_it(start, tmp_path, caplog):
     folder = tmp_path / "cell"
     folder.mkdir()
-    with (folder / ".lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    with FileLock(folder / ".lock"):
         assert math.isnan(start("sampler=fps", "weights=null"))
     assert "another process runs this cell" in caplog.text
     assert not (folder / FAILED).exists()

@@ -282,8 +282,8 @@ def test_the_hash_of_the_archive_is_checked(
     address, _, folder = shelf
     shutil.make_archive(str(folder / "set"), "zip", layout.parent, FOLDER)
     mirrors = [f"{address}/set.zip"]
-    with pytest.raises(UserError, match=r"sha256 is .*, expected 0000"):
-        modelnet40(tmp_path / "new", download=True, mirrors=mirrors, sha256="0" * 64)
+    with pytest.raises(UserError, match=r"hash.*expected 0000"):
+        modelnet40(tmp_path / "new", download=True, mirrors=mirrors, archive_hash="0" * 64)
 
 
 @pytest.mark.skipif("MOPS_DATA" not in os.environ, reason="MOPS_DATA names no folder of real data")

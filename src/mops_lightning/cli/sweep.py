@@ -13,11 +13,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.errors import Interrupted, UserError
-from mops_lightning.files import lock
 from mops_lightning.records import run_record
 from mops_lightning.records.attempts import ASIDE, FAILED
 
@@ -95,18 +95,21 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
 
 @contextmanager
 def _claimed(folder: Path) -> Iterator[None]:
-    """Hold the cell's lock, which goes with the process that has it.
+    """Hold the cell's lock; a killed process releases it.
 
     Raises:
         Busy: another process runs this cell.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as file:
-        try:
-            lock(file, wait=False)
-        except BlockingIOError:
-            raise Busy from None
+    lock = FileLock(folder / ".lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise Busy from None
+    try:
         yield
+    finally:
+        lock.release()
 
 
 def _earlier(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:

@@ -27,8 +27,7 @@ def modelnet40(
     classes: Sequence[str] | None = None,
     download: bool = False,
     mirrors: Sequence[str] | None = None,
-    sha256: str | None = None,
-    size: int | None = None,
+    archive_hash: str | None = None,
 ) -> CloudDataset:
     """Read ModelNet40, the shapes of the paper's classification and registration experiments.
 
@@ -42,8 +41,8 @@ def modelnet40(
         classes: names from ``shape_names.txt`` to keep; None or empty means all 40.
         download: fetch and unpack the archive into ``root`` when the files are not there.
         mirrors: addresses of the archive, tried in turn; None means ``MIRRORS``.
-        sha256: hexadecimal hash that the archive must have, or None.
-        size: bytes that the archive must have, or None.
+        archive_hash: hexadecimal sha256 of the archive, or another hash as ``md5:...``; None
+            accepts any archive.
 
     Returns:
         Float32 clouds ``(S, n_points, 3)`` and int64 labels ``(S,)``. The fingerprint hangs on
@@ -58,7 +57,7 @@ def modelnet40(
     root = Path(root).expanduser()
     folder = _find(root)
     if folder is None and download:
-        folder = _download(root, mirrors or MIRRORS, sha256, size)
+        folder = _download(root, mirrors or MIRRORS, archive_hash)
     if folder is None:
         raise UserError(
             f"dataset.root: no ModelNet40 in {root}. Looked there and in {root / FOLDER} for "
@@ -96,13 +95,13 @@ def _find(root: Path) -> Path | None:
     return None
 
 
-def _download(root: Path, mirrors: Sequence[str], sha256: str | None, size: int | None) -> Path:
+def _download(root: Path, mirrors: Sequence[str], archive_hash: str | None) -> Path:
     folder = root if root.name == FOLDER else root / FOLDER
     archive = folder.parent / f"{FOLDER}.zip"
     with one_at_a_time(folder.parent / f".{FOLDER}.lock"):
         if _find(folder) is None:
             brought = archive.exists()
-            fetch(mirrors, archive, sha256=sha256, size=size)
+            fetch(mirrors, archive, archive_hash)
             unpack(archive, folder)
             if not brought:
                 archive.unlink()
