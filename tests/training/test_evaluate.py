@@ -53,12 +53,12 @@ def test_renamed_sampler_settings_of_an_old_record_are_accepted(trained, tmp_pat
     folder, record = trained
     shutil.copytree(folder, tmp_path / "run")
     old_names = {new: old for old, new in RENAMED.items()}
-    sampler = {old_names.get(k, k): v for k, v in record["config"]["sampler"].items()}
+    sampler = {old_names.get(k, k): v for k, v in record.config["sampler"].items()}
     assert "sizes_per_step" in sampler
-    config = {**record["config"], "sampler": sampler}
-    run_record.write(tmp_path / "run", {**record, "config": config})
+    config = {**record.config, "sampler": sampler}
+    run_record.write(tmp_path / "run", {**record.plain(), "config": config})
     again = evaluated((tmp_path / "run", record), tmp_path)
-    assert again["metrics"] == record["metrics"]
+    assert again.metrics == record.metrics
 
 
 def test_other_sizes_and_other_data(trained, tmp_path):
