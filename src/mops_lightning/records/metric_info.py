@@ -25,9 +25,9 @@ def metric_info(name: str, records: Iterable[Mapping[str, Any]] = ()) -> MetricI
             unknown there too has no unit.
     """
     for record in records:
-        described = record["notes"].get(NOTE, {})
-        if name in described:
-            return MetricInfo.from_dict(name, described[name])
+        values = record["notes"].get(NOTE, {}).get(name)
+        if values is not None:
+            return MetricInfo.from_dict(name, values)
     return _package_metrics().get(name, MetricInfo(name))
 
 

@@ -1,26 +1,26 @@
-"""What the readouts and their metrics are called, in logs, records and tables."""
+"""Names of readouts and test metrics in logs, records and tables."""
 
 from typing import NamedTuple
 
 GENERATED_READOUTS = ("generated", "matched", "completed")
-"""Straight out of the sampler; nearest input points; these made unique and filled up by FPS."""
+"""The sampler's output; its nearest input points; these made unique and completed by FPS."""
 INDEX_READOUT = "sampled"
-"""Index samplers choose input points, so their three readouts are one."""
+"""The only readout of samplers that choose input points."""
 FULL = "full"
-"""The cloud before sampling: what the task net can do at best."""
+"""The cloud before sampling: an upper bound for the task net."""
 SOFT_PROJECTED = "soft_projected"
-"""What SampleNet's task net sees in training; logged under ``train/`` alone, never a result."""
+"""Input of SampleNet's task net in training; logged under ``train/`` only, never a result."""
 
 ROWS = (*GENERATED_READOUTS, INDEX_READOUT, FULL)
 """Readouts in the order of tables, after the baselines."""
 
 
 class MetricName(NamedTuple):
-    """A test metric's name in its parts.
+    """The parts of a test metric's name.
 
     Attributes:
-        m: the size, or None where the run tests one size only.
-        readout: of the sampler under test, a baseline's name, or ``full``.
+        m: the size; None if the run tests one size only.
+        readout: of the tested sampler, a baseline's name, or ``full``.
         metric: such as ``accuracy``.
     """
 
@@ -30,12 +30,12 @@ class MetricName(NamedTuple):
 
 
 def size_prefix(m: int | None) -> str:
-    """Return ``m32/`` for 32, and nothing for None."""
+    """Return ``m32/`` for 32, and an empty string for None."""
     return "" if m is None else f"m{m}/"
 
 
 def parse(name: str, stage: str = "test") -> MetricName | None:
-    """Take a name such as ``test/m32/generated/accuracy`` or ``test/generated/accuracy`` apart.
+    """Split a name such as ``test/m32/generated/accuracy`` or ``test/generated/accuracy``.
 
     Returns:
         None for names of another stage, of losses and of the sampling matrix.
