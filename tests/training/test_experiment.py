@@ -48,7 +48,7 @@ def test_learning_the_sampler_leaves_the_task_bit_identical():
 
 @pytest.mark.parametrize(("learn", "rates"), [("joint", [1e-2, 1e-3]), ("sampler", [1e-2])])
 def test_a_jointly_trained_task_net_may_learn_more_slowly(learn, rates):
-    module = fit(experiment(learn, task_rate=0.1), epochs=1)
+    module = fit(experiment(learn, task_lr_scale=0.1), epochs=1)
     groups = module.optimizers().param_groups
     assert [group["lr"] for group in groups] == pytest.approx(rates)
     parts = (module.sampler, module.task)[: len(rates)]

@@ -1,30 +1,31 @@
-"""The only LightningModule: a sampler and a task net, of which one or both learn."""
+"""The only LightningModule: trains a sampler, a task net or both, and scores every readout.
+
+Per batch: loader, ``sampler.sample_sizes``, ``readouts``, ``task.step``, losses and metrics.
+"""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any
 
 import lightning as L
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
-from torchmetrics import MeanMetric
 
-from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.metrics.sampled_set import SET_METRICS
+from mops_lightning.errors import UserError
 from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
 from mops_lightning.records.readout_names import FULL, SOFT_PROJECTED, size_prefix
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
+from mops_lightning.training.learn import Learn, check_learn
 from mops_lightning.training.readouts import readout_names, readouts
+from mops_lightning.training.scores import Scores
 from mops_lightning.types import Batch, SampleOutput
 
 CHECKPOINT_KEY = "mops_lightning"
 """Where a checkpoint keeps the identity of its run."""
-
-Learn = Literal["task", "sampler", "joint", "nothing"]
 
 
 class Experiment(L.LightningModule):
@@ -36,17 +37,16 @@ class Experiment(L.LightningModule):
         learn: what is trained. The rest is frozen: no gradients, evaluation mode.
         make_optimizer: from parameters to optimizer; not needed for testing only.
         make_schedule: from (optimizer, total_steps) to a per-step schedule.
-        baselines: index samplers that are tested beside the sampler, by name.
+        baselines: index samplers to test for comparison, by name.
         seed: what happens in step i of epoch e depends on (seed, e, i) only.
         identity: kept in checkpoints, so that none is resumed under other settings.
         sizes: how many points are tested, from one pass over the data; None: ``m`` alone. With
             several, the metrics are named ``test/m32/generated/accuracy`` and so on.
-        task_rate: with ``learn="joint"`` the task net's learning rate over that of the sampler.
+        task_lr_scale: with ``learn="joint"`` the task net's learning rate over that of the sampler.
         m: the size that is validated and whose score stands for the run; None: the sampler's.
 
     Raises:
-        UserError: ``learn`` is unknown, the sampler that it needs is missing, or the task net lets
-            no gradient through.
+        UserError: see ``check_learn``.
     """
 
     def __init__(
@@ -61,21 +61,10 @@ class Experiment(L.LightningModule):
         identity: dict[str, str] | None = None,
         sizes: Sequence[int] | None = None,
         m: int | None = None,
-        task_rate: float = 1.0,
+        task_lr_scale: float = 1.0,
     ) -> None:
         super().__init__()
-        allowed = get_args(Learn)
-        if learn not in allowed:
-            raise UserError(f"learn: unknown value {learn!r}.{did_you_mean(learn, allowed)}")
-        if sampler is None and learn != "task":
-            raise UserError(f"learn={learn} needs a sampler; without one only learn=task works.")
-        learns = learn in ("task", "joint") or (sampler.learned and learn != "nothing")  # type: ignore[union-attr]
-        if learns and not getattr(task.net, "differentiable", True):
-            raise UserError(
-                f"learn={learn}: {type(task.net).__name__} has no weights and lets no gradient "
-                "through. Train under another task/net and test with evaluate=RUN, or choose a "
-                "sampler that needs no training, such as sampler=fps."
-            )
+        check_learn(learn, task, sampler)
         self.task: Task = task
         self.sampler = None if learn == "task" else sampler
         self.baselines = nn.ModuleDict({} if learn == "task" else dict(baselines or {}))
@@ -84,32 +73,26 @@ class Experiment(L.LightningModule):
         self.make_schedule = make_schedule
         self.seed = seed
         self.identity = identity
-        self.task_rate = task_rate
+        self.task_lr_scale = task_lr_scale
         self.total_steps = 1
         for module in self._frozen():
             module.requires_grad_(False)
         self.m: int = m or (self.sampler.m if self.sampler is not None else 0)
         self.sizes = tuple(sizes or (self.m,))
-        self.own_readouts = readout_names(self.sampler)
+        self.prefixes = {m: size_prefix(m) if len(self.sizes) > 1 else "" for m in self.sizes}
+        self.main_readout, *others = readout_names(self.sampler)
         score = task.full_score or task.score if self.sampler is None else task.score
-        self.score_name = f"test/{self._prefix(self.m)}{self.own_readouts[0]}/{score}"
-        readouts = dict.fromkeys([*self.own_readouts, *self.baselines])
-        keys = [f"{self._prefix(size)}{name}" for size in self.sizes for name in readouts]
-        make_metrics = task.metrics
-        self.scores = nn.ModuleDict({key: make_metrics() for key in (*keys, *readouts, FULL)})
-        self.train_scores = make_metrics(training=True)
-        self.loss_means = nn.ModuleDict()  # the task says their names with its first result
-        self.set_metrics = nn.ModuleDict(
-            {
-                f"{prefix}{name}": metric()
-                for name, metric in SET_METRICS.items()
-                for prefix in {"", *map(self._prefix, self.sizes)}
-            }
-        )
+        self.score_name = f"test/{self.prefixes.get(self.m, '')}{self.main_readout}/{score}"
+        names = dict.fromkeys([self.main_readout, *others, *self.baselines, FULL])
+        self.scores = Scores(task.metrics, names, self.prefixes.values())
+        self.train_scores = task.metrics(training=True)
         self.train()
 
     def train(self, mode: bool = True) -> "Experiment":
-        """Set training mode, but never for what is frozen: BatchNorm would go on learning."""
+        """Set the mode of what learns; frozen parts stay in evaluation mode.
+
+        In training mode, BatchNorm would update its statistics without gradients, too.
+        """
         super().train(mode)
         for module in self._frozen():
             module.eval()
@@ -136,7 +119,7 @@ class Experiment(L.LightningModule):
         groups = [[p for p in module.parameters() if p.requires_grad] for module in modules]
         optimizer = self.make_optimizer([{"params": group} for group in groups if group])
         if self.learn == "joint":
-            optimizer.param_groups[-1]["lr"] *= self.task_rate
+            optimizer.param_groups[-1]["lr"] *= self.task_lr_scale
         self.total_steps = int(self.trainer.estimated_stepping_batches)
         if self.make_schedule is None:
             return optimizer
@@ -144,13 +127,13 @@ class Experiment(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the run's identity beside its state."""
+        """Add the run's identity."""
         checkpoint[CHECKPOINT_KEY] = self.identity or {}
 
     def on_train_start(self) -> None:
-        """Put the loader where a resumed run goes on, which may be the middle of an epoch.
+        """Set the loader to where a resumed run continues, which may be inside an epoch.
 
-        Lightning 2.6 hands a loader its state only in some cases, and calls no
+        Lightning 2.6 restores a loader's state only in some cases, and does not call
         ``on_train_epoch_start`` for an epoch that had begun.
         """
         loader: Any = self.trainer.train_dataloader
@@ -171,126 +154,96 @@ class Experiment(L.LightningModule):
         if self.sampler is not None:
             self.sampler.anneal(self.global_step / max(self.total_steps - 1, 1))
 
+    def _sample(self, points: Tensor, sizes: Sequence[int]) -> dict[int, SampleOutput]:
+        """Sample at all sizes; without a sampler, the task net is given all points."""
+        if self.sampler is None:
+            return {m: SampleOutput(points, None, {}) for m in sizes}
+        return self.sampler.sample_sizes(points, sizes)
+
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the task loss plus the sampler's losses, over all sizes of this step."""
-        with restrict_autocast_to_pointwise(self.device.type):
-            return self._training_step(batch, batch_idx)
-
-    def _training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         sizes = (0,) if self.sampler is None else self.sampler.training_sizes()
-        if self.global_rank:  # sizes are everyone's, what is drawn for clouds each process's own
-            torch.manual_seed(
-                derive_seed(self.seed, self.current_epoch, batch_idx, self.global_rank)
-            )
-        outputs = {} if self.sampler is None else self.sampler.sample_sizes(batch.points, sizes)
-        terms: dict[str, list[Tensor]] = defaultdict(list)
-        for m in sizes:
-            output = outputs.get(m) or SampleOutput(batch.points, None, {})
-            soft = output.soft_projected
-            result = self.task.step(batch, output.points if soft is None else soft)
-            self.train_scores.update(result.predictions, result.targets)
-            for name, value in (*result.losses.items(), *output.losses.items()):
-                terms[name].append(value)
-        share = 1.0
-        if self.sampler is not None and self.sampler.size_reduction == "mean":
-            share = 1 / len(sizes)
-        losses = {name: torch.stack(values).sum() * share for name, values in terms.items()}
-        total = torch.stack(list(losses.values())).sum()
-        self._log_training(losses, total, soft is not None, len(batch.points))
+        rank = self.global_rank
+        if rank:  # processes draw the same sizes, but random numbers of their own
+            torch.manual_seed(derive_seed(self.seed, self.current_epoch, batch_idx, rank))
+        with restrict_autocast_to_pointwise(self.device.type):
+            outputs = self._sample(batch.points, sizes)
+            terms: dict[str, list[Tensor]] = defaultdict(list)
+            for m in sizes:
+                sampled, soft = outputs[m], outputs[m].soft_projected
+                result = self.task.step(batch, sampled.points if soft is None else soft)
+                self.train_scores.update(result.predictions, result.targets)
+                for name, value in (*result.losses.items(), *sampled.losses.items()):
+                    terms[name].append(value)
+            mean = self.sampler is not None and self.sampler.size_reduction == "mean"
+            share = 1 / len(sizes) if mean else 1.0
+            losses = {name: torch.stack(values).sum() * share for name, values in terms.items()}
+            total = torch.stack(list(losses.values())).sum()
+        readout = self.main_readout if soft is None else SOFT_PROJECTED
+        self._log_training({**losses, "total": total}, readout, len(batch.points))
         return total
 
-    def _log_training(
-        self, losses: dict[str, Tensor], total: Tensor, soft: bool, size: int
-    ) -> None:
-        for name, value in {**losses, "total": total}.items():
-            self.log(f"train/loss/{name}", value.detach(), batch_size=size, sync_dist=True)
-        self.log("loss", total.detach(), prog_bar=True, logger=False, batch_size=size)
-        mean = total.detach()
-        self.log(
-            "train/mean_loss", mean, on_step=False, on_epoch=True, batch_size=size, sync_dist=True
-        )
+    def _log_training(self, losses: dict[str, Tensor], readout: str, clouds: int) -> None:
+        for name, value in losses.items():
+            self.log(f"train/loss/{name}", value.detach(), batch_size=clouds, sync_dist=True)
+        total = losses["total"].detach()
+        over_epoch: dict[str, Any] = {"on_step": False, "on_epoch": True, "batch_size": clouds}
+        self.log("loss", total, prog_bar=True, logger=False, batch_size=clouds)
+        self.log("train/mean_loss", total, sync_dist=True, **over_epoch)
         tau: Any = getattr(self.sampler, "tau", None)
         if tau is not None:
-            self.log("train/tau", tau, batch_size=size)
-        seen = SOFT_PROJECTED if soft else self.own_readouts[0]
+            self.log("train/tau", tau, batch_size=clouds)
         for name, metric in self.train_scores.items(keep_base=True, copy_state=False):
-            self.log(f"train/{seen}/{name}", metric, on_step=False, on_epoch=True, batch_size=size)
+            self.log(f"train/{readout}/{name}", metric, **over_epoch)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Score the learned readouts on held-out training clouds, at one size."""
         with full_precision(self.device.type):
-            outputs, samples = self._sampled(batch.points, (self.m,))
-            own = samples[self.m] or {FULL: batch.points}
-            self._score(batch, "val/", own, self.task.reference(batch))
-            self._score_sets(batch.points, outputs, {self.m: "val/"})
+            outputs = self._sample(batch.points, (self.m,))
+            samples = readouts(batch.points, outputs, self.sampler)[self.m]
+            self._score("val/", "", batch, samples, self.task.reference(batch))
+            self._score_sets("val/", {self.m: ""}, batch.points, outputs)
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         """Score the learned readouts and the baselines at every size, and the full clouds."""
         with full_precision(self.device.type):
-            self._test_step(batch)
-
-    def _test_step(self, batch: Batch) -> None:
-        outputs, samples = self._sampled(batch.points, self.sizes)
-        for name, baseline in self.baselines.items():
-            sampler: Any = baseline
-            for m, output in sampler.sample_sizes(batch.points, self.sizes).items():
-                samples[m].setdefault(name, output.points)
-        reference = self.task.reference(batch)
-        prefixes = {m: f"test/{self._prefix(m)}" for m in self.sizes}
-        for m, prefix in prefixes.items():
-            self._score(batch, prefix, samples[m], reference)
-        self._score(batch, "test/", {FULL: batch.points}, reference)
-        self._score_sets(batch.points, outputs, prefixes)
-
-    def _sampled(
-        self, points: Tensor, sizes: Sequence[int]
-    ) -> tuple[dict[int, SampleOutput], dict[int, dict[str, Tensor]]]:
-        """Return the sampler's outputs and all their readouts, by size; empty without a sampler."""
-        if self.sampler is None:
-            return {}, {m: {} for m in sizes}
-        outputs = self.sampler.sample_sizes(points, sizes)
-        return outputs, readouts(points, outputs, self.sampler)
-
-    def _prefix(self, m: int) -> str:
-        return size_prefix(m) if len(self.sizes) > 1 else ""
+            outputs = self._sample(batch.points, self.sizes)
+            samples = readouts(batch.points, outputs, self.sampler)
+            for name, baseline in self.baselines.items():
+                assert isinstance(baseline, Sampler)
+                for m, output in baseline.sample_sizes(batch.points, self.sizes).items():
+                    samples[m].setdefault(name, output.points)
+            reference = self.task.reference(batch)
+            for m, prefix in self.prefixes.items():
+                self._score("test/", prefix, batch, samples[m], reference)
+            if self.sampler is not None:  # without one, the full clouds are scored already
+                self._score("test/", "", batch, {FULL: batch.points}, reference)
+            self._score_sets("test/", self.prefixes, batch.points, outputs)
 
     def _score(
-        self, batch: Batch, prefix: str, samples: Mapping[str, Tensor], reference: Any
+        self, stage: str, prefix: str, batch: Batch, samples: Mapping[str, Tensor], reference: Any
     ) -> None:
-        """Update and log the metrics of readouts at one size; ``prefix`` is of stage and size."""
-        size = len(batch.points)
-        within = prefix.split("/", 1)[1]
+        """Update and log the task's metrics of readouts, and the loss of the main one."""
+        clouds = len(batch.points)
         for readout, points in samples.items():
             result = self.task.scored(batch, points, reference)
-            metrics: Any = self.scores[f"{within}{readout}"]
-            metrics.update(result.predictions, result.targets)
-            for name, metric in metrics.items(keep_base=True, copy_state=False):
-                self.log(f"{prefix}{readout}/{name}", metric, batch_size=size)
-            if readout == self.own_readouts[0]:
-                for name, value in result.losses.items():
-                    self._log_loss(f"{prefix}loss/{name}", value, size)
-
-    def _log_loss(self, key: str, value: Tensor, size: int) -> None:
-        """Log a mean over clouds that may be spread unevenly over processes."""
-        if key not in self.loss_means:
-            self.loss_means[key] = MeanMetric(nan_strategy="disable").to(self.device)
-        mean: Any = self.loss_means[key]
-        mean.update(value, size)
-        self.log(key, mean, batch_size=size, metric_attribute=f"loss_means.{key}")
+            for name, metric in self.scores.update_readout(f"{prefix}{readout}", result).items():
+                self.log(f"{stage}{name}", metric, batch_size=clouds)
+            for name, value in result.losses.items() if readout == self.main_readout else ():
+                key = f"{stage}{prefix}loss/{name}"
+                mean, place = self.scores.update_loss(key, value, clouds), f"scores.losses.{key}"
+                self.log(key, mean, batch_size=clouds, metric_attribute=place)
 
     def _score_sets(
-        self, points: Tensor, outputs: dict[int, SampleOutput], prefixes: dict[int, str]
+        self,
+        stage: str,
+        prefixes: Mapping[int, str],
+        points: Tensor,
+        outputs: Mapping[int, SampleOutput],
     ) -> None:
-        """Update and log what is measured of the sampled sets themselves, at every size."""
+        """Update and log the metrics of the sampled sets themselves."""
         if self.sampler is None:
             return
-        # Of a nested sampler the largest set is measured, for it contains the smaller ones.
-        groups: dict[int, tuple[int, ...]] = {m: (m,) for m in outputs}
-        if self.sampler.nested:
-            groups = {max(outputs): tuple(outputs)}
-        for largest, sizes in groups.items():
-            for name, metric in SET_METRICS.items():
-                for m, values in (metric.measure(points, outputs[largest], sizes) or {}).items():
-                    mean: Any = self.set_metrics[f"{prefixes[m].split('/', 1)[1]}{name}"]
-                    mean.update(values)
-                    self.log(f"{prefixes[m]}{name}", mean, batch_size=len(points))
+        updated = self.scores.update_sets(points, outputs, self.sampler.nested, prefixes)
+        for name, metric in updated.items():
+            self.log(f"{stage}{name}", metric, batch_size=len(points))

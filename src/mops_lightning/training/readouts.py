@@ -19,21 +19,24 @@ def readout_names(sampler: Sampler | None) -> tuple[str, ...]:
 
 
 def readouts(
-    points: Tensor, outputs: Mapping[int, SampleOutput], sampler: Sampler
+    points: Tensor, outputs: Mapping[int, SampleOutput], sampler: Sampler | None
 ) -> dict[int, dict[str, Tensor]]:
     """Return every readout at every size.
 
     Args:
         points: ``(B, N, 3)`` the clouds.
         outputs: what ``sampler.sample_sizes`` returned for them, by size.
-        sampler: the sampler; says whether it generates points and whether its sizes are nested.
+        sampler: says whether it generates points and whether its sizes are nested; None for
+            outputs that are the clouds themselves.
 
     Returns:
         By size m, then by readout, the points ``(B, m, 3)``: ``generated``, ``matched`` and
-        ``completed`` of a sampler that generates points, ``sampled`` of one that selects them.
+        ``completed`` of a sampler that generates points, ``sampled`` of one that selects them,
+        ``full`` without a sampler.
     """
-    if not sampler.generates:
-        return {m: {INDEX_READOUT: output.points} for m, output in outputs.items()}
+    if sampler is None or not sampler.generates:
+        (name,) = readout_names(sampler)
+        return {m: {name: output.points} for m, output in outputs.items()}
     found = {}
     # Points are matched one by one, so matching the largest nested set matches all smaller ones.
     largest = match(outputs[max(outputs)].points, points) if sampler.nested else None

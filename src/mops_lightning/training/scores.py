@@ -1,0 +1,83 @@
+"""The metrics of an experiment's validation and test."""
+
+from collections.abc import Callable, Iterable, Mapping
+
+from torch import Tensor, nn
+from torchmetrics import MeanMetric, Metric, MetricCollection
+
+from mops_lightning.metrics.sampled_set import SET_METRICS
+from mops_lightning.types import SampleOutput, TaskOutput
+
+
+class Scores(nn.Module):
+    """One collection of metrics for each readout at each size, and those of the sampled sets.
+
+    Every update returns the metrics that it changed, under the names they are logged by, without
+    the stage: ``m32/generated/accuracy``, or ``generated/accuracy`` where one size is tested.
+
+    Args:
+        make_metrics: makes a collection of the task's metrics.
+        readouts: names of the readouts.
+        prefixes: of the sizes, such as ``m32/``; the empty one is always there.
+    """
+
+    def __init__(
+        self,
+        make_metrics: Callable[[], MetricCollection],
+        readouts: Iterable[str],
+        prefixes: Iterable[str],
+    ) -> None:
+        super().__init__()
+        prefixes = dict.fromkeys(("", *prefixes))
+        self.readouts = nn.ModuleDict(
+            {f"{prefix}{name}": make_metrics() for name in readouts for prefix in prefixes}
+        )
+        self.sets = nn.ModuleDict(
+            {f"{prefix}{name}": cls() for name, cls in SET_METRICS.items() for prefix in prefixes}
+        )
+        self.losses = nn.ModuleDict()  # the task's first result brings their names
+
+    def update_readout(self, key: str, result: TaskOutput) -> dict[str, Metric]:
+        """Update the task's metrics of one readout; ``key`` is its name behind its prefix."""
+        collection = self.readouts[key]
+        assert isinstance(collection, MetricCollection)
+        collection.update(result.predictions, result.targets)
+        metrics = collection.items(keep_base=True, copy_state=False)
+        return {f"{key}/{name}": metric for name, metric in metrics}
+
+    def update_loss(self, key: str, value: Tensor, clouds: int) -> Metric:
+        """Update the mean of a loss over clouds, which processes may share unevenly."""
+        if key not in self.losses:
+            self.losses[key] = MeanMetric(nan_strategy="disable").to(value.device)
+        mean = self.losses[key]
+        assert isinstance(mean, MeanMetric)
+        mean.update(value, clouds)
+        return mean
+
+    def update_sets(
+        self,
+        points: Tensor,
+        outputs: Mapping[int, SampleOutput],
+        nested: bool,
+        prefixes: Mapping[int, str],
+    ) -> dict[str, Metric]:
+        """Update the metrics of the sampled sets at every size.
+
+        Args:
+            points: ``(B, N, 3)`` the clouds.
+            outputs: the sampler's, by size.
+            nested: whether smaller sets are the first points of larger ones.
+            prefixes: by size.
+        """
+        # The largest nested set contains all smaller ones, so it is measured once for all.
+        groups = {max(outputs): tuple(outputs)} if nested else {m: (m,) for m in outputs}
+        updated: dict[str, Metric] = {}
+        for largest, sizes in groups.items():
+            for name, cls in SET_METRICS.items():
+                for m, values in (cls.measure(points, outputs[largest], sizes) or {}).items():
+                    key = f"{prefixes[m]}{name}"
+                    mean = self.sets[key]
+                    assert isinstance(mean, cls)
+                    mean.update(values)
+                    updated[key] = mean
+        return updated
