@@ -18,7 +18,7 @@ def write(path: Path, mesh: Any, **options: Any) -> Path:
     return path
 
 
-def test_points_are_uniform_by_area(tmp_path: Path) -> None:
+def test_cloud_is_uniform_by_area(tmp_path: Path) -> None:
     # A big and a small triangle in the plane z = 5: 90 % and 10 % of the area.
     text = "OFF\n6 2 0\n0 0 5\n3 0 5\n0 3 5\n9 0 5\n10 0 5\n9 1 5\n3 0 1 2\n3 3 4 5\n"
     (tmp_path / "two.off").write_text(text)
@@ -30,7 +30,7 @@ def test_points_are_uniform_by_area(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl", "glb", "ascii.ply", "ascii.stl"])
-def test_every_format_holds_the_same_surface(tmp_path: Path, suffix: str) -> None:
+def test_parse_formats_give_same_surface(tmp_path: Path, suffix: str) -> None:
     options: dict[str, Any] = {}
     if suffix == "ascii.ply":
         options = {"encoding": "ascii"}
@@ -45,7 +45,7 @@ def test_every_format_holds_the_same_surface(tmp_path: Path, suffix: str) -> Non
 @pytest.mark.parametrize(
     "head", ["OFF490 518 0", "OFF 490 518 0", "OFF\r\n490 518 0", "OFF\n# a\n490 518 0"]
 )
-def test_the_counts_may_follow_off_in_any_way(head: str) -> None:
+def test_parse_off_header_variants(head: str) -> None:
     ball = trimesh.creation.uv_sphere(count=[16, 32])
     lines = trimesh.exchange.off.export_off(ball).splitlines()[2:]
     text = "\n".join(
@@ -60,12 +60,12 @@ def test_the_counts_may_follow_off_in_any_way(head: str) -> None:
     "face",
     ["4 0 1 2 3", "4 0 1 2 3 255 0 0", "3 0 1 2\n3 0 2 3", "3 0 1 2 0.5 0.5 0.5\n3 0 2 3"],
 )
-def test_polygons_and_colours_of_off_files_are_understood(face: str) -> None:
+def test_parse_off_polygons_and_colours(face: str) -> None:
     text = f"OFF\n4 {1 + face.count(chr(10))} 0\n0 0 5\n3 0 5\n3 3 5\n0 3 5\n{face}\n"
     assert parse_mesh(text.encode(), Path("m.off")).area == pytest.approx(9)
 
 
-def test_a_scene_s_parts_lie_where_their_transforms_put_them(tmp_path: Path) -> None:
+def test_parse_scene_applies_transforms(tmp_path: Path) -> None:
     scene = trimesh.Scene(BOX)
     turn = trimesh.transformations.rotation_matrix(np.pi / 2, (0, 0, 1), (5, 0, 0))
     scene.add_geometry(BOX, transform=turn)
@@ -77,7 +77,7 @@ def test_a_scene_s_parts_lie_where_their_transforms_put_them(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("suffix", ["off", "obj", "stl"])
-def test_comments_may_be_in_an_old_encoding(tmp_path: Path, suffix: str) -> None:
+def test_parse_latin1_comment(tmp_path: Path, suffix: str) -> None:
     comment = "# Körper\n".encode("latin-1")
     if suffix == "stl":
         text = trimesh.exchange.stl.export_stl_ascii(BOX).encode()
@@ -87,7 +87,7 @@ def test_comments_may_be_in_an_old_encoding(tmp_path: Path, suffix: str) -> None
     assert parse_mesh(data, Path(f"m.{suffix}")).area == pytest.approx(BOX.area)
 
 
-def test_an_obj_without_its_material_file_is_read() -> None:
+def test_parse_obj_without_material_file() -> None:
     text = "mtllib gone.mtl\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
     assert parse_mesh(text.encode(), Path("m.obj")).area == 0.5
 
@@ -113,29 +113,29 @@ BROKEN = {
     "half.ply": (half(BALL, "ply"), "is broken"),
     "half.stl": (half(BALL, "stl"), "80 triangles take 4084 bytes, not 2042"),
     "half.glb": (half(BALL, "glb"), "is broken"),
-    "cut.off": (last_faces_missing(BALL, "off"), "announces 80 faces and holds 75"),
-    "cut.ply": (last_faces_missing(BALL, "ply"), "announces 80 faces and holds 75"),
+    "cut.off": (last_faces_missing(BALL, "off"), "announces 80 faces, but it has 75"),
+    "cut.ply": (last_faces_missing(BALL, "ply"), "announces 80 faces, but it has 75"),
     "noise.off": (bytes(range(256)) * 9, "is broken"),
-    "noise.obj": (bytes(range(256)) * 9, r"is broken|holds no faces"),
+    "noise.obj": (bytes(range(256)) * 9, r"is broken|has no faces"),
     "noise.ply": (bytes(range(256)) * 9, "is broken"),
     "noise.stl": (bytes(range(256)) * 9, "is broken"),
     "noise.glb": (bytes(range(256)) * 9, "is broken"),
-    "cloud.off": (b"OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n", "holds no faces"),
-    "cloud.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "holds no faces"),
+    "cloud.off": (b"OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n", "has no faces"),
+    "cloud.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "has no faces"),
     "line.off": (b"OFF\n3 1 0\n0 0 0\n1 1 1\n2 2 2\n3 0 1 2\n", "area zero"),
     "thin.off": (b"OFF\n3 1 0\n.1 .2 .3\n.2 .4 .6\n.3 .6 .9\n3 0 1 2\n", "area zero"),
     "point.off": (b"OFF\n3 1 0\n1 1 1\n1 1 1\n1 1 1\n3 0 1 2\n", "area zero"),
     "nan.obj": (TRIANGLE.format("nan", 3).encode(), "not all finite"),
     "huge.obj": (TRIANGLE.format("1e308", 3).replace("1 0", "1e308 0").encode(), "not all finite"),
     "outside.obj": (TRIANGLE.format(1, 9).encode(), "is broken"),
-    "outside.off": (SQUARE.replace("0 2 3", "0 2 4").encode(), "a face names a vertex"),
-    "negative.off": (SQUARE.replace("3 0 2 3", "3 0 2 -1").encode(), "a face names a vertex"),
+    "outside.off": (SQUARE.replace("0 2 3", "0 2 4").encode(), "a face refers to a vertex"),
+    "negative.off": (SQUARE.replace("3 0 2 3", "3 0 2 -1").encode(), "a face refers to a vertex"),
     "mesh.dae": (b"<COLLADA/>", "must end in"),
 }
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_mesh_is_one_error_that_names_it(tmp_path: Path, name: str) -> None:
+def test_cloud_of_broken_mesh_raises(tmp_path: Path, name: str) -> None:
     data, message = BROKEN[name]
     (tmp_path / name).write_bytes(data)
     with pytest.raises(BrokenMeshError, match=rf"{name}.*({message})"):
@@ -143,7 +143,7 @@ def test_a_broken_mesh_is_one_error_that_names_it(tmp_path: Path, name: str) -> 
 
 
 @pytest.mark.skipif("MOPS_DATA" not in os.environ, reason="MOPS_DATA names no folder of real data")
-def test_a_real_obj() -> None:
+def test_cloud_of_real_obj() -> None:
     path = Path(os.environ["MOPS_DATA"]) / "scans" / "stanford-bunny.obj"
     mesh = parse_mesh(path.read_bytes(), path)
     assert len(mesh.faces) > 10_000

@@ -8,7 +8,7 @@ from mops_lightning.errors import UserError
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two sequences of boxes that grow longer with time; names are not padded."""
+    """Two sequences of boxes that grow with time; frame numbers are not padded."""
     for name, frames in (("crane", 12), ("samba", 10)):
         (tmp_path / name).mkdir()
         for frame in range(frames):
@@ -19,12 +19,12 @@ def folder(tmp_path):
 
 
 def lengths(points):
-    """Frame numbers, from the boxes' proportions."""
+    """Return the frame numbers from the proportions of the boxes."""
     size = points.amax(1) - points.amin(1)
     return (size[:, 2] / size[:, 0] - 1).round().int().tolist()
 
 
-def test_the_last_frames_are_tested_and_their_neighbours_belong_to_neither(folder):
+def test_mesh_sequence_splits_by_time_with_gap(folder):
     data = mesh_sequence(folder, n_points=3000, test_share=0.25, gap=2)
     assert data.class_names == ("crane", "samba")
     train, test = data.train, data.test
@@ -37,7 +37,7 @@ def test_the_last_frames_are_tested_and_their_neighbours_belong_to_neither(folde
     assert train.points.norm(dim=2).amax(1).allclose(torch.ones(13))
 
 
-def test_one_sequence_and_a_cache(folder, tmp_path):
+def test_mesh_sequence_class_and_cache(folder, tmp_path):
     cache = tmp_path / "cache"
     first = mesh_sequence(folder, 100, ["samba"], cache=cache)
     assert first.class_names == ("samba",)
@@ -47,27 +47,27 @@ def test_one_sequence_and_a_cache(folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("arguments", "message"),
     [
-        ({"test_share": 0.0}, r"dataset.test_share must lie between 0 and 1, got 0.0"),
-        ({"gap": -1}, r"dataset.gap must be at least 0, got -1"),
-        ({"gap": 10}, r"dataset.gap: .*crane has 12 frames, of which 2 are tested and 10 left"),
-        ({"n_points": 0}, r"dataset.n_points must be at least 1, got 0"),
-        ({"classes": ["samb"]}, r"unknown class 'samb'.*samba"),
+        ({"test_share": 0.0}, r"^test_share must be between 0 and 1, got 0.0"),
+        ({"gap": -1}, r"^gap must be at least 0, got -1"),
+        ({"gap": 10}, r"^gap must .* got 10: .*crane has 12 frames, of which 2 are test"),
+        ({"n_points": 0}, r"^n_points must be at least 1, got 0"),
+        ({"classes": ["samb"]}, r"^classes: unknown class 'samb'.*samba"),
     ],
 )
-def test_mistakes_are_named(folder, settings, said):
-    with pytest.raises(UserError, match=said):
-        mesh_sequence(folder, **{"n_points": 50, **settings})
+def test_mesh_sequence_invalid_argument_raises(folder, arguments, message):
+    with pytest.raises(UserError, match=message):
+        mesh_sequence(folder, **{"n_points": 50, **arguments})
 
 
-def test_a_folder_without_sequences_is_named(tmp_path):
+def test_mesh_sequence_empty_folder_raises(tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match=r"no mesh in .* Looked for SEQUENCE"):
+    with pytest.raises(UserError, match=r"^root: no mesh in .* Looked for SEQUENCE"):
         mesh_sequence(tmp_path)
 
 
-def test_real_captures(real_data):
+def test_mesh_sequence_real_data(real_data):
     root = real_data / "vlasic2008"
     if not root.is_dir():
         pytest.skip(f"{root} is not there")

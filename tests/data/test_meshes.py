@@ -27,7 +27,7 @@ def scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
 
 @pytest.fixture
 def layout(tmp_path: Path) -> Path:
-    """ModelNet's form: two classes, three meshes to learn from and two to score."""
+    """ModelNet's layout: two classes, three training and two test meshes."""
     root = tmp_path / "set"
     for name, mesh in (("box", BOX), ("ball", BALL)):
         write(root / name / "train" / f"{name}_1.off", scaled(mesh, 10))
@@ -37,7 +37,7 @@ def layout(tmp_path: Path) -> Path:
     return root
 
 
-def test_the_folders_of_modelnet_are_read(layout: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_meshes_reads_modelnet_layout(layout: Path, capsys: pytest.CaptureFixture[str]) -> None:
     dataset = meshes(layout, n_points=200)
     assert dataset.class_names == ("ball", "box")
     assert dataset.train.labels.tolist() == [0, 1, 1]
@@ -49,10 +49,10 @@ def test_the_folders_of_modelnet_are_read(layout: Path, capsys: pytest.CaptureFi
         torch.testing.assert_close(clouds.points.mean(1), torch.zeros(len(clouds.labels), 3))
         farthest = clouds.points.norm(dim=2).amax(1)
         torch.testing.assert_close(farthest, torch.ones(len(clouds.labels)))
-    assert capsys.readouterr() == ("", "")  # no progress bar where nobody looks
+    assert capsys.readouterr() == ("", "")  # no progress bar without a terminal
 
 
-def test_a_class_of_one_split_only_is_said(
+def test_meshes_class_in_one_split_is_reported(
     layout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (layout / "ball" / "test" / "ball_3.OFF").unlink()
@@ -61,7 +61,7 @@ def test_a_class_of_one_split_only_is_said(
     assert "no test mesh of ball: never scored" in capsys.readouterr().err
 
 
-def test_broken_meshes_stop_the_reading_or_are_counted(layout: Path) -> None:
+def test_meshes_broken_mesh_raises_or_is_skipped(layout: Path) -> None:
     whole = meshes(layout, n_points=20)
     (layout / "ball" / "train" / "a.off").write_bytes(b"OFF\n")
     (layout / "box" / "test" / "b.stl").write_bytes(b"")
@@ -73,14 +73,14 @@ def test_broken_meshes_stop_the_reading_or_are_counted(layout: Path) -> None:
     assert torch.equal(dataset.test.labels, whole.test.labels)
 
 
-def test_a_split_in_which_all_are_broken_is_one_error(layout: Path) -> None:
+def test_meshes_split_without_mesh_raises(layout: Path) -> None:
     for path in layout.glob("*/test/*"):
         path.write_bytes(b"")
-    with pytest.raises(UserError, match=r"no test mesh of ball, box .*2 broken"):
+    with pytest.raises(UserError, match=r"no test mesh of ball, box .*2 broken meshes"):
         meshes(layout, n_points=20, skip_broken=True)
 
 
-def test_a_mesh_gives_the_same_cloud_wherever_it_lies(layout: Path, tmp_path: Path) -> None:
+def test_meshes_cloud_depends_on_content_and_seed(layout: Path, tmp_path: Path) -> None:
     before = repr(np.random.get_state())  # noqa: NPY002
     first = meshes(layout, n_points=50)
     assert repr(np.random.get_state()) == before  # noqa: NPY002
@@ -91,11 +91,13 @@ def test_a_mesh_gives_the_same_cloud_wherever_it_lies(layout: Path, tmp_path: Pa
     assert torch.equal(again.train.points[1:], first.train.points)
     other = meshes(layout, n_points=50, seed=1)
     assert not torch.isclose(other.train.points, first.train.points).all(-1).any()
-    # Two copies of one shape under two names and sizes are two files, and two samples.
+    # Files with the same shape at different scales have different samples.
     assert not torch.allclose(first.train.points[1], first.train.points[2], atol=1e-3)
 
 
-def test_the_fingerprint_follows_content_names_and_settings(layout: Path, tmp_path: Path) -> None:
+def test_meshes_fingerprint_depends_on_content_names_and_arguments(
+    layout: Path, tmp_path: Path
+) -> None:
     first = meshes(layout, n_points=20).fingerprint
     elsewhere = shutil.copytree(layout, tmp_path / "elsewhere")
     assert meshes(elsewhere, n_points=20, cache=tmp_path / "cache").fingerprint == first
@@ -112,12 +114,12 @@ def test_the_fingerprint_follows_content_names_and_settings(layout: Path, tmp_pa
     assert len(prints) == 6
 
 
-def test_clouds_are_kept_by_content_and_settings(layout: Path, tmp_path: Path) -> None:
+def test_meshes_cache_depends_on_content_and_arguments(layout: Path, tmp_path: Path) -> None:
     cache = tmp_path / "new" / "cache"
     first = meshes(layout, n_points=20, cache=cache)
     kept = sorted(cache.iterdir())
     assert [path.suffix for path in kept] == [".npy"] * 5
-    for path in kept:  # what the cache holds is what we get
+    for path in kept:  # the result comes from the cache
         np.save(path, np.load(path) + np.float32(1))
     shutil.move(layout, tmp_path / "moved")
     again = meshes(tmp_path / "moved", n_points=20, cache=str(cache))
@@ -132,7 +134,7 @@ def test_clouds_are_kept_by_content_and_settings(layout: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("damage", [b"", b"\x93NUMPY\x01\x00", b"noise" * 100])
-def test_a_damaged_cache_is_mended(layout: Path, tmp_path: Path, damage: bytes) -> None:
+def test_meshes_damaged_cache_is_replaced(layout: Path, tmp_path: Path, damage: bytes) -> None:
     first = meshes(layout, n_points=20, cache=tmp_path / "cache")
     kept = {path: path.read_bytes() for path in (tmp_path / "cache").iterdir()}
     for path in kept:
@@ -142,15 +144,13 @@ def test_a_damaged_cache_is_mended(layout: Path, tmp_path: Path, damage: bytes) 
     assert {path: path.read_bytes() for path in kept} == kept
 
 
-def test_a_cache_that_cannot_be_written_is_one_error_and_no_broken_mesh(
-    layout: Path, tmp_path: Path
-) -> None:
+def test_meshes_unwritable_cache_raises(layout: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(UserError, match=r"dataset\.cache: cannot write"):
+    with pytest.raises(UserError, match=r"^cache: cannot write"):
         meshes(layout, n_points=20, cache=tmp_path / "file", skip_broken=True)
 
 
-def test_workers_change_nothing(layout: Path) -> None:
+def test_meshes_workers_give_same_result(layout: Path) -> None:
     (layout / "ball" / "train" / "a.off").write_bytes(b"OFF\n")
     one = meshes(layout, n_points=20, skip_broken=True)
     two = meshes(layout, n_points=20, skip_broken=True, workers=2)
@@ -160,7 +160,7 @@ def test_workers_change_nothing(layout: Path) -> None:
     assert one.notes == two.notes == {"skipped_meshes": 1}
 
 
-def test_classes_are_chosen(layout: Path) -> None:
+def test_meshes_selects_classes(layout: Path) -> None:
     dataset = meshes(layout, n_points=20, classes=["box"])
     assert dataset.class_names == ("box",)
     assert dataset.train.labels.tolist() == [0, 0]
@@ -176,10 +176,10 @@ def flat(tmp_path: Path) -> Path:
     return root
 
 
-def test_a_split_file_says_which_is_which(flat: Path) -> None:
+def test_meshes_split_file_assigns_splits(flat: Path) -> None:
     lines = [
         "path,split",
-        "# what we keep",
+        "# a comment",
         "",
         "box/1.off,train",
         '"ball/old, round/3.off", train',
@@ -212,14 +212,14 @@ def test_a_split_file_says_which_is_which(flat: Path) -> None:
         ("box/9.off,test", "line 2: .*9.off does not exist"),
     ],
 )
-def test_a_wrong_line_of_a_split_file_is_named(flat: Path, line: str, message: str) -> None:
+def test_meshes_invalid_split_file_line_raises(flat: Path, line: str, message: str) -> None:
     (flat / "split.txt").write_text(f"box/1.off,train\n{line}\n")
-    with pytest.raises(UserError, match=rf"dataset\.split_file: .*split\.txt, {message}"):
+    with pytest.raises(UserError, match=rf"^split_file: .*split\.txt, {message}"):
         meshes(flat, split_file="split.txt")
 
 
-def test_a_split_file_that_is_missing_empty_or_one_sided_is_one_error(flat: Path) -> None:
-    with pytest.raises(UserError, match=r"dataset\.split_file: cannot read none\.txt"):
+def test_meshes_unusable_split_file_raises(flat: Path) -> None:
+    with pytest.raises(UserError, match=r"^split_file: cannot read none\.txt"):
         meshes(flat, split_file="none.txt")
     (flat / "split.txt").write_text("# nothing\n")
     with pytest.raises(UserError, match="lists no mesh"):
@@ -229,25 +229,25 @@ def test_a_split_file_that_is_missing_empty_or_one_sided_is_one_error(flat: Path
         meshes(flat, split_file="split.txt", n_points=20)
 
 
-def test_a_folder_that_is_not_laid_out_says_what_to_do(flat: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"dataset\.root: .*none is not a folder"):
+def test_meshes_unusable_folder_raises(flat: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"^root: .*none is not a folder"):
         meshes(tmp_path / "none")
-    with pytest.raises(UserError, match=r"CLASS/ itself.*dataset\.split_file=FILE"):
+    with pytest.raises(UserError, match=r"meshes in CLASS/\*.*dataset\.split_file=FILE"):
         meshes(flat)
     (tmp_path / "nothing").mkdir()
-    with pytest.raises(UserError, match=r"no mesh in .*CLASS/train.*dataset\.root=PATH"):
+    with pytest.raises(UserError, match=r"^root: no mesh in .*CLASS/train"):
         meshes(tmp_path / "nothing")
 
 
-@pytest.mark.parametrize("setting", [{"n_points": 0}, {"seed": -1}, {"workers": 0}])
-def test_settings_out_of_range_are_refused(layout: Path, setting: dict[str, Any]) -> None:
-    name = next(iter(setting))
-    with pytest.raises(UserError, match=rf"dataset\.{name} must be at least"):
-        meshes(layout, **setting)
+@pytest.mark.parametrize("argument", [{"n_points": 0}, {"seed": -1}, {"workers": 0}])
+def test_meshes_argument_out_of_range_raises(layout: Path, argument: dict[str, Any]) -> None:
+    name = next(iter(argument))
+    with pytest.raises(UserError, match=rf"^{name} must be at least"):
+        meshes(layout, **argument)
 
 
 @pytest.mark.skipif("MOPS_DATA" not in os.environ, reason="MOPS_DATA names no folder of real data")
-def test_real_captures(tmp_path: Path) -> None:
+def test_meshes_real_data(tmp_path: Path) -> None:
     root = Path(os.environ["MOPS_DATA"]) / "vlasic2008"
     names = [path.relative_to(root).as_posix() for path in sorted(root.glob("*/*.ply"))[::20]]
     lines = [f"{name},{'train' if i % 2 else 'test'}" for i, name in enumerate(names)]

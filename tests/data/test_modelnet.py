@@ -21,7 +21,7 @@ STORED = 12
 
 
 def cloud(split: str, file: int, row: int) -> np.ndarray:
-    """Points that tell where they were stored."""
+    """Return points that identify where they are stored."""
     random = np.random.default_rng([len(split), file, row])
     return random.uniform(-1, 1, (STORED, 3)).astype(np.float32)
 
@@ -33,7 +33,7 @@ def write_file(path: Path, **datasets: Any) -> None:
 
 
 def write_layout(folder: Path) -> Path:
-    """The public layout in small: 5 shapes a file, labels 0, 1, 2, 0, 1."""
+    """Write the public layout with 5 shapes per file and labels 0, 1, 2, 0, 1."""
     folder.mkdir(parents=True)
     (folder / "shape_names.txt").write_text("\n".join(NAMES) + "\n\n")
     for split, numbers in FILES.items():
@@ -52,7 +52,7 @@ def layout(tmp_path: Path) -> Path:
     return write_layout(tmp_path / "data" / FOLDER)
 
 
-def test_all_shapes_of_both_splits_are_read_in_order(layout: Path) -> None:
+def test_modelnet_reads_all_shapes_in_order(layout: Path) -> None:
     dataset = modelnet40(layout, n_points=STORED)
     assert dataset.class_names == NAMES
     for split, clouds in (("train", dataset.train), ("test", dataset.test)):
@@ -63,26 +63,26 @@ def test_all_shapes_of_both_splits_are_read_in_order(layout: Path) -> None:
         assert clouds.points.is_contiguous()
 
 
-def test_the_first_points_are_taken(layout: Path) -> None:
+def test_modelnet_uses_first_points(layout: Path) -> None:
     whole, part = modelnet40(layout, n_points=STORED), modelnet40(layout, n_points=5)
     assert torch.equal(part.train.points, whole.train.points[:, :5])
     assert torch.equal(part.test.points, whole.test.points[:, :5])
 
 
-def test_the_folder_above_will_do(layout: Path) -> None:
+def test_modelnet_accepts_parent_folder(layout: Path) -> None:
     above, itself = modelnet40(layout.parent, n_points=4), modelnet40(str(layout), n_points=4)
     assert torch.equal(above.train.points, itself.train.points)
     assert above.fingerprint == itself.fingerprint
 
 
-def test_without_lists_the_files_are_read_in_the_order_of_their_numbers(layout: Path) -> None:
+def test_modelnet_without_lists_sorts_files_by_number(layout: Path) -> None:
     listed = modelnet40(layout, n_points=4)
     for split in FILES:
         (layout / f"{split}_files.txt").unlink()
     assert torch.equal(modelnet40(layout, n_points=4).train.points, listed.train.points)
 
 
-def test_classes_are_chosen_and_numbered_anew(layout: Path) -> None:
+def test_modelnet_selects_classes(layout: Path) -> None:
     whole = modelnet40(layout, n_points=4)
     dataset = modelnet40(layout, n_points=4, classes=["chair", "night_stand"])
     assert dataset.class_names == ("night_stand", "chair")
@@ -92,15 +92,13 @@ def test_classes_are_chosen_and_numbered_anew(layout: Path) -> None:
         modelnet40(layout, n_points=4, classes=["chiar"])
 
 
-def test_labels_may_be_flat(layout: Path) -> None:
+def test_modelnet_accepts_flat_labels(layout: Path) -> None:
     path = layout / "ply_data_test1.h5"
     write_file(path, data=np.zeros((2, STORED, 3)), label=np.array([2, 0], dtype=np.int32))
     assert modelnet40(layout, n_points=4).test.labels.tolist()[-2:] == [2, 0]
 
 
-def test_the_fingerprint_follows_the_content_and_not_the_place(
-    layout: Path, tmp_path: Path
-) -> None:
+def test_modelnet_fingerprint_depends_on_content(layout: Path, tmp_path: Path) -> None:
     elsewhere = shutil.copytree(layout, tmp_path / "elsewhere")
     first = modelnet40(layout, n_points=4).fingerprint
     assert modelnet40(elsewhere, n_points=4).fingerprint == first
@@ -118,18 +116,18 @@ def test_the_fingerprint_follows_the_content_and_not_the_place(
     assert len(others | {first}) == 6
 
 
-def test_more_points_than_stored_are_refused(layout: Path) -> None:
-    with pytest.raises(UserError, match=r"n_points is 13, but .*train0\.h5 stores 12 points"):
+def test_modelnet_invalid_n_points_raises(layout: Path) -> None:
+    with pytest.raises(UserError, match=r"^n_points must be at most 12, .*train0\.h5, got 13"):
         modelnet40(layout, n_points=13)
-    with pytest.raises(UserError, match="at least 1, got 0"):
+    with pytest.raises(UserError, match="n_points must be at least 1, got 0"):
         modelnet40(layout, n_points=0)
 
 
-def test_a_missing_folder_says_what_to_do(tmp_path: Path) -> None:
+def test_modelnet_missing_folder_raises(tmp_path: Path) -> None:
     with pytest.raises(UserError) as caught:
         modelnet40(tmp_path / "none")
     for words in (
-        "dataset.root",
+        "root: ",
         str(tmp_path / "none"),
         "shape_names.txt",
         "dataset.download=true",
@@ -145,10 +143,13 @@ def set_item(path: Path, key: str, place: Any, value: float) -> None:
 shaped = partial(np.zeros, dtype=np.float32)
 label = np.zeros((2, 1), dtype=np.uint8)
 DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "cut off": (lambda p: os.truncate(p, p.stat().st_size // 2), "not a whole HDF5 file"),
-    "empty": (lambda p: os.truncate(p, 0), "not a whole HDF5 file"),
-    "text": (lambda p: p.write_text("<html>Not found</html>"), "not a whole HDF5 file"),
-    "no data": (lambda p: write_file(p, label=label), r"no dataset 'data'; it holds \['label'\]"),
+    "cut off": (lambda p: os.truncate(p, p.stat().st_size // 2), "damaged or not an HDF5 file"),
+    "empty": (lambda p: os.truncate(p, 0), "damaged or not an HDF5 file"),
+    "text": (lambda p: p.write_text("<html>Not found</html>"), "damaged or not an HDF5 file"),
+    "no data": (
+        lambda p: write_file(p, label=label),
+        r"no dataset 'data'; it contains \['label'\]",
+    ),
     "no label": (lambda p: write_file(p, data=shaped((2, 12, 3))), "no dataset 'label'"),
     "flat": (lambda p: write_file(p, data=shaped((2, 36)), label=label), r"got \(2, 36\)"),
     "scalar": (lambda p: write_file(p, data=1.0, label=label), r"got \(\)"),
@@ -156,7 +157,10 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "counts": (lambda p: write_file(p, data=shaped((3, 12, 3)), label=label), r"and \(2, 1\)"),
     "integers": (lambda p: write_file(p, data=np.ones((2, 12, 3), int), label=label), "int64"),
     "words": (lambda p: write_file(p, data=shaped((2, 12, 3)), label=[b"a", b"b"]), "of integers"),
-    "class 3": (lambda p: set_item(p, "label", 2, 3), "labels from 0 to 3, .* names 3 classes"),
+    "class 3": (
+        lambda p: set_item(p, "label", 2, 3),
+        "labels from 0 to 2, .* lists 3 classes, got 0 to 3",
+    ),
     "NaN": (lambda p: set_item(p, "data", (1, 2, 0), np.nan), "NaN or infinite"),
     "overflow": (
         lambda p: write_file(p, data=np.full((2, 12, 3), 1e300), label=label),
@@ -167,14 +171,14 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 
 @pytest.mark.parametrize("kind", DAMAGES)
-def test_a_damaged_file_is_one_error_that_names_it(layout: Path, kind: str) -> None:
+def test_modelnet_damaged_file_raises(layout: Path, kind: str) -> None:
     damage, message = DAMAGES[kind]
     damage(layout / "ply_data_train2.h5")
     with pytest.raises(UserError, match=rf"(?s)ply_data_train2\.h5.*{message}"):
         modelnet40(layout, n_points=4)
 
 
-def test_a_file_spoiled_in_the_middle_is_one_error(layout: Path) -> None:
+def test_modelnet_corrupted_file_raises(layout: Path) -> None:
     path = layout / "ply_data_test0.h5"
     with h5py.File(path, "w") as file:
         data = np.random.default_rng(0).random((50, STORED, 3))
@@ -184,11 +188,11 @@ def test_a_file_spoiled_in_the_middle_is_one_error(layout: Path) -> None:
     content = bytearray(path.read_bytes())
     content[offset + 100] ^= 0xFF
     path.write_bytes(content)
-    with pytest.raises(UserError, match=r"ply_data_test0\.h5 is not a whole HDF5 file"):
+    with pytest.raises(UserError, match=r"ply_data_test0\.h5 is damaged or not an HDF5 file"):
         modelnet40(layout, n_points=4)
 
 
-def test_a_folder_without_its_lists_of_names_or_files_is_one_error(layout: Path) -> None:
+def test_modelnet_missing_lists_raise(layout: Path) -> None:
     for path in layout.glob("*test*"):
         path.unlink()
     with pytest.raises(UserError, match=r"no ply_data_test\*\.h5"):
@@ -201,17 +205,17 @@ def test_a_folder_without_its_lists_of_names_or_files_is_one_error(layout: Path)
         modelnet40(layout, n_points=4)
 
 
-def test_a_class_without_test_shapes_is_one_error(layout: Path) -> None:
+def test_modelnet_class_without_shapes_raises(layout: Path) -> None:
     for number in FILES["test"]:
         path = layout / f"ply_data_test{number}.h5"
         write_file(path, data=shaped((1, STORED, 3)), label=label[:1])
-    with pytest.raises(UserError, match="chair has no test shape"):
+    with pytest.raises(UserError, match=r"^classes: .* has no test shape of chair"):
         modelnet40(layout, n_points=4, classes=["chair"])
 
 
 @pytest.fixture
 def shelf(tmp_path: Path) -> Iterator[tuple[str, list[str], Path]]:
-    """A web server over a folder: its address, what was asked of it, and the folder."""
+    """A web server for a folder: its address, the requests and the folder."""
     folder = tmp_path / "shelf"
     folder.mkdir()
     asked: list[str] = []
@@ -235,7 +239,7 @@ def shelf(tmp_path: Path) -> Iterator[tuple[str, list[str], Path]]:
 
 
 @pytest.mark.parametrize("name", ["data", f"data/{FOLDER}"])
-def test_download_fills_root_once(
+def test_modelnet_downloads_once(
     layout: Path, shelf: tuple[str, list[str], Path], tmp_path: Path, name: str
 ) -> None:
     address, asked, folder = shelf
@@ -259,24 +263,24 @@ def test_download_fills_root_once(
     assert not list((tmp_path / "new").rglob("*.zip*"))
 
 
-def test_what_is_there_is_not_downloaded(layout: Path, shelf: tuple[str, list[str], Path]) -> None:
+def test_modelnet_existing_files_are_not_downloaded(
+    layout: Path, shelf: tuple[str, list[str], Path]
+) -> None:
     address, asked, _ = shelf
     modelnet40(layout, n_points=4, download=True, mirrors=[f"{address}/set.zip"])
     assert asked == []
 
 
-def test_an_archive_of_something_else_is_one_error(
-    shelf: tuple[str, list[str], Path], tmp_path: Path
-) -> None:
+def test_modelnet_other_archive_raises(shelf: tuple[str, list[str], Path], tmp_path: Path) -> None:
     address, _, folder = shelf
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "readme.txt").write_text("something else")
     shutil.make_archive(str(folder / "set"), "zip", tmp_path / "other")
-    with pytest.raises(UserError, match=r"dataset\.mirrors: .* is not ModelNet40"):
+    with pytest.raises(UserError, match=r"^mirrors: .* is not ModelNet40"):
         modelnet40(tmp_path / "new", download=True, mirrors=[f"{address}/set.zip"])
 
 
-def test_the_hash_of_the_archive_is_checked(
+def test_modelnet_wrong_hash_raises(
     layout: Path, shelf: tuple[str, list[str], Path], tmp_path: Path
 ) -> None:
     address, _, folder = shelf
@@ -287,7 +291,7 @@ def test_the_hash_of_the_archive_is_checked(
 
 
 @pytest.mark.skipif("MOPS_DATA" not in os.environ, reason="MOPS_DATA names no folder of real data")
-def test_the_real_set() -> None:
+def test_modelnet_real_data() -> None:
     dataset = modelnet40(Path(os.environ["MOPS_DATA"]) / "modelnet40_hdf5_1024")
     assert dataset.train.points.shape == (9843, 1024, 3)
     assert dataset.test.points.shape == (2468, 1024, 3)

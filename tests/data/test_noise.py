@@ -4,15 +4,15 @@ import torch
 from mops_lightning.data.noise import noisy
 
 
-def test_noise_has_the_asked_deviation_in_every_coordinate(rng):
+def test_noisy_has_standard_deviation(rng):
     points = torch.randn(20, 2000, 3, generator=rng)
     added = noisy(points, 0.05) - points
     assert added.std((0, 1)).tolist() == pytest.approx([0.05] * 3, rel=0.02)
     assert added.mean((0, 1)).abs().max() < 0.001
-    assert added.abs().max() > 0.2  # no bound at four deviations
+    assert added.abs().max() > 0.2  # not clipped at four standard deviations
 
 
-def test_a_cloud_has_the_same_noise_in_every_split_and_at_every_level(rng):
+def test_noisy_depends_on_position_and_scales(rng):
     points = torch.randn(5, 30, 3, generator=rng)
     torch.testing.assert_close(noisy(points, 0.1)[:3], noisy(points[:3], 0.1))
     small, large = noisy(points, 0.01) - points, noisy(points, 0.1) - points

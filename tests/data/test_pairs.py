@@ -26,7 +26,7 @@ def moved(batch, points):
     return Motion(batch.quaternion, batch.translation).apply(points)
 
 
-def test_the_target_is_the_source_under_the_true_motion(rng):
+def test_pairs_target_is_moved_source(rng):
     points = clouds(rng)
     batch = Pairs()(points, generators(6))
     source, target = restored(batch)
@@ -36,7 +36,7 @@ def test_the_target_is_the_source_under_the_true_motion(rng):
     assert not torch.allclose(target, source, atol=0.1)
 
 
-def test_a_pair_hangs_on_its_generator_not_on_its_neighbours(rng):
+def test_pairs_depend_on_own_generator_only(rng):
     points = clouds(rng)
     pairs = Pairs(resample=20, jitter=0.02, overlap=0.6)
     together = pairs(points, generators(6))
@@ -54,7 +54,7 @@ def rows_of(cloud, points):
     return set(row.tolist())
 
 
-def test_resampled_clouds_hold_different_points_of_the_same_shape(rng):
+def test_pairs_resample_draws_different_points(rng):
     points = clouds(rng, points=60)
     batch = Pairs(resample=20)(points, generators(6))
     source, target = restored(batch)
@@ -67,7 +67,7 @@ def test_resampled_clouds_hold_different_points_of_the_same_shape(rng):
 
 
 @pytest.mark.parametrize("overlap", [0.2, 0.5, 0.9])
-def test_overlap_is_the_share_of_points_that_both_hold(overlap, rng):
+def test_pairs_overlap_is_share_of_common_points(overlap, rng):
     points = clouds(rng, points=100)
     pairs = Pairs(overlap=overlap)
     batch = pairs(points, generators(6))
@@ -78,7 +78,7 @@ def test_overlap_is_the_share_of_points_that_both_hold(overlap, rng):
         assert len(shared) == round(100 * overlap)
 
 
-def test_jitter_is_independent_in_both_clouds_and_clipped(rng):
+def test_pairs_jitter_is_independent_and_clipped(rng):
     points = clouds(rng, points=400)
     batch = Pairs(jitter=0.02, jitter_clip=0.03)(points, generators(6))
     plain = Pairs()(points, generators(6))
@@ -89,7 +89,7 @@ def test_jitter_is_independent_in_both_clouds_and_clipped(rng):
     assert not torch.allclose(noise[0], noise[1], atol=1e-3)
 
 
-def test_training_pairs_are_new_in_every_epoch_and_scored_ones_are_not():
+def test_pairs_change_by_epoch_in_training_only():
     data = small_dataset().train
     pairs = Pairs()
 
@@ -110,14 +110,14 @@ def test_training_pairs_are_new_in_every_epoch_and_scored_ones_are_not():
     first = torch.cat([batch.quaternion for batch in scored])
     scored.set_epoch(7)
     assert torch.equal(torch.cat([batch.quaternion for batch in scored]), first)
-    # However the batches are cut:
+    # Independent of the batch size:
     other = CloudLoader(data, 7, make_batch=make)
     assert torch.equal(torch.cat([batch.quaternion for batch in other]), first)
     assert torch.equal(scored.batch_of(torch.tensor([3, 9])).quaternion, first[[3, 9]])
 
 
 @pytest.mark.parametrize(
-    ("setting", "value"),
+    ("name", "value"),
     [
         ("rotation", 181.0),
         ("rotation", -1.0),
@@ -130,17 +130,17 @@ def test_training_pairs_are_new_in_every_epoch_and_scored_ones_are_not():
         ("test_seed", -1),
     ],
 )
-def test_numbers_out_of_range_are_refused_by_name(setting, value):
-    with pytest.raises(UserError, match=rf"task.pairs.{setting} must be .*{value}"):
-        Pairs(**{setting: value})
+def test_pairs_argument_out_of_range_raises(name, value):
+    with pytest.raises(UserError, match=rf"^{name} must be .*{value}"):
+        Pairs(**{name: value})
 
 
-def test_more_points_than_there_are_cannot_be_drawn(rng):
-    with pytest.raises(UserError, match=r"task.pairs.resample must be at most the 50 .*got 51"):
+def test_pairs_resample_above_n_points_raises(rng):
+    with pytest.raises(UserError, match=r"^resample must be at most the 50 .*got 51"):
         Pairs(resample=51)(clouds(rng), generators(6))
 
 
-def test_a_pair_batch_centres_both_clouds(rng):
+def test_pair_batch_centres_clouds(rng):
     source, target = clouds(rng), clouds(rng) + 3
     batch = pair_batch(source, target, Motion(torch.ones(6, 4), torch.ones(6, 3)))
     torch.testing.assert_close(batch.centroids[6:], target.mean(1))

@@ -1,4 +1,4 @@
-"""Files are written in the real layouts of the public archives."""
+"""Readers of ShapeNet, on small files with the layouts of the public archives."""
 
 import json
 from typing import Any
@@ -17,7 +17,7 @@ PLANE, CHAIR = "02691156", "03001627"
 
 @pytest.fixture
 def core(tmp_path):
-    """shape_net_core_uniform_samples_2048: binary PLY clouds, one folder a synset."""
+    """shape_net_core_uniform_samples_2048: binary PLY clouds, one folder per synset."""
     rng = np.random.default_rng(0)
     for synset, number in ((PLANE, 20), (CHAIR, 5)):
         (tmp_path / synset).mkdir()
@@ -27,7 +27,7 @@ def core(tmp_path):
     return tmp_path
 
 
-def test_core_clouds_are_read_and_split_by_class(core):
+def test_shapenet_core_splits_by_class(core):
     data = shapenet_core(core, n_points=50)
     assert data.class_names == (PLANE, CHAIR)
     assert data.train.points.shape == (17 + 4, 50, 3)
@@ -43,7 +43,7 @@ def test_core_clouds_are_read_and_split_by_class(core):
     assert other.fingerprint != data.fingerprint
 
 
-def test_core_clouds_can_stay_as_they_are_and_classes_be_chosen(core):
+def test_shapenet_core_without_normalisation(core):
     data = shapenet_core(core, n_points=60, classes=[CHAIR], normalize=False)
     assert data.class_names == (CHAIR,)
     stored: list[Any] = [trimesh.load(path) for path in (core / CHAIR).glob("*.ply")]
@@ -97,7 +97,7 @@ def part_text(tmp_path):
     return tmp_path
 
 
-def test_part_text_draws_points_and_repeats_only_where_there_are_too_few(part_text):
+def test_shapenet_part_text_draws_points(part_text):
     data = shapenet_part(part_text, n_points=25, normalize=False)
     assert data.class_names == ("Airplane", "Chair")
     assert data.train.points.shape == (8, 25, 3)
@@ -113,11 +113,11 @@ def test_part_text_draws_points_and_repeats_only_where_there_are_too_few(part_te
 
 
 @pytest.mark.parametrize(
-    ("break_", "said"),
+    ("damage", "message"),
     [
         (lambda f: (f / CHAIR / "test0.txt").write_text("a b"), "cannot be read as a table"),
         (lambda f: (f / CHAIR / "test0.txt").unlink(), "cannot be read as a table"),
-        (lambda f: (f / CHAIR / "test0.txt").write_text("nan 1 2"), "must hold finite points"),
+        (lambda f: (f / CHAIR / "test0.txt").write_text("nan 1 2"), "must contain finite points"),
         (lambda f: (f / "synsetoffset2category.txt").write_text("x"), "a name and a synset"),
         (lambda f: (f / "synsetoffset2category.txt").unlink(), "no ShapeNetPart in"),
         (
@@ -126,25 +126,25 @@ def test_part_text_draws_points_and_repeats_only_where_there_are_too_few(part_te
         ),
     ],
 )
-def test_damaged_text_files_are_named(part_text, break_, said):
-    break_(part_text)
-    with pytest.raises(UserError, match=said):
+def test_shapenet_part_damaged_text_raises(part_text, damage, message):
+    damage(part_text)
+    with pytest.raises(UserError, match=message):
         shapenet_part(part_text, 8)
 
 
-def test_mistakes_are_named(core, part_hdf5, tmp_path):
-    with pytest.raises(UserError, match=r"n_points is 61, but .*\.ply stores 60 points"):
+def test_shapenet_invalid_input_raises(core, part_hdf5, tmp_path):
+    with pytest.raises(UserError, match=r"^n_points must be at most 60, .*\.ply, got 61"):
         shapenet_core(core, n_points=61)
     with pytest.raises(UserError, match=r"unknown class '0269115'.*02691156"):
         shapenet_core(core, classes=["0269115"])
-    with pytest.raises(UserError, match=r"dataset.test_share must lie between 0 and 1, got 1"):
+    with pytest.raises(UserError, match=r"^test_share must be between 0 and 1, got 1"):
         shapenet_core(core, test_share=1)
-    with pytest.raises(UserError, match=r"dataset.n_points must be at least 1, got 0"):
+    with pytest.raises(UserError, match=r"^n_points must be at least 1, got 0"):
         shapenet_core(core, n_points=0)
     (core / PLANE / "bad.ply").write_bytes(b"ply\nformat")
     with pytest.raises(UserError, match=r"bad.ply cannot be read as a PLY cloud"):
         shapenet_core(core, n_points=8)
-    with pytest.raises(UserError, match=r"dataset.root: .* is not a folder"):
+    with pytest.raises(UserError, match=r"^root: .* is not a folder"):
         shapenet_part(tmp_path / "nowhere")
     for path in part_hdf5.glob("ply_data_test*"):
         path.unlink()

@@ -1,4 +1,4 @@
-"""Archives unpacked in one step, or not at all."""
+"""Atomic unpacking of archives."""
 
 import gzip
 import shutil
@@ -18,31 +18,28 @@ BROKEN = (
     gzip.BadGzipFile,
     zlib.error,
     EOFError,
-    RuntimeError,  # encrypted, or packed by a method that Python does not know
+    RuntimeError,  # encrypted, or compressed with an unsupported method
 )
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpack a zip or tar.gz file; the folder appears in one step, whole.
+    """Unpack a zip or tar.gz file; the folder is created completely or not at all.
 
-    Where the archive holds nothing but one folder, that folder's content becomes ``folder``.
+    If the archive has a single top-level folder, the content of that folder becomes ``folder``.
 
     Args:
-        archive: the file; its content tells which kind it is.
+        archive: the file; its format is detected from its content.
         folder: must be missing or empty.
 
     Raises:
-        UserError: the archive is broken, holds links or names that leave the folder, or the folder
-            is in use.
+        UserError: the archive is damaged or has unsafe members, or the folder is not empty.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UserError(
-            f"Cannot unpack {archive.name}: {folder} is in use. Move it out of the way."
-        )
+        raise UserError(f"Cannot unpack {archive.name}: {folder} is not empty. Empty it.")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as name:
-            content = Path(name) / "content"  # mkdir's permissions, not those of a private folder
+            content = Path(name) / "content"  # with default permissions
             content.mkdir()
             for member, stream in _members(archive):
                 path = content / member
@@ -57,7 +54,7 @@ def unpack(archive: Path, folder: Path) -> None:
             (inside[0] if alone else content).replace(folder)
     except BROKEN as error:
         raise UserError(
-            f"{archive} is broken ({str(error) or 'it ends early'}). Remove it and fetch it again."
+            f"{archive} is damaged ({str(error) or 'truncated'}). Remove it and download it again."
         ) from error
     except OSError as error:
         raise UserError(f"Cannot unpack {archive} into {folder}: {error}.") from error
@@ -76,19 +73,21 @@ def _members(archive: Path) -> Iterator[tuple[str, IO[bytes] | None]]:
             for member in tar:
                 _check_member(archive, member.name, not (member.isfile() or member.isdir()))
                 yield member.name, tar.extractfile(member) if member.isfile() else None
-            # The checksum stands behind the last member, and only reading on compares it.
+            # The checksum follows the last member and is verified by reading to the end.
             while tar.fileobj and tar.fileobj.read(1 << 20):
                 pass
     else:
         raise UserError(
-            f"{archive} is neither a zip nor a tar file, or is cut off. Remove it and fetch it "
-            "again."
+            f"{archive} is neither a zip nor a tar file, or is truncated. Remove it and download "
+            "it again."
         )
 
 
 def _check_member(archive: Path, name: str, special: bool) -> None:
     for path in (PurePosixPath(name), PureWindowsPath(name)):
         if path.anchor or ".." in path.parts:
-            raise UserError(f"{archive} holds {name!r}, which leaves its folder. Do not trust it.")
+            raise UserError(
+                f"{archive} contains {name!r}, which is outside its folder. Do not use it."
+            )
     if special:
-        raise UserError(f"{archive} holds {name!r}, which is neither a file nor a folder.")
+        raise UserError(f"{archive} contains {name!r}, which is neither a file nor a folder.")

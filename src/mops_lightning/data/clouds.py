@@ -1,4 +1,4 @@
-"""What every dataset is once loaded: two splits of clouds in memory."""
+"""Datasets in memory: a training and a test split of clouds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -28,10 +28,11 @@ class CloudDataset:
 
     Attributes:
         class_names: the classes, in the order of their labels.
-        train: the clouds to learn from.
-        test: the clouds to score; all of them are scored.
-        fingerprint: sha256 of all that fixes the content; part of the name of cached weights.
-        notes: plain facts worth recording with a run, such as how many meshes were skipped.
+        train: the training split.
+        test: the test split; all clouds are scored.
+        fingerprint: sha256 of everything that determines the content; part of the cache key of task
+            nets.
+        notes: facts for the run record, such as the number of skipped meshes.
     """
 
     class_names: tuple[str, ...]
@@ -41,33 +42,33 @@ class CloudDataset:
     notes: dict[str, Any] = field(default_factory=dict)
 
 
-def choose_classes(setting: Sequence[str] | None, known: Sequence[str]) -> tuple[str, ...]:
-    """Return the classes to load, in the order in which the dataset knows them.
+def choose_classes(classes: Sequence[str] | None, known: Sequence[str]) -> tuple[str, ...]:
+    """Return the classes to load, in the order of the dataset.
 
     Args:
-        setting: ``dataset.classes``; None or empty means all.
-        known: the dataset's classes.
+        classes: names to keep; None or empty means all.
+        known: all classes of the dataset.
 
     Raises:
-        UserError: a class is unknown; the nearest known ones are named.
+        UserError: a class is unknown.
     """
-    if isinstance(setting, str):
-        raise UserError(f"dataset.classes must be a list, such as [{setting}], got {setting!r}.")
-    if not setting:
+    if isinstance(classes, str):
+        raise UserError(f"classes must be a list, such as [{classes}], got {classes!r}.")
+    if not classes:
         return tuple(known)
-    for name in setting:
+    for name in classes:
         if name not in known:
-            raise UserError(f"dataset.classes: unknown class {name!r}.{did_you_mean(name, known)}")
-    return tuple(name for name in known if name in set(setting))
+            raise UserError(f"classes: unknown class {name!r}.{did_you_mean(name, known)}")
+    return tuple(name for name in known if name in set(classes))
 
 
 def select_classes(clouds: Clouds, known: Sequence[str], chosen: Sequence[str]) -> Clouds:
-    """Keep the clouds of the chosen classes and number these from 0.
+    """Keep the clouds of the chosen classes and renumber their labels from 0.
 
     Args:
         clouds: labels are positions in ``known``.
         known: all classes.
-        chosen: a subset of them, from ``choose_classes``.
+        chosen: a subset of ``known``, from ``choose_classes``.
 
     Returns:
         Clouds whose labels are positions in ``chosen``.

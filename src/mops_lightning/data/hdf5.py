@@ -20,23 +20,23 @@ def hdf5(
     """Read a folder with ``train.h5`` and ``test.h5``.
 
     Args:
-        root: the folder. ``shape_names.txt`` beside the files names the classes, one a line, in the
-            order of their labels; without it they are called ``class_0`` and so on.
-        n_points: the first so many points of each shape are taken.
+        root: the folder. An optional ``shape_names.txt`` lists the classes, one per line, in the
+            order of their labels; the default names are ``class_0``, ``class_1`` and so on.
+        n_points: number of points per shape; the first ones are used.
         classes: names to keep; None or empty means all.
 
     Returns:
-        Float32 clouds ``(S, n_points, 3)``, as they are stored.
+        Float32 clouds ``(S, n_points, 3)``, without normalisation.
 
     Raises:
-        UserError: naming the setting or the file that is wrong.
+        UserError: an argument or a file is invalid.
     """
     if n_points < 1:
-        raise UserError(f"dataset.n_points must be at least 1, got {n_points}.")
+        raise UserError(f"n_points must be at least 1, got {n_points}.")
     folder = Path(root).expanduser()
     if not folder.is_dir():
         raise UserError(
-            f"dataset.root: {folder} is not a folder. Give one with train.h5 and test.h5."
+            f"root: {folder} is not a folder. It must be one with train.h5 and test.h5."
         )
     known = read_names(folder / NAMES) if (folder / NAMES).is_file() else None
     splits = {
@@ -44,29 +44,29 @@ def hdf5(
         for split in ("train", "test")
     }
     if known is None:
-        most = max(int(clouds.labels.max()) for clouds in splits.values() if len(clouds.labels))
-        known = [f"class_{label}" for label in range(most + 1)]
-    return choose_and_sign("hdf5", splits, known, classes, folder)
+        highest = max(int(clouds.labels.max()) for clouds in splits.values() if len(clouds.labels))
+        known = [f"class_{label}" for label in range(highest + 1)]
+    return choose_and_fingerprint("hdf5", splits, known, classes, folder)
 
 
-def choose_and_sign(
+def choose_and_fingerprint(
     kind: str,
     splits: dict[str, Clouds],
     known: Sequence[str],
     classes: Sequence[str] | None,
     folder: Path,
 ) -> CloudDataset:
-    """Keep the chosen classes of both splits and take the fingerprint of what is left.
+    """Keep the chosen classes of both splits and compute the fingerprint of the result.
 
     Args:
-        kind: the dataset's name, part of the fingerprint.
+        kind: name of the dataset, part of the fingerprint.
         splits: ``train`` and ``test``; labels are positions in ``known``.
         known: all classes.
-        classes: ``dataset.classes``.
-        folder: where they come from, for errors.
+        classes: names to keep; None or empty means all.
+        folder: source of the files, for errors.
 
     Raises:
-        UserError: a class is unknown or a split without shapes.
+        UserError: a class is unknown, or a split has no shapes.
     """
     chosen = choose_classes(classes, known)
     n_points = splits["train"].points.shape[1]
@@ -75,9 +75,7 @@ def choose_and_sign(
     for split, whole in splits.items():
         clouds = select_classes(whole, known, chosen) if len(chosen) < len(known) else whole
         if not len(clouds.labels):
-            raise UserError(
-                f"dataset.classes: {', '.join(chosen)} has no {split} shape in {folder}."
-            )
+            raise UserError(f"classes: {folder} has no {split} shape of {', '.join(chosen)}.")
         digest.update(repr((split, tuple(clouds.points.shape))).encode())
         digest.update(clouds.points.numpy().data)
         digest.update(clouds.labels.numpy().data)
@@ -86,42 +84,39 @@ def choose_and_sign(
 
 
 def read_names(path: Path) -> list[str]:
-    """Read the names of the classes, one a line.
+    """Read the names of the classes, one per line.
 
     Raises:
-        UserError: the file cannot be read, or names a class twice or none.
+        UserError: the file cannot be read, is empty or lists a class twice.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"dataset.root: cannot read {path}: {error}.") from error
+        raise UserError(f"root: cannot read {path}: {error}.") from error
     names = [line.strip() for line in lines if line.strip()]
     if not names or len(set(names)) != len(names):
-        raise UserError(f"{path} must list each class once, one a line.")
+        raise UserError(f"{path} must list each class once, one per line.")
     return names
 
 
 def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:
-    """Read the first points and the labels of one file, and check all that can be wrong.
+    """Read and check the first points and the labels of a file.
 
     Args:
         path: an HDF5 file with ``data`` (S, N, 3) and ``label`` (S,) or (S, 1).
-        n_points: how many points of each shape to read, at most N.
-        n_classes: labels must lie below it; None allows any that are not negative.
+        n_points: number of points per shape to read, at most N.
+        n_classes: number of classes; None allows any non-negative label.
 
     Raises:
-        UserError: the file is missing, damaged or holds something else.
+        UserError: the file is missing, damaged or has other content.
     """
     if not path.is_file():
-        raise UserError(
-            f"dataset.root: {path} is missing. Complete the folder, or give another with "
-            "dataset.root=PATH."
-        )
+        raise UserError(f"root: {path} is missing. Complete the folder, or use another root.")
     try:
         with h5py.File(path, "r") as file:
             for key in ("data", "label"):
                 if not isinstance(file.get(key), h5py.Dataset):
-                    raise UserError(f"{path} has no dataset {key!r}; it holds {sorted(file)}.")
+                    raise UserError(f"{path} has no dataset {key!r}; it contains {sorted(file)}.")
             data, label = file["data"], file["label"]
             shapes, kinds = (data.shape, label.shape), data.dtype.kind + label.dtype.kind
             if (
@@ -131,28 +126,26 @@ def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:
                 or kinds not in ("fu", "fi")
             ):
                 raise UserError(
-                    f"{path} must hold data (S, N, 3) of floats and label (S, 1) or (S,) of "
+                    f"{path} must contain data (S, N, 3) of floats and label (S, 1) or (S,) of "
                     f"integers, got {shapes[0]} {data.dtype} and {shapes[1]} {label.dtype}."
                 )
             if data.shape[1] < n_points:
                 raise UserError(
-                    f"dataset.n_points is {n_points}, but {path} stores {data.shape[1]} points "
-                    f"a shape. Set dataset.n_points={data.shape[1]} or less."
+                    f"n_points must be at most {data.shape[1]}, the points per shape in {path}, "
+                    f"got {n_points}."
                 )
-            with np.errstate(over="ignore"):  # what overflows is found below
+            with np.errstate(over="ignore"):  # overflows are detected below
                 points = np.asarray(data[:, :n_points], dtype=np.float32)
             labels = np.asarray(label[()], dtype=np.int64).reshape(-1)
     except (OSError, RuntimeError, KeyError) as error:
         raise UserError(
-            f"{path} is not a whole HDF5 file ({error}). Replace it by a whole one."
+            f"{path} is damaged or not an HDF5 file ({error}). Replace it by an intact copy."
         ) from error
     if not np.isfinite(points).all():
-        raise UserError(f"{path} holds NaN or infinite coordinates. Replace it by a whole one.")
-    least, most = (labels.min(), labels.max()) if len(labels) else (0, 0)
-    if least < 0 or (n_classes is not None and most >= n_classes):
-        named = "" if n_classes is None else f" names {n_classes} classes (0 to {n_classes - 1})"
-        raise UserError(
-            f"{path} holds labels from {least} to {most}, but shape_names.txt"
-            f"{named or ' can name none below 0'}."
-        )
+        raise UserError(f"{path} contains NaN or infinite values. Replace it by an intact copy.")
+    low, high = (labels.min(), labels.max()) if len(labels) else (0, 0)
+    if low < 0 or (n_classes is not None and high >= n_classes):
+        allowed = "at least 0" if n_classes is None else f"from 0 to {n_classes - 1}"
+        reason = "" if n_classes is None else f", as shape_names.txt lists {n_classes} classes"
+        raise UserError(f"{path} must have labels {allowed}{reason}, got {low} to {high}.")
     return Clouds(torch.from_numpy(points), torch.from_numpy(labels))

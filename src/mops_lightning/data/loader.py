@@ -1,4 +1,4 @@
-"""Batches straight from memory: no worker processes, and an order that can be resumed."""
+"""A data loader from memory, without worker processes, whose order can be resumed."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,12 +15,15 @@ from mops_lightning.types import Batch
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What training does to clouds before the nets see them.
+    """Random changes of training clouds.
 
     Attributes:
-        rotate_up: turn every cloud by a random angle about the up axis (y).
+        rotate_up: rotate every cloud by a random angle about the up axis (y).
         jitter: standard deviation of the noise added to every coordinate.
-        jitter_clip: largest noise in either direction.
+        jitter_clip: largest absolute noise.
+
+    Raises:
+        UserError: an argument is out of range.
     """
 
     rotate_up: bool = False
@@ -28,15 +31,15 @@ class Augmentation:
     jitter_clip: float = 0.05
 
     def __post_init__(self) -> None:
-        """Refuse negative sizes."""
+        """Check the arguments."""
         if self.jitter < 0 or self.jitter_clip < 0:
             raise UserError(
-                "augment: jitter and jitter_clip must not be negative, "
+                "augment: jitter and jitter_clip must be at least 0, "
                 f"got {self.jitter} and {self.jitter_clip}."
             )
 
     def __call__(self, points: Tensor, rng: Generator) -> Tensor:
-        """Return ``(B, N, 3)`` points, changed as the attributes say."""
+        """Return the augmented ``(B, N, 3)`` points."""
         if self.rotate_up:
             angle = torch.rand(len(points), generator=rng) * (2 * torch.pi)
             cos, sin, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
@@ -49,30 +52,30 @@ class Augmentation:
 
 
 FIXED, DRAWN = 11, 12
-"""Streams of random numbers for what tasks draw: the same in every epoch, or new ones."""
+"""Random streams of tasks: the same in every epoch, or new in every epoch."""
 
 MakeBatch = Callable[[Batch, Callable[[], list[Generator]]], Any]
-"""What a task makes of a batch, given one source of random numbers for each cloud."""
+"""Function that converts a batch for a task, given one random generator per cloud."""
 
 
 class CloudLoader:
-    """An iterable over one split, of ``Batch`` or of what the task makes of it.
+    """Iterable over the batches of a split, as ``Batch`` or as converted by the task.
 
-    What batch i of an epoch holds depends on the seed, the epoch and i only, so a resumed run sees
-    what an unbroken one would have seen.
+    The content of batch i depends on the seed, the epoch and i only, so that a resumed run gets the
+    same batches as an uninterrupted one.
 
     Args:
         clouds: the split, in memory.
         batch_size: clouds per batch.
-        shuffle: new order every epoch; otherwise the order of the split.
-        augment: None leaves the points alone.
-        make_batch: what the task makes of a batch; see ``tasks.base.Task.make_batch``. Without
-            ``shuffle`` it draws the same in every epoch.
-        part: which share of every batch this process takes, and how many processes there are. In
-            training (``shuffle``) all shares are equal, in tests none is empty.
-        drop_last: leave out a last batch that is not full (BatchNorm cannot train on one cloud);
-            never when there is no full one.
-        seed: of order, augmentation and what ``make_batch`` draws.
+        shuffle: whether every epoch has a new order; otherwise the order of the split.
+        augment: augmentation, or None.
+        make_batch: the task's conversion of a batch, see ``tasks.base.Task.make_batch``. Without
+            ``shuffle`` its random numbers are the same in every epoch.
+        drop_last: whether to drop an incomplete last batch, because BatchNorm cannot train on a
+            single cloud; the only batch is never dropped.
+        seed: seed of the order, the augmentation and ``make_batch``.
+        part: rank of this process and number of processes, which share every batch. With
+            ``shuffle``, all shares have the same size; otherwise none is empty.
     """
 
     def __init__(
@@ -104,21 +107,21 @@ class CloudLoader:
         return self.batches
 
     def set_epoch(self, epoch: int) -> None:
-        """Start ``epoch`` from its first batch, unless it is the one under way."""
+        """Start ``epoch`` from its first batch, unless it is the current epoch."""
         if epoch != self.epoch:
             self.epoch, self.position, self.resume_at = epoch, 0, 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the next batch lies; Lightning keeps this in its checkpoints."""
+        """Return the position of the next batch, which Lightning saves in checkpoints."""
         return {"epoch": self.epoch, "position": self.position}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from ``state``."""
+        """Continue from a position saved by ``state_dict``."""
         self.epoch = state["epoch"]
         self.position = self.resume_at = state["position"]
 
     def __iter__(self) -> Iterator[Any]:
-        # The body runs at the first batch, after set_epoch and load_state_dict have been called.
+        # This code runs at the first batch, after set_epoch and load_state_dict.
         epoch, number = self.epoch, len(self.clouds.points)
         start, self.resume_at = self.resume_at, 0
         if self.shuffle:
@@ -127,17 +130,17 @@ class CloudLoader:
             order = torch.arange(number)
         for batch, (chosen, mine) in enumerate(self._cut(order)[start:], start):
             points = self.clouds.points[chosen]
-            if self.augment is not None:  # all clouds of the batch: they draw from one source
+            if self.augment is not None:  # the full batch, which shares one generator
                 points = self.augment(points, generator(self.seed, epoch, batch))
             last = batch + 1 == self.batches
             self.epoch, self.position = (epoch + 1, 0) if last else (epoch, batch + 1)
             yield self._made(points[mine], chosen[mine], epoch)
 
     def _cut(self, order: Tensor) -> list[tuple[Tensor, slice]]:
-        """Return the rows of every batch, and which of them are this process's."""
+        """Return the rows of every batch, and the slice of them that belongs to this process."""
         rank, processes = self.part
         if processes > 1 and not self.shuffle:
-            # Shares may differ by a cloud, but everyone has as many batches and none is empty.
+            # Shares differ by at most one cloud; all processes have the same number of batches.
             own = order.tensor_split(processes)[rank]
             return [(rows, slice(None)) for rows in own.tensor_split(self.batches)]
         size = self.batch_size
@@ -149,7 +152,7 @@ class CloudLoader:
         ]
 
     def batch_of(self, rows: Tensor) -> Any:
-        """Return the given clouds ``(B,)`` as one batch, for a loader that does not shuffle."""
+        """Return the clouds with the rows ``(B,)`` as a batch; for loaders without shuffle."""
         return self._made(self.clouds.points[rows], rows, 0)
 
     def _made(self, points: Tensor, rows: Tensor, epoch: int) -> Any:

@@ -1,4 +1,4 @@
-"""One mesh file to one cloud; without torch, so that worker processes start quickly."""
+"""Clouds from mesh files; the module does not import torch, so that workers start fast."""
 
 import hashlib
 import re
@@ -15,21 +15,21 @@ from mops_lightning.files import atomic_write
 
 SUFFIXES = (".off", ".obj", ".ply", ".stl", ".glb")
 VERSION = 1
-"""Part of the cached files' names; raise it when the same file would give another cloud."""
+"""Part of the cache key; increment it when the same file gives another cloud."""
 
 FLAT = 1e-12
-"""Area over squared extent under which a mesh is a line or a point, up to rounding."""
+"""Smallest ratio of area to squared extent; below, a mesh is a line or a point."""
 
 
 class BrokenMeshError(UserError):
-    """A mesh file without a readable surface; the one error that ``skip_broken`` skips."""
+    """A mesh file without a readable surface; ``skip_broken`` skips these errors only."""
 
 
 Result = tuple[str, NDArray[np.float32]] | BrokenMeshError
 
 
 def cloud_or_error(path: Path, n_points: int, seed: int, cache: Path | None) -> Result:
-    """Do as ``cloud_from_file``, but return a broken mesh's error, so that others can go on."""
+    """Do the same as ``cloud_from_file``, but return the error of a broken mesh."""
     try:
         return cloud_from_file(path, n_points, seed, cache)
     except BrokenMeshError as error:
@@ -39,24 +39,23 @@ def cloud_or_error(path: Path, n_points: int, seed: int, cache: Path | None) -> 
 def cloud_from_file(
     path: Path, n_points: int, seed: int, cache: Path | None = None
 ) -> tuple[str, NDArray[np.float32]]:
-    """Sample a mesh file's surface and put the cloud into the unit sphere.
+    """Sample the surface of a mesh file and normalise the cloud to the unit sphere.
 
-    The random numbers hang on ``seed`` and the file's bytes, so a mesh gives the same cloud in
-    whatever folder and order it is met.
+    The random numbers depend on ``seed`` and the content of the file only, so that a mesh gives the
+    same cloud in any folder and order.
 
     Args:
         path: a file with one of ``SUFFIXES``.
-        n_points: points to sample, uniform by area.
-        seed: not negative.
-        cache: folder that keeps sampled clouds under a name made from the file's bytes and the
-            settings, or None.
+        n_points: number of points, uniform by area.
+        seed: a non-negative number.
+        cache: folder for sampled clouds, found by file content and arguments, or None.
 
     Returns:
         sha256 of the file's bytes, and the cloud ``(n_points, 3)``: centroid at the origin, the
         farthest point at distance 1.
 
     Raises:
-        BrokenMeshError: the file cannot be read, or holds no surface.
+        BrokenMeshError: the file cannot be read, or has no surface.
         UserError: the cache cannot be written.
     """
     try:
@@ -65,35 +64,35 @@ def cloud_from_file(
         raise BrokenMeshError(f"{path} cannot be read: {error}.") from error
     digest = hashlib.sha256(data).hexdigest()
     key = repr((VERSION, digest, path.suffix.lower(), n_points, seed))
-    kept = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.npy" if cache else None
-    if kept is not None and (points := _recall(kept, n_points)) is not None:
+    cached = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.npy" if cache else None
+    if cached is not None and (points := _load_cached(cached, n_points)) is not None:
         return digest, points
     mesh = parse_mesh(data, path)
     random = np.random.default_rng([seed, int(digest[:16], 16)])
     points = unit_sphere(trimesh.sample.sample_surface(mesh, n_points, seed=random)[0])
-    if kept is not None:
+    if cached is not None:
         try:
-            with atomic_write(kept) as temporary:
+            with atomic_write(cached) as temporary:
                 np.save(temporary, points)
         except OSError as error:
-            raise UserError(f"dataset.cache: cannot write {kept}: {error}.") from error
+            raise UserError(f"cache: cannot write {cached}: {error}.") from error
     return digest, points
 
 
 def parse_mesh(data: bytes, path: Path) -> trimesh.Trimesh:
-    """Read one mesh; a scene's parts are joined, each where its transform puts it.
+    """Parse a mesh; the parts of a scene are transformed and joined.
 
-    ModelNet's headers in which the counts follow ``OFF`` without a line break are understood.
+    Headers of ModelNet files with the counts on the same line as ``OFF`` are accepted.
 
     Args:
-        data: the file's bytes.
-        path: its name, for the suffix and for errors.
+        data: content of the file.
+        path: path of the file, for its suffix and for errors.
 
     Returns:
         Triangles with a positive, finite area.
 
     Raises:
-        BrokenMeshError: naming the file and what is wrong with it.
+        BrokenMeshError: the file is not a valid mesh with a surface.
     """
     kind = path.suffix.lower()
     if kind not in SUFFIXES:
@@ -108,16 +107,16 @@ def parse_mesh(data: bytes, path: Path) -> trimesh.Trimesh:
             outside = len(faces) and not 0 <= faces.min() <= faces.max() < len(mesh.vertices)
             area = float(mesh.area) if len(faces) and not outside else 0.0
             extent = float(np.ptp(mesh.triangles, axis=(0, 1)).max()) if area else 0.0
-    except Exception as error:  # the parsers raise whatever a broken file makes them stumble over
+    except Exception as error:  # parsers raise many types of exception for broken files
         raise BrokenMeshError(f"{path} is broken: {type(error).__name__}: {error}.") from error
     if outside:
-        raise BrokenMeshError(f"{path} is broken: a face names a vertex that is not there.")
+        raise BrokenMeshError(f"{path} is broken: a face refers to a vertex that does not exist.")
     if not len(faces):
-        raise BrokenMeshError(f"{path} holds no faces, so there is no surface to sample.")
+        raise BrokenMeshError(f"{path} has no faces, so there is no surface to sample.")
     announced = _announced_faces(data, kind)
     if len(faces) < announced:
         raise BrokenMeshError(
-            f"{path} is broken: it announces {announced} faces and holds {len(faces)}."
+            f"{path} is broken: its header announces {announced} faces, but it has {len(faces)}."
         )
     if not np.isfinite(area):
         raise BrokenMeshError(f"{path} is broken: its vertices are not all finite numbers.")
@@ -127,14 +126,14 @@ def parse_mesh(data: bytes, path: Path) -> trimesh.Trimesh:
 
 
 def unit_sphere(points: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Move the centroid of ``(N, 3)`` points to the origin and the farthest point to distance 1."""
+    """Centre ``(N, 3)`` points at the origin and scale the largest norm to 1."""
     points = points - points.mean(axis=0)
     radius = np.linalg.norm(points, axis=1).max()
     return (points / radius if radius > 0 else points).astype(np.float32)
 
 
 def _load(data: bytes, kind: str) -> trimesh.Trimesh:
-    """Let trimesh parse the file and join the parts of a scene."""
+    """Parse a file with trimesh and join the parts of a scene."""
     text = kind in (".off", ".obj")
     if kind == ".stl":
         count = int.from_bytes(data[80:84], "little")
@@ -142,10 +141,10 @@ def _load(data: bytes, kind: str) -> trimesh.Trimesh:
         if text and not data.lstrip().startswith(b"solid"):
             raise ValueError(f"{count} triangles take {84 + 50 * count} bytes, not {len(data)}")
     if text:
-        # Comments may be in any old encoding, and trimesh guesses it with a package of its own.
+        # Comments may have any encoding, for which trimesh would need another package.
         data = data.decode("utf-8" if _is_utf8(data) else "latin-1").encode()
-        data = data.replace(b"\t", b" ")  # it knows an OBJ's faces by "f " only
-    # Materials have no say in the surface, and their files may be missing.
+        data = data.replace(b"\t", b" ")  # trimesh recognises faces of OBJ files by "f " only
+    # Materials do not affect the surface, and their files may be missing.
     extra: dict[str, Any] = {"skip_materials": True} if kind in (".obj", ".glb") else {}
     scene: Any = trimesh.load(
         BytesIO(data), file_type=kind[1:], force="scene", process=False, **extra
@@ -155,10 +154,10 @@ def _load(data: bytes, kind: str) -> trimesh.Trimesh:
 
 
 def _triangles_off(data: bytes) -> trimesh.Trimesh | None:
-    """Parse a plain OFF file of triangles, which all of ModelNet is, 5 times faster than trimesh.
+    """Parse a plain OFF file of triangles, such as ModelNet's, 5 times faster than trimesh.
 
     Returns:
-        None for any other file: trimesh knows more of the format, or says what is wrong.
+        The mesh, or None for any other file, which trimesh parses or rejects.
     """
     head = re.match(rb"\s*OFF\s*(\d+)[ \t]+(\d+)[ \t]+\d+\s", data)
     if not head or b"#" in data:
@@ -186,7 +185,7 @@ def _is_utf8(data: bytes) -> bool:
 
 
 def _announced_faces(data: bytes, kind: str) -> int:
-    """Read the face count in the head of an OFF or PLY file; a cut-off file has fewer faces."""
+    """Return the face count in the header of an OFF or PLY file; truncated files have fewer."""
     head = data[:4096]
     if kind == ".ply":
         counts = re.search(rb"element\s+face\s+(\d+)", head)
@@ -197,8 +196,8 @@ def _announced_faces(data: bytes, kind: str) -> int:
     return int(counts[1]) if counts else 0
 
 
-def _recall(path: Path, n_points: int) -> NDArray[np.float32] | None:
-    """Load a cached cloud; a damaged one counts as missing and is made again."""
+def _load_cached(path: Path, n_points: int) -> NDArray[np.float32] | None:
+    """Load a cached cloud; return None if it is missing or damaged."""
     try:
         points: NDArray[np.float32] = np.load(path)
     except (OSError, ValueError, EOFError):

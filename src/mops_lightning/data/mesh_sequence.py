@@ -1,4 +1,4 @@
-"""Captured motion: folders of meshes, frame after frame, split by time."""
+"""Mesh sequences of captured motion, split by time."""
 
 import re
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from pathlib import Path, PurePosixPath
 
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.mesh_io import SUFFIXES
-from mops_lightning.data.meshes import mesh_root, sample_rows
+from mops_lightning.data.mesh_sampling import mesh_root, sample_meshes
 from mops_lightning.errors import UserError
 
 
@@ -20,32 +20,37 @@ def mesh_sequence(
     cache: str | Path | None = None,
     workers: int = 1,
 ) -> CloudDataset:
-    """Sample the frames of sequences, ``SEQUENCE/FRAME.ply`` and the like.
+    """Sample the frames of sequences, such as ``SEQUENCE/FRAME.ply``.
 
-    Neighbouring frames are almost the same shape, so a random split would test on what was learned.
-    Here the last frames of every sequence are the test, and the frames just before them belong to
-    neither split.
+    Neighbouring frames are almost identical, so that a random split would test on training data.
+    Here, the last frames of every sequence are the test split, and the frames just before them
+    belong to neither split.
 
     Args:
-        root: the folder, with one folder for each sequence; these are the classes.
-        n_points: points to sample from each surface, uniform by area.
+        root: a folder with one folder per sequence; the sequences are the classes.
+        n_points: number of points per frame, uniform by area.
         classes: sequences to keep; None or empty means all.
-        test_share: share of a sequence's frames that are tested, at least one.
-        gap: frames between training and test that are left out.
-        seed: of the sampling.
-        cache: folder for the sampled clouds; None keeps nothing.
-        workers: processes that read meshes.
+        test_share: share of test frames in a sequence, between 0 and 1; at least one frame.
+        gap: number of frames between training and test frames that are not used.
+        seed: seed of the sampling.
+        cache: folder for sampled clouds; None disables the cache.
+        workers: number of processes that read meshes.
 
     Returns:
-        Float32 clouds ``(S, n_points, 3)`` in the unit sphere, centroid at the origin.
+        Float32 clouds ``(S, n_points, 3)`` in the unit sphere, with the centroid at the origin.
 
     Raises:
-        UserError: naming the setting or the file that is wrong.
+        UserError: an argument or a file is invalid.
     """
     if not 0 < test_share < 1:
-        raise UserError(f"dataset.test_share must lie between 0 and 1, got {test_share}.")
-    least = {"n_points": (n_points, 1), "gap": (gap, 0), "seed": (seed, 0), "workers": (workers, 1)}
-    folder = mesh_root(root, least)
+        raise UserError(f"test_share must be between 0 and 1, got {test_share}.")
+    minima = {
+        "n_points": (n_points, 1),
+        "gap": (gap, 0),
+        "seed": (seed, 0),
+        "workers": (workers, 1),
+    }
+    folder = mesh_root(root, minima)
     rows: list[tuple[PurePosixPath, str]] = []
     for sequence in sorted(path for path in folder.iterdir() if path.is_dir()):
         frames = sorted(
@@ -53,28 +58,27 @@ def mesh_sequence(
         )
         if not frames:
             continue
-        tested = max(round(len(frames) * test_share), 1)
-        trained = len(frames) - tested - gap
-        if trained < 1:
+        n_test = max(round(len(frames) * test_share), 1)
+        n_train = len(frames) - n_test - gap
+        if n_train < 1:
             raise UserError(
-                f"dataset.gap: {sequence} has {len(frames)} frames, of which {tested} are tested "
-                f"and {gap} left out; none is left to train on. Lower gap or test_share."
+                f"gap must leave training frames, got {gap}: {sequence} has {len(frames)} frames, "
+                f"of which {n_test} are test frames. Reduce gap or test_share."
             )
         for number, path in enumerate(frames):
             name = PurePosixPath(path.relative_to(folder).as_posix())
-            if number < trained:
+            if number < n_train:
                 rows.append((name, "train"))
-            elif number >= len(frames) - tested:
+            elif number >= len(frames) - n_test:
                 rows.append((name, "test"))
     if not rows:
         raise UserError(
-            f"dataset.root: no mesh in {folder}. Looked for SEQUENCE/* ending in "
-            f"{', '.join(SUFFIXES)}."
+            f"root: no mesh in {folder}. Looked for SEQUENCE/* ending in {', '.join(SUFFIXES)}."
         )
-    return sample_rows(folder, rows, classes, n_points, seed=seed, cache=cache, workers=workers)
+    return sample_meshes(folder, rows, classes, n_points, seed=seed, cache=cache, workers=workers)
 
 
 def _by_time(path: Path) -> tuple[list[tuple[int, str]], str]:
-    """Sort frame_9 before frame_10."""
+    """Return a sort key that puts frame_9 before frame_10."""
     parts = re.split(r"(\d+)", path.stem)
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts], path.name

@@ -1,4 +1,4 @@
-"""ModelNet40 in its public HDF5 layout, ``modelnet40_ply_hdf5_2048``."""
+"""ModelNet40 in its public HDF5 format, ``modelnet40_ply_hdf5_2048``."""
 
 import hashlib
 import re
@@ -29,43 +29,43 @@ def modelnet40(
     mirrors: Sequence[str] | None = None,
     archive_hash: str | None = None,
 ) -> CloudDataset:
-    """Read ModelNet40, the shapes of the paper's classification and registration experiments.
+    """Read ModelNet40, the dataset of the paper's classification and registration experiments.
 
-    The official split of the public files is kept: all training shapes and all test shapes. Each
-    cloud is its first ``n_points`` points, which are stored in random order, in the unit sphere,
-    y up.
+    The official split is used, with all training and all test shapes. Clouds are in the unit
+    sphere, with y up. Their points are stored in random order, so that the first ``n_points`` are
+    a random subset.
 
     Args:
-        root: the folder with the files, or the folder above ``modelnet40_ply_hdf5_2048``.
-        n_points: points per shape, at most as many as are stored.
+        root: the folder with the files, or its parent folder.
+        n_points: number of points per shape, at most the number that is stored.
         classes: names from ``shape_names.txt`` to keep; None or empty means all 40.
-        download: fetch and unpack the archive into ``root`` when the files are not there.
+        download: whether to download the archive into ``root`` if the files are missing.
         mirrors: addresses of the archive, tried in turn; None means ``MIRRORS``.
         archive_hash: hexadecimal sha256 of the archive, or another hash as ``md5:...``; None
             accepts any archive.
 
     Returns:
-        Float32 clouds ``(S, n_points, 3)`` and int64 labels ``(S,)``. The fingerprint hangs on
-        the files' names, what was read from them, ``n_points`` and the classes, and not on where
-        ``root`` lies.
+        Float32 clouds ``(S, n_points, 3)`` and int64 labels ``(S,)``. The fingerprint depends on
+        the file names, the data read from the files, ``n_points`` and the classes, but not on
+        ``root``.
 
     Raises:
-        UserError: the files are missing, damaged, or do not hold what was asked for.
+        UserError: an argument is invalid, or files are missing or damaged.
     """
     if n_points < 1:
-        raise UserError(f"dataset.n_points must be at least 1, got {n_points}.")
+        raise UserError(f"n_points must be at least 1, got {n_points}.")
     root = Path(root).expanduser()
     folder = _find(root)
     if folder is None and download:
         folder = _download(root, mirrors or MIRRORS, archive_hash)
     if folder is None:
         raise UserError(
-            f"dataset.root: no ModelNet40 in {root}. Looked there and in {root / FOLDER} for "
-            f"{LOOKED_FOR}. Try dataset.download=true to fetch them, or dataset.root=PATH."
+            f"root: no ModelNet40 in {root}. Looked there and in {root / FOLDER} for {LOOKED_FOR}. "
+            "Download it (dataset.download=true on the command line), or use another root."
         )
     known = _lines(folder / "shape_names.txt")
     if not known or len(set(known)) != len(known):
-        raise UserError(f"{folder / 'shape_names.txt'} must list each class once, one a line.")
+        raise UserError(f"{folder / 'shape_names.txt'} must list each class once, one per line.")
     chosen = choose_classes(classes, known)
     digest = hashlib.sha256(repr(("modelnet40", n_points, chosen)).encode())
     splits = []
@@ -77,9 +77,7 @@ def modelnet40(
         )
         clouds = select_classes(whole, known, chosen) if len(chosen) < len(known) else whole
         if not len(clouds.labels):
-            raise UserError(
-                f"dataset.classes: {', '.join(chosen)} has no {split} shape in {folder}."
-            )
+            raise UserError(f"classes: {folder} has no {split} shape of {', '.join(chosen)}.")
         digest.update(repr((split, [f.name for f in files], tuple(clouds.points.shape))).encode())
         digest.update(clouds.points.numpy().data)
         digest.update(clouds.labels.numpy().data)
@@ -107,8 +105,8 @@ def _download(root: Path, mirrors: Sequence[str], archive_hash: str | None) -> P
                 archive.unlink()
     if _find(folder) is None:
         raise UserError(
-            f"dataset.mirrors: the archive unpacked into {folder} is not ModelNet40; it lacks "
-            f"{LOOKED_FOR}. Remove the folder and set dataset.mirrors to another address."
+            f"mirrors: the archive unpacked into {folder} is not ModelNet40; it lacks "
+            f"{LOOKED_FOR}. Remove the folder and use other mirrors."
         )
     return folder
 
@@ -118,13 +116,13 @@ def _lines(path: Path) -> list[str]:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(
-            f"dataset.root: cannot read {path}: {error}. ModelNet40 needs {LOOKED_FOR}."
+            f"root: cannot read {path}: {error}. ModelNet40 needs {LOOKED_FOR}."
         ) from error
     return [line.strip() for line in text.splitlines() if line.strip()]
 
 
 def _files(folder: Path, split: str) -> list[Path]:
-    """List a split's files; the public lists carry a path prefix, so only the name counts."""
+    """Return the files of a split; lists contain paths of other machines, so only names count."""
     listing = folder / f"{split}_files.txt"
     if listing.is_file():
         files = [folder / re.split(r"[/\\]", line)[-1] for line in _lines(listing)]
@@ -132,5 +130,5 @@ def _files(folder: Path, split: str) -> list[Path]:
         found = folder.glob(f"ply_data_{split}*.h5")
         files = sorted(found, key=lambda f: (int(re.sub(r"\D", "", f.stem) or 0), f.name))
     if not files:
-        raise UserError(f"dataset.root: no ply_data_{split}*.h5 in {folder}.")
+        raise UserError(f"root: no ply_data_{split}*.h5 in {folder}.")
     return files

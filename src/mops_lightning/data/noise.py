@@ -1,4 +1,4 @@
-"""Noise on test clouds (paper section "Robustness Analysis")."""
+"""Gaussian noise on test clouds (paper section "Robustness Analysis")."""
 
 import torch
 from torch import Tensor
@@ -6,18 +6,21 @@ from torch import Tensor
 from mops_lightning.seeding import generator
 
 NOISE = 13
-"""Stream of random numbers of the noise."""
+"""Random stream of the noise."""
 
 
 def noisy(points: Tensor, noise: float) -> Tensor:
-    """Add Gaussian noise to every coordinate, without a bound.
+    """Add Gaussian noise to every coordinate, without clipping.
 
-    A cloud's noise depends on its place in the split only, so that every method is tested on the
-    same noisy clouds, and more noise is the same noise, enlarged.
+    The noise of a cloud depends on its position in the split only, so that every method is tested
+    on the same noisy clouds. Other standard deviations scale the same noise.
 
     Args:
-        points: ``(S, N, 3)``, one cloud a row.
-        noise: standard deviation in units of the coordinates; the paper's 10 % are 0.1.
+        points: ``(S, N, 3)`` clouds of a split.
+        noise: standard deviation in units of the coordinates; 0.1 is 10 % in the paper.
+
+    Returns:
+        ``(S, N, 3)``.
     """
     if not noise:
         return points

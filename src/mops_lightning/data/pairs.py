@@ -1,4 +1,4 @@
-"""Pairs for registration: a cloud and its copy under a random rigid motion."""
+"""Pairs for registration: a cloud and a copy under a random rigid motion."""
 
 import math
 from collections.abc import Sequence
@@ -15,25 +15,25 @@ from mops_lightning.types import PairBatch
 
 @dataclass(frozen=True)
 class Pairs:
-    """How a cloud becomes a pair of source and target.
+    """Converts clouds to pairs of source and target.
 
-    The target is the source under a motion with a uniform turn about each of the fixed axes x, y
-    and z and a uniform shift (paper section "Registration-oriented Downsampling"; the sizes are
-    those of PCRNet's authors).
+    The target is the source under a random motion, with uniform angles about the fixed axes x, y
+    and z and a uniform translation (paper section "Registration-oriented Downsampling"). The
+    default ranges are those of PCRNet's authors.
 
     Attributes:
-        rotation: largest turn about each axis, in degrees, 0 to 180.
-        translation: largest shift along each axis, in units of the coordinates.
-        resample: how many points source and target have, drawn from the shape independently, so
-            that they are different points of one surface; None: all points, the same in both.
+        rotation: largest angle about each axis, in degrees, from 0 to 180.
+        translation: largest translation along each axis, in units of the coordinates.
+        resample: number of points of source and target, drawn independently from the shape, so that
+            both have different points of one surface; None uses all points in both.
         jitter: standard deviation of the noise added to every coordinate of both clouds.
-        jitter_clip: largest noise in either direction.
-        overlap: share of the points that lie in both clouds, above 0 up to 1. Source and target
-            lose opposite ends of the shape, along a random direction; each keeps (1 + overlap)/2.
-        test_seed: fixes the pairs that are scored, whatever the run's own seed is.
+        jitter_clip: largest absolute noise.
+        overlap: share of points that are in both clouds, above 0 and at most 1. Source and target
+            lose opposite ends of the shape along a random direction; each keeps (1 + overlap)/2.
+        test_seed: seed of the test pairs, independent of the seed of the run.
 
     Raises:
-        UserError: a number is out of range.
+        UserError: an argument is out of range.
     """
 
     rotation: float = 45.0
@@ -45,11 +45,11 @@ class Pairs:
     test_seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse numbers out of range."""
+        """Check the arguments."""
         ranges = {
             "rotation": (0 <= self.rotation <= 180, "from 0 to 180 degrees"),
             "translation": (0 <= self.translation < math.inf, "a number of at least 0"),
-            "resample": (self.resample is None or self.resample >= 1, "null or at least 1"),
+            "resample": (self.resample is None or self.resample >= 1, "None or at least 1"),
             "jitter": (0 <= self.jitter < math.inf, "a number of at least 0"),
             "jitter_clip": (0 <= self.jitter_clip < math.inf, "a number of at least 0"),
             "overlap": (0 < self.overlap <= 1, "above 0 and at most 1"),
@@ -57,28 +57,34 @@ class Pairs:
         }
         for name, (fits, allowed) in ranges.items():
             if not fits:
-                raise UserError(f"task.pairs.{name} must be {allowed}, got {getattr(self, name)}.")
+                raise UserError(f"{name} must be {allowed}, got {getattr(self, name)}.")
 
     def points_of(self, n_points: int) -> int:
-        """Return how many points source and target have when the shape has ``n_points``.
+        """Return the number of points of source and target for shapes with ``n_points``.
 
         Raises:
-            UserError: ``resample`` asks for more than there are.
+            UserError: ``resample`` is larger than ``n_points``.
         """
         if self.resample is not None and self.resample > n_points:
             raise UserError(
-                f"task.pairs.resample must be at most the {n_points} points of a shape, got "
-                f"{self.resample}. Try dataset.n_points={self.resample}."
+                f"resample must be at most the {n_points} points of a shape, got {self.resample} "
+                "(task.pairs.resample and dataset.n_points on the command line)."
             )
         drawn = self.resample or n_points
         return max(round(drawn * (1 + self.overlap) / 2), 1)
 
     def __call__(self, points: Tensor, generators: Sequence[Generator]) -> PairBatch:
-        """Make a pair of every cloud.
+        """Convert every cloud to a pair.
 
         Args:
             points: ``(B, N, 3)``.
-            generators: one for each cloud, which fixes its pair whatever stands beside it.
+            generators: B generators; each determines the pair of its cloud.
+
+        Returns:
+            B pairs.
+
+        Raises:
+            UserError: ``resample`` is larger than N.
         """
         kept = self.points_of(points.shape[1])
         motion = random_motion(self.rotation, self.translation, generators)
@@ -105,12 +111,12 @@ class Pairs:
 
 
 def pair_batch(source: Tensor, target: Tensor, motion: Motion) -> PairBatch:
-    """Join sources and targets, both ``(B, N, 3)``, each with its centroid at the origin.
+    """Combine sources and targets into a batch, with every centroid at the origin.
 
     Args:
-        source: the clouds to be moved.
-        target: where they are to come to lie.
-        motion: the true motion from source to target.
+        source: ``(B, N, 3)`` the clouds to register.
+        target: ``(B, N, 3)`` the clouds to register them to.
+        motion: the true motions from source to target.
     """
     both = torch.cat([source, target])
     centroids = both.mean(1)
@@ -118,6 +124,6 @@ def pair_batch(source: Tensor, target: Tensor, motion: Motion) -> PairBatch:
 
 
 def _cut(points: Tensor, direction: Tensor, kept: int) -> Tensor:
-    """Keep the points that lie farthest along a direction ``(B, 3, 1)``, in their order."""
+    """Keep the farthest points along a direction ``(B, 3, 1)``, in their order."""
     rows = (points @ direction)[..., 0].topk(kept, dim=1)[1].sort(1).values
     return gather_points(points, rows)

@@ -1,6 +1,6 @@
-"""Procedural furniture, vessels and airplanes: a dataset that needs no download.
+"""A procedural dataset of furniture, vessels and airplanes that needs no download.
 
-It stands in wherever the paper's ModelNet40 is not at hand: quick starts, tests, demonstrations.
+It replaces the paper's ModelNet40 in quick starts, tests and demonstrations.
 """
 
 import hashlib
@@ -24,13 +24,13 @@ from mops_lightning.errors import UserError
 from mops_lightning.files import atomic_write
 
 GENERATOR_VERSION = 1
-"""To be raised with every change of the shapes: it makes old cache files and weights unused."""
+"""Part of the fingerprint; increment it with every change of the shapes."""
 
 STRETCH = (0.15, 0.3, 0.15)
-"""Largest random stretch of x, y, z, as a natural logarithm; it blurs what proportions tell."""
+"""Largest random scaling of x, y, z, as a natural logarithm, so that proportions differ."""
 
 YAW = np.radians(30)
-"""Largest random turn about the up axis; nobody sets things down quite straight."""
+"""Largest random rotation about the up axis, in radians."""
 
 
 def shapes(
@@ -41,39 +41,37 @@ def shapes(
     seed: int = 0,
     cache: str | Path | None = None,
 ) -> CloudDataset:
-    """Make a dataset of 16 classes of everyday shapes with random form and proportions.
+    """Generate a dataset of 16 classes of everyday shapes with random form and proportions.
 
-    Some classes are near each other (stool and table, cup and bucket, vase and bottle), and their
-    bounding boxes overlap, so that classification needs the parts: a handle, a back, a lip. Shape
-    i of a class in a split depends only on (seed, split, class, i): other settings neither change
-    it nor its form. Points are uniform by area over all surfaces; y is up, the front looks to +z.
+    Some classes are similar (stool and table, cup and bucket, vase and bottle), and their bounding
+    boxes overlap, so that classification depends on parts such as handles, backs and lips. Shape i
+    of a class in a split depends on (seed, split, class, i) only. Points are uniform by area; y is
+    up, and the front faces +z.
 
     Args:
-        n_points: points per shape.
-        train_per_class: training shapes of each class.
-        test_per_class: test shapes of each class.
+        n_points: number of points per shape.
+        train_per_class: number of training shapes per class.
+        test_per_class: number of test shapes per class.
         classes: names to keep; None or empty means all.
-        seed: fixes all shapes and points.
-        cache: folder to keep the clouds in, or None. A damaged file there is made anew.
+        seed: seed of all shapes and points.
+        cache: folder for generated clouds, or None. A damaged file is generated again.
 
     Returns:
-        Float32 clouds ``(S, n_points, 3)``, centroid subtracted, largest norm 1; int64 labels
-        ``(S,)``. The fingerprint hangs on all settings but ``cache``, and on the generator's
-        version.
+        Float32 clouds ``(S, n_points, 3)`` in the unit sphere, with the centroid at the origin, and
+        int64 labels ``(S,)``. The fingerprint depends on all arguments except ``cache``, and on the
+        version of the generator.
 
     Raises:
-        UserError: a setting is out of range, a class is unknown, or ``cache`` cannot be written.
+        UserError: an argument is invalid, or ``cache`` cannot be written.
     """
-    for name, value, least in (
+    for name, value, minimum in (
         ("n_points", n_points, 1),
         ("train_per_class", train_per_class, 1),
         ("test_per_class", test_per_class, 1),
         ("seed", seed, 0),
     ):
-        if not isinstance(value, int) or isinstance(value, bool) or value < least:
-            raise UserError(
-                f"dataset.{name} must be a whole number of at least {least}, got {value!r}."
-            )
+        if not isinstance(value, int) or isinstance(value, bool) or value < minimum:
+            raise UserError(f"{name} must be a whole number of at least {minimum}, got {value!r}.")
     chosen = _chosen(classes)
     counts = (train_per_class, test_per_class)
     fingerprint = _fingerprint(n_points, counts, chosen, seed)
@@ -99,8 +97,7 @@ def _chosen(classes: Sequence[str] | None) -> tuple[str, ...]:
         or not all(isinstance(name, str) for name in classes)
     ):
         raise UserError(
-            f"dataset.classes must be a list of names, got {classes!r}. "
-            f"Allowed: {', '.join(BUILDERS)}."
+            f"classes must be a list of names, got {classes!r}. Allowed: {', '.join(BUILDERS)}."
         )
     return choose_classes(classes, tuple(BUILDERS))
 
@@ -130,7 +127,7 @@ def _generate(
         for label, name in enumerate(chosen)
         for i in range(count)
     ]
-    # Asked of the stream itself: FORCE_COLOR makes rich take a log file for a terminal.
+    # Not rich's is_terminal, which FORCE_COLOR makes true for log files.
     silent = not sys.stderr.isatty()
     for split, row, name, i in track(
         jobs,
@@ -146,26 +143,21 @@ def _generate(
 def _cloud(name: str, n_points: int, seed: int, split: int, i: int) -> NDArray[np.float32]:
     """Build shape i of a class in a split and sample it: ``(n_points, 3)``.
 
-    The form and the points have streams of their own, so the form is the same for any number of
-    points.
+    Form and points have separate random streams, so that the form does not depend on ``n_points``.
     """
     key = (split, zlib.crc32(name.encode()), i)
     form, spread = SeedSequence(seed, spawn_key=key).spawn(2)
     rng = np.random.default_rng(form)
     mesh = BUILDERS[name](rng)
     mesh.vertices *= np.exp(rng.uniform(-1, 1, 3) * STRETCH)
-    turn = rng.uniform(-YAW, YAW)
-    cos, sin = np.cos(turn), np.sin(turn)
-    cloud = _sample(mesh, n_points, spread) @ ((cos, 0, -sin), (0, 1, 0), (sin, 0, cos))
+    angle = rng.uniform(-YAW, YAW)
+    cos, sin = np.cos(angle), np.sin(angle)
+    number = int(spread.generate_state(1, np.uint64)[0])
+    cloud = np.asarray(trimesh.sample.sample_surface(mesh, n_points, seed=number)[0])
+    cloud = cloud @ ((cos, 0, -sin), (0, 1, 0), (sin, 0, cos))
     cloud -= cloud.mean(0)
-    # A single point is its own centroid and stays at the origin.
+    # A single point is its own centroid and has norm 0.
     return (cloud / max(np.linalg.norm(cloud, axis=1).max(), 1e-12)).astype(np.float32)
-
-
-def _sample(mesh: trimesh.Trimesh, n_points: int, seed: SeedSequence) -> NDArray[np.float64]:
-    """Draw points uniformly by area: ``(n_points, 3)``."""
-    number = int(seed.generate_state(1, np.uint64)[0])
-    return np.asarray(trimesh.sample.sample_surface(mesh, n_points, seed=number)[0])
 
 
 def _cache_path(cache: str | Path, fingerprint: str) -> Path:
@@ -178,12 +170,12 @@ def _cache_path(cache: str | Path, fingerprint: str) -> Path:
 
 
 def _load(path: Path, expected: Sequence[tuple[int, int, int]]) -> list[NDArray[np.float32]] | None:
-    """Read a cache file, or return None when it is absent, damaged or of another shape."""
+    """Load a cache file; return None if it is missing, damaged or has another shape."""
     try:
-        # The archive carries a checksum of each array, which reading verifies.
+        # Reading verifies the checksums of the arrays.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             points = [file["train"], file["test"]]
-    except Exception:  # zipfile and numpy answer damage with a dozen kinds of exception
+    except Exception:  # zipfile and numpy raise many types of exception for damaged files
         return None
     whole = all(
         cloud.shape == shape and cloud.dtype == np.float32
@@ -202,6 +194,6 @@ def _save(path: Path, points: Sequence[NDArray[np.float32]]) -> None:
 
 def _unwritable(folder: Path, error: OSError) -> UserError:
     return UserError(
-        f"dataset.cache: cannot write to {folder} ({error}). Set it to a folder that can be "
-        "written, or to null for no cache."
+        f"cache: cannot write to {folder} ({error}). Set it to a writable folder, or to None "
+        "(null on the command line) for no cache."
     )

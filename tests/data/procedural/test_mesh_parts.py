@@ -1,4 +1,4 @@
-"""The parts of procedural shapes: sizes, volumes and areas that geometry knows."""
+"""Sizes, volumes and areas of mesh parts against closed formulas."""
 
 import numpy as np
 import pytest
@@ -16,11 +16,11 @@ from mops_lightning.data.procedural.mesh_parts import (
 )
 
 
-def test_a_box_fills_its_spans() -> None:
+def test_box_fills_spans() -> None:
     assert np.allclose(box((0, 1), (2, 4), (-3, 0)).bounds, [[0, 2, -3], [1, 4, 0]])
 
 
-def test_a_cushion_fills_its_spans_up_to_its_rounding() -> None:
+def test_cushion_has_size_and_volume() -> None:
     a, b, c, r = 2.0, 1.0, 1.5, 0.3
     mesh = cushion((0, a), (0, b), (0, c), r)
     x, y, z = a - 2 * r, b - 2 * r, c - 2 * r
@@ -30,7 +30,7 @@ def test_a_cushion_fills_its_spans_up_to_its_rounding() -> None:
     assert 0.9 * exact < mesh.volume < exact
 
 
-def test_tubes_are_closed_and_as_thick_as_asked() -> None:
+def test_tube_has_volume() -> None:
     straight = rod((1, 2, 3), (1, 5, 3), 0.5, sections=64)
     assert straight.volume == pytest.approx(3 * np.pi * 0.25, rel=0.01)
     square = rod((0, 0, 0), (0, 2, 0), 0.5, sections=4)
@@ -41,33 +41,33 @@ def test_tubes_are_closed_and_as_thick_as_asked() -> None:
     assert abs(torus.volume) == pytest.approx(2 * np.pi**2 * 0.01, rel=0.02)
 
 
-def test_a_loft_between_squares_is_a_block() -> None:
+def test_loft_of_squares_is_block() -> None:
     square = np.array([(0, 0, 0), (0, 1, 0), (1, 1, 0), (1, 0, 0)])
     block = loft((square, square + np.array((0, 0, 3))))
     assert abs(block.volume) == pytest.approx(3)
     assert block.area == pytest.approx(14)
 
 
-def test_a_profile_is_turned_about_the_up_axis() -> None:
+def test_turned_is_surface_of_revolution() -> None:
     mesh = turned([(1, 0), (1, 3)], sections=64)
     assert np.allclose(mesh.bounds, [[-1, 0, -1], [1, 3, 1]])
     assert mesh.area == pytest.approx(6 * np.pi, rel=0.01)
 
 
-def test_smooth_curves_pass_the_ends_and_do_not_overshoot() -> None:
+def test_smooth_interpolates_without_overshoot() -> None:
     curve = smooth([(1, 0), (3, 1), (0.5, 2)], steps=50)
     assert np.allclose(curve[[0, -1]], [(1, 0), (0.5, 2)])
     assert curve[:, 0].min() >= 0.5
     assert curve[:, 0].max() <= 3
 
 
-def test_a_bow_joins_its_ends_and_stands_off_as_asked() -> None:
+def test_bow_has_ends_and_reach() -> None:
     path = bow((1, 2), (1, 0), 0.5, steps=15)
     assert np.allclose(path[[0, -1]], [(1, 2, 0), (1, 0, 0)])
     assert path[:, 0].max() == pytest.approx(1.5)
 
 
-def test_joining_keeps_every_face() -> None:
+def test_join_keeps_all_faces() -> None:
     parts = [box((0, 1), (0, 1), (0, 1)), rod((5, 0, 0), (5, 1, 0), 0.1)]
     mesh = join(parts[0], parts[1:])
     assert mesh.area == pytest.approx(sum(part.area for part in parts))

@@ -1,1 +1,1 @@
-"""Procedural shapes, built from triangle meshes."""
+"""Procedural shapes from triangle meshes."""

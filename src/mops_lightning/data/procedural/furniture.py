@@ -1,4 +1,4 @@
-"""Builders of what stands in a room and is not sat on: desk, lamp, shelf, table."""
+"""Builders of furniture without seats: desk, lamp, shelf, table."""
 
 from itertools import pairwise, product
 
@@ -17,11 +17,11 @@ from mops_lightning.data.procedural.mesh_parts import (
     tube,
     turned,
 )
-from mops_lightning.data.procedural.seats import rungs, stand
+from mops_lightning.data.procedural.seats import four_legs, rungs
 
 
 def table(rng: Generator) -> Trimesh:
-    """Return a table: round, oval or rectangular top on legs, a pillar or two trestles."""
+    """Return a table: a round, oval or rectangular top on legs, a pillar or two trestles."""
     width, height = rng.uniform(0.6, 1.9), rng.uniform(0.5, 1.1)
     depth = width * rng.uniform(0.5, 1.0)
     thick, y = rng.uniform(0.03, 0.1), height
@@ -47,7 +47,9 @@ def table(rng: Generator) -> Trimesh:
         parts.append(box(around(width * 0.68), around(0.1, under * 0.4), around(0.05)))
     else:
         radius = rng.uniform(0.035, 0.06)
-        legs, ends = stand(rng, width * inset, depth * inset, under, radius, rng.uniform(0, 0.1))
+        legs, ends = four_legs(
+            rng, width * inset, depth * inset, under, radius, rng.uniform(0, 0.1)
+        )
         parts += legs
         if rng.random() < 0.4:
             parts += _apron(width * inset, depth * inset, (under - rng.uniform(0.07, 0.14), under))
@@ -62,7 +64,7 @@ def _apron(width: float, depth: float, y: Span) -> list[Trimesh]:
 
 
 def desk(rng: Generator) -> Trimesh:
-    """Return a desk: drawer blocks or flat drawers, maybe a back panel, maybe a hutch."""
+    """Return a desk with drawer blocks or flat drawers, and possibly a back panel and a hutch."""
     width, height = rng.uniform(1.2, 1.9), rng.uniform(0.7, 0.95)
     depth = rng.uniform(0.6, 0.9)
     under = height - rng.uniform(0.03, 0.06)
@@ -116,7 +118,7 @@ def _hutch(rng: Generator, width: float, y: Span, back: float) -> list[Trimesh]:
 
 
 def shelf(rng: Generator) -> Trimesh:
-    """Return a shelf: two sides, boards, maybe a back, dividers and books."""
+    """Return a shelf with sides and boards, and possibly a back, dividers and books."""
     width, height = rng.uniform(0.6, 1.6), rng.uniform(0.65, 1.9)
     depth, board = rng.uniform(0.25, 0.5), rng.uniform(0.03, 0.05)
     foot = rng.uniform(0.0, 0.12)
@@ -140,7 +142,7 @@ def shelf(rng: Generator) -> Trimesh:
 
 
 def _books(rng: Generator, x: Span, y: float, room: float, z: Span) -> list[Trimesh]:
-    """Return a row of books that fills part of a bay, from the left or the right."""
+    """Return a row of books in part of a bay, from the left or the right."""
     filled = (x[1] - x[0]) * rng.uniform(0.3, 0.9)
     thick = rng.uniform(0.04, 0.11, max(2, int(filled / 0.09)))
     edges = np.concatenate(([0], np.cumsum(thick))) * filled / thick.sum()
@@ -153,7 +155,7 @@ def _books(rng: Generator, x: Span, y: float, room: float, z: Span) -> list[Trim
 
 
 def lamp(rng: Generator) -> Trimesh:
-    """Return a lamp: shaded on a pole or a turned foot, bent over, or with a jointed arm."""
+    """Return a lamp: on a pole, on a turned foot, with a bent pole, or with a jointed arm."""
     base = rng.uniform(0.14, 0.28)
     parts = [turned([(0, 0), (base, 0), (base, 0.03), (base * 0.3, 0.06), (0, 0.06)])]
     kind = rng.random()
@@ -169,12 +171,12 @@ def lamp(rng: Generator) -> Trimesh:
         parts.append(rod((-narrow, bar, 0), (narrow, bar, 0), 0.01, 6))
         bulb = [(0, y + 0.04), (0.05, y + 0.07), (0.06, y + 0.1), (0, y + 0.16)]
         parts.append(turned(bulb, 10))
-    elif kind < 0.7:  # turned foot, as table lamps have
+    elif kind < 0.7:  # turned foot, as of table lamps
         foot = rng.uniform(0.1, 0.22)
         profile = [(base * 0.5, 0.05), (foot, low * 0.4), (0.03, low * 0.9), (0.025, low + deep)]
         parts.append(turned(smooth(profile, 18)))
         parts.append(turned([(wide, low), (narrow, low + deep)]))
-    elif kind < 0.85:  # bent over
+    elif kind < 0.85:  # bent pole
         y, reach = rng.uniform(0.9, 1.3), rng.uniform(0.35, 0.6)
         path = [(0, 0.05, 0), (0, y * 0.75, 0), (reach * 0.4, y, 0), (reach, y * 0.85, 0)]
         parts.append(tube(smooth(path, 20), pole, 8, across=(0, 0, 1)))

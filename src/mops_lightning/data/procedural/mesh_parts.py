@@ -1,7 +1,7 @@
-"""The parts that procedural shapes are put together from: boxes, cushions, tubes, turned profiles.
+"""Parts of procedural shapes: boxes, cushions, tubes and surfaces of revolution.
 
-Axes are those of the finished shapes: x to the side, y up, z to the front. Lengths have no unit;
-the clouds are normalised afterwards. All parts are ``trimesh.Trimesh``.
+Axes are those of the shapes: x to the side, y up, z to the front. Lengths have no unit; clouds are
+normalised afterwards. All parts are ``trimesh.Trimesh``.
 """
 
 from collections.abc import Sequence
@@ -21,19 +21,19 @@ UPRIGHT = trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0))
 
 
 def around(width: float, centre: float = 0.0) -> Span:
-    """Return the span of the given width about a centre."""
+    """Return the span of a given width around a centre."""
     return (centre - width / 2, centre + width / 2)
 
 
 def box(x: Span, y: Span, z: Span) -> Trimesh:
-    """Return the axis-aligned box over three spans."""
+    """Return the axis-aligned box with three spans."""
     return trimesh.creation.box(bounds=np.array((x, y, z)).T)
 
 
 def cushion(x: Span, y: Span, z: Span, radius: float) -> Trimesh:
-    """Return the box over three spans with slightly domed sides and rounded edges.
+    """Return the box with three spans, slightly domed sides and rounded edges.
 
-    ``radius`` is that of the edges; half a side is the most that has an effect.
+    ``radius`` is that of the edges, at most half a side.
     """
     ball, faces = _ball()
     low, high = np.array((x, y, z)).T
@@ -45,9 +45,9 @@ def cushion(x: Span, y: Span, z: Span, radius: float) -> Trimesh:
 
 @cache
 def _ball() -> tuple[Array, NDArray[np.int64]]:
-    """Return vertices and faces of a unit sphere none of whose faces crosses a coordinate plane.
+    """Return vertices and faces of a unit sphere without faces across a coordinate plane.
 
-    So its octants can be moved apart; the vertices on the planes stay in the middle of a side.
+    Its octants can therefore be moved apart; vertices on a plane stay in the middle of a side.
     """
     angles = np.linspace(-np.pi / 2, np.pi / 2, 9)
     ball = trimesh.creation.revolve(
@@ -57,7 +57,7 @@ def _ball() -> tuple[Array, NDArray[np.int64]]:
 
 
 def loft(rings: ArrayLike) -> Trimesh:
-    """Return the skin over a row of closed cross-sections, each end closed to its middle.
+    """Return the surface through a series of closed cross-sections, with closed ends.
 
     Args:
         rings: ``(R, K, 3)``, R cross-sections of K points each.
@@ -67,8 +67,8 @@ def loft(rings: ArrayLike) -> Trimesh:
     stack = np.concatenate((ends[:1], stack, ends[1:]))
     rows, sides = stack.shape[:2]
     here = np.arange((rows - 1) * sides)
-    beside = here // sides * sides + (here + 1) % sides
-    faces = np.stack((here, beside, here + sides, beside, beside + sides, here + sides), axis=1)
+    after = here // sides * sides + (here + 1) % sides
+    faces = np.stack((here, after, here + sides, after, after + sides, here + sides), axis=1)
     return Trimesh(stack.reshape(-1, 3), faces.reshape(-1, 3), process=False)
 
 
@@ -79,14 +79,14 @@ def tube(
     across: ArrayLike | None = None,
     flatten: float = 1.0,
 ) -> Trimesh:
-    """Return a closed tube along a path that lies in a plane.
+    """Return a closed tube along a path in a plane.
 
     Args:
-        path: ``(R, 3)`` centres of the cross-sections, no two neighbours alike.
-        radii: one for all, or one per centre.
+        path: ``(R, 3)`` centres of the cross-sections; neighbours must differ.
+        radii: one radius, or one per centre.
         sections: corners of a cross-section; 4 makes a square bar.
         across: normal of the path's plane; None for a straight path.
-        flatten: radius along ``across`` over the radius at right angles to it.
+        flatten: ratio of the radius along ``across`` to the radius perpendicular to it.
     """
     centres = np.asarray(path, dtype=np.float64)
     along = np.gradient(centres, axis=0)
@@ -96,7 +96,7 @@ def tube(
     normal = np.asarray(across, dtype=np.float64)
     normal = np.broadcast_to(normal / np.linalg.norm(normal), centres.shape)
     turn = 2 * np.pi * (np.arange(sections) + 0.5) / sections
-    # The radius is that of the inscribed circle, so a bar with few corners is no thinner.
+    # The radius is that of the inscribed circle, so that bars with few corners are not thinner.
     reach = (np.broadcast_to(radii, len(centres)) / np.cos(np.pi / sections))[:, None, None]
     first, second = normal[:, None] * flatten, np.cross(along, normal)[:, None]
     rings = np.cos(turn)[None, :, None] * first + np.sin(turn)[None, :, None] * second
@@ -104,7 +104,7 @@ def tube(
 
 
 def rod(start: ArrayLike, end: ArrayLike, radius: ArrayLike, sections: int = 12) -> Trimesh:
-    """Return a straight bar; ``radius`` is one number, or one at each end."""
+    """Return a straight bar; ``radius`` is one number, or one per end."""
     return tube(np.stack((np.asarray(start), np.asarray(end))), radius, sections)
 
 
@@ -112,8 +112,8 @@ def turned(profile: ArrayLike, sections: int = 32) -> Trimesh:
     """Return the surface of revolution about the y axis.
 
     Args:
-        profile: ``(P, 2)`` radius and height, from the bottom up; open where it ends off the axis.
-        sections: steps of a turn.
+        profile: ``(P, 2)`` radius and height, from the bottom up; open at ends off the axis.
+        sections: number of steps of the revolution.
     """
     return trimesh.creation.revolve(
         np.asarray(profile), sections=sections, transform=UPRIGHT, process=False
@@ -127,7 +127,7 @@ def disc(radius: float, y: Span, sections: int = 32) -> Trimesh:
 
 
 def smooth(points: ArrayLike, steps: int = 24) -> Array:
-    """Return a smooth curve through control points, which does not overshoot them.
+    """Return a smooth curve through control points, without overshoot.
 
     Args:
         points: ``(P, D)``.
@@ -138,12 +138,12 @@ def smooth(points: ArrayLike, steps: int = 24) -> Array:
 
 
 def bow(start: Sequence[float], end: Sequence[float], reach: float, steps: int = 14) -> Array:
-    """Return half an oval in the xy plane, as a handle runs: ``(steps, 3)``.
+    """Return half an oval in the xy plane, as of a handle: ``(steps, 3)``.
 
     Args:
-        start: x and y where it leaves the wall, which it does along x.
-        end: x and y where it comes back.
-        reach: how far it stands off along x; negative to the left.
+        start: x and y of the start; the curve leaves it along x.
+        end: x and y of the end.
+        reach: largest distance along x; negative to the left.
         steps: number of points.
     """
     turn = np.linspace(0, np.pi, steps)
@@ -154,11 +154,11 @@ def bow(start: Sequence[float], end: Sequence[float], reach: float, steps: int =
 
 
 def join(*parts: Trimesh | Sequence[Trimesh]) -> Trimesh:
-    """Return one mesh of all parts; lists of parts may stand among them."""
+    """Return one mesh of all parts, which may be given in lists."""
     flat: list[Trimesh] = []
     for part in parts:
         flat += [part] if isinstance(part, Trimesh) else part
-    # trimesh's own concatenate also merges normals and looks, which costs a third of the dataset.
+    # trimesh's concatenate also merges normals and visuals, at a third of the time of the dataset.
     starts = np.cumsum([0] + [len(part.vertices) for part in flat[:-1]])
     vertices = np.concatenate([part.vertices for part in flat])
     faces = np.concatenate([part.faces + start for part, start in zip(flat, starts, strict=True)])

@@ -1,4 +1,4 @@
-"""Builders of what one sits or lies on: bed, chair, sofa, stool."""
+"""Builders of seats and beds: bed, chair, sofa, stool."""
 
 import numpy as np
 from numpy.random import Generator
@@ -17,21 +17,21 @@ from mops_lightning.data.procedural.mesh_parts import (
 )
 
 
-def stand(
+def four_legs(
     rng: Generator, width: float, depth: float, height: float, radius: float, splay: float = 0.0
 ) -> tuple[list[Trimesh], Array]:
-    """Return four legs, round or square, straight or tapered, and where they start and end.
+    """Return four legs, round or square, straight or tapered, and their ends.
 
     Args:
         rng: chooses the form of the legs.
-        width: distance of the outer sides along x at the top.
-        depth: distance of the outer sides along z at the top.
-        height: y of the top; the feet stand at 0.
+        width: distance between the outer sides along x at the top.
+        depth: distance between the outer sides along z at the top.
+        height: y of the top; the feet are at 0.
         radius: half the thickness of a leg at the top.
-        splay: how far a foot stands outside its top, over the height.
+        splay: horizontal distance from top to foot, relative to the height.
 
     Returns:
-        The legs, and ``(4, 2, 3)`` their tops and feet: left front, right front, right back,
+        The legs, and their tops and feet ``(4, 2, 3)``: left front, right front, right back,
         left back.
     """
     sections = int(rng.choice((4, 12)))
@@ -49,17 +49,17 @@ def rungs(ends: Array, level: float, radius: float, sides: tuple[int, ...]) -> l
     """Return bars between neighbouring legs.
 
     Args:
-        ends: from ``stand``.
-        level: height of the bars as a share of the legs' height.
+        ends: from ``four_legs``.
+        level: height of the bars relative to the height of the legs.
         radius: half the thickness of a bar.
-        sides: numbers of the legs from which a bar runs to the next leg.
+        sides: indices of legs with a bar to the next leg.
     """
     at = ends[:, 1] + level * (ends[:, 0] - ends[:, 1])
     return [rod(at[i], at[(i + 1) % len(at)], radius, 8) for i in sides]
 
 
 def chair(rng: Generator) -> Trimesh:
-    """Return a chair: seat, back of one of four kinds, legs or a swivel foot, maybe arms."""
+    """Return a chair with one of four backs, legs or a swivel foot, and possibly arms."""
     width, depth = rng.uniform(0.75, 1.05), rng.uniform(0.75, 1.0)
     seat, rise = rng.uniform(0.65, 1.15), rng.uniform(0.3, 1.25)
     thick = rng.uniform(0.06, 0.16)
@@ -67,7 +67,7 @@ def chair(rng: Generator) -> Trimesh:
     if rng.random() < 0.25:
         parts += _swivel(rng, seat - thick, min(width, depth) * 0.5)
     else:
-        legs, ends = stand(
+        legs, ends = four_legs(
             rng, width, depth, seat - thick, rng.uniform(0.035, 0.06), rng.uniform(0, 0.12)
         )
         parts += legs
@@ -99,7 +99,7 @@ def _swivel(rng: Generator, height: float, reach: float) -> list[Trimesh]:
 
 
 def _chair_back(rng: Generator, width: float, z: float, y: Span) -> Trimesh:
-    """Return posts and rails, slats, rungs or a panel, upright at ``z`` and then leant back."""
+    """Return a back of posts and rails, slats, rungs or a panel, at ``z`` and tilted back."""
     low, high = y
     post, half = 0.045, width / 2 - 0.045
     kind = rng.integers(4)
@@ -125,7 +125,7 @@ def _chair_back(rng: Generator, width: float, z: float, y: Span) -> Trimesh:
 
 
 def stool(rng: Generator) -> Trimesh:
-    """Return a stool: round or square seat without a back, on three or four legs or one foot."""
+    """Return a stool: a round or square seat on three or four legs or one foot."""
     width, height = rng.uniform(0.6, 1.0), rng.uniform(0.5, 1.4)
     depth = width * rng.uniform(0.8, 1.0)
     thick = rng.uniform(0.04, 0.2)
@@ -148,7 +148,7 @@ def stool(rng: Generator) -> Trimesh:
         ends = np.stack((tops, out * (width * 0.36 + splay * y[0])), axis=1)
         parts += [rod(top, foot, (radius, radius * 0.8)) for top, foot in ends]
     else:
-        legs, ends = stand(rng, width * inset, depth * inset, y[0], radius, splay)
+        legs, ends = four_legs(rng, width * inset, depth * inset, y[0], radius, splay)
         parts += legs
     if rng.random() < 0.7:
         parts += rungs(ends, rng.uniform(0.2, 0.45), 0.025, tuple(range(len(ends))))
@@ -165,7 +165,7 @@ def _ring(radius: float, y: float) -> Trimesh:
 
 
 def sofa(rng: Generator) -> Trimesh:
-    """Return a sofa of one to three seats with arms and back, sometimes with a long side."""
+    """Return a sofa with one to three seats, arms and back, sometimes with a long side."""
     seats = int(rng.integers(1, 4))
     arm = rng.uniform(0.1, 0.28)
     width = seats * rng.uniform(0.6, 0.8)
@@ -201,13 +201,13 @@ def sofa(rng: Generator) -> Trimesh:
 
 
 def bed(rng: Generator) -> Trimesh:
-    """Return a bed: frame, mattress, pillows, headboard, maybe footboard or four posts."""
+    """Return a bed with mattress, pillows and headboard, possibly a footboard or four posts."""
     width, length = rng.uniform(0.8, 1.7), rng.uniform(1.7, 2.1)
     foot, frame = rng.uniform(0.08, 0.3), rng.uniform(0.12, 0.22)
     top = foot + frame + rng.uniform(0.14, 0.28)
     head = top + rng.uniform(0.2, 0.7)
     z = around(length)
-    # Rails and no full box, and no mattress under the blanket: what nobody sees takes no points.
+    # Rails instead of a box, and no mattress under the blanket: hidden surfaces get no points.
     parts = [box(around(width), (foot, foot + frame), around(0.06, at)) for at in z]
     parts += [box(around(0.06, x), (foot, foot + frame), z) for x in around(width - 0.06)]
     fold = z[1] - (length * rng.uniform(0.3, 0.6) if rng.random() < 0.5 else 0.0)
@@ -237,7 +237,7 @@ def bed(rng: Generator) -> Trimesh:
 
 
 def _board(rng: Generator, width: float, y: Span, z: float) -> list[Trimesh]:
-    """Return a head- or footboard: a panel, or posts with a rail and slats."""
+    """Return a headboard or footboard: a panel, or posts with a rail and slats."""
     low, high = y
     if rng.random() < 0.6:
         return [box(around(width * 1.03), (low + 0.1, high), around(0.07, z))]

@@ -1,6 +1,6 @@
-"""Builders of the vessel classes: bottle, bowl, bucket, cup, goblet, teapot, vase.
+"""Builders of vessels: bottle, bowl, bucket, cup, goblet, teapot, vase.
 
-Walls are single surfaces, so no points are lost on an inside that nobody sees.
+Walls are single surfaces, so that no points are on a hidden inner side.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ from mops_lightning.data.procedural.mesh_parts import (
 
 
 def bottle(rng: Generator) -> Trimesh:
-    """Return a bottle: straight, waisted or round body, narrow neck, mostly with a cap."""
+    """Return a bottle with a straight, waisted or round body and a neck, usually with a cap."""
     radius, height = rng.uniform(0.22, 0.42), 1.0
     neck = radius * rng.uniform(0.28, 0.6)
     shoulder = rng.uniform(0.48, 0.68)
@@ -35,7 +35,7 @@ def bottle(rng: Generator) -> Trimesh:
         (neck, start),
         (neck, height),
     ]
-    if kind == 0:  # a straight wall, which the smooth curve would round off
+    if kind == 0:  # a straight wall, which a smooth curve would round off
         del body[2]
     parts = [turned([(0.0, 0.0), *smooth(body, 28)])]
     if rng.random() < 0.7:
@@ -46,13 +46,13 @@ def bottle(rng: Generator) -> Trimesh:
 
 
 def vase(rng: Generator) -> Trimesh:
-    """Return a vase: foot, belly, neck and lip, sometimes with two handles; or a mere beaker."""
+    """Return a vase with foot, belly, neck and lip, sometimes with two handles; or a beaker."""
     belly, height = rng.uniform(0.24, 0.45), 1.0
     foot = belly * rng.uniform(0.4, 0.7)
     neck = belly * rng.uniform(0.28, 0.85)
     lip = min(neck * rng.uniform(1.05, 1.9), belly * 1.15)
     low, high = rng.uniform(0.3, 0.55), rng.uniform(0.72, 0.85)
-    if rng.random() < 0.25:  # a beaker: no belly, wider upwards
+    if rng.random() < 0.25:  # a beaker: no belly, wider at the top
         wall = smooth([(foot, 0), (foot * rng.uniform(0.9, 1.3), low), (belly, height)], 24)
         return turned([(0.0, 0.0), *wall])
     wall = smooth([(foot, 0), (foot * 0.85, 0.06), (belly, low), (neck, high), (lip, height)], 32)
@@ -65,7 +65,7 @@ def vase(rng: Generator) -> Trimesh:
 
 
 def bowl(rng: Generator) -> Trimesh:
-    """Return a bowl: open, wide, on a foot ring; a deep one is near a cup without its handle."""
+    """Return a bowl on a foot ring; a deep one is similar to a cup without a handle."""
     radius, depth = 0.5, rng.uniform(0.28, 0.75)
     foot = radius * rng.uniform(0.3, 0.55)
     ring = rng.uniform(0.02, 0.14)
@@ -81,7 +81,7 @@ def bowl(rng: Generator) -> Trimesh:
 
 
 def cup(rng: Generator) -> Trimesh:
-    """Return a cup: a wall of one of three forms and a handle; sometimes a saucer."""
+    """Return a cup with a handle, sometimes with a saucer."""
     radius, height = rng.uniform(0.34, 0.5), rng.uniform(0.55, 1.0)
     foot = radius * rng.uniform(0.55, 1.0)
     waist = rng.uniform(0.85, 1.12)
@@ -97,7 +97,7 @@ def cup(rng: Generator) -> Trimesh:
 
 
 def bucket(rng: Generator) -> Trimesh:
-    """Return a bucket: straight wall that widens upwards, rim, and a bail, up or laid down."""
+    """Return a bucket with a conical wall, a rim and a handle at a random angle."""
     radius, height = 0.5, rng.uniform(0.75, 1.1)
     foot = radius * rng.uniform(0.6, 0.85)
     parts = [turned([(0, 0), (foot, 0), (radius, height)])]
@@ -114,7 +114,7 @@ def bucket(rng: Generator) -> Trimesh:
     out = np.sin(turn) * lift
     rise = height - rim / 2 + np.sin(swing) * out
     path = np.column_stack((np.cos(turn) * ear, rise, np.cos(swing) * out))
-    # A laid bail rests outside the wall, which the rim keeps it off.
+    # A lowered handle is outside the wall, at the distance of the rim.
     across = (0, -np.cos(swing), np.sin(swing))
     parts.append(tube(path, rng.uniform(0.018, 0.03), 8, across))
     for side in (-1, 1):
@@ -123,7 +123,7 @@ def bucket(rng: Generator) -> Trimesh:
 
 
 def goblet(rng: Generator) -> Trimesh:
-    """Return a stemmed glass: round, tall, conical or tulip bowl over a thin stem and a foot."""
+    """Return a stemmed glass with a round, tall, conical or tulip-shaped bowl."""
     foot, stem = rng.uniform(0.2, 0.3), rng.uniform(0.025, 0.045)
     rise = rng.uniform(0.15, 0.55)
     deep = 1.0 - rise
@@ -146,7 +146,7 @@ def goblet(rng: Generator) -> Trimesh:
 
 
 def teapot(rng: Generator) -> Trimesh:
-    """Return a teapot: round body, lid with knob, spout, handle at the back or over the top."""
+    """Return a teapot with lid, spout, and a handle at the back or over the top."""
     radius, height = 0.5, rng.uniform(0.6, 1.1)
     foot, mouth = radius * rng.uniform(0.5, 0.8), radius * rng.uniform(0.35, 0.6)
     widest = height * rng.uniform(0.3, 0.55)
@@ -185,9 +185,9 @@ def teapot(rng: Generator) -> Trimesh:
 
 
 def _handle(wall: Array, top: float, low: float, reach: float, thick: float) -> Trimesh:
-    """Return a bowed handle between two heights of a wall; a negative reach puts it to the left."""
+    """Return a curved handle between two heights of a wall; on the left for negative reach."""
     side = np.sign(reach)
-    # The ends lie a little inside the wall, so that no gap shows.
+    # The ends are slightly inside the wall, so that there is no gap.
     start, end = (
         (side * 0.96 * float(np.interp(y, wall[:, 1], wall[:, 0])), y) for y in (top, low)
     )
