@@ -1,14 +1,14 @@
 # Needs only Python >= 3.11 with venv, and make.
 PYTHON ?= python3
 BIN := .venv/bin
-# Test processes, each of one thread and about 1 GB.
+# Test processes, each with one thread and about 1 GB.
 WORKERS ?= 2
 
 .PHONY: setup run test check clean
 
 setup: .venv/.installed
 
-# Made anew only when what it was made from has changed.
+# Reinstalled only when the requirements change.
 .venv/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,check]'

@@ -1,13 +1,13 @@
-"""The measurements: each function returns rows, plain dictionaries of names and numbers."""
+"""The benchmarks: each function returns table rows as plain dictionaries."""
 
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import rivals
+import libraries
 import torch
+from libraries import Calls
 from measure import Timing, flops, interleaved, peak_memory
-from rivals import Calls
 from torch import Tensor, nn
 from twins import PlainMOPS, plain_farthest_point_sample
 
@@ -32,20 +32,20 @@ CHUNK = 8192
 
 
 def cloud(number: int, clouds: int = 1) -> Tensor:
-    """Return the same points on spheres each time: surfaces, as clouds are."""
+    """Return points on the unit sphere, the same at every call: surfaces, as real clouds are."""
     rng = torch.Generator().manual_seed(number)
     return nn.functional.normalize(torch.randn(clouds, number, 3, generator=rng), dim=2)
 
 
 def frozen(net: nn.Module, points: Tensor) -> Tensor:
-    """Return the points that a sampler, or a plain twin, gives in evaluation."""
+    """Return the points of a sampler, or of a plain twin, in eval mode."""
     with torch.no_grad():
         made = net.eval().requires_grad_(False)(points)
     return made if isinstance(made, Tensor) else made.points
 
 
 def chunked(sampler: MOPSNet, points: Tensor, size: int = CHUNK) -> Tensor:
-    """Return the same by chunks of the cloud."""
+    """Return the sampled points, computed from chunks of the cloud."""
     return stream_sample(sampler, partial(points[0].split, size))
 
 
@@ -105,7 +105,7 @@ torch.randn(512, 512) @ torch.randn(512, 512)
 
 
 def modules(peak: dict[str, float], rounds: int) -> list[Row]:
-    """Where time and memory of one cloud of 40,960 points go (the paper's table of modules)."""
+    """Time and memory by module for a cloud of 40,960 points (the paper's table of modules)."""
     points = cloud(40960)[0]
     rows: list[Row] = []
     for m in LARGE:
@@ -123,11 +123,11 @@ PARTS = ("features", "matrix", "regression", "pointnet", "mfoldingnet")
 
 
 class Parts:
-    """MOPS-Net's modules one by one, and two task nets behind it, each ready to be called.
+    """MOPS-Net's modules and two task nets, each with its input prepared.
 
     Args:
         points: ``(N, 3)``.
-        m: how many are generated.
+        m: number of generated points.
     """
 
     def __init__(self, points: Tensor, m: int) -> None:
@@ -145,11 +145,11 @@ class Parts:
         return self.net.local_features(self.points)
 
     def matrix(self) -> Tensor:
-        """Learn the sampling matrix, as its keys."""
+        """Compute the keys of the sampling matrix."""
         return self.net.keys(self.local, self.peak)
 
     def regression(self) -> Tensor:
-        """Regress the points."""
+        """Compute the sampled points."""
         return attend(self.net.queries, self.keys, self.points).result()
 
     def pointnet(self) -> Tensor:
@@ -157,14 +157,14 @@ class Parts:
         return self.classifier(self.generated)
 
     def mfoldingnet(self) -> Tensor:
-        """Rebuild N points from the generated ones."""
+        """Reconstruct N points from the generated ones."""
         return self.builder(self.generated)
 
 
 def training(peak: dict[str, float], rounds: int) -> list[Row]:
     """One cloud's share of a training step of the sampler alone, 32 clouds in a batch.
 
-    Freed memory is kept for the next step, as every training of a run does.
+    Freed memory is kept for the next step, as in every training run.
     """
     keep_freed_memory()
     points = cloud(1024, 32)
@@ -174,7 +174,7 @@ def training(peak: dict[str, float], rounds: int) -> list[Row]:
 
 
 def compiled(peak: dict[str, float], rounds: int) -> list[Row]:
-    """The same step by torch.compile, which wants a C++ compiler and minutes before the first."""
+    """The training step with torch.compile, which needs a C++ compiler and minutes to compile."""
     keep_freed_memory()
     points, net, made = cloud(1024, 32), MOPSNet(32).train(), MOPSNet(32).train()
     made.compile()
@@ -186,14 +186,14 @@ def compiled(peak: dict[str, float], rounds: int) -> list[Row]:
 
 
 def step(net: nn.Module, points: Tensor) -> None:
-    """Go forwards and backwards once."""
+    """Run one forward and one backward pass."""
     net.zero_grad()
     made = net(points)
     (made if isinstance(made, Tensor) else made.points).square().sum().backward()
 
 
 def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
-    """Farthest point sampling beside the plain form (to 100,000) and what else is installed."""
+    """Farthest point sampling, its plain twin (up to 100,000 points) and other libraries."""
     rows: list[Row] = []
     for number, m in ((1024, 32), (1024, 512), (10_000, 1024), (100_000, 1024), (1_000_000, 4096)):
         points = cloud(number)
@@ -201,7 +201,7 @@ def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
         calls: Calls = {"fps": own}
         if number <= 100_000:
             calls["fps, plain twin"] = partial(plain_farthest_point_sample, points[0], m)
-        others = rivals.farthest(points[0], m)
+        others = libraries.farthest(points[0], m)
         wanted = {tuple(point) for point in points[0, own()[0]].tolist()}
         shared = {
             name: len(wanted & {tuple(point) for point in call().astype("f4").tolist()})
@@ -214,7 +214,7 @@ def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
 
 
 def neighbours(peak: dict[str, float], rounds: int) -> list[Row]:
-    """Nearest points of a cloud: ours by looking at all, by a tree where it pays, and others."""
+    """Nearest points: exhaustive search, a KD-tree where it is faster, and other libraries."""
     rows: list[Row] = []
     for number, m in ((1024, 1024), (10_000, 1024), (40_960, 4096), (40_960, 40_960)):
         points, queries = cloud(number), cloud(m + 1)[:, :m]
@@ -222,7 +222,7 @@ def neighbours(peak: dict[str, float], rounds: int) -> list[Row]:
             "nearest": partial(nearest, queries, points),
             "nearest_distances": partial(nearest_distances, queries, points),
         }
-        others = rivals.nearest(queries[0], points[0])
+        others = libraries.nearest(queries[0], points[0])
         own = nearest(queries, points)[1][0].numpy()
         shared = {name: int((call() == own).sum()) for name, call in others.items()}
         for row in _rows("search", calls | others, {"N": number, "m": m}, rounds, peak):
@@ -231,7 +231,7 @@ def neighbours(peak: dict[str, float], rounds: int) -> list[Row]:
 
 
 def growth(peak: dict[str, float], rounds: int) -> list[Row]:
-    """Time and memory as N grows to 10,000,000 and m to 65,536, chunks of 65,536; one call each."""
+    """Time and memory for N up to 10,000,000 and m up to 65,536 in chunks of 65,536; one call."""
     sizes = [(100_000, m) for m in (256, 4096, 16384, 65536)]
     sizes += [(number, 4096) for number in (1_000_000, 10_000_000)]
     rows: list[Row] = []
@@ -244,7 +244,7 @@ def growth(peak: dict[str, float], rounds: int) -> list[Row]:
 
 
 def _equal(fast: Tensor, plain: Tensor) -> None:
-    """Refuse to time what does not compute the same."""
+    """Check that both results agree before they are timed."""
     torch.testing.assert_close(fast, plain, rtol=1e-3, atol=1e-4)
 
 
@@ -256,7 +256,7 @@ def _rows(
     peak: dict[str, float],
     clouds: int = 1,
 ) -> list[Row]:
-    """Time the calls in turns; one row for each, per cloud."""
+    """Time the calls in turn; return one row for each, per cloud."""
     rows = []
     for name, timing in interleaved(calls, rounds).items():
         row = {kind: name, **names, **_seconds(timing, clouds)}
@@ -280,7 +280,7 @@ ALL: dict[str, Callable[[dict[str, float], int], list[Row]]] = {
     "farthest": farthest,
     "neighbours": neighbours,
     "growth": growth,
-    # Last, for what they do to the process's memory lasts; give them last on the command line, too.
+    # Last, because they change the process's memory settings; also on the command line.
     "training": training,
     "compiled": compiled,
 }

@@ -1,4 +1,4 @@
-"""How times and memory are taken: the method of every figure under benchmarks/."""
+"""Measuring time and memory; the method behind every figure in benchmarks/."""
 
 import gc
 import os
@@ -15,20 +15,20 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 WARM_UP = 2
-"""Calls before any is timed: caches, thread pools and allocators settle."""
+"""Calls before the first timed one, to fill caches and start thread pools."""
 
-LEAST = 0.05
-"""Seconds that one timing takes at least; quicker calls are repeated within it."""
+MIN_SECONDS = 0.05
+"""Minimum duration of one timing; faster calls are repeated within it."""
 
 
 class Timing(NamedTuple):
-    """Seconds of one call, over rounds.
+    """Seconds per call over all rounds.
 
     Attributes:
-        median: of all rounds.
-        low: first quartile.
-        high: third quartile.
-        rounds: how many.
+        median: the median.
+        low: the first quartile.
+        high: the third quartile.
+        rounds: number of rounds.
     """
 
     median: float
@@ -38,23 +38,23 @@ class Timing(NamedTuple):
 
 
 def interleaved(cases: Mapping[str, Callable[[], Any]], rounds: int = 7) -> dict[str, Timing]:
-    """Time several calls in turns, so that a slow spell of the machine meets all of them.
+    """Time several calls in turn, so that a slow period of the machine affects all of them.
 
     Args:
-        cases: what to call, by name.
-        rounds: how often each is timed.
+        cases: functions to call, by name.
+        rounds: number of timings of each.
 
     Returns:
-        By name, the median and quartiles of the seconds of one call.
+        Median and quartiles of the seconds per call, by name.
     """
     repeats = {}
     for name, call in cases.items():
-        last = LEAST
+        last = MIN_SECONDS
         for _ in range(WARM_UP):
             start = time.perf_counter()
             _wait(call())
             last = time.perf_counter() - start
-        repeats[name] = max(1, round(LEAST / max(last, 1e-9)))
+        repeats[name] = max(1, round(MIN_SECONDS / max(last, 1e-9)))
     seconds: dict[str, list[float]] = {name: [] for name in cases}
     for _ in range(rounds):
         for name, call in cases.items():
@@ -85,7 +85,7 @@ def flops(call: Callable[[], Any]) -> int:
 
 
 def ceiling(rounds: int = 7) -> dict[str, float]:
-    """Measure what the machine can do: matrix products, and copies that miss the caches.
+    """Measure the machine's peak: matrix products, and copies larger than the caches.
 
     Returns:
         ``flops``: float32 multiply-adds per second, times two, of products of 2048 × 2048;
@@ -116,7 +116,7 @@ torch.set_num_threads({threads})
 def status(name):
     text = Path("/proc/self/status").read_text()
     return int(re.search(name + ":[^0-9]*([0-9]+)", text)[1]) * 1024
-Path("/proc/self/clear_refs").write_text("5")  # getrusage knows the peak of the parent, too
+Path("/proc/self/clear_refs").write_text("5")  # getrusage would include the parent's peak
 before = status("VmRSS")
 start = time.perf_counter()
 {call}
@@ -126,11 +126,11 @@ print(status("VmHWM") - before)
 
 
 def peak_memory(setup: str, call: str) -> tuple[int, float]:
-    """Return the bytes by which a statement raises the peak of a process of its own, and seconds.
+    """Run a statement in a new process; return the growth of its peak memory in bytes, and seconds.
 
     Args:
-        setup: statements before; what they hold is not counted.
-        call: the statement.
+        setup: statements that run first; their memory is not counted.
+        call: the statement to measure.
     """
     path = [str(Path(__file__).parent), *sys.path]
     code = PEAK.format(path=path, threads=torch.get_num_threads(), setup=setup, call=call)
@@ -142,7 +142,7 @@ def peak_memory(setup: str, call: str) -> tuple[int, float]:
 
 
 def machine() -> dict[str, Any]:
-    """Return what a record must say about where it was taken."""
+    """Return a record's description of the machine and the software."""
     from mops_lightning.records.environment import environment
 
     name = platform.processor() or platform.machine()

@@ -1,11 +1,11 @@
-"""``python benchmarks/run.py``: measure, and write a record and a table of it."""
+"""``python benchmarks/run.py``: measure, and write a record and a table."""
 
 import argparse
 import json
 from pathlib import Path
 from typing import Any
 
-import rivals
+import libraries
 import torch
 from cases import ALL
 from measure import ceiling, machine
@@ -21,21 +21,21 @@ COLUMNS = {
 
 
 def main() -> None:
-    """Run the chosen measurements one after the other."""
+    """Run the chosen benchmarks one after the other."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("cases", nargs="*", help=f"of {', '.join(ALL)}; default: all")
+    parser.add_argument("cases", nargs="*", help=f"from {', '.join(ALL)}; default: all")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "cpu")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     chosen = parser.parse_args()
     unknown = [name for name in chosen.cases if name not in ALL]
     if unknown:
-        parser.error(f"no such measurement: {', '.join(unknown)}; there are {', '.join(ALL)}")
+        parser.error(f"unknown benchmark: {', '.join(unknown)}. Allowed: {', '.join(ALL)}")
     torch.set_num_threads(chosen.threads)
     torch.manual_seed(0)
     peak = ceiling(chosen.rounds)
-    where = {**machine(), "others": rivals.versions()}
-    record: dict[str, Any] = {"machine": where, "ceiling": peak, "cases": {}}
+    hardware = {**machine(), "others": libraries.versions()}
+    record: dict[str, Any] = {"machine": hardware, "ceiling": peak, "cases": {}}
     print(f"ceiling: {peak['flops'] / 1e9:.0f} GFLOP/s, {peak['bytes'] / 1e9:.1f} GB/s", flush=True)
     for name in chosen.cases or ALL:
         record["cases"][name] = ALL[name](peak, chosen.rounds)
@@ -44,18 +44,18 @@ def main() -> None:
             temporary.write_text(json.dumps(record, indent=1) + "\n")
         with atomic_write(chosen.out.with_suffix(".md")) as temporary:
             temporary.write_text(markdown(record))
-    print(f"\nin {chosen.out}.json and .md")
+    print(f"\nwritten to {chosen.out}.json and .md")
 
 
 def markdown(record: dict[str, Any]) -> str:
-    """Return all tables of a record, with where it was taken."""
+    """Return all tables of a record, with the machine and the ceiling."""
     where, peak = record["machine"], record["ceiling"]
     parts = [
         f"{where['cpu']}, {where['threads']} threads, {where['gpu'] or 'no GPU'}, torch "
         f"{where['versions']['torch']}, commit {(where['git']['commit'] or 'none')[:10]}"
         f"{' with changes' if where['git']['dirty'] else ''}. Ceiling in this run: "
         f"{peak['flops'] / 1e9:.0f} GFLOP/s (float32 products), {peak['bytes'] / 1e9:.1f} GB/s "
-        "(copies). Medians per cloud; spread: between the quartiles of all rounds."
+        "(copies). Medians per cloud; spread: distance between the quartiles over all rounds."
     ]
     for name, rows in record["cases"].items():
         parts += [f"## {name}", (ALL[name].__doc__ or "").strip(), table(rows)]

@@ -1,4 +1,4 @@
-"""What the fast operations are measured against: the same, written as the paper's formulas are."""
+"""Plain twins: direct implementations of the formulas, for comparison with the fast ones."""
 
 import torch
 from torch import Tensor, nn
@@ -7,10 +7,10 @@ from mops_lightning.samplers.mops import MOPSNet
 
 
 class PlainMOPS(nn.Module):
-    """MOPS-Net by convolutions over (B, C, N), the global feature repeated N times, S dense.
+    """MOPS-Net with convolutions over (B, C, N), a repeated global feature and a dense S.
 
     Args:
-        sampler: whose weights it takes.
+        sampler: the sampler whose weights are used.
     """
 
     def __init__(self, sampler: MOPSNet) -> None:
@@ -46,7 +46,7 @@ def _convolutions(stack: nn.Sequential) -> nn.Sequential:
 
 
 def plain_farthest_point_sample(points: Tensor, m: int) -> Tensor:
-    """Return the rows ``(m,)`` that farthest point sampling takes from ``(N, 3)``, from row 0."""
+    """Return the rows ``(m,)`` of a farthest point sample of ``(N, 3)``, starting with row 0."""
     rows = torch.zeros(m, dtype=torch.int64)
     distance = torch.full((len(points),), torch.inf)
     for place in range(1, m):

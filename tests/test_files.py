@@ -1,10 +1,9 @@
 import pytest
 
-from mops_lightning.errors import did_you_mean
 from mops_lightning.files import atomic_write
 
 
-def test_a_whole_file_takes_the_place_of_the_old_one(tmp_path):
+def test_atomic_write_replaces_the_old_file(tmp_path):
     path = tmp_path / "folder" / "file.txt"
     for text in ("old", "new"):
         with atomic_write(path) as temporary:
@@ -15,7 +14,7 @@ def test_a_whole_file_takes_the_place_of_the_old_one(tmp_path):
     assert path.stat().st_mode & 0o444
 
 
-def test_after_an_error_the_old_file_stands_and_nothing_else(tmp_path):
+def test_atomic_write_after_an_error_keeps_the_old_file(tmp_path):
     path = tmp_path / "file.txt"
     path.write_text("old")
 
@@ -28,10 +27,3 @@ def test_after_an_error_the_old_file_stands_and_nothing_else(tmp_path):
         break_off()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_the_nearest_names_are_offered():
-    assert did_you_mean("chiar", ["chair", "table"]) == (
-        " Did you mean 'chair'? Allowed: chair, table."
-    )
-    assert did_you_mean("zzz", ["chair"]) == " Allowed: chair."

@@ -11,7 +11,7 @@ from typing import NoReturn, TextIO
 USER_ERROR = 2
 INTERRUPTED = 130
 CLOSED_PIPE = 141
-"""128 + SIGPIPE, which is what shells report of other programs."""
+"""128 + SIGPIPE, the status that shells report for other programs."""
 
 
 class UserError(ValueError):
@@ -26,14 +26,14 @@ class Interrupted(Exception):
 
 
 def did_you_mean(name: str, allowed: Iterable[str]) -> str:
-    """Say which allowed names are nearest to ``name``, and all of them when they are few.
+    """Suggest the allowed names closest to ``name``, and list all of them if they are few.
 
     Args:
-        name: what came.
-        allowed: what would have been accepted.
+        name: the unknown name.
+        allowed: the allowed names.
 
     Returns:
-        A phrase that starts with a space, to be put behind an error's first sentence.
+        A phrase that starts with a space, to append to the first sentence of an error.
     """
     names = sorted(allowed)
     close = get_close_matches(name, names, n=3, cutoff=0.5)
@@ -54,10 +54,10 @@ def end(name: str, message: str, status: int) -> NoReturn:
 
 @contextmanager
 def quiet_on_closed_pipe() -> Iterator[None]:
-    """Exit without a traceback when the reader of the output has gone, as ``| head`` does.
+    """Exit without a traceback when the reader of the output has ended, such as ``| head``.
 
     Raises:
-        SystemExit: with ``CLOSED_PIPE``, when stdout or stderr is a pipe that nobody reads.
+        SystemExit: with ``CLOSED_PIPE``, when stdout or stderr is a pipe without a reader.
     """
     try:
         try:

@@ -1,11 +1,11 @@
-"""Random numbers that depend on named numbers only, never on what ran before."""
+"""Seeds and generators that do not depend on the global random state."""
 
 import numpy as np
 import torch
 
 
 def derive_seed(*numbers: int) -> int:
-    """Return one seed (below 2^63) for a tuple of non-negative numbers, well mixed."""
+    """Hash non-negative numbers to one seed below 2^63."""
     low, high = np.random.SeedSequence(numbers).generate_state(2, np.uint32)
     return (int(high) << 32 | int(low)) >> 1
 

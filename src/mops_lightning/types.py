@@ -1,7 +1,7 @@
-"""What flows between data, sampler, task and metrics, and the letters of its shapes.
+"""Types that data, samplers, tasks and metrics exchange, and the letters of their shapes.
 
 ``B`` clouds in a batch, ``N`` input points, ``M`` sampled points, ``C`` channels, ``S`` shapes in
-a split. Points are float32 ``(B, N, 3)``, coordinates without unit in the unit sphere.
+a split. Points are float32 ``(B, N, 3)`` in the unit sphere, without unit.
 """
 
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -28,11 +28,11 @@ class PairBatch(NamedTuple):
     """One batch of pairs for registration.
 
     Attributes:
-        points: ``(2B, N, 3)`` the sources, then the targets, each with its centroid at the origin;
-            one tensor, so that a sampler sees all clouds in one pass.
-        centroids: ``(2B, 3)`` what was subtracted.
-        quaternion: ``(B, 4)`` rotation of the true motion from source to target, scalar first,
-        translation: ``(B, 3)`` and its translation; both are of the clouds before centring.
+        points: ``(2B, N, 3)`` all sources, then all targets, each with its centroid at the origin;
+            one tensor, so that a sampler processes all clouds in one pass.
+        centroids: ``(2B, 3)`` the subtracted centroids.
+        quaternion: ``(B, 4)`` rotation of the true motion from source to target, scalar first.
+        translation: ``(B, 3)`` its translation. Both refer to the clouds before centring.
     """
 
     points: Tensor
@@ -42,15 +42,15 @@ class PairBatch(NamedTuple):
 
 
 class SampleOutput(NamedTuple):
-    """What every sampler returns; a NamedTuple, so it survives device transfer and collation.
+    """The output of every sampler; a NamedTuple, which device transfer and collation support.
 
     Attributes:
         points: ``(B, M, 3)`` the sampled points.
         indices: ``(B, M)`` int64 rows of the input, or None when the points are generated.
-        losses: the sampler's own loss terms, already weighted, to be added to the task loss.
-        matrix: the sampling matrix S behind the points, or None.
-        soft_projected: ``(B, M, 3)`` what the task net is trained on in place of ``points``, or
-            None; exists in training only and is never a test result.
+        losses: the sampler's own weighted loss terms, to add to the task loss.
+        matrix: the sampling matrix S that generated the points, or None.
+        soft_projected: ``(B, M, 3)`` points on which the task net is trained in place of
+            ``points``, or None; only in training, never a test result.
 
     Example:
         >>> import torch
@@ -67,7 +67,7 @@ class SampleOutput(NamedTuple):
     soft_projected: Tensor | None = None
 
     def first(self, m: int) -> "SampleOutput":
-        """Return the output of the first ``m`` points; losses, being of all of them, stay out."""
+        """Return the first ``m`` points, without the losses, which are those of all points."""
         if m == self.points.shape[1]:
             return self._replace(losses={})
         return SampleOutput(
@@ -80,12 +80,12 @@ class SampleOutput(NamedTuple):
 
 
 class TaskOutput(NamedTuple):
-    """What a task's step returns.
+    """The output of a task's step.
 
     Attributes:
-        losses: the task's loss terms, already weighted.
-        predictions: what the task's metrics compare,
-        targets: and what they compare it with.
+        losses: the task's weighted loss terms.
+        predictions: first argument of the task's metrics.
+        targets: second argument of the task's metrics.
     """
 
     losses: dict[str, Tensor]

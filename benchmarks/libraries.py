@@ -1,8 +1,8 @@
-"""Other libraries that find farthest or nearest points, each where it is installed.
+"""Other libraries with farthest point sampling or nearest points, where they are installed.
 
-They are called as their documentation says, on arrays of their own kind; what it takes to make
-these is not timed. None of them is a requirement: ``pip install fpsample open3d-cpu
-point-cloud-utils``, in an environment of their own if their requirements do not agree with ours.
+Each is called as its documentation says, on its own type of array; the conversion is not timed.
+None is required: ``pip install fpsample open3d-cpu point-cloud-utils``, in a separate environment
+if their requirements conflict with ours.
 """
 
 from collections.abc import Callable
@@ -16,11 +16,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 Calls = dict[str, Callable[[], Any]]
-"""What to time, by name."""
+"""Functions to time, by name."""
 
 
 def installed(name: str) -> Any:
-    """Return a library, or None."""
+    """Return a library, or None if it is not installed."""
     try:
         return import_module(name)
     except ImportError:
@@ -28,7 +28,7 @@ def installed(name: str) -> Any:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what is installed, by the names that pip knows."""
+    """Return the versions of the installed libraries, by their names in pip."""
     found = {}
     for name in ("scipy", "fpsample", "open3d", "open3d-cpu", "point-cloud-utils"):
         try:
@@ -39,9 +39,9 @@ def versions() -> dict[str, str]:
 
 
 def farthest(points: Tensor, m: int) -> Calls:
-    """Return calls that take m farthest points ``(m, 3)`` of ``(N, 3)``, from row 0 on.
+    """Return calls that choose m points ``(m, 3)`` from ``(N, 3)``, starting at row 0.
 
-    fpsample's buckets begin with a row of their own, whatever they are told.
+    fpsample's bucket variants start at a row of their own choice and ignore the given one.
     """
     array, calls = points.numpy(), Calls()
     if fpsample := installed("fpsample"):
@@ -56,9 +56,9 @@ def farthest(points: Tensor, m: int) -> Calls:
 
 
 def nearest(queries: Tensor, points: Tensor) -> Calls:
-    """Return calls that find the row of the nearest of ``(N, 3)`` for each of ``(M, 3)``.
+    """Return calls that find the row of the nearest of ``(N, 3)`` points for ``(M, 3)`` queries.
 
-    What a library builds first, a tree in most, is part of the call.
+    Building the library's index, a tree in most, is part of the call.
     """
     many, few = points.numpy(), queries.numpy()
 
