@@ -1,4 +1,4 @@
-"""The wheel, built, installed and used away from the checkout."""
+"""The wheel, built, installed and used outside the checkout."""
 
 import json
 import os
@@ -27,7 +27,7 @@ TINY_JOB = (
 
 
 def python(*arguments: str, cwd: Path, path: Path | None = None) -> str:
-    """Run this interpreter elsewhere and return what it prints."""
+    """Run this interpreter in another folder and return its output."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     environment.pop("PYTHONPATH", None)
     if path is not None:
@@ -42,7 +42,7 @@ def python(*arguments: str, cwd: Path, path: Path | None = None) -> str:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built from a copy, so that the checkout stays clean."""
+    """Build the wheel from a copy, so that the checkout stays clean."""
     copy = tmp_path_factory.mktemp("copy")
     for name in SOURCES:
         if (ROOT / name).is_dir():
@@ -64,12 +64,12 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def files_below(folder: Path, inside: str) -> set[str]:
-    """Name the files of a folder as they should be named in the wheel."""
+    """List the files of a folder by their expected names in the wheel."""
     files = (file.relative_to(folder) for file in folder.rglob("*") if file.is_file())
     return {f"{inside}/{f.as_posix()}" for f in files if "__pycache__" not in f.parts}
 
 
-def test_the_wheel_holds_the_package_its_configs_and_nothing_else(wheel: Path) -> None:
+def test_wheel_contains_package_and_configs_only(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
     configs = files_below(ROOT / "conf", "mops_lightning/conf")
@@ -78,7 +78,7 @@ def test_the_wheel_holds_the_package_its_configs_and_nothing_else(wheel: Path) -
     assert names == configs | files_below(ROOT / "src/mops_lightning", "mops_lightning")
 
 
-def test_the_wheel_declares_the_console_script_and_carries_the_licence(wheel: Path) -> None:
+def test_wheel_has_console_script_and_licence(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         (info,) = {name.split("/")[0] for name in archive.namelist() if ".dist-info/" in name}
         scripts = archive.read(f"{info}/entry_points.txt").decode().splitlines()
@@ -89,7 +89,7 @@ def test_the_wheel_declares_the_console_script_and_carries_the_licence(wheel: Pa
     assert licence == (ROOT / "LICENSE").read_bytes()
 
 
-def test_the_installed_copy_is_what_these_tests_import(installed: Path, tmp_path: Path) -> None:
+def test_installed_copy_is_imported(installed: Path, tmp_path: Path) -> None:
     code = (
         "import mops_lightning, mops_lightning.config.compose as c; print(mops_lightning.__file__)"
     )
@@ -98,14 +98,14 @@ def test_the_installed_copy_is_what_these_tests_import(installed: Path, tmp_path
     assert Path(lines[1]) == installed.resolve() / "mops_lightning" / "conf"
 
 
-def test_help_works_from_the_installed_copy(installed: Path, tmp_path: Path) -> None:
+def test_help_of_installed_copy_lists_datasets(installed: Path, tmp_path: Path) -> None:
     text = python("-m", "mops_lightning", "--help", cwd=tmp_path, path=installed)
     datasets = sorted(file.stem for file in (ROOT / "conf/dataset").glob("*.yaml"))
     assert f"dataset: {', '.join(datasets)}" in text
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_job_runs_from_the_installed_copy(installed: Path, tmp_path: Path) -> None:
+def test_run_of_installed_copy_leaves_a_record(installed: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "empty"
     elsewhere.mkdir()
     folders = (f"out={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}")
