@@ -53,29 +53,30 @@ def mesh_sequence(
     folder = mesh_root(root, minima)
     rows: list[tuple[PurePosixPath, str]] = []
     for sequence in sorted(path for path in folder.iterdir() if path.is_dir()):
-        frames = sorted(
-            (path for path in sequence.iterdir() if path.suffix.lower() in SUFFIXES), key=_by_time
-        )
-        if not frames:
-            continue
-        n_test = max(round(len(frames) * test_share), 1)
-        n_train = len(frames) - n_test - gap
-        if n_train < 1:
-            raise UserError(
-                f"gap must leave training frames, got {gap}: {sequence} has {len(frames)} frames, "
-                f"of which {n_test} are test frames. Reduce gap or test_share."
-            )
-        for number, path in enumerate(frames):
-            name = PurePosixPath(path.relative_to(folder).as_posix())
-            if number < n_train:
-                rows.append((name, "train"))
-            elif number >= len(frames) - n_test:
-                rows.append((name, "test"))
+        frames = (path for path in sequence.iterdir() if path.suffix.lower() in SUFFIXES)
+        paths = sorted(frames, key=_by_time)
+        splits = _split_frames(sequence, len(paths), test_share, gap)
+        names = [PurePosixPath(path.relative_to(folder).as_posix()) for path in paths]
+        rows += [(name, split) for name, split in zip(names, splits, strict=True) if split]
     if not rows:
         raise UserError(
             f"root: no mesh in {folder}. Looked for SEQUENCE/* ending in {', '.join(SUFFIXES)}."
         )
     return sample_meshes(folder, rows, classes, n_points, seed=seed, cache=cache, workers=workers)
+
+
+def _split_frames(sequence: Path, frames: int, test_share: float, gap: int) -> list[str]:
+    """Return the split of every frame of a sequence; frames in the gap have an empty one."""
+    if not frames:
+        return []
+    n_test = max(round(frames * test_share), 1)
+    n_train = frames - n_test - gap
+    if n_train < 1:
+        raise UserError(
+            f"gap must leave training frames, got {gap}: {sequence} has {frames} frames, "
+            f"of which {n_test} are test frames. Reduce gap or test_share."
+        )
+    return ["train"] * n_train + [""] * gap + ["test"] * n_test
 
 
 def _by_time(path: Path) -> tuple[list[tuple[int, str]], str]:

@@ -10,7 +10,7 @@ import torch
 from mops_lightning.data.archive import unpack
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, select_classes
 from mops_lightning.data.download import fetch, one_at_a_time
-from mops_lightning.data.hdf5 import read_clouds
+from mops_lightning.data.hdf5 import read_clouds, read_names
 from mops_lightning.errors import UserError
 
 FOLDER = "modelnet40_ply_hdf5_2048"
@@ -63,9 +63,7 @@ def modelnet40(
             f"root: no ModelNet40 in {root}. Looked there and in {root / FOLDER} for {LOOKED_FOR}. "
             "Download it (dataset.download=true on the command line), or use another root."
         )
-    known = _lines(folder / "shape_names.txt")
-    if not known or len(set(known)) != len(known):
-        raise UserError(f"{folder / 'shape_names.txt'} must list each class once, one per line.")
+    known = read_names(folder / "shape_names.txt")
     chosen = choose_classes(classes, known)
     digest = hashlib.sha256(repr(("modelnet40", n_points, chosen)).encode())
     splits = []

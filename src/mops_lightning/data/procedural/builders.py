@@ -7,8 +7,9 @@ from numpy.random import Generator
 from trimesh import Trimesh
 
 from mops_lightning.data.procedural.airplane import airplane
+from mops_lightning.data.procedural.beds import bed
 from mops_lightning.data.procedural.furniture import desk, lamp, shelf, table
-from mops_lightning.data.procedural.seats import bed, chair, sofa, stool
+from mops_lightning.data.procedural.seats import chair, sofa, stool
 from mops_lightning.data.procedural.vessels import bottle, bowl, bucket, cup, goblet, teapot, vase
 
 BUILDERS: Mapping[str, Callable[[Generator], Trimesh]] = MappingProxyType(

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.random import Generator
 from trimesh import Trimesh
 
+from mops_lightning.data.procedural.legs import four_legs, rungs
 from mops_lightning.data.procedural.mesh_parts import (
     Span,
     around,
@@ -17,7 +18,6 @@ from mops_lightning.data.procedural.mesh_parts import (
     tube,
     turned,
 )
-from mops_lightning.data.procedural.seats import four_legs, rungs
 
 
 def table(rng: Generator) -> Trimesh:
