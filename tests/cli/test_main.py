@@ -192,7 +192,7 @@ def test_cfg_job_shows_the_config(tmp_path):
         (["dataset=modelnet40", "dataset.root=nowhere"], "dataset.root"),
         (["dataset.classes=[chiar]"], "chair"),
         (["ckpt_path=last", *TINY_WITH_PICTURES], "ckpt_path=last"),
-        ([*TINY_WITH_PICTURES, "dataset.classes=[chair]"], "at least two classes"),
+        ([*TINY_WITH_PICTURES, "dataset.classes=[chair]"], "num_classes must be at least 2"),
         (["weights=nowhere.pt", *TINY_WITH_PICTURES], "no file nowhere.pt"),
     ],
 )

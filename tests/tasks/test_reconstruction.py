@@ -127,7 +127,7 @@ def test_scored_other_cloud_size_needs_flexible_net(rng):
 
 
 def test_emd_weight_negative_raises():
-    with pytest.raises(UserError, match=r"emd_weight.*negative.*-1"):
+    with pytest.raises(UserError, match=r"emd_weight.*at least 0.*-1"):
         task(emd_weight=-1)
 
 

@@ -36,7 +36,7 @@ def fit(module, epochs=2):
     return module
 
 
-def test_learning_the_sampler_leaves_the_task_bit_identical():
+def test_fit_learn_sampler_leaves_task_unchanged():
     module = experiment("sampler")
     before = state(module)
     names = changed(before, fit(module))
@@ -47,7 +47,7 @@ def test_learning_the_sampler_leaves_the_task_bit_identical():
 
 
 @pytest.mark.parametrize(("learn", "rates"), [("joint", [1e-2, 1e-3]), ("sampler", [1e-2])])
-def test_a_jointly_trained_task_net_may_learn_more_slowly(learn, rates):
+def test_task_lr_scale_joint_scales_task_rate(learn, rates):
     module = fit(experiment(learn, task_lr_scale=0.1), epochs=1)
     groups = module.optimizers().param_groups
     assert [group["lr"] for group in groups] == pytest.approx(rates)
@@ -56,7 +56,7 @@ def test_a_jointly_trained_task_net_may_learn_more_slowly(learn, rates):
         assert {id(p) for p in group["params"]} == {id(p) for p in part.parameters()}
 
 
-def test_learning_jointly_changes_both():
+def test_fit_learn_joint_changes_both():
     module = experiment("joint")
     before = state(module)
     names = changed(before, fit(module))
@@ -64,21 +64,21 @@ def test_learning_jointly_changes_both():
     assert {"task.net.pool.linear.weight", "task.net.pool.norm.running_var"} <= names
 
 
-def test_learning_the_task_needs_no_sampler_and_changes_every_layer():
+def test_fit_learn_task_changes_every_layer():
     module = experiment("task", sampler=None)
     before = state(module)
     names = changed(before, fit(module))
     assert {f"task.{name}" for name, _ in module.task.named_parameters()} <= names
 
 
-def test_frozen_parts_stay_in_evaluation_mode_whatever_is_asked():
+def test_train_frozen_parts_stay_in_evaluation_mode():
     module = experiment("sampler").train()
     assert not any(m.training for m in module.task.modules())
     assert module.sampler.training
     assert not any(p.requires_grad for p in module.task.parameters())
 
 
-def test_test_scores_every_readout_and_the_whole_set():
+def test_test_scores_every_readout_and_set():
     data = small_dataset()
     run = quiet_trainer(2)
     run.test(experiment(), CloudLoader(data.test, 4), verbose=False)
@@ -92,7 +92,7 @@ def test_test_scores_every_readout_and_the_whole_set():
     assert metrics["test/matrix/orthogonality_error"] >= 0
 
 
-def test_scores_are_those_of_a_plain_loop():
+def test_test_accuracy_equals_plain_loop():
     data = small_dataset()
     module = experiment().eval()
     run = quiet_trainer(2)
@@ -114,7 +114,7 @@ def test_scores_are_those_of_a_plain_loop():
     assert got["test/generated/mean_class_accuracy"] == pytest.approx(sum(means) / 3)
 
 
-def test_an_index_sampler_has_one_readout():
+def test_test_index_sampler_has_one_readout():
     data = small_dataset()
     run = quiet_trainer(2)
     module = experiment(sampler=RandomSampler(8))
@@ -125,7 +125,7 @@ def test_an_index_sampler_has_one_readout():
     assert "test/sampled/accuracy" in run.callback_metrics
 
 
-def test_an_unlearned_sampler_that_makes_points_has_three_readouts():
+def test_test_generating_unlearned_sampler_has_three_readouts():
     data = small_dataset()
     run = quiet_trainer(2)
     module = experiment(sampler=VoxelSampler(8, "centroid"))
@@ -135,12 +135,12 @@ def test_an_unlearned_sampler_that_makes_points_has_three_readouts():
     assert run.callback_metrics["test/generated/subset_distance"] > 0
 
 
-def test_two_runs_of_one_seed_agree_exactly():
+def test_fit_same_seed_gives_same_weights():
     first, second = (fit(experiment("joint")).state_dict() for _ in range(2))
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-def test_unknown_learn_and_missing_sampler_are_named():
+def test_learn_unknown_or_without_sampler_raises():
     with pytest.raises(UserError, match="Did you mean 'sampler'"):
         experiment("samplr")
     with pytest.raises(UserError, match="needs a sampler"):

@@ -71,10 +71,13 @@ def test_training_that_goes_astray_fails_and_is_not_kept(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        (["task/net=pointnet"], r"PointNetVanilla takes \(points\) and registration needs"),
+        (
+            ["task/net=pointnet"],
+            r"task\.net must take \(source, target\).*PointNetVanilla.*\(points\)",
+        ),
         (["task.net=null"], r"task.net cannot be removed"),
-        (["~task.pairs"], r"task.pairs cannot be removed"),
-        (["task.loss=null"], r"task.loss cannot be removed"),
+        (["~task.pairs"], r"task\.pairs cannot be None"),
+        (["task.loss=null"], r"task\.loss cannot be None"),
         (["task.loss.translation_weight=-1"], r"task.loss.translation_weight must be .*got -1"),
         (["task.pairs.translation=inf"], r"task.pairs.translation must be .*got inf"),
         (["task.pairs.resample=32", "task.pairs.overlap=0.4", "m=24"], r"task.pairs.overlap"),

@@ -19,7 +19,7 @@ SEVEN = (1, 2, 3, 5, 8, 13, 20)
 
 
 def trained(sampler):
-    """A sampler after some steps, so that its running statistics are not those it began with."""
+    """A sampler after some steps, whose running statistics have changed."""
     data = small_dataset()
     torch.manual_seed(0)
     module = Experiment(
@@ -52,7 +52,7 @@ def progressive():
 
 
 @pytest.mark.parametrize("make", [fmops, progressive])
-def test_seven_sizes_at_once_equal_seven_tests(make):
+def test_test_several_sizes_equals_single_tests(make):
     module = trained(make())
 
     def baselines():
@@ -69,7 +69,7 @@ def test_seven_sizes_at_once_equal_seven_tests(make):
             assert together[within] == pytest.approx(value, abs=1e-6), within
 
 
-def test_the_run_s_own_size_gives_its_score():
+def test_score_name_several_sizes_uses_own_size():
     module = Experiment(Classification(PointNetVanilla(3), 3), fmops(), sizes=(5, 8), m=8)
     assert module.score_name == "test/m8/generated/accuracy"
     assert Experiment(module.task, fmops(), m=8).score_name == "test/generated/accuracy"
@@ -88,20 +88,20 @@ def test_the_run_s_own_size_gives_its_score():
         ("auto", 32, None, ()),
     ],
 )
-def test_sizes_that_are_tested(sizes, m, sampler, expected):
+def test_sizes_to_test_returns_ascending_sizes(sizes, m, sampler, expected):
     assert sizes_to_test(sizes, m, sampler, 1024) == expected
 
 
 @pytest.mark.parametrize(
     ("sizes", "m", "sampler", "named"),
     [
-        ([8], 32, MOPSNet(32), r"returns 32 points only, got sizes=\[8\]"),
+        ([8], 32, MOPSNet(32), r"returns 32 points.*got sizes=\[8\]"),
         ([101], 32, FMOPSNet(100), r"at most sampler.m_max=100, .* got \[101\]"),
         ([201], 32, FPSSampler(32), "from 1 to the 200 points"),
         ("auto", 101, FMOPSNet(100), "m must be at most sampler.m_max=100, got m=101"),
         ("auto", 32, FMOPSNet(512), "sampler.m_max must be at most the 200 points .* got 512"),
     ],
 )
-def test_sizes_out_of_range_are_refused(sizes, m, sampler, named):
+def test_sizes_to_test_out_of_range_raises(sizes, m, sampler, named):
     with pytest.raises(UserError, match=named):
         sizes_to_test(sizes, m, sampler, 200)

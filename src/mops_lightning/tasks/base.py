@@ -1,4 +1,4 @@
-"""What every task offers to the experiment."""
+"""The contract that every task keeps."""
 
 from collections.abc import Callable, Mapping, Sequence
 from inspect import signature
@@ -18,10 +18,10 @@ class Task(nn.Module):
     """Base of all tasks: owns the task net, its losses and its metrics.
 
     Args:
-        net: the task net; how it is called is the task's own affair.
+        net: the task net; its call signature is task-specific, see ``net_takes``.
 
     Raises:
-        UserError: it is no net, or one of another task.
+        UserError: ``net`` is not a module, or takes other arguments than ``net_takes``.
     """
 
     score: str
@@ -31,39 +31,39 @@ class Task(nn.Module):
     """Name of the metric that scores the task net on full clouds; None: ``score``."""
 
     requires_same_classes: bool = False
-    """Whether the net's outputs are the data's classes, so that it fits no others."""
+    """Whether the net's outputs are the classes of the data it was trained on."""
 
     net_takes: tuple[str, ...] = ("points",)
-    """What the net's ``forward`` takes, by name."""
+    """Names of the arguments of the net's ``forward``."""
 
     test_seed: int = 0
-    """Fixes what ``make_batch`` draws for the clouds that are scored."""
+    """Seed of the random numbers that ``make_batch`` draws for clouds that are scored."""
 
     def __init__(self, net: nn.Module) -> None:
         super().__init__()
         if not isinstance(net, nn.Module):
-            raise UserError(f"task.net must be a net, got {net!r}. Choose one with task/net=NAME.")
+            raise UserError(f"net must be a torch.nn.Module, got {net!r}.")
         takes = tuple(signature(net.forward).parameters)
         if takes != self.net_takes:
             raise UserError(
-                f"task/net: {type(net).__name__} takes ({', '.join(takes)}) and "
-                f"{type(self).__name__.lower()} needs a net that takes "
-                f"({', '.join(self.net_takes)}). Leave task/net out for the task's own."
+                f"net must take ({', '.join(self.net_takes)}), as "
+                f"{type(self).__name__.lower()} needs it; got {type(net).__name__}, which takes "
+                f"({', '.join(takes)}). Choose a net of this task."
             )
         self.net = net
 
     def make_batch(self, batch: Batch, generators: Callable[[], list[Generator]]) -> Any:
-        """Turn a batch of clouds into what ``step`` takes; the same by default.
+        """Turn the loader's batch into the one that ``step`` takes; the same by default.
 
         Args:
-            batch: of the loader.
-            generators: makes one for each cloud, which fixes what is drawn for it, whatever stands
-                beside it in the batch.
+            batch: clouds and labels.
+            generators: makes one random number generator per cloud, so that what is drawn for a
+                cloud does not depend on the rest of its batch.
         """
         return batch
 
     def points_of(self, n_points: int) -> int:
-        """Return how many points the clouds have that are sampled, from the dataset's number."""
+        """Return the number of points per cloud of ``make_batch``, for ``n_points`` in the data."""
         return n_points
 
     def step(self, batch: Any, points: Tensor) -> TaskOutput:
@@ -96,21 +96,21 @@ class Task(nn.Module):
         return self.step(batch, points)
 
     def metrics(self, training: bool = False) -> MetricCollection:
-        """Return new metrics that take predictions and targets of ``scored``.
+        """Return new metrics of the predictions and targets of ``scored``.
 
         Args:
-            training: take those of ``step`` instead.
+            training: of those of ``step`` instead.
         """
         raise NotImplementedError
 
     def cloud_titles(self, titles: Sequence[str]) -> list[str]:
-        """Return a title for each of a batch's points, from those of the dataset's clouds."""
+        """Return one title per cloud of ``batch.points``, from one per cloud of the dataset."""
         return list(titles)
 
     def figures(
         self, batch: Any, samples: Mapping[str, Tensor], titles: Sequence[str]
     ) -> "dict[str, Figure]":
-        """Draw what the task makes of a few clouds, by name; nothing by default.
+        """Draw the task's results for a few clouds, by name; nothing by default.
 
         Args:
             batch: as for ``step``.

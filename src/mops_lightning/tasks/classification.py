@@ -12,7 +12,7 @@ from mops_lightning.types import Batch, TaskOutput
 
 
 class Classification(Task):
-    """Names the class of a cloud from its sampled points.
+    """Classifies clouds from their sampled points.
 
     Args:
         net: maps ``(B, M, 3)`` points to ``(B, num_classes)`` logits.
@@ -29,7 +29,8 @@ class Classification(Task):
         super().__init__(net)
         if num_classes < 2:
             raise UserError(
-                f"dataset.classes must leave at least two classes to tell apart, got {num_classes}."
+                f"num_classes must be at least 2, got {num_classes}. Give data of more classes "
+                "(dataset.classes)."
             )
         self.num_classes = num_classes
 

@@ -28,28 +28,28 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCORED_BLOCK, SCORED_ROUNDS = 128, 8
-"""How earth mover's distances are scored that are too large for the exact one."""
+"""Blocks and rounds of the earth mover's distances of clouds above ``exact_up_to``, in scores."""
 
 
 class Reconstruction(Task):
-    """Rebuilds a cloud from its sampled points with an auto-encoder.
+    """Reconstructs clouds from their sampled points with an auto-encoder.
 
-    The loss is the chamfer distance plus ``emd_weight`` times the earth mover's distance. The
-    latter goes by blocks (see ``emd.block_matching``), for exact matching would take most of the
-    training's time.
-    Scores take it exactly up to ``exact_up_to`` points, and by larger blocks above.
+    The loss is the chamfer distance plus ``emd_weight`` times the earth mover's distance. In
+    training the latter is computed by blocks (see ``ops.emd``), because exact matching would take
+    most of the time. In scores it is exact up to ``exact_up_to`` points, and by larger blocks
+    above.
 
     Args:
         net: maps ``(B, M, 3)`` points and a number n to ``(B, n, 3)``.
-        emd_weight: of the earth mover's distance in the loss; 0 leaves it out.
-        emd_block: points in a block, in training.
+        emd_weight: weight of the earth mover's distance in the loss; 0 leaves it out.
+        emd_block: points per block, in training.
         emd_rounds: rounds of blocks, in training.
-        exact_up_to: largest clouds whose distance is scored exactly.
-        emd_workers: processes that search for bijections; None: as many as torch has threads. No
-            result depends on it.
+        exact_up_to: largest number of points for the exact distance in scores.
+        emd_workers: processes that compute assignments; None: as many as torch has threads. Does
+            not affect results.
 
     Raises:
-        UserError: the weight is negative.
+        UserError: ``emd_weight`` is negative or not finite.
     """
 
     score = NormalizedChamfer.name
@@ -67,7 +67,7 @@ class Reconstruction(Task):
     ) -> None:
         super().__init__(net)
         if not 0 <= emd_weight < math.inf:
-            raise UserError(f"task.emd_weight must not be negative, got {emd_weight}.")
+            raise UserError(f"emd_weight must be at least 0 and finite, got {emd_weight}.")
         self.emd_weight = emd_weight
         self.emd_block = emd_block
         self.emd_rounds = emd_rounds

@@ -28,16 +28,19 @@ Loss = Callable[[Motion, Motion, Tensor, Tensor], dict[str, Tensor]]
 
 
 class Registration(Task):
-    """Finds the rigid motion between two clouds from sampled points of both.
+    """Estimates the rigid motion between two clouds from sampled points of both.
 
-    Each cloud's centroid is subtracted before sampling; the translation that is answered and scored
-    is that of the clouds as they came.
+    Each cloud's centroid is subtracted before sampling; the predicted and scored translation is
+    that of the original clouds.
 
     Args:
         net: maps sources ``(B, M, 3)`` and targets ``(B, M, 3)`` to a ``Motion``.
-        pairs: how training and test pairs are made.
+        pairs: makes the training and test pairs.
         loss: takes the predicted and the true motion and the two centred clouds ``(B, N, 3)``;
             returns its terms by name.
+
+    Raises:
+        UserError: ``pairs`` or ``loss`` is None.
     """
 
     score = RotationError.name
@@ -49,7 +52,7 @@ class Registration(Task):
         super().__init__(net)
         for name, part in (("pairs", pairs), ("loss", loss)):
             if part is None:
-                raise UserError(f"task.{name} cannot be removed; leave task.{name} out.")
+                raise UserError(f"{name} cannot be None. Leave it at its default.")
         assert pairs is not None
         assert loss is not None
         self.pairs = pairs
@@ -61,7 +64,7 @@ class Registration(Task):
         return self.pairs(batch.points, generators())
 
     def points_of(self, n_points: int) -> int:
-        """Return how many points the clouds have that are sampled."""
+        """Return the number of points per cloud of a pair."""
         return self.pairs.points_of(n_points)
 
     def step(self, batch: PairBatch, points: Tensor) -> TaskOutput:
@@ -77,7 +80,7 @@ class Registration(Task):
         found = self.net(*points.chunk(2))
         true = Motion(batch.quaternion, batch.translation)
         from_source, from_target = batch.centroids.chunk(2)
-        # The true motion seen between the centred clouds: R·(p + c) + t = R·p + (R·c + t).
+        # The true motion between the centred clouds: R·(p + c) + t = R·p + (R·c + t).
         shift = true.apply(from_source[:, None])[:, 0] - from_target
         losses = self.loss(found, true._replace(translation=shift), *batch.points.chunk(2))
         turned = found._replace(translation=from_target).apply(-from_source[:, None])[:, 0]
@@ -96,7 +99,7 @@ class Registration(Task):
         )
 
     def cloud_titles(self, titles: Sequence[str]) -> list[str]:
-        """Tell sources and targets apart."""
+        """Return titles of all sources, then of all targets."""
         return [f"{title}_{side}" for side in ("source", "target") for title in titles]
 
     def figures(

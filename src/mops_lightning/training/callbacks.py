@@ -26,11 +26,11 @@ STANDARD = ("learning_rate", "checkpoint", "stop", "progress", "pictures")
 class StopBetweenSteps(Callback):
     """On the first Ctrl-C or SIGTERM, finish the step, write a checkpoint and stop.
 
-    A signal may come in the middle of an optimizer step; only between steps is the state whole, so
-    that resuming gives the result of an unbroken run. A second signal stops at once.
+    A signal may arrive inside an optimizer step. The state is consistent between steps only, and
+    only then does resuming give the result of an uninterrupted run. A second signal stops at once.
 
     Args:
-        checkpoint: where to write.
+        checkpoint: path to write to.
     """
 
     def __init__(self, checkpoint: Path) -> None:
@@ -40,24 +40,24 @@ class StopBetweenSteps(Callback):
         self._before: dict[int, Any] = {}
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Listen; not earlier, for Lightning sets its own handlers first."""
+        """Install the signal handlers, after Lightning has set its own."""
         self.leads = trainer.is_global_zero
         for number in (signal.SIGINT, signal.SIGTERM):
             self._before[number] = signal.signal(number, self._note)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         if self.received is not None:
-            raise KeyboardInterrupt("Stopped at once; the checkpoint is the last whole one.")
+            raise KeyboardInterrupt("Stopped at once; the last complete checkpoint is kept.")
         self.received = number
         if self.leads:
             print("Stopping after this step (once more: at once) ...", file=sys.stderr, flush=True)
 
     def on_train_batch_end(self, trainer: L.Trainer, *args: Any) -> None:
-        """Stop here if asked to, all processes of a run after the same step."""
+        """Stop if a signal came, all processes of a run after the same step."""
         self._stop_if_asked(trainer, save=True)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Stop after the last step, or stop listening."""
+        """Restore the signal handlers; stop if a signal came in the last step."""
         self._restore()
         self._stop_if_asked(trainer, save=False)
 
@@ -65,10 +65,10 @@ class StopBetweenSteps(Callback):
         if trainer.strategy.reduce_boolean_decision(self.received is not None, all=False):
             if save:
                 trainer.save_checkpoint(self.checkpoint)
-            raise Interrupted(f"Go on with the same command and ckpt_path={self.checkpoint}")
+            raise Interrupted(f"Resume with the same command and ckpt_path={self.checkpoint}")
 
     def on_exception(self, trainer: L.Trainer, *args: Any) -> None:
-        """Stop listening."""
+        """Restore the signal handlers."""
         self._restore()
 
     def _restore(self) -> None:
@@ -78,17 +78,17 @@ class StopBetweenSteps(Callback):
 
 
 class EpochLines(Callback):
-    """One printed line per epoch, for logs and pipes, where a progress bar is noise.
+    """Prints one line per epoch, for logs and pipes, where a progress bar is noise.
 
     Args:
-        score: the task's metric, which is shown as validated.
+        score: the task metric whose validation values are printed.
     """
 
     def __init__(self, score: str) -> None:
         self.score = score
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Print what the progress bar would show."""
+        """Print the mean loss and the score."""
         if not trainer.is_global_zero:
             return
         numbers = {
@@ -102,10 +102,10 @@ class EpochLines(Callback):
 
 
 def last_checkpoint(checkpoint: Path) -> ModelCheckpoint:
-    """Return the callback that writes a checkpoint after every epoch over the last one.
+    """Return the callback that overwrites one checkpoint after every epoch.
 
     Args:
-        checkpoint: where to write.
+        checkpoint: path to write to.
     """
     return ModelCheckpoint(
         dirpath=checkpoint.parent,

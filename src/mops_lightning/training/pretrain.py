@@ -121,4 +121,6 @@ def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
             job = prepare(own, folder, dataset, record)
             fit_and_test(job, record, None)
     except (KeyboardInterrupt, Interrupted):
-        raise Interrupted("The task net was in training: the same command goes on there.") from None
+        raise Interrupted(
+            "The task net was being trained; the same command resumes its training."
+        ) from None

@@ -1,4 +1,7 @@
-"""Learning rate schedules as factors over a run's steps, so that a resumed run may be longer."""
+"""Learning rate schedules.
+
+Each is a factor per step and has no state, so that a resumed run may be longer.
+"""
 
 import math
 
@@ -15,12 +18,12 @@ def one_cycle(
     start_factor: float = 0.04,
     end_factor: float = 1e-4,
 ) -> LambdaLR:
-    """Rise by a half cosine to the optimizer's rate, then fall by one (Smith and Topin, 2018).
+    """Increase to the optimizer's rate along a half cosine, then decrease (Smith and Topin, 2018).
 
     Args:
         optimizer: its learning rate is the peak.
         total_steps: optimizer steps in the run.
-        warmup: share of the run that rises.
+        warmup: fraction of the run in which the rate increases.
         start_factor: first rate over peak.
         end_factor: last rate over peak.
     """
@@ -39,7 +42,7 @@ def one_cycle(
 
 
 def exponential(optimizer: Optimizer, total_steps: int, end_lr: float) -> LambdaLR:
-    """Fall exponentially from the optimizer's rate to ``end_lr``, as the paper does.
+    """Decay exponentially from the optimizer's rate to ``end_lr``, as in the paper.
 
     Args:
         optimizer: its learning rate is the first one.
@@ -50,7 +53,7 @@ def exponential(optimizer: Optimizer, total_steps: int, end_lr: float) -> Lambda
         UserError: ``end_lr`` is not positive.
     """
     if end_lr <= 0:
-        raise UserError(f"optimizer.schedule.end_lr must be positive, got {end_lr}.")
+        raise UserError(f"end_lr must be positive, got {end_lr}.")
     ratio = end_lr / optimizer.param_groups[0]["lr"]
     return LambdaLR(optimizer, lambda step: ratio ** min(step / max(total_steps - 1, 1), 1.0))
 
@@ -60,13 +63,13 @@ def step_decay(
 ) -> LambdaLR:
     """Multiply the rate by ``factor`` every ``every`` steps, down to ``floor_lr``.
 
-    This is how PointNet, S-Net and SampleNet were trained: ×0.7 per 200,000 or 600,000 samples.
+    PointNet, S-Net and SampleNet were trained so: ×0.7 per 200,000 or 600,000 samples.
 
     Args:
         optimizer: its learning rate is the first one.
         total_steps: unused; all schedules share this signature.
-        every: steps between two falls.
-        factor: of one fall.
+        every: steps between two decays.
+        factor: of one decay.
         floor_lr: smallest rate.
     """
     first = optimizer.param_groups[0]["lr"]

@@ -1,4 +1,4 @@
-"""Which sizes a run tests."""
+"""The sizes that a run tests."""
 
 from collections.abc import Sequence
 
@@ -17,18 +17,18 @@ def sizes_to_test(
     n_points: int,
     training: bool = True,
 ) -> tuple[int, ...]:
-    """Return how many points the test asks the sampler for, in ascending order.
+    """Return the sizes that are tested, in ascending order.
 
     Args:
-        sizes: ``auto`` tests a learned sampler of many sizes at the standard ones, as far as it
-            and the clouds go, and any other at ``m`` alone. A list is taken as it is.
-        m: the size that the run is about; it is always tested.
+        sizes: ``auto`` tests a flexible learned sampler at those standard sizes that it and the
+            clouds allow, any other sampler at ``m`` alone. A list is used as given.
+        m: the run's own size, which is always tested.
         sampler: None where only the task net learns.
         n_points: N of the test clouds.
-        training: whether the sampler learns, which it does at its largest size too.
+        training: whether the sampler is trained, which includes its largest size.
 
     Raises:
-        UserError: a size that the sampler or the clouds do not allow.
+        UserError: the sampler or the clouds do not allow a size.
     """
     if sampler is None:
         return ()
@@ -52,7 +52,7 @@ def sizes_to_test(
         )
     if sampler.learned and wanted[-1] > sampler.m:
         raise UserError(
-            f"sizes must be at most sampler.m_max={sampler.m}, which this net was made for, "
+            f"sizes must be at most sampler.m_max={sampler.m}, the largest size of this net, "
             f"got {list(sizes)}."
         )
     return tuple(wanted)

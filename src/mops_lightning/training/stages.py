@@ -121,7 +121,7 @@ def _interruptible() -> Iterator[None]:
     try:
         yield
     except SystemExit:
-        raise Interrupted("Go on with the same command and ckpt_path=last.") from None
+        raise Interrupted("Resume with the same command and ckpt_path=last.") from None
 
 
 def _save(job: Job, record: RunRecord) -> None:

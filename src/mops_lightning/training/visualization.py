@@ -1,4 +1,4 @@
-"""The callback that draws the same few test clouds while a sampler learns, and when it is done."""
+"""The callback that draws the same few test clouds during training and after the test."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,17 +24,17 @@ from mops_lightning.viz.figures import save_figure
 from mops_lightning.viz.snapshots import CLOUDS, save_clouds
 
 DENSE_PIXELS = 2**20
-"""Largest S that is drawn: 1,024 points by 1,024 columns."""
+"""Most entries of S that are drawn: 1,024 points by 1,024 columns."""
 
 
 class CloudVisualization(Callback):
-    """Draws a fixed set of clouds with every readout, S with SᵀS, and what the task draws.
+    """Draws a fixed set of clouds with every readout, S with SᵀS, and the task's figures.
 
-    TensorBoard gets them about ten times in a run and after the test; the run's folder gets PNGs
-    after the test, where the task shows the baselines too.
+    They go to TensorBoard about ten times in a run and after the test, and as PNGs to the run's
+    folder after the test, when the task's figures include the baselines.
 
     Args:
-        batch: the test clouds to draw, as the task takes them.
+        batch: the test clouds to draw, as the task's ``step`` takes them.
         titles: one per cloud of the dataset.
         folder: the run's folder; PNGs go to ``pictures`` below it.
     """
@@ -68,7 +68,7 @@ class CloudVisualization(Callback):
         module.eval()
         batch = move_data_to_device(self.batch, module.device)
         beside: Any = module.baselines
-        # The baselines do not change in training: they are drawn once, at the end.
+        # Baselines do not change in training, so they are drawn once, at the end.
         baselines = dict(beside.items()) if folder is not None else {}
         points = batch.points
         methods = {name: baseline(points, m).points for name, baseline in baselines.items()}
