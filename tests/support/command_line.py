@@ -14,20 +14,25 @@ from hydra.core.global_hydra import GlobalHydra
 
 from mops_lightning.cli.main import main
 
-TINY = [
+TINY_ANY_DATA = [
     "trainer=cpu",
     "trainer.max_epochs=1",
     "epochs.task=1",
-    "dataset.train_per_class=4",
-    "dataset.test_per_class=3",
     "dataset.n_points=64",
-    "dataset.classes=[chair,vase,lamp]",
     "batch_size=4",
     "m=8",
     "pictures=0",
     "logger=none",
 ]
-"""The smallest job that runs every stage."""
+"""The settings of the smallest job that do not depend on the dataset."""
+
+TINY = [
+    *TINY_ANY_DATA,
+    "dataset.train_per_class=4",
+    "dataset.test_per_class=3",
+    "dataset.classes=[chair,vase,lamp]",
+]
+"""The smallest job that runs every stage, on procedural shapes."""
 
 TINY_WITH_PICTURES = [*TINY, "pictures=2", "logger=tensorboard"]
 

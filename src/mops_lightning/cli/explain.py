@@ -30,19 +30,19 @@ def explain(error: BaseException) -> str:
         return texts[0]
     for text in texts:
         if "Interpolation key 'labels." in text:
-            # labels.${learn} names the run's folder, so Hydra meets a wrong learn before we do.
+            # labels.${learn} names the run's folder, so Hydra finds a wrong learn first.
             value = text.split("'labels.")[1].split("'")[0]
             return f"learn: unknown value {value!r}.{did_you_mean(value, LEARN)}"
         if "Could not override '" in text:
             key = text.split("Could not override '")[1].split("'")[0]
             return _no_such_setting(key)
-    # What Hydra and OmegaConf say themselves, without their notes for developers.
+    # Hydra's and OmegaConf's own messages, without their notes for developers.
     lines = [line for text in texts for line in text.splitlines() if line.strip()]
     return " ".join(dict.fromkeys(line.strip() for line in lines if line[0] != " "))
 
 
 def _names_there(cause: Any) -> str:
-    """Say which configurations the folder behind --config-dir has."""
+    """Name the configurations in the folder of --config-dir."""
     from pathlib import Path
 
     places = [i for i, a in enumerate(sys.argv) if a in ("--config-dir", "-cd")]
@@ -52,7 +52,7 @@ def _names_there(cause: Any) -> str:
 
 
 def _no_such_setting(key: str) -> str:
-    """Say what was meant by a key: a group, a setting, or one that YAML leaves at its default."""
+    """Name the nearest group or setting, or say how to set an argument that no YAML file sets."""
     from omegaconf import OmegaConf
 
     from mops_lightning.config.build import signature
@@ -66,13 +66,13 @@ def _no_such_setting(key: str) -> str:
     node, _, name = key.rpartition(".")
     target = OmegaConf.select(cfg, f"{node}._target_")
     if target and name in signature(target, node):
-        return f"{key}: {target} takes it, but no file sets it: write +{key}=..."
+        return f"{key}: {target} accepts it, but no file sets it. Write +{key}=..."
     hint = did_you_mean(key, [known for known in _known_keys(cfg) if known != key])
     return f"{key}: no such setting.{hint} --cfg job shows all of them."
 
 
 def _composed(groups: Sequence[str]) -> "DictConfig":
-    """Compose what the command line chooses from groups, without what else it sets."""
+    """Compose the groups that the command line chooses, without its other settings."""
     from mops_lightning.config.compose import compose
 
     try:

@@ -49,7 +49,7 @@ def _run() -> None:
 
 
 def _job(cfg: "DictConfig") -> float | None:
-    """Run one job; the returned score is what an optimising sweeper looks at."""
+    """Run one job and return its score, which an optimising sweeper reads."""
     from pathlib import Path
 
     from hydra.core.hydra_config import HydraConfig
@@ -69,13 +69,13 @@ def _job(cfg: "DictConfig") -> float | None:
         distributed.check_start(cfg, hydra_cfg.overrides.hydra)
         return run(cfg, folder, overrides).score
     except UserError as error:
-        # Ended here, Hydra does not add lines of its own.
+        # Exit here, before Hydra adds lines of its own.
         end(NAME, str(error), USER_ERROR)
     except Interrupted as stop:
         if distributed.is_worker_rank(cfg):
-            sys.exit(INTERRUPTED)  # the first process says it for all
-        # To Hydra, this is an error like any other.
-        again = "The same command with hydra.sweep.dir={} goes on with the sweep."
+            sys.exit(INTERRUPTED)  # rank 0 prints the message
+        # Hydra passes this on like any other error.
+        again = "Run the same command with hydra.sweep.dir={} to continue the sweep."
         swept = hydra_cfg.mode == RunMode.MULTIRUN
         text = again.format(os.path.relpath(hydra_cfg.sweep.dir)) if swept else str(stop)
         raise KeyboardInterrupt(text) from None

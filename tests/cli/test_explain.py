@@ -1,0 +1,33 @@
+"""Mistakes in settings end in one line."""
+
+import pytest
+
+from tests.support.command_line import TINY_WITH_PICTURES, call
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["sampler.alhpa=3"], "sampler.alpha"),
+        (["sampler=mosp"], "mops"),
+        (["task=registration", "task/lss=quaternion"], "Did you mean 'task/loss'"),
+        (["sampler.log=2"], "sampler.log: no such setting"),
+        (["sampler.feature_channels=[8]"], "Write +sampler.feature_channels=..."),
+        (["learn=smapler"], "Did you mean 'sampler'"),
+        (["m=4096"], "dataset.n_points=4096"),
+        (["trainer=gpu", *TINY_WITH_PICTURES[1:]], "Try trainer=auto or trainer=cpu"),
+        (["m=abc"], "m must be a whole number"),
+        (["dataset=modelnet40", "dataset.root=nowhere"], "dataset.root"),
+        (["dataset.classes=[chiar]"], "chair"),
+        (["ckpt_path=last", *TINY_WITH_PICTURES], "ckpt_path=last"),
+        ([*TINY_WITH_PICTURES, "dataset.classes=[chair]"], "num_classes must be at least 2"),
+        (["weights=nowhere.pt", *TINY_WITH_PICTURES], "no file nowhere.pt"),
+    ],
+)
+def test_mistake_ends_in_one_line(arguments, said, tmp_path):
+    status, _, err = call(arguments, tmp_path)
+    assert status == 2
+    assert said in err
+    assert "Traceback" not in err
+    assert err.startswith("mops_lightning: ")
+    assert len(err.strip().splitlines()) == 1

@@ -1,0 +1,66 @@
+"""Runs that are stopped and resumed by the same command."""
+
+import signal
+import time
+
+import pytest
+import torch
+
+from mops_lightning.records import run_record
+from tests.support.command_line import TINY_WITH_PICTURES, call, runs, start
+
+
+def final_state(run):
+    return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+
+
+LONGER = [*TINY_WITH_PICTURES, "trainer.max_epochs=6", "dataset.train_per_class=12"]
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("unbroken")
+    status, out, err = call(LONGER, folder)
+    assert status == 0, err
+    (run,) = runs(folder)
+    return folder, final_state(run)
+
+
+@pytest.mark.parametrize(
+    ("number", "left"), [(signal.SIGINT, "interrupted"), (signal.SIGKILL, "running")]
+)
+def test_run_stopped_mid_epoch_resumes_to_same_weights(unbroken, number, left):
+    folder, want = unbroken
+    out = f"stopped-{left}"
+    process = start([*LONGER, f"out={out}"], folder)
+    for line in process.stdout:
+        if line.startswith("epoch 2/"):
+            break
+    time.sleep(0.05)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    (run,) = (path.parent for path in (folder / out).rglob("result.json"))
+    assert run_record.read(run)["status"] == left
+    if number == signal.SIGINT:
+        assert process.returncode == 130
+        assert "ckpt_path=" in err
+        assert "Traceback" not in err
+    status, _, err = call([*LONGER, f"out={out}", "ckpt_path=last"], folder)
+    assert status == 0, err
+    (resumed,) = (path.parent for path in (folder / out).rglob("result.json") if path.parent != run)
+    assert run_record.read(resumed)["notes"]["resumed_from"] == str(
+        (run / "checkpoints" / "last.ckpt").relative_to(folder)
+    )
+    got = final_state(resumed)
+    assert got.keys() == want.keys()
+    different = [name for name in want if not torch.equal(got[name], want[name])]
+    assert different == []
+
+
+def test_checkpoint_of_other_settings_is_rejected(unbroken):
+    folder, _ = unbroken
+    (run,) = runs(folder)
+    arguments = [*LONGER, "m=4", f"ckpt_path={run.relative_to(folder)}", "out=wrong"]
+    status, out, err = call(arguments, folder)
+    assert status == 2
+    assert "other settings (sampler" in err

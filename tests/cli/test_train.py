@@ -1,0 +1,240 @@
+"""Training from the command line, as a user types it."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from mops_lightning.records import run_record
+from mops_lightning.zoo import weights
+from tests.support.command_line import (
+    TINY_ANY_DATA,
+    TINY_WITH_PICTURES,
+    call,
+    call_anew,
+    runs,
+)
+
+
+@pytest.fixture(scope="module")
+def main_job(tmp_path_factory):
+    """The main job, small, once: its folder, its run's folder and what it printed."""
+    folder = tmp_path_factory.mktemp("main")
+    status, out, err = call_anew(TINY_WITH_PICTURES, folder)
+    assert status == 0, err
+    (run,) = runs(folder)
+    return folder, run, out, err
+
+
+def test_main_job_prints_scores_and_output_paths(main_job):
+    folder, run, out, err = main_job
+    assert "training it first" in out
+    for word in ("random", "voxel", "fps", "generated", "matched", "completed", "accuracy"):
+        assert word in out
+    last = out.strip().splitlines()[-1]
+    for name in ("result.json", "checkpoints/last.ckpt", "pictures", "tensorboard"):
+        assert name in last
+        assert (run / name).exists()
+    assert err == "", "nothing but the result is said"
+
+
+def test_main_job_writes_complete_record(main_job):
+    folder, run, *_ = main_job
+    record = run_record.read(run)
+    assert record["status"] == "completed"
+    assert record["overrides"] == TINY_WITH_PICTURES
+    for readout in ("random", "voxel", "fps", "generated", "matched", "completed", "full"):
+        assert 0 <= record["metrics"][f"test/{readout}/accuracy"] <= 1
+    assert record["score"] == record["metrics"]["test/generated/accuracy"]
+    assert record["seconds"]["total"] > record["seconds"]["fit"] > 0
+    assert record["device"] == "cpu"
+    assert record["notes"]["test_clouds"] == 3 * len(record["config"]["dataset"]["classes"])
+
+
+def test_main_job_writes_weights_pictures_and_curves(main_job):
+    folder, run, *_ = main_job
+    content = weights.read(run / "weights.pt")
+    assert content["state"]["queries.weight"].shape[0] == 8
+    for name in ("clouds.png", "matrix.png"):
+        assert (run / "pictures" / name).read_bytes().startswith(b"\x89PNG")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    tags: dict[str, set[str]] = {}
+    for path in (run / "tensorboard").rglob("events*"):
+        accumulator = EventAccumulator(str(path))
+        accumulator.Reload()
+        for kind, names in accumulator.Tags().items():
+            if isinstance(names, list):
+                tags.setdefault(kind, set()).update(names)
+    for tag in ("train/loss/cross_entropy", "train/loss/subset", "train/tau", "lr-Adam"):
+        assert tag in tags["scalars"]
+    assert "test/generated/accuracy" in tags["scalars"]
+    assert "val/matched/accuracy" in tags["scalars"]
+    assert {"clouds", "matrix"} <= tags["images"]
+    assert any(tag.startswith("generated/0_") for tag in tags["tensors"])
+    assert any("hparams" in tag for kind in tags.values() for tag in kind)
+
+
+def test_second_run_uses_cached_task_net(main_job):
+    folder, *_ = main_job
+    status, out, err = call([*TINY_WITH_PICTURES, "sampler=fps", "m=4"], folder)
+    assert status == 0, err
+    assert "training it first" not in out
+    record = run_record.read(runs(folder)[-1 if "fps" in str(runs(folder)[-1]) else 0])
+    assert record["status"] == "completed"
+    assert "test/sampled/accuracy" in record["metrics"]
+    assert "weights" not in record["files"]
+
+
+def test_sweep_with_failed_cell_completes_the_rest(main_job):
+    folder, *_ = main_job
+    fixed = ["out=sweep", "hydra.sweep.dir=sweep/cells"]
+    status, out, err = call(
+        ["-m", *TINY_WITH_PICTURES, "sampler=random", "m=4,65,8", *fixed], folder
+    )
+    assert status == 1
+    assert "sweep/cells/1 failed: m must be at most dataset.n_points=64, got m=65" in out
+    assert "3 cells: 2 completed, 1 failed; in sweep/cells" in out
+    assert "Traceback" not in out + err
+    found = sorted((folder / "sweep").rglob("result.json"))
+    assert [json.loads(p.read_text())["config"]["m"] for p in found] == [4, 8]
+    # Only the cells of this start count, not what an earlier one has left.
+    status, out, err = call(["-m", *TINY_WITH_PICTURES, "sampler=random", "m=4", *fixed], folder)
+    assert status == 0, out + err
+    assert "1 cells: 1 completed; in sweep/cells" in out
+
+
+def test_joint_training_starts_from_cached_task_net(main_job):
+    folder, *_ = main_job
+    status, out, err = call([*TINY_WITH_PICTURES, "learn=joint", "out=joint"], folder)
+    assert status == 0, err
+    assert "training it first" not in out
+    (path,) = (folder / "joint").rglob("result.json")
+    before = next((folder / "cache" / "weights").rglob("weights.pt"))
+    after = weights.read(path.parent / "task_weights.pt")
+    assert after["sha256"] != weights.read(before)["sha256"]
+
+
+def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
+    settings = [
+        *TINY_WITH_PICTURES,
+        "task=registration",
+        "sampler=fmops",
+        "sampler.m_max=16",
+        "pictures=1",
+    ]
+    status, out, err = call([*settings, "learn=joint"], tmp_path)
+    assert status == 0, err
+    assert "training it first" in out
+    assert "registration by pcrnet, shapes, rotation error (°), test" in out
+    (run,) = runs(tmp_path)
+    record = run_record.read(run)
+    assert 0 < record["metrics"]["test/m16/matched/rotation_error_p90_deg"] < 180
+    assert record["score"] == record["metrics"]["test/m8/generated/rotation_error_deg"]
+    assert {path.name for path in (run / "pictures").iterdir()} == {
+        "clouds.npz",
+        "clouds.png",
+        "matrix.png",
+        "pairs.png",
+    }
+    assert (run / "task_weights.pt").is_file()
+    status, out, err = call(
+        [f"evaluate={run}", "task/net=icp", "task.pairs.overlap=0.8", "pictures=0"], tmp_path
+    )
+    assert status == 0, err
+    assert "registration by icp" in out
+    status, _, err = call(["task=registration", "task/net=icp", *TINY_WITH_PICTURES], tmp_path)
+    assert status == 2
+    assert "learn=sampler: ICP has no weights" in err
+
+
+def test_cfg_job_prints_config(tmp_path):
+    status, out, err = call(["--cfg", "job", "m=64"], tmp_path)
+    assert (status, err) == (0, "")
+    assert "m: 64" in out
+
+
+def test_failed_run_writes_record_with_error(tmp_path):
+    root = tmp_path / "broken"
+    root.mkdir()
+    (root / "shape_names.txt").write_text("a\nb\n")
+    for split in ("train", "test"):
+        (root / f"{split}_files.txt").write_text(f"ply_data_{split}0.h5\n")
+        with h5py.File(root / f"ply_data_{split}0.h5", "w") as file:
+            file["data"] = np.zeros((4, 32, 3), np.float32)
+            file["label"] = np.zeros((4, 1), np.uint8)
+    path = root / "ply_data_test0.h5"
+    path.write_bytes(path.read_bytes()[:700])
+    settings = ["dataset=modelnet40", "dataset.root=broken", "dataset.n_points=32", "m=4"]
+    status, out, err = call(settings, tmp_path)
+    assert status == 2
+    assert "ply_data_test0.h5" in err
+    (run,) = runs(tmp_path)
+    record = run_record.read(run)
+    assert record["status"] == "failed"
+    assert "ply_data_test0.h5" in record["error"]
+
+
+def test_real_modelnet40_trains(real_data, tmp_path):
+    root = (real_data / "modelnet40_hdf5_1024").resolve()
+    if not root.is_dir():
+        pytest.skip(f"no modelnet40_hdf5_1024 in {real_data}")
+    settings = [*TINY_ANY_DATA, "pictures=2"]
+    data = ["dataset=modelnet40", f"dataset.root={root}", "dataset.classes=[cup,bowl]"]
+    status, out, err = call([*settings, *data, "sampler.alpha=10", "sampler.tau_min=0.2"], tmp_path)
+    assert status == 0, err
+    (run,) = runs(tmp_path)
+    notes = run_record.read(run)["notes"]
+    assert (notes["train_clouds"], notes["test_clouds"]) == (79 + 64, 20 + 20)
+
+
+def test_folder_of_meshes_trains(tmp_path):
+    import trimesh
+
+    for name, mesh in (("ball", trimesh.creation.icosphere()), ("box", trimesh.creation.box())):
+        for split, number in (("train", 9), ("test", 2)):
+            folder = tmp_path / "mine" / name / split
+            folder.mkdir(parents=True)
+            for i in range(number):
+                mesh.export(folder / f"{i}.off")
+    settings = [*TINY_ANY_DATA, "pictures=2"]
+    status, out, err = call([*settings, "dataset=meshes", "dataset.root=mine"], tmp_path)
+    assert status == 0, err
+    (run,) = runs(tmp_path)
+    assert run_record.read(run)["notes"]["skipped_meshes"] == 0
+
+
+def test_flexible_sampler_is_tested_at_all_sizes_and_evaluated(main_job):
+    folder, *_ = main_job
+    status, out, err = call([*TINY_WITH_PICTURES, "sampler=fmops", "sampler.m_max=32"], folder)
+    assert status == 0, err
+    for word in ("m=8", "m=16", "m=32", "fmops completed", "all points"):
+        assert word in out
+    run = next(path for path in runs(folder) if path.parent.name == "fmops-m32")
+    before = run_record.read(run)
+    status, out, err = call([f"evaluate={run}", "sizes=[3,16]", "pictures=0"], folder)
+    assert status == 0, err
+    again = next(path for path in runs(folder) if path.parent.name == "fmops-m32-evaluated")
+    after = run_record.read(again)
+    name = "test/m16/completed/accuracy"
+    assert after["metrics"][name] == before["metrics"][name]
+    assert "test/m3/matched/accuracy" in after["metrics"]
+    status, _, err = call([f"evaluate={run}", "sampler.tau_min=0.5"], folder)
+    assert status == 2
+    assert err.count("\n") == 1
+    assert "sampler.tau_min is 0.5 here and was 0.1" in err
+
+
+def test_weights_of_another_net_are_rejected(main_job):
+    folder, run, *_ = main_job
+    other = next((folder / "cache" / "weights").rglob("weights.pt"))
+    settings = [
+        *TINY_WITH_PICTURES,
+        f"weights={other}",
+        "dataset.classes=[chair,table]",
+        "out=other",
+    ]
+    status, out, err = call(settings, folder)
+    assert status == 2
+    assert "holds another net's weights" in err
