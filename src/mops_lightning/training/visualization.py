@@ -1,6 +1,6 @@
 """The callback that draws the same few test clouds during training and after the test."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import torch
 from lightning.fabric.utilities import move_data_to_device
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from mops_lightning.records.readout_names import FULL
@@ -54,54 +55,69 @@ class CloudVisualization(Callback):
         """Draw into TensorBoard and as PNG."""
         self._draw(trainer, pl_module, self.folder)
 
-    @torch.no_grad()
     def _draw(self, trainer: L.Trainer, module: L.LightningModule, folder: Path | None) -> None:
-        if not trainer.is_global_zero:
-            return
+        """Draw with the nets as they are; PNGs and baselines only where there is a folder."""
         board = trainer.logger if isinstance(trainer.logger, TensorBoardLogger) else None
-        if board is None and folder is None:
+        if not trainer.is_global_zero or (board is None and folder is None):
             return
-        sampler: Any = module.sampler
-        task: Any = module.task
-        m: Any = module.m
         training = module.training
         module.eval()
         batch = move_data_to_device(self.batch, module.device)
-        beside: Any = module.baselines
-        # Baselines do not change in training, so they are drawn once, at the end.
-        baselines = dict(beside.items()) if folder is not None else {}
-        points = batch.points
-        methods = {name: baseline(points, m).points for name, baseline in baselines.items()}
-        output = None if sampler is None else sampler(points, m)
-        sampled = {} if output is None else readouts(points, {m: output}, sampler)[m]
-        figures = task.figures(batch, {**methods, **(sampled or {FULL: points})}, self.titles)
-        titles = task.cloud_titles(self.titles)
-        if output is not None:
-            figures["clouds"] = cloud_grid(points, sampled, titles)
-            matrix = output.matrix
-            if matrix is not None and points.shape[1] * len(matrix.queries) <= DENSE_PIXELS:
-                first = matrix._replace(keys=matrix.keys[:1])
-                figures["matrix"] = matrix_figure(first.dense()[0], first.gram()[0], titles[0])
-        if folder is not None and sampled:
-            save_clouds(folder / CLOUDS, points, sampled, titles)
+        figures, samples = self._figures(module, batch, with_baselines=folder is not None)
         module.train(training)
-        step = trainer.global_step
-        for name, figure in figures.items():
-            if folder is not None:
+        task: Any = module.task
+        titles = task.cloud_titles(self.titles)
+        if folder is not None:
+            if samples:
+                save_clouds(folder / CLOUDS, batch.points, samples, titles)
+            for name, figure in figures.items():
                 save_figure(figure, folder / f"{name}.png")
-            if board is not None:
-                board.experiment.add_figure(name, figure, step)
         if board is not None:
-            for name, chosen in sampled.items():
-                for number, title in enumerate(titles):
-                    vertices, colours = _coloured(points[number], chosen[number], name)
-                    board.experiment.add_mesh(
-                        f"{name}/{number}_{title}",
-                        vertices=vertices,
-                        colors=colours,
-                        config_dict={"material": {"cls": "PointsMaterial", "size": 0.03}},
-                        global_step=step,
-                    )
+            for name, figure in figures.items():
+                board.experiment.add_figure(name, figure, trainer.global_step)
+            _add_meshes(board, batch.points, samples, titles, trainer.global_step)
+
+    @torch.no_grad()
+    def _figures(
+        self, module: Any, batch: Any, with_baselines: bool
+    ) -> tuple[dict[str, Figure], dict[str, Tensor]]:
+        """Return the figures by name, and the sampler's readouts of the batch."""
+        points, sampler, m = batch.points, module.sampler, module.m
+        # Baselines do not change in training, so they are drawn once, at the end.
+        baselines = module.baselines.items() if with_baselines else ()
+        methods = {name: baseline(points, m).points for name, baseline in baselines}
+        if sampler is None:
+            return module.task.figures(batch, {**methods, FULL: points}, self.titles), {}
+        output = sampler(points, m)
+        samples = readouts(points, {m: output}, sampler)[m]
+        figures = module.task.figures(batch, {**methods, **samples}, self.titles)
+        titles = module.task.cloud_titles(self.titles)
+        figures["clouds"] = cloud_grid(points, samples, titles)
+        matrix = output.matrix
+        if matrix is not None and points.shape[1] * len(matrix.queries) <= DENSE_PIXELS:
+            first = matrix._replace(keys=matrix.keys[:1])
+            figures["matrix"] = matrix_figure(first.dense()[0], first.gram()[0], titles[0])
+        return figures, samples
+
+
+def _add_meshes(
+    board: TensorBoardLogger,
+    points: Tensor,
+    samples: Mapping[str, Tensor],
+    titles: Sequence[str],
+    step: int,
+) -> None:
+    """Show every cloud with each readout, to be turned with the mouse."""
+    for name, chosen in samples.items():
+        for number, title in enumerate(titles):
+            vertices, colours = _coloured(points[number], chosen[number], name)
+            board.experiment.add_mesh(
+                f"{name}/{number}_{title}",
+                vertices=vertices,
+                colors=colours,
+                config_dict={"material": {"cls": "PointsMaterial", "size": 0.03}},
+                global_step=step,
+            )
 
 
 def _coloured(points: Tensor, samples: Tensor, readout: str) -> tuple[Tensor, Tensor]:

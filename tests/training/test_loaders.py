@@ -1,0 +1,40 @@
+import torch
+
+from mops_lightning.training.loaders import clouds_to_draw, num_held_out, split
+from tests.support.training import small_dataset
+
+
+def rows(part, whole):
+    """Rows of a part's clouds in the whole split."""
+    return [int((whole == cloud).all(2).all(1).nonzero()) for cloud in part]
+
+
+def test_split_holds_out_fraction_in_order():
+    clouds = small_dataset(train=20).train
+    train, held_out = split(clouds, 0.2, seed=5)
+    kept, out = rows(train.points, clouds.points), rows(held_out.points, clouds.points)
+    assert len(out) == num_held_out(clouds, 0.2) == 4
+    assert sorted([*kept, *out]) == list(range(20))
+    assert (kept, out) == (sorted(kept), sorted(out))
+    assert torch.equal(held_out.labels, clouds.labels[out])
+
+
+def test_split_other_seed_holds_out_others():
+    clouds = small_dataset(train=20).train
+    first, again, other = (split(clouds, 0.2, seed)[1].points for seed in (5, 5, 6))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_split_zero_fraction_holds_out_nothing():
+    train, held_out = split(small_dataset(train=20).train, 0.0, seed=5)
+    assert (len(train.points), len(held_out.points)) == (20, 0)
+
+
+def test_clouds_to_draw_spreads_over_classes():
+    dataset = small_dataset()
+    chosen, names = clouds_to_draw(dataset, 2)
+    assert names == ["long", "round"]
+    assert dataset.test.labels[chosen].tolist() == [0, 2]
+    assert clouds_to_draw(dataset, 9)[1] == ["long", "tall", "round"]
+    assert clouds_to_draw(dataset, 0)[1] == []
