@@ -26,22 +26,22 @@ def test_axes_of_differing_settings_need_mixed(tmp_path):
 def test_axes_one_differing_setting_gives_columns(tmp_path):
     for noise in (0.0, 0.1, 0.02):
         values = {"generated": 1 + noise, "full": 0.5 + noise}
-        put_cell(tmp_path, f"a{noise}", "mops", values, noise=noise)
-        put_cell(tmp_path, f"b{noise}", "fps", {"sampled": 2 + noise}, noise=noise)
+        put_cell(tmp_path, f"a{noise}", "mops", values, test_noise_std=noise)
+        put_cell(tmp_path, f"b{noise}", "fps", {"sampled": 2 + noise}, test_noise_std=noise)
     assert rows(table(tmp_path)) == [
-        ["sampled by", "noise=0.0", "noise=0.02", "noise=0.1"],
+        ["sampled by", "test_noise_std=0.0", "test_noise_std=0.02", "test_noise_std=0.1"],
         ["fps", "2", "2.02", "2.1"],
         ["mops", "1", "1.02", "1.1"],
         ["all points", "0.5", "0.52", "0.6"],
     ]
-    put_cell(tmp_path, "c", "mops", {"generated": 1.0}, noise=0.0, m=8)
-    with pytest.raises(UserError, match=r"differ in size \(m=8, m=32\) and in noise.*--mixed"):
+    put_cell(tmp_path, "c", "mops", {"generated": 1.0}, test_noise_std=0.0, m=8)
+    with pytest.raises(UserError, match=r"differ in size .* and in test_noise_std.*--mixed"):
         table(tmp_path)
 
 
 def test_axes_mixed_sizes_and_settings_give_columns_by_size(tmp_path):
-    put_cell(tmp_path, "a", "mops", {"generated": 1.0}, noise=0.0, m=32)
-    put_cell(tmp_path, "b", "mops", {"generated": 2.0}, noise=0.1, m=8)
+    put_cell(tmp_path, "a", "mops", {"generated": 1.0}, test_noise_std=0.0, m=32)
+    put_cell(tmp_path, "b", "mops", {"generated": 2.0}, test_noise_std=0.1, m=8)
     assert rows(table(tmp_path, mixed=True))[:2] == [
         ["sampled by", "m=32", "m=8"],
         ["mops", "1", "2"],

@@ -44,11 +44,14 @@ def test_curves_show_values_by_size(tmp_path):
 def test_clouds_by_column_draws_each_noise_level(tmp_path, rng):
     for noise in (0.0, 0.1):
         for name, readout in (("mops", "generated"), ("fps", "sampled")):
-            path = put_cell(tmp_path, f"{name}{noise}", name, {readout: 1.0}, noise=noise)
+            path = put_cell(tmp_path, f"{name}{noise}", name, {readout: 1.0}, test_noise_std=noise)
             content = json.loads(path.read_text())
             path.write_text(json.dumps({**content, "files": {"clouds": "clouds.npz"}}))
             points = torch.rand(1, 40, 3, generator=rng)
             save_clouds(path.parent / "clouds.npz", points, {readout: points[:, :4]}, ["chair"])
     figure = plots(build(tmp_path))["clouds"]
-    assert [axes.get_title() for axes in figure.axes[:2]] == ["noise=0", "noise=0.1"]
+    assert [axes.get_title() for axes in figure.axes[:2]] == [
+        "test_noise_std=0",
+        "test_noise_std=0.1",
+    ]
     assert len(figure.axes) == 4

@@ -71,7 +71,7 @@ def test_other_sizes_and_other_data(trained, tmp_path):
 
 def test_noise_is_added_to_test_clouds_alone(trained, tmp_path):
     _, record = trained
-    noisy = evaluated(trained, tmp_path, "noise=0.5")
+    noisy = evaluated(trained, tmp_path, "test_noise_std=0.5")
     key = "test/m8/generated/subset_distance"
     assert noisy.metrics[key] != record.metrics[key]
     for note in ("dataset_fingerprint", "task_weights_sha256"):
@@ -145,7 +145,7 @@ def test_a_task_net_alone_is_tested_on_other_data(tmp_path):
     assert again.metrics == made.metrics
     assert "fit" not in again.seconds
     assert not (tmp_path / "same" / "new" / "weights.pt").exists()
-    more = evaluated(folder, tmp_path / "more", "dataset.n_points=90", "noise=0.01")
+    more = evaluated(folder, tmp_path / "more", "dataset.n_points=90", "test_noise_std=0.01")
     assert more.config["task"]["net"]["n_points"] == 90
     assert more.score != made.score
     with pytest.raises(UserError, match="is a task net itself; leave weights out"):

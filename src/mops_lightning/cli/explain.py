@@ -4,8 +4,9 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from mops_lightning.config import settings
 from mops_lightning.config.compose import conf_dir
-from mops_lightning.config.validate import GROUPS, LEARN, RUN_KEYS
+from mops_lightning.config.validate import misfit_of
 from mops_lightning.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
@@ -16,6 +17,9 @@ def explain(error: BaseException) -> str:
     """Turn an error into one line that names the setting and the nearest known one."""
     from hydra.errors import MissingConfigException
 
+    refused = misfit_of(error)
+    if refused is not None:
+        return str(refused)
     texts = []
     cause: BaseException | None = error
     while cause is not None:
@@ -32,7 +36,7 @@ def explain(error: BaseException) -> str:
         if "Interpolation key 'labels." in text:
             # labels.${learn} names the run's folder, so Hydra finds a wrong learn first.
             value = text.split("'labels.")[1].split("'")[0]
-            return f"learn: unknown value {value!r}.{did_you_mean(value, LEARN)}"
+            return f"learn: unknown value {value!r}.{did_you_mean(value, settings.LEARN)}"
         if "Could not override '" in text:
             key = text.split("Could not override '")[1].split("'")[0]
             return _no_such_setting(key)
@@ -74,9 +78,10 @@ def _no_such_setting(key: str) -> str:
 def _composed(groups: Sequence[str]) -> "DictConfig":
     """Compose the groups that the command line chooses, without its other settings."""
     from mops_lightning.config.compose import compose
+    from mops_lightning.config.overrides import key
 
     try:
-        return compose([part for part in sys.argv[1:] if part.split("=")[0] in groups])
+        return compose([part for part in sys.argv[1:] if key(part) in groups])
     except Exception:  # the mistake may be among them
         return compose()
 
@@ -85,7 +90,7 @@ def _known_keys(cfg: "DictConfig") -> list[str]:
     """List every key of a configuration, dotted."""
     from omegaconf import DictConfig
 
-    keys = [*RUN_KEYS, *GROUPS]
+    keys = list(settings.declared())
 
     def walk(node: DictConfig, prefix: str) -> None:
         for key in node:

@@ -17,6 +17,8 @@ from filelock import FileLock, Timeout
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
+from mops_lightning.config import settings
+from mops_lightning.config.declaration import Affects
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records import run_record
 from mops_lightning.records.attempts import ASIDE, FAILED
@@ -26,18 +28,6 @@ BEGUN = ".begun"
 
 STAYS = (ASIDE, ".hydra", ".lock", "cli.log")
 """What belongs to the cell and not to an attempt."""
-
-MAY_DIFFER = (
-    "ckpt_path",
-    "out",
-    "cache",
-    "dataset.cache",
-    "dataset.workers",
-    "logger",
-    "pictures",
-    "task.emd_workers",
-)
-"""Settings that change where things lie or how many processes there are, and no result."""
 
 log = logging.getLogger(__name__)
 
@@ -141,8 +131,7 @@ def _differences(cfg: DictConfig, record: dict[str, Any]) -> dict[str, tuple[Any
     return {
         key: (mine.get(key), theirs.get(key))
         for key in {**mine, **theirs}
-        if mine.get(key) != theirs.get(key)
-        and not any(key == name or key.startswith(f"{name}.") for name in MAY_DIFFER)
+        if mine.get(key) != theirs.get(key) and settings.of(key).affects is not Affects.NOTHING
     }
 
 

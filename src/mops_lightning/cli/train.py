@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from mops_lightning.cli.commands import help_lines
 from mops_lightning.config.compose import conf_dir
+from mops_lightning.config.overrides import key
 from mops_lightning.errors import INTERRUPTED, USER_ERROR, Interrupted, UserError, end
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def _run() -> None:
     # Makes Hydra raise instead of printing its own shortened traceback.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
-        if any(argument.lstrip("+").startswith("evaluate=") for argument in sys.argv):
+        if any(key(argument) == "evaluate" for argument in sys.argv[1:]):
             from mops_lightning.training.evaluate import command_line
 
             sys.argv[1:] = command_line(sys.argv[1:])

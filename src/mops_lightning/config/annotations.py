@@ -25,7 +25,7 @@ def misfit(value: Any, annotation: Any) -> str | None:
     Returns:
         Such as "a whole number or null"; None where the value fits.
     """
-    return None if _fits(value, annotation) else _describe(annotation)
+    return None if _fits(value, annotation) else describe(annotation)
 
 
 def _fits(value: Any, annotation: Any) -> bool:
@@ -52,10 +52,11 @@ def _fits(value: Any, annotation: Any) -> bool:
     )
 
 
-def _describe(annotation: Any) -> str:
+def describe(annotation: Any) -> str:
+    """Say in words what an annotation wants."""
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin in (Union, types.UnionType):
-        wanted = [_describe(part) for part in inner if getattr(part, "__name__", "") != "Tensor"]
+        wanted = [describe(part) for part in inner if getattr(part, "__name__", "") != "Tensor"]
         return " or ".join(dict.fromkeys(wanted))
     if origin is Literal:
         return " or ".join(map(str, inner))

@@ -3,7 +3,9 @@
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
+from mops_lightning.config.validate import misfit_of
 from mops_lightning.errors import UserError
 
 
@@ -28,13 +30,23 @@ def compose(overrides: list[str] | None = None) -> DictConfig:
 
     Args:
         overrides: such as ``["m=64", "sampler=fps"]``.
+
+    Raises:
+        UserError: a run-level setting has a value of another type.
     """
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
     from hydra.core.hydra_config import HydraConfig
+    from hydra.errors import HydraException
 
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = hydra_compose("config", overrides=overrides or [], return_hydra_config=True)
+    try:
+        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            cfg = hydra_compose("config", overrides=overrides or [], return_hydra_config=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        refused = misfit_of(error)
+        if refused is None:
+            raise
+        raise refused from None
     HydraConfig.instance().set_config(cfg)
     plain = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
     # Names come from Hydra's choices; resolved here they outlive the global HydraConfig.

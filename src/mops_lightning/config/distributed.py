@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from omegaconf import DictConfig, OmegaConf
 
+from mops_lightning.config.overrides import key
 from mops_lightning.errors import UserError
 
 RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "SLURM_PROCID")
@@ -45,7 +46,7 @@ def check_start(cfg: DictConfig, hydra_overrides: Sequence[str]) -> None:
             f"{number} processes were started (WORLD_SIZE), but trainer.devices=1. Give "
             "trainer=ddp trainer.devices=N, as many as on this host, or start one process."
         )
-    named = any(override.startswith("hydra.run.dir=") for override in hydra_overrides)
+    named = "hydra.run.dir" in map(key, hydra_overrides)
     if started_together(cfg) and not named:
         raise UserError(
             "hydra.run.dir: processes that were started together need one folder. Give "

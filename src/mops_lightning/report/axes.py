@@ -3,15 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
+from mops_lightning.config import settings
 from mops_lightning.errors import UserError
-from mops_lightning.records.run_record import dotted
 from mops_lightning.report.collect import Record, epochs
-
-CONSIDERED = ("sampler", "optimizer", "task", "augment", "batch_size", "noise", "task_rate")
-"""Settings that may change a result and are not compared as a whole; see ``comparable``."""
-
-SIZES = ("sampler.m", "sampler.m_max", "sampler.seed")
-"""Settings that differ between the cells of one row, or between seeds."""
 
 
 @dataclass(frozen=True)
@@ -75,21 +69,14 @@ def varying(found: list[Record]) -> list[str]:
     """Return the dotted settings in which records of one sampler differ."""
     flat = [considered(record) for record in found]
     keys = sorted({key for one in flat for key in one})
-    return [key for key in keys if len({repr(one.get(key)) for one in flat}) > 1]
+    return [key for key in keys if len({_text(one.get(key)) for one in flat}) > 1]
 
 
 def considered(record: Record) -> dict[str, Any]:
     """Return the settings that are compared, with dotted keys, and the epochs trained."""
     config = record["config"]
     learn = (record["notes"].get("evaluated") or {}).get("learn", config["learn"])
-    nodes = {key: config[key] for key in CONSIDERED if key in config}
-    if isinstance(nodes.get("augment"), dict):
-        nodes["augment"] = nodes["augment"].get(learn)
-    nodes.setdefault("noise", 0.0)  # records from before there was noise
-    return {
-        **{key: value for key, value in dotted(nodes).items() if key not in SIZES},
-        "trainer.max_epochs": epochs(record),
-    }
+    return {**settings.compared_by(config, learn), "trainer.max_epochs": epochs(record)}
 
 
 def value(record: Record, key: str) -> Any:
@@ -106,3 +93,8 @@ def row(record: Record, net: str) -> str:
 def _numeric(found: list[Record], key: str) -> bool:
     values = [considered(record).get(key) for record in found if key in considered(record)]
     return all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
+
+
+def _text(value: Any) -> str:
+    """Return a value as text; numbers that are equal give the same text."""
+    return repr(float(value)) if type(value) is int else repr(value)

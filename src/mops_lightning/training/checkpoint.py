@@ -6,43 +6,30 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from mops_lightning.config import settings
 from mops_lightning.errors import UserError
-from mops_lightning.training.callbacks import CHECKPOINT, added
+from mops_lightning.training.callbacks import CHECKPOINT
 from mops_lightning.training.experiment import CHECKPOINT_KEY
 from mops_lightning.zoo import weights
+
+LENGTH = "trainer.max_epochs"
+"""How long a run was planned to be."""
 
 
 def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
     """Return what must be equal for a checkpoint to be resumed, as text by setting.
 
-    ``epochs`` is noted too, but may differ: a finished run may be made longer.
+    These are the settings that affect training (see ``config.settings``), and the content of the
+    files that the others name. ``LENGTH`` is one of them but may differ: a finished run may be made
+    longer.
+
+    Args:
+        cfg: the run's settings.
+        fingerprint: of the data.
     """
-    task: Any = OmegaConf.to_container(cfg.task, resolve=True)
-    task.pop("emd_workers", None)  # how many processes there are changes no result
-    if isinstance(task.get("pairs"), dict):
-        task["pairs"].pop("test_seed", None)  # of what is scored, not of what is learned
-    parts = {
-        "task": task,
-        "sampler": cfg.sampler if cfg.learn != "task" else None,
-        "optimizer": cfg.optimizer,
-        "augment": cfg.augment.get(cfg.learn),
-        "learn": cfg.learn,
-        "seed": cfg.seed,
-        "batch_size": cfg.batch_size,
-        **({"task_rate": cfg.task_rate} if cfg.learn == "joint" else {}),
-        "val_fraction": cfg.val_fraction,
-        "dataset": fingerprint,
-        "epochs": cfg.trainer.max_epochs,
-        **_given_weights(cfg),
-        **({"callbacks": added(cfg.callbacks)} if added(cfg.callbacks) else {}),
-    }
-    return {
-        name: json.dumps(
-            OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value,
-            sort_keys=True,
-        )
-        for name, value in parts.items()
-    }
+    plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    parts = {**settings.trained_with(plain), "dataset": fingerprint, **_given_weights(cfg)}
+    return {name: json.dumps(value, sort_keys=True) for name, value in parts.items()}
 
 
 def _given_weights(cfg: DictConfig) -> dict[str, str]:
@@ -54,7 +41,7 @@ def _given_weights(cfg: DictConfig) -> dict[str, str]:
 
 def lengthened(cfg: DictConfig, checkpoint: Path) -> bool:
     """Return whether ``checkpoint`` comes from a run of another planned length."""
-    return _read(checkpoint).get("epochs") != json.dumps(cfg.trainer.max_epochs)
+    return _read(checkpoint).get(LENGTH) != json.dumps(cfg.trainer.max_epochs)
 
 
 def find(cfg: DictConfig, mine: dict[str, str]) -> Path | None:
@@ -109,7 +96,7 @@ def _newest(out: Path, mine: dict[str, str]) -> Path:
 
 
 def _different(theirs: dict[str, str], mine: dict[str, str]) -> list[str]:
-    names = [name for name in {**mine, **theirs} if name != "epochs"]
+    names = [name for name in {**mine, **theirs} if name != LENGTH]
     return [name for name in names if theirs.get(name) != mine.get(name)]
 
 

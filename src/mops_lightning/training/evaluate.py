@@ -12,9 +12,10 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from mops_lightning.config import overrides, settings
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
-from mops_lightning.records import run_record
+from mops_lightning.records import migrate, run_record
 from mops_lightning.training.callbacks import CHECKPOINT
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.zoo import weights
@@ -23,18 +24,6 @@ from mops_lightning.zoo.load import RENAMED
 KEY = "evaluate"
 OF_RUN = "run"
 """``weights=run``: the task net that the evaluated run was trained with."""
-NOT_REPEATED = (
-    "ckpt_path",
-    "weights",
-    "learn",
-    "trainer",
-    "callbacks",
-    "optimizer",
-    "out",
-    "pictures",
-    KEY,
-)
-"""What a run was told about its training and its folders does not matter to its evaluation."""
 
 
 def command_line(arguments: list[str]) -> list[str]:
@@ -49,45 +38,65 @@ def command_line(arguments: list[str]) -> list[str]:
     Raises:
         UserError: RUN is no run with a trained sampler.
     """
-    places = [i for i, a in enumerate(arguments) if a.lstrip("+").startswith(f"{KEY}=")]
-    chosen = arguments[places[-1]].split("=", 1)[1].strip("'\"") if places else ""
-    if chosen in ("", "null"):
+    places = [i for i, a in enumerate(arguments) if overrides.key(a) == KEY]
+    chosen = _chosen(arguments[places[-1]]) if places else None
+    if not chosen:
         return arguments
     folder = Path(chosen).expanduser()
     record = trained_run(folder)
     names = record["config"]["names"]
     groups = {"task": names["task"], "dataset": names["dataset"], "sampler": names["sampler"]}
-    typed = [a for i, a in enumerate(arguments) if i not in places and not a.startswith("-")]
+    typed = [a for i, a in enumerate(arguments) if i not in places and overrides.key(a)]
     # Naming what the run has anyway changes nothing, its settings below it stay too.
-    typed_keys = [_key(a) for a in typed if a not in [f"{k}={v}" for k, v in groups.items()]]
-    repeated = [a for a in record["overrides"] if _key(a) not in groups]
-    repeated = [f"{group}={name}" for group, name in groups.items()] + repeated
-    given = {_key(a) for a in typed}
+    typed_keys = [
+        overrides.key(a) for a in typed if a not in [f"{k}={v}" for k, v in groups.items()]
+    ]
+    earlier = [_present(a) for a in record["overrides"] if overrides.key(a) not in groups]
+    earlier = [f"{group}={name}" for group, name in groups.items()] + earlier
     kept = [
         a
-        for a in repeated
-        if not any(_covers(key, _key(a)) for key in (*typed_keys, *NOT_REPEATED))
+        for a in earlier
+        if settings.of(overrides.path(a)).repeated
+        and not any(_covers(key, overrides.key(a)) for key in typed_keys)
     ]
     _data_are_here(kept, folder)
-    quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
     learn = "task" if record["config"]["learn"] == "task" else "nothing"
-    own = [*kept, f"learn={learn}", f"weights={OF_RUN}", f"{KEY}='{quoted}'"]
+    own = [*kept, f"learn={learn}", f"weights={OF_RUN}", f"{KEY}={overrides.quote(str(folder))}"]
     # In one place: flags may stand before or behind all overrides, not between them.
     before = [a for i, a in enumerate(arguments[: places[0]]) if i not in places]
     behind = [a for i, a in enumerate(arguments) if i > places[0] and i not in places]
-    defaults = [a for a in own if _key(a) not in given]
+    given = {overrides.key(a) for a in typed}
+    defaults = [a for a in own if overrides.key(a) not in given]
     return [*before, *defaults, *behind]
 
 
-def _data_are_here(overrides: list[str], folder: Path) -> None:
+def _chosen(argument: str) -> str | None:
+    """Return the run that ``evaluate=RUN`` names."""
+    override = overrides.parse(argument)
+    if override is None or override.is_delete():
+        return None
+    if override.is_sweep_override():
+        raise UserError(f"{argument}: {KEY} takes one run. Start one evaluation for each.")
+    value = override.value()
+    return None if value is None else str(value)
+
+
+def _present(argument: str) -> str:
+    """Return an override of an earlier version as it is written now."""
+    key = overrides.key(argument)
+    return overrides.readable(argument).replace(key, migrate.new_path(key), 1)
+
+
+def _data_are_here(kept: list[str], folder: Path) -> None:
     """Refuse a folder of data that is named from where the run was started, which is elsewhere."""
-    for override in overrides:
-        key, _, value = override.partition("=")
-        path = Path(value.strip("'\"")).expanduser()
-        if key == "dataset.root" and value not in ("", "null") and not path.exists():
+    for argument in kept:
+        override = overrides.parse(argument)
+        if override is None or overrides.key(argument) != "dataset.root" or not override.value():
+            continue
+        if not Path(str(override.value())).expanduser().exists():
             raise UserError(
-                f"{KEY}: {folder} had its data in dataset.root={value}, which is not there, seen "
-                "from this folder. Say where they are: dataset.root=PATH."
+                f"{KEY}: {folder} had its data in {argument}, which is not there, seen from this "
+                "folder. Say where they are: dataset.root=PATH."
             )
 
 
@@ -99,8 +108,6 @@ def trained_run(folder: Path) -> dict[str, Any]:
     """
     if folder.name == run_record.FILE:
         folder = folder.parent
-    if not folder.is_dir() and "," in str(folder):
-        raise UserError(f"{KEY} takes one run, got {folder}. Start one evaluation for each.")
     if not folder.is_dir():
         raise UserError(f"{KEY}: no folder {folder}. Give the folder of a run, with result.json.")
     record = run_record.read(folder)
@@ -248,11 +255,6 @@ def _same_settings(
                 f"{KEY}: sampler.{key} is {new} here and was {old} when {folder} was trained; "
                 f"leave it out, or train a sampler with it.{hint}"
             )
-
-
-def _key(override: str) -> str:
-    """Return the key of ``++key=value`` or ``~key``."""
-    return override.split("=", 1)[0].lstrip("+~")
 
 
 def _covers(key: str, other: str) -> bool:

@@ -45,7 +45,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         identity=identity,
         sizes=sizes,
         m=cfg.m,
-        task_lr_scale=cfg.task_rate,
+        task_lr_scale=cfg.task_lr_scale,
     )
 
 

@@ -4,9 +4,8 @@ import hashlib
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 
 from mops_lightning.config import distributed
 from mops_lightning.data.clouds import CloudDataset
@@ -73,21 +72,7 @@ def task_config(cfg: DictConfig) -> DictConfig:
 
 def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
     """Return where the task net of these settings and data is kept, there or not."""
-    own = task_config(cfg)
-    # Where it runs and what it logs do not change the net; all else about the trainer may.
-    elsewhere = {
-        "accelerator",
-        "devices",
-        "num_nodes",
-        "strategy",
-        "log_every_n_steps",
-        "_target_",
-    }
-    trainer: dict[str, Any] = OmegaConf.to_container(own.trainer, resolve=True)  # type: ignore[assignment]
-    key = {
-        **checkpoint.identity(own, dataset.fingerprint),
-        "trainer": {name: value for name, value in trainer.items() if name not in elsewhere},
-    }
+    key = checkpoint.identity(task_config(cfg), dataset.fingerprint)
     digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:12]
     name = f"{cfg.names.task}-{cfg.names.net}-{cfg.names.dataset}-{digest}"
     return Path(cfg.cache).expanduser() / "weights" / name

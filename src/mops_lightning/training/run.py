@@ -73,5 +73,5 @@ def _load_data(cfg: DictConfig) -> CloudDataset:
     points = dataset.train.points.shape[1]
     if cfg.m > points:
         raise UserError(f"m must be at most the {points} points of a cloud, got m={cfg.m}.")
-    test_points = noisy(dataset.test.points, cfg.noise)
+    test_points = noisy(dataset.test.points, cfg.test_noise_std)
     return replace(dataset, test=dataset.test._replace(points=test_points))

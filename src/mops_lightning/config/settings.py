@@ -1,0 +1,351 @@
+"""The declaration of every setting of a run: its type, help, limits and what it affects.
+
+Help, validation, resuming, the cache of pretrained task nets, sweeps, ``evaluate`` and ``report``
+read it. A new setting is one field of ``RunSettings``; one inside a group that differs from its
+group is one line of ``INSIDE``.
+"""
+
+import textwrap
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cache
+from typing import Any, get_type_hints
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
+
+from mops_lightning.config.annotations import describe
+from mops_lightning.config.declaration import (
+    Affects,
+    Limits,
+    Setting,
+    about,
+    group,
+    number,
+    one_of,
+    table,
+    whole,
+)
+from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.records.run_record import dotted
+
+LEARN = ("task", "sampler", "joint", "nothing")
+"""What a run may train."""
+PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
+"""What ``trainer.precision`` may be; Lightning has more."""
+WITH_SAMPLER = ("sampler", "joint", "nothing")
+NAME = "run_settings"
+"""What the schema is called in the defaults list of ``conf/config.yaml``."""
+
+
+SIZES = Limits(
+    "auto or a list of whole numbers of at least 1",
+    lambda x: (
+        x == "auto"
+        or (isinstance(x, list) and bool(x) and all(type(m) is int and m >= 1 for m in x))
+    ),
+)
+
+
+@dataclass
+class RunSettings:
+    """The top level of the configuration."""
+
+    # Sizes and seeds make the rows and columns of a report, so that it does not compare them.
+    m: int = field(
+        default=32,
+        metadata=about(
+            "points that the sampler returns; for a net of many sizes, the size that is shown",
+            Affects.SCORES,
+            limits=whole(1),
+            compare=False,
+        ),
+    )
+    sizes: Any = field(
+        default="auto",
+        metadata=about(
+            "sizes tested in addition to m: auto (the usual sizes for a net of many sizes) or "
+            "[8,100,...]",
+            Affects.SCORES,
+            limits=SIZES,
+            compare=False,
+        ),
+    )
+    # What a run learned, its weights, data and task net are compared by the record's notes.
+    learn: str = field(
+        default="sampler",
+        metadata=about(
+            "what is trained: sampler (task net frozen), task (alone, full clouds), joint, nothing",
+            Affects.TRAINING,
+            limits=one_of(*LEARN),
+            repeat=False,
+            compare=False,
+        ),
+    )
+    seed: int = field(
+        default=0,
+        metadata=about(
+            "of weights, order, augmentation and procedural data",
+            limits=whole(0),
+            compare=False,
+        ),
+    )
+    weights: str | None = field(
+        default="auto",
+        metadata=about(
+            "task net: auto (cached, else trained first), a weights file, or null (untrained); "
+            "with learn=task the file that training starts from",
+            nullable=True,
+            by_content=True,
+            repeat=False,
+            compare=False,
+        ),
+    )
+    ckpt_path: str | None = field(
+        default=None,
+        metadata=about(
+            "resume training: last (newest run of these settings), a run folder or a .ckpt file",
+            Affects.NOTHING,
+            nullable=True,
+        ),
+    )
+    evaluate: str | None = field(
+        default=None,
+        metadata=about(
+            "test this trained run again, with other sizes=, dataset= or weights=; trains nothing",
+            nullable=True,
+            repeat=False,
+            compare=False,
+        ),
+    )
+    task_lr_scale: float = field(
+        default=1.0,
+        metadata=about(
+            "with learn=joint, the task net's learning rate as a share of the sampler's",
+            Affects.TRAINING,
+            limits=number("above 0", lambda x: x > 0),
+            learn=("joint",),
+        ),
+    )
+    batch_size: int = field(
+        default=32,
+        metadata=about(
+            "clouds per batch",
+            limits=whole(2),  # BatchNorm cannot learn from one cloud
+        ),
+    )
+    val_fraction: float = field(
+        default=0.05,
+        metadata=about(
+            "share of the training clouds held out for the curves under val/; never trained on",
+            Affects.TRAINING,
+            limits=number("of at least 0 and below 1", lambda x: 0 <= x < 1),
+        ),
+    )
+    test_noise_std: float = field(
+        default=0.0,
+        metadata=about(
+            "standard deviation of Gaussian noise on all coordinates of test clouds (0.1 is 10 %)",
+            Affects.SCORES,
+            limits=number("of at least 0", lambda x: x >= 0),
+        ),
+    )
+    pictures: int = field(
+        default=4,
+        metadata=about(
+            "number of test clouds in the pictures; 0 for none", Affects.NOTHING, limits=whole(0)
+        ),
+    )
+    out: str = field(
+        default="outputs",
+        metadata=about(
+            "folder for runs; every run makes a folder of its own below it",
+            Affects.NOTHING,
+        ),
+    )
+    cache: str = field(
+        default="${oc.env:MOPS_CACHE,'~/.cache/mops_lightning'}",
+        metadata=about(
+            "folder for generated data and pretrained task nets, shared between runs",
+            Affects.NOTHING,
+            repeat=True,  # where the run's data and task net are
+        ),
+    )
+    epochs: Any = field(
+        default=None, metadata=table("default number of epochs for each value of learn")
+    )
+    schedules: Any = field(
+        default=None, metadata=table("where these come from: the dataset's numbers for each task")
+    )
+    augment: Any = field(
+        default=None,
+        metadata=about(
+            "augmentation of the training clouds for each value of learn",
+            Affects.TRAINING,
+            per_learn=True,
+            repeat=True,
+        ),
+    )
+    pretrain: Any = field(
+        default=None,
+        metadata=about(
+            "epochs and optimizer with which weights=auto trains the task net",
+            learn=WITH_SAMPLER,
+            compare=False,
+        ),
+    )
+    paper: Any = field(default=None, metadata=table("settings that the paper fixes for this task"))
+    rivals: Any = field(
+        default=None,
+        metadata=table("settings that the publications of S-Net and SampleNet fix for this task"),
+    )
+    baselines: Any = field(
+        default=None,
+        metadata=about(
+            "index samplers that are tested for comparison with a learned one",
+            Affects.SCORES,
+            learn=WITH_SAMPLER,
+            compare=False,  # they have rows of their own
+        ),
+    )
+    labels: Any = field(
+        default=None, metadata=table("what a run's folder is called for each value of learn")
+    )
+    names: Any = field(
+        default=None,
+        metadata=about(
+            "the chosen groups' names; derived, not to be set", Affects.SCORES, compare=False
+        ),
+    )
+    task: Any = field(default=None, metadata=group())
+    dataset: Any = field(default=None, metadata=group(by_content=True, compare=False))
+    sampler: Any = field(default=None, metadata=group(learn=WITH_SAMPLER))
+    optimizer: Any = field(default=None, metadata=group(Affects.TRAINING, repeat=False))
+    trainer: Any = field(
+        default=None, metadata=group(Affects.TRAINING, repeat=False, compare=False)
+    )
+    callbacks: Any = field(default=None, metadata=group(Affects.NOTHING, nullable=True))
+    logger: Any = field(default=None, metadata=group(Affects.NOTHING, nullable=True, repeat=True))
+
+
+SCHEMA: type = RunSettings
+"""The declaration in use."""
+
+_NOTHING = {"affects": Affects.NOTHING}
+INSIDE: dict[str, dict[str, Any]] = {
+    "dataset.cache": _NOTHING,
+    "dataset.workers": _NOTHING,
+    "task.emd_workers": _NOTHING,
+    "task.pairs.test_seed": {"affects": Affects.SCORES},
+    "sampler.m": {"compare": False},
+    "sampler.m_max": {"compare": False, "limits": whole(1)},
+    "sampler.seed": {"compare": False},
+    "pretrain.max_epochs": {"limits": whole(1)},
+    "trainer.max_epochs": {"limits": whole(0)},
+    "trainer.precision": {"limits": one_of(*PRECISIONS, others=("32", 32, None))},
+    "trainer._target_": _NOTHING,
+    "trainer.accelerator": _NOTHING,
+    "trainer.devices": _NOTHING,
+    "trainer.num_nodes": _NOTHING,
+    "trainer.strategy": _NOTHING,
+    "trainer.log_every_n_steps": _NOTHING,
+}
+"""Settings inside groups: how they differ from their group."""
+
+
+def declared() -> dict[str, Setting]:
+    """Return the settings of the top level by name."""
+    return {one.name: one.metadata["setting"] for one in fields(SCHEMA)}
+
+
+def of(path: str) -> Setting:
+    """Return the declaration of a dotted setting, or the one of the group that it is in."""
+    return _of(SCHEMA, path)
+
+
+@cache
+def _of(schema: type, path: str) -> Setting:
+    top = {one.name: one.metadata["setting"] for one in fields(schema)}
+    found = top.get(path.partition(".")[0], Setting())
+    for inner, changes in INSIDE.items():
+        if path == inner or path.startswith(f"{inner}."):
+            # A run is evaluated with its groups as they were.
+            found = replace(found, **{"repeat": found.repeated, **changes})
+    return found
+
+
+def limited() -> dict[str, Limits]:
+    """Return the limits of all settings that have some, by dotted name."""
+    names = [*declared(), *INSIDE]
+    found = {name: of(name).limits for name in names}
+    return {name: limits for name, limits in found.items() if limits is not None}
+
+
+def refusal(path: str, value: Any) -> UserError:
+    """Return the error about a value that does not fit a setting's type or limits."""
+    limits = of(path).limits
+    allowed = limits.allowed if limits else describe(get_type_hints(SCHEMA).get(path, Any))
+    near = did_you_mean(str(value), limits.choices) if limits and limits.choices else ""
+    return UserError(f"{path} must be {allowed}, got {value!r}.{near.partition(' Allowed:')[0]}")
+
+
+def leaves(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
+    """Return the dotted settings that count with ``learn``.
+
+    Args:
+        config: plain data, such as a record's.
+        learn: what is trained. Of a setting with one entry for each value, this one is taken.
+    """
+    flat: dict[str, Any] = {}
+    for name, node in config.items():
+        chosen = node.get(learn) if of(name).per_learn and isinstance(node, dict) else node
+        flat |= dotted(chosen, name)
+    return {path: value for path, value in flat.items() if of(path).counts(learn)}
+
+
+def trained_with(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the dotted settings that affect what a run learns.
+
+    Left out are those that are identified by the content of files; see ``Setting.by_content``.
+    """
+    return {
+        path: value
+        for path, value in leaves(config, config["learn"]).items()
+        if Affects.TRAINING in of(path).affects and not of(path).by_content
+    }
+
+
+def compared_by(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
+    """Return the dotted settings in which the runs of one table must not differ.
+
+    A setting that the record's version did not have yet counts with its default.
+    """
+    defaults = {
+        one.name: one.default
+        for one in fields(SCHEMA)
+        if one.default is not None and not one.metadata["setting"].group
+    }
+    known = {name: node for name, node in config.items() if name in declared()}
+    flat = leaves({**defaults, **known}, learn)
+    return {path: value for path, value in flat.items() if of(path).compared}
+
+
+def help_lines() -> str:
+    """Return the run-level keys with their texts, for ``--help``."""
+    shown = {name: one for name, one in declared().items() if not one.group}
+    width = max(map(len, shown)) + 2
+    return "\n".join(
+        textwrap.fill(
+            one.help, 100, initial_indent=f"{name:<{width}}", subsequent_indent=" " * width
+        )
+        for name, one in shown.items()
+    )
+
+
+def register() -> None:
+    """Make the declaration known to Hydra: as a schema, and as text for the help."""
+    ConfigStore.instance().store(NAME, SCHEMA)
+    OmegaConf.register_new_resolver("run_level_keys", help_lines, replace=True)
+
+
+register()

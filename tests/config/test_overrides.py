@@ -1,0 +1,31 @@
+import pytest
+
+from mops_lightning.config import overrides
+from mops_lightning.config.compose import compose
+
+
+@pytest.mark.parametrize(
+    ("argument", "key", "path"),
+    [
+        ("m=8", "m", "m"),
+        ("++sampler.alpha=3", "sampler.alpha", "sampler.alpha"),
+        ("~task.pairs", "task.pairs", "task.pairs"),
+        ("task/net=icp", "task/net", "task.net"),
+        ("optimizer@pretrain.optimizer=x", "optimizer@pretrain.optimizer", "pretrain.optimizer"),
+        ("m=4,8", "m", "m"),
+        ("out=it's (1), = ~", "out", "out"),
+        ("--cfg", "", ""),
+        ("job", "", ""),
+    ],
+)
+def test_key_and_path_of_an_argument(argument, key, path):
+    assert (overrides.key(argument), overrides.path(argument)) == (key, path)
+
+
+@pytest.mark.parametrize("text", ["a/b=0.1", "~/runs", "it's (1), a \\ run", "plain/path", "a b"])
+def test_value_is_read_as_typed(text):
+    for argument in (f"out={text}", f"out={overrides.quote(text)}"):
+        override = overrides.parse(argument)
+        assert override is not None
+        assert override.value() == text
+        assert compose([overrides.readable(argument)]).out == text

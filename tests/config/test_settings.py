@@ -1,0 +1,134 @@
+"""The declaration of settings, and a made-up setting that everything finds there."""
+
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from mops_lightning.cli.sweep import run_cell
+from mops_lightning.config import settings
+from mops_lightning.config.compose import compose
+from mops_lightning.config.declaration import Affects, about, number
+from mops_lightning.config.settings import RunSettings
+from mops_lightning.config.validate import check
+from mops_lightning.errors import UserError
+from mops_lightning.report.build import build
+from mops_lightning.training.checkpoint import identity
+from mops_lightning.training.evaluate import command_line
+from mops_lightning.training.pretrain import cache_folder
+from tests.support.command_line import TINY, call
+from tests.support.reports import put_cell
+from tests.support.training import small_dataset
+
+DATA = small_dataset(train=4, test=4)
+
+
+@pytest.fixture(params=[Affects.TRAINING, Affects.SCORES, Affects.NOTHING], ids=str)
+def affects(request, monkeypatch):
+    """Declare the setting ``haste``, and say what it affects."""
+    limits = number("of at least 0", lambda x: x >= 0)
+
+    @dataclass
+    class WithHaste(RunSettings):
+        haste: float = field(
+            default=1.0, metadata=about("how much haste there is", request.param, limits=limits)
+        )
+
+    monkeypatch.setattr(settings, "SCHEMA", WithHaste)
+    settings.register()
+    yield request.param
+    monkeypatch.undo()
+    settings.register()
+
+
+def test_made_up_setting_is_shown_by_help(affects, tmp_path):
+    status, out, _ = call(["--help"], tmp_path)
+    assert status == 0
+    assert "haste           how much haste there is" in out
+
+
+def test_made_up_setting_is_validated(affects):
+    check(compose(["haste=2"]))
+    for value in ("-1", "much", "null"):
+        with pytest.raises(UserError, match="haste must be a number of at least 0, got"):
+            check(compose([f"haste={value}"]))
+    with pytest.raises(UserError, match="Did you mean 'haste'"):
+        check(compose(["+hast=1"]))
+
+
+def test_made_up_setting_of_training_is_in_the_identity_and_the_cache_key(affects):
+    trains = affects is Affects.TRAINING
+    plain, changed = compose(), compose(["haste=2"])
+    assert ("haste" in identity(plain, "d")) == trains
+    assert (identity(plain, "d") != identity(changed, "d")) == trains
+    assert (cache_folder(plain, DATA) != cache_folder(changed, DATA)) == trains
+
+
+def test_made_up_setting_that_affects_results_may_not_differ_in_a_sweep(affects, tmp_path, caplog):
+    overrides = [*TINY, "sampler=fps", "weights=null"]
+    run_cell(compose(overrides), tmp_path / "cell", overrides)
+    run_cell(compose([*overrides, "haste=2"]), tmp_path / "cell", overrides)
+    refused = "other settings: haste is 2.0 now and was 1.0" in caplog.text
+    assert refused == (affects is not Affects.NOTHING)
+
+
+def test_made_up_setting_that_affects_results_is_repeated_by_evaluate(affects, tmp_path):
+    path = put_cell(tmp_path, "run", "mops", {"generated": 1.0})
+    record = json.loads(path.read_text())
+    changes = {"overrides": ["haste=2"], "files": {"weights": "weights.pt"}}
+    path.write_text(json.dumps({**record, **changes}))
+    repeated = "haste=2" in command_line([f"evaluate={path.parent}"])
+    assert repeated == (affects is not Affects.NOTHING)
+
+
+def test_made_up_setting_that_affects_results_makes_columns_of_a_report(affects, tmp_path):
+    for haste in (1.0, 2.0):
+        put_cell(tmp_path, f"a{haste}", "mops", {"generated": haste}, haste=haste, m=8)
+    if affects is Affects.NOTHING:
+        with pytest.raises(UserError, match="Two runs of mops have m=8"):
+            build(tmp_path)
+    else:
+        assert build(tmp_path).grids[0].head == ["sampled by", "haste=1.0", "haste=2.0"]
+
+
+@pytest.mark.parametrize(
+    ("path", "affects", "repeated", "compared"),
+    [
+        ("seed", Affects.RESULTS, True, False),
+        ("learn", Affects.TRAINING, False, False),
+        ("pictures", Affects.NOTHING, False, False),
+        ("task.net.dropout", Affects.RESULTS, True, True),
+        ("task.emd_workers", Affects.NOTHING, True, False),
+        ("task.pairs.test_seed", Affects.SCORES, True, True),
+        ("dataset.cache", Affects.NOTHING, True, False),
+        ("optimizer.schedule.warmup", Affects.TRAINING, False, True),
+        ("trainer.precision", Affects.TRAINING, False, False),
+        ("trainer.accelerator", Affects.NOTHING, False, False),
+    ],
+)
+def test_of_a_path_gives_the_nearest_declaration(path, affects, repeated, compared):
+    found = settings.of(path)
+    assert (found.affects, found.repeated, found.compared) == (affects, repeated, compared)
+
+
+def test_defaults_of_the_schema_are_the_composed_values():
+    cfg: Any = OmegaConf.to_container(compose(), resolve=False)
+    assert set(cfg) == set(settings.declared())
+    assert (cfg["m"], cfg["batch_size"], cfg["task_lr_scale"]) == (32, 32, 1.0)
+    assert compose(["task=registration"]).task_lr_scale == 0.1
+
+
+def test_trained_with_counts_what_the_run_learns():
+    joint = settings.trained_with(plain("learn=joint"))
+    alone = settings.trained_with(plain("learn=task"))
+    assert {"task_lr_scale", "sampler.tau_min", "trainer.max_epochs", "learn"} <= set(joint)
+    assert not {name for name in alone if name.startswith(("sampler", "task_lr_scale", "pretrain"))}
+    assert alone["augment.rotate_up"] is True
+    assert joint["augment.rotate_up"] is False
+    assert not {name for name in joint if name.startswith(("dataset", "weights", "out", "logger"))}
+
+
+def plain(*overrides: str) -> Any:
+    return OmegaConf.to_container(compose(list(overrides)), resolve=True)
