@@ -66,8 +66,10 @@ class PointMaxPool(nn.Module):
             with torch.no_grad():
                 momentum = 0.1 if norm.momentum is None else norm.momentum
                 unbiased = variance * (rows.shape[0] / max(rows.shape[0] - 1, 1))
-                norm.running_mean.lerp_(mean.to(norm.running_mean.dtype), momentum)
-                norm.running_var.lerp_(unbiased.to(norm.running_var.dtype), momentum)
+                # As BatchNorm's own update, this must not count as an in-place change: a call with
+                # few points in the same step has saved these tensors for its backward pass.
+                norm.running_mean.data.lerp_(mean.to(norm.running_mean.dtype), momentum)
+                norm.running_var.data.lerp_(unbiased.to(norm.running_var.dtype), momentum)
                 if norm.num_batches_tracked is not None:
                     norm.num_batches_tracked += 1
         return mean, norm.weight * torch.rsqrt(variance + norm.eps)

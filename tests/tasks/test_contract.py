@@ -1,0 +1,82 @@
+"""Every task trains with every sampler and every value of ``learn`` that exists."""
+
+from typing import Any
+
+import pytest
+import torch
+
+from mops_lightning.data.loader import CloudLoader
+from mops_lightning.data.pairs import Pairs
+from mops_lightning.losses.registration import quaternion_loss
+from mops_lightning.nets.autoencoder import AutoEncoder
+from mops_lightning.nets.foldingnet import MFoldingNet
+from mops_lightning.nets.pcrnet import PCRNet
+from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
+from mops_lightning.samplers.snet import ProgressiveSNet, SNet
+from mops_lightning.tasks.classification import Classification
+from mops_lightning.tasks.reconstruction import Reconstruction
+from mops_lightning.tasks.registration import Registration
+from mops_lightning.training.experiment import Experiment
+from tests.support.training import changed, quiet_trainer, small_dataset, state
+
+POINTS, LARGEST = 72, 64
+MOPS: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
+SNET: dict[str, Any] = {"feature_channels": (8, 16), "head_channels": (16,)}
+
+TASKS = {
+    "classification": lambda: Classification(PointNetVanilla(3), 3),
+    "reconstruction": lambda: Reconstruction(AutoEncoder(POINTS, 8)),
+    "reconstruction_folding": lambda: Reconstruction(MFoldingNet(POINTS, 2, 8)),
+    "registration": lambda: Registration(
+        PCRNet(feature_channels=(8, 16), head_channels=(16,)), Pairs(), quaternion_loss
+    ),
+}
+# Sizes on both sides of 32 points, where the pooling layer changes its algorithm, in one step.
+SAMPLERS = {
+    "mops": lambda: MOPSNet(LARGEST, **MOPS),
+    "fmops": lambda: FMOPSNet(LARGEST, **MOPS),
+    "snet": lambda: SNet(LARGEST, **SNET),
+    "samplenet": lambda: SampleNet(LARGEST, k=4, **SNET),
+    "snet_progressive": lambda: ProgressiveSNet(LARGEST, min_size=8, **SNET),
+    "samplenet_progressive": lambda: ProgressiveSampleNet(LARGEST, min_size=8, k=4, **SNET),
+    "fps": lambda: FPSSampler(LARGEST),
+}
+
+
+def trained_parts(task: str, sampler: str | None, learn: Any) -> set[str]:
+    """Train one step and return which of task and sampler changed their parameters."""
+    torch.manual_seed(0)
+    module = Experiment(
+        TASKS[task](),
+        None if sampler is None else SAMPLERS[sampler](),
+        learn=learn,
+        make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
+    )
+    data = small_dataset(train=4, points=POINTS)
+    loader = CloudLoader(data.train, 4, shuffle=True, make_batch=module.task.make_batch)
+    before = state(module)
+    quiet_trainer(1).fit(module, loader, loader)
+    parameters = {name for name, _ in module.named_parameters()}
+    return {name.split(".")[0] for name in changed(before, module) & parameters}
+
+
+LEARNS = {
+    **{(name, "sampler"): {"sampler"} for name in SAMPLERS if name != "fps"},
+    **{(name, "joint"): {"sampler", "task"} for name in SAMPLERS if name != "fps"},
+    ("fps", "joint"): {"task"},
+}
+
+
+@pytest.mark.parametrize(("sampler", "learn"), LEARNS)
+@pytest.mark.parametrize("task", TASKS)
+def test_task_step_with_any_sampler_changes_what_learns(task, sampler, learn):
+    assert trained_parts(task, sampler, learn) == LEARNS[sampler, learn]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_task_step_without_sampler_changes_task(task):
+    assert trained_parts(task, None, "task") == {"task"}
