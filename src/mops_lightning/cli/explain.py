@@ -8,6 +8,7 @@ from mops_lightning.config import settings
 from mops_lightning.config.compose import conf_dir
 from mops_lightning.config.validate import misfit_of
 from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.records.migrate import new_path
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -61,6 +62,8 @@ def _no_such_setting(key: str) -> str:
 
     from mops_lightning.config.build import signature
 
+    if new_path(key) != key:
+        return f"{key} is now {new_path(key)}."
     root = conf_dir()
     paths = [str(path.relative_to(root)) for path in root.rglob("*") if path.is_dir()]
     groups = [path for path in paths if not path.startswith("hydra")]
