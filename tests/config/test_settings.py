@@ -118,17 +118,3 @@ def test_defaults_of_the_schema_are_the_composed_values():
     assert set(cfg) == set(settings.declared())
     assert (cfg["m"], cfg["batch_size"], cfg["task_lr_scale"]) == (32, 32, 1.0)
     assert compose(["task=registration"]).task_lr_scale == 0.1
-
-
-def test_trained_with_counts_what_the_run_learns():
-    joint = settings.trained_with(plain("learn=joint"))
-    alone = settings.trained_with(plain("learn=task"))
-    assert {"task_lr_scale", "sampler.tau_min", "trainer.max_epochs", "learn"} <= set(joint)
-    assert not {name for name in alone if name.startswith(("sampler", "task_lr_scale", "pretrain"))}
-    assert alone["augment.rotate_up"] is True
-    assert joint["augment.rotate_up"] is False
-    assert not {name for name in joint if name.startswith(("dataset", "weights", "out", "logger"))}
-
-
-def plain(*overrides: str) -> Any:
-    return OmegaConf.to_container(compose(list(overrides)), resolve=True)

@@ -6,7 +6,6 @@ group is one line of ``INSIDE``.
 """
 
 import textwrap
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Any, get_type_hints
@@ -27,7 +26,6 @@ from mops_lightning.config.declaration import (
     whole,
 )
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.records.run_record import dotted
 
 LEARN = ("task", "sampler", "joint", "nothing")
 """What a run may train."""
@@ -287,47 +285,6 @@ def refusal(path: str, value: Any) -> UserError:
     allowed = limits.allowed if limits else describe(get_type_hints(SCHEMA).get(path, Any))
     near = did_you_mean(str(value), limits.choices) if limits and limits.choices else ""
     return UserError(f"{path} must be {allowed}, got {value!r}.{near.partition(' Allowed:')[0]}")
-
-
-def leaves(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
-    """Return the dotted settings that count with ``learn``.
-
-    Args:
-        config: plain data, such as a record's.
-        learn: what is trained. Of a setting with one entry for each value, this one is taken.
-    """
-    flat: dict[str, Any] = {}
-    for name, node in config.items():
-        chosen = node.get(learn) if of(name).per_learn and isinstance(node, dict) else node
-        flat |= dotted(chosen, name)
-    return {path: value for path, value in flat.items() if of(path).counts(learn)}
-
-
-def trained_with(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the dotted settings that affect what a run learns.
-
-    Left out are those that are identified by the content of files; see ``Setting.by_content``.
-    """
-    return {
-        path: value
-        for path, value in leaves(config, config["learn"]).items()
-        if Affects.TRAINING in of(path).affects and not of(path).by_content
-    }
-
-
-def compared_by(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
-    """Return the dotted settings in which the runs of one table must not differ.
-
-    A setting that the record's version did not have yet counts with its default.
-    """
-    defaults = {
-        one.name: one.default
-        for one in fields(SCHEMA)
-        if one.default is not None and not one.metadata["setting"].group
-    }
-    known = {name: node for name, node in config.items() if name in declared()}
-    flat = leaves({**defaults, **known}, learn)
-    return {path: value for path, value in flat.items() if of(path).compared}
 
 
 def help_lines() -> str:

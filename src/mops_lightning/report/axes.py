@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from mops_lightning.config import settings
+from mops_lightning.config.comparison import compared_by
 from mops_lightning.errors import UserError
 from mops_lightning.report.collect import Record, epochs
 
@@ -76,7 +76,7 @@ def considered(record: Record) -> dict[str, Any]:
     """Return the settings that are compared, with dotted keys, and the epochs trained."""
     config = record["config"]
     learn = (record["notes"].get("evaluated") or {}).get("learn", config["learn"])
-    return {**settings.compared_by(config, learn), "trainer.max_epochs": epochs(record)}
+    return {**compared_by(config, learn), "trainer.max_epochs": epochs(record)}
 
 
 def value(record: Record, key: str) -> Any:

@@ -6,7 +6,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mops_lightning.config import settings
+from mops_lightning.config.comparison import trained_with
 from mops_lightning.errors import UserError
 from mops_lightning.training.callbacks import CHECKPOINT
 from mops_lightning.training.experiment import CHECKPOINT_KEY
@@ -28,7 +28,7 @@ def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
         fingerprint: of the data.
     """
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
-    parts = {**settings.trained_with(plain), "dataset": fingerprint, **_given_weights(cfg)}
+    parts = {**trained_with(plain), "dataset": fingerprint, **_given_weights(cfg)}
     return {name: json.dumps(value, sort_keys=True) for name, value in parts.items()}
 
 

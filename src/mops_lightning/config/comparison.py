@@ -1,0 +1,50 @@
+"""The settings that two runs must share: to resume one, to reuse a net, to make one table."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from mops_lightning.config import settings
+from mops_lightning.config.declaration import Affects
+from mops_lightning.records.run_record import dotted
+
+
+def leaves(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
+    """Return the dotted settings that count with ``learn``.
+
+    Args:
+        config: plain data, such as a record's.
+        learn: what is trained. Of a setting with one entry for each value, this one is taken.
+    """
+    flat: dict[str, Any] = {}
+    for name, node in config.items():
+        chosen = node.get(learn) if settings.of(name).per_learn and isinstance(node, dict) else node
+        flat |= dotted(chosen, name)
+    return {path: value for path, value in flat.items() if settings.of(path).counts(learn)}
+
+
+def trained_with(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the dotted settings that affect what a run learns.
+
+    Left out are those that are identified by the content of files; see ``Setting.by_content``.
+    """
+    return {
+        path: value
+        for path, value in leaves(config, config["learn"]).items()
+        if Affects.TRAINING in settings.of(path).affects and not settings.of(path).by_content
+    }
+
+
+def compared_by(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
+    """Return the dotted settings in which the runs of one table must not differ.
+
+    A setting that the record's version did not have yet counts with its default.
+    """
+    defaults = {
+        one.name: one.default
+        for one in fields(settings.SCHEMA)
+        if one.default is not None and not one.metadata["setting"].group
+    }
+    known = {name: node for name, node in config.items() if name in settings.declared()}
+    flat = leaves({**defaults, **known}, learn)
+    return {path: value for path, value in flat.items() if settings.of(path).compared}
