@@ -49,7 +49,7 @@ def _print(candidates: Iterable[str]) -> None:
 def _options(name: str, line: str) -> list[str]:
     """Return the options, or the choices of the last option, that the line can continue with."""
     try:
-        import argcomplete  # type: ignore[import-not-found, unused-ignore]
+        import argcomplete
     except ImportError:  # an extra
         return []
     found = io.StringIO()
