@@ -12,7 +12,7 @@ from tests.support.command_line import TINY_WITH_PICTURES, call
         (["sampler=mosp"], "mops"),
         (["task=registration", "task/lss=quaternion"], "Did you mean 'task/loss'"),
         (["sampler.log=2"], "sampler.log: no such setting"),
-        (["noise=0.1"], "noise is now test_noise_std"),
+        (["noise=0.1"], "noise is now called test_noise_std"),
         (["sampler.feature_channels=[8]"], "Write +sampler.feature_channels=..."),
         (["learn=smapler"], "Did you mean 'sampler'"),
         (["m=4096"], "dataset.n_points=4096"),

@@ -8,7 +8,6 @@ from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.evaluate import command_line
 from mops_lightning.training.run import run
-from mops_lightning.zoo.load import RENAMED
 from tests.support.command_line import TINY
 
 
@@ -52,7 +51,7 @@ def test_weights_kept_elsewhere_are_found_by_the_record(trained, tmp_path):
 def test_renamed_sampler_settings_of_an_old_record_are_accepted(trained, tmp_path):
     folder, record = trained
     shutil.copytree(folder, tmp_path / "run")
-    old_names = {new: old for old, new in RENAMED.items()}
+    old_names = {"size_sampling": "sizes_per_step", "num_sizes": "prefixes"}
     sampler = {old_names.get(k, k): v for k, v in record.config["sampler"].items()}
     assert "sizes_per_step" in sampler
     config = {**record.config, "sampler": sampler}

@@ -24,7 +24,7 @@ def test_a_task_net_can_be_trained_on_from_a_file_and_is_not_taken_for_a_new_one
     (published,) = files(tmp_path, "cache/weights/*/weights.pt")
     first = tmp_path / "run0" / "weights.pt"
     record = train(
-        tmp_path, "learn=task", "task=registration", f"weights={first}", "optimizer.optimizer.lr=0"
+        tmp_path, "learn=task", "task=registration", f"weights={first}", "optimizer.lr=0"
     )
     assert record.notes["weights_loaded"] == published["sha256"]
     own, again = (weights.read(path)["state"] for path in sorted(tmp_path.glob("run*/weights.pt")))
@@ -62,7 +62,7 @@ def test_a_run_is_not_resumed_under_other_weights(tmp_path):
 
 def test_training_that_goes_astray_fails_and_is_not_kept(tmp_path):
     with pytest.raises(UserError, match=r"rotation_error_deg is nan: .*diverged"):
-        train(tmp_path, "learn=task", "task=registration", "optimizer.optimizer.lr=1e30")
+        train(tmp_path, "learn=task", "task=registration", "optimizer.lr=1e30")
     assert not files(tmp_path, "**/weights.pt")
     record = json.loads((tmp_path / "run0" / "result.json").read_text())
     assert record["status"] == "failed"

@@ -8,10 +8,14 @@ from mops_lightning.config import settings
 from mops_lightning.config.compose import conf_dir
 from mops_lightning.config.validate import misfit_of
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.records.migrate import new_path
+from mops_lightning.records.migrate import answer
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
+
+
+FROM_RESOLVER = f"{UserError.__name__} raised while resolving interpolation: "
+"""What OmegaConf puts before the error of a resolver."""
 
 
 def explain(error: BaseException) -> str:
@@ -34,10 +38,12 @@ def explain(error: BaseException) -> str:
     if isinstance(error, UserError):
         return texts[0]
     for text in texts:
-        if "Interpolation key 'labels." in text:
-            # labels.${learn} names the run's folder, so Hydra finds a wrong learn first.
-            value = text.split("'labels.")[1].split("'")[0]
-            return f"learn: unknown value {value!r}.{did_you_mean(value, settings.LEARN)}"
+        if text.startswith(FROM_RESOLVER):
+            return text.removeprefix(FROM_RESOLVER).splitlines()[0]
+        if "Interpolation key '" in text:
+            key = text.split("Interpolation key '")[1].split("'")[0]
+            if said := answer(key):
+                return said
         if "Could not override '" in text:
             key = text.split("Could not override '")[1].split("'")[0]
             return _no_such_setting(key)
@@ -62,12 +68,12 @@ def _no_such_setting(key: str) -> str:
 
     from mops_lightning.config.build import signature
 
-    if new_path(key) != key:
-        return f"{key} is now {new_path(key)}."
     root = conf_dir()
     paths = [str(path.relative_to(root)) for path in root.rglob("*") if path.is_dir()]
     groups = [path for path in paths if not path.startswith("hydra")]
-    if "/" in key:
+    if said := answer(key):
+        return said
+    if "/" in key or "@" in key:
         return f"{key}: no such group of choices.{did_you_mean(key, groups)}"
     cfg = _composed(groups)
     node, _, name = key.rpartition(".")

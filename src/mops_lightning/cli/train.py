@@ -1,6 +1,7 @@
 """Training from the command line: one run, or a sweep, composed by Hydra."""
 
 import os
+import re
 import sys
 from typing import TYPE_CHECKING
 
@@ -8,6 +9,7 @@ from mops_lightning.cli.commands import help_lines
 from mops_lightning.config.compose import conf_dir
 from mops_lightning.config.overrides import key
 from mops_lightning.errors import INTERRUPTED, USER_ERROR, Interrupted, UserError, end
+from mops_lightning.records.migrate import answer
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -35,6 +37,7 @@ def _run() -> None:
     # Makes Hydra raise instead of printing its own shortened traceback.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
+        _refuse_old_settings(sys.argv[1:])
         if any(key(argument) == "evaluate" for argument in sys.argv[1:]):
             from mops_lightning.training.evaluate import command_line
 
@@ -47,6 +50,19 @@ def _run() -> None:
         from mops_lightning.cli.explain import explain
 
         end(NAME, explain(error), USER_ERROR)
+
+
+def _refuse_old_settings(arguments: list[str]) -> None:
+    """Refuse settings of earlier versions, also those that ``+`` would add unnoticed.
+
+    Raises:
+        UserError: there is one; it names the new setting.
+    """
+    for argument in arguments:
+        match = re.match(r"[+~]*([^=+~-][^=]*)=|~(.+)$", argument)
+        said = answer(match.group(1) or match.group(2)) if match else None
+        if said:
+            raise UserError(said)
 
 
 def _job(cfg: "DictConfig") -> float | None:

@@ -14,12 +14,13 @@ def leaves(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
 
     Args:
         config: plain data, such as a record's.
-        learn: what is trained. Of a setting with one entry for each value, this one is taken.
+        learn: what is trained. Of a setting with an entry for it, only this entry counts.
     """
     flat: dict[str, Any] = {}
     for name, node in config.items():
-        chosen = node.get(learn) if settings.of(name).per_learn and isinstance(node, dict) else node
-        flat |= dotted(chosen, name)
+        if settings.of(name).per_learn and isinstance(node, dict):
+            node = node.get("task" if learn == "task" else "sampler")
+        flat |= dotted(node, name)
     return {path: value for path, value in flat.items() if settings.of(path).counts(learn)}
 
 

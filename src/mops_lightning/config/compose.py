@@ -5,6 +5,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from mops_lightning.config import resolvers  # noqa: F401, registers what conf/ uses
 from mops_lightning.config.validate import misfit_of
 from mops_lightning.errors import UserError
 

@@ -68,7 +68,7 @@ class Setting:
         learn: the values of ``learn`` with which it counts; None: with all.
         group: whether it is a group of choices, which ``--help`` lists elsewhere.
         nullable: whether it may be removed or null.
-        per_learn: whether it holds one entry for each value of ``learn``, of which one counts.
+        per_learn: whether it has one entry for learn=task and one for training a sampler.
         by_content: whether a run is identified by the content of the files that it names.
         repeat: whether ``evaluate=RUN`` takes it from RUN; None: if it affects anything.
         compare: whether ``report`` refuses runs in one table that differ in it; None: if it

@@ -170,15 +170,15 @@ class RunSettings:
         ),
     )
     epochs: Any = field(
-        default=None, metadata=table("default number of epochs for each value of learn")
-    )
-    schedules: Any = field(
-        default=None, metadata=table("where these come from: the dataset's numbers for each task")
+        default=None,
+        metadata=table(
+            "default number of epochs: task for learn=task, sampler for sampler and joint"
+        ),
     )
     augment: Any = field(
         default=None,
         metadata=about(
-            "augmentation of the training clouds for each value of learn",
+            "augmentation of training clouds: task for learn=task, sampler for sampler and joint",
             Affects.TRAINING,
             per_learn=True,
             repeat=True,
@@ -192,22 +192,13 @@ class RunSettings:
             compare=False,
         ),
     )
-    paper: Any = field(default=None, metadata=table("settings that the paper fixes for this task"))
-    rivals: Any = field(
-        default=None,
-        metadata=table("settings that the publications of S-Net and SampleNet fix for this task"),
-    )
     baselines: Any = field(
         default=None,
-        metadata=about(
-            "index samplers that are tested for comparison with a learned one",
+        metadata=group(
             Affects.SCORES,
             learn=WITH_SAMPLER,
             compare=False,  # they have rows of their own
         ),
-    )
-    labels: Any = field(
-        default=None, metadata=table("what a run's folder is called for each value of learn")
     )
     names: Any = field(
         default=None,
@@ -222,7 +213,10 @@ class RunSettings:
     trainer: Any = field(
         default=None, metadata=group(Affects.TRAINING, repeat=False, compare=False)
     )
-    callbacks: Any = field(default=None, metadata=group(Affects.NOTHING, nullable=True))
+    callbacks: Any = field(
+        default=None,
+        metadata=group(Affects.TRAINING, nullable=True, repeat=False, compare=False),
+    )
     logger: Any = field(default=None, metadata=group(Affects.NOTHING, nullable=True, repeat=True))
 
 
@@ -231,6 +225,11 @@ SCHEMA: type = RunSettings
 
 _NOTHING = {"affects": Affects.NOTHING}
 INSIDE: dict[str, dict[str, Any]] = {
+    "callbacks.learning_rate": _NOTHING,
+    "callbacks.checkpoint": _NOTHING,
+    "callbacks.stop": _NOTHING,
+    "callbacks.progress": _NOTHING,
+    "callbacks.pictures": _NOTHING,
     "dataset.cache": _NOTHING,
     "dataset.workers": _NOTHING,
     "task.emd_workers": _NOTHING,

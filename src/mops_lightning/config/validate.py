@@ -9,6 +9,10 @@ from mops_lightning.config import distributed, settings
 from mops_lightning.config.annotations import misfit
 from mops_lightning.config.build import signature
 from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.records import migrate
+
+OPTIMIZERS = ("optimizer", "pretrain.optimizer")
+"""Nodes whose ``schedule`` is not an argument of the optimizer."""
 
 
 def check(cfg: DictConfig) -> None:
@@ -21,7 +25,8 @@ def check(cfg: DictConfig) -> None:
     declared = settings.declared()
     for key in map(str, cfg):
         if key not in declared:
-            raise UserError(f"{key}: no such setting.{did_you_mean(key, declared)}")
+            hint = did_you_mean(key, declared)
+            raise UserError(migrate.answer(key) or f"{key}: no such setting.{hint}")
     for name, setting in declared.items():
         if cfg.get(name) is None and not setting.nullable:
             raise UserError(f"{name} cannot be removed. Choose another one with {name}=...")
@@ -96,9 +101,12 @@ def _check_node(node: Any, where: str) -> None:
         takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
         for key in node:
             name = str(key)
+            if name == "schedule" and where in OPTIMIZERS:
+                continue  # built separately
             if not name.startswith("_") and name not in parameters and not takes_any:
                 raise UserError(
-                    f"{where}: {node['_target_']} takes no setting {name!r}."
+                    migrate.answer(f"{where}.{name}")
+                    or f"{where}: {node['_target_']} takes no setting {name!r}."
                     f"{did_you_mean(name, parameters)}"
                 )
             if OmegaConf.is_missing(node, key):

@@ -14,8 +14,8 @@ from typing import Any
 
 from mops_lightning.errors import UserError
 from mops_lightning.files import atomic_write
-from mops_lightning.records import migrate
 from mops_lightning.records.environment import environment
+from mops_lightning.records.migrate import upgraded_config, upgraded_overrides
 
 SCHEMA = "mops_lightning/result/1"
 FILE = "result.json"
@@ -111,7 +111,7 @@ def write(folder: Path, record: dict[str, Any]) -> Path:
 
 
 def read(folder: Path) -> dict[str, Any]:
-    """Read and validate the record in ``folder``, as plain data with the present names of settings.
+    """Read and validate the record in ``folder``, as plain data; settings get their present names.
 
     Raises:
         UserError: the folder has no ``result.json``, or it is not a run record.
@@ -126,7 +126,9 @@ def read(folder: Path) -> dict[str, Any]:
         raise UserError(f"{path}: no run record. Give a run's folder.") from None
     except (json.JSONDecodeError, jsonschema.ValidationError) as error:
         raise UserError(f"{path}: not a run record: {str(error).splitlines()[0]}") from None
-    return {**record, "config": migrate.config(record["config"])}
+    record["config"] = upgraded_config(record["config"])
+    record["overrides"] = upgraded_overrides(record["overrides"])
+    return record
 
 
 def dotted(tree: Any, prefix: str = "") -> dict[str, Any]:

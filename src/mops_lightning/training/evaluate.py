@@ -15,11 +15,10 @@ from omegaconf import DictConfig, OmegaConf
 from mops_lightning.config import overrides, settings
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
-from mops_lightning.records import migrate, run_record
+from mops_lightning.records import run_record
 from mops_lightning.training.callbacks import CHECKPOINT
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.zoo import weights
-from mops_lightning.zoo.load import RENAMED
 
 KEY = "evaluate"
 OF_RUN = "run"
@@ -51,7 +50,7 @@ def command_line(arguments: list[str]) -> list[str]:
     typed_keys = [
         overrides.key(a) for a in typed if a not in [f"{k}={v}" for k, v in groups.items()]
     ]
-    earlier = [_present(a) for a in record["overrides"] if overrides.key(a) not in groups]
+    earlier = [overrides.readable(a) for a in record["overrides"] if overrides.key(a) not in groups]
     earlier = [f"{group}={name}" for group, name in groups.items()] + earlier
     kept = [
         a
@@ -79,12 +78,6 @@ def _chosen(argument: str) -> str | None:
         raise UserError(f"{argument}: {KEY} takes one run. Start one evaluation for each.")
     value = override.value()
     return None if value is None else str(value)
-
-
-def _present(argument: str) -> str:
-    """Return an override of an earlier version as it is written now."""
-    key = overrides.key(argument)
-    return overrides.readable(argument).replace(key, migrate.new_path(key), 1)
 
 
 def _data_are_here(kept: list[str], folder: Path) -> None:
@@ -246,9 +239,8 @@ def _same_settings(
             f"{KEY}: the task net of {folder} is {there['names']['net']}; for "
             f"task/net={here['names']['net']} give its weights too: weights=auto or a file."
         )
-    trained = {RENAMED.get(key, key): value for key, value in there["sampler"].items()}
-    for key in sorted({*trained, *here["sampler"]}) if cfg.learn != "task" else ():
-        old, new = trained.get(key), here["sampler"].get(key)
+    for key in sorted({*there["sampler"], *here["sampler"]}) if cfg.learn != "task" else ():
+        old, new = there["sampler"].get(key), here["sampler"].get(key)
         if old != new:
             hint = "" if key != "m" else " Sizes of a net for many are chosen with sizes=[...]."
             raise UserError(

@@ -1,7 +1,9 @@
 """Building the experiment that a configuration describes."""
 
+from typing import Any
+
 import lightning as L
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config.build import accepted, build
 from mops_lightning.data.clouds import CloudDataset
@@ -34,12 +36,13 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         baselines = _make_baselines(cfg, max(sizes))
     elif sampler is not None and sampler.flexible:
         sampler = build(cfg.sampler, "sampler", m=max(sizes))
+    make_optimizer, make_schedule = optimizer_makers(cfg.optimizer)
     return Experiment(
         task,
         sampler,
         learn=cfg.learn,
-        make_optimizer=build(cfg.optimizer.optimizer, "optimizer.optimizer"),
-        make_schedule=build(cfg.optimizer.schedule, "optimizer.schedule"),
+        make_optimizer=make_optimizer,
+        make_schedule=make_schedule,
         baselines=baselines,
         seed=cfg.seed,
         identity=identity,
@@ -58,4 +61,22 @@ def _make_task(cfg: DictConfig, num_classes: int) -> Task:
 
 def _make_baselines(cfg: DictConfig, m: int) -> dict[str, Sampler]:
     nodes = {str(name): node for name, node in cfg.baselines.items() if node}
-    return {name: build(node, f"baselines.{name}", m=m) for name, node in nodes.items()}
+    return {name: _make_baseline(name, node, m, cfg.seed) for name, node in nodes.items()}
+
+
+def _make_baseline(name: str, node: DictConfig, m: int, seed: int) -> Any:
+    """Build an index sampler for ``m`` points, with the run's seed unless it has its own."""
+    own = {} if "seed" in node else accepted(node, {"seed": seed})
+    return build(node, f"baselines.{name}", m=m, **own)
+
+
+def optimizer_makers(node: DictConfig) -> tuple[Any, Any]:
+    """Return what makes an optimizer of parameters, and a schedule of an optimizer, or None."""
+    settings: Any = OmegaConf.to_container(node, resolve=True)
+    schedule = settings.pop("schedule", None)
+    makers = {"optimizer": settings, "optimizer.schedule": schedule}
+    make_optimizer, make_schedule = (
+        one and build(OmegaConf.create({**one, "_partial_": True}), where)
+        for where, one in makers.items()
+    )
+    return make_optimizer, make_schedule

@@ -1,6 +1,9 @@
 """Loaders of a run's clouds: for training, for ``val/`` and for the test."""
 
+from typing import Any
+
 import torch
+from omegaconf import DictConfig
 from torch import Tensor
 
 from mops_lightning.data.clouds import CloudDataset, Clouds
@@ -23,6 +26,11 @@ def score_loader(
     return CloudLoader(
         clouds, batch_size, make_batch=task.make_batch, seed=task.test_seed, part=part
     )
+
+
+def augmentation(cfg: DictConfig) -> Any:
+    """Return the augmentation settings of this run; joint training has the sampler's."""
+    return cfg.augment.task if cfg.learn == "task" else cfg.augment.sampler
 
 
 def num_held_out(clouds: Clouds, fraction: float) -> int:

@@ -15,7 +15,7 @@ from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training import evaluate
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.job import Job
-from mops_lightning.training.loaders import score_loader, split
+from mops_lightning.training.loaders import augmentation, score_loader, split
 from mops_lightning.training.trainer import log_hparams
 from mops_lightning.viz.snapshots import CLOUDS
 from mops_lightning.zoo import weights
@@ -78,7 +78,7 @@ def _fit(job: Job) -> None:
         train,
         cfg.batch_size,
         shuffle=True,
-        augment=Augmentation(**cfg.augment[cfg.learn]),
+        augment=Augmentation(**augmentation(cfg)),
         make_batch=task.make_batch,
         drop_last=True,
         seed=cfg.seed,
@@ -146,7 +146,7 @@ def _save(job: Job, record: RunRecord) -> None:
     if not math.isfinite(score):
         raise UserError(
             f"{experiment.score_name} is {score}: training diverged; no weights were saved. "
-            "Try a lower learning rate (optimizer.optimizer.lr) or other weights of the losses."
+            "Try a lower learning rate (optimizer.lr) or other weights of the losses."
         )
     if not job.trains:
         return

@@ -31,14 +31,6 @@ SAMPLERS: tuple[type[Sampler], ...] = (
 )
 """What ``load`` can build. A file's ``_target_`` is compared with this list and never imported."""
 
-RENAMED = {
-    "sizes_per_step": "size_sampling",
-    "prefixes": "num_sizes",
-    "least": "min_size",
-    "over_sizes": "size_reduction",
-}
-"""Arguments that older files have under another name."""
-
 HINT = "Give the weights.pt of a run with learn=sampler or learn=joint."
 
 
@@ -94,7 +86,6 @@ def _build(config: dict[str, Any], path: Path) -> Sampler:
                 f"{path}: sampler.{name} must be a number, a string, a list of them or null, "
                 f"got {type(value).__name__}."
             )
-    arguments = {RENAMED.get(name, name): value for name, value in arguments.items()}
     try:
         with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
             return classes[target](**arguments)

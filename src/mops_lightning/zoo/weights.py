@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from mops_lightning.errors import UserError
 from mops_lightning.files import atomic_write
 from mops_lightning.records import run_record
+from mops_lightning.records.migrate import upgraded_config
 
 SCHEMA = "mops_lightning/weights/1"
 FILE = "weights.pt"
@@ -50,7 +51,8 @@ def read(path: str | Path) -> dict[str, Any]:
     """Read a weights file and verify it.
 
     Returns:
-        The content as saved: ``config``, ``metrics``, ``classes``, ``sha256`` and ``state``.
+        The content as saved: ``config``, ``metrics``, ``classes``, ``sha256`` and ``state``;
+        settings in ``config`` get their present names.
 
     Raises:
         UserError: the file is missing, damaged or not a weights file.
@@ -66,6 +68,7 @@ def read(path: str | Path) -> dict[str, Any]:
         )
     if digest(content["state"]) != content["sha256"]:
         raise UserError(f"{path} is damaged (sha256 differs). Delete it and run again.")
+    content["config"] = upgraded_config(content["config"])
     return content
 
 

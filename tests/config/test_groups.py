@@ -1,0 +1,142 @@
+"""The groups of conf/: what one run's configuration shows, and what depends on several groups."""
+
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from mops_lightning.config.compose import compose, conf_dir
+from mops_lightning.config.validate import check
+from tests.support.command_line import TINY, call, runs
+
+TASKS = ("classification", "registration", "reconstruction")
+
+
+def test_default_run_is_described_in_90_lines(tmp_path):
+    status, out, err = call(["--cfg", "job"], tmp_path)
+    assert (status, err) == (0, "")
+    assert len(out.splitlines()) <= 90
+
+
+def test_only_experiments_set_keys_of_other_groups():
+    names = [
+        path.relative_to(conf_dir()).as_posix()
+        for path in conf_dir().rglob("*.yaml")
+        if "@package _global_" in path.read_text()
+    ]
+    assert names
+    assert {name.split("/")[0] for name in names} == {"experiment"}
+
+
+def test_specialised_files_belong_to_groups_that_exist():
+    root = conf_dir()
+    for path in root.glob("dataset_task/*.yaml"):
+        dataset, task = path.stem.rsplit("_", 1)
+        assert (root / "dataset" / f"{dataset}.yaml").is_file()
+        assert task in TASKS
+    for path in [
+        *root.glob("task_settings/*"),
+        *root.glob("sampler/*/*"),
+        *root.glob("optimizer/*/*"),
+    ]:
+        assert path.stem in TASKS
+
+
+@pytest.mark.parametrize(
+    ("task", "alpha", "tau_min"),
+    [("classification", 30.0, 0.1), ("registration", 1.0, 0.1), ("reconstruction", 0.2, 0.5)],
+)
+def test_mops_has_the_task_s_alpha_and_tau(task, alpha, tau_min):
+    for sampler in ("mops", "fmops"):
+        node = compose([f"task={task}", f"sampler={sampler}"]).sampler
+        assert (node.alpha, node.tau_min) == (alpha, tau_min)
+
+
+@pytest.mark.parametrize(
+    ("task", "learn", "rate"),
+    [
+        ("classification", "sampler", 1e-2),
+        ("classification", "joint", 1e-3),
+        ("registration", "sampler", 1e-3),
+        ("reconstruction", "sampler", 5e-4),
+    ],
+)
+def test_snet_has_the_rate_of_task_and_learn(task, learn, rate):
+    cfg = compose([f"task={task}", f"learn={learn}", "sampler=snet"])
+    assert (cfg.optimizer.lr, cfg.pretrain.optimizer.lr) == (rate, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "epochs"),
+    [
+        ([], (12, 6)),
+        (["task=registration"], (40, 10)),
+        (["dataset=modelnet40"], (30, 8)),
+        (["dataset=modelnet40", "task=reconstruction"], (200, 60)),
+        (["dataset=shapenet_core", "task=reconstruction"], (100, 30)),
+        (["experiment=reconstruction_paper"], (400, 250)),
+    ],
+)
+def test_epochs_depend_on_dataset_and_task(overrides, epochs):
+    cfg = compose(overrides)
+    assert (cfg.epochs.task, cfg.epochs.sampler) == epochs
+    lengths = {learn: compose([*overrides, f"learn={learn}"]).trainer.max_epochs for learn in LEARN}
+    assert lengths == {"task": epochs[0], "sampler": epochs[1], "joint": epochs[1], "nothing": 0}
+
+
+LEARN = ("task", "sampler", "joint", "nothing")
+
+
+def test_files_of_ones_own_need_no_specialised_file(tmp_path):
+    own = {
+        "sampler/mine": "_target_: mops_lightning.samplers.fps.FPSSampler\nm: ${m}\n",
+        "task/ours": (
+            "defaults:\n  - net: pointnet\n  - _self_\n"
+            "_target_: mops_lightning.tasks.classification.Classification\n"
+        ),
+        "dataset/blobs": (
+            "_target_: mops_lightning.data.shapes.shapes\nn_points: 64\ntrain_per_class: 4\n"
+            "test_per_class: 3\nclasses: [chair, lamp]\nseed: ${seed}\n"
+        ),
+    }
+    for name, text in own.items():
+        (tmp_path / "own" / f"{name}.yaml").parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "own" / f"{name}.yaml").write_text(text)
+    chosen = ["sampler=mine", "task=ours", "dataset=blobs"]
+    tiny = [one for one in TINY if not one.startswith("dataset.")]
+    status, _, err = call(["--config-dir", "own", *chosen, *tiny], tmp_path)
+    assert status == 0, err
+    (run,) = runs(tmp_path)
+    assert run.relative_to(tmp_path / "outputs").as_posix().startswith("ours/blobs/mine-m8/")
+
+
+def test_devices_inherit_the_default_trainer():
+    default: Any = OmegaConf.to_container(compose().trainer)
+    expected: dict[str, dict[str, Any]] = {
+        "cpu": {"accelerator": "cpu"},
+        "gpu": {"accelerator": "gpu"},
+        "ddp": {"devices": "auto", "num_nodes": 1, "strategy": "ddp"},
+    }
+    for name, changes in expected.items():
+        assert compose([f"trainer={name}"]).trainer == {**default, **changes}
+
+
+def test_baselines_are_left_out_added_and_checked(tmp_path):
+    given = ["baselines.voxel=null", "+sampler@baselines.poisson=poisson"]
+    cfg = compose(given)
+    check(cfg)
+    assert [name for name, node in cfg.baselines.items() if node] == ["random", "fps", "poisson"]
+
+
+@pytest.mark.parametrize(
+    ("learn", "label"),
+    [
+        ("task", "pointnet"),
+        ("sampler", "fmops-m512"),
+        ("joint", "fmops-m512-joint"),
+        ("nothing", "fmops-m512-evaluated"),
+    ],
+)
+def test_run_label_names_net_or_sampler(learn, label):
+    cfg = compose([f"learn={learn}", "sampler=fmops", "+logger.name2=${run_label:}"])
+    assert cfg.logger.name2 == label
