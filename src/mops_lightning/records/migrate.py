@@ -47,6 +47,8 @@ OLD: dict[str, Now] = {
     "rivals.samplenet": Now("sampler", source=True),
     "rivals": Now(hint="use sampler=snet or sampler=samplenet and sampler.KEY"),
     "schedules": Now(hint="use epochs.task and epochs.sampler"),
+    "dataset.sha256": Now(hint="use dataset.archive_hash=sha256:HASH"),
+    "dataset.size": Now(hint="use dataset.archive_hash"),
     "labels": Now(hint="use hydra.run.dir"),
 }
 """Old key, or what it starts with, and what became of it; the longest entry counts."""
