@@ -51,7 +51,8 @@ class Scores(nn.Module):
             self.losses[key] = MeanMetric(nan_strategy="disable").to(value.device)
         mean = self.losses[key]
         assert isinstance(mean, MeanMetric)
-        mean.update(value, clouds)
+        # MeanMetric ignores weights when it does not look for NaN, so each cloud counts itself.
+        mean.update(value.expand(clouds))
         return mean
 
     def update_sets(
