@@ -95,10 +95,10 @@ def test_joint_runs_bring_their_task_net(tmp_path):
 @pytest.mark.parametrize(
     ("argument", "named"),
     [
-        ("sampler.tau_min=0.2", "sampler.tau_min is 0.2 here and was 0.1 when"),
+        ("sampler.tau_min=0.2", "sampler.tau_min must be 0.1.*got 0.2"),
         ("sampler=mops", "trained with sampler=fmops, got sampler=mops"),
-        ("dataset.classes=[chair,vase]", "tells apart 3 classes .* those of the data .2."),
-        ("dataset.classes=[vase,chair,bed]", "classes that are not those of the data"),
+        ("dataset.classes=[chair,vase]", "has 3 classes, which are not the 2 classes"),
+        ("dataset.classes=[vase,chair,bed]", "classes, which are not the"),
         ("learn=sampler", "trains nothing, got learn=sampler"),
         ("sizes=[33]", "at most sampler.m_max=32"),
         ("ckpt_path=last", "give evaluate=RUN"),
@@ -114,7 +114,7 @@ def test_a_task_net_of_other_classes_is_refused_wherever_it_is_given(tmp_path):
     run(compose(overrides), tmp_path / "task", overrides)
     swapped = [*TINY, "sampler=fps", f"weights={tmp_path}/task/weights.pt"]
     swapped.append("dataset.classes=[vase,chair,bed]")
-    with pytest.raises(UserError, match="classes that are not those of the data"):
+    with pytest.raises(UserError, match="classes, which are not the"):
         run(compose(swapped), tmp_path / "new", swapped)
 
 
@@ -147,7 +147,7 @@ def test_a_task_net_alone_is_tested_on_other_data(tmp_path):
     more = evaluated(folder, tmp_path / "more", "dataset.n_points=90", "test_noise_std=0.01")
     assert more.config["task"]["net"]["n_points"] == 90
     assert more.score != made.score
-    with pytest.raises(UserError, match="is a task net itself; leave weights out"):
+    with pytest.raises(UserError, match="trained a task net; leave weights out"):
         evaluated(folder, tmp_path / "a", "weights=null")
     with pytest.raises(UserError, match=r"made with learn=task.*weights=.*/weights.pt"):
         evaluated(folder, tmp_path / "b", "learn=nothing")
@@ -197,9 +197,7 @@ def test_the_run_may_be_named_in_several_ways(trained, tmp_path):
 def test_data_that_are_not_here_are_asked_for(trained, tmp_path):
     record = {**trained[1].plain(), "overrides": ["dataset=meshes", "dataset.root=meshes"]}
     (tmp_path / "result.json").write_text(json.dumps(record))
-    with pytest.raises(
-        UserError, match=r"had its data in dataset\.root=meshes, which is not there"
-    ):
+    with pytest.raises(UserError, match=r"dataset\.root=meshes, which does not exist"):
         command_line([f"evaluate={tmp_path}"])
     assert "dataset.root=." in command_line([f"evaluate={tmp_path}", "dataset.root=."])
 
@@ -214,7 +212,7 @@ def test_a_task_net_of_other_classes_and_their_data(trained, tmp_path):
 def test_a_lost_sampler_is_named(trained, tmp_path):
     record = trained[1].plain()
     (tmp_path / "result.json").write_text(json.dumps(record))
-    with pytest.raises(UserError, match=r"evaluate: the sampler of .* cannot be had"):
+    with pytest.raises(UserError, match=r"evaluate: the sampler of .* cannot be loaded"):
         evaluated((tmp_path, record), tmp_path, "weights=null")
 
 

@@ -1,7 +1,7 @@
-"""Cells of a sweep: finished ones are skipped, failed ones tried again, interrupted ones go on.
+"""Runs of a sweep: completed ones are skipped, failed ones repeated, interrupted ones resumed.
 
-A sweep whose folder and cells have fixed names (``hydra.sweep.dir``, ``hydra.sweep.subdir``) may be
-started again with the same command at any time.
+A sweep whose folders have fixed names (``hydra.sweep.dir``, ``hydra.sweep.subdir``) can be started
+again with the same command at any time.
 """
 
 import logging
@@ -24,25 +24,25 @@ from mops_lightning.records import run_record
 from mops_lightning.records.attempts import ASIDE, FAILED
 
 BEGUN = ".begun"
-"""File in a sweep's folder that is as old as its last start."""
+"""File in a sweep's folder with the time of its last start."""
 
 STAYS = (ASIDE, ".hydra", ".lock", "cli.log")
-"""What belongs to the cell and not to an attempt."""
+"""Files that belong to the cell, not to an attempt."""
 
 log = logging.getLogger(__name__)
 
 
 def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
-    """Run one cell of a sweep, as far as no earlier start of the sweep has.
+    """Run one cell of a sweep, unless an earlier start of the sweep completed it.
 
     Args:
         cfg: the cell's configuration.
         folder: the cell's folder.
-        overrides: what the sweep and the user changed, for the record.
+        overrides: of the sweep and the user, for the record.
 
     Returns:
-        The score; not a number when the cell failed, which its record and the log explain, so that
-        the other cells are run all the same.
+        The score. NaN if the cell failed, so that the sweep continues; the record and the log say
+        why.
 
     Raises:
         Interrupted: the user stopped the sweep.
@@ -54,7 +54,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
             (folder / FAILED).unlink(missing_ok=True)
             earlier = _earlier(cfg, folder)
             if earlier and earlier["status"] == "completed":
-                log.info(f"{folder}: done before, score {earlier['score']:.6g}")
+                log.info(f"{folder}: already completed, score {earlier['score']:.6g}")
                 return float(earlier["score"])
             if earlier:
                 _move_aside(folder)
@@ -62,18 +62,17 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
                 checkpoint = _checkpoint(cfg, folder)
                 if checkpoint and cfg.ckpt_path is None:
                     cfg.ckpt_path = str(checkpoint)
-                goes_on = f"goes on from {cfg.ckpt_path}" if cfg.ckpt_path else "tried again"
-                log.info(
-                    f"{folder}: {earlier['status'] if earlier else 'cut off'} before, {goes_on}"
-                )
-            # A process that was killed at its very start left this, and no record.
+                action = f"resuming from {cfg.ckpt_path}" if cfg.ckpt_path else "starting again"
+                status = earlier["status"] if earlier else "killed"
+                log.info(f"{folder}: the last attempt was {status}; {action}")
+            # A process that was killed before it wrote a record left this file.
             (folder / STARTED).unlink(missing_ok=True)
             score = run(cfg, folder, overrides).score
             return math.nan if score is None else float(score)
     except Interrupted:
         raise
     except Busy:
-        log.warning(f"{folder}: another process runs this cell, and it is left to it")
+        log.warning(f"{folder}: skipped, because another process runs this cell")
     except UserError as error:
         (folder / FAILED).write_text(f"{error}\n")
         log.error(f"{folder} failed: {error}")
@@ -103,29 +102,29 @@ def _claimed(folder: Path) -> Iterator[None]:
 
 
 def _earlier(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
-    """Return the record that lies in the cell's folder.
+    """Return the record in the cell's folder, if any.
 
     Raises:
-        UserError: it is of other settings, or is no record.
+        UserError: it has other settings, or is not a record.
     """
     if not (folder / run_record.FILE).exists():
         return None
     record = run_record.read(folder)
     different = _differences(cfg, record)
     if different:
-        # The setting itself, not one of those that are derived from it.
+        # The setting itself, not one that is derived from it.
         key = min(different, key=lambda one: (one.count("."), one))
         ours, other = different[key]
         raise UserError(
-            f"its result is of other settings: {key} is {ours} now and was {other}. Give the sweep "
-            f"another folder with hydra.sweep.dir=FOLDER; where {key} is swept, name the cells by "
-            "it too, with hydra.sweep.subdir; or move the cell's folder away."
+            f"its result has other settings: {key} was {other}, got {ours}. Give the sweep another "
+            f"folder with hydra.sweep.dir=FOLDER; if {key} is swept, add it to hydra.sweep.subdir; "
+            "or move the cell's folder away."
         )
     return record
 
 
 def _differences(cfg: DictConfig, record: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Return the dotted settings that differ and may not: what they are now, and were."""
+    """Return the dotted settings that differ but must not: the present and the earlier value."""
     mine = run_record.dotted(OmegaConf.to_container(cfg, resolve=True))
     theirs = run_record.dotted(record["config"])
     return {
@@ -136,9 +135,9 @@ def _differences(cfg: DictConfig, record: dict[str, Any]) -> dict[str, tuple[Any
 
 
 def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
-    """Return the checkpoint of the newest attempt with one: the last may have been cut off early.
+    """Return the checkpoint of the newest attempt that has one.
 
-    An attempt that failed by itself is no place to go on from, nor what lies before it.
+    Neither a failed attempt nor any attempt before it is resumed.
     """
     from mops_lightning.training.callbacks import CHECKPOINT
 
@@ -172,20 +171,20 @@ def _state(cell: Path) -> str:
     try:
         return str(run_record.read(cell)["status"])
     except UserError:
-        return "not begun"
+        return "not started"
 
 
 class SweepSummary(Callback):
-    """Says at the end of a sweep what became of its cells; failed ones make the exit status 1."""
+    """Prints the states of a sweep's cells at its end; the exit status is 1 if any failed."""
 
     def on_multirun_start(self, config: DictConfig, **extra: Any) -> None:
-        """Mark the beginning, on the clock of the folder's own disk."""
+        """Mark the start, on the clock of the folder's file system."""
         folder = Path(config.hydra.sweep.dir)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / BEGUN).touch()
 
     def on_multirun_end(self, config: DictConfig, **extra: Any) -> None:
-        """Count the cells of this start and print what became of them."""
+        """Count the cells of this start by state."""
         folder = Path(os.path.relpath(config.hydra.sweep.dir))
         begun = (folder / BEGUN).stat().st_mtime_ns
         states: Counter[str] = Counter()
@@ -196,7 +195,7 @@ class SweepSummary(Callback):
                 states[_state(cell)] += 1
         counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
         print(f"{sum(states.values())} cells: {counts}; in {folder}")
-        print(f"A table of them: python -m mops_lightning.report {folder}")
+        print(f"Table: python -m mops_lightning report {folder}")
         if set(states) != {"completed"}:
-            print(f"The same command with hydra.sweep.dir={folder} tries the others again.")
+            print(f"To repeat the rest: the same command with hydra.sweep.dir={folder}")
             raise SystemExit(1)

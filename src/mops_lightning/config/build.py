@@ -136,7 +136,7 @@ def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
         parameters = {**named, **parameters}
         if not rest:
             return parameters
-    return {**parameters, **own}  # nobody says what else is allowed
+    return {**parameters, **own}  # the target takes any further argument
 
 
 def _own_signature(function: Any) -> dict[str, inspect.Parameter]:

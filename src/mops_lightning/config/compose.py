@@ -21,7 +21,7 @@ def conf_dir() -> Path:
         if (folder / "config.yaml").is_file():
             return folder
     raise UserError(
-        f"conf/ is neither in {here} nor beside src/: reinstall with "
+        f"conf/ is neither in {here} nor next to src/: reinstall with "
         "pip install --force-reinstall mops-lightning."
     )
 

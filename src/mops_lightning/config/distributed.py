@@ -1,6 +1,6 @@
-"""One run over several processes (Lightning's DDP): who leads, and what each may do.
+"""One run on several processes (Lightning's DDP).
 
-Rank 0 leads: it alone writes files and prints. The others follow, and load, train and score.
+Rank 0 writes files and prints. Worker ranks only load, train and score.
 """
 
 import os
@@ -12,14 +12,14 @@ from mops_lightning.config.overrides import key
 from mops_lightning.errors import UserError
 
 RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "SLURM_PROCID")
-"""Where launchers tell a process which one it is; Lightning's own, torchrun and SLURM."""
+"""Environment variables with a process's rank: Lightning's own, torchrun's and SLURM's."""
 
 STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true")
-"""Those of Lightning's that start each process as this program."""
+"""Lightning's strategies that start every process as this program."""
 
 
 def is_distributed(cfg: DictConfig) -> bool:
-    """Return whether the settings ask for more than one device or host."""
+    """Return whether the settings request more than one device or host."""
     devices = cfg.trainer.get("devices")
     one = len(devices) == 1 if OmegaConf.is_list(devices) else devices == 1
     return not (one and cfg.trainer.get("num_nodes", 1) == 1)
@@ -31,14 +31,14 @@ def is_worker_rank(cfg: DictConfig) -> bool:
 
 
 def check_start(cfg: DictConfig, hydra_overrides: Sequence[str]) -> None:
-    """Find mistakes of a run whose processes were started by torchrun or the like.
+    """Check a run whose processes were started by a launcher such as torchrun.
 
     Args:
         cfg: the run's settings.
-        hydra_overrides: what was typed for Hydra itself.
+        hydra_overrides: overrides of Hydra's own settings.
 
     Raises:
-        UserError: the settings ask for one process, or every process would have its own folder.
+        UserError: the settings request one process, or every process would have its own folder.
     """
     number = _number("WORLD_SIZE")
     if number > 1 and not is_distributed(cfg):
@@ -60,10 +60,10 @@ def started_together(cfg: DictConfig) -> bool:
 
 
 def check(cfg: DictConfig) -> None:
-    """Find mistakes in the number of devices and hosts.
+    """Check the number of devices and hosts, and the strategy.
 
     Raises:
-        UserError: a value out of range, or a strategy that does not go with this program.
+        UserError: a value out of range, or a strategy that this program does not support.
     """
     devices = cfg.trainer.get("devices")
     if OmegaConf.is_list(devices):
@@ -82,8 +82,8 @@ def check(cfg: DictConfig) -> None:
         raise UserError(f"trainer.num_nodes must be a number of hosts, got {nodes!r}.")
     if cfg.trainer.get("sync_batchnorm"):
         raise UserError(
-            "trainer.sync_batchnorm: cannot be true, for the nets here pool and normalise in one "
-            "step, each process over its share of the batch. Leave it out."
+            "trainer.sync_batchnorm must be false: the nets pool and normalise in one step, each "
+            "process over its share of the batch. Leave it out."
         )
     strategy = cfg.trainer.get("strategy", "auto")
     if is_distributed(cfg) and strategy not in STRATEGIES:
@@ -94,32 +94,32 @@ def check(cfg: DictConfig) -> None:
 
 
 def check_multirun(cfg: DictConfig) -> None:
-    """Refuse a sweep whose cells ask for several devices each.
+    """Reject a sweep whose runs request several devices each.
 
     Raises:
-        UserError: they do; the processes of one cell would run the whole sweep.
+        UserError: they do; the processes of one run would repeat the whole sweep.
     """
     if is_distributed(cfg):
         raise UserError(
             f"trainer.devices={cfg.trainer.get('devices')}, trainer.num_nodes="
-            f"{cfg.trainer.get('num_nodes', 1)}: a sweep (-m) gives each cell one device. Run "
-            "cells beside each other with trainer.devices=1 hydra/launcher=joblib (or "
-            "submitit_slurm), or start each big run by itself, without -m."
+            f"{cfg.trainer.get('num_nodes', 1)}: a sweep (-m) gives each run one device. Use "
+            "trainer.devices=1 hydra/launcher=joblib (or submitit_slurm) for parallel runs, or "
+            "start each large run separately, without -m."
         )
 
 
 def check_shares(batch_size: int, test_clouds: int, held_out: int, processes: int) -> None:
-    """Refuse data that do not go round.
+    """Reject sizes that cannot be split across processes.
 
     Args:
-        batch_size: of all processes together.
-        test_clouds: how many there are.
-        held_out: how many training clouds are kept for ``val/``; 0 for none.
-        processes: how many share them.
+        batch_size: clouds in a batch of all processes together.
+        test_clouds: number of test clouds.
+        held_out: number of training clouds that are held out for ``val/``.
+        processes: number of processes.
 
     Raises:
-        UserError: ``batch_size`` is no multiple of the number of processes, or leaves fewer than
-            two clouds to one of them, or there are fewer clouds than processes.
+        UserError: ``batch_size`` is not a multiple of the number of processes, leaves fewer than
+            two clouds to a process, or there are fewer clouds than processes.
     """
     if test_clouds < processes:
         raise UserError(

@@ -83,13 +83,13 @@ def _check_limits(cfg: DictConfig) -> None:
 def _check_evaluation(cfg: DictConfig) -> None:
     if cfg.evaluate and cfg.learn not in ("nothing", "task"):
         raise UserError(
-            f"evaluate: trains nothing, got learn={cfg.learn}. Leave learn out, or train anew "
+            f"evaluate: trains nothing, got learn={cfg.learn}. Leave learn out, or train "
             "without evaluate."
         )
     if not cfg.evaluate and cfg.weights == "run":
         raise UserError("weights=run means the run named by evaluate=RUN, which is not given.")
     if cfg.learn == "nothing" and cfg.ckpt_path is not None:
-        raise UserError("ckpt_path resumes a training; to test a trained run give evaluate=RUN.")
+        raise UserError("ckpt_path resumes training; to test a trained run give evaluate=RUN.")
 
 
 def _check_node(node: Any, where: str) -> None:

@@ -1,4 +1,4 @@
-"""Names of files that a sweep's cells have beside a run's; reports know them too."""
+"""Names of files in the folders of a sweep's runs, which reports read too."""
 
 ASIDE = ".attempts"
 """Folder in a cell's where earlier attempts are kept."""

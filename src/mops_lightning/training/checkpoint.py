@@ -1,4 +1,4 @@
-"""Finding the checkpoint to go on from, and making sure that it belongs to this run."""
+"""Finding the checkpoint to resume from, and checking that it belongs to this run."""
 
 import json
 from pathlib import Path
@@ -13,19 +13,18 @@ from mops_lightning.training.experiment import CHECKPOINT_KEY
 from mops_lightning.zoo import weights
 
 LENGTH = "trainer.max_epochs"
-"""How long a run was planned to be."""
+"""The planned length of a run."""
 
 
 def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
-    """Return what must be equal for a checkpoint to be resumed, as text by setting.
+    """Return the values that must be equal for a checkpoint to be resumed, as JSON by setting.
 
-    These are the settings that affect training (see ``config.settings``), and the content of the
-    files that the others name. ``LENGTH`` is one of them but may differ: a finished run may be made
-    longer.
+    These are the settings that affect training (see ``config.settings``), and hashes of the files
+    that settings name. ``LENGTH`` may differ: a completed run can be extended.
 
     Args:
         cfg: the run's settings.
-        fingerprint: of the data.
+        fingerprint: the data set's fingerprint.
     """
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     parts = {**trained_with(plain), "dataset": fingerprint, **_given_weights(cfg)}
@@ -33,14 +32,14 @@ def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
 
 
 def _given_weights(cfg: DictConfig) -> dict[str, str]:
-    """Return the hash of the weights file that the run begins with, if it is one of the user's."""
+    """Return the hash of the weights file that the user gave, if any."""
     if cfg.weights in (None, "auto", "run") or not Path(cfg.weights).expanduser().is_file():
         return {}
     return {"weights": str(weights.read(cfg.weights)["sha256"])}
 
 
 def lengthened(cfg: DictConfig, checkpoint: Path) -> bool:
-    """Return whether ``checkpoint`` comes from a run of another planned length."""
+    """Return whether ``checkpoint`` is from a run with another planned length."""
     return _read(checkpoint).get(LENGTH) != json.dumps(cfg.trainer.max_epochs)
 
 
@@ -71,9 +70,9 @@ def find(cfg: DictConfig, mine: dict[str, str]) -> Path | None:
     if different:
         name = different[0]
         raise UserError(
-            f"ckpt_path: {path} is of a run with other settings ({', '.join(different)}); "
+            f"ckpt_path: {path} is from a run with other settings ({', '.join(different)}); "
             f"{name} is {mine.get(name)} here and {theirs.get(name)} there. "
-            "Give the same settings, or leave ckpt_path out to start anew."
+            "Give the same settings, or leave ckpt_path out to start a new run."
         )
     return path
 
@@ -91,7 +90,7 @@ def _newest(out: Path, mine: dict[str, str]) -> Path:
             return path
     raise UserError(
         f"ckpt_path=last: none of the {len(found)} checkpoints below {out} has these settings. "
-        "Leave ckpt_path out to start anew, or name a run's folder."
+        "Leave ckpt_path out to start a new run, or give a run's folder."
     )
 
 

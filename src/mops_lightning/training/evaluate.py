@@ -1,9 +1,9 @@
-"""Testing a trained run anew: on other sizes, other data or under another task net.
+"""Evaluating a trained run: with other sizes, other data or another task net.
 
-A run that trained a task net alone is tested on all points of its data or of others.
+A run that trained only a task net is tested on full clouds.
 
-``python -m mops_lightning evaluate=RUN sizes=[8,100]`` repeats what RUN was told, then what stands
-on the command line, trains nothing, and leaves a record of its own.
+``python -m mops_lightning evaluate=RUN sizes=[8,100]`` applies RUN's overrides, then those of the
+command line, trains nothing, and writes a record of its own.
 """
 
 from pathlib import Path
@@ -26,16 +26,16 @@ OF_RUN = "run"
 
 
 def command_line(arguments: list[str]) -> list[str]:
-    """Put a run's own overrides before the user's where ``evaluate=RUN`` is among these.
+    """Insert a run's overrides before the user's if ``evaluate=RUN`` is among these.
 
     Args:
         arguments: as typed, without the program's name.
 
     Returns:
-        The arguments to go on with.
+        The arguments for Hydra.
 
     Raises:
-        UserError: RUN is no run with a trained sampler.
+        UserError: RUN is not a completed run that trained something.
     """
     places = [i for i, a in enumerate(arguments) if overrides.key(a) == KEY]
     chosen = _chosen(arguments[places[-1]]) if places else None
@@ -46,7 +46,7 @@ def command_line(arguments: list[str]) -> list[str]:
     names = record["config"]["names"]
     groups = {"task": names["task"], "dataset": names["dataset"], "sampler": names["sampler"]}
     typed = [a for i, a in enumerate(arguments) if i not in places and overrides.key(a)]
-    # Naming what the run has anyway changes nothing, its settings below it stay too.
+    # Choosing the run's own group again changes nothing; the settings below it stay too.
     typed_keys = [
         overrides.key(a) for a in typed if a not in [f"{k}={v}" for k, v in groups.items()]
     ]
@@ -61,7 +61,7 @@ def command_line(arguments: list[str]) -> list[str]:
     _data_are_here(kept, folder)
     learn = "task" if record["config"]["learn"] == "task" else "nothing"
     own = [*kept, f"learn={learn}", f"weights={OF_RUN}", f"{KEY}={overrides.quote(str(folder))}"]
-    # In one place: flags may stand before or behind all overrides, not between them.
+    # All in one place: argparse accepts flags before or after all overrides, not between them.
     before = [a for i, a in enumerate(arguments[: places[0]]) if i not in places]
     behind = [a for i, a in enumerate(arguments) if i > places[0] and i not in places]
     given = {overrides.key(a) for a in typed}
@@ -81,15 +81,15 @@ def _chosen(argument: str) -> str | None:
 
 
 def _data_are_here(kept: list[str], folder: Path) -> None:
-    """Refuse a folder of data that is named from where the run was started, which is elsewhere."""
+    """Reject a relative data folder that does not exist from the current folder."""
     for argument in kept:
         override = overrides.parse(argument)
         if override is None or overrides.key(argument) != "dataset.root" or not override.value():
             continue
         if not Path(str(override.value())).expanduser().exists():
             raise UserError(
-                f"{KEY}: {folder} had its data in {argument}, which is not there, seen from this "
-                "folder. Say where they are: dataset.root=PATH."
+                f"{KEY}: {folder} used {argument}, which does not exist from the current folder. "
+                "Give dataset.root=PATH."
             )
 
 
@@ -97,7 +97,7 @@ def trained_run(folder: Path) -> dict[str, Any]:
     """Return the record of a completed run that trained something.
 
     Raises:
-        UserError: it is none.
+        UserError: it is not such a run.
     """
     if folder.name == run_record.FILE:
         folder = folder.parent
@@ -118,13 +118,13 @@ def trained_run(folder: Path) -> dict[str, Any]:
 
 
 def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict[str, Any]:
-    """Fill an experiment with the nets of the run that ``cfg.evaluate`` names.
+    """Load the nets of the run that ``cfg.evaluate`` names into an experiment.
 
     Returns:
-        Notes for the record: which run, and what made it.
+        Notes for the record: the run and how it was trained.
 
     Raises:
-        UserError: settings, classes or files do not fit the run.
+        UserError: settings, classes or files do not match the run.
     """
     record = trained_run(Path(cfg.evaluate))
     folder = Path(cfg.evaluate.removesuffix(run_record.FILE))
@@ -139,7 +139,7 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
     try:
         content = weights.load_into(learned, weights.of_run(folder))
     except UserError as error:
-        raise UserError(f"{KEY}: the {what} of {folder} cannot be had: {error}") from None
+        raise UserError(f"{KEY}: the {what} of {folder} cannot be loaded: {error}") from None
     has_weights = any(True for _ in experiment.task.parameters())
     if cfg.learn != "task" and cfg.weights == OF_RUN and has_weights:
         try:
@@ -158,34 +158,34 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
 
 
 def same_classes(names: list[str] | None, dataset: CloudDataset, what: str) -> None:
-    """Refuse a net that numbers its classes in another way than the data do.
+    """Reject a net whose class numbers differ from those of the data.
 
     Args:
-        names: the classes that the net was trained on; None where nobody noted them.
+        names: the classes that the net was trained on; None if unknown.
         dataset: the data.
         what: the file or folder of the net.
 
     Raises:
-        UserError: they differ, or are not known.
+        UserError: they differ, or are unknown.
     """
     here = list(dataset.class_names)
     if names is None:
         raise UserError(
-            f"{what} does not say which classes its net tells apart, so it can be used on its own "
-            "data only."
+            f"{what} does not name the classes of its net, so it can be used with its own data "
+            "only."
         )
     if list(names) != here:
         missing = [name for name in names if name not in here] or list(names)
         raise UserError(
-            f"{what}: its net tells apart {len(names)} classes that are not those of the data "
-            f"({len(here)}): {', '.join(missing[:3])} ... against {', '.join(here[:3])} .... "
+            f"{what}: its net has {len(names)} classes, which are not the {len(here)} classes of "
+            f"the data: {', '.join(missing[:3])} ... instead of {', '.join(here[:3])} .... "
             "Give a task net of these classes with weights=auto, or data of its classes with "
             "dataset.classes."
         )
 
 
 def _load_task(task: torch.nn.Module, folder: Path, record: dict[str, Any]) -> None:
-    """Take the task net from a jointly trained run's file, or from the run's checkpoint."""
+    """Load the task net from a jointly trained run's weights, or from the run's checkpoint."""
     name = record["files"].get("task_weights")
     if name is not None:
         weights.load_into(task, folder / name)
@@ -193,17 +193,19 @@ def _load_task(task: torch.nn.Module, folder: Path, record: dict[str, Any]) -> N
     path = folder / "checkpoints" / CHECKPOINT
     if not path.is_file():
         raise UserError(
-            f"{KEY}: {path}, which holds the run's task net, is gone. Give one with weights=."
+            f"{KEY}: {path}, which contains the run's task net, does not exist. Give weights=FILE."
         )
     state = weights.read_plain(path, KEY, "a checkpoint")["state_dict"]
     own = {key.removeprefix("task."): value for key, value in state.items() if key[:5] == "task."}
     if weights.digest(own) != record["notes"].get("task_weights_sha256"):
-        raise UserError(f"{KEY}: {path} is not of the run in its folder. Give weights=.")
+        raise UserError(
+            f"{KEY}: {path} does not belong to the run in its folder. Give weights=FILE."
+        )
     weights.fit_state(task, own, path)
 
 
 def _other_net(cfg: DictConfig, record: dict[str, Any]) -> str:
-    """Say in which settings of the task net an evaluation differs from its run."""
+    """Return the settings of the task net in which an evaluation differs from its run."""
     here: Any = OmegaConf.to_container(cfg.task.net, resolve=True)
     there = record["config"]["task"].get("net") or {}
     changed = [
@@ -221,11 +223,12 @@ def _same_settings(
     here: Any = OmegaConf.to_container(cfg, resolve=True)
     if (cfg.learn == "task") != (there["learn"] == "task"):
         raise UserError(
-            f"{KEY}: {folder} was made with learn={there['learn']}; leave learn out. Samplers are "
-            f"tested under a task net of your own with weights={weights.of_run(folder)}."
+            f"{KEY}: {folder} was made with learn={there['learn']}; leave learn out. To test a "
+            "sampler with this task net, evaluate the sampler's run with "
+            f"weights={weights.of_run(folder)}."
         )
     if cfg.learn == "task" and cfg.weights != OF_RUN:
-        raise UserError(f"{KEY}: {folder} is a task net itself; leave weights out.")
+        raise UserError(f"{KEY}: {folder} trained a task net; leave weights out.")
     for group in ("task",) if cfg.learn == "task" else ("task", "sampler"):
         old, new = there["names"][group], here["names"][group]
         if old != new:
@@ -237,18 +240,22 @@ def _same_settings(
     if here["names"]["net"] != there["names"]["net"] and cfg.weights == OF_RUN and not weightless:
         raise UserError(
             f"{KEY}: the task net of {folder} is {there['names']['net']}; for "
-            f"task/net={here['names']['net']} give its weights too: weights=auto or a file."
+            f"task/net={here['names']['net']} also give its weights: weights=auto or weights=FILE."
         )
     for key in sorted({*there["sampler"], *here["sampler"]}) if cfg.learn != "task" else ():
         old, new = there["sampler"].get(key), here["sampler"].get(key)
         if old != new:
-            hint = "" if key != "m" else " Sizes of a net for many are chosen with sizes=[...]."
+            hint = (
+                ""
+                if key != "m"
+                else " For other sizes of a sampler for many sizes give sizes=[...]."
+            )
             raise UserError(
-                f"{KEY}: sampler.{key} is {new} here and was {old} when {folder} was trained; "
-                f"leave it out, or train a sampler with it.{hint}"
+                f"{KEY}: sampler.{key} must be {old}, as in {folder}, got {new}. "
+                f"Leave it out, or train a sampler with it.{hint}"
             )
 
 
 def _covers(key: str, other: str) -> bool:
-    """Return whether overriding ``key`` makes an earlier override of ``other`` void."""
+    """Return whether overriding ``key`` cancels an earlier override of ``other``."""
     return other == key or other.startswith((f"{key}.", f"{key}/", f"{key.replace('/', '.')}."))

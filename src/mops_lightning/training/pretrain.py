@@ -24,11 +24,11 @@ from mops_lightning.zoo.weights import FILE
 def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
     """Return the file that ``weights`` means; ``auto`` trains the net when it is not cached.
 
-    With ``learn=task`` a file is where the training starts from; ``auto`` starts anew.
+    With ``learn=task``, training starts from the given file; with ``auto`` from scratch.
 
     Returns:
-        None for ``weights=null``, which leaves the net as it was initialised, for a resumed run,
-        whose checkpoint holds the task net as well, and for the net of an evaluated run.
+        None for ``weights=null`` (the net stays as initialised), for a resumed run (its checkpoint
+        contains the task net), and for an evaluated run.
     """
     if cfg.weights in (None, OF_RUN) or cfg.ckpt_path is not None:
         return None
@@ -46,7 +46,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
             )
         print(
             f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it first, "
-            f"{cfg.pretrain.max_epochs} epochs. It is kept in {folder}",
+            f"{cfg.pretrain.max_epochs} epochs. Cache: {folder}",
             flush=True,
         )
         _train(cfg, folder, dataset)
@@ -71,7 +71,7 @@ def task_config(cfg: DictConfig) -> DictConfig:
 
 
 def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
-    """Return where the task net of these settings and data is kept, there or not."""
+    """Return the cache folder of the task net for these settings and data; it may not exist."""
     key = checkpoint.identity(task_config(cfg), dataset.fingerprint)
     digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:12]
     name = f"{cfg.names.task}-{cfg.names.net}-{cfg.names.dataset}-{digest}"
@@ -99,7 +99,7 @@ def publish(job: Job, record: RunRecord) -> None:
 def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
     own = task_config(cfg)
     if (folder / "checkpoints" / CHECKPOINT).is_file():
-        # An earlier pretraining was cut off: go on from there.
+        # An earlier pretraining was interrupted: resume it.
         own.ckpt_path = str(folder)
     try:
         with recorded(own, folder, []) as record:
