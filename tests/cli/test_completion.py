@@ -53,7 +53,7 @@ def press_tab(tmp_path):
 
 def test_tab_completes_settings_subcommands_and_files(press_tab):
     expected = {
-        "mops-lightning sam": ["sampler.", "sampler="],
+        "mops-lightning sam": ["sampler", "sampler."],
         "mops-lightning sampler=fm": ["sampler=fmops"],
         "mops-lightning sampler=fmops sampler.m_m": ["sampler.m_max="],
         "mops-lightning rep": ["report"],

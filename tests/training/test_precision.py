@@ -52,7 +52,7 @@ def test_evaluate_precision_does_not_change_metrics(tmp_path):
 def test_precision_gpu_only_on_cpu_raises(tmp_path):
     status, _, err = call([*TINY_WITH_PICTURES, "trainer.precision=16-mixed"], tmp_path)
     assert status != 0
-    assert "take bf16-mixed" in err
+    assert "trainer.precision=bf16-mixed" in err
 
 
 @pytest.mark.parametrize("precision", ["bf16-true", "64-true", "transformer-engine", "half"])

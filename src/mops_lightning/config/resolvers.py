@@ -5,6 +5,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from mops_lightning.config import settings
 from mops_lightning.errors import UserError, did_you_mean
 
 
@@ -39,9 +40,27 @@ def run_label(_root_: DictConfig) -> str:
     return f"{_root_.names.sampler}-m{size}{suffixes[_root_.learn]}"
 
 
+def selectable_groups() -> str:
+    """Return the groups that users choose from with their choices, one per line, for ``--help``.
+
+    Files for one choice in particular (``sampler/mops/``) and for combinations of groups
+    (``dataset_task/``) are left out: Hydra selects them.
+    """
+    from hydra.core.global_hydra import GlobalHydra
+
+    loader = GlobalHydra.instance().config_loader()
+    lines = []
+    for top in (*(name for name, one in settings.declared().items() if one.group), "experiment"):
+        choices = loader.get_group_options(top)
+        below = [name for name in loader.list_groups(top) if name not in choices]
+        groups = [top, *(f"{top}/{name}" for name in below)]
+        lines += [f"{group}: {', '.join(loader.get_group_options(group))}" for group in groups]
+    return "\n".join(sorted(lines))
+
+
 def register() -> None:
     """Register all resolvers."""
-    for resolver in (choose, group_choices, run_label):
+    for resolver in (choose, group_choices, run_label, selectable_groups):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
 
 
