@@ -150,7 +150,7 @@ def test_the_rivals_settings():
         (["trainer=cpu", "trainer.devices=-1"], "trainer.devices=-1 means all GPUs"),
         (["trainer=ddp", "trainer.num_nodes=0"], "trainer.num_nodes must be a number of hosts"),
         (["trainer=ddp", "trainer.strategy=fsdp"], "trainer.strategy: several devices work with"),
-        (["trainer=ddp", "+trainer.sync_batchnorm=true"], "trainer.sync_batchnorm: cannot be"),
+        (["trainer=ddp", "+trainer.sync_batchnorm=true"], "trainer.sync_batchnorm must be false"),
         (["sampler.alpha=abc"], r"sampler\.alpha must be a number, got 'abc'"),
         (["optimizer.lr=abc"], r"optimizer\.lr must be a number, got 'abc'"),
         (["dataset=meshes", "dataset.root=x", "dataset.skip_broken=maybe"], "true or false"),
