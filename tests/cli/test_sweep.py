@@ -24,7 +24,7 @@ def start(tmp_path):
     return cell
 
 
-def test_a_finished_cell_is_not_run_again(start, tmp_path):
+def test_run_cell_completed_is_skipped(start, tmp_path):
     score = start("sampler=fps", "weights=null")
     path = tmp_path / "cell" / run_record.FILE
     before = path.stat().st_mtime_ns
@@ -36,16 +36,16 @@ def test_a_finished_cell_is_not_run_again(start, tmp_path):
     assert not (tmp_path / "cell" / ASIDE).exists()
 
 
-def test_a_cell_of_other_settings_is_left_alone(start, tmp_path, caplog):
+def test_run_cell_other_settings_keeps_result(start, tmp_path, caplog):
     score = start("sampler=fps", "weights=null")
     assert math.isnan(start("sampler=fps", "weights=null", "seed=3"))
-    assert "other settings: seed is 3 now and was 0" in caplog.text
+    assert "other settings: seed was 0, got 3" in caplog.text
     assert "hydra.sweep.dir" in (tmp_path / "cell" / FAILED).read_text()
     assert start("sampler=fps", "weights=null") == score
     assert not (tmp_path / "cell" / FAILED).exists()
 
 
-def test_a_failed_cell_is_tried_again(start, tmp_path, caplog):
+def test_run_cell_failed_is_repeated(start, tmp_path, caplog):
     file = tmp_path / "net.pt"
     assert math.isnan(start("sampler=fps", f"weights={file}"))
     assert f"no file {file}" in caplog.text
@@ -58,7 +58,7 @@ def test_a_failed_cell_is_tried_again(start, tmp_path, caplog):
     assert run_record.read(tmp_path / "cell" / ASIDE / "1")["status"] == "failed"
 
 
-def test_an_interrupted_cell_goes_on_to_the_same_result(start, tmp_path):
+def test_run_cell_interrupted_resumes_to_same_result(start, tmp_path):
     longer = ["sampler=mops", "weights=null", "trainer.max_epochs=2"]
     score = start(*longer)
     whole = run_record.read(tmp_path / "cell")
@@ -82,7 +82,7 @@ def test_an_interrupted_cell_goes_on_to_the_same_result(start, tmp_path):
     assert resumed.endswith(f"{ASIDE}/1/checkpoints/last.ckpt")
 
 
-def test_a_cell_that_another_process_runs_is_left_to_it(start, tmp_path, caplog):
+def test_run_cell_busy_is_skipped(start, tmp_path, caplog):
     folder = tmp_path / "cell"
     folder.mkdir()
     with FileLock(folder / ".lock"):
@@ -92,7 +92,7 @@ def test_a_cell_that_another_process_runs_is_left_to_it(start, tmp_path, caplog)
     assert math.isfinite(start("sampler=fps", "weights=null"))
 
 
-def test_errors_of_the_program_do_not_end_the_sweep(start, tmp_path, monkeypatch, caplog):
+def test_run_cell_program_error_continues_sweep(start, tmp_path, monkeypatch, caplog):
     def broken(*_):
         raise RuntimeError("out of something")
 

@@ -26,7 +26,7 @@ def loaders(number, processes, batch_size=8, **extra):
 
 
 @pytest.mark.parametrize("number", [16, 29])
-def test_the_shares_of_a_training_batch_are_the_batch_of_one_process(number):
+def test_loader_shares_of_training_batch_form_whole_batch(number):
     settings = {"shuffle": True, "drop_last": True, "augment": Augmentation(True, 0.1)}
     (alone,) = loaders(number, 1, **settings)
     for whole, *shares in zip(alone, *loaders(number, 2, **settings), strict=True):
@@ -35,13 +35,13 @@ def test_the_shares_of_a_training_batch_are_the_batch_of_one_process(number):
         assert torch.equal(torch.cat([share.labels for share in shares]), whole.labels)
 
 
-def test_a_batch_that_does_not_go_round_leaves_the_last_clouds_out():
+def test_loader_indivisible_batch_drops_last_clouds():
     first, second = (list(loader) for loader in loaders(7, 2, shuffle=True))
     assert [len(batch.points) for batch in (*first, *second)] == [3, 3]
 
 
 @pytest.mark.parametrize("processes", [1, 2, 3, 4])
-def test_every_cloud_is_scored_once_in_equally_many_batches_none_of_them_empty(processes):
+def test_loader_test_split_scores_each_cloud_once(processes):
     for number in range(processes, 60):
         shares = [list(loader) for loader in loaders(number, processes)]
         assert {len(share) for share in shares} == {-(-number // 8)}
@@ -60,12 +60,12 @@ def test_every_cloud_is_scored_once_in_equally_many_batches_none_of_them_empty(p
         ((8, 9, 1, 2), "val_fraction holds out 1 training clouds, fewer than the 2 devices"),
     ],
 )
-def test_data_that_do_not_go_round_are_refused(numbers, said):
+def test_check_shares_indivisible_sizes_raise(numbers, said):
     with pytest.raises(UserError, match=said):
         check_shares(*numbers)
 
 
-def test_processes_of_a_launcher_must_be_meant_and_share_a_folder(monkeypatch):
+def test_check_start_unexpected_processes_raise(monkeypatch):
     several = compose(["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"])
     check_start(several, [])
     monkeypatch.setenv("WORLD_SIZE", "2")
@@ -76,7 +76,7 @@ def test_processes_of_a_launcher_must_be_meant_and_share_a_folder(monkeypatch):
         check_start(compose(["trainer=cpu"]), ["hydra.run.dir=here"])
 
 
-def test_a_wrong_batch_is_refused_before_the_task_net_is_trained(tmp_path):
+def test_wrong_batch_size_fails_before_pretraining(tmp_path):
     devices = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
     arguments = [*TINY_WITH_PICTURES[1:], *devices, "val_fraction=0", "batch_size=15"]
     status, out, err = call(arguments, tmp_path)
@@ -96,7 +96,7 @@ REGISTRATION = [
 ]
 
 
-def test_two_processes_give_the_metrics_of_one_and_only_the_first_writes(tmp_path):
+def test_two_processes_equal_one_and_rank_zero_writes(tmp_path):
     """PCRNet has no BatchNorm, so that nothing but the order of sums may differ."""
     status, _, err = call([*REGISTRATION, "hydra.run.dir=one"], tmp_path)
     assert status == 0, err
@@ -118,7 +118,7 @@ def test_two_processes_give_the_metrics_of_one_and_only_the_first_writes(tmp_pat
     }
 
 
-def test_a_sweep_over_several_devices_is_refused_with_the_way_out(tmp_path):
+def test_sweep_on_several_devices_raises(tmp_path):
     status, _, err = call(["-m", *TINY_WITH_PICTURES, "trainer.devices=2", "m=4,8"], tmp_path)
     assert status == 2
     assert "hydra/launcher=joblib" in err

@@ -46,7 +46,7 @@ def test_specialised_files_belong_to_groups_that_exist():
     ("task", "alpha", "tau_min"),
     [("classification", 30.0, 0.1), ("registration", 1.0, 0.1), ("reconstruction", 0.2, 0.5)],
 )
-def test_mops_has_the_task_s_alpha_and_tau(task, alpha, tau_min):
+def test_mops_alpha_and_tau_depend_on_task(task, alpha, tau_min):
     for sampler in ("mops", "fmops"):
         node = compose([f"task={task}", f"sampler={sampler}"]).sampler
         assert (node.alpha, node.tau_min) == (alpha, tau_min)
@@ -61,7 +61,7 @@ def test_mops_has_the_task_s_alpha_and_tau(task, alpha, tau_min):
         ("reconstruction", "sampler", 5e-4),
     ],
 )
-def test_snet_has_the_rate_of_task_and_learn(task, learn, rate):
+def test_snet_rate_depends_on_task_and_learn(task, learn, rate):
     cfg = compose([f"task={task}", f"learn={learn}", "sampler=snet"])
     assert (cfg.optimizer.lr, cfg.pretrain.optimizer.lr) == (rate, 1e-3)
 
@@ -87,7 +87,7 @@ def test_epochs_depend_on_dataset_and_task(overrides, epochs):
 LEARN = ("task", "sampler", "joint", "nothing")
 
 
-def test_files_of_ones_own_need_no_specialised_file(tmp_path):
+def test_user_files_need_no_specialised_file(tmp_path):
     own = {
         "sampler/mine": "_target_: mops_lightning.samplers.fps.FPSSampler\nm: ${m}\n",
         "task/ours": (

@@ -58,7 +58,7 @@ def test_made_up_setting_is_validated(affects):
         check(compose(["+hast=1"]))
 
 
-def test_made_up_setting_of_training_is_in_the_identity_and_the_cache_key(affects):
+def test_made_up_setting_of_training_is_in_identity_and_cache_key(affects):
     trains = affects is Affects.TRAINING
     plain, changed = compose(), compose(["haste=2"])
     assert ("haste" in identity(plain, "d")) == trains

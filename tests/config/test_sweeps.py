@@ -28,7 +28,7 @@ def composed(name, overrides=()):
 
 
 @pytest.mark.parametrize("name", SWEEPS)
-def test_cells_are_valid_and_named_by_all_that_is_swept(name):
+def test_sweep_cells_are_valid_and_named_by_swept_settings(name):
     quick = name.startswith("quick/")
     cfg = composed(name)
     raw: Any = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)
@@ -45,6 +45,6 @@ def test_cells_are_valid_and_named_by_all_that_is_swept(name):
     check(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"]))
 
 
-def test_every_sweep_has_its_quick_form():
+def test_sweeps_all_have_quick_form():
     full = {name for name in SWEEPS if "/" not in name}
     assert {f"quick/{name}" for name in full - {"noise"}} == set(SWEEPS) - full

@@ -60,7 +60,7 @@ def nodes(cfg):
 
 
 @pytest.mark.parametrize("override", list(choices()))
-def test_every_yaml_composes_resolves_and_fits_its_constructors(override):
+def test_compose_every_choice_fits_its_constructor(override):
     cfg = compose([override, *EXTRA.get(override, [])])
     OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     check(cfg)
@@ -78,7 +78,7 @@ def test_every_yaml_composes_resolves_and_fits_its_constructors(override):
         assert not missing, f"{node['_target_']} would lack {missing}"
 
 
-def test_the_main_job_is_what_the_readme_says():
+def test_default_settings_are_those_of_readme():
     cfg = compose()
     assert dict(cfg.names) == {
         "task": "classification",
@@ -89,7 +89,7 @@ def test_the_main_job_is_what_the_readme_says():
     assert (cfg.m, cfg.learn, cfg.weights) == (32, "sampler", "auto")
 
 
-def test_the_paper_s_settings():
+def test_paper_experiments_have_paper_settings():
     cfg = compose(["experiment=classification_paper"])
     assert (cfg.sampler.tau_min, cfg.sampler.alpha) == (0.1, 30.0)
     assert cfg.optimizer.lr == 5e-4
@@ -99,7 +99,7 @@ def test_the_paper_s_settings():
     assert cfg.val_fraction == 0
 
 
-def test_the_rivals_settings():
+def test_rival_samplers_have_published_settings():
     cfg = compose(["experiment=classification_snet", "sampler=samplenet"])
     assert (cfg.sampler.k, cfg.sampler.beta, cfg.sampler.alpha, cfg.sampler.sigma_min) == (
         7,
@@ -168,6 +168,6 @@ def test_the_rivals_settings():
         (["sampler._target_=mops_lightning.samplers.mops.MOPSNett"], "cannot import"),
     ],
 )
-def test_mistakes_are_named_before_any_work(overrides, said):
+def test_check_mistake_names_setting(overrides, said):
     with pytest.raises(UserError, match=said):
         check(compose(overrides))

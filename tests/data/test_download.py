@@ -87,7 +87,7 @@ def files(target: Path) -> list[str]:
 
 @pytest.mark.parametrize("how", ["well", "no length"])
 @pytest.mark.parametrize("known_hash", [None, SHA256, SHA256.upper(), f"md5:{MD5}"])
-def test_fetch_saves_the_whole_file_alone(
+def test_fetch_saves_only_whole_file(
     site: Site, target: Path, how: str, known_hash: str | None
 ) -> None:
     site.behave = [how]
@@ -98,7 +98,7 @@ def test_fetch_saves_the_whole_file_alone(
 
 
 @pytest.mark.parametrize("how", ["500", "503", "break off"])
-def test_fetch_after_a_passing_failure_asks_again(site: Site, target: Path, how: str) -> None:
+def test_fetch_temporary_failure_retries(site: Site, target: Path, how: str) -> None:
     site.behave = [how]
     fetch([site.url()], target)
     assert target.read_bytes() == CONTENT
@@ -161,7 +161,7 @@ def test_fetch_existing_file_is_checked_and_kept(site: Site, target: Path) -> No
     assert target.read_bytes() == CONTENT
 
 
-def test_fetch_into_a_file_is_one_error(site: Site, tmp_path: Path) -> None:
+def test_fetch_target_below_file_raises(site: Site, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match="Cannot write"):
         fetch([site.url()], tmp_path / "file" / "file.zip")

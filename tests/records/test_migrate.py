@@ -63,7 +63,7 @@ def test_old_key_on_the_command_line_is_refused(argument, said, tmp_path):
     assert len(err.strip().splitlines()) == 1
 
 
-def test_overrides_get_new_names_and_lose_gone_ones():
+def test_upgraded_overrides_rename_and_drop():
     old = ["m=8", "++optimizer.optimizer.lr=1e-3", "labels.task=x", "noise=0,0.1", "~epochs.joint"]
     new = ["m=8", "++optimizer.lr=1e-3", "test_noise_std=0,0.1", "~epochs.sampler"]
     assert upgraded_overrides(old) == new
@@ -102,13 +102,13 @@ NEW_CONFIG = {
 }
 
 
-def test_config_is_upgraded_once_and_for_all():
+def test_upgraded_config_is_idempotent():
     assert upgraded_config(OLD_CONFIG) == NEW_CONFIG
     assert upgraded_config(NEW_CONFIG) == NEW_CONFIG
     assert OLD_CONFIG["epochs"] == {"task": 12, "sampler": 6, "joint": 3, "nothing": 0}
 
 
-def test_every_committed_record_is_readable_under_the_present_names():
+def test_read_committed_records_get_present_names():
     paths = sorted(RESULTS.rglob(run_record.FILE))
     assert paths
     for path in paths:

@@ -56,7 +56,7 @@ def unbroken():
 
 
 @pytest.mark.parametrize(("epoch", "step"), [(0, 0), (0, 3), (1, 0), (1, 1), (1, 3), (2, 2)])
-def test_stopped_anywhere_it_resumes_to_the_same_weights(unbroken, tmp_path, epoch, step):
+def test_stopped_run_resumes_to_same_weights(unbroken, tmp_path, epoch, step):
     path = tmp_path / "last.ckpt"
     with pytest.raises(Interrupted, match="ckpt_path"):
         fit([StopAt(path, epoch, step)])

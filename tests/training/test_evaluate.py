@@ -24,7 +24,7 @@ def evaluated(trained, tmp_path, *arguments):
     return run(compose(chosen), tmp_path / "new", chosen)
 
 
-def test_the_run_s_own_figures_come_again(trained, tmp_path):
+def test_evaluate_without_changes_repeats_metrics(trained, tmp_path):
     folder, record = trained
     again = evaluated(trained, tmp_path)
     assert again.metrics == record.metrics
@@ -35,7 +35,7 @@ def test_the_run_s_own_figures_come_again(trained, tmp_path):
     assert not (tmp_path / "new" / "weights.pt").exists()
 
 
-def test_weights_kept_elsewhere_are_found_by_the_record(trained, tmp_path):
+def test_evaluate_follows_weights_path_of_record(trained, tmp_path):
     folder, record = trained
     (tmp_path / "kept").mkdir()
     (tmp_path / "run").mkdir()
@@ -48,7 +48,7 @@ def test_weights_kept_elsewhere_are_found_by_the_record(trained, tmp_path):
     assert again.metrics == record.metrics
 
 
-def test_renamed_sampler_settings_of_an_old_record_are_accepted(trained, tmp_path):
+def test_evaluate_old_record_accepts_renamed_settings(trained, tmp_path):
     folder, record = trained
     shutil.copytree(folder, tmp_path / "run")
     old_names = {"size_sampling": "sizes_per_step", "num_sizes": "prefixes"}
@@ -60,7 +60,7 @@ def test_renamed_sampler_settings_of_an_old_record_are_accepted(trained, tmp_pat
     assert again.metrics == record.metrics
 
 
-def test_other_sizes_and_other_data(trained, tmp_path):
+def test_evaluate_other_sizes_and_data(trained, tmp_path):
     record = evaluated(trained, tmp_path, "sizes=[5,20]", "dataset.n_points=100")
     sizes = {name.split("/")[1] for name in record.metrics if name.endswith("matched/accuracy")}
     assert sizes == {"m5", "m8", "m20"}
@@ -68,7 +68,7 @@ def test_other_sizes_and_other_data(trained, tmp_path):
     assert record.config["dataset"]["classes"] == ["chair", "vase", "lamp"]
 
 
-def test_noise_is_added_to_test_clouds_alone(trained, tmp_path):
+def test_evaluate_noise_changes_test_clouds_only(trained, tmp_path):
     _, record = trained
     noisy = evaluated(trained, tmp_path, "test_noise_std=0.5")
     key = "test/m8/generated/subset_distance"
@@ -77,7 +77,7 @@ def test_noise_is_added_to_test_clouds_alone(trained, tmp_path):
         assert noisy.notes[note] == record.notes[note]
 
 
-def test_another_task_net(trained, tmp_path):
+def test_evaluate_another_task_net(trained, tmp_path):
     overrides = [*TINY, "learn=task", "seed=5", "dataset.seed=0"]
     run(compose(overrides), tmp_path / "task", overrides)
     record = evaluated(trained, tmp_path, f"weights={tmp_path}/task/weights.pt")
@@ -85,7 +85,7 @@ def test_another_task_net(trained, tmp_path):
     assert record.notes["task_weights_sha256"] not in (None, ours)
 
 
-def test_joint_runs_bring_their_task_net(tmp_path):
+def test_evaluate_joint_run_uses_its_task_net(tmp_path):
     overrides = [*TINY, "learn=joint", f"cache={tmp_path}/cache"]
     record = run(compose(overrides), tmp_path / "run", overrides)
     again = evaluated((tmp_path / "run", record), tmp_path)
@@ -104,12 +104,12 @@ def test_joint_runs_bring_their_task_net(tmp_path):
         ("ckpt_path=last", "give evaluate=RUN"),
     ],
 )
-def test_mismatches_are_refused(trained, tmp_path, argument, named):
+def test_evaluate_mismatch_raises(trained, tmp_path, argument, named):
     with pytest.raises(UserError, match=named):
         evaluated(trained, tmp_path, argument)
 
 
-def test_a_task_net_of_other_classes_is_refused_wherever_it_is_given(tmp_path):
+def test_task_net_other_classes_raises(tmp_path):
     overrides = [*TINY, "learn=task"]
     run(compose(overrides), tmp_path / "task", overrides)
     swapped = [*TINY, "sampler=fps", f"weights={tmp_path}/task/weights.pt"]
@@ -118,7 +118,7 @@ def test_a_task_net_of_other_classes_is_refused_wherever_it_is_given(tmp_path):
         run(compose(swapped), tmp_path / "new", swapped)
 
 
-def test_what_cannot_be_evaluated_is_refused(trained, tmp_path):
+def test_trained_run_not_evaluable_raises(trained, tmp_path):
     with pytest.raises(UserError, match="no folder"):
         command_line([f"evaluate={tmp_path}/none"])
     record = trained[1].plain()
@@ -135,7 +135,7 @@ def test_what_cannot_be_evaluated_is_refused(trained, tmp_path):
         run(compose(untrained), tmp_path / "new", untrained)
 
 
-def test_a_task_net_alone_is_tested_on_other_data(tmp_path):
+def test_evaluate_task_net_on_other_data(tmp_path):
     overrides = [*TINY, "task=reconstruction", "task/net=mfoldingnet", "learn=task"]
     overrides += ["+task.net.fold_channels=[16,8]"]
     made = run(compose(overrides), tmp_path / "made", overrides)
@@ -153,7 +153,7 @@ def test_a_task_net_alone_is_tested_on_other_data(tmp_path):
         evaluated(folder, tmp_path / "b", "learn=nothing")
 
 
-def test_an_auto_encoder_says_why_it_does_not_fit_more_points(tmp_path):
+def test_evaluate_autoencoder_more_points_names_cause(tmp_path):
     overrides = [*TINY, "task=reconstruction", "sampler=mops", f"cache={tmp_path}/cache"]
     made = run(compose(overrides), tmp_path / "made", overrides)
     with pytest.raises(UserError, match=r"task.net.n_points is 90 here and was 64"):
@@ -164,14 +164,14 @@ def overrides_after(trained, *arguments):
     return [a for a in command_line(list(arguments)) if not a.startswith("evaluate=")]
 
 
-def test_flags_may_stand_before_or_behind(trained):
+def test_command_line_flags_before_or_after(trained):
     folder, _ = trained
     assert overrides_after(trained, "-m", "m=4,8", f"evaluate={folder}")[:2] == ["-m", "m=4,8"]
     assert overrides_after(trained, "--cfg", "job", f"evaluate={folder}")[:2] == ["--cfg", "job"]
     assert overrides_after(trained, f"evaluate={folder}", "m=4", "-m")[-2:] == ["m=4", "-m"]
 
 
-def test_naming_what_the_run_has_changes_nothing(trained):
+def test_command_line_same_group_keeps_settings(trained):
     folder, _ = trained
     plain = set(overrides_after(trained, f"evaluate={folder}"))
     named = overrides_after(trained, f"evaluate={folder}", "dataset=shapes", "sampler=fmops")
@@ -182,7 +182,7 @@ def test_naming_what_the_run_has_changes_nothing(trained):
     assert not any(a.startswith(("dataset.", "dataset=shapes")) for a in other)
 
 
-def test_the_run_may_be_named_in_several_ways(trained, tmp_path):
+def test_command_line_run_named_in_several_ways(trained, tmp_path):
     folder, _ = trained
     first = command_line([f"evaluate={folder}"])
     for name in (f"evaluate='{folder}'", f"+evaluate={folder}", f"evaluate={folder}/"):
@@ -194,7 +194,7 @@ def test_the_run_may_be_named_in_several_ways(trained, tmp_path):
         command_line([f"evaluate={folder},{folder}"])
 
 
-def test_data_that_are_not_here_are_asked_for(trained, tmp_path):
+def test_command_line_missing_data_raises(trained, tmp_path):
     record = {**trained[1].plain(), "overrides": ["dataset=meshes", "dataset.root=meshes"]}
     (tmp_path / "result.json").write_text(json.dumps(record))
     with pytest.raises(UserError, match=r"dataset\.root=meshes, which does not exist"):
@@ -202,26 +202,26 @@ def test_data_that_are_not_here_are_asked_for(trained, tmp_path):
     assert "dataset.root=." in command_line([f"evaluate={tmp_path}", "dataset.root=."])
 
 
-def test_a_task_net_of_other_classes_and_their_data(trained, tmp_path):
+def test_evaluate_task_net_with_its_classes(trained, tmp_path):
     folder, _ = trained
     classes = "dataset.classes=[bed,vase]"
     record = evaluated(trained, tmp_path, classes, "weights=auto", f"cache={folder.parent}/cache")
     assert record.notes["class_names"] == ["bed", "vase"]
 
 
-def test_a_lost_sampler_is_named(trained, tmp_path):
+def test_evaluate_missing_weights_raises(trained, tmp_path):
     record = trained[1].plain()
     (tmp_path / "result.json").write_text(json.dumps(record))
     with pytest.raises(UserError, match=r"evaluate: the sampler of .* cannot be loaded"):
         evaluated((tmp_path, record), tmp_path, "weights=null")
 
 
-def test_other_command_lines_are_left_alone():
+def test_command_line_without_evaluate_is_unchanged():
     assert command_line(["m=8", "evaluate=null"]) == ["m=8", "evaluate=null"]
     assert command_line(["--help"]) == ["--help"]
 
 
-def test_another_net_or_loss_takes_the_place_of_all_its_settings(tmp_path):
+def test_command_line_other_net_drops_its_settings(tmp_path):
     overrides = [*TINY, "task=registration", "task.net.iterations=2", f"cache={tmp_path}/cache"]
     overrides += ["sampler=mops", "task/loss=frobenius_chamfer", "task.loss.chamfer_weight=0.5"]
     run(compose(overrides), tmp_path / "run", overrides)

@@ -20,7 +20,7 @@ def logged(tmp_path, *arguments):
     return run(compose(overrides), tmp_path / "run", overrides)
 
 
-def test_csv(tmp_path):
+def test_csv_logger_writes_curves(tmp_path):
     record = logged(tmp_path, "logger=csv")
     with (tmp_path / "run" / "csv" / "metrics.csv").open() as file:
         values = [line["test/generated/accuracy"] for line in csv.DictReader(file)]
@@ -29,7 +29,7 @@ def test_csv(tmp_path):
     )
 
 
-def test_mlflow_keeps_settings_and_curves_in_a_folder(tmp_path, monkeypatch):
+def test_mlflow_logger_writes_settings_and_curves(tmp_path, monkeypatch):
     mlflow = pytest.importorskip("mlflow", reason="the extra 'mlflow' is not installed")
     monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
     store = f"file:{tmp_path}/mlruns"
@@ -44,7 +44,7 @@ def test_mlflow_keeps_settings_and_curves_in_a_folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["mlflow", "wandb"])
-def test_a_missing_package_is_named(name, tmp_path):
+def test_logger_missing_package_raises(name, tmp_path):
     if find_spec(name):
         pytest.skip(f"{name} is installed")
     with pytest.raises(UserError, match=f"needs a package that is not installed: .*{name}"):
@@ -52,5 +52,5 @@ def test_a_missing_package_is_named(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["csv", "mlflow", "none", "tensorboard", "wandb"])
-def test_every_logger_s_settings_fit_it(name):
+def test_logger_settings_fit_constructors(name):
     check(compose([f"logger={name}"]))

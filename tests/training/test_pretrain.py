@@ -19,7 +19,7 @@ def files(folder, pattern):
     return [weights.read(path) for path in sorted(folder.rglob(pattern))]
 
 
-def test_a_task_net_can_be_trained_on_from_a_file_and_is_not_taken_for_a_new_one(tmp_path):
+def test_task_net_from_file_is_not_published(tmp_path):
     train(tmp_path, "learn=task", "task=registration")
     (published,) = files(tmp_path, "cache/weights/*/weights.pt")
     first = tmp_path / "run0" / "weights.pt"
@@ -32,12 +32,12 @@ def test_a_task_net_can_be_trained_on_from_a_file_and_is_not_taken_for_a_new_one
     assert len(files(tmp_path, "cache/weights/*/weights.pt")) == 1
 
 
-def test_a_net_without_weights_takes_no_file(tmp_path):
+def test_weights_file_for_net_without_weights_raises(tmp_path):
     with pytest.raises(UserError, match=r"weights: icp.*got some.pt"):
         train(tmp_path, "task=registration", "task/net=icp", "sampler=fps", "weights=some.pt")
 
 
-def test_a_resumed_run_from_given_weights_is_not_published_either(tmp_path):
+def test_resumed_run_from_file_is_not_published(tmp_path):
     train(tmp_path, "learn=task", "task=registration")
     first = tmp_path / "run0" / "weights.pt"
     given = ["learn=task", "task=registration", f"weights={first}"]
@@ -48,7 +48,7 @@ def test_a_resumed_run_from_given_weights_is_not_published_either(tmp_path):
     assert not files(tmp_path, "cache/weights/*/weights.pt")
 
 
-def test_a_run_is_not_resumed_under_other_weights(tmp_path):
+def test_resume_other_weights_raises(tmp_path):
     task = ["learn=task", "task=registration"]
     train(tmp_path, *task)
     anew = tmp_path / "run0"
@@ -60,7 +60,7 @@ def test_a_run_is_not_resumed_under_other_weights(tmp_path):
             train(tmp_path, *task, weights_, f"ckpt_path={checkpoint}")
 
 
-def test_training_that_goes_astray_fails_and_is_not_kept(tmp_path):
+def test_diverged_training_fails_without_weights(tmp_path):
     with pytest.raises(UserError, match=r"rotation_error_deg is nan: .*diverged"):
         train(tmp_path, "learn=task", "task=registration", "optimizer.lr=1e30")
     assert not files(tmp_path, "**/weights.pt")
@@ -83,13 +83,13 @@ def test_training_that_goes_astray_fails_and_is_not_kept(tmp_path):
         (["task.pairs.resample=32", "task.pairs.overlap=0.4", "m=24"], r"task.pairs.overlap"),
     ],
 )
-def test_mistakes_end_before_anything_is_trained_or_kept(settings, said, tmp_path):
+def test_mistake_fails_before_pretraining(settings, said, tmp_path):
     with pytest.raises(UserError, match=said):
         train(tmp_path, "task=registration", *settings)
     assert not files(tmp_path, "**/weights.pt")
 
 
-def test_seeds_of_the_scored_pairs_do_not_train_the_net_anew(tmp_path):
+def test_test_seed_keeps_cached_task_net(tmp_path):
     train(tmp_path, "task=registration", "sampler=fps")
     (first,) = files(tmp_path, "cache/weights/*/weights.pt")
     train(tmp_path, "task=registration", "sampler=fps", "task.pairs.test_seed=5")
