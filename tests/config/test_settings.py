@@ -16,8 +16,8 @@ from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.report.build import build
 from mops_lightning.training.checkpoint import identity
-from mops_lightning.training.evaluate import command_line
 from mops_lightning.training.pretrain import cache_folder
+from mops_lightning.training.replay import command_line
 from tests.support.command_line import TINY, call
 from tests.support.reports import put_cell
 from tests.support.training import small_dataset

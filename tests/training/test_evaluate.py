@@ -6,7 +6,7 @@ import pytest
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-from mops_lightning.training.evaluate import command_line
+from mops_lightning.training.replay import command_line
 from mops_lightning.training.run import run
 from tests.support.command_line import TINY
 
@@ -160,48 +160,6 @@ def test_evaluate_autoencoder_more_points_names_cause(tmp_path):
         evaluated((tmp_path / "made", made), tmp_path, "dataset.n_points=90")
 
 
-def overrides_after(trained, *arguments):
-    return [a for a in command_line(list(arguments)) if not a.startswith("evaluate=")]
-
-
-def test_command_line_flags_before_or_after(trained):
-    folder, _ = trained
-    assert overrides_after(trained, "-m", "m=4,8", f"evaluate={folder}")[:2] == ["-m", "m=4,8"]
-    assert overrides_after(trained, "--cfg", "job", f"evaluate={folder}")[:2] == ["--cfg", "job"]
-    assert overrides_after(trained, f"evaluate={folder}", "m=4", "-m")[-2:] == ["m=4", "-m"]
-
-
-def test_command_line_same_group_keeps_settings(trained):
-    folder, _ = trained
-    plain = set(overrides_after(trained, f"evaluate={folder}"))
-    named = overrides_after(trained, f"evaluate={folder}", "dataset=shapes", "sampler=fmops")
-    assert set(named) == plain
-    assert len(named) == len(plain)
-    other = overrides_after(trained, f"evaluate={folder}", "dataset=meshes")
-    assert "dataset=meshes" in other
-    assert not any(a.startswith(("dataset.", "dataset=shapes")) for a in other)
-
-
-def test_command_line_run_named_in_several_ways(trained, tmp_path):
-    folder, _ = trained
-    first = command_line([f"evaluate={folder}"])
-    for name in (f"evaluate='{folder}'", f"+evaluate={folder}", f"evaluate={folder}/"):
-        assert command_line([name]) == first
-    strange = tmp_path / "it's (1), a run"
-    strange.symlink_to(folder)
-    assert compose(command_line([f"evaluate={strange}"])).evaluate == str(strange)
-    with pytest.raises(UserError, match="takes one run"):
-        command_line([f"evaluate={folder},{folder}"])
-
-
-def test_command_line_missing_data_raises(trained, tmp_path):
-    record = {**trained[1].plain(), "overrides": ["dataset=meshes", "dataset.root=meshes"]}
-    (tmp_path / "result.json").write_text(json.dumps(record))
-    with pytest.raises(UserError, match=r"dataset\.root=meshes, which does not exist"):
-        command_line([f"evaluate={tmp_path}"])
-    assert "dataset.root=." in command_line([f"evaluate={tmp_path}", "dataset.root=."])
-
-
 def test_evaluate_task_net_with_its_classes(trained, tmp_path):
     folder, _ = trained
     classes = "dataset.classes=[bed,vase]"
@@ -214,11 +172,6 @@ def test_evaluate_missing_weights_raises(trained, tmp_path):
     (tmp_path / "result.json").write_text(json.dumps(record))
     with pytest.raises(UserError, match=r"evaluate: the sampler of .* cannot be loaded"):
         evaluated((tmp_path, record), tmp_path, "weights=null")
-
-
-def test_command_line_without_evaluate_is_unchanged():
-    assert command_line(["m=8", "evaluate=null"]) == ["m=8", "evaluate=null"]
-    assert command_line(["--help"]) == ["--help"]
 
 
 def test_command_line_other_net_drops_its_settings(tmp_path):

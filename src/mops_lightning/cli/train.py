@@ -39,7 +39,7 @@ def _run() -> None:
     try:
         _refuse_old_settings(sys.argv[1:])
         if any(key(argument) == "evaluate" for argument in sys.argv[1:]):
-            from mops_lightning.training.evaluate import command_line
+            from mops_lightning.training.replay import command_line
 
             sys.argv[1:] = command_line(sys.argv[1:])
         app = hydra.main(config_path=str(conf_dir()), config_name="config", version_base="1.3")

@@ -12,109 +12,13 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from mops_lightning.config import overrides, settings
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.callbacks import CHECKPOINT
 from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.replay import KEY, OF_RUN, trained_run
 from mops_lightning.zoo import weights
-
-KEY = "evaluate"
-OF_RUN = "run"
-"""``weights=run``: the task net that the evaluated run was trained with."""
-
-
-def command_line(arguments: list[str]) -> list[str]:
-    """Insert a run's overrides before the user's if ``evaluate=RUN`` is among these.
-
-    Args:
-        arguments: as typed, without the program's name.
-
-    Returns:
-        The arguments for Hydra.
-
-    Raises:
-        UserError: RUN is not a completed run that trained something.
-    """
-    places = [i for i, a in enumerate(arguments) if overrides.key(a) == KEY]
-    chosen = _chosen(arguments[places[-1]]) if places else None
-    if not chosen:
-        return arguments
-    folder = Path(chosen).expanduser()
-    record = trained_run(folder)
-    names = record["config"]["names"]
-    groups = {"task": names["task"], "dataset": names["dataset"], "sampler": names["sampler"]}
-    typed = [a for i, a in enumerate(arguments) if i not in places and overrides.key(a)]
-    # Choosing the run's own group again changes nothing; the settings below it stay too.
-    typed_keys = [
-        overrides.key(a) for a in typed if a not in [f"{k}={v}" for k, v in groups.items()]
-    ]
-    earlier = [overrides.readable(a) for a in record["overrides"] if overrides.key(a) not in groups]
-    earlier = [f"{group}={name}" for group, name in groups.items()] + earlier
-    kept = [
-        a
-        for a in earlier
-        if settings.of(overrides.path(a)).repeated
-        and not any(_covers(key, overrides.key(a)) for key in typed_keys)
-    ]
-    _data_are_here(kept, folder)
-    learn = "task" if record["config"]["learn"] == "task" else "nothing"
-    own = [*kept, f"learn={learn}", f"weights={OF_RUN}", f"{KEY}={overrides.quote(str(folder))}"]
-    # All in one place: argparse accepts flags before or after all overrides, not between them.
-    before = [a for i, a in enumerate(arguments[: places[0]]) if i not in places]
-    behind = [a for i, a in enumerate(arguments) if i > places[0] and i not in places]
-    given = {overrides.key(a) for a in typed}
-    defaults = [a for a in own if overrides.key(a) not in given]
-    return [*before, *defaults, *behind]
-
-
-def _chosen(argument: str) -> str | None:
-    """Return the run that ``evaluate=RUN`` names."""
-    override = overrides.parse(argument)
-    if override is None or override.is_delete():
-        return None
-    if override.is_sweep_override():
-        raise UserError(f"{argument}: {KEY} takes one run. Start one evaluation for each.")
-    value = override.value()
-    return None if value is None else str(value)
-
-
-def _data_are_here(kept: list[str], folder: Path) -> None:
-    """Reject a relative data folder that does not exist from the current folder."""
-    for argument in kept:
-        override = overrides.parse(argument)
-        if override is None or overrides.key(argument) != "dataset.root" or not override.value():
-            continue
-        if not Path(str(override.value())).expanduser().exists():
-            raise UserError(
-                f"{KEY}: {folder} used {argument}, which does not exist from the current folder. "
-                "Give dataset.root=PATH."
-            )
-
-
-def trained_run(folder: Path) -> dict[str, Any]:
-    """Return the record of a completed run that trained something.
-
-    Raises:
-        UserError: it is not such a run.
-    """
-    if folder.name == run_record.FILE:
-        folder = folder.parent
-    if not folder.is_dir():
-        raise UserError(f"{KEY}: no folder {folder}. Give the folder of a run, with result.json.")
-    record = run_record.read(folder)
-    if record["status"] != "completed":
-        hint = "Name a completed run."
-        if (folder / "checkpoints" / CHECKPOINT).is_file():
-            hint = f"Finish it with its own command and ckpt_path={folder}."
-        raise UserError(f"{KEY}: {folder} is {record['status']}, not completed. {hint}")
-    if "weights" not in record["files"]:
-        raise UserError(
-            f"{KEY}: {folder} trained nothing, or its weights were not kept; "
-            "run its own command with other settings."
-        )
-    return record
 
 
 def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict[str, Any]:
@@ -254,8 +158,3 @@ def _same_settings(
                 f"{KEY}: sampler.{key} must be {old}, as in {folder}, got {new}. "
                 f"Leave it out, or train a sampler with it.{hint}"
             )
-
-
-def _covers(key: str, other: str) -> bool:
-    """Return whether overriding ``key`` cancels an earlier override of ``other``."""
-    return other == key or other.startswith((f"{key}.", f"{key}/", f"{key.replace('/', '.')}."))

@@ -10,10 +10,11 @@ from mops_lightning.config import distributed
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
-from mops_lightning.training import checkpoint, evaluate
+from mops_lightning.training import checkpoint
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.factory import make_experiment
 from mops_lightning.training.loaders import num_held_out
+from mops_lightning.training.replay import OF_RUN
 from mops_lightning.training.trainer import device_name, make_trainer
 
 
@@ -79,7 +80,7 @@ def prepare(cfg: DictConfig, folder: Path, dataset: CloudDataset, record: RunRec
         num_held_out(dataset.train, cfg.val_fraction),
         trainer.world_size,
     )
-    if not job.has_task_weights and cfg.weights not in (None, "auto", evaluate.OF_RUN):
+    if not job.has_task_weights and cfg.weights not in (None, "auto", OF_RUN):
         raise UserError(
             f"weights: {cfg.names.net} has no weights to load, got {cfg.weights}. "
             "Leave weights out."

@@ -14,9 +14,9 @@ from mops_lightning.files import atomic_write
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training import checkpoint
 from mops_lightning.training.callbacks import CHECKPOINT, added
-from mops_lightning.training.evaluate import OF_RUN
 from mops_lightning.training.job import Job, prepare
 from mops_lightning.training.recording import recorded
+from mops_lightning.training.replay import OF_RUN
 from mops_lightning.training.stages import fit_and_test
 from mops_lightning.zoo.weights import FILE
 

@@ -1,0 +1,122 @@
+"""What ``evaluate=RUN`` takes from RUN's record, and what it refuses to take."""
+
+import json
+
+import pytest
+
+from mops_lightning.config.compose import compose
+from mops_lightning.errors import UserError
+from mops_lightning.training.replay import command_line
+from tests.support.command_line import TINY
+from tests.support.records import record
+
+OVERRIDES = [*TINY, "sampler=fmops", "sampler.m_max=32"]
+NAMES = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": "fmops"}
+
+
+def write_run(folder, overrides=OVERRIDES, **names):
+    """Write the record of a completed run; only the record is read here."""
+    folder.mkdir()
+    config = {"learn": "sampler", "names": {**NAMES, **names}}
+    content = record(overrides=overrides, config=config, files={"weights": "weights.pt"})
+    (folder / "result.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path):
+    return write_run(tmp_path / "run")
+
+
+def overrides_after(*arguments):
+    return [a for a in command_line(list(arguments)) if not a.startswith("evaluate=")]
+
+
+def test_command_line_flags_before_or_after(run):
+    assert overrides_after("-m", "m=4,8", f"evaluate={run}")[:2] == ["-m", "m=4,8"]
+    assert overrides_after("--cfg", "job", f"evaluate={run}")[:2] == ["--cfg", "job"]
+    assert overrides_after(f"evaluate={run}", "m=4", "-m")[-2:] == ["m=4", "-m"]
+
+
+def test_command_line_same_group_keeps_settings(run):
+    plain = set(overrides_after(f"evaluate={run}"))
+    named = overrides_after(f"evaluate={run}", "dataset=shapes", "sampler=fmops")
+    assert set(named) == plain
+    assert len(named) == len(plain)
+    other = overrides_after(f"evaluate={run}", "dataset=meshes")
+    assert "dataset=meshes" in other
+    assert not any(a.startswith(("dataset.", "dataset=shapes")) for a in other)
+
+
+def test_command_line_run_named_in_several_ways(run, tmp_path):
+    first = command_line([f"evaluate={run}"])
+    for name in (f"evaluate='{run}'", f"+evaluate={run}", f"evaluate={run}/"):
+        assert command_line([name]) == first
+    strange = tmp_path / "it's (1), a run"
+    strange.symlink_to(run)
+    assert compose(command_line([f"evaluate={strange}"])).evaluate == str(strange)
+    with pytest.raises(UserError, match="takes one run"):
+        command_line([f"evaluate={run},{run}"])
+
+
+def test_command_line_missing_data_raises(tmp_path):
+    run = write_run(tmp_path / "run", ["dataset=meshes", "dataset.root=meshes"], dataset="meshes")
+    with pytest.raises(UserError, match=r"dataset\.root=meshes, which does not exist"):
+        command_line([f"evaluate={run}"])
+    assert "dataset.root=." in command_line([f"evaluate={run}", "dataset.root=."])
+
+
+def test_command_line_without_evaluate_is_unchanged():
+    assert command_line(["m=8", "evaluate=null"]) == ["m=8", "evaluate=null"]
+    assert command_line(["--help"]) == ["--help"]
+
+
+ATTACKS = {
+    "target": ["sampler._target_=os.system"],
+    "added target": ["+task.net.extra._target_=os.system"],
+    "nested target": ["+sampler.extra={_target_: os.system}"],
+    "target in list": ["+sampler.extra=[{_target_: os.system}]"],
+    "interpolation": ["sampler.alpha=${oc.env:HOME}"],
+    "path as choice": ["task/net=../../evil"],
+    "path as experiment": ["+experiment=../evil"],
+    "path in a package": ["+sampler@baselines.x=../evil"],
+    "sweep": ["sampler.alpha=1,2"],
+}
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_command_line_record_with_code_raises(attack, tmp_path):
+    folder = write_run(tmp_path / "run", [*OVERRIDES, *ATTACKS[attack]])
+    with pytest.raises(UserError, match="not accepted from a record") as refused:
+        command_line([f"evaluate={folder}"])
+    assert ATTACKS[attack][0].partition("=")[0].lstrip("+") in str(refused.value)
+
+
+@pytest.mark.parametrize("group", ["task", "dataset", "sampler"])
+def test_command_line_record_with_path_as_group_raises(group, tmp_path):
+    folder = write_run(tmp_path / "run", [], **{group: "../../../tmp/evil"})
+    with pytest.raises(UserError, match="not accepted from a record"):
+        command_line([f"evaluate={folder}"])
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "+hydra.callbacks.x._target_=os.system",
+        "hydra/launcher=joblib",
+        "hydra.run.dir=/tmp/x",
+        "+callbacks.x._target_=os.system",
+        "+trainer.x._target_=os.system",
+        "+unknown.x._target_=os.system",
+    ],
+)
+def test_command_line_takes_no_undeclared_setting_from_record(override, tmp_path):
+    folder = write_run(tmp_path / "run", [*OVERRIDES, override])
+    key = override.lstrip("+").partition("=")[0]
+    assert not any(key in argument for argument in command_line([f"evaluate={folder}"]))
+
+
+def test_command_line_user_may_give_what_a_record_may_not(tmp_path):
+    folder = write_run(tmp_path / "run", ["sampler._target_=os.system"])
+    given = "sampler._target_=mops_lightning.samplers.fmops.FMOPSNet"
+    assert command_line([f"evaluate={folder}", given])[-1] == given
