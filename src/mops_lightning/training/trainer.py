@@ -17,6 +17,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import dotted
 from mops_lightning.tasks.base import Task
 from mops_lightning.training.callbacks import CHECKPOINT, build_callbacks
+from mops_lightning.training.checkpoint_io import AtomicCheckpointIO
 from mops_lightning.training.loaders import clouds_to_draw, score_loader
 from mops_lightning.training.malloc import keep_freed_memory
 
@@ -55,6 +56,7 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset, task: Tas
         "trainer",
         logger=logger,
         callbacks=callbacks,
+        plugins=[AtomicCheckpointIO()],
         default_root_dir=str(folder),
         num_sanity_val_steps=0,
         enable_model_summary=False,
