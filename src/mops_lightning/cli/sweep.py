@@ -26,7 +26,7 @@ from mops_lightning.records.attempts import ASIDE, FAILED
 BEGUN = ".begun"
 """File in a sweep's folder with the time of its last start."""
 
-STAYS = (ASIDE, ".hydra", ".lock", "cli.log")
+STAYS = (ASIDE, ".hydra", ".lock", "mops_lightning.log")
 """Files that belong to the cell, not to an attempt."""
 
 log = logging.getLogger(__name__)
