@@ -2,12 +2,15 @@ import json
 
 import pytest
 import torch
+from filelock import FileLock
 
+from mops_lightning.config.build import build
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
+from mops_lightning.training.pretrain import cache_folder
 from mops_lightning.training.run import run
 from mops_lightning.zoo import weights
-from tests.support.command_line import TINY
+from tests.support.command_line import TINY, start
 
 
 def train(folder, *arguments):
@@ -96,3 +99,35 @@ def test_test_seed_keeps_cached_task_net(tmp_path):
     assert [one["sha256"] for one in files(tmp_path, "cache/weights/*/weights.pt")] == [
         first["sha256"]
     ]
+
+
+def test_same_task_net_in_two_processes_is_trained_once(tmp_path):
+    overrides = [*TINY, "sampler=fps", f"cache={tmp_path}/cache"]
+    cfg = compose(overrides)
+    folder = cache_folder(cfg, build(cfg.dataset, "dataset"))
+    folder.parent.mkdir(parents=True)
+    lock = folder.parent / f"{folder.name}.lock"
+    with FileLock(lock):
+        processes = [start([*overrides, f"hydra.run.dir={one}"], tmp_path) for one in "ab"]
+        for process in processes:
+            lines = iter(process.stdout.readline, "")
+            assert any(
+                "Waiting for another process" in line and str(lock) in line for line in lines
+            )
+    results = [process.communicate(timeout=240) for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], results
+    assert sum(out.count("training it first") for out, _ in results) == 1
+    records = [json.loads((tmp_path / one / "result.json").read_text()) for one in "ab"]
+    first, second = (record["notes"]["task_weights_sha256"] for record in records)
+    assert first == second
+
+
+def test_resume_with_fewer_epochs_than_done_raises(tmp_path):
+    task = ["learn=task", "task=registration"]
+    train(tmp_path, *task, "trainer.max_epochs=3")
+    checkpoint = f"ckpt_path={tmp_path / 'run0'}"
+    with pytest.raises(UserError, match=r"max_epochs must be at least 3.*last\.ckpt, got 2"):
+        train(tmp_path, *task, "trainer.max_epochs=2", checkpoint)
+    same = train(tmp_path, *task, "trainer.max_epochs=3", checkpoint)
+    longer = train(tmp_path, *task, "trainer.max_epochs=4", checkpoint)
+    assert [one.notes["lengthened"] for one in (same, longer)] == [False, True]

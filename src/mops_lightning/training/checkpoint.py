@@ -39,8 +39,13 @@ def _given_weights(cfg: DictConfig) -> dict[str, str]:
 
 
 def lengthened(cfg: DictConfig, checkpoint: Path) -> bool:
-    """Return whether ``checkpoint`` is from a run with another planned length."""
-    return _read(checkpoint).get(LENGTH) != json.dumps(cfg.trainer.max_epochs)
+    """Return whether this run is planned longer than the run that wrote ``checkpoint``."""
+    return bool(cfg.trainer.max_epochs > planned_epochs(checkpoint))
+
+
+def planned_epochs(checkpoint: Path) -> int:
+    """Return the planned length of the run that wrote ``checkpoint``."""
+    return int(json.loads(_read(checkpoint)[CHECKPOINT_KEY][LENGTH]))
 
 
 def find(cfg: DictConfig, mine: dict[str, str]) -> Path | None:
@@ -52,12 +57,24 @@ def find(cfg: DictConfig, mine: dict[str, str]) -> Path | None:
         mine: this run's ``identity``.
 
     Raises:
-        UserError: there is no such checkpoint, or it belongs to other settings.
+        UserError: there is no such checkpoint, it belongs to other settings, or it has more epochs
+            than ``trainer.max_epochs``.
     """
     if cfg.ckpt_path is None:
         return None
-    if cfg.ckpt_path == "last":
-        return _newest(Path(cfg.out), mine)
+    last = cfg.ckpt_path == "last"
+    path = _newest(Path(cfg.out), mine) if last else _given(cfg, mine)
+    done = _read(path)["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"]
+    if cfg.trainer.max_epochs < done:
+        raise UserError(
+            f"trainer.max_epochs must be at least {done}, the epochs of {path}, got "
+            f"{cfg.trainer.max_epochs}."
+        )
+    return path
+
+
+def _given(cfg: DictConfig, mine: dict[str, str]) -> Path:
+    """Return the checkpoint of the run's folder or file that ``ckpt_path`` names."""
     path = Path(cfg.ckpt_path).expanduser()
     if path.is_dir():
         path = path / "checkpoints" / CHECKPOINT
@@ -65,7 +82,7 @@ def find(cfg: DictConfig, mine: dict[str, str]) -> Path | None:
         raise UserError(
             f"ckpt_path: no checkpoint {path}. Give a run's folder, a .ckpt file, or last."
         )
-    theirs = _read(path)
+    theirs = _read(path)[CHECKPOINT_KEY]
     different = _different(theirs, mine)
     if different:
         name = different[0]
@@ -83,7 +100,7 @@ def _newest(out: Path, mine: dict[str, str]) -> Path:
     )
     for path in found:
         try:
-            theirs = _read(path)
+            theirs = _read(path)[CHECKPOINT_KEY]
         except UserError:
             continue
         if not _different(theirs, mine):
@@ -101,6 +118,6 @@ def _different(theirs: dict[str, str], mine: dict[str, str]) -> list[str]:
 
 def _read(path: Path) -> dict[str, Any]:
     content = weights.read_plain(path, "ckpt_path", "a checkpoint")
-    if CHECKPOINT_KEY not in content:
+    if not isinstance(content, dict) or CHECKPOINT_KEY not in content:
         raise UserError(f"ckpt_path: {path} is not a checkpoint of this program.")
-    return content[CHECKPOINT_KEY]
+    return content

@@ -3,8 +3,11 @@
 import hashlib
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from filelock import FileLock, Timeout
 from omegaconf import DictConfig, open_dict
 
 from mops_lightning.config import distributed
@@ -44,12 +47,15 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
                 "processes. Run the same command once with learn=task trainer=auto and without "
                 "the launcher, or give weights=FILE."
             )
-        print(
-            f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it first, "
-            f"{cfg.pretrain.max_epochs} epochs. Cache: {folder}",
-            flush=True,
-        )
-        _train(cfg, folder, dataset)
+        with _locked(folder, cfg.names.net):
+            if not (folder / FILE).is_file():  # otherwise another process trained it meanwhile
+                epochs = cfg.pretrain.max_epochs
+                print(
+                    f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it "
+                    f"first, {epochs} {'epoch' if epochs == 1 else 'epochs'}. Cache: {folder}",
+                    flush=True,
+                )
+                _train(cfg, folder, dataset)
     return folder / FILE
 
 
@@ -81,19 +87,41 @@ def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
 def publish(job: Job, record: RunRecord) -> None:
     """Copy a task net that was trained with ``learn=task`` into the cache, unless one is there.
 
-    Not from a run that was lengthened by resuming it, whose learning rates differed, not from one
-    that started from given weights, and not from several devices, each of which has BatchNorm
-    statistics of its own share.
+    Not from a run that was resumed with another number of epochs, whose learning rates differed,
+    not from one that started from given weights, and not from several devices, each of which has
+    BatchNorm statistics of its own share.
     """
     cfg = job.cfg
     if cfg.learn != "task" or not job.trains or job.trainer.world_size > 1:
         return
-    if record.notes["lengthened"] or cfg.weights not in (None, "auto"):
+    if cfg.weights not in (None, "auto"):
+        return
+    if job.resumed is not None and checkpoint.planned_epochs(job.resumed) != cfg.trainer.max_epochs:
         return
     target = cache_folder(cfg, job.dataset) / FILE
     if not target.exists():
         with atomic_write(target) as temporary:
             shutil.copyfile(job.folder / FILE, temporary)
+
+
+@contextmanager
+def _locked(folder: Path, net: str) -> Iterator[None]:
+    """Hold the lock of a cache folder, so that one process at a time trains the net in it.
+
+    The lock is a file next to the folder. A process that is killed releases it.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    path = folder.parent / f"{folder.name}.lock"
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        print(f"Waiting for another process that trains {net} ({path})", flush=True)
+        lock.acquire(poll_interval=0.5)
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
