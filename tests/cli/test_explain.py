@@ -22,7 +22,7 @@ from tests.support.command_line import TINY_WITH_PICTURES, call
         (["dataset.classes=[chiar]"], "chair"),
         (["ckpt_path=last", *TINY_WITH_PICTURES], "ckpt_path=last"),
         ([*TINY_WITH_PICTURES, "dataset.classes=[chair]"], "num_classes must be at least 2"),
-        (["weights=nowhere.pt", *TINY_WITH_PICTURES], "no file nowhere.pt"),
+        (["weights=nowhere.pt", *TINY_WITH_PICTURES], "weights: no file nowhere.pt"),
     ],
 )
 def test_mistake_ends_in_one_line(arguments, said, tmp_path):

@@ -17,7 +17,7 @@ from mops_lightning.config.annotations import misfit
         (int | None, [3, None], [1.5, "x"], "a whole number or null"),
         (float | Tensor, [0.1, 3], ["x"], "a number"),
         (Sequence[int], [[1, 2], []], [3, [1.5], ["a"], None], "a list of whole numbers"),
-        (list[str] | None, [["a"], None], ["a", [3]], "a list of texts or null"),
+        (list[str] | None, [["a"], None], ["a", [3]], "a list of strings or null"),
         (tuple[float, float], [[0.9, 0.99]], [0.9], "a list of numbers"),
         (Literal["sum", "mean"], ["sum", "typo"], [3, None], "sum or mean"),
         (Any, [3, None, "x", [1]], [], ""),

@@ -46,6 +46,11 @@ def test_fps_out_of_range_raises(m, start):
         farthest_point_sample(torch.zeros(1, 5, 3), m, start=start)
 
 
+def test_fps_single_cloud_raises():
+    with pytest.raises(UserError, match=r"points must have shape \(B, N, C\), got \(5, 3\)"):
+        farthest_point_sample(torch.zeros(5, 3), 2)
+
+
 @pytest.mark.usefixtures("argextreme_path")
 def test_fill_equals_double_loop(rng):
     points = torch.randn(3, 45, 3, generator=rng)

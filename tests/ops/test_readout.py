@@ -83,3 +83,23 @@ def test_complete_of_coincident_points_is_distinct():
 def test_complete_more_rows_than_points_raises():
     with pytest.raises(UserError, match=r"N=3.*M=4"):
         complete(torch.zeros(1, 4, dtype=torch.int64), torch.zeros(1, 3, 3))
+
+
+@pytest.mark.parametrize(
+    ("indices", "points", "words"),
+    [
+        (torch.zeros(1, 2), torch.zeros(1, 3, 3), r"indices must be int64 .*got float32"),
+        (torch.tensor([0, 1]), torch.zeros(1, 3, 3), r"indices must .*\(B, M\).*\(2,\)"),
+        (torch.tensor([[0, 1]]), torch.zeros(3, 3), r"points must have shape .*got \(3, 3\)"),
+        (torch.tensor([[0, 1]]), torch.zeros(2, 3, 3), r"points must .*B=1.*got \(2, 3, 3\)"),
+    ],
+)
+def test_complete_wrong_arguments_raise(indices, points, words):
+    with pytest.raises(UserError, match=words):
+        complete(indices, points)
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (2, 4, 3), (1, 4, 2)])
+def test_match_other_shapes_raise(shape):
+    with pytest.raises(UserError, match=r"generated .* and points .* must agree"):
+        match(torch.zeros(shape), torch.zeros(1, 5, 3))

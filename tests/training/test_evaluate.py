@@ -121,10 +121,13 @@ def test_task_net_other_classes_raises(tmp_path):
 def test_trained_run_not_evaluable_raises(trained, tmp_path):
     with pytest.raises(UserError, match="no folder"):
         command_line([f"evaluate={tmp_path}/none"])
+    with pytest.raises(UserError, match=r"evaluate: .*no run record"):
+        command_line([f"evaluate={tmp_path}"])
     record = trained[1].plain()
     path = tmp_path / "result.json"
     for change, named in (
-        ({"status": "interrupted"}, "is interrupted, not completed"),
+        ({"status": "interrupted"}, "was interrupted. Give a completed run"),
+        ({"status": "failed"}, "failed. Give a completed run"),
         ({"files": {}}, "trained nothing"),
     ):
         path.write_text(json.dumps({**record, **change}))

@@ -105,6 +105,8 @@ def test_load_task_net_or_missing_file_is_refused(save, tmp_path):
         load(save(FMOPS, learn="task"))
     with pytest.raises(UserError, match=r"no file .*nowhere\.pt.*weights\.pt"):
         load(tmp_path / "nowhere.pt")
+    with pytest.raises(UserError, match="path must be a string or a Path, got None"):
+        load(None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

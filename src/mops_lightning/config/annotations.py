@@ -61,6 +61,6 @@ def describe(annotation: Any) -> str:
     if origin is Literal:
         return " or ".join(map(str, inner))
     if origin in LISTS or annotation in LISTS:
-        kinds = {int: "whole numbers", float: "numbers", str: "texts"}
+        kinds = {int: "whole numbers", float: "numbers", str: "strings"}
         return "a list" + (f" of {kinds[inner[0]]}" if inner and inner[0] in kinds else "")
     return PLAIN.get(annotation, str(annotation))

@@ -128,8 +128,8 @@ def check_shares(batch_size: int, test_clouds: int, held_out: int, processes: in
         )
     if 0 < held_out < processes:
         raise UserError(
-            f"val_fraction holds out {held_out} training clouds, fewer than the {processes} "
-            "devices. Try val_fraction=0, or a larger one."
+            f"val_fraction holds out {held_out} training {'cloud' if held_out == 1 else 'clouds'}, "
+            f"fewer than the {processes} devices. Try val_fraction=0, or a larger one."
         )
     if processes > 1 and (batch_size % processes or batch_size < 2 * processes):
         least = 2 * processes

@@ -83,7 +83,7 @@ class RunSettings:
     seed: int = field(
         default=0,
         metadata=about(
-            "of weights, order, augmentation and procedural data",
+            "seed of weights, order, augmentation and procedural data",
             limits=whole(0),
             compare=False,
         ),

@@ -87,7 +87,7 @@ def _check_member(archive: Path, name: str, special: bool) -> None:
     for path in (PurePosixPath(name), PureWindowsPath(name)):
         if path.anchor or ".." in path.parts:
             raise UserError(
-                f"{archive} contains {name!r}, which is outside its folder. Do not use it."
+                f"{archive} would write {name!r} outside the target folder; the archive is unsafe."
             )
     if special:
         raise UserError(f"{archive} contains {name!r}, which is neither a file nor a folder.")

@@ -36,7 +36,7 @@ def hdf5(
     folder = Path(root).expanduser()
     if not folder.is_dir():
         raise UserError(
-            f"root: {folder} is not a folder. It must be one with train.h5 and test.h5."
+            f"root: {folder} is not a folder. Give a folder that contains train.h5 and test.h5."
         )
     known = read_names(folder / NAMES) if (folder / NAMES).is_file() else None
     splits = {

@@ -40,7 +40,7 @@ def farthest_point_sample(
         the first k are the result for m = k.
 
     Raises:
-        UserError: ``m`` or ``start`` is out of range.
+        UserError: ``points`` has another shape, or ``m`` or ``start`` is out of range.
 
     Example:
         >>> import torch
@@ -49,6 +49,8 @@ def farthest_point_sample(
         >>> farthest_point_sample(line, 3)
         tensor([[0, 3, 2]])
     """
+    if points.ndim != 3:
+        raise UserError(f"points must have shape (B, N, C), got {tuple(points.shape)}.")
     clouds, n = points.shape[:2]
     if not 1 <= m <= n:
         raise UserError(f"m must be between 1 and the number of points N={n}, got {m}.")

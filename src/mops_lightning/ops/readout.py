@@ -32,6 +32,11 @@ def match(generated: Tensor, points: Tensor) -> Tensor:
         >>> match(torch.tensor([[[0.9, 0, 0], [1.2, 0, 0]]]), points)
         tensor([[1, 1]])
     """
+    if generated.ndim != 3 or points.ndim != 3 or generated.shape[::2] != points.shape[::2]:
+        raise UserError(
+            "generated (B, M, 3) and points (B, N, 3) must agree in all but the number of points, "
+            f"got {tuple(generated.shape)} and {tuple(points.shape)}."
+        )
     return nearest(generated.detach(), points.detach())[1]
 
 
@@ -59,7 +64,7 @@ def complete(indices: Tensor, points: Tensor) -> Tensor:
         followed by rows from farthest point sampling.
 
     Raises:
-        UserError: M is larger than N.
+        UserError: a shape or dtype is wrong, or M is larger than N.
 
     Example:
         >>> import torch
@@ -68,6 +73,16 @@ def complete(indices: Tensor, points: Tensor) -> Tensor:
         >>> complete(torch.tensor([[1, 1]]), points)
         tensor([[1, 2]])
     """
+    if indices.ndim != 2 or indices.dtype != torch.int64:
+        raise UserError(
+            "indices must be int64 of shape (B, M), got "
+            f"{str(indices.dtype).removeprefix('torch.')} of shape {tuple(indices.shape)}."
+        )
+    if points.ndim != 3 or len(points) != len(indices):
+        raise UserError(
+            f"points must have shape (B, N, 3) with B={len(indices)} as in indices, "
+            f"got {tuple(points.shape)}."
+        )
     if indices.shape[1] > points.shape[1]:
         raise UserError(
             f"indices must have at most as many columns as there are points, N={points.shape[1]}, "

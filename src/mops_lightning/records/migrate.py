@@ -67,7 +67,7 @@ def find(key: str) -> tuple[Now, str] | None:
         key: dotted, such as ``optimizer.optimizer.lr``.
 
     Returns:
-        None where the key is no old one.
+        None if the key is not an old one.
     """
     parts = re.split(r"(?=\.)", key)
     for count in range(len(parts), 0, -1):
@@ -78,7 +78,7 @@ def find(key: str) -> tuple[Now, str] | None:
 
 
 def answer(key: str) -> str | None:
-    """Return one line that says what to use instead of an old key; None where it is no old one."""
+    """Return one line that says what to use instead of an old key; None if it is not an old one."""
     found = find(key)
     if found is None:
         return None

@@ -65,7 +65,7 @@ class RunRecord:
 
     @classmethod
     def begin(cls, config: dict[str, Any], overrides: list[str], seed: int) -> "RunRecord":
-        """Return the record of a run that starts now, here."""
+        """Return the record of a run that starts now on this machine."""
         started = datetime.now(UTC).isoformat(timespec="seconds")
         return cls(config=config, overrides=overrides, seed=seed, started=started, **environment())
 

@@ -38,7 +38,8 @@ def without_result(found: Found) -> list[str]:
     if not found.undone:
         return []
     lines = [f"- {folder}: {why}" for folder, why in found.undone.items()]
-    return ["", f"{len(lines)} of {found.count} runs are not completed:", "", *lines]
+    verb = "is" if len(lines) == 1 else "are"
+    return ["", f"{len(lines)} of {found.count} runs {verb} not completed:", "", *lines]
 
 
 def _kind(record: Record, net: str) -> str:
@@ -51,11 +52,14 @@ def _kind(record: Record, net: str) -> str:
 
 
 def _way(record: Record) -> str:
-    length = "nothing to train" if epochs(record) is None else f"{epochs(record)} epochs"
+    length = "nothing to train"
+    if epochs(record) is not None:
+        length = f"{epochs(record)} {'epoch' if epochs(record) == 1 else 'epochs'}"
     if "fit" not in record["seconds"] and epochs(record) is not None:
         length = f"evaluated after {length}"
+    threads = "thread" if record["threads"] == 1 else "threads"
     changes = " with changes" if record["git"]["dirty"] else ""
     return (
-        f"{length}, seed {seed(record)}, {record['device']}, {record['threads']} threads, "
+        f"{length}, seed {seed(record)}, {record['device']}, {record['threads']} {threads}, "
         f"commit {commit(record)}{changes}"
     )

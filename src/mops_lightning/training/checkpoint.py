@@ -35,7 +35,10 @@ def _given_weights(cfg: DictConfig) -> dict[str, str]:
     """Return the hash of the weights file that the user gave, if any."""
     if cfg.weights in (None, "auto", "run") or not Path(cfg.weights).expanduser().is_file():
         return {}
-    return {"weights": str(weights.read(cfg.weights)["sha256"])}
+    try:
+        return {"weights": str(weights.read(cfg.weights)["sha256"])}
+    except UserError as error:
+        raise UserError(f"weights: {error}") from None
 
 
 def lengthened(cfg: DictConfig, checkpoint: Path) -> bool:
@@ -117,7 +120,10 @@ def _different(theirs: dict[str, str], mine: dict[str, str]) -> list[str]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    content = weights.read_plain(path, "ckpt_path", "a checkpoint")
+    try:
+        content = weights.read_plain(path, "a checkpoint")
+    except UserError as error:
+        raise UserError(f"ckpt_path: {error}") from None
     if not isinstance(content, dict) or CHECKPOINT_KEY not in content:
         raise UserError(f"ckpt_path: {path} is not a checkpoint of this program.")
     return content

@@ -49,7 +49,7 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
         try:
             _load_task(experiment.task, folder, record)
         except UserError as error:
-            raise UserError(f"{error}{_other_net(cfg, record)}") from None
+            raise UserError(f"{KEY}: {error}{_other_net(cfg, record)}") from None
     return {
         "run": str(folder),
         "commit": record["git"]["commit"],
@@ -97,14 +97,12 @@ def _load_task(task: torch.nn.Module, folder: Path, record: dict[str, Any]) -> N
     path = folder / "checkpoints" / CHECKPOINT
     if not path.is_file():
         raise UserError(
-            f"{KEY}: {path}, which contains the run's task net, does not exist. Give weights=FILE."
+            f"{path}, which contains the run's task net, does not exist. Give weights=FILE."
         )
-    state = weights.read_plain(path, KEY, "a checkpoint")["state_dict"]
+    state = weights.read_plain(path, "a checkpoint")["state_dict"]
     own = {key.removeprefix("task."): value for key, value in state.items() if key[:5] == "task."}
     if weights.digest(own) != record["notes"].get("task_weights_sha256"):
-        raise UserError(
-            f"{KEY}: {path} does not belong to the run in its folder. Give weights=FILE."
-        )
+        raise UserError(f"{path} does not belong to the run in its folder. Give weights=FILE.")
     weights.fit_state(task, own, path)
 
 
@@ -138,7 +136,7 @@ def _same_settings(
         if old != new:
             raise UserError(
                 f"{KEY}: {folder} was trained with {group}={old}, got {group}={new}. "
-                f"Leave {group} out, or name a run with {group}={new}."
+                f"Leave {group} out, or give a run with {group}={new}."
             )
     weightless = not any(True for _ in task.parameters())
     if here["names"]["net"] != there["names"]["net"] and cfg.weights == OF_RUN and not weightless:

@@ -142,12 +142,16 @@ def trained_run(folder: Path) -> dict[str, Any]:
         folder = folder.parent
     if not folder.is_dir():
         raise UserError(f"{KEY}: no folder {folder}. Give the folder of a run, with result.json.")
-    record = run_record.read(folder)
+    try:
+        record = run_record.read(folder)
+    except UserError as error:
+        raise UserError(f"{KEY}: {error}") from None
     if record["status"] != "completed":
-        hint = "Name a completed run."
+        hint = "Give a completed run."
         if (folder / "checkpoints" / CHECKPOINT).is_file():
             hint = f"Finish it with its own command and ckpt_path={folder}."
-        raise UserError(f"{KEY}: {folder} is {record['status']}, not completed. {hint}")
+        state = {"failed": "failed", "running": "is still running or was killed"}
+        raise UserError(f"{KEY}: {folder} {state.get(record['status'], 'was interrupted')}. {hint}")
     if "weights" not in record["files"]:
         raise UserError(
             f"{KEY}: {folder} trained nothing, or its weights were not kept; "

@@ -62,8 +62,8 @@ def _begin(folder: Path) -> None:
         (folder / STARTED).touch(exist_ok=False)
     except FileExistsError:
         raise UserError(
-            f"{folder} holds another run, which is not overwritten. Start again for a new folder, "
-            "and leave hydra.run.dir out or give another one."
+            f"{folder} already contains a run; runs are never overwritten. Start again for a "
+            "new folder, and leave hydra.run.dir out or give another one."
         ) from None
 
 

@@ -57,7 +57,10 @@ def fit_and_test(job: Job, record: RunRecord, task_weights: Path | None) -> None
 def _load_weights(job: Job, record: RunRecord, task_weights: Path | None) -> None:
     task = job.experiment.task
     if task_weights is not None:
-        content = weights.load_into(task, task_weights)
+        try:
+            content = weights.load_into(task, task_weights)
+        except UserError as error:
+            raise UserError(f"weights: {error}") from None
         record.notes["weights_loaded"] = content["sha256"]
         if task.requires_same_classes and content.get("classes"):
             evaluate.same_classes(content["classes"], job.dataset, f"weights: {task_weights}")
@@ -69,9 +72,11 @@ def _fit(job: Job) -> None:
     """Train what learns, from the checkpoint if the run is resumed."""
     cfg, trainer, task = job.cfg, job.trainer, job.experiment.task
     train, held_out = split(job.dataset.train, cfg.val_fraction, cfg.seed)
-    if len(train.labels) < 2 * trainer.world_size:
+    clouds = len(train.labels)
+    if clouds < 2 * trainer.world_size:
         raise UserError(
-            f"val_fraction={cfg.val_fraction} leaves {len(train.labels)} training clouds; "
+            f"val_fraction={cfg.val_fraction} leaves {clouds} training "
+            f"{'cloud' if clouds == 1 else 'clouds'}; "
             "at least two are needed for each device. Lower it, or give more data."
         )
     loader = CloudLoader(

@@ -24,6 +24,7 @@ from mops_lightning.training.malloc import keep_freed_memory
 HARMLESS = (
     ".*does not have many workers.*",  # the data are in memory; workers would only copy them
     ".*no `val_dataloader`.*",  # val_fraction=0 is a choice
+    ".*Checkpoint directory .* exists and is not empty.*",  # a pretraining resumes in its folder
     ".*dirpath has changed.*",  # a resumed run has its own folder
     ".*module.s. in eval mode at the start.*",  # frozen parts stay in evaluation mode
     ".*smaller than the logging interval.*",  # the interval is lowered for small data sets

@@ -52,7 +52,7 @@ def draw_cloud(
         axes: where to draw.
         cloud: ``(N, 3)``, z up.
         samples: ``(M, 3)`` or None. They are drawn over the whole cloud, because a dense cloud
-            would hide all samples in front of which it has points.
+            would hide the samples behind it.
         readout: gives the samples' colour.
         size: marker area of up to ``LARGE_MARKER_SAMPLES`` samples; more get smaller markers.
     """

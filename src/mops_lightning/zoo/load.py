@@ -58,6 +58,8 @@ def load(path: str | Path) -> Sampler:
         >>> sampler(torch.rand(2, 64, 3)).points.shape
         torch.Size([2, 8, 3])
     """
+    if not isinstance(path, str | Path):
+        raise UserError(f"path must be a string or a Path, got {path!r}.")
     path = Path(path).expanduser()
     path = weights.of_run(path) if path.is_dir() else path
     if not path.is_file():

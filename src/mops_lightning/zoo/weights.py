@@ -60,10 +60,10 @@ def read(path: str | Path) -> dict[str, Any]:
     path = Path(path).expanduser()
     if not path.is_file():
         raise UserError(f"no file {path}. Give a weights.pt, or weights=auto.")
-    content = read_plain(path, "weights", "a weights file")
+    content = read_plain(path, "a weights file")
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise UserError(
-            f"{path} is not a {SCHEMA} file. "
+            f"{path} is not a weights file of mops_lightning. "
             "Lightning checkpoints are for ckpt_path; weights.pt is in the run's folder."
         )
     if digest(content["state"]) != content["sha256"]:
@@ -72,22 +72,24 @@ def read(path: str | Path) -> dict[str, Any]:
     return content
 
 
-def read_plain(path: Path, setting: str, what: str) -> Any:
+def read_plain(path: Path, what: str) -> Any:
     """Read a file of plain tensors and plain data; pickled code is refused, not executed.
 
     Args:
         path: the file.
-        setting: name of the setting that gave the path, for the error.
         what: kind of file that was expected, for the error.
 
     Raises:
-        UserError: the file is damaged, or contains more than plain data.
+        UserError: the file cannot be opened, is damaged, or contains more than plain data.
     """
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        first = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise UserError(f"{setting}: {path} cannot be read as {what}: {first}") from None
+    except PermissionError:
+        raise UserError(f"{path} may not be read. Check its permissions.") from None
+    except Exception:  # torch's messages advise to execute the file's code
+        raise UserError(
+            f"{path} is damaged or not a file of this program (expected {what})."
+        ) from None
 
 
 def of_run(folder: Path) -> Path:
