@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.support.command_line import TINY_WITH_PICTURES, call
+from tests.support.command_line import TINY, TINY_WITH_PICTURES, call
 
 
 @pytest.mark.parametrize(
@@ -31,4 +31,36 @@ def test_mistake_ends_in_one_line(arguments, said, tmp_path):
     assert said in err
     assert "Traceback" not in err
     assert err.startswith("mops_lightning: ")
+    assert len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("arguments", [["out=file"], ["-m", "out=file"]])
+def test_out_that_is_a_file_ends_in_one_line(arguments, tmp_path):
+    (tmp_path / "file").touch()
+    status, _, err = call([*arguments, *TINY], tmp_path)
+    assert status == 2
+    assert err.startswith("mops_lightning: out: cannot write to file/")
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_dataset_of_another_type_ends_in_one_line(tmp_path):
+    (tmp_path / "dataset").mkdir()
+    (tmp_path / "dataset" / "mine.yaml").write_text("_target_: builtins.int\n")
+    status, _, err = call(["--config-dir", str(tmp_path), "dataset=mine"], tmp_path)
+    assert (status, err) == (
+        2,
+        "mops_lightning: dataset: builtins.int must return a CloudDataset, got int.\n",
+    )
+
+
+@pytest.mark.parametrize("name", ["EarlyStopping", "ModelCheckpoint"])
+def test_callback_with_an_unknown_metric_ends_in_one_line(name, tmp_path):
+    added = [
+        f"+callbacks.mine._target_=lightning.pytorch.callbacks.{name}",
+        "+callbacks.mine.monitor=nope",
+    ]
+    status, _, err = call([*TINY, "learn=task", *added], tmp_path)
+    assert status == 2
+    assert err.startswith("mops_lightning: callbacks: ")
+    assert "nope" in err
     assert len(err.strip().splitlines()) == 1

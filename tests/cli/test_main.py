@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
 
@@ -33,6 +34,12 @@ def test_subcommand_error_names_the_subcommand(arguments, tmp_path):
     status, _, err = call(arguments, tmp_path)
     assert status == 2
     assert err.startswith(f"mops_lightning {arguments[0]}: nowhere: ")
+
+
+def test_version_is_that_of_the_package(tmp_path):
+    status, out, err = call(["--version"], tmp_path)
+    assert (status, err) == (0, "")
+    assert out == f"mops_lightning {version('mops-lightning')}\n"
 
 
 @pytest.mark.parametrize(

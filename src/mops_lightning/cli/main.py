@@ -7,6 +7,7 @@ import os
 import re
 import sys
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 
 from mops_lightning.cli.commands import COMMANDS
@@ -24,7 +25,9 @@ def main() -> None:
     with quiet_on_closed_pipe():
         if is_query(arguments) and complete(os.environ.get("COMP_LINE", "")):
             return
-        if first in COMMANDS:
+        if first == "--version":
+            print(f"mops_lightning {version('mops-lightning')}")
+        elif first in COMMANDS:
             command = import_module(COMMANDS[first].module)
             command.main(arguments[1:], f"{program()} {first}")
         elif WORD.fullmatch(first):

@@ -14,12 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
+from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from mops_lightning.config import settings
 from mops_lightning.config.declaration import Affects
-from mops_lightning.errors import Interrupted, UserError
+from mops_lightning.errors import USER_ERROR, Interrupted, UserError, end
 from mops_lightning.records import run_record
 from mops_lightning.records.attempts import ASIDE, FAILED
 
@@ -174,13 +176,31 @@ def _state(cell: Path) -> str:
         return "not started"
 
 
+def _make(folder: Path) -> None:
+    """Make a folder, or end the program: Hydra only warns of other exceptions of callbacks."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        text = f"out: cannot write to {folder}: {error.strerror}."
+        end("mops_lightning", text, USER_ERROR)
+
+
 class SweepSummary(Callback):
     """Prints the states of a sweep's cells at its end; the exit status is 1 if any failed."""
+
+    def on_run_start(self, config: DictConfig, **extra: Any) -> None:
+        """Make the folder of a single run before Hydra does, for a better error."""
+        HydraConfig.instance().set_config(config)  # the folder's name is made from it
+        try:
+            folder = Path(config.hydra.run.dir)
+        except OmegaConfBaseException:
+            return  # Hydra raises it again
+        _make(folder)
 
     def on_multirun_start(self, config: DictConfig, **extra: Any) -> None:
         """Mark the start, on the clock of the folder's file system."""
         folder = Path(config.hydra.sweep.dir)
-        folder.mkdir(parents=True, exist_ok=True)
+        _make(folder)
         (folder / BEGUN).touch()
 
     def on_multirun_end(self, config: DictConfig, **extra: Any) -> None:

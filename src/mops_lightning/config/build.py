@@ -1,6 +1,7 @@
 """Turning configuration nodes into objects: the only place that calls Hydra's instantiate."""
 
 import inspect
+import logging
 import re
 from functools import partial
 from typing import Any
@@ -8,6 +9,9 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.errors import UserError
+
+# It logs as an error what it also raises.
+logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
 
 
 def build(node: Any, where: str = "", **extra: Any) -> Any:
@@ -119,7 +123,7 @@ def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
         found = get_object(target)
     except Exception as error:
         raise UserError(
-            f"{where}._target_: cannot import {target!r}: {str(error).splitlines()[0]}"
+            f"{where}._target_: cannot import {target!r}: {_last_line(error)}"
         ) from None
     if not inspect.isclass(found):
         return _own_signature(found)
@@ -137,6 +141,11 @@ def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
         if not rest:
             return parameters
     return {**parameters, **own}  # the target takes any further argument
+
+
+def _last_line(error: BaseException) -> str:
+    """Return what failed, without the lines that Hydra puts before and after it."""
+    return str(error.__cause__ or error).strip().splitlines()[-1]
 
 
 def _own_signature(function: Any) -> dict[str, inspect.Parameter]:

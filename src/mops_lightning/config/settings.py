@@ -237,6 +237,9 @@ INSIDE: dict[str, dict[str, Any]] = {
     "sampler.m": {"compare": False},
     "sampler.m_max": {"compare": False, "limits": whole(1)},
     "sampler.seed": {"compare": False},
+    # Before the settings that take their values from them, so that an error names these.
+    "epochs.task": {"limits": whole(1)},
+    "epochs.sampler": {"limits": whole(0)},
     "pretrain.max_epochs": {"limits": whole(1)},
     "trainer.max_epochs": {"limits": whole(0)},
     "trainer.precision": {"limits": one_of(*PRECISIONS, others=("32", 32, None))},

@@ -14,6 +14,9 @@ from mops_lightning.records import migrate
 OPTIMIZERS = ("optimizer", "pretrain.optimizer")
 """Nodes whose ``schedule`` is not an argument of the optimizer."""
 
+TABLES = ("epochs", "augment", "pretrain")
+"""Settings that have settings of their own but are no groups of choices."""
+
 
 def check(cfg: DictConfig) -> None:
     """Find mistakes in a configuration before any heavy work.
@@ -28,8 +31,12 @@ def check(cfg: DictConfig) -> None:
             hint = did_you_mean(key, declared)
             raise UserError(migrate.answer(key) or f"{key}: no such setting.{hint}")
     for name, setting in declared.items():
+        if name not in cfg:
+            raise UserError(f"{name} cannot be removed. Choose another value with {name}=...")
         if cfg.get(name) is None and not setting.nullable:
             raise UserError(f"{name} cannot be removed. Choose another one with {name}=...")
+        if setting.group or name in TABLES:
+            _check_table(cfg.get(name), name)
     if not isinstance(cfg.task.get("net"), DictConfig):
         raise UserError("task.net cannot be removed. Choose another one with task/net=NAME.")
     _check_limits(cfg)
@@ -66,6 +73,20 @@ def misfit_of(error: BaseException) -> UserError | None:
             return settings.refusal(cause.full_key, cause.value)
         cause = cause.__cause__
     return None
+
+
+def _check_table(value: Any, name: str) -> None:
+    """Refuse a plain value where there must be settings, also for one callback or baseline."""
+    if value is not None and not isinstance(value, DictConfig):
+        raise UserError(f"{name} must be settings, got {value!r}. Write {name}.KEY=VALUE.")
+    if value is None or name not in ("callbacks", "baselines"):
+        return
+    for key in value:
+        if value[key] is not None and not isinstance(value[key], DictConfig):
+            raise UserError(
+                f"{name}.{key!s} must be null or settings with a class, got {value[key]!r}. "
+                f"Give its class as {name}.{key!s}._target_=MODULE.CLASS."
+            )
 
 
 def _check_limits(cfg: DictConfig) -> None:

@@ -56,7 +56,10 @@ def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> Ru
 
 
 def _begin(folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"out: cannot write to {folder}: {error.strerror}.") from None
     try:
         # Two runs that start in the same second get the same folder; the second one stops here.
         (folder / STARTED).touch(exist_ok=False)
@@ -65,11 +68,18 @@ def _begin(folder: Path) -> None:
             f"{folder} already contains a run; runs are never overwritten. Start again for a "
             "new folder, and leave hydra.run.dir out or give another one."
         ) from None
+    except OSError as error:
+        raise UserError(f"out: cannot write to {folder}: {error.strerror}.") from None
 
 
 def _load_data(cfg: DictConfig) -> CloudDataset:
     """Load both splits and add noise to the test clouds."""
-    dataset: CloudDataset = build(cfg.dataset, "dataset")
+    dataset = build(cfg.dataset, "dataset")
+    if not isinstance(dataset, CloudDataset):
+        raise UserError(
+            f"dataset: {cfg.dataset.get('_target_')} must return a CloudDataset, got "
+            f"{type(dataset).__name__}."
+        )
     points = dataset.train.points.shape[1]
     if cfg.m > points:
         raise UserError(f"m must be at most the {points} points of a cloud, got m={cfg.m}.")

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import nn
 
 from mops_lightning.data.loader import Augmentation, CloudLoader
@@ -95,7 +96,7 @@ def _fit(job: Job) -> None:
     # An epoch of a small data set may be shorter than the logging interval.
     every = min(trainer.log_every_n_steps, len(loader))  # type: ignore[attr-defined]
     trainer.log_every_n_steps = every  # type: ignore[attr-defined]
-    with _interruptible():
+    with _interruptible(), _monitoring():
         trainer.fit(job.experiment, loader, validation, ckpt_path=job.resumed)
 
 
@@ -127,6 +128,18 @@ def _interruptible() -> Iterator[None]:
         yield
     except SystemExit:
         raise Interrupted("Resume with the same command and ckpt_path=last.") from None
+
+
+@contextmanager
+def _monitoring() -> Iterator[None]:
+    """Raise ``UserError`` where a callback of Lightning's monitors a metric that is not there."""
+    try:
+        yield
+    except (RuntimeError, MisconfigurationException) as error:
+        text = str(error)
+        if not (text.startswith("Early stopping conditioned on metric") or "monitor=" in text):
+            raise
+        raise UserError(f"callbacks: {' '.join(text.split())}") from None
 
 
 def _save(job: Job, record: RunRecord) -> None:
