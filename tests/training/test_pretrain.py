@@ -131,3 +131,12 @@ def test_resume_with_fewer_epochs_than_done_raises(tmp_path):
     same = train(tmp_path, *task, "trainer.max_epochs=3", checkpoint)
     longer = train(tmp_path, *task, "trainer.max_epochs=4", checkpoint)
     assert [one.notes["lengthened"] for one in (same, longer)] == [False, True]
+
+
+def test_resumed_pretraining_does_not_warn_about_its_folder(tmp_path, capsys, recwarn):
+    train(tmp_path, "sampler=fps")
+    (weights_file,) = tmp_path.glob("cache/weights/*/weights.pt")
+    weights_file.unlink()
+    train(tmp_path, "sampler=fps")
+    assert capsys.readouterr().out.count("training it first, 1 epoch.") == 2
+    assert not [one for one in recwarn if "not empty" in str(one.message)]
