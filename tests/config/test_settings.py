@@ -70,7 +70,7 @@ def test_made_up_setting_that_affects_results_may_not_differ_in_a_sweep(affects,
     overrides = [*TINY, "sampler=fps", "weights=null"]
     run_cell(compose(overrides), tmp_path / "cell", overrides)
     run_cell(compose([*overrides, "haste=2"]), tmp_path / "cell", overrides)
-    refused = "other settings: haste is 2.0 now and was 1.0" in caplog.text
+    refused = "other settings: haste was 1.0, got 2.0" in caplog.text
     assert refused == (affects is not Affects.NOTHING)
 
 
