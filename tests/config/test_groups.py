@@ -5,7 +5,8 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from mops_lightning.config.compose import compose, conf_dir
+from mops_lightning.config.compose import compose
+from mops_lightning.config.composition import conf_dir
 from mops_lightning.config.validate import check
 from tests.support.command_line import TINY, call, runs
 

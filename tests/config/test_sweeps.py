@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from mops_lightning.config.compose import conf_dir
+from mops_lightning.config.composition import conf_dir
 from mops_lightning.config.validate import check
 
 ROOT = Path(__file__).parents[2] / "sweeps"

@@ -3,7 +3,8 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config.build import signature
-from mops_lightning.config.compose import compose, conf_dir
+from mops_lightning.config.compose import compose
+from mops_lightning.config.composition import conf_dir
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 

@@ -6,7 +6,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from mops_lightning.cli.commands import help_lines
-from mops_lightning.config.compose import conf_dir
+from mops_lightning.config.composition import conf_dir
 from mops_lightning.config.overrides import key
 from mops_lightning.errors import INTERRUPTED, USER_ERROR, Interrupted, UserError, end
 from mops_lightning.records.migrate import answer
@@ -31,6 +31,9 @@ def _run() -> None:
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError  # type: ignore[import-untyped]
+
+    from mops_lightning.config.explain import explain, refuse_plain_groups
 
     OmegaConf.register_new_resolver("subcommands", help_lines, replace=True)
     show_traceback = bool(os.environ.get("HYDRA_FULL_ERROR"))
@@ -38,18 +41,17 @@ def _run() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         _refuse_old_settings(sys.argv[1:])
+        refuse_plain_groups(sys.argv[1:])
         if any(key(argument) == "evaluate" for argument in sys.argv[1:]):
             from mops_lightning.training.replay import command_line
 
             sys.argv[1:] = command_line(sys.argv[1:])
         app = hydra.main(config_path=str(conf_dir()), config_name="config", version_base="1.3")
         app(_job)()
-    except (UserError, HydraException, OmegaConfBaseException) as error:
+    except (UserError, HydraException, OmegaConfBaseException, YAMLError) as error:
         if show_traceback:
             raise
-        from mops_lightning.cli.explain import explain
-
-        end(NAME, explain(error), USER_ERROR)
+        end(NAME, explain(error, sys.argv[1:]), USER_ERROR)
 
 
 def _refuse_old_settings(arguments: list[str]) -> None:

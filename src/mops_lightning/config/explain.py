@@ -1,27 +1,64 @@
 """Hydra's and OmegaConf's errors as one line that names the setting and the nearest known one."""
 
-import sys
+import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from yaml import MarkedYAMLError  # type: ignore[import-untyped]
 
 from mops_lightning.config import settings
-from mops_lightning.config.compose import conf_dir
+from mops_lightning.config.build import signature
+from mops_lightning.config.composition import composed, conf_dir
+from mops_lightning.config.overrides import key as key_of
+from mops_lightning.config.overrides import parse
 from mops_lightning.config.validate import misfit_of
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.records.migrate import answer
 
-if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
-
 FROM_RESOLVER = f"{UserError.__name__} raised while resolving interpolation: "
 """What OmegaConf puts before the error of a resolver."""
 
+OTHERWISE = {
+    "logger": " (logger=none for none)",
+    "callbacks": " or leave single callbacks out with callbacks.NAME=null",
+    "baselines": " or leave single baselines out with baselines.NAME=null",
+    "experiment": " or leave it out",
+}
+"""How to do without a choice, by group."""
 
-def explain(error: BaseException) -> str:
-    """Turn an error into one line that names the setting and the nearest known one."""
+
+def refuse_plain_groups(arguments: Sequence[str]) -> None:
+    """Refuse ``logger=null`` and the like, at which Hydra raises an error without the key.
+
+    Raises:
+        UserError: a group of choices is set to something else than a name.
+    """
+    groups = _groups()
+    for argument in arguments:
+        override = parse(argument)
+        if override is None or override.is_delete() or key_of(argument) not in groups:
+            continue
+        if override.is_sweep_override() or isinstance(override.value(), str | list | dict):
+            continue
+        name = key_of(argument)
+        hint = OTHERWISE.get(name, "")
+        raise UserError(f"{argument}: choose one with {name}=NAME{hint}.")
+
+
+def explain(error: BaseException, arguments: Sequence[str]) -> str:
+    """Turn an error into one line that names the setting and the nearest known one.
+
+    Args:
+        error: raised while a configuration was composed.
+        arguments: of the command line, or the overrides.
+    """
     from hydra.errors import MissingConfigException
 
+    if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
+        mark = error.problem_mark
+        return f"{mark.name}, line {mark.line + 1}: not valid YAML: {error.problem}."
     refused = misfit_of(error)
     if refused is not None:
         return str(refused)
@@ -30,7 +67,8 @@ def explain(error: BaseException) -> str:
     while cause is not None:
         if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
             if not cause.options:
-                return f"no file {cause.missing_cfg_file} in --config-dir.{_names_there(cause)}"
+                near = _names_there(cause, arguments)
+                return f"no file {cause.missing_cfg_file} in --config-dir.{near}"
             group, _, choice = cause.missing_cfg_file.rpartition("/")
             return f"{group}={choice}: no such choice.{did_you_mean(choice, cause.options or ())}"
         texts.append(str(cause).strip())
@@ -46,36 +84,37 @@ def explain(error: BaseException) -> str:
                 return said
         if "Could not override '" in text:
             key = text.split("Could not override '")[1].split("'")[0]
-            return _no_such_setting(key)
+            return _no_such_setting(key, arguments)
+        if removed := re.search(r"Key '(\w+)' not in 'RunSettings'", text):
+            return f"{removed.group(1)} cannot be removed."
     # Hydra's and OmegaConf's own messages, without their notes for developers.
     lines = [line for text in texts for line in text.splitlines() if line.strip()]
     return " ".join(dict.fromkeys(line.strip() for line in lines if line[0] != " "))
 
 
-def _names_there(cause: Any) -> str:
-    """Name the configurations in the folder of --config-dir."""
-    from pathlib import Path
+def _groups() -> list[str]:
+    """List the groups of choices, such as ``task/net``."""
+    root = conf_dir()
+    paths = [path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_dir()]
+    return [path for path in paths if not path.startswith("hydra")]
 
-    places = [i for i, a in enumerate(sys.argv) if a in ("--config-dir", "-cd")]
-    root = Path(sys.argv[places[-1] + 1]) if places else conf_dir()
+
+def _names_there(cause: Any, arguments: Sequence[str]) -> str:
+    """Name the configurations in the folder of --config-dir."""
+    places = [i for i, a in enumerate(arguments) if a in ("--config-dir", "-cd")]
+    root = Path(arguments[places[-1] + 1]) if places else conf_dir()
     names = [str(path.relative_to(root).with_suffix("")) for path in root.rglob("*.yaml")]
     return did_you_mean(cause.missing_cfg_file, names)
 
 
-def _no_such_setting(key: str) -> str:
+def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     """Name the nearest group or setting, or say how to set an argument that no YAML file sets."""
-    from omegaconf import OmegaConf
-
-    from mops_lightning.config.build import signature
-
-    root = conf_dir()
-    paths = [str(path.relative_to(root)) for path in root.rglob("*") if path.is_dir()]
-    groups = [path for path in paths if not path.startswith("hydra")]
+    groups = _groups()
     if said := answer(key):
         return said
     if "/" in key or "@" in key:
         return f"{key}: no such group of choices.{did_you_mean(key, groups)}"
-    cfg = _composed(groups)
+    cfg = _composed(groups, arguments)
     node, _, name = key.rpartition(".")
     target = OmegaConf.select(cfg, f"{node}._target_")
     if target and name in signature(target, node):
@@ -84,21 +123,16 @@ def _no_such_setting(key: str) -> str:
     return f"{key}: no such setting.{hint} --cfg job shows all of them."
 
 
-def _composed(groups: Sequence[str]) -> "DictConfig":
+def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
     """Compose the groups that the command line chooses, without its other settings."""
-    from mops_lightning.config.compose import compose
-    from mops_lightning.config.overrides import key
-
     try:
-        return compose([part for part in sys.argv[1:] if key(part) in groups])
+        return composed([part for part in arguments if key_of(part) in groups])
     except Exception:  # the mistake may be among them
-        return compose()
+        return composed([])
 
 
-def _known_keys(cfg: "DictConfig") -> list[str]:
+def _known_keys(cfg: DictConfig) -> list[str]:
     """List every key of a configuration, dotted."""
-    from omegaconf import DictConfig
-
     keys = list(settings.declared())
 
     def walk(node: DictConfig, prefix: str) -> None:

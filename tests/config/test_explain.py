@@ -22,6 +22,11 @@ from tests.support.command_line import TINY, TINY_WITH_PICTURES, call
         (["dataset.classes=[chiar]"], "chair"),
         (["ckpt_path=last", *TINY_WITH_PICTURES], "ckpt_path=last"),
         ([*TINY_WITH_PICTURES, "dataset.classes=[chair]"], "num_classes must be at least 2"),
+        (["logger=null"], "logger=null: choose one with logger=NAME (logger=none for none)"),
+        (["callbacks=null"], "callbacks.NAME=null"),
+        (["baselines=null"], "baselines=null: choose one"),
+        (["sampler=3"], "sampler=3: choose one with sampler=NAME"),
+        (["~m"], "m cannot be removed."),
         (["weights=nowhere.pt", *TINY_WITH_PICTURES], "weights: no file nowhere.pt"),
     ],
 )
@@ -63,4 +68,13 @@ def test_callback_with_an_unknown_metric_ends_in_one_line(name, tmp_path):
     assert status == 2
     assert err.startswith("mops_lightning: callbacks: ")
     assert "nope" in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_broken_yaml_ends_in_one_line(tmp_path):
+    (tmp_path / "sampler").mkdir()
+    (tmp_path / "sampler" / "mine.yaml").write_text("a: [1\nb: 2\n")
+    status, _, err = call(["--config-dir", str(tmp_path), "sampler=mine"], tmp_path)
+    assert status == 2
+    assert "mine.yaml, line 2: not valid YAML: " in err
     assert len(err.strip().splitlines()) == 1
