@@ -59,7 +59,7 @@ def test_resume_other_weights_raises(tmp_path):
     train(tmp_path, *task, given)
     begun = tmp_path / "run2"
     for weights_, checkpoint in ((given, anew), ("weights=auto", begun)):
-        with pytest.raises(UserError, match=r"of a run with other settings \(weights"):
+        with pytest.raises(UserError, match=r"from a run with other settings \(weights"):
             train(tmp_path, *task, weights_, f"ckpt_path={checkpoint}")
 
 
