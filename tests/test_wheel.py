@@ -90,8 +90,11 @@ def test_wheel_has_console_script_and_licence(wheel: Path) -> None:
 
 
 def test_installed_copy_is_imported(installed: Path, tmp_path: Path) -> None:
-    code = "import mops_lightning, mops_lightning.config.composition as c; print(mops_lightning.__file__)"
-    lines = python("-c", f"{code}; print(c.conf_dir())", cwd=tmp_path, path=installed).split("\n")
+    code = (
+        "import mops_lightning, mops_lightning.config.composition as c;"
+        "print(mops_lightning.__file__); print(c.conf_dir())"
+    )
+    lines = python("-c", code, cwd=tmp_path, path=installed).split("\n")
     assert Path(lines[0]) == installed / "mops_lightning" / "__init__.py"
     assert Path(lines[1]) == installed.resolve() / "mops_lightning" / "conf"
 
