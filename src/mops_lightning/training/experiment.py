@@ -43,7 +43,7 @@ class Experiment(L.LightningModule):
         sizes: how many points are tested, from one pass over the data; None: ``m`` alone. With
             several, the metrics are named ``test/m32/generated/accuracy`` and so on.
         task_lr_scale: with ``learn="joint"`` the task net's learning rate over that of the sampler.
-        m: the size that is validated and whose score stands for the run; None: the sampler's.
+        m: the size that is validated and gives the run's score; None: the sampler's.
 
     Raises:
         UserError: see ``check_learn``.
