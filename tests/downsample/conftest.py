@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from mops_lightning.downsample.formats.registry import WRITERS
-from mops_lightning.downsample.formats.table import Table
+from mops_lightning.data.formats.registry import WRITERS
+from mops_lightning.data.formats.table import Table
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
 

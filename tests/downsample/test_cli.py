@@ -2,7 +2,7 @@
 
 import pytest
 
-from mops_lightning.downsample.formats.registry import read
+from mops_lightning.data.formats.registry import read
 from tests.support.downsample import call
 
 

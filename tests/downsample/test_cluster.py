@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from mops_lightning.data.formats.registry import WRITERS, read
+from mops_lightning.data.formats.table import Table
 from mops_lightning.downsample.cluster import cluster, engine_of, environment_kept
-from mops_lightning.downsample.formats.registry import WRITERS, read
-from mops_lightning.downsample.formats.table import Table
 from mops_lightning.downsample.large import by_chunks
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.mops import MOPSNet

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mops_lightning.downsample.formats.registry import WRITERS, read
-from mops_lightning.downsample.formats.table import Table
+from mops_lightning.data.formats.registry import WRITERS, read
+from mops_lightning.data.formats.table import Table
 from tests.support.downsample import call
 
 

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from mops_lightning.downsample.formats.cloud_file import CloudFile
+from mops_lightning.data.formats.cloud_file import CloudFile
 from mops_lightning.downsample.large import Engine
 from mops_lightning.errors import UserError
 

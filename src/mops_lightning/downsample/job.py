@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mops_lightning.downsample.formats.errors import check_size
-from mops_lightning.downsample.formats.registry import read, write
-from mops_lightning.downsample.formats.table import Table
+from mops_lightning.data.formats.errors import check_size
+from mops_lightning.data.formats.registry import read, write
+from mops_lightning.data.formats.table import Table
 from mops_lightning.downsample.large import Engine, Kept, by_chunks, in_turn
 from mops_lightning.downsample.settings import Settings
 from mops_lightning.downsample.unit_sphere import largest_distance, sum_of, unit_sphere

@@ -15,10 +15,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.downsample.formats.cloud_file import CloudFile
-from mops_lightning.downsample.formats.errors import check_size
-from mops_lightning.downsample.formats.registry import open_cloud_file
-from mops_lightning.downsample.formats.table import Table
+from mops_lightning.data.formats.cloud_file import CloudFile
+from mops_lightning.data.formats.errors import check_size
+from mops_lightning.data.formats.registry import open_cloud_file
+from mops_lightning.data.formats.table import Table
 from mops_lightning.downsample.unit_sphere import (
     UnitSphere,
     largest_distance,

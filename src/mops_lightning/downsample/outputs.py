@@ -3,7 +3,7 @@
 from collections import Counter
 from pathlib import Path
 
-from mops_lightning.downsample.formats.registry import READABLE, WRITERS
+from mops_lightning.data.formats.registry import READABLE, WRITERS
 from mops_lightning.errors import UserError
 
 Job = tuple[Path, Path]

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.downsample.formats.errors import BadCloudError
+from mops_lightning.data.formats.errors import BadCloudError
 
 
 class UnitSphere(NamedTuple):

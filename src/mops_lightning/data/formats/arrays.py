@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from mops_lightning.downsample.formats.cloud_file import BinaryCloudFile
-from mops_lightning.downsample.formats.errors import BadCloudError
-from mops_lightning.downsample.formats.table import (
+from mops_lightning.data.formats.cloud_file import BinaryCloudFile
+from mops_lightning.data.formats.errors import BadCloudError
+from mops_lightning.data.formats.table import (
     Column,
     Table,
     column_names,

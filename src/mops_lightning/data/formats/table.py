@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.downsample.formats.errors import BadCloudError
+from mops_lightning.data.formats.errors import BadCloudError
 
 Column = NDArray[Any]
 

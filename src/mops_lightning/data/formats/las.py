@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from mops_lightning.downsample.formats.cloud_file import CloudFile
-from mops_lightning.downsample.formats.errors import BadCloudError, ends_early
-from mops_lightning.downsample.formats.table import Column, Table, unique_names
+from mops_lightning.data.formats.cloud_file import CloudFile
+from mops_lightning.data.formats.errors import BadCloudError, ends_early
+from mops_lightning.data.formats.table import Column, Table, unique_names
 from mops_lightning.errors import UserError
 
 

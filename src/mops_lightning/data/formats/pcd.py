@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.downsample.formats.errors import BadCloudError
-from mops_lightning.downsample.formats.lzf import decompress
-from mops_lightning.downsample.formats.table import (
+from mops_lightning.data.formats.errors import BadCloudError
+from mops_lightning.data.formats.lzf import decompress
+from mops_lightning.data.formats.table import (
     Table,
     compact_coordinates,
     from_array,

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.downsample.formats.cloud_file import BinaryCloudFile
-from mops_lightning.downsample.formats.errors import BadCloudError
-from mops_lightning.downsample.formats.table import (
+from mops_lightning.data.formats.cloud_file import BinaryCloudFile
+from mops_lightning.data.formats.errors import BadCloudError
+from mops_lightning.data.formats.table import (
     Column,
     Table,
     columns_to_rows,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mops_lightning.downsample.formats import pcd
+from mops_lightning.data.formats import pcd
 
 
 def packed(data):

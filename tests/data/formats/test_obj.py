@@ -1,6 +1,6 @@
 """OBJ files."""
 
-from mops_lightning.downsample.formats.registry import read
+from mops_lightning.data.formats.registry import read
 
 
 def test_obj_faces_after_tab_make_a_mesh(tmp_path):

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from mops_lightning.data.formats import arrays, kitti, las, obj, pcd, ply, text
+from mops_lightning.data.formats.cloud_file import CloudFile
+from mops_lightning.data.formats.errors import BadCloudError, naming_file
+from mops_lightning.data.formats.table import Table
 from mops_lightning.data.mesh_io import SUFFIXES as MESHES
 from mops_lightning.data.mesh_io import parse_mesh
-from mops_lightning.downsample.formats import arrays, kitti, las, obj, pcd, ply, text
-from mops_lightning.downsample.formats.cloud_file import CloudFile
-from mops_lightning.downsample.formats.errors import BadCloudError, naming_file
-from mops_lightning.downsample.formats.table import Table
 from mops_lightning.files import atomic_write
 
 READERS: dict[str, Callable[[Path], Table | None]] = {

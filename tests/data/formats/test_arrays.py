@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mops_lightning.downsample.formats.registry import open_cloud_file, read
+from mops_lightning.data.formats.registry import open_cloud_file, read
 from mops_lightning.errors import UserError
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mops_lightning.downsample.formats.errors import BadCloudError
-from mops_lightning.downsample.formats.table import Table, compact_coordinates
-from mops_lightning.downsample.formats.text import number_format
+from mops_lightning.data.formats.errors import BadCloudError
+from mops_lightning.data.formats.table import Table, compact_coordinates
+from mops_lightning.data.formats.text import number_format
 
 
 def read(path: Path) -> Table | None:

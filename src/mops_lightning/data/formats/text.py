@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mops_lightning.downsample.formats.errors import BadCloudError
-from mops_lightning.downsample.formats.table import (
+from mops_lightning.data.formats.errors import BadCloudError
+from mops_lightning.data.formats.table import (
     Column,
     Table,
     columns_to_rows,

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mops_lightning.downsample.formats.cloud_file import BinaryCloudFile
-from mops_lightning.downsample.formats.errors import BadCloudError
-from mops_lightning.downsample.formats.table import Table, compact_coordinates
+from mops_lightning.data.formats.cloud_file import BinaryCloudFile
+from mops_lightning.data.formats.errors import BadCloudError
+from mops_lightning.data.formats.table import Table, compact_coordinates
 
 ROW = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
 

@@ -4,8 +4,8 @@ import laspy
 import numpy as np
 import pytest
 
-from mops_lightning.downsample.formats.registry import WRITERS, open_cloud_file, read
-from mops_lightning.downsample.formats.table import Table
+from mops_lightning.data.formats.registry import WRITERS, open_cloud_file, read
+from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 
 

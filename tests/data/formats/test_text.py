@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mops_lightning.downsample.formats.registry import read
+from mops_lightning.data.formats.registry import read
 
 
 @pytest.mark.parametrize(

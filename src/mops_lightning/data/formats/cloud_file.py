@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from mops_lightning.downsample.formats.errors import ends_early, naming_file
-from mops_lightning.downsample.formats.table import Table, from_array
+from mops_lightning.data.formats.errors import ends_early, naming_file
+from mops_lightning.data.formats.table import Table, from_array
 
 
 @dataclass(frozen=True, kw_only=True)
