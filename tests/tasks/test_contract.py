@@ -80,3 +80,19 @@ def test_task_step_with_any_sampler_changes_what_learns(task, sampler, learn):
 @pytest.mark.parametrize("task", TASKS)
 def test_task_step_without_sampler_changes_task(task):
     assert trained_parts(task, None, "task") == {"task"}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_disagreement_is_zero_only_for_equal_predictions(task: str) -> None:
+    torch.manual_seed(0)
+    module = TASKS[task]().eval()
+    loader = CloudLoader(small_dataset(4, points=POINTS).test, 4, make_batch=module.make_batch)
+    batch = next(iter(loader))
+    reference = module.predict(batch, batch.points)
+    same = module.disagreement(reference, reference)
+    other = module.disagreement(module.predict(batch, 9 - batch.points[:, :8]), reference)
+    assert same.shape == other.shape == (4,)
+    assert same.abs().max() < 1e-6
+    assert other.min() > 1e-6
+    other.sum().backward()
+    assert any(p.grad is not None and p.grad.any() for p in module.parameters())

@@ -66,6 +66,24 @@ class Task(nn.Module):
         """Return the number of points per cloud of ``make_batch``, for ``n_points`` in the data."""
         return n_points
 
+    def predict(self, batch: Any, points: Tensor) -> Any:
+        """Return the net's output for sampled points, as ``disagreement`` compares it.
+
+        Args:
+            batch: from ``make_batch``.
+            points: as for ``step``.
+        """
+        raise NotImplementedError
+
+    def disagreement(self, found: Any, reference: Any) -> Tensor:
+        """Return how far predictions are from the reference, one value ``(B,)`` per cloud.
+
+        Args:
+            found: from ``predict``; gradients flow to it.
+            reference: from ``predict``, for instance on all points.
+        """
+        raise NotImplementedError
+
     def step(self, batch: Any, points: Tensor) -> TaskOutput:
         """Run the net on sampled points, for training.
 

@@ -34,6 +34,15 @@ class Classification(Task):
             )
         self.num_classes = num_classes
 
+    def predict(self, batch: Batch, points: Tensor) -> Tensor:
+        """Return the logits ``(B, num_classes)`` of ``(B, M, 3)`` points."""
+        return self.net(points)
+
+    def disagreement(self, found: Tensor, reference: Tensor) -> Tensor:
+        """Return the Kullback-Leibler divergence KL(reference ‖ found) of the classes."""
+        expected = reference.log_softmax(1)
+        return (expected.exp() * (expected - found.log_softmax(1))).sum(1)
+
     def step(self, batch: Batch, points: Tensor) -> TaskOutput:
         """Classify one batch.
 
@@ -44,7 +53,7 @@ class Classification(Task):
         Returns:
             The cross entropy, logits ``(B, num_classes)`` and labels.
         """
-        logits = self.net(points)
+        logits = self.predict(batch, points)
         loss = F.cross_entropy(logits, batch.labels)
         return TaskOutput({"cross_entropy": loss}, logits, batch.labels)
 

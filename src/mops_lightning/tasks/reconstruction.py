@@ -74,6 +74,14 @@ class Reconstruction(Task):
         self.exact_up_to = exact_up_to
         self.emd_workers = emd_workers
 
+    def predict(self, batch: Batch, points: Tensor) -> Tensor:
+        """Return reconstructions ``(B, N, 3)`` of the clouds from ``(B, M, 3)`` points."""
+        return self.net(points, batch.points.shape[1])
+
+    def disagreement(self, found: Tensor, reference: Tensor) -> Tensor:
+        """Return the chamfer distance of two reconstructions."""
+        return chamfer_distance(found, reference)
+
     def step(self, batch: Batch, points: Tensor) -> TaskOutput:
         """Reconstruct one batch for training.
 
@@ -84,7 +92,7 @@ class Reconstruction(Task):
         Returns:
             The loss terms, and the distances of the reconstructions without a reference.
         """
-        built = self.net(points, batch.points.shape[1])
+        built = self.predict(batch, points)
         chamfer = chamfer_distance(built, batch.points)
         losses = {"chamfer": chamfer.mean()}
         emd = torch.zeros_like(chamfer)
@@ -118,7 +126,7 @@ class Reconstruction(Task):
 
     def _distances(self, batch: Batch, points: Tensor) -> Distances:
         clouds = batch.points
-        built = self.net(points, clouds.shape[1])
+        built = self.predict(batch, points)
         exact = clouds.shape[1] <= self.exact_up_to
         emd = self._emd(built, clouds, None if exact else SCORED_BLOCK, SCORED_ROUNDS)
         return Distances(chamfer_distance(built, clouds), emd)

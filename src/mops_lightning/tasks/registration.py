@@ -17,7 +17,7 @@ from mops_lightning.metrics.registration import (
     RotationRecall10,
     TranslationError,
 )
-from mops_lightning.ops.rigid import Motion, identity_motion
+from mops_lightning.ops.rigid import Motion, identity_motion, quaternion_to_matrix
 from mops_lightning.tasks.base import Task
 from mops_lightning.types import Batch, PairBatch, TaskOutput
 
@@ -67,6 +67,21 @@ class Registration(Task):
         """Return the number of points per cloud of a pair."""
         return self.pairs.points_of(n_points)
 
+    def predict(self, batch: PairBatch, points: Tensor) -> Motion:
+        """Return the motions between the centred clouds from ``(2B, M, 3)`` points of both."""
+        return self.net(*points.chunk(2))
+
+    def disagreement(self, found: Motion, reference: Motion) -> Tensor:
+        """Return the squared distance of two motions.
+
+        This is the sum over the unit axes of the squared distance between the rotated axes, plus
+        the squared distance of the translations.
+        """
+        rotation = quaternion_to_matrix(found.quaternion)
+        rotation = rotation - quaternion_to_matrix(reference.quaternion)
+        translation = found.translation - reference.translation
+        return rotation.square().sum((1, 2)) + translation.square().sum(1)
+
     def step(self, batch: PairBatch, points: Tensor) -> TaskOutput:
         """Register one batch.
 
@@ -77,7 +92,7 @@ class Registration(Task):
         Returns:
             The loss terms, the predicted motions and the true ones.
         """
-        found = self.net(*points.chunk(2))
+        found = self.predict(batch, points)
         true = Motion(batch.quaternion, batch.translation)
         from_source, from_target = batch.centroids.chunk(2)
         # The true motion between the centred clouds: R·(p + c) + t = R·p + (R·c + t).
