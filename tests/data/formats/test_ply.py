@@ -52,3 +52,11 @@ def test_ply_vertices_with_lists_are_rejected(tmp_path):
     path.write_text(f"ply\nformat binary_little_endian 1.0\n{head}end_header\n")
     with pytest.raises(UserError, match="without lists"):
         open_cloud_file(path)
+
+
+def test_ply_chunked_impossible_count_is_broken(tmp_path):
+    path = tmp_path / "a.ply"
+    WRITERS[".ply"](path, Table(np.ones((5, 3))))
+    path.write_bytes(path.read_bytes().replace(b"vertex 5", b"vertex 999999999999"))
+    with pytest.raises(UserError, match="ends after 5 points"):
+        open_cloud_file(path)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mops_lightning.data.formats.errors import ends_early, naming_file
+from mops_lightning.data.formats.errors import BadCloudError, ends_early, naming_file
 from mops_lightning.data.formats.table import Table, from_array
 
 
@@ -66,6 +66,14 @@ class BinaryCloudFile(CloudFile):
 
     kind: np.dtype[Any]
     offset: int = 0
+
+    def __post_init__(self) -> None:
+        """Reject a number of rows that the file is too short for."""
+        if not self.kind.itemsize or self.number < 0:
+            raise BadCloudError(f"{self.path} is broken: {self.number} points of {self.kind}.")
+        room = max(self.path.stat().st_size - self.offset, 0) // self.kind.itemsize
+        if self.number > room:
+            raise ends_early(self.path, room)
 
     def _parse(self, rows: range) -> Table:
         start = self.offset + rows.start * self.kind.itemsize

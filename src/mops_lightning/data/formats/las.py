@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mops_lightning.data.formats import las_header
 from mops_lightning.data.formats.cloud_file import CloudFile
 from mops_lightning.data.formats.errors import BadCloudError, ends_early
 from mops_lightning.data.formats.table import Column, Table, unique_names
@@ -15,13 +16,10 @@ from mops_lightning.errors import UserError
 def read(path: Path) -> Table:
     """Read all points with all their dimensions; coordinates are scaled and shifted."""
     laspy = _laspy(path)
-    with laspy.open(path) as file:
+    las_header.check(path)
+    with laspy.open(path, read_evlrs=False) as file:
         declared = file.header.point_count
-        try:
-            cloud = file.read()
-        except ValueError as error:
-            raise BadCloudError(f"{path} is broken: it ends too early ({error}).") from None
-    table = _table(cloud, cloud.header)
+        table = _table(file.read_points(declared), file.header)
     if len(table.points) < declared:
         raise ends_early(path, len(table.points))
     return table
@@ -32,7 +30,7 @@ class LasFile(CloudFile):
     """A file that laspy reads in ranges of rows."""
 
     def _parse(self, rows: range) -> Table:
-        with _laspy(self.path).open(self.path) as file:
+        with _laspy(self.path).open(self.path, read_evlrs=False) as file:
             file.seek(rows.start)
             table = _table(file.read_points(len(rows)), None)
             _check_bounds(self.path, table, file.header)
@@ -41,7 +39,9 @@ class LasFile(CloudFile):
 
 def locate(path: Path) -> LasFile:
     """Open a file to read ranges of its rows."""
-    with _laspy(path).open(path) as file:
+    laspy = _laspy(path)
+    las_header.check(path)
+    with laspy.open(path, read_evlrs=False) as file:
         return LasFile(path=path, number=file.header.point_count, header=file.header)
 
 
