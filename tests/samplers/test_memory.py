@@ -50,7 +50,7 @@ print(status("VmHWM") - before)
 IN_CHUNKS = """
 import numpy as np
 
-from mops_lightning.downsample.large import by_chunks
+from mops_lightning.downsample_files.large import by_chunks
 from mops_lightning.samplers.mops import MOPSNet
 
 sampler = MOPSNet(16, feature_channels=(8, 8), rho_channels=(8, 8)).eval()

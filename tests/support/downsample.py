@@ -3,7 +3,7 @@
 import contextlib
 import io
 
-from mops_lightning.downsample.cli import main
+from mops_lightning.downsample_files.cli import main
 
 
 def call(*arguments):

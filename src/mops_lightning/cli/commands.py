@@ -20,7 +20,7 @@ COMMANDS = {
         "mops_lightning.report.cli", "tables, plots and a page from the records of runs"
     ),
     "downsample": Command(
-        "mops_lightning.downsample.cli", "downsample clouds and meshes from files"
+        "mops_lightning.downsample_files.cli", "downsample clouds and meshes from files"
     ),
 }
 

@@ -2,7 +2,7 @@
 
 import os
 
-from mops_lightning.downsample import batch
+from mops_lightning.downsample_files import batch
 from tests.support.downsample import call
 
 

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from mops_lightning.downsample.settings import METHODS, Settings
+from mops_lightning.downsample_files.settings import METHODS, Settings
 from mops_lightning.errors import INTERRUPTED, USER_ERROR, UserError, end, quiet_on_closed_pipe
 from mops_lightning.records.readout_names import GENERATED_READOUTS
 
@@ -19,7 +19,7 @@ the unit sphere, as in training, sampled by a trained sampler (--weights) or an 
 
 
 def main(
-    arguments: list[str] | None = None, prog: str = "python -m mops_lightning.downsample"
+    arguments: list[str] | None = None, prog: str = "python -m mops_lightning.downsample_files"
 ) -> None:
     """Downsample all files; failed files are listed at the end and make the exit status 1.
 
@@ -81,9 +81,9 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
 def _run(chosen: argparse.Namespace) -> int:
     """Do what the arguments say and return the exit status."""
     settings = _settings(chosen)
-    from mops_lightning.downsample.batch import process_file, process_folder
-    from mops_lightning.downsample.job import sampler_of
-    from mops_lightning.downsample.outputs import jobs
+    from mops_lightning.downsample_files.batch import process_file, process_folder
+    from mops_lightning.downsample_files.job import sampler_of
+    from mops_lightning.downsample_files.outputs import jobs
 
     sampler_of(settings)  # reports its mistakes before any file is read
     found = jobs(chosen.source, chosen.target, chosen.format, chosen.keep_attributes)
@@ -123,9 +123,9 @@ def _settings(chosen: argparse.Namespace) -> Settings:
 def _engine(chosen: argparse.Namespace) -> AbstractContextManager[Any]:
     """Return what processes the chunks of a file; see ``large.Engine``."""
     if not chosen.cluster:
-        from mops_lightning.downsample.large import in_turn
+        from mops_lightning.downsample_files.large import in_turn
 
         return nullcontext(in_turn)
-    from mops_lightning.downsample.cluster import cluster
+    from mops_lightning.downsample_files.cluster import cluster
 
     return cluster(chosen.cluster, chosen.workers)

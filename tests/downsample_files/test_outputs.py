@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from mops_lightning.downsample.outputs import jobs
+from mops_lightning.downsample_files.outputs import jobs
 from mops_lightning.errors import UserError
 
 

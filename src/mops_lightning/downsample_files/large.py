@@ -19,7 +19,7 @@ from mops_lightning.data.formats.cloud_file import CloudFile
 from mops_lightning.data.formats.errors import check_size
 from mops_lightning.data.formats.registry import open_cloud_file
 from mops_lightning.data.formats.table import Table
-from mops_lightning.downsample.unit_sphere import (
+from mops_lightning.downsample_files.unit_sphere import (
     UnitSphere,
     largest_distance,
     sum_of,

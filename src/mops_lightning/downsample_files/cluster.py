@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import Any
 
 from mops_lightning.data.formats.cloud_file import CloudFile
-from mops_lightning.downsample.large import Engine
+from mops_lightning.downsample_files.large import Engine
 from mops_lightning.errors import UserError
 
 LOCAL = "local"

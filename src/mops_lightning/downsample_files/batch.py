@@ -16,7 +16,7 @@ from typing import Any
 
 from rich.progress import track
 
-from mops_lightning.downsample.settings import Settings
+from mops_lightning.downsample_files.settings import Settings
 from mops_lightning.errors import UserError
 from mops_lightning.ops.workers import pool
 
@@ -33,8 +33,8 @@ def attempt(
         workers: number of processes that share the cores; None: leave torch's threads alone.
         engine: processes the chunks of a file, see ``large.Engine``; None: this process.
     """
-    from mops_lightning.downsample.job import run
-    from mops_lightning.downsample.large import in_turn
+    from mops_lightning.downsample_files.job import run
+    from mops_lightning.downsample_files.large import in_turn
 
     if workers:
         import torch

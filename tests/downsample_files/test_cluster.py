@@ -11,8 +11,8 @@ import torch
 
 from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
-from mops_lightning.downsample.cluster import cluster, engine_of, environment_kept
-from mops_lightning.downsample.large import by_chunks
+from mops_lightning.downsample_files.cluster import cluster, engine_of, environment_kept
+from mops_lightning.downsample_files.large import by_chunks
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.zoo import weights
@@ -113,7 +113,7 @@ def test_broken_file_is_named(client, scan, tmp_path):
 
 
 def test_missing_scheduler_is_reported(scan, tmp_path, monkeypatch):
-    monkeypatch.setattr("mops_lightning.downsample.cluster.PATIENCE", 1)
+    monkeypatch.setattr("mops_lightning.downsample_files.cluster.PATIENCE", 1)
     settings = ["--weights", scan[0].parent, "--readout", "generated", "--chunk", 500]
     for address in ("tcp://127.0.0.1:9", "nonsense://"):
         status, _, err = call(scan[0], tmp_path / "a.ply", *settings, "--cluster", address)
@@ -122,7 +122,7 @@ def test_missing_scheduler_is_reported(scan, tmp_path, monkeypatch):
 
 
 def test_scheduler_without_workers_is_reported(monkeypatch):
-    monkeypatch.setattr("mops_lightning.downsample.cluster.PATIENCE", 1)
+    monkeypatch.setattr("mops_lightning.downsample_files.cluster.PATIENCE", 1)
     with (
         environment_kept(),
         distributed.LocalCluster(n_workers=0, dashboard_address=":0") as empty,

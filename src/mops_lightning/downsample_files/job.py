@@ -10,9 +10,9 @@ from torch import Tensor
 from mops_lightning.data.formats.errors import check_size
 from mops_lightning.data.formats.registry import read, write
 from mops_lightning.data.formats.table import Table
-from mops_lightning.downsample.large import Engine, Kept, by_chunks, in_turn
-from mops_lightning.downsample.settings import Settings
-from mops_lightning.downsample.unit_sphere import largest_distance, sum_of, unit_sphere
+from mops_lightning.downsample_files.large import Engine, Kept, by_chunks, in_turn
+from mops_lightning.downsample_files.settings import Settings
+from mops_lightning.downsample_files.unit_sphere import largest_distance, sum_of, unit_sphere
 from mops_lightning.errors import UserError
 from mops_lightning.ops.readout import complete
 from mops_lightning.samplers.base import Sampler
