@@ -89,7 +89,7 @@ def test_meshes_unusable_split_file_raises(flat: Path) -> None:
     with pytest.raises(UserError, match=r"^split_file: cannot read none\.txt"):
         meshes(flat, split_file="none.txt")
     (flat / "split.txt").write_text("# nothing\n")
-    with pytest.raises(UserError, match="lists no mesh"):
+    with pytest.raises(UserError, match="lists no file"):
         meshes(flat, split_file="split.txt")
     (flat / "split.txt").write_text("box/1.off,train\n")
     with pytest.raises(UserError, match="no test mesh of box"):

@@ -34,7 +34,9 @@ def dataset() -> CloudDataset:
 
 
 def same(first: CloudDataset, second: CloudDataset) -> bool:
-    pairs = zip((*first.train, *first.test), (*second.train, *second.test), strict=True)
+    pairs = zip(
+        (*first.train[:2], *first.test[:2]), (*second.train[:2], *second.test[:2]), strict=True
+    )
     return all(torch.equal(a, b) for a, b in pairs) and first.fingerprint == second.fingerprint
 
 

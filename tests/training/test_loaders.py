@@ -1,6 +1,6 @@
 import torch
 
-from mops_lightning.training.loaders import clouds_to_draw, num_held_out, split
+from mops_lightning.training.loaders import clouds_to_draw, held_out_mask, split
 from tests.support.training import small_dataset
 
 
@@ -13,7 +13,7 @@ def test_split_holds_out_fraction_in_order():
     clouds = small_dataset(train=20).train
     train, held_out = split(clouds, 0.2, seed=5)
     kept, out = rows(train.points, clouds.points), rows(held_out.points, clouds.points)
-    assert len(out) == num_held_out(clouds, 0.2) == 4
+    assert len(out) == held_out_mask(clouds, 0.2, 0).sum() == 4
     assert sorted([*kept, *out]) == list(range(20))
     assert (kept, out) == (sorted(kept), sorted(out))
     assert torch.equal(held_out.labels, clouds.labels[out])
@@ -38,3 +38,11 @@ def test_clouds_to_draw_spreads_over_classes():
     assert dataset.test.labels[chosen].tolist() == [0, 2]
     assert clouds_to_draw(dataset, 9)[1] == ["long", "tall", "round"]
     assert clouds_to_draw(dataset, 0)[1] == []
+
+
+def test_split_holds_out_whole_sources():
+    clouds = small_dataset(train=20).train
+    clouds = clouds._replace(sources=torch.arange(5).repeat_interleave(4))
+    mask = held_out_mask(clouds, 0.4, seed=5)
+    assert mask.view(5, 4).sum(1).sort().values.tolist() == [0, 0, 0, 4, 4]
+    assert len(split(clouds, 0.4, seed=5)[1].points) == 8

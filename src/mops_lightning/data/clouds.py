@@ -16,10 +16,13 @@ class Clouds(NamedTuple):
     Attributes:
         points: ``(S, N, 3)`` float32.
         labels: ``(S,)`` int64, positions in ``CloudDataset.class_names``.
+        sources: ``(S,)`` int64, the same number for clouds that must be in the same split, such as
+            the crops of a file; None: no two must.
     """
 
     points: Tensor
     labels: Tensor
+    sources: Tensor | None = None
 
 
 @dataclass(frozen=True)

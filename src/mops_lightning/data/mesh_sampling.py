@@ -18,9 +18,8 @@ from rich.progress import track
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
 from mops_lightning.data.mesh_io import VERSION, BrokenMeshError, Result, cloud_or_error
+from mops_lightning.data.split_list import SPLITS
 from mops_lightning.errors import UserError
-
-SPLITS = ("train", "test")
 
 
 def mesh_root(root: str | Path, minima: dict[str, tuple[int, int]]) -> Path:

@@ -1,12 +1,12 @@
 """Datasets of mesh files: ModelNet's folder layout, or any split listed in a file."""
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.mesh_io import SUFFIXES
-from mops_lightning.data.mesh_sampling import SPLITS, mesh_root, sample_meshes
+from mops_lightning.data.mesh_sampling import mesh_root, sample_meshes
+from mops_lightning.data.split_list import SPLITS, read_split_list
 from mops_lightning.errors import UserError
 
 
@@ -55,7 +55,10 @@ def meshes(
         UserError: an argument or a file is invalid.
     """
     root = mesh_root(root, {"n_points": (n_points, 1), "seed": (seed, 0), "workers": (workers, 1)})
-    rows = _from_list(root, Path(split_file).expanduser()) if split_file else _from_layout(root)
+    if split_file:
+        rows = read_split_list(root, Path(split_file).expanduser(), SUFFIXES)
+    else:
+        rows = _from_layout(root)
     return sample_meshes(
         root,
         rows,
@@ -87,37 +90,3 @@ def _from_layout(root: Path) -> list[tuple[PurePosixPath, str]]:
             f"{', '.join(SUFFIXES)}.{hint if flat else ''}"
         )
     return rows
-
-
-def _from_list(root: Path, split_file: Path) -> list[tuple[PurePosixPath, str]]:
-    """Read and check a list of meshes."""
-    path = split_file if split_file.is_file() else root / split_file
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"split_file: cannot read {split_file}: {error}.") from error
-    rows: dict[PurePosixPath, str] = {}
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        fields = [field.strip() for field in next(csv.reader([line]))]
-        if fields == ["path", "split"] and not rows:
-            continue
-        where = f"split_file: {path}, line {number}:"
-        if len(fields) != 2 or fields[1] not in SPLITS:
-            raise UserError(f"{where} must read 'path,train' or 'path,test', got {line!r}.")
-        name = PurePosixPath(fields[0])
-        if name.is_absolute() or ".." in name.parts or len(name.parts) < 2:
-            raise UserError(
-                f"{where} the path must be CLASS/…/FILE, relative to {root}, got {fields[0]!r}."
-            )
-        if name.suffix.lower() not in SUFFIXES:
-            raise UserError(f"{where} {name} must end in {', '.join(SUFFIXES)}.")
-        if name in rows:
-            raise UserError(f"{where} {name} is listed twice.")
-        if not (root / name).is_file():
-            raise UserError(f"{where} {root / name} does not exist.")
-        rows[name] = fields[1]
-    if not rows:
-        raise UserError(f"split_file: {path} lists no mesh.")
-    return list(rows.items())

@@ -13,7 +13,7 @@ from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training import checkpoint
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.factory import make_experiment
-from mops_lightning.training.loaders import num_held_out
+from mops_lightning.training.loaders import held_out_mask
 from mops_lightning.training.replay import OF_RUN
 from mops_lightning.training.trainer import device_name, make_trainer
 
@@ -77,7 +77,7 @@ def prepare(cfg: DictConfig, folder: Path, dataset: CloudDataset, record: RunRec
     distributed.check_shares(
         cfg.batch_size,
         len(dataset.test.labels),
-        num_held_out(dataset.train, cfg.val_fraction),
+        int(held_out_mask(dataset.train, cfg.val_fraction, cfg.seed).sum()),
         trainer.world_size,
     )
     if not job.has_task_weights and cfg.weights not in (None, "auto", OF_RUN):

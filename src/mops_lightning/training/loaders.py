@@ -33,9 +33,17 @@ def augmentation(cfg: DictConfig) -> Any:
     return cfg.augment.task if cfg.learn == "task" else cfg.augment.sampler
 
 
-def num_held_out(clouds: Clouds, fraction: float) -> int:
-    """Return how many training clouds ``split`` holds out."""
-    return round(len(clouds.labels) * fraction)
+def held_out_mask(clouds: Clouds, fraction: float, seed: int) -> Tensor:
+    """Return a mask ``(S,)`` of the training clouds that ``split`` holds out.
+
+    Clouds of one source, such as the crops of a file, are held out together.
+    """
+    sources = clouds.sources
+    if sources is None:
+        sources = torch.arange(len(clouds.labels))
+    names = sources.unique()
+    order = torch.randperm(len(names), generator=generator(seed, 2))
+    return torch.isin(sources, names[order[: round(len(names) * fraction)]])
 
 
 def split(clouds: Clouds, fraction: float, seed: int) -> tuple[Clouds, Clouds]:
@@ -44,11 +52,9 @@ def split(clouds: Clouds, fraction: float, seed: int) -> tuple[Clouds, Clouds]:
     Returns:
         The clouds to train on and the held-out clouds, each in their original order.
     """
-    held_out = num_held_out(clouds, fraction)
-    order = torch.randperm(len(clouds.labels), generator=generator(seed, 2))
-    rest, chosen = order[held_out:].sort().values, order[:held_out].sort().values
+    chosen = held_out_mask(clouds, fraction, seed)
     return (
-        Clouds(clouds.points[rest], clouds.labels[rest]),
+        Clouds(clouds.points[~chosen], clouds.labels[~chosen]),
         Clouds(clouds.points[chosen], clouds.labels[chosen]),
     )
 
