@@ -18,10 +18,17 @@ class Batch(NamedTuple):
     Attributes:
         points: ``(B, N, 3)``.
         labels: ``(B,)`` int64 class numbers.
+        rows: ``(B,)`` int64 rows of the clouds in their split, or None.
     """
 
     points: Tensor
     labels: Tensor
+    rows: Tensor | None = None
+
+    @property
+    def num_clouds(self) -> int:
+        """Number of clouds, B."""
+        return len(self.points)
 
 
 class PairBatch(NamedTuple):
@@ -39,6 +46,11 @@ class PairBatch(NamedTuple):
     centroids: Tensor
     quaternion: Tensor
     translation: Tensor
+
+    @property
+    def num_clouds(self) -> int:
+        """Number of pairs, B."""
+        return len(self.quaternion)
 
 
 class SampleOutput(NamedTuple):
@@ -86,8 +98,10 @@ class TaskOutput(NamedTuple):
         losses: the task's weighted loss terms.
         predictions: first argument of the task's metrics.
         targets: second argument of the task's metrics.
+        output: what the task net returned; see ``Task.predict``.
     """
 
     losses: dict[str, Tensor]
     predictions: Any
     targets: Any
+    output: Any = None

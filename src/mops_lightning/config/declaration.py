@@ -50,6 +50,11 @@ def number(allowed: str, fits: Callable[[float], bool]) -> Limits:
     )
 
 
+def or_null(limits: Limits) -> Limits:
+    """Allow null, too."""
+    return Limits(f"{limits.allowed}, or null", lambda x: x is None or limits.fits(x))
+
+
 def one_of(*choices: str, others: tuple[Any, ...] = ()) -> Limits:
     """Allow named choices, and ``others`` that are other spellings of them."""
     return Limits(

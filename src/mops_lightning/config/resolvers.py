@@ -15,11 +15,12 @@ def choose(key: str, table: Mapping[str, Any], otherwise: Any) -> Any:
 
 
 def group_choices() -> DictConfig:
-    """Return the names of the chosen task, task net, data set and sampler."""
+    """Return the names of the chosen task, task net, data set, sampler and recipe."""
     from hydra.core.hydra_config import HydraConfig
 
     choices = HydraConfig.get().runtime.choices
     groups = {"task": "task", "net": "task/net", "dataset": "dataset", "sampler": "sampler"}
+    groups["recipe"] = "recipe"
     # A node, so that interpolations find the names below it.
     return OmegaConf.create({name: choices.get(group) for name, group in groups.items()})
 

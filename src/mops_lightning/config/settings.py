@@ -22,6 +22,7 @@ from mops_lightning.config.declaration import (
     group,
     number,
     one_of,
+    or_null,
     table,
     whole,
 )
@@ -43,6 +44,9 @@ SIZES = Limits(
         or (isinstance(x, list) and bool(x) and all(type(m) is int and m >= 1 for m in x))
     ),
 )
+
+WHOLE_OR_NULL = or_null(whole(1))
+SHARE_OR_NULL = or_null(number("between 0 and 1", lambda x: 0 <= x <= 1))
 
 
 @dataclass
@@ -184,6 +188,11 @@ class RunSettings:
             repeat=True,
         ),
     )
+    recipe: Any = field(
+        default=None,
+        # What was in force is compared by the record's notes: index samplers have no recipe.
+        metadata=group(Affects.TRAINING, learn=("sampler", "joint"), repeat=False, compare=False),
+    )
     pretrain: Any = field(
         default=None,
         metadata=about(
@@ -237,6 +246,12 @@ INSIDE: dict[str, dict[str, Any]] = {
     "sampler.m": {"compare": False},
     "sampler.m_max": {"compare": False, "limits": whole(1)},
     "sampler.seed": {"compare": False},
+    "recipe.train_points": {"limits": WHOLE_OR_NULL},
+    "recipe.all_points_from": {"limits": SHARE_OR_NULL},
+    "recipe.warm_start": {"limits": Limits("true or false", lambda x: isinstance(x, bool))},
+    "recipe.distillation": {"limits": number("of at least 0", lambda x: x >= 0)},
+    "recipe.straight_through": {"limits": SHARE_OR_NULL},
+    "recipe.ema_span": {"limits": SHARE_OR_NULL},
     # Before the settings that take their values from them, so that an error names these.
     "epochs.task": {"limits": whole(1)},
     "epochs.sampler": {"limits": whole(0)},

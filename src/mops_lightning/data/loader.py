@@ -38,6 +38,11 @@ class Augmentation:
                 f"got {self.jitter} and {self.jitter_clip}."
             )
 
+    @property
+    def active(self) -> bool:
+        """Whether clouds are changed at all."""
+        return self.rotate_up or self.jitter > 0
+
     def __call__(self, points: Tensor, rng: Generator) -> Tensor:
         """Return the augmented ``(B, N, 3)`` points."""
         if self.rotate_up:
@@ -156,7 +161,7 @@ class CloudLoader:
         return self._made(self.clouds.points[rows], rows, 0)
 
     def _made(self, points: Tensor, rows: Tensor, epoch: int) -> Any:
-        batch = Batch(points, self.clouds.labels[rows])
+        batch = Batch(points, self.clouds.labels[rows], rows)
         if self.make_batch is None:
             return batch
         stream = (DRAWN, self.seed, epoch) if self.shuffle else (FIXED, self.seed)

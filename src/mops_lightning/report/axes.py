@@ -5,7 +5,8 @@ from typing import Any
 
 from mops_lightning.config.comparison import compared_by
 from mops_lightning.errors import UserError
-from mops_lightning.report.collect import Record, epochs
+from mops_lightning.records.run_record import dotted
+from mops_lightning.report.collect import Record, epochs, recipe, sampler_row
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,8 @@ def considered(record: Record) -> dict[str, Any]:
     """Return the settings that are compared, with dotted keys, and the epochs trained."""
     config = record["config"]
     learn = (record["notes"].get("evaluated") or {}).get("learn", config["learn"])
-    return {**compared_by(config, learn), "trainer.max_epochs": epochs(record)}
+    settings = {**compared_by(config, learn), **dotted(recipe(record), "recipe")}
+    return {**settings, "trainer.max_epochs": epochs(record)}
 
 
 def value(record: Record, key: str) -> Any:
@@ -87,7 +89,8 @@ def value(record: Record, key: str) -> Any:
 def row(record: Record, net: str) -> str:
     """Return the row of a record's own results; it names a net that is not the table's."""
     names = record["config"]["names"]
-    return names["sampler"] if names["net"] == net else f"{names['net']} on {names['sampler']}"
+    sampler = sampler_row(record)
+    return sampler if names["net"] == net else f"{names['net']} on {sampler}"
 
 
 def _numeric(found: list[Record], key: str) -> bool:

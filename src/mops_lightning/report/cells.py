@@ -9,7 +9,7 @@ from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT, parse
 from mops_lightning.report.axes import Axes, row, value
-from mops_lightning.report.collect import Record, seed, trained_with
+from mops_lightning.report.collect import Record, sampler_row, seed, trained_with
 
 Column = Any
 """A size, a value of another setting, or a pair of values in a heat map."""
@@ -82,7 +82,7 @@ def make_cells(found: list[Record], metric: str, net: str, axes: Axes) -> Cells:
 
 def _add(table: Cells, record: Record, net: str, axes: Axes) -> None:
     own_row = row(record, net)
-    prefix = own_row.removesuffix(record["config"]["names"]["sampler"])  # such as "icp on "
+    prefix = own_row.removesuffix(sampler_row(record))  # such as "icp on "
     for name, figure in record["metrics"].items():
         parts = parse(name)
         if parts is None or parts.metric != table.metric.name or parts.readout == FULL:

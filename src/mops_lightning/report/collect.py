@@ -69,6 +69,18 @@ def trained_with(record: Record) -> str:
     return "joint" if learn == "joint" else "sampler alone"
 
 
+def recipe(record: Record) -> dict[str, Any]:
+    """Return the recipe that a record's sampler was trained by, with its name; {}: the paper's."""
+    notes = record["notes"]
+    return notes.get("recipe") or (notes.get("evaluated") or {}).get("recipe") or {}
+
+
+def sampler_row(record: Record) -> str:
+    """Return the name of a record's sampler, with that of its recipe unless it is the paper's."""
+    sampler: str = record["config"]["names"]["sampler"]
+    return " ".join([sampler, *filter(None, [recipe(record).get("name")])])
+
+
 def epochs(record: Record) -> int | None:
     """Return the epochs that a run, or the run that it evaluates, was trained; None: untrained."""
     earlier = record["notes"].get("evaluated") or {}

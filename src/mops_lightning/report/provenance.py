@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from mops_lightning.report.collect import Found, Record, epochs, seed, trained_with
+from mops_lightning.report.collect import Found, Record, epochs, sampler_row, seed, trained_with
 from mops_lightning.report.comparable import commit
 
 MAX_NAMED = 8
@@ -44,7 +44,7 @@ def without_result(found: Found) -> list[str]:
 
 def _kind(record: Record, net: str) -> str:
     names = record["config"]["names"]
-    kind = names["net"] if record["config"]["learn"] == "task" else names["sampler"]
+    kind = names["net"] if record["config"]["learn"] == "task" else sampler_row(record)
     if names["net"] not in (net, kind):
         kind += f" under {names['net']}"
     joint = trained_with(record) == "joint" and "fit" in record["seconds"]

@@ -33,6 +33,9 @@ class Task(nn.Module):
     requires_same_classes: bool = False
     """Whether the net's outputs are the classes of the data it was trained on."""
 
+    clouds_are_batches: bool = True
+    """Whether ``make_batch`` leaves clouds as they are, so that their predictions can be kept."""
+
     net_takes: tuple[str, ...] = ("points",)
     """Names of the arguments of the net's ``forward``."""
 

@@ -55,7 +55,7 @@ class Classification(Task):
         """
         logits = self.predict(batch, points)
         loss = F.cross_entropy(logits, batch.labels)
-        return TaskOutput({"cross_entropy": loss}, logits, batch.labels)
+        return TaskOutput({"cross_entropy": loss}, logits, batch.labels, logits)
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return overall and mean class accuracy, both in [0, 1]."""

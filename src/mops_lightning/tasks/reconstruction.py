@@ -99,7 +99,7 @@ class Reconstruction(Task):
         if self.emd_weight:
             emd = self._emd(built, batch.points, self.emd_block, self.emd_rounds)
             losses["emd"] = self.emd_weight * emd.mean()
-        return TaskOutput(losses, Distances(chamfer, emd), None)
+        return TaskOutput(losses, Distances(chamfer, emd), None, built)
 
     def reference(self, batch: Batch) -> Distances:
         """Return the distances of the reconstructions from all points, for normalized errors."""

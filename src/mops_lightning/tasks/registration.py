@@ -45,6 +45,7 @@ class Registration(Task):
 
     score = RotationError.name
     net_takes = ("source", "target")
+    clouds_are_batches = False
 
     def __init__(
         self, net: nn.Module, pairs: Pairs | None = None, loss: Loss | None = None
@@ -100,7 +101,7 @@ class Registration(Task):
         losses = self.loss(found, true._replace(translation=shift), *batch.points.chunk(2))
         turned = found._replace(translation=from_target).apply(-from_source[:, None])[:, 0]
         predicted = Motion(found.quaternion, found.translation + turned)
-        return TaskOutput(losses, predicted, true)
+        return TaskOutput(losses, predicted, true, found)
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return rotation errors in degrees, recalls in [0, 1] and the translation error."""

@@ -55,6 +55,7 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
         "commit": record["git"]["commit"],
         "max_epochs": record["config"]["trainer"]["max_epochs"],
         "learn": record["config"]["learn"],
+        "recipe": notes.get("recipe"),
         "seed": record["seed"],
         "dataset": record["config"]["names"]["dataset"],
         f"{what.split()[0]}_weights_sha256": content["sha256"],

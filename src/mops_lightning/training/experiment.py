@@ -21,6 +21,7 @@ from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
 from mops_lightning.training.learn import Learn, check_learn
 from mops_lightning.training.readouts import readout_names, readouts
+from mops_lightning.training.recipe import Recipe, draw_points, straight_through
 from mops_lightning.training.scores import Scores
 from mops_lightning.types import Batch, SampleOutput
 
@@ -42,6 +43,7 @@ class Experiment(L.LightningModule):
         identity: kept in checkpoints, so that none is resumed under other settings.
         sizes: how many points are tested, from one pass over the data; None: ``m`` alone. With
             several, the metrics are named ``test/m32/generated/accuracy`` and so on.
+        recipe: how the sampler is trained beyond its own losses; None: by these alone.
         task_lr_scale: with ``learn="joint"`` the task net's learning rate over that of the sampler.
         m: the size that is validated and gives the run's score; None: the sampler's.
 
@@ -62,6 +64,7 @@ class Experiment(L.LightningModule):
         sizes: Sequence[int] | None = None,
         m: int | None = None,
         task_lr_scale: float = 1.0,
+        recipe: Recipe | None = None,
     ) -> None:
         super().__init__()
         check_learn(learn, task, sampler)
@@ -74,6 +77,9 @@ class Experiment(L.LightningModule):
         self.seed = seed
         self.identity = identity
         self.task_lr_scale = task_lr_scale
+        self.recipe = recipe or Recipe()
+        self.distills = self.recipe.distillation > 0 and learn == "sampler"
+        self.full_predictions: Tensor | None = None
         self.total_steps = 1
         for module in self._frozen():
             module.requires_grad_(False)
@@ -152,7 +158,12 @@ class Experiment(L.LightningModule):
         """Seed dropout and the like by (seed, epoch, step), and set the temperature."""
         torch.manual_seed(derive_seed(self.seed, self.current_epoch, batch_idx))
         if self.sampler is not None:
-            self.sampler.anneal(self.global_step / max(self.total_steps - 1, 1))
+            self.sampler.anneal(self._progress)
+
+    @property
+    def _progress(self) -> float:
+        """Share of the training steps before this one."""
+        return self.global_step / max(self.total_steps - 1, 1)
 
     def _sample(self, points: Tensor, sizes: Sequence[int]) -> dict[int, SampleOutput]:
         """Sample at all sizes; without a sampler, the task net is given all points."""
@@ -167,21 +178,48 @@ class Experiment(L.LightningModule):
         if rank:  # processes draw the same sizes, but random numbers of their own
             torch.manual_seed(derive_seed(self.seed, self.current_epoch, batch_idx, rank))
         with restrict_autocast_to_pointwise(self.device.type):
+            taught = self._full_prediction(batch) if self.distills else None
+            available = batch.points.shape[1]
+            batch = draw_points(batch, self.recipe.points_at(self._progress, available, max(sizes)))
             outputs = self._sample(batch.points, sizes)
             terms: dict[str, list[Tensor]] = defaultdict(list)
             for m in sizes:
-                sampled, soft = outputs[m], outputs[m].soft_projected
-                result = self.task.step(batch, sampled.points if soft is None else soft)
-                self.train_scores.update(result.predictions, result.targets)
-                for name, value in (*result.losses.items(), *sampled.losses.items()):
+                for name, value in self._losses(batch, outputs[m], taught).items():
                     terms[name].append(value)
             mean = self.sampler is not None and self.sampler.size_reduction == "mean"
             share = 1 / len(sizes) if mean else 1.0
             losses = {name: torch.stack(values).sum() * share for name, values in terms.items()}
             total = torch.stack(list(losses.values())).sum()
+        soft = outputs[sizes[0]].soft_projected
         readout = self.main_readout if soft is None else SOFT_PROJECTED
         self._log_training({**losses, "total": total}, readout, len(batch.points))
         return total
+
+    def _full_prediction(self, batch: Batch) -> Any:
+        """Return what the task net predicts for all points, from the table if there is one."""
+        if self.full_predictions is not None and batch.rows is not None:
+            return self.full_predictions[batch.rows]
+        with torch.no_grad():
+            return self.task.predict(batch, batch.points)
+
+    def _losses(self, batch: Batch, sampled: SampleOutput, taught: Any) -> dict[str, Tensor]:
+        """Return the loss terms at one size: the task's, distillation and the sampler's own."""
+        soft = sampled.soft_projected
+        inputs = [sampled.points if soft is None else soft]
+        if self.recipe.sees_matched(self._progress):
+            inputs.append(straight_through(sampled, batch.points))
+        terms: dict[str, Tensor] = {}
+        for points in inputs:
+            result = self.task.step(batch, points)
+            if points is inputs[0]:
+                self.train_scores.update(result.predictions, result.targets)
+            losses = dict(result.losses)
+            if taught is not None:
+                apart = self.task.disagreement(result.output, taught).mean()
+                losses["distillation"] = self.recipe.distillation * apart
+            for name, value in losses.items():
+                terms[name] = terms.get(name, 0) + value / len(inputs)
+        return {**terms, **sampled.losses}
 
     def _log_training(self, losses: dict[str, Tensor], readout: str, clouds: int) -> None:
         for name, value in losses.items():

@@ -11,6 +11,7 @@ from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
 from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.recipe import Recipe
 from mops_lightning.training.sizes import sizes_to_test
 
 
@@ -49,7 +50,13 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         sizes=sizes,
         m=cfg.m,
         task_lr_scale=cfg.task_lr_scale,
+        recipe=_recipe(cfg) if sampler is not None and sampler.learned else None,
     )
+
+
+def _recipe(cfg: DictConfig) -> Recipe:
+    settings: Any = OmegaConf.to_container(cfg.recipe, resolve=True)
+    return Recipe(**settings)
 
 
 def _make_task(cfg: DictConfig, num_classes: int) -> Task:

@@ -72,7 +72,7 @@ def prepare(cfg: DictConfig, folder: Path, dataset: CloudDataset, record: RunRec
         **dataset.notes,
     }
     experiment = make_experiment(cfg, dataset, identity)
-    trainer = make_trainer(cfg, folder, dataset, experiment.task)
+    trainer = make_trainer(cfg, folder, dataset, experiment)
     job = Job(cfg, folder, dataset, experiment, trainer, resumed)
     distributed.check_shares(
         cfg.batch_size,

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
@@ -10,13 +11,16 @@ from torch import nn
 
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import Interrupted, UserError
+from mops_lightning.nets.layers import copy_pointwise_layers
 from mops_lightning.records.metric_info import described
 from mops_lightning.records.readout_names import parse
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training import evaluate
 from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.full_predictions import full_predictions
 from mops_lightning.training.job import Job
 from mops_lightning.training.loaders import augmentation, score_loader, split
+from mops_lightning.training.recipe import Recipe
 from mops_lightning.training.trainer import log_hparams
 from mops_lightning.viz.snapshots import CLOUDS
 from mops_lightning.zoo import weights
@@ -43,6 +47,9 @@ def fit_and_test(job: Job, record: RunRecord, task_weights: Path | None) -> None
     """
     _load_weights(job, record, task_weights)
     if job.trains:
+        if job.experiment.recipe != Recipe():
+            record.notes["recipe"] = {"name": job.cfg.names.recipe, **asdict(job.experiment.recipe)}
+        _warm_start(job, record)
         with record.timed("fit"):
             _fit(job)
     if job.cfg.learn in ("sampler", "nothing") and job.has_task_weights:
@@ -69,9 +76,18 @@ def _load_weights(job: Job, record: RunRecord, task_weights: Path | None) -> Non
         record.notes["evaluated"] = evaluate.load(job.cfg, job.experiment, job.dataset)
 
 
+def _warm_start(job: Job, record: RunRecord) -> None:
+    """Copy the task net's first layers to the sampler, unless the run is resumed."""
+    experiment = job.experiment
+    if experiment.recipe.warm_start and experiment.sampler is not None and job.resumed is None:
+        copied = copy_pointwise_layers(experiment.task.net, experiment.sampler)
+        record.notes["warm_start_layers"] = copied
+
+
 def _fit(job: Job) -> None:
     """Train what learns, from the checkpoint if the run is resumed."""
-    cfg, trainer, task = job.cfg, job.trainer, job.experiment.task
+    cfg, trainer, experiment = job.cfg, job.trainer, job.experiment
+    task = experiment.task
     train, held_out = split(job.dataset.train, cfg.val_fraction, cfg.seed)
     clouds = len(train.labels)
     if clouds < 2 * trainer.world_size:
@@ -80,16 +96,21 @@ def _fit(job: Job) -> None:
             f"{'cloud' if clouds == 1 else 'clouds'}; "
             "at least two are needed for each device. Lower it, or give more data."
         )
+    augment = Augmentation(**augmentation(cfg))
     loader = CloudLoader(
         train,
         cfg.batch_size,
         shuffle=True,
-        augment=Augmentation(**augmentation(cfg)),
+        augment=augment,
         make_batch=task.make_batch,
         drop_last=True,
         seed=cfg.seed,
         part=job.part,
     )
+    if experiment.distills and task.clouds_are_batches and not augment.active:
+        experiment.full_predictions = full_predictions(
+            task, train, cfg.batch_size, Path(cfg.cache).expanduser(), trainer.strategy.root_device
+        )
     validation = None
     if len(held_out.labels):
         validation = score_loader(held_out, cfg.batch_size, task, job.part)
@@ -97,7 +118,7 @@ def _fit(job: Job) -> None:
     every = min(trainer.log_every_n_steps, len(loader))  # type: ignore[attr-defined]
     trainer.log_every_n_steps = every  # type: ignore[attr-defined]
     with _interruptible(), _monitoring():
-        trainer.fit(job.experiment, loader, validation, ckpt_path=job.resumed)
+        trainer.fit(experiment, loader, validation, ckpt_path=job.resumed)
 
 
 def _test(job: Job) -> dict[str, float]:

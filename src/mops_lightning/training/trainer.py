@@ -15,9 +15,10 @@ from mops_lightning.config.build import build
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import dotted
-from mops_lightning.tasks.base import Task
+from mops_lightning.training.averaging import MovingAverage
 from mops_lightning.training.callbacks import CHECKPOINT, build_callbacks
 from mops_lightning.training.checkpoint_io import AtomicCheckpointIO
+from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.loaders import clouds_to_draw, score_loader
 from mops_lightning.training.malloc import keep_freed_memory
 
@@ -35,7 +36,9 @@ HARMLESS = (
 """Warnings about what is intended."""
 
 
-def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset, task: Task) -> L.Trainer:
+def make_trainer(
+    cfg: DictConfig, folder: Path, dataset: CloudDataset, experiment: Experiment
+) -> L.Trainer:
     """Build the trainer with this run's callbacks and logger.
 
     Raises:
@@ -44,6 +47,7 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset, task: Tas
     """
     _silence_lightning()
     keep_freed_memory()
+    task = experiment.task
     logger = build(cfg.logger, "logger", save_dir=str(folder)) if cfg.get("logger") else False
     score = task.score if cfg.learn != "task" else task.full_score or task.score
     offered = {"folder": folder, "checkpoint": folder / "checkpoints" / CHECKPOINT, "score": score}
@@ -52,6 +56,8 @@ def make_trainer(cfg: DictConfig, folder: Path, dataset: CloudDataset, task: Tas
         batch = score_loader(dataset.test, cfg.batch_size, task).batch_of(rows)
         offered |= {"batch": batch, "titles": titles}
     callbacks = build_callbacks(cfg.callbacks, offered, logged=bool(logger))
+    if experiment.recipe.ema_span:  # before those that save
+        callbacks.insert(0, MovingAverage(experiment.recipe.ema_span))
     trainer: L.Trainer = build(
         cfg.trainer,
         "trainer",

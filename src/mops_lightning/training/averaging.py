@@ -1,0 +1,23 @@
+"""A moving average of the weights, which is validated, tested and saved in their place."""
+
+import lightning as L
+from lightning.pytorch.callbacks import WeightAveraging
+from torch.optim.swa_utils import get_ema_multi_avg_fn
+
+
+class MovingAverage(WeightAveraging):
+    """Exponential moving average of weights and running statistics over a share of the training.
+
+    Args:
+        span: time constant of the average, as a share of all training steps.
+    """
+
+    def __init__(self, span: float) -> None:
+        super().__init__()
+        self.span = span
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Choose the decay per step for the length of this training."""
+        steps = self.span * trainer.estimated_stepping_batches
+        assert self._average_model is not None
+        self._average_model.multi_avg_fn = get_ema_multi_avg_fn(1 - 1 / max(steps, 1.0))

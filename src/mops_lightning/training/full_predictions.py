@@ -1,0 +1,64 @@
+"""What the frozen task net predicts for all points of every training cloud, computed once."""
+
+import hashlib
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mops_lightning.data.clouds import Clouds
+from mops_lightning.data.loader import CloudLoader
+from mops_lightning.errors import UserError
+from mops_lightning.files import atomic_write
+from mops_lightning.tasks.base import Task
+from mops_lightning.zoo import weights
+
+
+def full_predictions(
+    task: Task, clouds: Clouds, batch_size: int, cache: Path, device: torch.device
+) -> Tensor:
+    """Return the predictions of a task whose batches are the clouds themselves.
+
+    They are kept in a file, which is named by the weights and the clouds.
+
+    Args:
+        task: in evaluation mode; its net is moved to ``device``.
+        clouds: the training clouds, without augmentation.
+        batch_size: clouds per batch.
+        cache: folder for the file.
+        device: where to compute.
+
+    Returns:
+        One row per cloud, on the CPU; see ``Task.predict``.
+    """
+    named = hashlib.sha256(weights.digest(task.state_dict()).encode())
+    named.update(clouds.points.numpy().tobytes())
+    path = cache / "predictions" / f"{named.hexdigest()[:16]}.pt"
+    found = _read(path, len(clouds.points))
+    if found is None:
+        found = _predict(task, clouds, batch_size, device)
+        with atomic_write(path) as temporary:
+            torch.save(found, temporary)
+    return found
+
+
+def _read(path: Path, rows: int) -> Tensor | None:
+    """Return what was kept; None if there is nothing usable."""
+    if not path.is_file():
+        return None
+    try:
+        kept = weights.read_plain(path, "predictions")
+    except UserError:
+        return None
+    usable = isinstance(kept, Tensor) and len(kept) == rows and bool(kept.isfinite().all())
+    return kept if usable else None
+
+
+@torch.no_grad()
+def _predict(task: Task, clouds: Clouds, batch_size: int, device: torch.device) -> Tensor:
+    task.to(device)
+    parts = []
+    for batch in CloudLoader(clouds, batch_size):
+        points = batch.points.to(device)
+        parts.append(task.predict(batch._replace(points=points), points).cpu())
+    return torch.cat(parts)

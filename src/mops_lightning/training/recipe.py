@@ -1,0 +1,108 @@
+"""How a sampler is trained beyond the losses of its publication."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mops_lightning.errors import UserError
+from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.readout import match
+from mops_lightning.types import Batch, PairBatch, SampleOutput
+
+POINTS_PER_SAMPLE = 2
+"""A training step sees at least this many times the number of sampled points."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What makes training cheaper or better; the defaults change nothing.
+
+    Shares are of the training steps of the whole run, from 0 to 1.
+
+    Attributes:
+        train_points: points of a cloud that a training step sees, drawn in every step, and at
+            least twice the sampled ones; None: all. Validation and test always see all.
+        all_points_from: share from which on training steps see all points; None: never.
+        warm_start: whether the sampler's first layers start as copies of the task net's.
+        distillation: weight of the disagreement between the frozen task net's predictions on the
+            sample and on all points; see ``Task.disagreement``. Only with ``learn="sampler"``.
+        straight_through: share from which on the task net also sees the matched points, whose
+            gradients go to the generated ones; None: never.
+        ema_span: time constant of an exponential moving average of the weights, as a share; the
+            average is validated, tested and saved. None: the last weights are.
+
+    Raises:
+        UserError: an attribute is out of range.
+    """
+
+    train_points: int | None = None
+    all_points_from: float | None = None
+    warm_start: bool = False
+    distillation: float = 0.0
+    straight_through: float | None = None
+    ema_span: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the attributes."""
+        if self.train_points is not None and self.train_points < 1:
+            raise UserError(f"train_points must be at least 1 or null, got {self.train_points}.")
+        for name in ("all_points_from", "straight_through", "ema_span"):
+            share = getattr(self, name)
+            if share is not None and not 0 <= share <= 1:
+                raise UserError(f"{name} must be between 0 and 1 or null, got {share}.")
+        if not 0 <= self.distillation < math.inf:
+            raise UserError(f"distillation must be at least 0, got {self.distillation}.")
+
+    def points_at(self, progress: float, available: int, largest: int) -> int:
+        """Return how many points of a cloud a step sees.
+
+        Args:
+            progress: share of the training before this step.
+            available: points per cloud.
+            largest: the largest number of points that this step samples.
+        """
+        if self.train_points is None or reached(self.all_points_from, progress):
+            return available
+        return min(available, max(self.train_points, POINTS_PER_SAMPLE * largest))
+
+    def sees_matched(self, progress: float) -> bool:
+        """Return whether the task net also sees matched points."""
+        return reached(self.straight_through, progress)
+
+
+def reached(share: float | None, progress: float) -> bool:
+    """Return whether training has come to a share of its steps; never for None."""
+    return share is not None and progress >= share
+
+
+def draw_points(batch: Any, n: int) -> Any:
+    """Return a batch with ``n`` random points of every cloud, without repetition.
+
+    The clouds of a pair keep the same rows. Random numbers are from torch's global generator.
+
+    Args:
+        batch: ``Batch`` or ``PairBatch``.
+        n: at most the number of points.
+    """
+    assert isinstance(batch, Batch | PairBatch)
+    points = batch.points
+    if n >= points.shape[1]:
+        return batch
+    clouds = batch.num_clouds
+    rows = torch.rand(clouds, points.shape[1], device=points.device).topk(n).indices
+    rows = rows.repeat(len(points) // clouds, 1)
+    return batch._replace(points=gather_points(points, rows))
+
+
+def straight_through(sampled: SampleOutput, points: Tensor) -> Tensor:
+    """Return the matched points of a sample, with the gradients of the generated ones.
+
+    Args:
+        sampled: generated points ``(B, M, 3)``.
+        points: ``(B, N, 3)`` the clouds.
+    """
+    matched = gather_points(points, match(sampled.points, points))
+    return sampled.points + (matched - sampled.points).detach()
