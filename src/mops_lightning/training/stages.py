@@ -52,6 +52,11 @@ def fit_and_test(job: Job, record: RunRecord, task_weights: Path | None) -> None
         _warm_start(job, record)
         with record.timed("fit"):
             _fit(job)
+        record.notes["validation"] = {
+            name: float(value)
+            for name, value in job.trainer.callback_metrics.items()
+            if name.startswith("val/")
+        }
     if job.cfg.learn in ("sampler", "nothing") and job.has_task_weights:
         # A resumed run has its task net from the checkpoint, not from a weights file.
         digest = weights.digest(job.experiment.task.state_dict())
