@@ -1,6 +1,6 @@
 import pytest
 
-from mops_lightning.files import atomic_write
+from mops_lightning.files import atomic_write, is_temporary, remove_temporary, set_aside
 
 
 def test_atomic_write_replaces_the_old_file(tmp_path):
@@ -27,3 +27,25 @@ def test_atomic_write_after_an_error_keeps_the_old_file(tmp_path):
         break_off()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_remove_temporary_removes_what_a_kill_left(tmp_path):
+    path = tmp_path / "below" / f"{'n' * 240}.txt"
+    with atomic_write(path) as temporary:
+        temporary.write_text("half")
+        left = temporary.with_name(f"{temporary.name}2").write_bytes(b"as after a kill")
+        assert is_temporary(temporary)
+    assert left
+    assert len(list(path.parent.iterdir())) == 2
+    remove_temporary(tmp_path)
+    assert list(path.parent.iterdir()) == [path]
+    assert not is_temporary(path)
+
+
+def test_set_aside_keeps_every_damaged_file(tmp_path):
+    path = tmp_path / "last.ckpt"
+    for text in ("first", "second", "third"):
+        path.write_text(text)
+        assert set_aside(path).read_text() == text
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"last.ckpt.damaged", "last.ckpt.damaged-2", "last.ckpt.damaged-3"}

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and what a kill or a damage leaves."""
 
 import os
 import tempfile
@@ -6,13 +6,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+TEMPORARY = ".mops_lightning-"
+"""What names of temporary files start with."""
+
+DAMAGED = "damaged"
+"""Part of the names of files that were set aside."""
+
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path that replaces ``path`` when the block ends without an error.
 
     A reader sees the old file or the new one, never part of one. After an error the old file is
-    unchanged and the temporary one is deleted.
+    unchanged and the temporary one is deleted. A killed process leaves the temporary one; see
+    ``remove_temporary``.
 
     Args:
         path: the file to write; its folder is created if necessary.
@@ -22,7 +29,9 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    # A part of the name only: with all of a long one the temporary name would be too long.
+    prefix = f"{TEMPORARY}{path.stem[:32]}-"
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=path.suffix)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -36,3 +45,34 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def is_temporary(path: Path) -> bool:
+    """Return whether a file is a temporary one of ``atomic_write``, which is no input."""
+    return path.name.startswith(TEMPORARY)
+
+
+def remove_temporary(folder: Path) -> None:
+    """Remove what killed processes left of ``atomic_write`` in a folder and below it.
+
+    Args:
+        folder: no other process may write into it at the same time; it need not exist.
+    """
+    for path in folder.rglob(f"{TEMPORARY}*"):
+        path.unlink(missing_ok=True)
+
+
+def set_aside(path: Path) -> Path:
+    """Rename a damaged file so that nothing reads it any more.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Its new path, in the same folder: ``last.ckpt.damaged``, or ``last.ckpt.damaged-2``.
+    """
+    number, target = 1, path.with_name(f"{path.name}.{DAMAGED}")
+    while target.exists():
+        number += 1
+        target = path.with_name(f"{path.name}.{DAMAGED}-{number}")
+    return path.rename(target)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import pytest
 from filelock import FileLock
@@ -80,6 +81,55 @@ def test_run_cell_interrupted_resumes_to_same_result(start, tmp_path):
     assert start(*longer) == score
     resumed = run_record.read(tmp_path / "cell")["notes"]["resumed_from"]
     assert resumed.endswith(f"{ASIDE}/1/checkpoints/last.ckpt")
+
+
+class Killed(BaseException):
+    """Stands for kill -9."""
+
+
+@pytest.mark.parametrize("number", [1, 3, 5])
+def test_run_cell_killed_while_setting_aside_recovers(start, tmp_path, monkeypatch, number):
+    score = start("sampler=fps", "weights=null")
+    cell = tmp_path / "cell"
+    record = run_record.read(cell)
+    (cell / run_record.FILE).write_text(json.dumps({**record, "status": "interrupted"}))
+    (cell / "checkpoints").mkdir()
+    (cell / "pictures").mkdir()
+    moved = {path.name for path in cell.iterdir()} - {".lock"}
+    assert len(moved) == 4
+    renames, rename = [], Path.rename
+
+    def rename_or_die(path, target):
+        renames.append(path)
+        if len(renames) == number:
+            raise Killed
+        return rename(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", rename_or_die)
+        with pytest.raises(Killed):
+            start("sampler=fps", "weights=null")
+    assert start("sampler=fps", "weights=null") == score
+    assert run_record.read(cell)["status"] == "completed"
+    assert {path.name for path in (cell / ASIDE / "1").iterdir()} == moved
+    assert [path.name for path in (cell / ASIDE).iterdir()] == ["1"]
+
+
+def test_run_cell_damaged_files_are_set_aside(start, tmp_path, capsys, caplog):
+    longer = ["sampler=mops", "weights=null", "trainer.max_epochs=2"]
+    score = start(*longer)
+    cell = tmp_path / "cell"
+    record = run_record.read(cell)
+    checkpoint = cell / "checkpoints" / "last.ckpt"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    (cell / run_record.FILE).write_text(json.dumps({**record, "status": "running"}))
+    assert start(*longer) == score
+    assert "last.ckpt is damaged" in capsys.readouterr().out
+    assert (cell / ASIDE / "1" / "checkpoints" / "last.ckpt.damaged").is_file()
+    (cell / run_record.FILE).write_text('{"schema"')
+    assert start(*longer) == score
+    assert "result.json: not a run record" in caplog.text
+    assert (cell / ASIDE / "2" / "result.json.damaged").is_file()
 
 
 def test_run_cell_busy_is_skipped(start, tmp_path, caplog):

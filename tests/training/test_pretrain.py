@@ -64,7 +64,7 @@ def test_resume_other_weights_raises(tmp_path):
 
 
 def test_diverged_training_fails_without_weights(tmp_path):
-    with pytest.raises(UserError, match=r"rotation_error_deg is nan: .*diverged"):
+    with pytest.raises(UserError, match=r"training diverged: the loss is nan .*No weights"):
         train(tmp_path, "learn=task", "task=registration", "optimizer.lr=1e30")
     assert not files(tmp_path, "**/weights.pt")
     record = json.loads((tmp_path / "run0" / "result.json").read_text())
@@ -90,6 +90,35 @@ def test_mistake_fails_before_pretraining(settings, said, tmp_path):
     with pytest.raises(UserError, match=said):
         train(tmp_path, "task=registration", *settings)
     assert not files(tmp_path, "**/weights.pt")
+
+
+@pytest.mark.parametrize("damage", ["cut", "nan", "not restorable"])
+def test_damaged_cache_is_set_aside_and_trained_again(tmp_path, capsys, damage):
+    settings = ["task=registration", "sampler=fps", "pretrain.max_epochs=2"]
+    train(tmp_path, *settings)
+    (path,) = tmp_path.glob("cache/weights/*/weights.pt")
+    checkpoint = path.parent / "checkpoints" / "last.ckpt"
+    digest = weights.read(path)["sha256"]
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:1000])
+        checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    elif damage == "nan":
+        content = torch.load(path, weights_only=True)
+        next(iter(content["state"].values())).fill_(float("nan"))
+        torch.save({**content, "sha256": weights.digest(content["state"])}, path)
+        content = torch.load(checkpoint, weights_only=True)
+        next(iter(content["state_dict"].values())).fill_(float("nan"))
+        torch.save(content, checkpoint)
+    else:
+        path.unlink()
+        content = torch.load(checkpoint, weights_only=True)
+        torch.save({**content, "optimizer_states": [{"state": {}}]}, checkpoint)
+    train(tmp_path, *settings)
+    assert weights.read(path)["sha256"] == digest
+    assert checkpoint.with_name("last.ckpt.damaged").is_file()
+    assert path.with_name("weights.pt.damaged").is_file() == (damage != "not restorable")
+    out = capsys.readouterr().out
+    assert out.count("Renamed to") == (1 if damage == "not restorable" else 2)
 
 
 def test_test_seed_keeps_cached_task_net(tmp_path):

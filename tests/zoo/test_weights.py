@@ -88,3 +88,41 @@ def test_of_run_prefers_the_file_that_the_record_names(tmp_path):
     assert weights.of_run(run) == run / "weights.pt"
     run_record.write(run, record(files={"weights": "../kept/net.pt"}))
     assert weights.of_run(run).resolve() == tmp_path / "kept" / "net.pt"
+
+
+def rewrite(path, **changes):
+    content = torch.load(path, weights_only=True) | changes
+    torch.save({name: value for name, value in content.items() if value != "absent"}, path)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"state": "absent"},
+        {"state": [1, 2]},
+        {"state": {"a": 1}},
+        {"state": {1: torch.ones(1)}},
+        {"state": {"a": torch.ones(2).to_sparse()}},
+        {"config": [1]},
+        {"config": {"sampler": torch.ones(1)}},
+        {"config": {"optimizer": 3, "baselines": [1]}},
+        {"classes": 5},
+        {"sha256": "absent"},
+    ],
+    ids=str,
+)
+def test_read_missing_or_other_parts_are_refused(saved, changes):
+    _, path = saved
+    rewrite(path, **changes)
+    with pytest.raises(weights.Damaged, match="damaged"):
+        weights.read(path)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_read_not_finite_is_refused(saved, value):
+    net, path = saved
+    with torch.no_grad():
+        net.head[0].weight[3, 1] = value
+    weights.save(path, net, {}, {})
+    with pytest.raises(weights.Damaged, match=r"head\.0\.weight is not finite"):
+        weights.load_into(PointNetVanilla(4), path)

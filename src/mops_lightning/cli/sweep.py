@@ -22,11 +22,15 @@ from omegaconf.errors import OmegaConfBaseException
 from mops_lightning.config import settings
 from mops_lightning.config.declaration import Affects
 from mops_lightning.errors import USER_ERROR, Interrupted, UserError, end
+from mops_lightning.files import remove_temporary, set_aside
 from mops_lightning.records import run_record
 from mops_lightning.records.attempts import ASIDE, FAILED
 
 BEGUN = ".begun"
 """File in a sweep's folder with the time of its last start."""
+
+MOVING = "moving"
+"""Folder of an attempt that is being moved."""
 
 STAYS = (ASIDE, ".hydra", ".lock", "mops_lightning.log")
 """Files that belong to the cell, not to an attempt."""
@@ -54,6 +58,9 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
     try:
         with _claimed(folder):
             (folder / FAILED).unlink(missing_ok=True)
+            remove_temporary(folder)
+            if (folder / ASIDE / MOVING).is_dir():
+                _move_aside(folder)  # an earlier start was killed in the middle of it
             earlier = _earlier(cfg, folder)
             if earlier and earlier["status"] == "completed":
                 log.info(f"{folder}: already completed, score {earlier['score']:.6g}")
@@ -104,14 +111,18 @@ def _claimed(folder: Path) -> Iterator[None]:
 
 
 def _earlier(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
-    """Return the record in the cell's folder, if any.
+    """Return the record in the cell's folder, if any; a damaged one is set aside.
 
     Raises:
-        UserError: it has other settings, or is not a record.
+        UserError: it has other settings.
     """
     if not (folder / run_record.FILE).exists():
         return None
-    record = run_record.read(folder)
+    try:
+        record = run_record.read(folder)
+    except UserError as error:
+        log.warning(f"{error} Renamed to {set_aside(folder / run_record.FILE).name}.")
+        return {"status": "damaged"}
     different = _differences(cfg, record)
     if different:
         # The setting itself, not one that is derived from it.
@@ -142,25 +153,38 @@ def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
     Neither a failed attempt nor any attempt before it is resumed.
     """
     from mops_lightning.training.callbacks import CHECKPOINT
+    from mops_lightning.training.checkpoint import set_aside_if_damaged
 
-    attempts = (folder / ASIDE).iterdir()
-    for attempt in sorted(attempts, key=lambda path: int(path.name), reverse=True):
-        record = run_record.read(attempt)
+    for attempt in sorted(_attempts(folder), key=lambda path: int(path.name), reverse=True):
+        try:
+            record = run_record.read(attempt)
+        except UserError:
+            continue  # its checkpoint may belong to other settings
         if record["status"] == "failed" or _differences(cfg, record):
             return None
-        if (attempt / "checkpoints" / CHECKPOINT).is_file():
-            return attempt / "checkpoints" / CHECKPOINT
+        path = attempt / "checkpoints" / CHECKPOINT
+        if path.is_file() and not set_aside_if_damaged(path):
+            return path
     return None
 
 
+def _attempts(folder: Path) -> list[Path]:
+    return [path for path in (folder / ASIDE).glob("*") if path.name.isdigit()]
+
+
 def _move_aside(folder: Path) -> None:
-    """Move an attempt into a numbered folder."""
-    aside = folder / ASIDE
-    target = aside / str(1 + len(list(aside.glob("*"))))
-    target.mkdir(parents=True)
-    for path in folder.iterdir():
-        if path.name not in STAYS:
-            path.rename(target / path.name)
+    """Move an attempt into a numbered folder.
+
+    The number is given in one step at the end, and until then ``MOVING`` shows that it is to be
+    done. The record is moved last, so that a repeated call completes what a killed one began.
+    """
+    moving = folder / ASIDE / MOVING
+    moving.mkdir(parents=True, exist_ok=True)
+    paths = [path for path in folder.iterdir() if path.name not in STAYS]
+    for path in sorted(paths, key=lambda path: path.name == run_record.FILE):
+        path.rename(moving / path.name)
+    numbers = [int(path.name) for path in _attempts(folder)]
+    moving.rename(folder / ASIDE / str(max(numbers, default=0) + 1))
 
 
 class Busy(Exception):

@@ -1,5 +1,6 @@
 """Finding mistakes in a configuration before any heavy work."""
 
+import math
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -40,6 +41,7 @@ def check(cfg: DictConfig) -> None:
     if not isinstance(cfg.task.get("net"), DictConfig):
         raise UserError("task.net cannot be removed. Choose another one with task/net=NAME.")
     _check_limits(cfg)
+    _check_numbers(OmegaConf.to_container(cfg, resolve=True), "")
     _check_evaluation(cfg)
     for name, setting in declared.items():
         if setting.counts(cfg.learn):
@@ -87,6 +89,20 @@ def _check_table(value: Any, name: str) -> None:
                 f"{name}.{key!s} must be null or settings with a class, got {value[key]!r}. "
                 f"Give its class as {name}.{key!s}._target_=MODULE.CLASS."
             )
+
+
+def _check_numbers(value: Any, path: str) -> None:
+    """Refuse NaN, infinity and whole numbers beyond 64 bits, which no setting allows."""
+    if isinstance(value, dict):
+        for key, below in value.items():
+            _check_numbers(below, f"{path}.{key}" if path else str(key))
+    elif isinstance(value, list):
+        for item in value:
+            _check_numbers(item, path)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise UserError(f"{path} must be finite, got {value}.")
+    elif isinstance(value, int) and abs(value) >= 2**63:
+        raise UserError(f"{path} must be below 2**63, got one of {value.bit_length()} bits.")
 
 
 def _check_limits(cfg: DictConfig) -> None:

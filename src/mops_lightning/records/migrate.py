@@ -4,6 +4,8 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+from mops_lightning.errors import UserError
+
 
 @dataclass(frozen=True)
 class Now:
@@ -106,7 +108,17 @@ def upgraded_config(config: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         config: nested and resolved, of any version.
+
+    Raises:
+        UserError: it is not the configuration of a run.
     """
+    try:
+        return _upgraded(config)
+    except (AttributeError, KeyError, TypeError, RecursionError):
+        raise UserError("config does not hold the settings of a run.") from None
+
+
+def _upgraded(config: dict[str, Any]) -> dict[str, Any]:
     new: dict[str, Any] = {}
     _copy(config, "", new)
     # Keys that gave way to others, where a run used their values.

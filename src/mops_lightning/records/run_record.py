@@ -122,11 +122,14 @@ def read(folder: Path) -> dict[str, Any]:
     try:
         record = json.loads(path.read_text())
         jsonschema.validate(record, schema())
-    except FileNotFoundError:
+        record["config"] = upgraded_config(record["config"])
+    except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"{path}: no run record. Give a run's folder.") from None
-    except (json.JSONDecodeError, jsonschema.ValidationError) as error:
-        raise UserError(f"{path}: not a run record: {str(error).splitlines()[0]}") from None
-    record["config"] = upgraded_config(record["config"])
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}.") from None
+    except (ValueError, RecursionError, jsonschema.ValidationError) as error:
+        reason = str(error).splitlines()[0][:200]
+        raise UserError(f"{path}: not a run record: {reason}") from None
     record["overrides"] = upgraded_overrides(record["overrides"])
     return record
 

@@ -8,12 +8,17 @@ from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config.comparison import trained_with
 from mops_lightning.errors import UserError
+from mops_lightning.files import set_aside
+from mops_lightning.records import run_record
 from mops_lightning.training.callbacks import CHECKPOINT
 from mops_lightning.training.experiment import CHECKPOINT_KEY
 from mops_lightning.zoo import weights
 
 LENGTH = "trainer.max_epochs"
 """The planned length of a run."""
+
+PARTS = {CHECKPOINT_KEY: dict, "state_dict": dict, "optimizer_states": list, "loops": dict}
+"""What resuming needs of a checkpoint, with its types."""
 
 
 def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
@@ -43,16 +48,11 @@ def _given_weights(cfg: DictConfig) -> dict[str, str]:
 
 def lengthened(cfg: DictConfig, checkpoint: Path) -> bool:
     """Return whether this run is planned longer than the run that wrote ``checkpoint``."""
-    return bool(cfg.trainer.max_epochs > planned_epochs(checkpoint))
-
-
-def planned_epochs(checkpoint: Path) -> int:
-    """Return the planned length of the run that wrote ``checkpoint``."""
-    return int(json.loads(_read(checkpoint)[CHECKPOINT_KEY][LENGTH]))
+    return bool(cfg.trainer.max_epochs > planned_epochs(read(checkpoint)))
 
 
 def find(cfg: DictConfig, mine: dict[str, str]) -> Path | None:
-    """Return the checkpoint that ``ckpt_path`` means, or None when it is not set.
+    """Return the checkpoint that ``ckpt_path`` means; None where training starts at the beginning.
 
     Args:
         cfg: ``ckpt_path`` may be ``last`` (the newest run below ``out`` with these settings), a
@@ -65,9 +65,10 @@ def find(cfg: DictConfig, mine: dict[str, str]) -> Path | None:
     """
     if cfg.ckpt_path is None:
         return None
-    last = cfg.ckpt_path == "last"
-    path = _newest(Path(cfg.out), mine) if last else _given(cfg, mine)
-    done = _read(path)["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"]
+    path = _newest(cfg, mine) if cfg.ckpt_path == "last" else _given(cfg, mine)
+    if path is None:
+        return None
+    done = _epochs_done(read(path))
     if cfg.trainer.max_epochs < done:
         raise UserError(
             f"trainer.max_epochs must be at least {done}, the epochs of {path}, got "
@@ -85,7 +86,12 @@ def _given(cfg: DictConfig, mine: dict[str, str]) -> Path:
         raise UserError(
             f"ckpt_path: no checkpoint {path}. Give a run's folder, a .ckpt file, or last."
         )
-    theirs = _read(path)[CHECKPOINT_KEY]
+    try:
+        theirs = read(path)[CHECKPOINT_KEY]
+    except UserError as error:
+        raise UserError(
+            f"ckpt_path: {error} Give another one, or leave ckpt_path out to start a new run."
+        ) from None
     different = _different(theirs, mine)
     if different:
         name = different[0]
@@ -97,21 +103,38 @@ def _given(cfg: DictConfig, mine: dict[str, str]) -> Path:
     return path
 
 
-def _newest(out: Path, mine: dict[str, str]) -> Path:
+def _newest(cfg: DictConfig, mine: dict[str, str]) -> Path | None:
+    """Return the newest checkpoint of these settings; None if it was damaged and has no older one.
+
+    Damaged ones are set aside.
+    """
+    out = Path(cfg.out)
     found = sorted(
         out.glob(f"**/checkpoints/{CHECKPOINT}"), key=lambda p: p.stat().st_mtime, reverse=True
     )
+    lost = False
     for path in found:
-        try:
-            theirs = _read(path)[CHECKPOINT_KEY]
-        except UserError:
-            continue
-        if not _different(theirs, mine):
+        if set_aside_if_damaged(path):
+            lost |= _run_had(path.parents[1], cfg)
+        elif not _different(read(path)[CHECKPOINT_KEY], mine):
             return path
+    if lost:
+        print("No other checkpoint has these settings: the run starts again.", flush=True)
+        return None
     raise UserError(
         f"ckpt_path=last: none of the {len(found)} checkpoints below {out} has these settings. "
         "Leave ckpt_path out to start a new run, or give a run's folder."
     )
+
+
+def _run_had(folder: Path, cfg: DictConfig) -> bool:
+    """Return whether the record in a folder has the settings that affect training here."""
+    plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    try:
+        there = run_record.read(folder)["config"]
+        return trained_with({**there, "trainer": plain["trainer"]}) == trained_with(plain)
+    except (UserError, KeyError):
+        return False
 
 
 def _different(theirs: dict[str, str], mine: dict[str, str]) -> list[str]:
@@ -119,11 +142,45 @@ def _different(theirs: dict[str, str], mine: dict[str, str]) -> list[str]:
     return [name for name in names if theirs.get(name) != mine.get(name)]
 
 
-def _read(path: Path) -> dict[str, Any]:
+def set_aside_if_damaged(path: Path) -> bool:
+    """Rename a checkpoint that cannot be resumed, and print one line about it.
+
+    Returns:
+        Whether it was damaged.
+    """
     try:
-        content = weights.read_plain(path, "a checkpoint")
-    except UserError as error:
-        raise UserError(f"ckpt_path: {error}") from None
-    if not isinstance(content, dict) or CHECKPOINT_KEY not in content:
-        raise UserError(f"ckpt_path: {path} is not a checkpoint of this program.")
+        read(path)
+    except weights.Damaged as error:
+        print(f"{error} Renamed to {set_aside(path).name}.", flush=True)
+        return True
+    return False
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read a checkpoint and check that it holds all that resuming needs.
+
+    Raises:
+        UserError: the file cannot be opened.
+        Damaged: it is damaged, not finite, or not a checkpoint of this program.
+    """
+    content = weights.read_plain(path, "a checkpoint")
+    try:
+        planned, done = planned_epochs(content), _epochs_done(content)
+        complete = min(planned, done) >= 0 and all(
+            isinstance(content[key], kind) for key, kind in PARTS.items()
+        )
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+        complete = False
+    if not complete:
+        raise weights.Damaged(f"{path} is not a checkpoint of this program.")
+    weights.check_state(content["state_dict"], path)
     return content
+
+
+def planned_epochs(content: dict[str, Any]) -> int:
+    """Return the planned length of the run that wrote a checkpoint."""
+    return int(json.loads(content[CHECKPOINT_KEY][LENGTH]))
+
+
+def _epochs_done(content: dict[str, Any]) -> int:
+    return int(content["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"])

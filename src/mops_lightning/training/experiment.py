@@ -19,6 +19,7 @@ from mops_lightning.records.readout_names import FULL, SOFT_PROJECTED, size_pref
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
+from mops_lightning.training.divergence import check_checkpoint, check_loss
 from mops_lightning.training.learn import Learn, check_learn
 from mops_lightning.training.readouts import readout_names, readouts
 from mops_lightning.training.recipe import Recipe, draw_points, straight_through
@@ -81,6 +82,7 @@ class Experiment(L.LightningModule):
         self.distills = self.recipe.distillation > 0 and learn == "sampler"
         self.full_predictions: Tensor | None = None
         self.total_steps = 1
+        self.started = False  # whether a checkpoint, if any, was restored
         for module in self._frozen():
             module.requires_grad_(False)
         self.m: int = m or (self.sampler.m if self.sampler is not None else 0)
@@ -133,7 +135,8 @@ class Experiment(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the run's identity."""
+        """Add the run's identity; refuse a state that is not finite."""
+        check_checkpoint(checkpoint, self.trainer.strategy)
         checkpoint[CHECKPOINT_KEY] = self.identity or {}
 
     def on_train_start(self) -> None:
@@ -142,6 +145,7 @@ class Experiment(L.LightningModule):
         Lightning 2.6 restores a loader's state only in some cases, and does not call
         ``on_train_epoch_start`` for an epoch that had begun.
         """
+        self.started = True
         loader: Any = self.trainer.train_dataloader
         if hasattr(loader, "load_state_dict"):
             begun = self.trainer.fit_loop.epoch_loop.batch_progress.current.ready
@@ -172,7 +176,11 @@ class Experiment(L.LightningModule):
         return self.sampler.sample_sizes(points, sizes)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Return the task loss plus the sampler's losses, over all sizes of this step."""
+        """Return the task loss plus the sampler's losses, over all sizes of this step.
+
+        Raises:
+            Diverged: the loss is NaN or infinite.
+        """
         sizes = (0,) if self.sampler is None else self.sampler.training_sizes()
         rank = self.global_rank
         if rank:  # processes draw the same sizes, but random numbers of their own
@@ -190,6 +198,7 @@ class Experiment(L.LightningModule):
             share = 1 / len(sizes) if mean else 1.0
             losses = {name: torch.stack(values).sum() * share for name, values in terms.items()}
             total = torch.stack(list(losses.values())).sum()
+        check_loss(total, self.global_step, self.trainer.strategy)
         soft = outputs[sizes[0]].soft_projected
         readout = self.main_readout if soft is None else SOFT_PROJECTED
         self._log_training({**losses, "total": total}, readout, len(batch.points))

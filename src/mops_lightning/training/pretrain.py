@@ -13,7 +13,7 @@ from omegaconf import DictConfig, open_dict
 from mops_lightning.config import distributed
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
-from mops_lightning.files import atomic_write
+from mops_lightning.files import atomic_write, remove_temporary, set_aside
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training import checkpoint
 from mops_lightning.training.callbacks import CHECKPOINT, added
@@ -21,6 +21,7 @@ from mops_lightning.training.job import Job, prepare
 from mops_lightning.training.recording import recorded
 from mops_lightning.training.replay import OF_RUN
 from mops_lightning.training.stages import fit_and_test
+from mops_lightning.zoo import weights
 from mops_lightning.zoo.weights import FILE
 
 
@@ -40,7 +41,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
     if cfg.weights != "auto":
         return Path(cfg.weights)
     folder = cache_folder(cfg, dataset)
-    if not (folder / FILE).is_file():
+    if not _is_good(folder / FILE):
         if distributed.started_together(cfg):
             raise UserError(
                 f"weights: {cfg.names.net} must be trained before a launcher starts several "
@@ -48,7 +49,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
                 "the launcher, or give weights=FILE."
             )
         with _locked(folder, cfg.names.net):
-            if not (folder / FILE).is_file():  # otherwise another process trained it meanwhile
+            if not _is_good(folder / FILE):  # otherwise another process trained it meanwhile
                 epochs = cfg.pretrain.max_epochs
                 print(
                     f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it "
@@ -57,6 +58,16 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
                 )
                 _train(cfg, folder, dataset)
     return folder / FILE
+
+
+def _is_good(path: Path) -> bool:
+    """Return whether there is a weights file that can be loaded."""
+    try:
+        return path.is_file() and bool(weights.read(path))
+    except weights.Damaged:
+        return False
+    except UserError as error:
+        raise UserError(f"weights: {error}") from None
 
 
 def task_config(cfg: DictConfig) -> DictConfig:
@@ -96,10 +107,12 @@ def publish(job: Job, record: RunRecord) -> None:
         return
     if cfg.weights not in (None, "auto"):
         return
-    if job.resumed is not None and checkpoint.planned_epochs(job.resumed) != cfg.trainer.max_epochs:
-        return
+    if job.resumed is not None:
+        planned = checkpoint.planned_epochs(checkpoint.read(job.resumed))
+        if planned != cfg.trainer.max_epochs:
+            return
     target = cache_folder(cfg, job.dataset) / FILE
-    if not target.exists():
+    if not _is_good(target):
         with atomic_write(target) as temporary:
             shutil.copyfile(job.folder / FILE, temporary)
 
@@ -125,15 +138,30 @@ def _locked(folder: Path, net: str) -> Iterator[None]:
 
 
 def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
+    """Train the task net in its cache folder, or resume a training that was interrupted there."""
     own = task_config(cfg)
-    if (folder / "checkpoints" / CHECKPOINT).is_file():
-        # An earlier pretraining was interrupted: resume it.
+    remove_temporary(folder)
+    if (folder / FILE).exists():
+        print(f"{folder / FILE} is damaged. Renamed to {set_aside(folder / FILE).name}.")
+    path = folder / "checkpoints" / CHECKPOINT
+    if path.is_file() and not checkpoint.set_aside_if_damaged(path):
         own.ckpt_path = str(folder)
     try:
-        with recorded(own, folder, []) as record:
-            job = prepare(own, folder, dataset, record)
-            fit_and_test(job, record, None)
+        try:
+            _run(own, folder, dataset)
+        except weights.Damaged as error:
+            if own.ckpt_path is None:
+                raise
+            print(f"{error} Renamed to {set_aside(path).name}.", flush=True)
+            own.ckpt_path = None
+            _run(own, folder, dataset)
     except (KeyboardInterrupt, Interrupted):
         raise Interrupted(
             "The task net was being trained; the same command resumes its training."
         ) from None
+
+
+def _run(own: DictConfig, folder: Path, dataset: CloudDataset) -> None:
+    with recorded(own, folder, []) as record:
+        job = prepare(own, folder, dataset, record)
+        fit_and_test(job, record, None)

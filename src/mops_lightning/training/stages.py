@@ -16,6 +16,7 @@ from mops_lightning.records.metric_info import described
 from mops_lightning.records.readout_names import parse
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training import evaluate
+from mops_lightning.training.divergence import Diverged, with_checkpoint
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.full_predictions import full_predictions
 from mops_lightning.training.job import Job
@@ -122,8 +123,24 @@ def _fit(job: Job) -> None:
     # An epoch of a small data set may be shorter than the logging interval.
     every = min(trainer.log_every_n_steps, len(loader))  # type: ignore[attr-defined]
     trainer.log_every_n_steps = every  # type: ignore[attr-defined]
-    with _interruptible(), _monitoring():
-        trainer.fit(experiment, loader, validation, ckpt_path=job.resumed)
+    try:
+        with _interruptible(), _monitoring():
+            trainer.fit(job.experiment, loader, validation, ckpt_path=job.resumed)
+        if name := weights.first_nonfinite(job.experiment.state_dict()):
+            raise Diverged(f"training diverged: {name} is not finite.")
+    except Diverged as error:
+        raise with_checkpoint(error, _last_checkpoint(job)) from None
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        if job.resumed is None or job.experiment.started or isinstance(error, UserError):
+            raise
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise weights.Damaged(f"ckpt_path: cannot resume from {job.resumed}: {reason}.") from error
+
+
+def _last_checkpoint(job: Job) -> Path | None:
+    """Return the newest checkpoint of this run, or the one that it was resumed from."""
+    own = job.folder / OUTPUTS["checkpoint"]
+    return own if own.is_file() else job.resumed
 
 
 def _test(job: Job) -> dict[str, float]:
@@ -168,6 +185,20 @@ def _monitoring() -> Iterator[None]:
         raise UserError(f"callbacks: {' '.join(text.split())}") from None
 
 
+def _check_scores(job: Job, metrics: dict[str, float]) -> None:
+    """Refuse a test whose score or losses are not finite, though the weights are."""
+    score = job.experiment.score_name
+    judged = [name for name in metrics if name == score or name.split("/")[-2] == "loss"]
+    bad = [name for name in judged if not math.isfinite(metrics[name])]
+    if not bad:
+        return
+    text = f"{bad[0]} is {metrics[bad[0]]}"
+    if not job.trains:
+        raise UserError(f"{text}. Check the data and the weights.")
+    error = UserError(f"training diverged: {text}.")
+    raise with_checkpoint(error, _last_checkpoint(job))
+
+
 def _save(job: Job, record: RunRecord) -> None:
     """Fill in what the run wrote and scored, and save what it trained."""
     cfg, experiment = job.cfg, job.experiment
@@ -175,7 +206,7 @@ def _save(job: Job, record: RunRecord) -> None:
     for kind, name in OUTPUTS.items():
         if (job.folder / name).exists():
             record.files[kind] = name
-    record.score = score = record.metrics[experiment.score_name]
+    record.score = record.metrics[experiment.score_name]
     parts: dict[str, nn.Module | None] = {"task": task, "sampler": sampler}
     record.notes |= {
         "score": experiment.score_name,
@@ -187,11 +218,7 @@ def _save(job: Job, record: RunRecord) -> None:
             if module is not None
         },
     }
-    if not math.isfinite(score):
-        raise UserError(
-            f"{experiment.score_name} is {score}: training diverged; no weights were saved. "
-            "Try a lower learning rate (optimizer.lr) or other weights of the losses."
-        )
+    _check_scores(job, record.metrics)
     if not job.trains:
         return
     files = {weights.FILE: task if cfg.learn == "task" else sampler}

@@ -1,7 +1,8 @@
 """Weights files: plain tensors and plain data, checked when read."""
 
 import hashlib
-from collections.abc import Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,10 @@ from mops_lightning.records.migrate import upgraded_config
 SCHEMA = "mops_lightning/weights/1"
 FILE = "weights.pt"
 OTHER_NET = "Check task, task/net and dataset.classes, or use weights=auto."
+
+
+class Damaged(UserError):
+    """A file of this program that cannot be used any more, or a file of another program."""
 
 
 def save(
@@ -55,21 +60,57 @@ def read(path: str | Path) -> dict[str, Any]:
         settings in ``config`` get their present names.
 
     Raises:
-        UserError: the file is missing, damaged or not a weights file.
+        UserError: the file is missing.
+        Damaged: it is damaged or not a weights file, or its tensors are not finite.
     """
     path = Path(path).expanduser()
     if not path.is_file():
         raise UserError(f"no file {path}. Give a weights.pt, or weights=auto.")
     content = read_plain(path, "a weights file")
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        raise UserError(
+        raise Damaged(
             f"{path} is not a weights file of mops_lightning. "
             "Lightning checkpoints are for ckpt_path; weights.pt is in the run's folder."
         )
+    content = {"config": {}, "metrics": {}, "classes": [], "sha256": None, **content}
+    check_state(content.get("state"), path)
     if digest(content["state"]) != content["sha256"]:
-        raise UserError(f"{path} is damaged (sha256 differs). Delete it and run again.")
-    content["config"] = upgraded_config(content["config"])
+        raise Damaged(f"{path} is damaged (sha256 differs). Delete it and run again.")
+    if not _is_plain(content["config"], dict) or not _is_plain(content["classes"], list):
+        raise Damaged(f"{path} is damaged (config or classes). Delete it and run again.")
+    try:
+        content["config"] = upgraded_config(content["config"])
+    except UserError as error:
+        raise Damaged(f"{path} is damaged: {error}") from None
     return content
+
+
+def check_state(state: Any, path: str | Path) -> None:
+    """Reject what is not a ``state_dict`` of finite tensors.
+
+    Args:
+        state: of a file.
+        path: the file, for the error.
+
+    Raises:
+        Damaged: it is not one, or a tensor contains NaN or infinity.
+    """
+    if not isinstance(state, dict) or not all(
+        isinstance(name, str) and isinstance(value, Tensor) and value.layout == torch.strided
+        for name, value in state.items()
+    ):
+        raise Damaged(f"{path} is damaged (no tensors by name). Delete it and run again.")
+    if name := first_nonfinite(state):
+        raise Damaged(f"{path}: {name} is not finite, because the training diverged. Train again.")
+
+
+def _is_plain(value: Any, kind: type) -> bool:
+    """Return whether a value of a file is of a kind and holds plain data that JSON can hold."""
+    try:
+        json.dumps(value)
+    except (TypeError, ValueError, RecursionError):
+        return False
+    return isinstance(value, kind)
 
 
 def read_plain(path: Path, what: str) -> Any:
@@ -80,14 +121,15 @@ def read_plain(path: Path, what: str) -> Any:
         what: kind of file that was expected, for the error.
 
     Raises:
-        UserError: the file cannot be opened, is damaged, or contains more than plain data.
+        UserError: the file cannot be opened.
+        Damaged: it is damaged, or contains more than plain data.
     """
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except PermissionError:
         raise UserError(f"{path} may not be read. Check its permissions.") from None
     except Exception:  # torch's messages advise to execute the file's code
-        raise UserError(
+        raise Damaged(
             f"{path} is damaged or not a file of this program (expected {what})."
         ) from None
 
@@ -146,6 +188,19 @@ def fit_state(
         more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
         raise UserError(f"{path} holds another net's weights: {'; '.join(wrong[:3])}{more}. {hint}")
     module.load_state_dict(state, strict=True)
+
+
+def first_nonfinite(state: Any, name: str = "") -> str | None:
+    """Return the dotted name of the first tensor with NaN or infinity in nested data, if any."""
+    if isinstance(state, Tensor):
+        return None if bool(torch.isfinite(state).all()) else name
+    parts: Iterable[tuple[Any, Any]] = ()
+    if isinstance(state, Mapping):
+        parts = state.items()
+    elif isinstance(state, list | tuple):
+        parts = enumerate(state)
+    named = ((f"{name}.{key}" if name else str(key), value) for key, value in parts)
+    return next(filter(None, (first_nonfinite(value, path) for path, value in named)), None)
 
 
 def digest(state: dict[str, Tensor]) -> str:

@@ -1,0 +1,80 @@
+import pytest
+import torch
+from lightning.pytorch.strategies import SingleDeviceStrategy
+
+from mops_lightning.config.compose import compose
+from mops_lightning.errors import UserError
+from mops_lightning.records import run_record
+from mops_lightning.training.callbacks import CHECKPOINT
+from mops_lightning.training.divergence import Diverged, check_checkpoint, check_loss
+from mops_lightning.training.run import run
+from mops_lightning.zoo import weights
+from tests.support.command_line import TINY
+
+STRATEGY = SingleDeviceStrategy()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_check_loss_not_finite_raises(value):
+    check_loss(torch.tensor(3.0), 1, STRATEGY)
+    with pytest.raises(Diverged, match=f"loss is {value} after 7 steps"):
+        check_loss(torch.tensor(value), 7, STRATEGY)
+
+
+@pytest.mark.parametrize("part", ["state_dict", "optimizer_states"])
+def test_check_checkpoint_not_finite_raises(part):
+    good = {
+        "state_dict": {"w": torch.ones(2), "n": torch.tensor(1)},
+        "optimizer_states": [{"state": {0: {"exp_avg": torch.ones(2)}}, "param_groups": [{}]}],
+        "callbacks": {"best": torch.tensor(float("inf"))},
+    }
+    check_checkpoint(good, STRATEGY)
+    bad = {**good, part: [{"state": {0: {"exp_avg": torch.tensor([1.0, float("nan")])}}}]}
+    with pytest.raises(Diverged, match=rf"{part}\.0\.state\.0\.exp_avg is not finite"):
+        check_checkpoint(bad, STRATEGY)
+
+
+@pytest.fixture(scope="module")
+def diverged(tmp_path_factory):
+    """A run whose rate explodes in its second epoch, and its error."""
+    folder = tmp_path_factory.mktemp("diverged")
+    overrides = [
+        *TINY,
+        f"cache={folder}/cache",
+        "weights=null",
+        "trainer.max_epochs=3",
+        "optimizer=step_decay",
+        "optimizer.schedule.factor=1e12",
+        "optimizer.schedule.every=3",
+    ]
+    with pytest.raises(UserError) as error:
+        run(compose(overrides), folder / "run", overrides)
+    return folder / "run", str(error.value)
+
+
+def test_run_diverged_keeps_last_finite_checkpoint(diverged):
+    folder, error = diverged
+    path = folder / "checkpoints" / CHECKPOINT
+    assert "training diverged" in error
+    assert f"last finite checkpoint is {path}" in error
+    content = torch.load(path, weights_only=True)
+    assert weights.first_nonfinite(content["state_dict"]) is None
+    assert content["epoch"] < 2
+    assert run_record.read(folder)["status"] == "failed"
+    assert not (folder / "weights.pt").exists()
+
+
+def test_run_diverged_in_last_step_fails(tmp_path):
+    overrides = [
+        *TINY,
+        f"cache={tmp_path}/cache",
+        "weights=null",
+        "optimizer.lr=1e30",
+        "dataset.train_per_class=2",
+        "batch_size=6",
+        "val_fraction=0",
+        "callbacks.checkpoint=null",
+    ]
+    with pytest.raises(UserError, match=r"training diverged: .*Try a lower"):
+        run(compose(overrides), tmp_path / "run", overrides)
+    assert run_record.read(tmp_path / "run")["status"] == "failed"
