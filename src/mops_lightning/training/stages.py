@@ -88,6 +88,8 @@ def _warm_start(job: Job, record: RunRecord) -> None:
     if experiment.recipe.warm_start and experiment.sampler is not None and job.resumed is None:
         copied = copy_pointwise_layers(experiment.task.net, experiment.sampler)
         record.notes["warm_start_layers"] = copied
+        if copied and job.trainer.is_global_zero:
+            print(f"Warm start: the first {copied} layers are copies of {job.cfg.names.net}'s.")
 
 
 def _fit(job: Job) -> None:

@@ -1,0 +1,178 @@
+"""Recipes: what a training step sees, what it adds to the loss, and which weights are kept."""
+
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from mops_lightning.config.compose import compose
+from mops_lightning.config.validate import check
+from mops_lightning.data.loader import CloudLoader
+from mops_lightning.data.pairs import Pairs
+from mops_lightning.errors import UserError
+from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.tasks.classification import Classification
+from mops_lightning.training.averaging import MovingAverage
+from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.recipe import Recipe, draw_points, straight_through
+from mops_lightning.types import Batch, SampleOutput
+from tests.support.training import quiet_trainer, small_dataset
+
+POINTS = 48
+
+
+class SeenBy(MOPSNet):
+    """Notes how many points it is given, in training and in evaluation."""
+
+    def __init__(self) -> None:
+        super().__init__(8, feature_channels=(8, 8), rho_channels=(16, 8))
+        self.seen: dict[bool, list[int]] = {True: [], False: []}
+
+    def sample(self, points: torch.Tensor, m: int) -> SampleOutput:
+        self.seen[self.training].append(points.shape[1])
+        return super().sample(points, m)
+
+
+def trained(recipe: Recipe, epochs: int = 2, table: Any = None, **more: Any) -> Experiment:
+    """Train on 24 clouds in batches of 6, with a table of the task net's predictions if given."""
+    torch.manual_seed(0)
+    module = Experiment(
+        Classification(PointNetVanilla(3), 3),
+        SeenBy(),
+        make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
+        recipe=recipe,
+    )
+    module.full_predictions = table
+    data = small_dataset(points=POINTS)
+    trainer = quiet_trainer(epochs, **more)
+    trainer.fit(module, CloudLoader(data.train, 6, shuffle=True), CloudLoader(data.test, 6))
+    return module
+
+
+def logged(recipe: Recipe) -> dict[str, float]:
+    """Return the last logged training losses."""
+    metrics = trained(recipe, epochs=1).trainer.callback_metrics
+    return {name: float(value) for name, value in metrics.items() if name.startswith("train/loss")}
+
+
+def test_recipe_paper_and_fast_are_valid_and_differ():
+    paper: Any = OmegaConf.to_container(compose(["recipe=paper"]).recipe)
+    fast: Any = OmegaConf.to_container(compose().recipe)
+    assert Recipe(**paper) == Recipe()
+    assert Recipe(**fast) != Recipe()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("train_points", 0),
+        ("all_points_from", 1.5),
+        ("straight_through", -0.1),
+        ("ema_span", float("nan")),
+        ("distillation", -1.0),
+        ("distillation", float("inf")),
+    ],
+)
+def test_recipe_value_out_of_range_raises(name, value):
+    with pytest.raises(UserError, match=rf"{name} must be .* got"):
+        Recipe(**{name: value})
+    with pytest.raises(UserError, match=rf"recipe.{name} must be .* got"):
+        check(compose([f"recipe.{name}={value}"]))
+
+
+def test_training_sees_drawn_points_then_all_and_validation_always_all():
+    module = trained(Recipe(train_points=20, all_points_from=0.5))
+    assert isinstance(module.sampler, SeenBy)
+    assert module.sampler.seen[True] == [20] * 4 + [POINTS] * 4
+    assert set(module.sampler.seen[False]) == {POINTS}
+
+
+def test_points_at_is_at_least_twice_the_sample():
+    recipe = Recipe(train_points=256)
+    assert recipe.points_at(0, 1024, 32) == 256
+    assert recipe.points_at(0, 1024, 200) == 400
+    assert recipe.points_at(0, 1024, 800) == 1024
+    assert Recipe().points_at(0, 1024, 32) == 1024
+
+
+def test_draw_points_returns_distinct_rows_new_in_every_draw():
+    cloud = torch.arange(POINTS * 3.0).view(1, POINTS, 3)
+    batch = Batch(cloud.repeat(2, 1, 1), torch.zeros(2))
+    torch.manual_seed(0)
+    first, second = (draw_points(batch, 30).points[..., 0] / 3 for _ in range(2))
+    for rows in (*first, *second):
+        assert len(rows.unique()) == 30
+        assert set(rows.tolist()) <= set(range(POINTS))
+    assert not torch.equal(first[0].sort().values, first[1].sort().values)
+    assert not torch.equal(first, second)
+    assert draw_points(batch, POINTS) is batch
+
+
+def test_draw_points_keeps_the_rows_of_a_pair():
+    points = torch.randn(3, POINTS, 3)
+    pairs = Pairs()(points, [torch.Generator().manual_seed(i) for i in range(3)])
+    drawn = draw_points(pairs, 10)
+    source, target = drawn.points.chunk(2)
+    full_source, full_target = pairs.points.chunk(2)
+    rows = [torch.cdist(a, b).argmin(2) for a, b in ((source, full_source), (target, full_target))]
+    assert torch.equal(*rows)
+
+
+def test_straight_through_has_matched_values_and_gradients_of_generated():
+    points = torch.randn(2, POINTS, 3)
+    generated = (points[:, :5] + 1e-3).requires_grad_()
+    found = straight_through(SampleOutput(generated, None, {}), points)
+    torch.testing.assert_close(found, points[:, :5])
+    weight = torch.randn_like(found)
+    (found * weight).sum().backward()
+    torch.testing.assert_close(generated.grad, weight)
+
+
+def test_distillation_is_logged_with_its_weight_and_only_then():
+    assert "train/loss/distillation" not in logged(Recipe())
+    light, heavy = (logged(Recipe(distillation=w))["train/loss/distillation"] for w in (1e-6, 2e-6))
+    assert light > 0
+    assert heavy == pytest.approx(2 * light, rel=1e-3)
+
+
+def test_distillation_with_kept_predictions_trains_the_same():
+    recipe = Recipe(distillation=3.0)
+    computed = trained(recipe)
+    with torch.no_grad():
+        table = computed.task.eval().predict(None, small_dataset(points=POINTS).train.points)
+    kept, wrong = trained(recipe, table=table), trained(recipe, table=table.flip(0))
+    weights = [module.state_dict()["sampler.queries.weight"] for module in (computed, kept, wrong)]
+    torch.testing.assert_close(weights[0], weights[1])
+    assert not torch.allclose(weights[0], weights[2])
+
+
+def test_straight_through_changes_the_training_from_its_share_on():
+    weights = [
+        trained(Recipe(straight_through=share)).state_dict()["sampler.queries.weight"]
+        for share in (None, 1.0, 0.5)
+    ]
+    last_step_only, half = (not torch.equal(one, weights[0]) for one in weights[1:])
+    assert last_step_only
+    assert half
+    assert not torch.equal(weights[1], weights[2])
+
+
+def test_moving_average_ends_with_the_average_of_all_steps():
+    steps: list[torch.Tensor] = []
+
+    class Watch(MovingAverage):
+        def on_train_batch_end(self, trainer, pl_module, *args: Any) -> None:
+            steps.append(pl_module.sampler.queries.weight.detach().clone())
+            super().on_train_batch_end(trainer, pl_module, *args)
+
+    span = 0.5
+    module = trained(Recipe(), callbacks=[Watch(span)])
+    decay = 1 - 1 / (span * len(steps))
+    expected = steps[0]
+    for weights in steps[1:]:
+        expected = decay * expected + (1 - decay) * weights
+    assert module.sampler is not None
+    torch.testing.assert_close(module.sampler.queries.weight, expected)
+    assert not torch.allclose(expected, steps[-1])
