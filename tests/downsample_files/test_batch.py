@@ -36,7 +36,7 @@ def test_dead_worker_is_reported_and_second_run_completes(folder, tmp_path, monk
     settings = ["--method", "random", "--m", 5]
     status, out, err = call(folder / "in", tmp_path, *settings, "--workers", 2)
     assert status == 1
-    assert err.count("a worker process died") == 2
+    assert err.count("its process died") == 2
     assert "2 files: 2 failed" in out
     monkeypatch.undo()
     assert call(folder / "in", tmp_path, *settings, "--workers", 2)[0] == 0

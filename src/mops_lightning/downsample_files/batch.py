@@ -4,21 +4,21 @@ Worker processes import this module, so it imports torch only when there is a fi
 """
 
 import os
+import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
-from concurrent.futures import Future, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Generator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from rich.progress import track
 
+from mops_lightning.data.formats import limits
+from mops_lightning.downsample_files.processes import Died, processes
 from mops_lightning.downsample_files.settings import Settings
 from mops_lightning.errors import UserError
-from mops_lightning.ops.workers import pool
 
 
 def attempt(
@@ -91,7 +91,8 @@ def process_folder(
     done: Counter[str] = Counter()
     todo = [job for job in jobs if overwrite or not job[1].exists()]
     failures, dropped = {}, 0
-    with _results(todo, settings, workers, engine) as results:
+    results = _results(todo, settings, workers, engine)
+    with closing(results):  # ends the processes when the user interrupts
         for (source, _), result in track(
             results, "downsampling", total=len(todo), disable=not sys.stdout.isatty()
         ):
@@ -111,29 +112,34 @@ def process_folder(
     return len(failures)
 
 
-@contextmanager
 def _results(
     jobs: list[tuple[Path, Path]], settings: Settings, workers: int, engine: Any
-) -> Iterator[Iterator[Any]]:
-    """Yield pairs of job and result, in the order of completion."""
-    if workers == 1 or len(jobs) < 2:
-        yield ((job, attempt(*job, settings, None, engine)) for job in jobs)
+) -> Generator[Any, None, None]:
+    """Yield pairs of job and result, in the order of completion.
+
+    Several files are read in other processes, so that one bad file cannot stop the rest; with
+    ``--cluster`` the cluster's processes read them.
+    """
+    from mops_lightning.downsample_files.large import in_turn
+
+    if engine is not in_turn or len(jobs) < 2:
+        yield from ((job, attempt(*job, settings, None, engine)) for job in jobs)
         return
-    workers = min(workers, len(jobs))
-    futures = {pool(workers).submit(attempt, *job, settings, workers): job for job in jobs}
-    try:
-        yield ((futures[future], _result(future)) for future in as_completed(futures))
-    finally:
-        for future in futures:
-            future.cancel()
+    shared = workers if workers > 1 else None
+    calls = ((*job, settings, shared) for job in jobs)
+    for place, result in processes(min(workers, len(jobs))).run(attempt, calls):
+        yield jobs[place], _death(jobs[place][0], result) if isinstance(result, Died) else result
 
 
-def _result(future: Future[Any]) -> Any:
-    try:
-        return future.result()
-    except BrokenProcessPool:
-        pool.cache_clear()
+def _death(source: Path, died: Died) -> UserError:
+    """Return the error of a file whose process died."""
+    if died.signal == getattr(signal, "SIGALRM", -1):
         return UserError(
-            "a worker process died, perhaps for lack of memory, before this file was done. Run the "
-            "same command again with fewer --workers."
+            f"{source} is broken or very slow to read: it took more than "
+            f"{limits.seconds(source):.0f} s. Downsample it alone, without a limit."
         )
+    how = f" (signal {died.signal})" if died.signal else ""
+    return UserError(
+        f"{source} is broken or needs too much memory: its process died{how}. Downsample it alone, "
+        "or run the same command again with fewer --workers."
+    )

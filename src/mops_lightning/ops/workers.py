@@ -16,10 +16,10 @@ def pool(workers: int) -> ProcessPoolExecutor:
     spawned process imports the main module and the module of its function; the latter should
     therefore not import torch.
     """
-    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_start)
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=start_worker)
 
 
-def _start() -> None:
+def start_worker() -> None:
     """Ignore Ctrl-C, which the parent handles, and exit with the parent, even if it is killed."""
     os.environ["POT_BACKEND_DISABLE_PYTORCH"] = "1"  # POT would import torch in every worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mops_lightning.data.formats.errors import BadCloudError, ends_early, naming_file
+from mops_lightning.data.formats.limits import limited
 from mops_lightning.data.formats.table import Table, from_array
 
 
@@ -36,7 +37,7 @@ class CloudFile(ABC):
         Raises:
             BadCloudError: the file is broken or missing.
         """
-        with naming_file(self.path):
+        with limited(self.path), naming_file(self.path):
             return self.read_all(rows).finite()
 
     def read_all(self, rows: range) -> Table:

@@ -22,6 +22,8 @@ def naming_file(path: Path) -> Iterator[None]:
         yield
     except UserError:
         raise
+    except MemoryError as error:
+        raise BadCloudError(f"{path} is broken or too large for the memory: {error}.") from None
     except Exception as error:
         raise BadCloudError(f"{path} is broken: {type(error).__name__}: {error}.") from None
 

@@ -9,6 +9,7 @@ import trimesh
 from mops_lightning.data.formats import arrays, kitti, las, obj, pcd, ply, text
 from mops_lightning.data.formats.cloud_file import CloudFile
 from mops_lightning.data.formats.errors import BadCloudError, naming_file
+from mops_lightning.data.formats.limits import limited
 from mops_lightning.data.formats.table import Table
 from mops_lightning.data.mesh_io import SUFFIXES as MESHES
 from mops_lightning.data.mesh_io import parse_mesh
@@ -52,12 +53,11 @@ def read(path: Path, surface: int, seed: int) -> Table:
         raise BadCloudError(f"{path} must end in {', '.join(READABLE)}.")
     if not path.is_file():
         raise BadCloudError(f"{path}: no such file.")
-    with naming_file(path):
+    with limited(path), naming_file(path):
         table = READERS[suffix](path) if suffix in READERS else None
-        data = path.read_bytes() if table is None else b""
-    if table is not None:
-        return table
-    mesh = parse_mesh(data, path)
+        if table is not None:
+            return table
+        mesh = parse_mesh(path.read_bytes(), path)
     points, faces = trimesh.sample.sample_surface(mesh, surface, seed=seed)
     normals = np.asarray(mesh.face_normals)[faces].T
     columns = dict(zip(("nx", "ny", "nz"), normals.astype(np.float32), strict=True))
@@ -85,5 +85,5 @@ def open_cloud_file(path: Path) -> CloudFile:
         raise BadCloudError(f"{path}: --chunk works with {', '.join(CHUNKED)}.")
     if not path.is_file():
         raise BadCloudError(f"{path}: no such file.")
-    with naming_file(path):
+    with limited(path), naming_file(path):
         return CHUNKED[suffix](path)
