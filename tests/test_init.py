@@ -14,8 +14,10 @@ from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.zoo import weights
 
 NAMES = [
+    "CriticalSampler",
     "FMOPSNet",
     "FPSSampler",
+    "GumbelSampler",
     "MOPSNet",
     "PoissonSampler",
     "ProgressiveSNet",
@@ -26,6 +28,7 @@ NAMES = [
     "SampleOutput",
     "Sampler",
     "SamplingMatrix",
+    "SubmodularSampler",
     "VoxelSampler",
     "chamfer_distance",
     "complete",

@@ -15,20 +15,25 @@ if TYPE_CHECKING:
     from mops_lightning.ops.readout import complete, match
     from mops_lightning.ops.sampling_matrix import SamplingMatrix
     from mops_lightning.samplers.base import Sampler
+    from mops_lightning.samplers.critical import CriticalSampler
     from mops_lightning.samplers.fmops import FMOPSNet
     from mops_lightning.samplers.fps import FPSSampler
+    from mops_lightning.samplers.gumbel import GumbelSampler
     from mops_lightning.samplers.mops import MOPSNet
     from mops_lightning.samplers.poisson import PoissonSampler
     from mops_lightning.samplers.random import RandomSampler
     from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
     from mops_lightning.samplers.snet import ProgressiveSNet, SNet
+    from mops_lightning.samplers.submodular import SubmodularSampler
     from mops_lightning.samplers.voxel import VoxelSampler
     from mops_lightning.types import SampleOutput
     from mops_lightning.zoo.load import load
 
 __all__ = [
+    "CriticalSampler",
     "FMOPSNet",
     "FPSSampler",
+    "GumbelSampler",
     "MOPSNet",
     "PoissonSampler",
     "ProgressiveSNet",
@@ -39,6 +44,7 @@ __all__ = [
     "SampleOutput",
     "Sampler",
     "SamplingMatrix",
+    "SubmodularSampler",
     "VoxelSampler",
     "chamfer_distance",
     "complete",
@@ -57,13 +63,16 @@ _MODULES = {
     "ops.readout": ("complete", "match"),
     "ops.sampling_matrix": ("SamplingMatrix",),
     "samplers.base": ("Sampler",),
+    "samplers.critical": ("CriticalSampler",),
     "samplers.fmops": ("FMOPSNet",),
     "samplers.fps": ("FPSSampler",),
+    "samplers.gumbel": ("GumbelSampler",),
     "samplers.mops": ("MOPSNet",),
     "samplers.poisson": ("PoissonSampler",),
     "samplers.random": ("RandomSampler",),
     "samplers.samplenet": ("ProgressiveSampleNet", "SampleNet"),
     "samplers.snet": ("ProgressiveSNet", "SNet"),
+    "samplers.submodular": ("SubmodularSampler",),
     "samplers.voxel": ("VoxelSampler",),
     "types": ("SampleOutput",),
     "zoo.load": ("load",),

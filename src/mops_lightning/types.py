@@ -4,7 +4,7 @@
 a split. Points are float32 ``(B, N, 3)`` in the unit sphere, without unit.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -105,3 +105,23 @@ class TaskOutput(NamedTuple):
     predictions: Any
     targets: Any
     output: Any = None
+
+
+@runtime_checkable
+class PointFeatureNet(Protocol):
+    """A task net whose result depends on a cloud through maxima over points only.
+
+    The features of a point must not depend on other points of the cloud. Then the maxima of a
+    sample follow from the features of the whole cloud, without running the net on the sample.
+    """
+
+    def point_features(self, points: Tensor) -> Tensor:
+        """Map ``(B, N, 3)`` points to non-negative features ``(B, N, C)``."""
+
+
+@runtime_checkable
+class PooledNet(PointFeatureNet, Protocol):
+    """A net that maps the maxima of ``point_features`` over the points to its result."""
+
+    def from_pooled(self, pooled: Tensor) -> Any:
+        """Map maxima ``(B, C)`` to what ``forward`` returns."""

@@ -1,8 +1,11 @@
 """What every reconstruction net guarantees. A new net adds one line to NETS."""
 
+from typing import Any
+
 import pytest
 import torch
 
+from mops_lightning.errors import UserError
 from mops_lightning.nets.atlasnet import AtlasNet
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
@@ -46,3 +49,18 @@ def test_number_of_points_is_variable(name, n, rng):
     assert net(points, n).shape == (2, n, 3)
     net.n_points = n
     torch.testing.assert_close(net(points), net(points, n))
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_result_follows_from_maxima_of_point_features(name, rng):
+    torch.manual_seed(0)
+    net: Any = NETS[name](50).eval()
+    points = torch.randn(2, 40, 3, generator=rng)
+    if name == "graph":
+        with pytest.raises(UserError, match=r"encoder must be mlp .* got graph"):
+            net.point_features(points)
+        return
+    features = net.point_features(points)
+    assert features.min() >= 0
+    torch.testing.assert_close(net.from_pooled(features.amax(1)), net(points))
+    torch.testing.assert_close(net.point_features(points[:, 7:9]), features[:, 7:9])

@@ -7,14 +7,18 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
+from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.critical import CriticalSampler
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.gumbel import GumbelSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.poisson import PoissonSampler
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
+from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.samplers.voxel import VoxelSampler
 
 SMALL: dict[str, Any] = {"feature_channels": (8, 6), "head_channels": (12, 10)}
@@ -24,6 +28,10 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "voxel": lambda m: VoxelSampler(m),
     "voxel-centroid": lambda m: VoxelSampler(m, pick="centroid"),
     "poisson": lambda m, **kw: PoissonSampler(m, **kw),
+    "submodular": lambda m, **kw: SubmodularSampler(m, PointNetVanilla(3), **kw),
+    "submodular-gradient": lambda m: SubmodularSampler(m, PointNetVanilla(3), "gradient"),
+    "critical": lambda m, **kw: CriticalSampler(m, PointNetVanilla(3), **kw),
+    "gumbel": lambda m: GumbelSampler(m, feature_channels=(8, 6), key_channels=(12, 10)),
     "mops": lambda m: MOPSNet(m, feature_channels=(8, 6), rho_channels=(12, 10)),
     "fmops": lambda m: FMOPSNet(m, feature_channels=(8, 6), rho_channels=(12, 10)),
     "snet": lambda m: SNet(m, **SMALL),
@@ -223,7 +231,7 @@ def test_gradients_are_correct(make, rng):
         (gradient,) = torch.autograd.grad(output.points.sum(), points)
         chosen = torch.zeros(1, 9, 1).index_fill(1, output.indices[0], 1.0)
         assert torch.equal(gradient, chosen.expand_as(gradient).to(gradient))
-    if sampler.learned:
+    if sampler.learned and not isinstance(sampler, GumbelSampler):  # it chooses in evaluation
         assert torch.autograd.gradcheck(lambda p: sampler(p).points, (points,))
         total = output.points.square().sum()
         # SampleNet's temperature has an effect in training only.

@@ -75,15 +75,22 @@ class AtlasNet(nn.Module):
             points: the sampled or the full cloud.
             n_points: n; None means the attribute ``n_points``.
         """
+        return self.from_pooled(self.encoder(points), n_points)
+
+    def point_features(self, points: Tensor) -> Tensor:
+        """Return the features ``(B, N, d)`` whose maxima over points are the codeword."""
+        return self.encoder.point_features(points)
+
+    def from_pooled(self, pooled: Tensor, n_points: int | None = None) -> Tensor:
+        """Map codewords ``(B, d)`` to ``(B, n, 3)``; ``n_points`` as for ``forward``."""
         n = n_points or self.n_points
         size = -(-n // len(self.patches))
-        codeword = self.encoder(points)
         patches = []
         for patch in self.patches:
             if self.training:
-                square = torch.rand(len(points), size, 2, device=points.device, dtype=points.dtype)
+                square = torch.rand(len(pooled), size, 2, device=pooled.device, dtype=pooled.dtype)
                 square = (square - 0.5) * 2 * REACH
             else:
-                square = square_grid(size).to(points)[None]
-            patches.append(patch(codeword, square))
+                square = square_grid(size).to(pooled)[None]
+            patches.append(patch(pooled, square))
         return torch.stack(patches, 2).flatten(1, 2)[:, :n]

@@ -37,6 +37,10 @@ class PointEncoder(nn.Module):
         """Map ``(B, N, 3)`` points to ``(B, d)`` codewords, any N."""
         return self.pool(self.features(points))
 
+    def point_features(self, points: Tensor) -> Tensor:
+        """Return the features ``(B, N, d)`` whose maxima over points are the codeword."""
+        return self.pool.values(self.features(points))
+
 
 class AutoEncoder(nn.Module):
     """Encoder, and a decoder of linear layers with all 3n coordinates as output.
@@ -80,10 +84,18 @@ class AutoEncoder(nn.Module):
         Raises:
             UserError: ``n_points`` is neither None nor n.
         """
+        return self.from_pooled(self.encoder(points), n_points)
+
+    def point_features(self, points: Tensor) -> Tensor:
+        """Return the features ``(B, N, d)`` whose maxima over points are the codeword."""
+        return self.encoder.point_features(points)
+
+    def from_pooled(self, pooled: Tensor, n_points: int | None = None) -> Tensor:
+        """Map codewords ``(B, d)`` to ``(B, n, 3)``; ``n_points`` as for ``forward``."""
         if n_points not in (None, self.n_points):
             raise UserError(
                 f"n_points must be {self.n_points}, the size this AutoEncoder was made for, got "
                 f"{n_points}. Train one for {n_points} points, or use MFoldingNet "
                 "(task/net=mfoldingnet), which has a variable number of points."
             )
-        return self.decoder(self.encoder(points)).unflatten(1, (-1, 3))
+        return self.decoder(pooled).unflatten(1, (-1, 3))

@@ -172,4 +172,20 @@ class MFoldingNet(nn.Module):
             points: the sampled or the full cloud.
             n_points: n; None means the attribute ``n_points``.
         """
-        return self.decoder(self.encoder(points), n_points or self.n_points)
+        return self.from_pooled(self.encoder(points), n_points)
+
+    def point_features(self, points: Tensor) -> Tensor:
+        """Return the features ``(B, N, d)`` whose maxima over points are the codeword.
+
+        Raises:
+            UserError: the encoder is ``graph``, whose features depend on neighbouring points.
+        """
+        if isinstance(self.encoder, GraphEncoder):
+            raise UserError(
+                "encoder must be mlp for what needs features of single points, got graph."
+            )
+        return self.encoder.point_features(points)
+
+    def from_pooled(self, pooled: Tensor, n_points: int | None = None) -> Tensor:
+        """Map codewords ``(B, d)`` to ``(B, n, 3)``; ``n_points`` as for ``forward``."""
+        return self.decoder(pooled, n_points or self.n_points)

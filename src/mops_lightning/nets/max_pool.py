@@ -49,6 +49,16 @@ class PointMaxPool(nn.Module):
         assert self.norm.bias is not None
         return F.relu((extremes - mean) * scale + self.norm.bias)
 
+    def values(self, features: Tensor) -> Tensor:
+        """Return what the maximum is taken of: ``(B, N, channels_out)``, non-negative.
+
+        Args:
+            features: as for ``forward``.
+        """
+        rows = self.linear(features.to(self.linear.weight).flatten(0, 1))
+        rows = rows if self.norm is None else self.norm(rows)
+        return rows.relu_().unflatten(0, features.shape[:2])
+
     def _mean_and_scale(self, norm: nn.BatchNorm1d, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and gamma/std of the wide product, and update the running statistics."""
         weight = self.linear.weight

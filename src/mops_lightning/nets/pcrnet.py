@@ -81,5 +81,12 @@ class PCRNet(nn.Module):
             total = step.after(total)
         return total
 
+    def point_features(self, points: Tensor) -> Tensor:
+        """Return the features ``(B, N, C)`` of one cloud whose maxima over points the head takes.
+
+        With several iterations, those of the source hold for the first one.
+        """
+        return self.pool.values(self.features(points))
+
     def _global(self, points: Tensor) -> Tensor:
         return self.pool(self.features(points))

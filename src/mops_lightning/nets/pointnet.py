@@ -32,3 +32,11 @@ class PointNetVanilla(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         """Map ``(B, N, 3)`` points to ``(B, num_classes)`` logits."""
         return self.head(self.pool(self.features(points)))
+
+    def point_features(self, points: Tensor) -> Tensor:
+        """Return the features ``(B, N, 1024)`` of which the net takes the maximum over points."""
+        return self.pool.values(self.features(points))
+
+    def from_pooled(self, pooled: Tensor) -> Tensor:
+        """Map the maxima ``(B, 1024)`` to logits."""
+        return self.head(pooled)

@@ -29,14 +29,17 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     task = _make_task(cfg, len(dataset.class_names))
     # A seed of its own: the sampler's initial weights must not depend on the task net's size.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
-    sampler = build(cfg.sampler, "sampler") if cfg.learn != "task" else None
+    # For samplers that select points by the task net's features.
+    net = {"net": task.net}
+    own = accepted(cfg.sampler, net)
+    sampler = build(cfg.sampler, "sampler", **own) if cfg.learn != "task" else None
     points = task.points_of(dataset.test.points.shape[1])
     sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, points, training=cfg.learn != "nothing")
     baselines: dict[str, Sampler] = {}
     if sampler is not None and sampler.learned:
-        baselines = _make_baselines(cfg, max(sizes))
+        baselines = _make_baselines(cfg, max(sizes), net)
     elif sampler is not None and sampler.flexible:
-        sampler = build(cfg.sampler, "sampler", m=max(sizes))
+        sampler = build(cfg.sampler, "sampler", m=max(sizes), **own)
     make_optimizer, make_schedule = optimizer_makers(cfg.optimizer)
     return Experiment(
         task,
@@ -66,14 +69,14 @@ def _make_task(cfg: DictConfig, num_classes: int) -> Task:
     return build(cfg.task, "task", net=net, **accepted(cfg.task, offered))
 
 
-def _make_baselines(cfg: DictConfig, m: int) -> dict[str, Sampler]:
+def _make_baselines(cfg: DictConfig, m: int, net: dict[str, Any]) -> dict[str, Sampler]:
     nodes = {str(name): node for name, node in cfg.baselines.items() if node}
-    return {name: _make_baseline(name, node, m, cfg.seed) for name, node in nodes.items()}
+    return {name: _make_baseline(name, node, m, cfg.seed, net) for name, node in nodes.items()}
 
 
-def _make_baseline(name: str, node: DictConfig, m: int, seed: int) -> Any:
+def _make_baseline(name: str, node: DictConfig, m: int, seed: int, net: dict[str, Any]) -> Any:
     """Build an index sampler for ``m`` points, with the run's seed unless it has its own."""
-    own = {} if "seed" in node else accepted(node, {"seed": seed})
+    own = accepted(node, net if "seed" in node else {**net, "seed": seed})
     return build(node, f"baselines.{name}", m=m, **own)
 
 

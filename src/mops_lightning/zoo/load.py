@@ -7,13 +7,16 @@ import torch
 
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.critical import CriticalSampler
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.gumbel import GumbelSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.poisson import PoissonSampler
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
+from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.zoo import weights
 
@@ -24,10 +27,13 @@ SAMPLERS: tuple[type[Sampler], ...] = (
     ProgressiveSNet,
     SampleNet,
     ProgressiveSampleNet,
+    GumbelSampler,
     RandomSampler,
     VoxelSampler,
     FPSSampler,
     PoissonSampler,
+    SubmodularSampler,
+    CriticalSampler,
 )
 """What ``load`` can build. A file's ``_target_`` is compared with this list and never imported."""
 

@@ -1,0 +1,50 @@
+import pytest
+import torch
+
+from mops_lightning.errors import UserError
+from mops_lightning.samplers.gumbel import GumbelSampler
+
+
+@pytest.fixture
+def sampler():
+    torch.manual_seed(0)
+    return GumbelSampler(4, feature_channels=(8, 6), key_channels=(12, 10))
+
+
+def test_gumbel_evaluation_chooses_largest_score(sampler, rng):
+    points = torch.randn(3, 20, 3, generator=rng)
+    sampler.eval()
+    chosen = sampler(points).points
+    for cloud, scores, got in zip(points, sampler.scores(points), chosen, strict=True):
+        assert torch.equal(got, cloud[[int(row.argmax()) for row in scores]])
+
+
+def test_gumbel_training_means_are_frequencies_of_choice(sampler, rng):
+    """At a low temperature, a point is chosen with its probability under softmax of the scores."""
+    cloud = torch.randn(5, 3, generator=rng)
+    points = cloud.expand(1000, -1, -1)
+    sampler.training_tau = 1e-4
+    scores = sampler.scores(points)[0, 0]
+    distances = (sampler(points).points[:, :1] - cloud).norm(dim=2)
+    assert distances.amin(1).median() < 1e-6
+    counts = distances.argmin(1).bincount(minlength=5)
+    torch.testing.assert_close(counts / 1000, scores.softmax(0), atol=0.06, rtol=0)
+
+
+def test_gumbel_training_has_gradients(sampler, rng):
+    sampler(torch.randn(3, 20, 3, generator=rng)).points.square().sum().backward()
+    assert all(p.grad is not None and p.grad.any() for p in sampler.parameters())
+
+
+def test_gumbel_anneals_exponentially(sampler):
+    taus = []
+    for progress in (0.0, 0.5, 1.0, 2.0):
+        sampler.anneal(progress)
+        taus.append(sampler.tau)
+    assert taus == pytest.approx([1, 0.1**0.5, 0.1, 0.1])
+    assert sampler.eval().tau == 0.1
+
+
+def test_gumbel_temperature_out_of_range_raises():
+    with pytest.raises(UserError, match="tau_min must be above 0 and at most 1, got 0"):
+        GumbelSampler(4, tau_min=0)

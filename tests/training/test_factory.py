@@ -1,0 +1,38 @@
+from typing import Any
+
+import pytest
+import torch
+
+from mops_lightning.config.compose import compose
+from mops_lightning.errors import UserError
+from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.samplers.submodular import SubmodularSampler
+from mops_lightning.training.factory import make_experiment
+from tests.support.training import small_dataset
+
+BASELINE = "+baselines.submodular._target_=mops_lightning.samplers.submodular.SubmodularSampler"
+
+
+def test_factory_gives_task_net_to_samplers_that_need_it():
+    for overrides in (["sampler=submodular", "sizes=[4,16]"], ["m=16", BASELINE]):
+        made = make_experiment(compose([*overrides, "m=8"]), small_dataset(), {})
+        sampler: Any = made.baselines["submodular"] if len(made.baselines) else made.sampler
+        assert isinstance(sampler, SubmodularSampler)
+        assert sampler.net is made.task.net
+        assert not any(name.startswith(("sampler.net", "baselines")) for name in made.state_dict())
+
+
+def test_factory_net_without_point_features_raises():
+    cfg = compose(["sampler=critical", "task=registration", "task/net=icp", "m=8"])
+    with pytest.raises(UserError, match=r"net must have features of single points.*got ICP"):
+        make_experiment(cfg, small_dataset(), {})
+
+
+def test_factory_sampler_sees_weights_loaded_later(rng):
+    points = torch.randn(2, 48, 3, generator=rng)
+    made = make_experiment(compose(["sampler=critical", "m=8"]), small_dataset(), {})
+    assert made.sampler is not None
+    before = made.sampler(points).indices
+    torch.manual_seed(9)
+    made.task.net.load_state_dict(PointNetVanilla(3).state_dict())
+    assert not torch.equal(made.sampler(points).indices, before)
