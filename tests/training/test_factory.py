@@ -15,8 +15,8 @@ BASELINE = "+baselines.submodular._target_=mops_lightning.samplers.submodular.Su
 
 def test_factory_gives_task_net_to_samplers_that_need_it():
     for overrides in (["sampler=submodular", "sizes=[4,16]"], ["m=16", BASELINE]):
-        made = make_experiment(compose([*overrides, "m=8"]), small_dataset(), {})
-        sampler: Any = made.baselines["submodular"] if len(made.baselines) else made.sampler
+        made: Any = make_experiment(compose([*overrides, "m=8"]), small_dataset(), {})
+        sampler = made.baselines["submodular"] if len(made.baselines) else made.sampler
         assert isinstance(sampler, SubmodularSampler)
         assert sampler.net is made.task.net
         assert not any(name.startswith(("sampler.net", "baselines")) for name in made.state_dict())
