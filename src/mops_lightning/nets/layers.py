@@ -79,30 +79,6 @@ class PointMLP(nn.Module):
         return rows.unflatten(0, features.shape[:2])
 
 
-def copy_pointwise_layers(source: nn.Module, target: nn.Module) -> int:
-    """Copy the first layers of one net's first ``PointMLP`` to that of another.
-
-    Linear layers and BatchNorm are copied up to the first whose shapes differ, with the running
-    statistics.
-
-    Returns:
-        The number of layers copied, a linear layer with its BatchNorm counting as one; 0 if a net
-        has no ``PointMLP``.
-    """
-    stacks = [
-        next((m.layers for m in net.modules() if isinstance(m, PointMLP)), nn.Sequential())
-        for net in (source, target)
-    ]
-    copied = 0
-    for theirs, mine in zip(*stacks, strict=False):
-        state, own = theirs.state_dict(), mine.state_dict()
-        if {k: v.shape for k, v in state.items()} != {k: v.shape for k, v in own.items()}:
-            break
-        mine.load_state_dict(state)
-        copied += isinstance(mine, nn.Linear)
-    return copied
-
-
 class PointFeatures(nn.Module):
     """Local and global features of a cloud (paper section "Feature Extraction").
 

@@ -11,7 +11,7 @@ from torch import nn
 
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import Interrupted, UserError
-from mops_lightning.nets.layers import copy_pointwise_layers
+from mops_lightning.nets.warm_start import copy_pointwise_layers
 from mops_lightning.records.metric_info import described
 from mops_lightning.records.readout_names import parse
 from mops_lightning.records.run_record import RunRecord
@@ -33,6 +33,9 @@ OUTPUTS = {
     "tensorboard": "tensorboard",
 }
 """What callbacks and loggers may have written."""
+
+WARM_START_CLOUDS = 64
+"""Clouds whose statistics BatchNorm takes where the task net has none."""
 
 
 def fit_and_test(job: Job, record: RunRecord, task_weights: Path | None) -> None:
@@ -86,7 +89,8 @@ def _warm_start(job: Job, record: RunRecord) -> None:
     """Copy the task net's first layers to the sampler, unless the run is resumed."""
     experiment = job.experiment
     if experiment.recipe.warm_start and experiment.sampler is not None and job.resumed is None:
-        copied = copy_pointwise_layers(experiment.task.net, experiment.sampler)
+        typical = job.dataset.train.points[:WARM_START_CLOUDS]
+        copied = copy_pointwise_layers(experiment.task.net, experiment.sampler, typical)
         record.notes["warm_start_layers"] = copied
         if copied and job.trainer.is_global_zero:
             print(f"Warm start: the first {copied} layers are copies of {job.cfg.names.net}'s.")

@@ -1,0 +1,42 @@
+"""Copies of one net's first pointwise layers in another."""
+
+import copy
+
+import torch
+from torch import nn
+
+from mops_lightning.nets.layers import PointFeatures, PointMLP
+from mops_lightning.nets.warm_start import copy_pointwise_layers
+
+POINTS = torch.randn(4, 60, 3, generator=torch.Generator().manual_seed(0))
+
+
+def test_copy_pointwise_layers_copies_until_shapes_differ():
+    torch.manual_seed(0)
+    source, target = PointMLP([3, 8, 8, 16, 32]), PointFeatures([8, 8, 16, 16])
+    source(POINTS)  # moves the running statistics
+    before = copy.deepcopy(target.state_dict())
+    assert copy_pointwise_layers(nn.Sequential(nn.Linear(3, 3), source), target, POINTS) == 3
+    theirs, mine = source.layers.state_dict(), target.mlp.layers.state_dict()
+    for name, value in mine.items():
+        same = int(name.split(".")[0]) < 9  # three times linear layer, BatchNorm and ReLU
+        expected = theirs[name] if same else before[f"mlp.layers.{name}"]
+        assert torch.equal(value, expected), name
+    with torch.no_grad():
+        next(source.parameters()).zero_()
+    assert next(target.parameters()).any()  # a copy, not the same tensor
+
+
+def test_copy_pointwise_layers_without_batch_norm_computes_the_same():
+    torch.manual_seed(0)
+    source, target = PointMLP([3, 8, 8, 16], norm=False), PointMLP([3, 8, 8, 16])
+    assert copy_pointwise_layers(source, target, POINTS) == 3
+    for mode in (False, True):  # in training, with the statistics of the same points
+        target.train(mode)
+        torch.testing.assert_close(target(POINTS), source(POINTS), rtol=1e-4, atol=1e-5)
+
+
+def test_copy_pointwise_layers_without_counterpart_copies_none():
+    assert copy_pointwise_layers(nn.Linear(3, 8), PointMLP([3, 8]), POINTS) == 0
+    assert copy_pointwise_layers(PointMLP([3, 8]), PointMLP([3, 4]), POINTS) == 0
+    assert copy_pointwise_layers(PointMLP([3, 8]), PointMLP([3, 8], norm=False), POINTS) == 0
