@@ -46,7 +46,7 @@ def test_rotation_error_matches_scipy():
         assert in_batches(recall(limit), *given) == pytest.approx(share)
 
 
-def test_doubled_error_matches_pcrnet_formula():
+def test_doubled_error_matches_samplenet_formula():
     a, b = Rotation.random(40, random_state=1), Rotation.random(40, random_state=2)
     given = motions(a), motions(b)
     cosine = 2 * (given[0].quaternion * given[1].quaternion).sum(1).double() ** 2 - 1

@@ -100,6 +100,19 @@ def test_mops_points_are_in_bounding_box(rng):
     assert (sampled.amin(1) >= points.amin(1)).all()
 
 
+def test_mops_threshold_drops_small_entries_in_evaluation_only(rng):
+    points = torch.randn(2, 20, 3, generator=rng)
+    net, dense = small(tau_min=0.02, threshold=0.05), small(tau_min=0.02)
+    torch.testing.assert_close(net.train()(points).points, dense.train()(points).points)
+    output = net.eval()(points)
+    matrix = output.matrix.dense()
+    kept = matrix * (matrix >= 0.05)
+    assert (kept > 0).any(1).all()
+    assert (kept == 0).any()
+    kept = kept / kept.sum(1, keepdim=True)
+    torch.testing.assert_close(output.points, kept.mT @ points)
+
+
 def test_mops_gradcheck(rng):
     net = small(m=3, tau_min=0.5).double().eval()
     points = torch.randn(1, 7, 3, dtype=torch.float64, generator=rng, requires_grad=True)
@@ -113,6 +126,7 @@ def test_mops_gradcheck(rng):
         ({"tau_min": 1.5}, "^tau_min must be above 0 and at most 1, got 1.5"),
         ({"feature_channels": ()}, "^feature_channels must be sizes of at least 1 layer,"),
         ({"rho_channels": (8, 0)}, "^rho_channels must be sizes"),
+        ({"threshold": 1.0}, "^threshold must be at least 0 and below 1, got 1.0"),
         ({"alpha": -1.0}, "^alpha must be at least 0, got -1.0"),
         ({"annealing": "exponentail"}, "^annealing: unknown 'exponentail'.*exponential"),
     ],

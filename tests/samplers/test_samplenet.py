@@ -92,6 +92,17 @@ def test_progressive_samplenet_is_nested(rng):
         assert set(output.losses) == {"simplification", "projection"}
 
 
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+def test_progressive_samplenet_adds_projection_once(reduction, rng):
+    net = ProgressiveSampleNet(16, k=3, beta=0.5, size_reduction=reduction).train()
+    sizes = net.training_sizes()
+    outputs = net.sample_sizes(torch.randn(4, 30, 3, generator=rng), sizes)
+    terms = torch.stack([outputs[m].losses["projection"] for m in sizes])
+    total = terms.sum() if reduction == "sum" else terms.mean()
+    assert len(sizes) == 4
+    torch.testing.assert_close(total, torch.tensor(0.5))  # sigma starts at 1
+
+
 @pytest.mark.parametrize(
     "arguments", [{"k": 0}, {"beta": -1.0}, {"gamma": -1.0}, {"sigma_min": -1}]
 )

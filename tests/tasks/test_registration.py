@@ -10,6 +10,7 @@ from mops_lightning.losses.registration import frobenius_chamfer_loss, quaternio
 from mops_lightning.metrics.registration import RotationError
 from mops_lightning.nets.icp import ICP
 from mops_lightning.nets.pcrnet import PCRNet
+from mops_lightning.ops.chamfer import chamfer_distance
 from mops_lightning.ops.rigid import Motion, identity_motion, quaternion_from_matrix
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
@@ -55,6 +56,16 @@ def test_step_exact_net_recovers_motions(rng):
             result.predictions.translation, true.translation, atol=1e-4, rtol=0
         )
         assert sum(result.losses.values()) < 1e-3
+
+
+def test_step_loss_takes_sampled_points(rng):
+    batch = pair_batch(*torch.randn(2, 5, 40, 3, generator=rng), motion(1))
+    sampled = batch.points[:, :8]
+    result = task(loss=frobenius_chamfer_loss).eval().step(batch, sampled)
+    source, target = sampled.chunk(2)
+    found = task().eval().net(source, target)
+    expected = chamfer_distance(found.apply(source), target).mean()
+    torch.testing.assert_close(result.losses["chamfer"], expected)
 
 
 def test_step_shifted_cloud_shifts_translation(rng):

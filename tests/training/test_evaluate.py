@@ -77,6 +77,16 @@ def test_evaluate_noise_changes_test_clouds_only(trained, tmp_path):
         assert noisy.notes[note] == record.notes[note]
 
 
+def test_evaluate_threshold_changes_generated_points(trained, tmp_path):
+    _, record = trained
+    sparse = evaluated(trained, tmp_path, "+sampler.threshold=0.02")
+    keys = ("test/m8/generated/subset_distance", "test/m8/matrix/nonzero_percent")
+    changed, same = keys
+    assert sparse.metrics[changed] != record.metrics[changed]
+    assert sparse.metrics[same] == record.metrics[same]
+    assert sparse.config["sampler"]["threshold"] == 0.02
+
+
 def test_evaluate_another_task_net(trained, tmp_path):
     overrides = [*TINY, "learn=task", "seed=5", "dataset.seed=0"]
     run(compose(overrides), tmp_path / "task", overrides)

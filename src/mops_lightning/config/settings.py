@@ -252,6 +252,10 @@ INSIDE: dict[str, dict[str, Any]] = {
     "recipe.distillation": {"limits": number("of at least 0", lambda x: x >= 0)},
     "recipe.straight_through": {"limits": SHARE_OR_NULL},
     "recipe.ema_span": {"limits": SHARE_OR_NULL},
+    "sampler.threshold": {
+        "affects": Affects.SCORES,
+        "limits": number("of at least 0 and below 1", lambda x: 0 <= x < 1),
+    },
     # Before the settings that take their values from them, so that an error names these.
     "epochs.task": {"limits": whole(1)},
     "epochs.sampler": {"limits": whole(0)},

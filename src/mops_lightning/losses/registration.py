@@ -55,8 +55,8 @@ def quaternion_loss(
     Args:
         predicted: the predicted motion between centred clouds.
         true: the true motion between centred clouds.
-        source: ``(B, N, 3)`` the centred source; unused.
-        target: ``(B, N, 3)`` the centred target; unused.
+        source: ``(B, M, 3)`` points of the centred source; unused.
+        target: ``(B, M, 3)`` points of the centred target; unused.
         translation_weight: weight of the L2 distance between translations. The paper does not
             mention this term, but without it the predicted translation would not be trained.
 
@@ -83,11 +83,14 @@ def frobenius_chamfer_loss(
 ) -> dict[str, Tensor]:
     """Return SampleNet's registration loss: ‖R̂Rᵀ − I‖²_F and a chamfer distance.
 
+    As in SampleNet's code, the chamfer distance is that of the points that the task net receives:
+    the sampled ones, or all points while the task net is trained alone.
+
     Args:
         predicted: the predicted motion between centred clouds.
         true: the true motion between centred clouds.
-        source: ``(B, N, 3)`` the centred source, all points.
-        target: ``(B, N, 3)`` the centred target, all points.
+        source: ``(B, M, 3)`` points of the centred source.
+        target: ``(B, M, 3)`` points of the centred target.
         chamfer_weight: weight of the chamfer distance between moved source and target.
 
     Returns:

@@ -66,7 +66,8 @@ class RotationErrorP90(RotationError):
 class DoubledRotationError(RotationError):
     """Twice the mean rotation error, in degrees.
 
-    The code of PCRNet and SampleNet reports it: 2·acos(2⟨q₁, q₂⟩² − 1).
+    SampleNet's registration code reports it: 2·acos(2⟨q₁, q₂⟩² − 1). The geodesic angle is
+    acos(2⟨q₁, q₂⟩² − 1).
     """
 
     name = "rotation_error_doubled_deg"

@@ -33,6 +33,9 @@ class MOPSNet(Sampler):
         feature_channels: sizes of the pointwise layers; the last is that of the local and the
             global feature.
         rho_channels: sizes of the hidden layers of ρ.
+        threshold: in evaluation, entries of S below it count as zero, as ``SamplingMatrix.sparse``
+            drops them (paper section "Efficient Regression of the Sampled Set", with 0.01); 0 keeps
+            all. Sampling in chunks keeps all.
 
     Raises:
         UserError: an argument is out of range.
@@ -58,6 +61,7 @@ class MOPSNet(Sampler):
         annealing: Literal["exponential", "linear"] = "exponential",
         feature_channels: Sequence[int] = (64, 64, 64, 128, 128),
         rho_channels: Sequence[int] = (512, 256, 128),
+        threshold: float = 0.0,
     ) -> None:
         super().__init__(m)
         if not 0 < tau_min <= 1:
@@ -69,7 +73,10 @@ class MOPSNet(Sampler):
             raise UserError(f"annealing: unknown {annealing!r}.{hint}")
         check_channels("feature_channels", feature_channels)
         check_channels("rho_channels", rho_channels)
+        if not 0 <= threshold < 1:
+            raise UserError(f"threshold must be at least 0 and below 1, got {threshold}.")
         self.alpha = alpha
+        self.threshold = threshold
         self.tau_min = tau_min
         self.annealing = annealing
         self.training_tau = 1.0
@@ -130,7 +137,11 @@ class MOPSNet(Sampler):
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Generate points; see ``Sampler.forward``."""
         matrix = self.sampling_matrix(points).leftmost(m)
-        return SampleOutput(matrix.sample(points), None, {}, matrix)
+        if self.threshold and not self.training:
+            sampled = torch.bmm(matrix.sparse(self.threshold).mT, points)
+        else:
+            sampled = matrix.sample(points)
+        return SampleOutput(sampled, None, {}, matrix)
 
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]

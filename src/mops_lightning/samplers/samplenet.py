@@ -109,9 +109,12 @@ class SampleNet(SNet):
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]
     ) -> dict[int, dict[str, Tensor]]:
-        """Return, at every size, the weighted simplification loss and β·σ."""
-        projection = {"projection": self.beta * self.sigma}
+        """Return the weighted simplification loss at every size, and β·σ once over all sizes."""
         losses = super().losses(points, output, sizes)
+        # The publication adds β·σ once per step. Every size has the share that makes the sum or
+        # the mean over the sizes β·σ.
+        share = 1.0 if self.size_reduction == "mean" else 1 / len(losses)
+        projection = {"projection": share * self.beta * self.sigma}
         return {m: {**terms, **projection} for m, terms in losses.items()}
 
 

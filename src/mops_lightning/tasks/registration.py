@@ -36,8 +36,8 @@ class Registration(Task):
     Args:
         net: maps sources ``(B, M, 3)`` and targets ``(B, M, 3)`` to a ``Motion``.
         pairs: makes the training and test pairs.
-        loss: takes the predicted and the true motion and the two centred clouds ``(B, N, 3)``;
-            returns its terms by name.
+        loss: takes the predicted and the true motion between the centred clouds, and the sampled
+            points ``(B, M, 3)`` of source and target; returns its terms by name.
 
     Raises:
         UserError: ``pairs`` or ``loss`` is None.
@@ -98,7 +98,7 @@ class Registration(Task):
         from_source, from_target = batch.centroids.chunk(2)
         # The true motion between the centred clouds: R·(p + c) + t = R·p + (R·c + t).
         shift = true.apply(from_source[:, None])[:, 0] - from_target
-        losses = self.loss(found, true._replace(translation=shift), *batch.points.chunk(2))
+        losses = self.loss(found, true._replace(translation=shift), *points.chunk(2))
         turned = found._replace(translation=from_target).apply(-from_source[:, None])[:, 0]
         predicted = Motion(found.quaternion, found.translation + turned)
         return TaskOutput(losses, predicted, true, found)

@@ -12,6 +12,8 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from mops_lightning.config import settings
+from mops_lightning.config.declaration import Affects
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
@@ -147,7 +149,7 @@ def _same_settings(
         )
     for key in sorted({*there["sampler"], *here["sampler"]}) if cfg.learn != "task" else ():
         old, new = there["sampler"].get(key), here["sampler"].get(key)
-        if old != new:
+        if old != new and Affects.TRAINING in settings.of(f"sampler.{key}").affects:
             hint = (
                 ""
                 if key != "m"
