@@ -59,6 +59,11 @@ def test_axes_two_differing_settings_give_plane_per_sampler(tmp_path):
         ["alpha \\ tau", "0.5", "0.9"],
         ["0.1", "1 / 2", "1 / 2"],
         ["1.0", "1.5 / 2", "1.9 / 2"],
+        ["window", "generated", "matched"],
+        ["samplenet, beta 0.1 to 1, gamma 1e-05", "10", "1"],
+        ["samplenet, beta 0.1 to 1, gamma 0.001", "9.91", "1"],
+        ["samplenet, beta 0.1 to 1, gamma 0.1", "5.5", "1"],
+        ["mops, alpha 0.1 to 1, tau 0.5 to 0.9", "1.9", "1"],
     ]
     assert "of mops: reconstruction on shapes, m=32, under autoencoder" in text
     assert "plane of mops: generated 1 to 1.9 (factor 1.9), matched 2 to 2 (factor 1)." in text

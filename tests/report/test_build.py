@@ -53,6 +53,7 @@ def test_build_registration_shows_degrees_and_icp_last(tmp_path):
     ]
     assert "pcrnet on all points: 7.50 (the paper: 7.21)." in text
     assert "icp on all points: 7.50." in text
+    assert "The paper does not say whether its angles are geodesic" in text
 
 
 def test_build_joint_registration_shows_paper_joint_table(tmp_path):

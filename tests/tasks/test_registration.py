@@ -59,12 +59,12 @@ def test_step_exact_net_recovers_motions(rng):
 
 
 def test_step_loss_takes_sampled_points(rng):
-    batch = pair_batch(*torch.randn(2, 5, 40, 3, generator=rng), motion(1))
+    source, target = torch.randn(2, 5, 40, 3, generator=rng)
+    batch = pair_batch(source, target, motion(1))
     sampled = batch.points[:, :8]
     result = task(loss=frobenius_chamfer_loss).eval().step(batch, sampled)
-    source, target = sampled.chunk(2)
-    found = task().eval().net(source, target)
-    expected = chamfer_distance(found.apply(source), target).mean()
+    few, others = sampled.chunk(2)
+    expected = chamfer_distance(task().eval().net(few, others).apply(few), others).mean()
     torch.testing.assert_close(result.losses["chamfer"], expected)
 
 

@@ -15,6 +15,7 @@ from mops_lightning.report.comparable import shared_names
 from mops_lightning.report.nets import nets_grid
 from mops_lightning.report.provenance import provenance, without_result
 from mops_lightning.report.text import PAPER, Grid
+from mops_lightning.report.windows import equal_ratios
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,11 @@ def build(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Rep
 
 def _grids(found: list[Record], table: Cells, names: dict[str, str], layout: Axes) -> list[Grid]:
     """Return the texts of one metric's table, with the values of full clouds."""
-    grids = _planes(table, names, layout) if layout.planes else [_by_column(table, names, layout)]
+    if layout.planes:
+        compared = equal_ratios(table, layout.planes)
+        grids = [*_planes(table, names, layout), *([compared] if compared else [])]
+    else:
+        grids = [_by_column(table, names, layout)]
     if layout.column == "m":
         grids[-1].below += _full_lines(found, names, table.metric)
     else:
@@ -91,13 +96,14 @@ def _by_column(table: Cells, names: dict[str, str], layout: Axes) -> Grid:
         if any(str(column) in theirs for column in columns):
             values = [theirs.get(str(column), []) for column in columns]
             rows.append([PAPER, *(" / ".join(f"{one:.2f}" for one in cell) for cell in values)])
+    below = [published["note"]] if "note" in published and any(r[0] == PAPER for r in rows) else []
     size = "" if layout == Axes() else f", m={names['m']},"
     title = (
         f"Test {table.metric.title}: {names['task']} on {names['dataset']}{size} "
         f"under {names['net']}; generated / matched / completed sets, or one figure for "
         "samplers that choose input points."
     )
-    return Grid(title, ["sampled by", *(f"{layout.column}={one}" for one in columns)], rows)
+    return Grid(title, ["sampled by", *(f"{layout.column}={one}" for one in columns)], rows, below)
 
 
 def _planes(table: Cells, names: dict[str, str], layout: Axes) -> list[Grid]:
