@@ -1,13 +1,26 @@
-"""PointNet vanilla, the task net for classification.
+"""PointNet for classification: vanilla, the paper's task net, and with transform nets.
 
 Qi et al., "PointNet: Deep Learning on Point Sets for 3D Classification and Segmentation", CVPR
 2017.
 """
 
+import torch
 from torch import Tensor, nn
 
 from mops_lightning.nets.layers import PointMLP, linear_norm_relu
 from mops_lightning.nets.max_pool import PointMaxPool
+
+
+def classifier_head(num_classes: int, dropout: float) -> nn.Sequential:
+    """Return PointNet's layers from the pooled feature ``(B, 1024)`` to logits.
+
+    Args:
+        num_classes: number of logits.
+        dropout: dropout probability before the last layer.
+    """
+    return nn.Sequential(
+        *linear_norm_relu([1024, 512, 256]), nn.Dropout(dropout), nn.Linear(256, num_classes)
+    )
 
 
 class PointNetVanilla(nn.Module):
@@ -25,9 +38,7 @@ class PointNetVanilla(nn.Module):
         super().__init__()
         self.features = PointMLP([3, 64, 64, 64, 128])
         self.pool = PointMaxPool(128, 1024)
-        self.head = nn.Sequential(
-            *linear_norm_relu([1024, 512, 256]), nn.Dropout(dropout), nn.Linear(256, num_classes)
-        )
+        self.head = classifier_head(num_classes, dropout)
 
     def forward(self, points: Tensor) -> Tensor:
         """Map ``(B, N, 3)`` points to ``(B, num_classes)`` logits."""
@@ -40,3 +51,55 @@ class PointNetVanilla(nn.Module):
     def from_pooled(self, pooled: Tensor) -> Tensor:
         """Map the maxima ``(B, 1024)`` to logits."""
         return self.head(pooled)
+
+
+class TransformNet(nn.Module):
+    """Predicts a square matrix for every cloud, the identity before training.
+
+    Args:
+        size: number of rows of the matrix and channels of the input.
+    """
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.features = PointMLP([size, 64, 128])
+        self.pool = PointMaxPool(128, 1024)
+        self.head = nn.Sequential(*linear_norm_relu([1024, 512, 256]), nn.Linear(256, size * size))
+        self.size = size
+        last = self.head[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        with torch.no_grad():
+            last.bias.copy_(torch.eye(size).flatten())
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map ``(B, N, size)`` to ``(B, size, size)``."""
+        matrix = self.head(self.pool(self.features(features)))
+        return matrix.unflatten(1, (self.size, self.size))
+
+
+class PointNetTransform(nn.Module):
+    """PointNet with transform nets for the points and for the features of 64 channels.
+
+    The published loss also keeps the feature transform near a rotation (weight 0.001), which is
+    left out. Accepts any number of points.
+
+    Args:
+        num_classes: number of logits.
+        dropout: dropout probability.
+    """
+
+    def __init__(self, num_classes: int, dropout: float = 0.3) -> None:
+        super().__init__()
+        self.first = PointMLP([3, 64, 64])
+        self.point_transform = TransformNet(3)
+        self.feature_transform = TransformNet(64)
+        self.features = PointMLP([64, 64, 128])
+        self.pool = PointMaxPool(128, 1024)
+        self.head = classifier_head(num_classes, dropout)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Map ``(B, N, 3)`` points to ``(B, num_classes)`` logits."""
+        features = self.first(points @ self.point_transform(points))
+        features = features @ self.feature_transform(features)
+        return self.head(self.pool(self.features(features)))

@@ -1,0 +1,68 @@
+"""What every classifier guarantees. A new net adds one line to NETS."""
+
+import pytest
+import torch
+
+from mops_lightning.errors import UserError
+from mops_lightning.nets.dgcnn import DGCNN, EdgeConv, max_of_rows
+from mops_lightning.nets.pointnet import PointNetTransform, PointNetVanilla, TransformNet
+
+NETS = {"pointnet": PointNetVanilla, "pointnet_transform": PointNetTransform, "dgcnn": DGCNN}
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_logits_are_independent_of_order_and_batch(name, rng):
+    torch.manual_seed(0)
+    net = NETS[name](5).eval()
+    points = torch.randn(3, 60, 3, generator=rng)
+    logits = net(points)
+    assert logits.shape == (3, 5)
+    order = torch.randperm(60, generator=rng)
+    torch.testing.assert_close(net(points[:, order]), logits, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(net(points[1:2]), logits[1:2], atol=1e-5, rtol=1e-4)
+    assert net(points[:, :1]).shape == (3, 5)
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_all_parameters_have_gradients(name, rng):
+    torch.manual_seed(0)
+    net = NETS[name](5)
+    for module in net.modules():
+        if isinstance(module, TransformNet):  # its last weights are zero, which stops gradients
+            torch.nn.init.normal_(list(module.head.parameters())[-2], std=0.01)
+    net(torch.randn(4, 60, 3, generator=rng)).square().sum().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in net.parameters())
+
+
+def test_transform_net_starts_at_identity(rng):
+    matrix = TransformNet(4)(torch.randn(3, 20, 4, generator=rng))
+    torch.testing.assert_close(matrix, torch.eye(4).expand(3, 4, 4))
+
+
+def test_edge_conv_equals_published_form_without_norm(rng):
+    torch.manual_seed(0)
+    layer = EdgeConv(3, 6, k=5).eval()  # untrained BatchNorm divides by sqrt(1 + eps)
+    points = torch.randn(2, 20, 3, generator=rng)
+    near = torch.cdist(points, points).topk(5, largest=False).indices
+    others = points[torch.arange(2)[:, None, None], near]  # (B, N, k, 3)
+    edges = layer.own(points)[:, :, None] + layer.edge(others - points[:, :, None])
+    expected = (edges.amax(2) / (1 + layer.norm.eps) ** 0.5).relu()
+    torch.testing.assert_close(layer(points), expected, atol=1e-5, rtol=1e-4)
+
+
+def test_max_of_rows_equals_maximum_of_gathered_rows(rng):
+    features = torch.randn(2, 20, 6, generator=rng, requires_grad=True)
+    rows = torch.randint(20, (2, 9, 4), generator=rng)
+    gathered = features[torch.arange(2)[:, None, None], rows].amax(2)
+    found = max_of_rows(features, rows)
+    torch.testing.assert_close(found, gathered)
+    weight = torch.randn(found.shape, generator=rng)
+    expected = torch.autograd.grad((gathered * weight).sum(), features)
+    torch.testing.assert_close(torch.autograd.grad((found * weight).sum(), features), expected)
+
+
+def test_dgcnn_bad_arguments_raise():
+    with pytest.raises(UserError, match="k must be at least 1, got 0"):
+        DGCNN(5, k=0)
+    with pytest.raises(UserError, match="edge_channels must be"):
+        DGCNN(5, edge_channels=())
