@@ -92,7 +92,7 @@ class NonzeroPercent(SetMetric):
 
 
 class OrthogonalityError(SetMetric):
-    """‖SᵀS − I‖_F, which the paper's Eq. (3) makes small; undefined without S."""
+    """‖SᵀS − I‖_F, which the paper's Eq. (3) bounds; undefined without S."""
 
     name = "orthogonality_error"
     group = "matrix"
