@@ -84,6 +84,8 @@ def test_task_net_alone_has_no_size():
 
 
 def test_rows_are_baselines_readouts_full():
-    names = ("full", "matched", "fps", "generated", "random")
-    rows = readout_rows({f"test/{name}/accuracy": 0.5 for name in names})
-    assert list(rows) == ["fps", "random", "generated", "matched", "full"]
+    names = ("full", "refined", "matched", "fps", "generated", "random")
+    metrics: dict[str, float | None] = {f"test/{name}/accuracy": 0.5 for name in names}
+    order = ["fps", "random", "generated", "matched", "refined", "full"]
+    assert list(readout_rows(metrics)) == order
+    assert "mops refined (with the task net)" in printed(metrics, "test/generated/accuracy")

@@ -43,3 +43,18 @@ def test_cells_unknown_metric_is_refused(tmp_path):
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
     with pytest.raises(UserError, match=r"--metric: no run has 'acuracy'.*accuracy"):
         table(tmp_path, "acuracy")
+
+
+def test_cells_refined_samples_have_row_of_their_own(tmp_path):
+    metrics = {"test/full/accuracy": 0.9}
+    for m in (8, 32):
+        metrics |= {f"test/m{m}/{name}/accuracy": m / 100 for name in ("sampled", "refined")}
+    put(tmp_path, "fps", 32, metrics)
+    put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.3, "test/refined/accuracy": 0.7})
+    ours = [row for row in rows(table(tmp_path)) if "paper" not in row[0]]
+    assert ours[1:] == [
+        ["fps", "32.00", "8.00"],
+        ["fps refined (with the task net)", "32.00", "8.00"],
+        ["mops", "30.00", ""],
+        ["mops refined (with the task net)", "70.00", ""],
+    ]

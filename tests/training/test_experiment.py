@@ -135,6 +135,15 @@ def test_test_generating_unlearned_sampler_has_three_readouts():
     assert run.callback_metrics["test/generated/subset_distance"] > 0
 
 
+def test_test_refine_adds_readout():
+    data = small_dataset()
+    run = quiet_trainer(2)
+    module = experiment(refine=1)
+    run.test(module, CloudLoader(data.test, 4), verbose=False)
+    assert "test/refined/accuracy" in run.callback_metrics
+    assert module.score_name == "test/generated/accuracy"
+
+
 def test_fit_same_seed_gives_same_weights():
     first, second = (fit(experiment("joint")).state_dict() for _ in range(2))
     assert all(torch.equal(first[name], second[name]) for name in first)

@@ -45,5 +45,23 @@ def test_readouts_index_sampler_has_sampled_only(rng):
         assert torch.equal(samples["sampled"], sampler(points, m).points)
 
 
+@pytest.mark.parametrize("sampler", [FPSSampler(8), MOPSNet(8, **SMALL)])
+@torch.no_grad()
+def test_readouts_refine_starts_from_distinct_rows(sampler, rng):
+    points = torch.randn(3, 60, 3, generator=rng)
+    started = {}
+
+    def refine(rows):
+        started.update(rows)
+        return {m: 59 - one for m, one in rows.items()}
+
+    outputs = sampler.eval().sample_sizes(points, (8,))
+    samples = readouts(points, outputs, sampler, refine)[8]
+    *names, last = samples
+    assert last == "refined"
+    assert torch.equal(gather_points(points, started[8]), samples[names[-1]])
+    assert torch.equal(samples["refined"], gather_points(points, 59 - started[8]))
+
+
 def test_readout_names_without_sampler_is_full():
     assert readout_names(None) == ("full",)

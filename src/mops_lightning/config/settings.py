@@ -152,6 +152,17 @@ class RunSettings:
             limits=number("of at least 0", lambda x: x >= 0),
         ),
     )
+    refine: int = field(
+        default=0,
+        metadata=about(
+            "passes of exchanges that improve the tested points by asking the task net (readout "
+            "refined; slow); 0 leaves it out",
+            Affects.SCORES,
+            limits=whole(0),
+            learn=WITH_SAMPLER,
+            compare=False,  # its results have rows of their own
+        ),
+    )
     pictures: int = field(
         default=4,
         metadata=about(

@@ -6,12 +6,14 @@ GENERATED_READOUTS = ("generated", "matched", "completed")
 """The sampler's output; its nearest input points; these made unique and completed by FPS."""
 INDEX_READOUT = "sampled"
 """The only readout of samplers that choose input points."""
+REFINED = "refined"
+"""The completed or sampled points, improved by asking the task net."""
 FULL = "full"
 """The cloud before sampling: an upper bound for the task net."""
 SOFT_PROJECTED = "soft_projected"
 """Input of SampleNet's task net in training; logged under ``train/`` only, never a result."""
 
-ROWS = (*GENERATED_READOUTS, INDEX_READOUT, FULL)
+ROWS = (*GENERATED_READOUTS, INDEX_READOUT, REFINED, FULL)
 """Readouts in the order of tables, after the baselines."""
 
 

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mops_lightning.records.metric_info import in_summary_order, metric_info
-from mops_lightning.records.readout_names import FULL, ROWS, parse
+from mops_lightning.records.readout_names import FULL, REFINED, ROWS, parse
 from mops_lightning.records.run_record import FILE
 
 Rows = dict[str, dict[str, float | None]]
@@ -83,6 +83,7 @@ def results_table(record: dict[str, Any]) -> tuple[str, Table]:
         if all(value is None for value in values.values()):
             continue  # metrics of the sampled set only
         label = f"{names['sampler']} {readout}" if readout in ROWS[:-1] else readout
+        label += " (with the task net)" if readout == REFINED else ""
         cells = [
             "" if value is None else columns[column][1].format(value)
             for column, value in values.items()

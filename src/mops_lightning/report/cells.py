@@ -7,12 +7,22 @@ from typing import Any
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import metric_info
-from mops_lightning.records.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT, parse
+from mops_lightning.records.readout_names import (
+    FULL,
+    GENERATED_READOUTS,
+    INDEX_READOUT,
+    REFINED,
+    parse,
+)
 from mops_lightning.report.axes import Axes, row, value
 from mops_lightning.report.collect import Record, sampler_row, seed, trained_with
 
 Column = Any
 """A size, a value of another setting, or a pair of values in a heat map."""
+
+
+WITH_NET = f" {REFINED} (with the task net)"
+"""End of the name of a row of refined samples."""
 
 
 @dataclass
@@ -96,15 +106,20 @@ def _add(table: Cells, record: Record, net: str, axes: Axes) -> None:
             column = tuple(value(record, key) for key in axes.planes[own_row])
         elif axes.column == "m":
             column = parts.m or column
-        if parts.readout in (INDEX_READOUT, *GENERATED_READOUTS):
-            place, readout = (own_row, column), parts.readout
+        if parts.readout in (INDEX_READOUT, *GENERATED_READOUTS, REFINED):
+            refined = parts.readout == REFINED
+            if axes.planes and refined:
+                continue
+            own, readout = own_row + WITH_NET * refined, parts.readout
+            readout = INDEX_READOUT if refined else readout
+            place = (own, column)
             if place not in table.own:  # replaces values of a baseline
-                table.values.setdefault(own_row, {})[column] = {}
+                table.values.setdefault(own, {})[column] = {}
                 table.own.add(place)
-            values = table.values[own_row][column].setdefault(readout, {})
+            values = table.values[own][column].setdefault(readout, {})
             if seed(record) in values:
                 raise UserError(
-                    f"Two runs of {own_row} have {axes.column}={column} and seed={seed(record)}; "
+                    f"Two runs of {own} have {axes.column}={column} and seed={seed(record)}; "
                     f"the second is {record['folder']}. Give a folder with one of each."
                 )
         else:
@@ -148,6 +163,7 @@ ORDER = (
 
 def sort_key(row: str) -> tuple[int, str]:
     """Return a key that sorts rows as the paper's tables do."""
-    name = row.rsplit(" ", 1)[-1]  # after "icp on"
+    plain = row.removesuffix(WITH_NET)
+    name = plain.rsplit(" ", 1)[-1]  # after "icp on"
     number = ORDER.index(name) if name in ORDER else len(ORDER)
-    return number + len(ORDER) * (name != row) * 2, row
+    return number + len(ORDER) * (name != plain) * 2, row

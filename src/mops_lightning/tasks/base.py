@@ -78,6 +78,17 @@ class Task(nn.Module):
         """
         raise NotImplementedError
 
+    def predict_pooled(self, batch: Any, pooled: Tensor) -> Tensor:
+        """Return what ``predict`` returns, from the pooled features of the points.
+
+        Only tasks whose prediction follows from them implement this; the refined readout needs it.
+
+        Args:
+            batch: from ``make_batch``.
+            pooled: ``(R, C)`` maxima over the net's ``point_features``.
+        """
+        raise NotImplementedError
+
     def disagreement(self, found: Any, reference: Any) -> Tensor:
         """Return how far predictions are from the reference, one value ``(B,)`` per cloud.
 

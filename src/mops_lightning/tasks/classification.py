@@ -1,5 +1,7 @@
 """Classification of sampled clouds (paper section "Classification-oriented Downsampling")."""
 
+from typing import Any
+
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torchmetrics import MetricCollection
@@ -37,6 +39,11 @@ class Classification(Task):
     def predict(self, batch: Batch, points: Tensor) -> Tensor:
         """Return the logits ``(B, num_classes)`` of ``(B, M, 3)`` points."""
         return self.net(points)
+
+    def predict_pooled(self, batch: Batch, pooled: Tensor) -> Tensor:
+        """Return the logits ``(R, num_classes)`` of pooled features ``(R, C)``."""
+        net: Any = self.net
+        return net.from_pooled(pooled)
 
     def disagreement(self, found: Tensor, reference: Tensor) -> Tensor:
         """Return the Kullback-Leibler divergence KL(reference ‖ found) of the classes."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -77,6 +77,11 @@ class Reconstruction(Task):
     def predict(self, batch: Batch, points: Tensor) -> Tensor:
         """Return reconstructions ``(B, N, 3)`` of the clouds from ``(B, M, 3)`` points."""
         return self.net(points, batch.points.shape[1])
+
+    def predict_pooled(self, batch: Batch, pooled: Tensor) -> Tensor:
+        """Return reconstructions ``(R, N, 3)`` from codewords ``(R, C)``."""
+        net: Any = self.net
+        return net.from_pooled(pooled, batch.points.shape[1])
 
     def disagreement(self, found: Tensor, reference: Tensor) -> Tensor:
         """Return the chamfer distance of two reconstructions."""

@@ -5,6 +5,7 @@ Per batch: loader, ``sampler.sample_sizes``, ``readouts``, ``task.step``, losses
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import lightning as L
@@ -15,10 +16,11 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
-from mops_lightning.records.readout_names import FULL, SOFT_PROJECTED, size_prefix
+from mops_lightning.records.readout_names import FULL, REFINED, SOFT_PROJECTED, size_prefix
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
+from mops_lightning.tasks.refinement import Refinement
 from mops_lightning.training.divergence import check_checkpoint, check_loss
 from mops_lightning.training.learn import Learn, check_learn
 from mops_lightning.training.readouts import readout_names, readouts
@@ -46,10 +48,11 @@ class Experiment(L.LightningModule):
             several, the metrics are named ``test/m32/generated/accuracy`` and so on.
         recipe: how the sampler is trained beyond its own losses; None: by these alone.
         task_lr_scale: with ``learn="joint"`` the task net's learning rate over that of the sampler.
+        refine: passes of the refined readout in tests; 0: without this readout.
         m: the size that is validated and gives the run's score; None: the sampler's.
 
     Raises:
-        UserError: see ``check_learn``.
+        UserError: see ``check_learn`` and ``Refinement``.
     """
 
     def __init__(
@@ -66,6 +69,7 @@ class Experiment(L.LightningModule):
         m: int | None = None,
         task_lr_scale: float = 1.0,
         recipe: Recipe | None = None,
+        refine: int = 0,
     ) -> None:
         super().__init__()
         check_learn(learn, task, sampler)
@@ -91,6 +95,8 @@ class Experiment(L.LightningModule):
         self.main_readout, *others = readout_names(self.sampler)
         score = task.full_score or task.score if self.sampler is None else task.score
         self.score_name = f"test/{self.prefixes.get(self.m, '')}{self.main_readout}/{score}"
+        self.refinement = Refinement(task, refine) if refine and self.sampler is not None else None
+        others += [] if self.refinement is None else [REFINED]
         names = dict.fromkeys([self.main_readout, *others, *self.baselines, FULL])
         self.scores = Scores(task.metrics, names, self.prefixes.values())
         self.train_scores = task.metrics(training=True)
@@ -255,7 +261,8 @@ class Experiment(L.LightningModule):
         """Score the learned readouts and the baselines at every size, and the full clouds."""
         with full_precision(self.device.type):
             outputs = self._sample(batch.points, self.sizes)
-            samples = readouts(batch.points, outputs, self.sampler)
+            refine = None if self.refinement is None else partial(self.refinement, batch)
+            samples = readouts(batch.points, outputs, self.sampler, refine)
             for name, baseline in self.baselines.items():
                 assert isinstance(baseline, Sampler)
                 for m, output in baseline.sample_sizes(batch.points, self.sizes).items():

@@ -53,6 +53,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         sizes=sizes,
         m=cfg.m,
         task_lr_scale=cfg.task_lr_scale,
+        refine=cfg.refine,
         recipe=_recipe(cfg) if sampler is not None and sampler.learned else None,
     )
 
