@@ -12,8 +12,11 @@ import torch
 from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
 from mops_lightning.downsample_files.cluster import cluster, engine_of, environment_kept
-from mops_lightning.downsample_files.large import by_chunks
+from mops_lightning.downsample_files.large import by_chunks, in_turn
+from mops_lightning.downsample_files.scene import sample_scene
+from mops_lightning.downsample_files.settings import Settings
 from mops_lightning.errors import UserError
+from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.zoo import weights
 from tests.support.downsample import call
@@ -53,13 +56,23 @@ def same(one: Table, other: Table) -> None:
 
 @pytest.mark.parametrize("readout", ["generated", "matched"])
 def test_workers_equal_one_process(readout, client, scan):
-    here, number, _ = by_chunks(scan[0], scan[1], 24, 300, readout, True)
-    there, same_number, left_out = by_chunks(
+    here, number, *_ = by_chunks(scan[0], scan[1], 24, 300, readout, True)
+    there, same_number, left_out, _ = by_chunks(
         scan[0], scan[1], 24, 300, readout, True, engine_of(client)
     )
     assert (number, same_number, left_out) == (2780, 2780, 220)
     # Threads differ between the two, and with them the order of sums.
     np.testing.assert_allclose(there.points, here.points, atol=1e-5 * np.ptp(here.points))
+
+
+def test_workers_sample_tiles_like_one_process(client, scan, tmp_path):
+    settings = Settings(500, method="fps", keep_attributes=True, chunk=700, tile=128)
+    sampler = FPSSampler(500)
+    here = sample_scene(scan[0], tmp_path / "out.ply", sampler, settings, in_turn)
+    there = sample_scene(scan[0], tmp_path / "out.ply", sampler, settings, engine_of(client))
+    assert len(here.table.points) == 500
+    assert here[1:] == there[1:]
+    same(here.table, there.table)
 
 
 def test_killed_worker_leaves_result_unchanged(client, scan):

@@ -64,10 +64,13 @@ def process_file(source: Path, target: Path, settings: Settings, engine: Any) ->
     result = attempt(source, target, settings, None, with_progress)
     if isinstance(result, UserError):
         raise result
-    written, number, dropped = result
+    written, number, dropped, seams = result
     more = f" ({dropped:,} more without finite coordinates left out)" if dropped else ""
     seconds = time.perf_counter() - start
-    print(f"{target}: {written:,} of {number:,} points{more}, {seconds:.1f} s")
+    close = ""
+    if seams is not None:
+        close = f", {seams.after:,} of {seams.before:,} close pairs at seams left"
+    print(f"{target}: {written:,} of {number:,} points{more}{close}, {seconds:.1f} s")
 
 
 def process_folder(

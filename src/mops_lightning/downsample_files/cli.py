@@ -49,6 +49,7 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
     add("source", metavar="IN", type=Path, help="a file or a folder")
     add("target", metavar="OUT", type=Path, help="a file or a folder")
     add("--m", type=int, help="number of points to keep; default: as the weights were trained for")
+    add("--ratio", type=float, help="with tiles: the share of the points to keep, instead of --m")
     add("--weights", type=Path, help="weights.pt of a trained sampler, or the folder of its run")
     add("--method", choices=METHODS, help="an untrained method, instead of --weights")
     add(
@@ -66,6 +67,14 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
         default=1,
         help="processes that share a folder's files, or with --cluster local their chunks",
     )
+    add(
+        "--tile",
+        type=int,
+        metavar="POINTS",
+        help="cut large scenes into tiles of up to so many points (a balanced kd-tree), sample "
+        "each as in training, and keep --m points in total",
+    )
+    add("--tile-size", type=float, metavar="SIDE", help="the same with cubes, in the file's unit")
     add("--chunk", type=int, help="points to read at a time, for clouds larger than memory")
     add(
         "--cluster",
@@ -117,6 +126,9 @@ def _settings(chosen: argparse.Namespace) -> Settings:
         chosen.surface,
         chosen.seed,
         chosen.chunk,
+        chosen.tile,
+        chosen.tile_size,
+        chosen.ratio,
     )
 
 

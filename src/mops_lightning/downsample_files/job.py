@@ -2,7 +2,7 @@
 
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,6 +11,8 @@ from mops_lightning.data.formats.errors import check_size
 from mops_lightning.data.formats.registry import read, write
 from mops_lightning.data.formats.table import Table
 from mops_lightning.downsample_files.large import Engine, Kept, by_chunks, in_turn
+from mops_lightning.downsample_files.scene import sample_scene
+from mops_lightning.downsample_files.seams import Seams
 from mops_lightning.downsample_files.settings import Settings
 from mops_lightning.downsample_files.unit_sphere import largest_distance, sum_of, unit_sphere
 from mops_lightning.errors import UserError
@@ -26,6 +28,26 @@ from mops_lightning.zoo.load import load
 
 CHUNK = 65536
 """Number of points that a learned sampler processes at a time; it bounds the memory of features."""
+
+
+ANY_SIZE = 2**31 - 1
+"""The largest sample of an untrained method that is asked for a ratio."""
+
+
+class Outcome(NamedTuple):
+    """What became of a file.
+
+    Attributes:
+        written: number of points that were written.
+        number: how many points with finite coordinates the cloud has.
+        dropped: how many it has without.
+        seams: close pairs at the seams of tiles.
+    """
+
+    written: int
+    number: int
+    dropped: int
+    seams: Seams | None = None
 
 
 @cache
@@ -44,13 +66,18 @@ def sampler_of(settings: Settings) -> Sampler:
             "poisson": PoissonSampler,
         }
         own = {} if settings.method == "voxel" else {"seed": settings.seed}
-        return classes[settings.method](settings.m, **own)
+        return classes[settings.method](settings.m or ANY_SIZE, **own)
     assert settings.weights is not None
     try:
         sampler = load(settings.weights)
     except UserError as error:
         raise UserError(f"--weights: {error}") from None
-    m = settings.m
+    if settings.tiled and not sampler.flexible:
+        raise UserError(
+            f"--weights: tiles need a sampler of every size, such as FMOPS-Net; "
+            f"{settings.weights} is a {type(sampler).__name__} for {sampler.m} points."
+        )
+    m = None if settings.tiled else settings.m  # a tile keeps a part of them
     if m is not None and (m > sampler.m or (m != sampler.m and not sampler.flexible)):
         allowed = f"up to {sampler.m}" if sampler.flexible else f"{sampler.m}"
         raise UserError(
@@ -60,21 +87,17 @@ def sampler_of(settings: Settings) -> Sampler:
     return sampler
 
 
-def run(
-    source: Path, target: Path, settings: Settings, engine: Engine = in_turn
-) -> tuple[int, int, int]:
+def run(source: Path, target: Path, settings: Settings, engine: Engine = in_turn) -> Outcome:
     """Downsample one file into another.
-
-    Returns:
-        How many points were written, how many points with finite coordinates the cloud has, and how
-        many without.
 
     Raises:
         UserError: the file holds no cloud, or one of too few points.
     """
     sampler = sampler_of(settings)
     m = settings.m or sampler.m
-    if settings.chunk:
+    if settings.tiled:
+        kept = sample_scene(source, target, sampler, settings, engine)
+    elif settings.chunk:
         kept = by_chunks(
             source, sampler, m, settings.chunk, settings.readout, settings.keep_attributes, engine
         )
@@ -86,7 +109,7 @@ def run(
         chosen = sampled(source, finite, sampler, m, settings)
         kept = Kept(chosen, number, len(table.points) - number)
     write(target, kept.table)
-    return len(kept.table.points), kept.number, kept.dropped
+    return Outcome(len(kept.table.points), kept.number, kept.dropped, kept.seams)
 
 
 def sampled(source: Path, table: Table, sampler: Sampler, m: int, settings: Settings) -> Table:

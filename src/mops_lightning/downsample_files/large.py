@@ -19,6 +19,7 @@ from mops_lightning.data.formats.cloud_file import CloudFile
 from mops_lightning.data.formats.errors import check_size
 from mops_lightning.data.formats.registry import open_cloud_file
 from mops_lightning.data.formats.table import Table
+from mops_lightning.downsample_files.seams import Seams
 from mops_lightning.downsample_files.unit_sphere import (
     UnitSphere,
     largest_distance,
@@ -72,11 +73,13 @@ class Kept(NamedTuple):
         table: the sampled points.
         number: how many points with finite coordinates the file has.
         dropped: how many it has without.
+        seams: close pairs at the seams of tiles.
     """
 
     table: Table
     number: int
     dropped: int
+    seams: Seams | None = None
 
 
 def by_chunks(
