@@ -11,7 +11,7 @@ from mops_lightning.config.compose import compose
         ("++sampler.alpha=3", "sampler.alpha", "sampler.alpha"),
         ("~task.pairs", "task.pairs", "task.pairs"),
         ("task/net=icp", "task/net", "task.net"),
-        ("optimizer@pretrain.optimizer=x", "optimizer@pretrain.optimizer", "pretrain.optimizer"),
+        ("optimizer@pretrain=x", "optimizer@pretrain", "pretrain"),
         ("m=4,8", "m", "m"),
         ("out=it's (1), = ~", "out", "out"),
         ("--cfg", "", ""),

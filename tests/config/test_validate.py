@@ -24,6 +24,7 @@ def choices():
 EXTRA = {
     "dataset=meshes": ["dataset.root=somewhere"],
     "dataset=hdf5": ["dataset.root=somewhere"],
+    "dataset=clouds": ["dataset.root=somewhere"],
     "dataset=mesh_sequence": ["dataset.root=somewhere"],
     "task/loss=quaternion": ["task=registration"],
     "task/loss=frobenius_chamfer": ["task=registration"],
@@ -31,6 +32,8 @@ EXTRA = {
 CALLER = {
     # Arguments that code gives, not YAML: see training.factory and training.trainer.
     "PointNetVanilla": {"num_classes"},
+    "PointNetTransform": {"num_classes"},
+    "DGCNN": {"num_classes"},
     "Classification": {"net", "num_classes"},
     "Registration": {"net"},
     "quaternion_loss": {"predicted", "true", "source", "target"},
@@ -45,7 +48,6 @@ CALLER = {
     "TensorBoardLogger": {"save_dir"},
     "CSVLogger": {"save_dir"},
     "last_checkpoint": {"checkpoint"},
-    "StopBetweenSteps": {"checkpoint"},
     "progress": {"score"},
     "CloudVisualization": {"batch", "titles", "folder"},
 }
@@ -86,6 +88,7 @@ def test_default_settings_are_those_of_readme():
         "net": "pointnet",
         "dataset": "shapes",
         "sampler": "mops",
+        "recipe": "fast",
     }
     assert (cfg.m, cfg.learn, cfg.weights) == (32, "sampler", "auto")
 
@@ -116,7 +119,7 @@ def test_rival_samplers_have_published_settings():
     assert cfg.optimizer.schedule.every * cfg.batch_size == 600_000
     assert (cfg.trainer.max_epochs, cfg.val_fraction) == (500, 0)
     cfg = compose(["sampler=snet"])
-    assert (cfg.optimizer.lr, cfg.pretrain.optimizer.lr) == (0.01, 0.001)
+    assert (cfg.optimizer.lr, cfg.pretrain.lr) == (0.01, 0.001)
     assert compose(["sampler=snet", "learn=joint"]).optimizer.lr == 0.001
     assert compose(["sampler=snet", "optimizer=exponential"]).optimizer.lr == 5e-4
     assert compose(["sampler=fmops"]).optimizer.lr == 0.001

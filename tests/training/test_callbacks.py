@@ -8,7 +8,6 @@ from mops_lightning.errors import UserError
 from mops_lightning.training.callbacks import (
     STANDARD,
     EpochLines,
-    StopBetweenSteps,
     added,
     build_callbacks,
 )
@@ -33,14 +32,14 @@ def test_standard_names_are_those_of_the_yaml():
     assert added(compose().callbacks) == {}
 
 
-def test_without_logger_and_pictures_three_are_built(tmp_path):
+def test_without_logger_and_pictures_two_are_built(tmp_path):
     made = build_from([], tmp_path)
-    assert [type(one) for one in made] == [ModelCheckpoint, StopBetweenSteps, EpochLines]
+    assert [type(one) for one in made] == [ModelCheckpoint, EpochLines]
 
 
 def test_null_leaves_a_callback_out(tmp_path):
-    made = build_from(["callbacks.checkpoint=null", "callbacks.progress=null"], tmp_path)
-    assert [type(one) for one in made] == [StopBetweenSteps]
+    made = build_from(["callbacks.progress=null"], tmp_path)
+    assert [type(one) for one in made] == [ModelCheckpoint]
 
 
 def test_added_callback_is_built_with_its_settings(tmp_path):

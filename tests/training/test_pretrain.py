@@ -94,7 +94,7 @@ def test_mistake_fails_before_pretraining(settings, said, tmp_path):
 
 @pytest.mark.parametrize("damage", ["cut", "nan", "not restorable"])
 def test_damaged_cache_is_set_aside_and_trained_again(tmp_path, capsys, damage):
-    settings = ["task=registration", "sampler=fps", "pretrain.max_epochs=2"]
+    settings = ["task=registration", "sampler=fps", "epochs.task=2"]
     train(tmp_path, *settings)
     (path,) = tmp_path.glob("cache/weights/*/weights.pt")
     checkpoint = path.parent / "checkpoints" / "last.ckpt"

@@ -207,7 +207,7 @@ class RunSettings:
     pretrain: Any = field(
         default=None,
         metadata=about(
-            "epochs and optimizer with which weights=auto trains the task net",
+            "optimizer with which weights=auto trains the task net, for epochs.task epochs",
             learn=WITH_SAMPLER,
             compare=False,
         ),
@@ -247,7 +247,6 @@ _NOTHING = {"affects": Affects.NOTHING}
 INSIDE: dict[str, dict[str, Any]] = {
     "callbacks.learning_rate": _NOTHING,
     "callbacks.checkpoint": _NOTHING,
-    "callbacks.stop": _NOTHING,
     "callbacks.progress": _NOTHING,
     "callbacks.pictures": _NOTHING,
     "dataset.cache": _NOTHING,
@@ -270,7 +269,6 @@ INSIDE: dict[str, dict[str, Any]] = {
     # Before the settings that take their values from them, so that an error names these.
     "epochs.task": {"limits": whole(1)},
     "epochs.sampler": {"limits": whole(0)},
-    "pretrain.max_epochs": {"limits": whole(1)},
     "trainer.max_epochs": {"limits": whole(0)},
     "trainer.precision": {"limits": one_of(*PRECISIONS, others=("32", 32, None))},
     "trainer._target_": _NOTHING,

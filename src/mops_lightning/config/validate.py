@@ -12,10 +12,10 @@ from mops_lightning.config.build import signature
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.records import migrate
 
-OPTIMIZERS = ("optimizer", "pretrain.optimizer")
+OPTIMIZERS = ("optimizer", "pretrain")
 """Nodes whose ``schedule`` is not an argument of the optimizer."""
 
-TABLES = ("epochs", "augment", "pretrain")
+TABLES = ("epochs", "augment")
 """Settings that have settings of their own but are no groups of choices."""
 
 

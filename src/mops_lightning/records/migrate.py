@@ -27,7 +27,10 @@ OLD: dict[str, Now] = {
     "task_rate": Now("task_lr_scale"),
     "noise": Now("test_noise_std"),
     "optimizer.optimizer": Now("optimizer"),
-    "pretrain.optimizer.optimizer": Now("pretrain.optimizer"),
+    "pretrain.optimizer.optimizer": Now("pretrain"),
+    "pretrain.optimizer": Now("pretrain"),
+    "pretrain.max_epochs": Now("epochs.task"),
+    "callbacks.stop": Now(hint="a run always stops between two steps"),
     "epochs.joint": Now("epochs.sampler", source=True),
     "epochs.nothing": Now(hint="learn=nothing trains nothing"),
     "augment.joint": Now("augment.sampler", source=True),
@@ -126,15 +129,23 @@ def _upgraded(config: dict[str, Any]) -> dict[str, Any]:
         for group in ("epochs", "augment"):
             if "joint" in (config.get(group) or {}):
                 new[group]["sampler"] = config[group]["joint"]
-    for optimizer in (new.get("optimizer"), (new.get("pretrain") or {}).get("optimizer")):
+    for optimizer in (new.get("optimizer"), new.get("pretrain")):
         if isinstance(optimizer, dict):
             for node in (optimizer, optimizer.get("schedule") or {}):
                 node.pop("_partial_", None)
     for node in (new.get("baselines") or {}).values():
-        for key, given in (("m", new.get("m")), ("seed", new.get("seed")), *UNSET.items()):
-            if isinstance(node, dict) and key in node and node[key] == given:
-                del node[key]
+        _drop(node, {"m": new.get("m"), "seed": new.get("seed"), **UNSET})
+    for node in (new.get("augment") or {}).values():
+        _drop(node, {"jitter_clip": 0.05})
+    _drop(new.get("sampler"), {"annealing": "exponential"})
     return new
+
+
+def _drop(node: Any, given: dict[str, Any]) -> None:
+    """Remove settings that files no longer set, where they have the given values."""
+    for key, value in given.items():
+        if isinstance(node, dict) and key in node and node[key] == value:
+            del node[key]
 
 
 UNSET = {"start": None, "pick": "nearest"}

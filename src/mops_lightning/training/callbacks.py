@@ -19,7 +19,7 @@ from mops_lightning.errors import Interrupted, UserError
 
 CHECKPOINT = "last.ckpt"
 
-STANDARD = ("learning_rate", "checkpoint", "stop", "progress", "pictures")
+STANDARD = ("learning_rate", "checkpoint", "progress", "pictures")
 """Names in ``conf/callbacks/default.yaml``. None of them changes what is learned."""
 
 

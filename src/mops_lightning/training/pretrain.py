@@ -50,7 +50,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
             )
         with _locked(folder, cfg.names.net):
             if not _is_good(folder / FILE):  # otherwise another process trained it meanwhile
-                epochs = cfg.pretrain.max_epochs
+                epochs = cfg.epochs.task
                 print(
                     f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it "
                     f"first, {epochs} {'epoch' if epochs == 1 else 'epochs'}. Cache: {folder}",
@@ -75,8 +75,8 @@ def task_config(cfg: DictConfig) -> DictConfig:
     own = cfg.copy()
     with open_dict(own):
         if cfg.learn != "task":
-            own.trainer.max_epochs = cfg.pretrain.max_epochs
-            own.optimizer = cfg.pretrain.optimizer
+            own.trainer.max_epochs = cfg.epochs.task
+            own.optimizer = cfg.pretrain
             own.weights = "auto"
             for name in added(cfg.callbacks):  # such as early stopping on a readout's score
                 del own.callbacks[name]

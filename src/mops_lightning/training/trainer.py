@@ -16,7 +16,7 @@ from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import dotted
 from mops_lightning.training.averaging import MovingAverage
-from mops_lightning.training.callbacks import CHECKPOINT, build_callbacks
+from mops_lightning.training.callbacks import CHECKPOINT, StopBetweenSteps, build_callbacks
 from mops_lightning.training.checkpoint_io import AtomicCheckpointIO
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.loaders import clouds_to_draw, score_loader
@@ -56,6 +56,7 @@ def make_trainer(
         batch = score_loader(dataset.test, cfg.batch_size, task).batch_of(rows)
         offered |= {"batch": batch, "titles": titles}
     callbacks = build_callbacks(cfg.callbacks, offered, logged=bool(logger))
+    callbacks.append(StopBetweenSteps(folder / "checkpoints" / CHECKPOINT))
     if experiment.recipe.ema_span:  # before those that save
         callbacks.insert(0, MovingAverage(experiment.recipe.ema_span))
     trainer: L.Trainer = build(
