@@ -213,6 +213,7 @@ class Experiment(L.LightningModule):
     def _full_prediction(self, batch: Batch) -> Any:
         """Return what the task net predicts for all points, from the table if there is one."""
         if self.full_predictions is not None and batch.rows is not None:
+            self.full_predictions = self.full_predictions.to(batch.rows.device)
             return self.full_predictions[batch.rows]
         with torch.no_grad():
             return self.task.predict(batch, batch.points)
