@@ -3,8 +3,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Test processes, each with one thread and about 1 GB.
 WORKERS ?= 2
+# Examples of each kind that `make fuzz` tries.
+EXAMPLES ?= 1000
 
-.PHONY: setup run test check clean
+.PHONY: setup run test fuzz check clean
 
 setup: .venv/.installed
 
@@ -19,6 +21,10 @@ run: setup
 
 test: setup
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+# The long round of tests/fuzz; `make test` contains a short one.
+fuzz: setup
+	MOPS_FUZZ=$(EXAMPLES) $(BIN)/python -m pytest tests/fuzz -s
 
 check: setup
 	$(BIN)/ruff check .

@@ -1,6 +1,15 @@
+import numpy as np
 import pytest
 
-from mops_lightning.files import atomic_write, is_temporary, remove_temporary, set_aside
+from mops_lightning import files
+from mops_lightning.errors import UserError
+from mops_lightning.files import (
+    atomic_write,
+    is_temporary,
+    load_npz,
+    remove_temporary,
+    set_aside,
+)
 
 
 def test_atomic_write_replaces_the_old_file(tmp_path):
@@ -49,3 +58,17 @@ def test_set_aside_keeps_every_damaged_file(tmp_path):
         assert set_aside(path).read_text() == text
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"last.ckpt.damaged", "last.ckpt.damaged-2", "last.ckpt.damaged-3"}
+
+
+def test_load_npz_small_file_of_large_arrays_is_refused(tmp_path, monkeypatch):
+    np.savez_compressed(tmp_path / "a.npz", points=np.zeros((10**6, 3)))
+    assert load_npz(tmp_path / "a.npz")["points"].shape == (10**6, 3)
+    monkeypatch.setattr(files, "MEMORY", 1000)
+    with pytest.raises(UserError, match=r"a\.npz is broken: .* bytes announced"):
+        load_npz(tmp_path / "a.npz")
+
+
+def test_load_npz_pickled_objects_are_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", points=np.array([{}], object))
+    with pytest.raises(UserError, match=r"a\.npz is broken"):
+        load_npz(tmp_path / "a.npz")

@@ -10,6 +10,9 @@ from typing import NoReturn, TextIO
 
 USER_ERROR = 2
 INTERRUPTED = 130
+MESSAGE = 300
+"""Most characters of a parser's message."""
+
 CLOSED_PIPE = 141
 """128 + SIGPIPE, the status that shells report for other programs."""
 
@@ -40,6 +43,12 @@ def did_you_mean(name: str, allowed: Iterable[str]) -> str:
     hint = f" Did you mean {' or '.join(repr(c) for c in close)}?" if close else ""
     listed = f" Allowed: {', '.join(names)}." if len(names) <= 40 else ""
     return hint + listed
+
+
+def one_line(error: Exception) -> str:
+    """Return the type and the message of a parser's error, short and on one line."""
+    said = " ".join(str(error).split())
+    return f"{type(error).__name__}: {said[:MESSAGE]}{'…' if len(said) > MESSAGE else ''}"
 
 
 def end(name: str, message: str, status: int) -> NoReturn:

@@ -1,16 +1,23 @@
-"""Files that are written whole or not at all, and what a kill or a damage leaves."""
+"""Files that are written whole or not at all, what a kill or a damage leaves, and unpacking."""
 
 import os
 import tempfile
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+from mops_lightning.errors import UserError, one_line
 
 TEMPORARY = ".mops_lightning-"
 """What names of temporary files start with."""
 
 DAMAGED = "damaged"
 """Part of the names of files that were set aside."""
+
+MEMORY, MEMORY_PER_BYTE = 2 << 30, 200
+"""Bytes that the content of a file may take, and more per byte of the file."""
 
 
 @contextmanager
@@ -76,3 +83,27 @@ def set_aside(path: Path) -> Path:
         number += 1
         target = path.with_name(f"{path.name}.{DAMAGED}-{number}")
     return path.rename(target)
+
+
+def memory(path: Path) -> int:
+    """Return how many bytes the content of a file may take, unpacked."""
+    return MEMORY + MEMORY_PER_BYTE * path.stat().st_size
+
+
+def load_npz(path: Path) -> dict[str, Any]:
+    """Load all arrays of an .npz file, without pickled objects.
+
+    Raises:
+        UserError: the file is missing or broken, or announces much more than its length can hold.
+    """
+    import numpy as np
+
+    try:
+        with zipfile.ZipFile(path) as packed:
+            announced = sum(info.file_size for info in packed.infolist())
+        if announced > memory(path):
+            raise ValueError(f"{announced:,} bytes announced in {path.stat().st_size:,}")
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except Exception as error:  # numpy parses headers as Python literals
+        raise UserError(f"{path} is broken: {one_line(error)}.") from None

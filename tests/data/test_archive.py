@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from mops_lightning import files
 from mops_lightning.data.archive import unpack
 from mops_lightning.errors import UserError
 
@@ -116,3 +117,40 @@ def test_unpack_nonempty_folder_raises(tmp_path: Path, write: Write) -> None:
 def test_unpack_missing_archive_raises(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="Cannot unpack"):
         unpack(tmp_path / "none.zip", tmp_path / "out")
+
+
+@both
+@pytest.mark.parametrize("name", ["", ".", "./"])
+def test_unpack_member_without_name_raises(tmp_path: Path, write: Write, name: str) -> None:
+    if write is write_zip:
+        with zipfile.ZipFile(tmp_path / "a", "w") as packed:
+            packed.writestr("x", b"1")
+            packed.infolist()[0].filename = name  # zipfile itself writes no empty name
+    else:
+        write(tmp_path / "a", {name: b"1"})
+    with pytest.raises(UserError, match="a member without a name"):
+        unpack(tmp_path / "a", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@both
+def test_unpack_more_than_limit_raises(
+    tmp_path: Path, write: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "MEMORY", 1000)
+    write(tmp_path / "a", {"a.txt": bytes(3_000_000), "b.txt": bytes(10)})
+    with pytest.raises(UserError, match="unpacks to more than"):
+        unpack(tmp_path / "a", tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_unpack_damaged_xz_raises(tmp_path: Path) -> None:
+    with tarfile.open(tmp_path / "a", "w:xz") as packed:
+        info = tarfile.TarInfo("a.txt")
+        info.size = 100_000
+        packed.addfile(info, io.BytesIO(bytes(range(250)) * 400))
+    content = bytearray((tmp_path / "a").read_bytes())
+    content[-60:-40] = bytes(20)
+    (tmp_path / "a").write_bytes(content)
+    with pytest.raises(UserError, match=r"is damaged|neither a zip nor a tar"):
+        unpack(tmp_path / "a", tmp_path / "out")

@@ -50,6 +50,56 @@ def test_hdf5_invalid_input_raises(folder, tmp_path):
         hdf5(folder, 20)
 
 
+def change_file(path, key, **options):
+    with h5py.File(path, "a") as file:
+        del file[key]
+        file.create_dataset(key, **options)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"label": {"data": np.full(6, 2_000_000_000)}}, "labels from 0 to 9999, without shape_"),
+        (
+            {"data": {"shape": (0, 50, 3), "dtype": "f4"}, "label": {"shape": (0,), "dtype": "u1"}},
+            "no shapes",
+        ),
+        (
+            {
+                "data": {"shape": (10**9, 50, 3), "dtype": "f4", "chunks": (1, 50, 3)},
+                "label": {"shape": (10**9,), "dtype": "u1", "chunks": (9,)},
+            },
+            "announces 1,000,000,000 shapes",
+        ),
+        (
+            {"data": {"shape": (6, 50, 3), "dtype": "f4", "external": "/etc/passwd"}},
+            "'data' refers to other files",
+        ),
+    ],
+)
+def test_hdf5_crafted_file_raises(changes, message, folder):
+    for key, options in changes.items():
+        change_file(folder / "train.h5", key, **options)
+    with pytest.raises(UserError, match=message):
+        hdf5(folder, 20)
+
+
+@pytest.mark.parametrize("link", ["external", "soft", "virtual"])
+def test_hdf5_data_of_another_file_raises(link, folder):
+    with h5py.File(folder / "train.h5", "a") as file:
+        del file["data"]
+        if link == "virtual":
+            layout = h5py.VirtualLayout((6, 50, 3), "f4")
+            layout[:4] = h5py.VirtualSource(str(folder / "test.h5"), "data", (4, 50, 3))
+            file.create_virtual_dataset("data", layout)
+        else:
+            other = h5py.ExternalLink(str(folder / "test.h5"), "/data")
+            file["other"] = other
+            file["data"] = other if link == "external" else h5py.SoftLink("/other")
+    with pytest.raises(UserError, match="'data' refers to other files"):
+        hdf5(folder, 20)
+
+
 def test_hdf5_real_data(real_data):
     root = real_data / "modelnet40_airplane_10000"
     if not root.is_dir():

@@ -149,3 +149,10 @@ def test_cloud_of_real_obj() -> None:
     assert len(mesh.faces) > 10_000
     _, points = cloud_from_file(path, 1000, seed=0)
     assert np.linalg.norm(points, axis=1).max() == pytest.approx(1)
+
+
+def test_obj_vertices_of_two_coordinates_are_broken(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n")
+    with pytest.raises(BrokenMeshError, match=r"a\.obj is broken"):
+        cloud_from_file(path, 9, 0)

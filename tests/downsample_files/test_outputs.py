@@ -6,6 +6,7 @@ import pytest
 
 from mops_lightning.downsample_files.outputs import jobs
 from mops_lightning.errors import UserError
+from mops_lightning.files import TEMPORARY
 
 
 @pytest.fixture
@@ -52,3 +53,22 @@ def test_impossible_output_is_rejected(source, target, file_format, message, inp
     Path("in/a.ply").touch()
     with pytest.raises(UserError, match=message):
         jobs(Path(source), Path(target), file_format, True)
+
+
+@pytest.mark.parametrize(
+    ("source", "target"),
+    [("loop", "out"), ("b.npy", "loop"), ("in", "loop"), ("loop/a.npy", "out"),
+     ("a" * 300, "out"), ("b.npy", "a" * 300 + ".ply"), ("in", "a" * 300)],
+)  # fmt: skip
+def test_outputs_loop_or_long_name_raises(source, target, inputs):
+    Path("loop").symlink_to("loop")
+    with pytest.raises(UserError, match=r"IN or OUT|no such file|cannot be"):
+        jobs(Path(source), Path(target), None, False)
+
+
+def test_outputs_links_and_temporary_files_are_no_inputs(inputs):
+    Path("in/loop.npy").symlink_to("loop.npy")
+    Path("in/circle").symlink_to("../in")
+    Path(f"in/{TEMPORARY}a-x.npy").touch()
+    found = jobs(Path("in"), Path("out"), None, False)
+    assert [str(path) for path, _ in found] == ["in/a.npy", "in/c.stl", "in/deep/b.ply"]

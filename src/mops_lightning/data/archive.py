@@ -1,25 +1,17 @@
 """Atomic unpacking of archives."""
 
 import gzip
-import shutil
 import tarfile
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import IO
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, one_line
+from mops_lightning.files import memory
 
-BROKEN = (
-    zipfile.BadZipFile,
-    tarfile.TarError,
-    gzip.BadGzipFile,
-    zlib.error,
-    EOFError,
-    RuntimeError,  # encrypted, or compressed with an unsupported method
-)
+MAX_MEMBERS = 1_000_000
 
 
 def unpack(archive: Path, folder: Path) -> None:
@@ -41,23 +33,49 @@ def unpack(archive: Path, folder: Path) -> None:
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as name:
             content = Path(name) / "content"  # with default permissions
             content.mkdir()
-            for member, stream in _members(archive):
+            room = memory(archive)
+            for number, (member, stream) in enumerate(_members(archive)):
+                if number >= MAX_MEMBERS:
+                    raise UserError(f"{archive} has more than {MAX_MEMBERS:,} members.")
                 path = content / member
                 if stream is None:
                     path.mkdir(parents=True, exist_ok=True)
                     continue
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with stream, path.open("xb") as file:
-                    shutil.copyfileobj(stream, file, 1 << 20)
+                    room = _copy(archive, stream, file, room)
             inside = [entry for entry in content.iterdir() if entry.name != "__MACOSX"]
             alone = len(inside) == 1 and inside[0].is_dir()
             (inside[0] if alone else content).replace(folder)
-    except BROKEN as error:
-        raise UserError(
-            f"{archive} is damaged ({str(error) or 'truncated'}). Remove it and download it again."
-        ) from error
+    except UserError:
+        raise
     except OSError as error:
+        if isinstance(error, gzip.BadGzipFile):
+            raise _damaged(archive, error) from error
         raise UserError(f"Cannot unpack {archive} into {folder}: {error}.") from error
+    except Exception as error:  # zip and tar files have many ways to be damaged
+        raise _damaged(archive, error) from error
+
+
+def _damaged(archive: Path, error: Exception) -> UserError:
+    return UserError(f"{archive} is damaged ({one_line(error)}). Remove it and download it again.")
+
+
+def _copy(archive: Path, stream: IO[bytes], file: IO[bytes], room: int) -> int:
+    """Copy a member and return how many bytes the rest may take.
+
+    Raises:
+        UserError: the archive unpacks to much more than its length.
+    """
+    while piece := stream.read(1 << 20):
+        room -= len(piece)
+        if room < 0:
+            raise UserError(
+                f"{archive} unpacks to more than {memory(archive):,} bytes, the limit for an "
+                "archive of its length. If you trust it, unpack it yourself."
+            )
+        file.write(piece)
+    return room
 
 
 def _members(archive: Path) -> Iterator[tuple[str, IO[bytes] | None]]:
@@ -67,7 +85,7 @@ def _members(archive: Path) -> Iterator[tuple[str, IO[bytes] | None]]:
             for info in packed.infolist():
                 link = info.external_attr >> 28 == 0o12
                 _check_member(archive, info.filename, link)
-                yield info.filename, None if info.is_dir() else packed.open(info)
+                yield info.filename, None if info.filename.endswith("/") else packed.open(info)
     elif tarfile.is_tarfile(archive):
         with tarfile.open(archive) as tar:
             for member in tar:
@@ -84,6 +102,8 @@ def _members(archive: Path) -> Iterator[tuple[str, IO[bytes] | None]]:
 
 
 def _check_member(archive: Path, name: str, special: bool) -> None:
+    if not PurePosixPath(name).parts:
+        raise UserError(f"{archive} has a member without a name; it is damaged.")
     for path in (PurePosixPath(name), PureWindowsPath(name)):
         if path.anchor or ".." in path.parts:
             raise UserError(

@@ -9,9 +9,12 @@ import numpy as np
 import torch
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, select_classes
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, one_line
+from mops_lightning.files import memory
 
 NAMES = "shape_names.txt"
+MAX_CLASSES = 10_000
+"""Most classes without a list of their names."""
 
 
 def hdf5(
@@ -105,7 +108,7 @@ def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:
     Args:
         path: an HDF5 file with ``data`` (S, N, 3) and ``label`` (S,) or (S, 1).
         n_points: number of points per shape to read, at most N.
-        n_classes: number of classes; None allows any non-negative label.
+        n_classes: number of classes; None allows labels below ``MAX_CLASSES``.
 
     Raises:
         UserError: the file is missing, damaged or has other content.
@@ -114,10 +117,7 @@ def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:
         raise UserError(f"root: {path} is missing. Complete the folder, or use another root.")
     try:
         with h5py.File(path, "r") as file:
-            for key in ("data", "label"):
-                if not isinstance(file.get(key), h5py.Dataset):
-                    raise UserError(f"{path} has no dataset {key!r}; it contains {sorted(file)}.")
-            data, label = file["data"], file["label"]
+            data, label = _dataset(path, file, "data"), _dataset(path, file, "label")
             shapes, kinds = (data.shape, label.shape), data.dtype.kind + label.dtype.kind
             if (
                 data.ndim != 3
@@ -134,18 +134,43 @@ def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:
                     f"n_points must be at most {data.shape[1]}, the points per shape in {path}, "
                     f"got {n_points}."
                 )
+            if not len(data):
+                raise UserError(f"{path} contains no shapes.")
+            if len(data) * n_points * 3 * data.dtype.itemsize > memory(path):
+                raise UserError(
+                    f"{path} announces {len(data):,} shapes, much more than its "
+                    f"{path.stat().st_size:,} bytes hold. Replace it by an intact copy."
+                )
             with np.errstate(over="ignore"):  # overflows are detected below
                 points = np.asarray(data[:, :n_points], dtype=np.float32)
             labels = np.asarray(label[()], dtype=np.int64).reshape(-1)
-    except (OSError, RuntimeError, KeyError) as error:
+    except UserError:
+        raise
+    except Exception as error:  # h5py raises many types of exception for damaged files
         raise UserError(
-            f"{path} is damaged or not an HDF5 file ({error}). Replace it by an intact copy."
+            f"{path} is damaged or not an HDF5 file ({one_line(error)}). Replace it by an intact "
+            "copy."
         ) from error
     if not np.isfinite(points).all():
         raise UserError(f"{path} contains NaN or infinite values. Replace it by an intact copy.")
-    low, high = (labels.min(), labels.max()) if len(labels) else (0, 0)
-    if low < 0 or (n_classes is not None and high >= n_classes):
-        allowed = "at least 0" if n_classes is None else f"from 0 to {n_classes - 1}"
-        reason = "" if n_classes is None else f", as shape_names.txt lists {n_classes} classes"
-        raise UserError(f"{path} must have labels {allowed}{reason}, got {low} to {high}.")
+    low, high = labels.min(), labels.max()
+    allowed = MAX_CLASSES if n_classes is None else n_classes
+    if low < 0 or high >= allowed:
+        reason = (
+            f"without {NAMES}" if n_classes is None else f"as {NAMES} lists {n_classes} classes"
+        )
+        raise UserError(
+            f"{path} must have labels from 0 to {allowed - 1}, {reason}, got {low} to {high}."
+        )
     return Clouds(torch.from_numpy(points), torch.from_numpy(labels))
+
+
+def _dataset(path: Path, file: h5py.File, key: str) -> h5py.Dataset:
+    """Return a dataset whose numbers are in the file itself, not in another one."""
+    linked = key in file and not isinstance(file.get(key, getlink=True), h5py.HardLink)
+    found = None if linked else file.get(key)
+    if linked or (isinstance(found, h5py.Dataset) and (found.is_virtual or found.external)):
+        raise UserError(f"{path}: dataset {key!r} refers to other files, which is not accepted.")
+    if not isinstance(found, h5py.Dataset):
+        raise UserError(f"{path} has no dataset {key!r}; it contains {sorted(file)[:20]}.")
+    return found

@@ -10,7 +10,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from mops_lightning.errors import UserError
+from mops_lightning.data import glb_bounds, ply_header
+from mops_lightning.errors import UserError, one_line
 from mops_lightning.files import atomic_write
 
 SUFFIXES = (".off", ".obj", ".ply", ".stl", ".glb")
@@ -103,12 +104,14 @@ def parse_mesh(data: bytes, path: Path) -> trimesh.Trimesh:
         with np.errstate(all="ignore"):
             mesh = _triangles_off(data) if kind == ".off" else None
             mesh = _load(data, kind) if mesh is None else mesh
+            if mesh.vertices.shape[1] != 3:
+                raise ValueError(f"vertices must have 3 coordinates, got {mesh.vertices.shape[1]}")
             faces = np.asarray(mesh.faces).reshape(-1, 3)
             outside = len(faces) and not 0 <= faces.min() <= faces.max() < len(mesh.vertices)
             area = float(mesh.area) if len(faces) and not outside else 0.0
             extent = float(np.ptp(mesh.triangles, axis=(0, 1)).max()) if area else 0.0
     except Exception as error:  # parsers raise many types of exception for broken files
-        raise BrokenMeshError(f"{path} is broken: {type(error).__name__}: {error}.") from error
+        raise BrokenMeshError(f"{path} is broken: {one_line(error)}.") from error
     if outside:
         raise BrokenMeshError(f"{path} is broken: a face refers to a vertex that does not exist.")
     if not len(faces):
@@ -144,8 +147,12 @@ def _load(data: bytes, kind: str) -> trimesh.Trimesh:
         # Comments may have any encoding, for which trimesh would need another package.
         data = data.decode("utf-8" if _is_utf8(data) else "latin-1").encode()
         data = data.replace(b"\t", b" ")  # trimesh recognises faces of OBJ files by "f " only
+    if kind == ".ply":
+        data = ply_header.plain(data)
+    if kind == ".glb":
+        glb_bounds.check(data)
     # Materials do not affect the surface, and their files may be missing.
-    extra: dict[str, Any] = {"skip_materials": True} if kind in (".obj", ".glb") else {}
+    extra: dict[str, Any] = {"skip_materials": True} if kind != ".off" else {}
     scene: Any = trimesh.load(
         BytesIO(data), file_type=kind[1:], force="scene", process=False, **extra
     )

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mops_lightning.data import ply_header
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
 from mops_lightning.data.hdf5 import choose_and_fingerprint, read_clouds
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, one_line
 from mops_lightning.ops.points import normalize_unit_sphere
 from mops_lightning.seeding import derive_seed
 
@@ -170,10 +172,11 @@ def _ply(path: Path) -> Cloud:
     import trimesh
 
     try:
-        cloud: Any = trimesh.load(path, process=False)
+        data = BytesIO(ply_header.plain(path.read_bytes()))
+        cloud: Any = trimesh.load(data, file_type="ply", process=False, skip_materials=True)
         points = np.asarray(cloud.vertices, np.float32)
     except Exception as error:  # trimesh raises many types of exception for damaged files
-        raise UserError(f"{path} cannot be read as a PLY cloud: {error}") from None
+        raise UserError(f"{path} cannot be read as a PLY cloud: {one_line(error)}") from None
     return _finite(points, path)
 
 
@@ -181,7 +184,7 @@ def _drawn(path: Path, n_points: int, seed: int, number: int) -> Cloud:
     try:
         table = np.loadtxt(path, dtype=np.float32, ndmin=2)
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read as a table of numbers: {error}") from None
+        raise UserError(f"{path} cannot be read as a table of numbers: {one_line(error)}") from None
     points = _finite(table[:, :3], path)
     rng = np.random.default_rng(derive_seed(seed, number))
     rows = rng.permutation(len(points))[:n_points]

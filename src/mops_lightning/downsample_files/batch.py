@@ -18,7 +18,7 @@ from rich.progress import track
 from mops_lightning.data.formats import limits
 from mops_lightning.downsample_files.processes import Died, processes
 from mops_lightning.downsample_files.settings import Settings
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, one_line
 
 
 def attempt(
@@ -45,7 +45,7 @@ def attempt(
     except UserError as error:
         return error
     except Exception as error:
-        return UserError(f"{source}: {type(error).__name__}: {error}.")
+        return UserError(f"{source}: {one_line(error)}.")
 
 
 def process_file(source: Path, target: Path, settings: Settings, engine: Any) -> None:

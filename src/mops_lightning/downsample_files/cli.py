@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from mops_lightning.downsample_files.settings import METHODS, Settings
-from mops_lightning.errors import INTERRUPTED, USER_ERROR, UserError, end, quiet_on_closed_pipe
+from mops_lightning.errors import (
+    INTERRUPTED,
+    USER_ERROR,
+    UserError,
+    end,
+    one_line,
+    quiet_on_closed_pipe,
+)
 from mops_lightning.records.readout_names import GENERATED_READOUTS
 
 DESCRIPTION = """Downsample clouds and meshes from files.
@@ -34,6 +41,10 @@ def main(
             sys.exit(_run(chosen))
         except UserError as error:
             end(name, str(error), USER_ERROR)
+        except BrokenPipeError:
+            raise
+        except OSError as error:  # of a path that the arguments name
+            end(name, one_line(error), USER_ERROR)
         except KeyboardInterrupt:
             end(name, "interrupted. Run the same command to do the rest.", INTERRUPTED)
 

@@ -4,7 +4,8 @@ from collections import Counter
 from pathlib import Path
 
 from mops_lightning.data.formats.registry import READABLE, WRITERS
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, one_line
+from mops_lightning.files import is_temporary
 
 Job = tuple[Path, Path]
 """An input file and its output file."""
@@ -23,6 +24,15 @@ def jobs(source: Path, target: Path, file_format: str | None, keep_attributes: b
     Raises:
         UserError: an input is missing, or an output is ambiguous or cannot be written.
     """
+    try:
+        return _jobs(source, target, file_format, keep_attributes)
+    except OSError as error:  # a name that is too long, a folder that may not be read
+        raise UserError(f"IN or OUT cannot be used: {one_line(error)}.") from None
+    except RuntimeError:  # of pathlib
+        raise UserError(f"IN or OUT: {source} or {target} is a loop of symbolic links.") from None
+
+
+def _jobs(source: Path, target: Path, file_format: str | None, keep_attributes: bool) -> list[Job]:
     wanted = f".{file_format.lstrip('.').lower()}" if file_format else None
     if wanted and wanted not in WRITERS:
         raise UserError(f"--format must be one of {', '.join(WRITERS)}, got {file_format}.")
@@ -54,7 +64,8 @@ def _inputs(source: Path, target: Path) -> list[Path]:
     """Return the readable files below a folder, without those below ``target``."""
     if target.is_file():
         raise UserError(f"OUT must be a folder because IN is one, got the file {target}.")
-    files = sorted(p for p in source.rglob("*") if p.is_file() and p.suffix.lower() in READABLE)
+    found = (p for p in source.rglob("*") if p.suffix.lower() in READABLE and p.is_file())
+    files = sorted(path for path in found if not is_temporary(path))
     outputs = target.resolve()
     files = [p for p in files if outputs not in p.resolve().parents]
     if not files:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.files import atomic_write
+from mops_lightning.files import atomic_write, load_npz
 
 CLOUDS = "clouds.npz"
 INPUT = "input"
@@ -45,8 +45,12 @@ def load_clouds(path: Path) -> tuple[list[str], dict[str, NDArray[np.float32]]]:
         UserError: the file is missing or not of this format.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        return [str(title) for title in arrays.pop(TITLES)], arrays
-    except (OSError, ValueError, KeyError) as error:
+        arrays = load_npz(path)
+    except UserError as error:
         raise UserError(f"{path}: cannot read saved clouds: {error}") from None
+    titles = arrays.pop(TITLES, np.zeros(()))
+    shapes = [a.shape for a in arrays.values() if a.dtype.kind == "f" and a.ndim == 3]
+    right = len(shapes) == len(arrays) and all(s[0] == len(titles) and s[2] == 3 for s in shapes)
+    if titles.ndim != 1 or INPUT not in arrays or not right:
+        raise UserError(f"{path}: cannot read saved clouds: arrays of other names or shapes.")
+    return [str(title) for title in titles], arrays

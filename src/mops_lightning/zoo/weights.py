@@ -13,6 +13,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.files import atomic_write
 from mops_lightning.records import run_record
 from mops_lightning.records.migrate import upgraded_config
+from mops_lightning.zoo import bounds
 
 SCHEMA = "mops_lightning/weights/1"
 FILE = "weights.pt"
@@ -125,7 +126,10 @@ def read_plain(path: Path, what: str) -> Any:
         Damaged: it is damaged, or contains more than plain data.
     """
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        bounds.check_archive(path)
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        bounds.check_content(content, path)
+        return content
     except PermissionError:
         raise UserError(f"{path} may not be read. Check its permissions.") from None
     except Exception:  # torch's messages advise to execute the file's code

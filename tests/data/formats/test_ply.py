@@ -60,3 +60,29 @@ def test_ply_chunked_impossible_count_is_broken(tmp_path):
     path.write_bytes(path.read_bytes().replace(b"vertex 5", b"vertex 999999999999"))
     with pytest.raises(UserError, match="ends after 5 points"):
         open_cloud_file(path)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_ply_line_ends_and_latin_comments_are_read(end, form, tmp_path):
+    path = tmp_path / "a.ply"
+    lines = ["ply", "comment größe", f"format {form} 1.0", "comment é", "element vertex 2"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    points = np.array([[1, 2, 3], [4, 5, 10]], "<f4")  # its last bytes hold a line end
+    body = points.tobytes() if form != "ascii" else f"1 2 3{end}4 5 10{end}".encode()
+    head = end.join([*lines, "end_header", ""])
+    path.write_bytes(head.encode("latin-1") + body)
+    np.testing.assert_array_equal(read(path, 9, 0).points, points)
+    if form != "ascii":
+        np.testing.assert_array_equal(open_cloud_file(path).read(range(2)).points, points)
+
+
+def test_ply_texture_comment_opens_no_file(tmp_path, monkeypatch):
+    path = tmp_path / "a.ply"
+    trimesh.creation.box().export(path)
+    content = path.read_bytes().replace(b"ply\n", b"ply\ncomment TextureFile /etc/passwd\n", 1)
+    path.write_bytes(content.replace(b"comment TextureFile", b"comment  TextureFile"))
+    opened = []
+    monkeypatch.setattr("PIL.Image.open", lambda *a: opened.append(a))
+    assert len(read(path, 9, 0).points) == 9
+    assert not opened

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mops_lightning.data.formats.registry import WRITERS, open_cloud_file, read
+from mops_lightning.data.formats.registry import WRITERS, open_cloud_file, read, write
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 
@@ -156,3 +156,17 @@ def test_bad_file_is_named(name, content, said, tmp_path):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(UserError, match=said):
         read(tmp_path / name, 10, 0)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_full_disk_is_one_error(suffix, tmp_path):
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    random = np.random.default_rng(0).normal(size=(3000, 3))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+    try:
+        with pytest.raises(UserError, match=rf"a{suffix}|Io|File too large"):
+            write(tmp_path / f"a{suffix}", Table(random))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())

@@ -14,6 +14,8 @@ from mops_lightning.data.formats.table import (
     from_unnamed,
     unique_names,
 )
+from mops_lightning.errors import one_line
+from mops_lightning.files import load_npz
 
 POINTS = ("points", "xyz", "pos")
 """Names of the array of an .npz file that holds the coordinates."""
@@ -21,7 +23,7 @@ POINTS = ("points", "xyz", "pos")
 
 def read_npy(path: Path) -> Table:
     """Read one array: ``(N, K)`` numbers, x, y and z first, or ``(N,)`` rows of named fields."""
-    return from_unnamed(_load(path), path)
+    return from_unnamed(_load_npy(path), path)
 
 
 def write_npy(path: Path, table: Table) -> None:
@@ -47,7 +49,7 @@ def locate_npy(path: Path) -> BinaryCloudFile:
 
 def read_npz(path: Path) -> Table:
     """Read the array named as in ``POINTS``, or the only one; the others are attributes."""
-    arrays: Any = _load(path)
+    arrays = load_npz(path)
     chosen = next((name for name in POINTS if name in arrays), None)
     if chosen is None and len(arrays) == 1:
         (chosen,) = arrays
@@ -76,9 +78,8 @@ def write_npz(path: Path, table: Table) -> None:
         np.savez_compressed(file, allow_pickle=False, points=table.points, **named)
 
 
-def _load(path: Path) -> Any:
+def _load_npy(path: Path) -> Any:
     try:
-        found = np.load(path, allow_pickle=False)
-        return dict(found) if path.suffix.lower() == ".npz" else found
-    except (OSError, ValueError, EOFError) as error:
-        raise BadCloudError(f"{path} is broken: {error}.") from None
+        return np.load(path, allow_pickle=False)
+    except Exception as error:
+        raise BadCloudError(f"{path} is broken: {one_line(error)}.") from None

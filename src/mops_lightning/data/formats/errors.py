@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, one_line
 
 
 class BadCloudError(UserError):
@@ -23,9 +23,11 @@ def naming_file(path: Path) -> Iterator[None]:
     except UserError:
         raise
     except MemoryError as error:
-        raise BadCloudError(f"{path} is broken or too large for the memory: {error}.") from None
+        raise BadCloudError(
+            f"{path} is broken or too large for the memory: {one_line(error)}."
+        ) from None
     except Exception as error:
-        raise BadCloudError(f"{path} is broken: {type(error).__name__}: {error}.") from None
+        raise BadCloudError(f"{path} is broken: {one_line(error)}.") from None
 
 
 def ends_early(path: Path, number: int) -> BadCloudError:

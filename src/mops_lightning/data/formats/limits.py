@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from mops_lightning.files import memory
+
 try:
     import resource
 except ModuleNotFoundError:  # Windows
@@ -16,9 +18,6 @@ except ModuleNotFoundError:  # Windows
 
 SECONDS, BYTES_PER_SECOND = 60.0, 200_000
 """A file may take this long, and longer if it is large."""
-
-MEMORY, MEMORY_PER_BYTE = 2 << 30, 200
-"""Bytes of memory that a file may take, and more per byte of the file."""
 
 
 class _State:
@@ -48,8 +47,7 @@ def limited(path: Path) -> Iterator[None]:
         yield
         return
     before = resource.getrlimit(resource.RLIMIT_DATA)
-    room = MEMORY + MEMORY_PER_BYTE * path.stat().st_size
-    _set_memory(_data_bytes() + room, before[1])
+    _set_memory(_data_bytes() + memory(path), before[1])
     # The system's timer also ends a parser that never returns to Python.
     signal.setitimer(signal.ITIMER_REAL, seconds(path))
     try:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mops_lightning.data import ply_header
 from mops_lightning.data.formats.cloud_file import BinaryCloudFile
 from mops_lightning.data.formats.errors import BadCloudError
 from mops_lightning.data.formats.table import (
@@ -25,16 +26,14 @@ KINDS = {
 }  # fmt: skip
 TYPES = {kind: name for name, kind in KINDS.items() if not name[-1].isdigit()}
 
-MAX_LINE, MAX_LINES = 4096, 1000
-"""Limits of a header; a file that exceeds them is not PLY."""
-
 
 def read(path: Path) -> Table | None:
     """Read the vertices with all their properties; None for a mesh, which has faces as well."""
     from trimesh.exchange.ply import load_ply
 
     with np.errstate(all="ignore"):
-        found: Any = load_ply(BytesIO(path.read_bytes()))
+        content = BytesIO(ply_header.plain(path.read_bytes()))
+        found: Any = load_ply(content, skip_materials=True)
     if "faces" in found and len(found["faces"]):
         return None
     vertex = found["metadata"]["_ply_raw"]["vertex"]
@@ -112,9 +111,7 @@ def locate(path: Path) -> BinaryCloudFile:
 def _header(path: Path) -> tuple[list[list[str]], int]:
     """Return the words of the header's lines, and where the header ends, in bytes."""
     with path.open("rb") as file:
-        lines: list[list[str]] = []
-        while (line := file.readline(MAX_LINE)).split() != [b"end_header"]:
-            if not line or len(lines) == MAX_LINES:
-                raise BadCloudError(f"{path} is broken: its header does not end.")
-            lines.append(line.decode("latin-1").split())
-        return lines, file.tell()
+        found = ply_header.split(file.read(ply_header.LONGEST))
+    if found is None:
+        raise BadCloudError(f"{path} is broken: its header does not end.")
+    return [line.split() for line in found[0]], found[1]

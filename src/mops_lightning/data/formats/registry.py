@@ -13,6 +13,7 @@ from mops_lightning.data.formats.limits import limited
 from mops_lightning.data.formats.table import Table
 from mops_lightning.data.mesh_io import SUFFIXES as MESHES
 from mops_lightning.data.mesh_io import parse_mesh
+from mops_lightning.errors import one_line
 from mops_lightning.files import atomic_write
 
 READERS: dict[str, Callable[[Path], Table | None]] = {
@@ -68,10 +69,15 @@ def write(path: Path, table: Table) -> None:
     """Write a file that ends in one of ``WRITERS``, completely or not at all.
 
     Raises:
-        BadCloudError: the format cannot hold the table.
+        BadCloudError: the format cannot hold the table, or the file cannot be written.
     """
-    with atomic_write(path) as temporary:
-        WRITERS[path.suffix.lower()](temporary, table)
+    try:
+        with atomic_write(path) as temporary:
+            WRITERS[path.suffix.lower()](temporary, table)
+    except OSError as error:
+        raise BadCloudError(
+            f"OUT: cannot write {path} ({one_line(error)}). Free space, or give another OUT."
+        ) from None
 
 
 def open_cloud_file(path: Path) -> CloudFile:

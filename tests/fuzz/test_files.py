@@ -1,0 +1,92 @@
+"""Damaged and crafted files of every kind: read, or refused in one line.
+
+A short round by default; ``MOPS_FUZZ=NUMBER`` tries NUMBER files of every kind (``make fuzz``).
+``MOPS_FUZZ_KEEP=FOLDER`` keeps the files that failed.
+"""
+
+import copy
+import io
+import json
+import os
+import signal
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+import torch
+
+from mops_lightning.downsample_files.processes import Died, Processes
+from mops_lightning.zoo.weights import digest
+from tests.support import mutations
+from tests.support.fuzz_readers import try_file
+from tests.support.fuzz_seeds import changed_content, json_bytes, seeds
+
+FILES = int(os.environ.get("MOPS_FUZZ", "12"))
+KINDS = (
+    "bin", "checkpoint", "glb", "hdf5", "las", "laz", "listing", "names", "npy", "npz", "obj",
+    "obj cloud", "off", "pcd", "pcd ascii", "pcd compressed", "pictured clouds", "ply",
+    "ply ascii", "ply mesh", "record", "record content", "stl", "tar", "tar xz", "weights",
+    "weights content", "xyz", "zip",
+)  # fmt: skip
+
+pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="the system has no timer")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return seeds(tmp_path_factory.mktemp("seeds"))
+
+
+@pytest.fixture(scope="module")
+def processes():
+    return Processes(1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fuzzed_file_is_read_or_refused(kind, made, processes, tmp_path):
+    contents = (fuzzed(kind, made, number) for number in range(FILES))
+    suffix = made[kind.removesuffix(" content")][0]
+    # A folder each: some readers look at neighbouring files.
+    kept: dict[int, bytes] = {}
+
+    def jobs():
+        for number, content in enumerate(contents):
+            kept[number] = content
+            yield kind, str(tmp_path / str(number) / f"a{suffix}"), content
+
+    counts: Counter[str] = Counter()
+    bad = []
+    for number, result in processes.run(try_file, jobs()):
+        content = kept.pop(number)
+        said = str(result) if isinstance(result, Died) else result
+        counts[said if len(said) < 10 else "bad"] += 1
+        if len(said) >= 10:
+            bad.append(f"{kind}, file {number}: {said}")
+        if len(said) >= 10 or said == "memory":
+            keep(f"{kind}-{number}{suffix}".replace(" ", "_"), content, said)
+    print(f"{kind}: {dict(counts)}")
+    assert not bad, f"{len(bad)} of {FILES} files:\n" + "\n".join(bad[:3])
+
+
+def fuzzed(kind, made, number):
+    random = mutations.generator(kind, number)
+    if kind == "weights content":
+        content = torch.load(io.BytesIO(made["weights"][1][0]), weights_only=True)
+        content = changed_content(random, copy.deepcopy(content))
+        with suppress(AttributeError, KeyError, TypeError, RuntimeError):  # a state that is none
+            content["sha256"] = digest(content["state"])
+        file = io.BytesIO()
+        torch.save(content, file)
+        return file.getvalue()
+    if kind == "record content":
+        return json_bytes(changed_content(random, json.loads(made["record"][1][0])))
+    others = made[kind][1]
+    return mutations.mutated(random, others[random.integers(len(others))], others)
+
+
+def keep(name, content, said):
+    if folder := os.environ.get("MOPS_FUZZ_KEEP"):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        (Path(folder) / name).write_bytes(content)
+        (Path(folder) / f"{name}.said").write_text(said)

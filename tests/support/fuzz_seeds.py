@@ -1,0 +1,187 @@
+"""Small good files of every kind that the program reads, from which fuzzed ones are made."""
+
+import io
+import json
+import tarfile
+import zipfile
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+import trimesh
+
+from mops_lightning.data.formats.registry import WRITERS
+from mops_lightning.data.formats.table import Table
+from mops_lightning.records import run_record
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.training.experiment import CHECKPOINT_KEY
+from mops_lightning.viz.snapshots import save_clouds
+from mops_lightning.zoo import weights
+from tests.support.records import record
+
+BOX = trimesh.creation.box((1.0, 2.0, 3.0))
+SAMPLER = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 8, "sizes": [2, 4]}
+
+
+def seeds(folder):
+    """Return the seeds by kind: the suffix and the contents of good files."""
+    random = np.random.default_rng(0)
+    points = random.normal(size=(40, 3))
+    columns = {"intensity": random.random(40), "label": np.arange(40)}
+    tables = Table(points, columns), Table(points)
+    made = {
+        kind: (suffix, [_written(folder, suffix, table) for table in tables])
+        for kind, suffix in (("ply", ".ply"), ("pcd", ".pcd"), ("bin", ".bin"), ("npy", ".npy"),
+                             ("npz", ".npz"), ("xyz", ".xyz"), ("obj cloud", ".obj"))
+    }  # fmt: skip
+    rows = np.zeros(40, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("label", "i4")])
+    made["npy"][1].append(_saved(lambda file: np.save(file, rows)))
+    made["ply ascii"] = (
+        ".ply",
+        [_ascii_ply(points), BOX.export(file_type="ply", encoding="ascii")],
+    )
+    made["ply mesh"] = (".ply", [BOX.export(file_type="ply"), made["ply"][1][0]])
+    made["pcd ascii"] = (".pcd", [_pcd(points, "ascii")])
+    made["pcd compressed"] = (".pcd", [_pcd(points, "binary_compressed")])
+    for suffix in (".las", ".laz"):
+        made[suffix[1:]] = (suffix, [_las(folder / f"a{suffix}", form) for form in (3, 6, 7)])
+    for suffix in (".off", ".obj", ".stl", ".glb"):
+        made[suffix[1:]] = (suffix, [_bytes(BOX.export(file_type=suffix[1:]))])
+    made["stl"][1].append(_bytes(BOX.export(file_type="stl_ascii")))
+    made["glb"][1].append(_bytes(trimesh.Scene([BOX, BOX.copy()]).export(file_type="glb")))
+    packed = {"compression": "gzip", "chunks": (2, 20, 3)}
+    made["hdf5"] = (".h5", [_hdf5(folder / "a.h5", options) for options in ({}, packed)])
+    made["names"] = (".txt", [b"chair\ntable\nlamp\n"])
+    made["listing"] = (".json", [b'["shape_data/02691156/a", "shape_data/02691156/b"]'])
+    made["zip"] = (".zip", [_zip()])
+    made["tar"] = (".tar.gz", [_tar("w:gz")])
+    made["tar xz"] = (".tar.xz", [_tar("w:xz"), _tar("w")])
+    made["weights"] = (".pt", [_weights(folder / "a.pt")])
+    made["checkpoint"] = (".ckpt", [_saved(lambda file: torch.save(CHECKPOINT, file))])
+    run_record.write(folder, record(files={"weights": "weights.pt"}))
+    made["record"] = (".json", [(folder / run_record.FILE).read_bytes()])
+    save_clouds(
+        folder / "c.npz", torch.rand(2, 9, 3), {"generated": torch.rand(2, 3, 3)}, ["a", "b"]
+    )
+    made["pictured clouds"] = (".npz", [(folder / "c.npz").read_bytes()])
+    return made
+
+
+CHECKPOINT = {
+    CHECKPOINT_KEY: {"trainer.max_epochs": "3", "m": "8"},
+    "optimizer_states": [],
+    "loops": {"fit_loop": {"epoch_progress": {"current": {"processed": 2}}}},
+    "state_dict": {"task.a": torch.ones(3)},
+}
+
+
+def _written(folder, suffix, table):
+    WRITERS[suffix](folder / f"a{suffix}", table)
+    return (folder / f"a{suffix}").read_bytes()
+
+
+def _saved(save):
+    file = io.BytesIO()
+    save(file)
+    return file.getvalue()
+
+
+def _bytes(content):
+    return content.encode() if isinstance(content, str) else content
+
+
+def _ascii_ply(points):
+    rows = "\n".join(" ".join(map(str, row)) for row in points)
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat ascii 1.0\ncomment made\nelement vertex {len(points)}\n{axes}end_header\n"
+    return (head + rows + "\n").encode()
+
+
+def _pcd(points, kind):
+    head = (
+        "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+        f"WIDTH {len(points)}\nHEIGHT 1\nPOINTS {len(points)}\nDATA {kind}\n"
+    )
+    if kind == "ascii":
+        return (head + "\n".join(" ".join(map(str, row)) for row in points)).encode()
+    plain = points.T.astype("<f4").tobytes()
+    packed = b"".join(
+        bytes([len(plain[i : i + 32]) - 1]) + plain[i : i + 32] for i in range(0, len(plain), 32)
+    )
+    return head.encode() + np.array([len(packed), len(plain)], "<u4").tobytes() + packed
+
+
+def _las(path, form):
+    import laspy
+
+    header = laspy.LasHeader(point_format=form, version="1.4" if form > 5 else "1.2")
+    header.add_extra_dim(laspy.ExtraBytesParams("depth", "f4"))
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = np.random.default_rng(form).uniform(0, 9, (3, 40))
+    cloud.write(path)
+    return path.read_bytes()
+
+
+def _hdf5(path, options):
+    with h5py.File(path, "w") as file:
+        file.create_dataset(
+            "data", data=np.random.default_rng(0).random((6, 40, 3), "f4"), **options
+        )
+        file["label"] = (np.arange(6) % 3).astype("u1")[:, None]
+    return path.read_bytes()
+
+
+def _zip():
+    def save(file):
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
+            packed.writestr("set/", b"")
+            packed.writestr("set/a.txt", b"chair\n" * 50)
+            packed.writestr("set/deep/b.txt", bytes(range(256)))
+
+    return _saved(save)
+
+
+def _tar(mode):
+    def save(file):
+        with tarfile.open(fileobj=file, mode=mode) as packed:
+            for name in ("set/a.txt", "set/deep/b.txt"):
+                info = tarfile.TarInfo(name)
+                info.size = 300
+                packed.addfile(info, io.BytesIO(bytes(range(250)) + bytes(50)))
+
+    return _saved(save)
+
+
+def _weights(path):
+    torch.manual_seed(0)
+    weights.save(path, FMOPSNet(8), {"learn": "sampler", "sampler": SAMPLER}, {"a": 0.5}, ["x"])
+    return path.read_bytes()
+
+
+def changed_content(random, content):
+    """Return nested plain data with one value replaced, for what byte changes rarely reach."""
+    found = list(_places(content))
+    holder, key = found[random.integers(len(found))]
+    odd: list[Any] = [
+        None, True, -1, 0, 3.5, 2**70, float("nan"), 1e308, "", "nan", "x" * 3000, "\ud800",
+        [], {}, [[[]]], [None], [1e400], (1, 2), {"_target_": "os.system"}, {"a": {"b": 1}},
+        b"x", torch.ones(2), torch.ones(()), "../../../etc/passwd",
+    ]  # fmt: skip
+    value = odd[random.integers(len(odd))]
+    if random.random() < 0.2 and isinstance(holder, dict):
+        holder.pop(key)
+    else:
+        holder[key] = value
+    return content
+
+
+def _places(content):
+    for key in list(content) if isinstance(content, dict) else range(len(content)):
+        yield content, key
+        if isinstance(content[key], dict | list) and content[key]:
+            yield from _places(content[key])
+
+
+def json_bytes(content):
+    return json.dumps(content, default=str).encode()
