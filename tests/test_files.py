@@ -1,3 +1,5 @@
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -71,4 +73,11 @@ def test_load_npz_small_file_of_large_arrays_is_refused(tmp_path, monkeypatch):
 def test_load_npz_pickled_objects_are_refused(tmp_path):
     np.savez(tmp_path / "a.npz", points=np.array([{}], object))
     with pytest.raises(UserError, match=r"a\.npz is broken"):
+        load_npz(tmp_path / "a.npz")
+
+
+def test_load_npz_member_that_is_no_array_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as packed:
+        packed.writestr("points.npy", b"no array")
+    with pytest.raises(UserError, match="points is not an array"):
         load_npz(tmp_path / "a.npz")

@@ -104,6 +104,9 @@ def load_npz(path: Path) -> dict[str, Any]:
         if announced > memory(path):
             raise ValueError(f"{announced:,} bytes announced in {path.stat().st_size:,}")
         with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
+            arrays = {name: file[name] for name in file.files}
+        if other := next((n for n, a in arrays.items() if not isinstance(a, np.ndarray)), None):
+            raise ValueError(f"{other} is not an array")  # numpy returns the bytes of other members
+        return arrays
     except Exception as error:  # numpy parses headers as Python literals
         raise UserError(f"{path} is broken: {one_line(error)}.") from None
