@@ -51,7 +51,7 @@ def test_report_writes_all_files(tmp_path, capsys):
     assert "samplenet" in svg or "<path" in svg
     tex = (tmp_path / "table.tex").read_text()
     assert r"1.0 & 1.5 / 2 & 1.9 / 2 \\" in tex
-    assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 2
+    assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 3
     with (tmp_path / "table.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert len(lines) == 20
