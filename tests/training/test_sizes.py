@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import pytest
 import torch
 
@@ -13,6 +15,7 @@ from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.sizes import sizes_to_test
+from tests.support.recording import Fingerprint, RecordingTask
 from tests.support.training import quiet_trainer, small_dataset
 
 SEVEN = (1, 2, 3, 5, 8, 13, 20)
@@ -23,7 +26,7 @@ def trained(sampler):
     data = small_dataset()
     torch.manual_seed(0)
     module = Experiment(
-        Classification(PointNetVanilla(3), 3),
+        RecordingTask(Fingerprint()),
         sampler,
         make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
     )
@@ -62,11 +65,14 @@ def test_test_several_sizes_equals_single_tests(make):
     readouts = {"generated", "matched", "completed", "fps", "voxel", "poisson"}
     for m in SEVEN:
         alone = metrics_of(module, (m,), m, baselines())
-        scored = {name.split("/")[1] for name in alone if name.endswith("/accuracy")}
+        scored = {name.split("/")[1] for name in alone if name.endswith("/fingerprint")}
         assert scored == {*readouts, "full"}
         for name, value in alone.items():
             within = name if "/full/" in name else name.replace("test/", f"test/m{m}/")
-            assert together[within] == pytest.approx(value, abs=1e-6), within
+            assert together[within] == pytest.approx(value, abs=1e-5), within
+    for readout in readouts:
+        scores = [together[f"test/m{m}/{readout}/fingerprint"] for m in SEVEN]
+        assert min(b - a for a, b in pairwise(sorted(scores))) > 1e-4, readout
 
 
 def test_score_name_several_sizes_uses_own_size():

@@ -1,0 +1,162 @@
+"""Which points every score is computed from, through Lightning's trainer and by their outcome."""
+
+from itertools import pairwise
+from typing import Any
+
+import pytest
+import torch
+
+from mops_lightning.data.loader import CloudLoader
+from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.samplers.critical import CriticalSampler
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.gumbel import GumbelSampler
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.poisson import PoissonSampler
+from mops_lightning.samplers.random import RandomSampler
+from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
+from mops_lightning.samplers.snet import ProgressiveSNet, SNet
+from mops_lightning.samplers.submodular import SubmodularSampler
+from mops_lightning.samplers.voxel import VoxelSampler
+from mops_lightning.training.experiment import Experiment
+from tests.support.plain import plain_farthest
+from tests.support.recording import Fingerprint, RecordingTask, numbered_clouds
+from tests.support.training import quiet_trainer
+
+MOPS: dict[str, Any] = {"feature_channels": (8, 6), "rho_channels": (12, 10)}
+SNET: dict[str, Any] = {"feature_channels": (8, 6), "head_channels": (12,)}
+SAMPLERS = {
+    "mops": lambda: MOPSNet(8, **MOPS),
+    "fmops": lambda: FMOPSNet(8, **MOPS),
+    "snet": lambda: SNet(8, **SNET),
+    "samplenet": lambda: SampleNet(8, k=3, **SNET),
+    "snet-progressive": lambda: ProgressiveSNet(8, **SNET),
+    "samplenet-progressive": lambda: ProgressiveSampleNet(8, k=3, **SNET),
+    "voxel-centroid": lambda: VoxelSampler(8, pick="centroid"),
+    "voxel": lambda: VoxelSampler(8),
+    "fps": lambda: FPSSampler(8),
+    "random": lambda: RandomSampler(8),
+    "poisson": lambda: PoissonSampler(8),
+    "submodular": lambda: SubmodularSampler(8, PointNetVanilla(3)),
+    "critical": lambda: CriticalSampler(8, PointNetVanilla(3)),
+    "gumbel": lambda: GumbelSampler(8, feature_channels=(8, 6), key_channels=(12, 10)),
+}
+BASELINES = {"fps": FPSSampler, "random": RandomSampler, "voxel": VoxelSampler}
+
+
+@pytest.fixture(params=SAMPLERS)
+def sampler(request):
+    """A sampler whose generated points are spread, but so little that some matches repeat."""
+    torch.manual_seed(0)
+    made = SAMPLERS[request.param]()
+    with torch.no_grad():
+        for name, weight in made.named_parameters():
+            if weight.ndim == 2:
+                weight.mul_(4 if name.startswith("queries") else 1.5)
+    return made.eval()
+
+
+def experiment(sampler, **settings):
+    baselines = {name: make(8) for name, make in BASELINES.items()}
+    sizes = (5, 8) if sampler.flexible else (8,)
+    task = RecordingTask(Fingerprint())
+    return Experiment(task, sampler, "nothing", baselines=baselines, sizes=sizes, m=8, **settings)
+
+
+@torch.no_grad()
+def expected_points(sampler, cloud, m):
+    """Every readout of one cloud ``(N, 3)``, by its definition."""
+    sampled = sampler(cloud[None], m)
+    if not sampler.generates:
+        return {"sampled": cloud[sampled.indices[0]]}
+    squares = (sampled.points[0][:, None] - cloud).square().sum(2)
+    rows = squares.argmin(1).tolist()
+    filled = plain_farthest(cloud, dict.fromkeys(rows), m)
+    return {"generated": sampled.points[0], "matched": cloud[rows], "completed": cloud[filled]}
+
+
+def expected_scores(module, clouds, sizes, baselines=BASELINES):
+    """The mean fingerprint of every readout and baseline at every size."""
+    sums: dict[str, list[float]] = {}
+    for cloud in clouds:
+        for m in sizes:
+            prefix = f"m{m}/" if len(sizes) > 1 else ""
+            sets = expected_points(module.sampler, cloud, m)
+            sets |= {name: make(m)(cloud[None]).points[0] for name, make in baselines.items()}
+            for name, points in sets.items():
+                assert points.shape == (m, 3)
+                score = float(module.task.net(points[None]))
+                sums.setdefault(f"{prefix}{name}", []).append(score)
+        if baselines:
+            sums.setdefault("full", []).append(float(module.task.net(cloud[None])))
+    return {name: sum(values) / len(clouds) for name, values in sums.items()}
+
+
+def scores(trainer):
+    """The logged fingerprints, by readout."""
+    return {
+        name.removesuffix("/fingerprint"): float(value)
+        for name, value in trainer.callback_metrics.items()
+        if name.endswith("/fingerprint")
+    }
+
+
+def assert_distinct(values):
+    """Assert that no two scores are so near that a test could take one for the other."""
+    values = sorted(values)
+    assert all(after - before > 1e-3 for before, after in pairwise(values)), values
+
+
+def test_test_scores_each_readout_from_its_own_points(sampler, calls):
+    data = numbered_clouds()
+    module, trainer = experiment(sampler), quiet_trainer(1)
+    trainer.test(module, CloudLoader(data.test, 4), verbose=False)
+    got = scores(trainer)
+    want = expected_scores(module, data.test.points, module.sizes)
+    want = {f"test/{name}": value for name, value in want.items()}
+    # A sampler and the baseline of its kind return the same points; voxels share no match; what
+    # Gumbel subset sampling generates in the test are input points.
+    same = {
+        FPSSampler: ("fps",),
+        RandomSampler: ("random",),
+        VoxelSampler: ("voxel", "completed"),
+        GumbelSampler: ("matched",),
+    }
+    twins = same.get(type(sampler), ())
+    assert_distinct(v for name, v in want.items() if name.rsplit("/")[-1] not in twins)
+    assert got == pytest.approx(want, abs=1e-4)
+    main = "generated" if sampler.generates else "sampled"
+    own_size = "m8/" if sampler.flexible else ""
+    assert module.score_name == f"test/{own_size}{main}/fingerprint"
+    for call in calls:
+        assert torch.equal(call.clouds, data.test.points[torch.tensor(call.labels) - 1000])
+    assert not any(call.training for call in calls)
+
+
+@pytest.mark.parametrize("sampler", ["mops", "samplenet-progressive", "fps"], indirect=True)
+def test_validation_scores_readouts_at_own_size(sampler):
+    data = numbered_clouds()
+    module, trainer = experiment(sampler), quiet_trainer(1)
+    trainer.validate(module, CloudLoader(data.train, 3), verbose=False)
+    want = expected_scores(module, data.train.points, (8,), baselines={})
+    assert_distinct(want.values())
+    assert scores(trainer) == pytest.approx(
+        {f"val/{name}": value for name, value in want.items()}, abs=1e-4
+    )
+
+
+@pytest.mark.parametrize("sampler", ["fmops", "fps"], indirect=True)
+def test_loss_of_each_size_is_that_of_main_readout(sampler):
+    data = numbered_clouds()
+    module, trainer = experiment(sampler), quiet_trainer(1)
+    trainer.test(module, CloudLoader(data.test, 4), verbose=False)
+    want = {}
+    for m in (5, 8):
+        main = "generated" if sampler.generates else "sampled"
+        points = [expected_points(sampler, cloud, m)[main] for cloud in data.test.points]
+        loss = module.task.net(torch.stack(points)).square().mean()
+        want[f"test/m{m}/loss/task"] = float(loss)
+    assert_distinct(want.values())
+    got = {name: float(v) for name, v in trainer.callback_metrics.items() if "/loss/" in name}
+    assert got == pytest.approx(want, rel=1e-4)

@@ -1,0 +1,164 @@
+"""What a training step does: temperature, points of the task net, losses over sizes."""
+
+import copy
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+
+from mops_lightning.data.loader import CloudLoader
+from mops_lightning.losses.subset import simplification_loss, subset_loss
+from mops_lightning.ops.nearest import k_nearest
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
+from mops_lightning.samplers.snet import ProgressiveSNet, SNet
+from mops_lightning.training.experiment import Experiment
+from tests.support.recording import Fingerprint, RecordingTask, numbered_clouds
+from tests.support.training import quiet_trainer
+
+MOPS: dict[str, Any] = {"feature_channels": (8, 6), "rho_channels": (12, 10), "alpha": 2.0}
+SNET: dict[str, Any] = {"feature_channels": (8, 6), "head_channels": (12,), "alpha": 2.0}
+
+
+def noting(kind, *arguments, **settings):
+    """A sampler that keeps what it returned, in ``samples``."""
+
+    class Noting(kind):  # type: ignore[misc, valid-type]
+        def sample(self, points, m):
+            output = super().sample(points, m)
+            self.samples.append((self.training, points.detach(), output))
+            return output
+
+    torch.manual_seed(0)
+    made = Noting(*arguments, **settings)
+    made.samples = []
+    return made
+
+
+def fitted(sampler, epochs=1, learn="sampler", **extra):
+    """Train with a rate of 0, so that all steps see the same weights, and validate each epoch."""
+    data = numbered_clouds()
+    module = Experiment(
+        RecordingTask(Fingerprint()),
+        sampler,
+        learn,
+        make_optimizer=lambda parameters: torch.optim.SGD(parameters, lr=0.0),
+    )
+    trainer = quiet_trainer(epochs, **extra)
+    train = CloudLoader(data.train, 4, shuffle=True, drop_last=True)
+    trainer.fit(module, train, CloudLoader(data.test, 10))
+    return module, {name: float(value) for name, value in trainer.callback_metrics.items()}
+
+
+@pytest.mark.parametrize(
+    ("annealing", "tau"),
+    [("exponential", lambda part: 0.2**part), ("linear", lambda part: 1 - 0.8 * part)],
+    ids=["exponential", "linear"],
+)
+def test_step_uses_temperature_of_its_progress(annealing, tau):
+    sampler = noting(MOPSNet, 8, tau_min=0.2, annealing=annealing, **MOPS)
+    fitted(sampler, epochs=2)
+    seen = [(training, output.matrix.tau) for training, _, output in sampler.samples]
+    want = [(True, tau(step / 7)) for step in range(8)]  # 2 epochs of 4 batches
+    want = [*want[:4], (False, 0.2), *want[4:], (False, 0.2)]
+    assert [phase for phase, _ in seen] == [phase for phase, _ in want]
+    assert [value for _, value in seen] == pytest.approx([value for _, value in want])
+
+
+@pytest.mark.parametrize("kind", [SampleNet, ProgressiveSampleNet])
+def test_task_net_of_samplenet_gets_projected_points_in_training_only(kind, calls):
+    sampler = noting(kind, 8, k=3, **SNET)
+    torch.nn.init.constant_(sampler.temperature, 0.7)
+    fitted(sampler)
+    trained = [output for training, _, output in sampler.samples if training]
+    sizes = sampler.training_sizes()
+    steps = [call for call in calls if call.training]
+    assert [call.points.shape[1] for call in steps] == [m for _ in trained for m in sizes]
+    for number, output in enumerate(trained):
+        for call, m in zip(steps[number * len(sizes) :], sizes, strict=False):
+            distances, rows = k_nearest(output.points[:, :m], call.clouds, 3)
+            near = call.clouds[torch.arange(4)[:, None, None], rows]
+            weights = torch.softmax(-distances / 0.7**2, 2)
+            projected = (weights[..., None] * near).sum(2)
+            torch.testing.assert_close(call.points, projected)
+            assert (call.points - output.points[:, :m]).abs().max() > 0.1
+    (scored,) = [output for training, _, output in sampler.samples if not training]
+    assert scored.soft_projected is None
+    generated, matched, _ = (call.points for call in calls if not call.training)
+    assert torch.equal(generated, scored.points)
+    assert not torch.equal(generated, matched)
+
+
+@pytest.mark.parametrize("kind", [MOPSNet, SNet])
+def test_task_net_of_generating_sampler_gets_generated_points_in_training(kind, calls):
+    sampler = noting(kind, 8, **(MOPS if kind is MOPSNet else SNET))
+    fitted(sampler)
+    generated = [output.points for training, _, output in sampler.samples if training]
+    steps = [call for call in calls if call.training]
+    assert len(steps) == len(generated) == 4
+    for call, points in zip(steps, generated, strict=True):
+        assert torch.equal(call.points, points)
+
+
+@pytest.mark.parametrize(
+    ("how", "make", "name", "loss"),
+    [
+        ("mean", lambda **_: noting(FMOPSNet, 16, **MOPS), "subset", subset_loss),
+        *(
+            (how, partial(noting, kind, 16, **SNET), "simplification", simplification_loss)
+            for how in ("sum", "mean")
+            for kind in (ProgressiveSNet, ProgressiveSampleNet)
+        ),
+    ],
+    ids=["fmops", "snet-sum", "samplenet-sum", "snet-mean", "samplenet-mean"],
+)
+def test_losses_over_sizes_are_summed_or_averaged(how, make, name, loss, calls):
+    sampler = make(size_reduction=how)
+    module, logged = fitted(sampler, limit_train_batches=1, limit_val_batches=0)
+    ((_, clouds, output),) = sampler.samples
+    sizes = [call.points.shape[1] for call in calls]
+    assert len(sizes) > 2
+    assert sizes == sorted(set(sizes))
+    share = 1 / len(sizes) if how == "mean" else 1
+    with torch.no_grad():
+        own = sum(2 * loss(clouds, output.points[:, :m]) for m in sizes) * share
+        task = sum(module.task.net(call.points).square().mean() for call in calls) * share
+    assert logged[f"train/loss/{name}"] == pytest.approx(float(own), rel=1e-4)
+    assert logged["train/loss/task"] == pytest.approx(float(task), rel=1e-4)
+    parts = [value for key, value in logged.items() if key.startswith("train/loss/")]
+    assert 2 * logged["train/loss/total"] == pytest.approx(sum(parts), rel=1e-4)
+    assert logged["train/mean_loss"] == pytest.approx(logged["train/loss/total"], rel=1e-4)
+
+
+@pytest.mark.parametrize("learn", ["sampler", "joint", "task"])
+def test_step_follows_the_gradient_of_the_total_loss(learn, calls):
+    torch.manual_seed(0)
+    task, sampler = RecordingTask(Fingerprint()), MOPSNet(8, **MOPS)
+    before = copy.deepcopy((task, sampler))
+    module = Experiment(
+        task,
+        None if learn == "task" else sampler,
+        learn,
+        make_optimizer=lambda parameters: torch.optim.SGD(parameters, lr=0.01),
+    )
+    data = numbered_clouds()
+    trainer = quiet_trainer(1, limit_train_batches=1, limit_val_batches=0)
+    trainer.fit(module, CloudLoader(data.train, 4, shuffle=True), CloudLoader(data.test, 4))
+    ((_, clouds, _, _),) = calls
+    old_task, old_sampler = before
+    output = old_sampler.train()(clouds)
+    points = clouds if learn == "task" else output.points
+    loss = old_task.net(points).square().mean()
+    if learn != "task":
+        loss = loss + 2 * subset_loss(clouds, points)
+    loss.backward()
+    for old, new, learns in (
+        (old_task, task, learn != "sampler"),
+        (old_sampler, sampler, learn != "task"),
+    ):
+        for was, now in zip(old.parameters(), new.parameters(), strict=True):
+            gradient = was.grad if learns else torch.zeros_like(was)
+            assert gradient is not None
+            torch.testing.assert_close(now.detach(), was.detach() - 0.01 * gradient)
