@@ -51,13 +51,24 @@ def one_line(error: Exception) -> str:
     return f"{type(error).__name__}: {said[:MESSAGE]}{'…' if len(said) > MESSAGE else ''}"
 
 
+def printable(text: str) -> str:
+    """Return a text with its control characters escaped: names of files may hold any.
+
+    Line ends and tabs are kept.
+    """
+    return "".join(
+        one if one.isprintable() or one in "\n\t" else one.encode("unicode_escape").decode()
+        for one in text
+    )
+
+
 def end(name: str, message: str, status: int) -> NoReturn:
     """Print ``name: message`` on stderr and exit.
 
     Raises:
         SystemExit: always, with ``status``.
     """
-    print(f"{name}: {message}", file=sys.stderr)
+    print(printable(f"{name}: {message}"), file=sys.stderr)
     sys.exit(status)
 
 

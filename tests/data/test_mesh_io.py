@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mops_lightning.data.mesh_io import BrokenMeshError, cloud_from_file, parse_mesh
+from mops_lightning.data.mesh_io import MAX_MATERIALS, BrokenMeshError, cloud_from_file, parse_mesh
 
 BOX = trimesh.creation.box((1.0, 2.0, 3.0))
 BALL = trimesh.creation.icosphere(subdivisions=1)
@@ -156,3 +156,10 @@ def test_obj_vertices_of_two_coordinates_are_broken(tmp_path):
     path.write_text("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n")
     with pytest.raises(BrokenMeshError, match=r"a\.obj is broken"):
         cloud_from_file(path, 9, 0)
+
+
+def test_obj_of_many_materials_is_read(tmp_path):
+    path = tmp_path / "a.obj"
+    faces = "".join(f"usemtl m{number}\nf 1 2 3\n" for number in range(MAX_MATERIALS + 1))
+    path.write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\n{faces}")
+    assert len(parse_mesh(path.read_bytes(), path).faces) == MAX_MATERIALS + 1

@@ -22,6 +22,10 @@ FLAT = 1e-12
 """Smallest ratio of area to squared extent; below, a mesh is a line or a point."""
 
 
+MAX_MATERIALS = 1000
+"""In an OBJ file with more, materials are ignored: trimesh's time grows with their square."""
+
+
 class BrokenMeshError(UserError):
     """A mesh file without a readable surface; ``skip_broken`` skips these errors only."""
 
@@ -147,6 +151,8 @@ def _load(data: bytes, kind: str) -> trimesh.Trimesh:
         # Comments may have any encoding, for which trimesh would need another package.
         data = data.decode("utf-8" if _is_utf8(data) else "latin-1").encode()
         data = data.replace(b"\t", b" ")  # trimesh recognises faces of OBJ files by "f " only
+    if kind == ".obj" and data.count(b"usemtl") > MAX_MATERIALS:
+        data = re.sub(rb"(?m)^[ ]*usemtl.*$", b"", data)
     if kind == ".ply":
         data = ply_header.plain(data)
     if kind == ".glb":

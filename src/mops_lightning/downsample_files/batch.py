@@ -18,7 +18,7 @@ from rich.progress import track
 from mops_lightning.data.formats import limits
 from mops_lightning.downsample_files.processes import Died, processes
 from mops_lightning.downsample_files.settings import Settings
-from mops_lightning.errors import UserError, one_line
+from mops_lightning.errors import UserError, one_line, printable
 
 
 def attempt(
@@ -70,7 +70,7 @@ def process_file(source: Path, target: Path, settings: Settings, engine: Any) ->
     close = ""
     if seams is not None:
         close = f", {seams.after:,} of {seams.before:,} close pairs at seams left"
-    print(f"{target}: {written:,} of {number:,} points{more}{close}, {seconds:.1f} s")
+    print(printable(f"{target}: {written:,} of {number:,} points{more}{close}, {seconds:.1f} s"))
 
 
 def process_folder(
@@ -108,10 +108,10 @@ def process_folder(
         done["skipped"] = len(jobs) - len(todo)
     for source, error in sorted(failures.items()):
         name = "" if str(source) in str(error) else f"{source}: "
-        print(f"failed: {name}{error}", file=sys.stderr)
+        print(printable(f"failed: {name}{error}"), file=sys.stderr)
     counts = ", ".join(f"{number} {state}" for state, number in done.items())
     left = f"; {dropped:,} points without finite coordinates left out" if dropped else ""
-    print(f"{len(jobs)} files: {counts}{left}; in {target}")
+    print(printable(f"{len(jobs)} files: {counts}{left}; in {target}"))
     return len(failures)
 
 

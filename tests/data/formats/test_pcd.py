@@ -1,8 +1,12 @@
 """PCD files."""
 
 import numpy as np
+import pytest
 
 from mops_lightning.data.formats import pcd
+from mops_lightning.data.formats.lzf import decompress
+from mops_lightning.data.formats.registry import read
+from mops_lightning.errors import UserError
 
 
 def packed(data):
@@ -65,3 +69,24 @@ def test_pcd_every_encoding_is_read(tmp_path):
         table = pcd.read(path)
         np.testing.assert_array_equal(table.points, points)
         np.testing.assert_array_equal(table.columns["rgb"], colour)
+
+
+@pytest.mark.parametrize(
+    ("number", "body"),
+    [
+        (99999999999, b"ascii\n"),
+        (1, b"binary_compressed\n" + np.array([9, 4], "<u4").tobytes() + b"\0a"),
+    ],
+)
+def test_pcd_impossible_count_is_broken(number, body, tmp_path):
+    path = tmp_path / "a.pcd"
+    head = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nPOINTS {number}\nDATA "
+    path.write_bytes(head.encode() + body)
+    with pytest.raises(UserError, match=rf"bytes are not {number} points"):
+        read(path, 9, 0)
+
+
+def test_lzf_repeats_and_stops_at_its_size():
+    assert decompress(b"\0a\xe0\x02\0\x01bc\x40\x01", 1 + 11 + 2 + 4) == b"a" * 12 + b"bcbcbc"
+    with pytest.raises(ValueError, match="expected 12"):
+        decompress(b"\0a" + b"\xe0\xff\0" * 100_000, 12)

@@ -9,7 +9,7 @@ def decompress(data: bytes, size: int) -> bytes:
     """
     out = bytearray()
     place = 0
-    while place < len(data):
+    while place < len(data) and len(out) <= size:
         control = data[place]
         place += 1
         if control < 32:  # control + 1 literal bytes
@@ -25,11 +25,10 @@ def decompress(data: bytes, size: int) -> bytes:
         length += 2
         if start < 0:
             raise ValueError("compressed data refer to bytes before their start")
-        while length:  # the source may overlap the bytes that the copy appends
-            piece = out[start : start + length]
-            out += piece
-            start += len(piece)
-            length -= len(piece)
+        piece = bytes(out[start : start + length])
+        if len(piece) < length:  # the source overlaps the bytes that the copy appends
+            piece = (piece * (length // max(len(piece), 1) + 1))[:length]
+        out += piece
     if len(out) != size:
         raise ValueError(f"compressed data give {len(out)} bytes, expected {size}")
     return bytes(out)

@@ -88,6 +88,8 @@ def _header(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
 
 def _body(body: bytes, kind: str, layout: np.dtype[Any], number: int) -> NDArray[Any]:
     if kind == "ascii":
+        if number > len(body):
+            raise ValueError(f"{len(body)} bytes are not {number} points")
         numbers = np.array(body.split(), dtype=np.float64).reshape(number, -1)
         array, place = np.empty(number, layout), 0
         for name in layout.names or ():
@@ -100,6 +102,8 @@ def _body(body: bytes, kind: str, layout: np.dtype[Any], number: int) -> NDArray
     if kind != "binary_compressed":
         raise ValueError(f"DATA {kind} is not ascii, binary or binary_compressed")
     packed, unpacked_size = np.frombuffer(body, "<u4", 2)
+    if unpacked_size < number * layout.itemsize:
+        raise ValueError(f"{unpacked_size} bytes are not {number} points")
     unpacked = decompress(body[8 : 8 + int(packed)], int(unpacked_size))
     array, place = np.empty(number, layout), 0
     for name in layout.names or ():  # one field after the other
