@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
@@ -14,6 +15,9 @@ from mops_lightning.report.cells import Cells, sort_key
 from mops_lightning.viz.clouds import draw_cloud, upright
 from mops_lightning.viz.figures import cloud_axes, new_figure
 from mops_lightning.viz.snapshots import INPUT, load_clouds
+
+COLOURS = (*(f"C{i}" for i in range(10)), *(colormaps["Dark2"](i) for i in range(8)))
+"""Of curves, in the order of the rows."""
 
 LOG_SCALE_RATIO = 20
 """Heat maps whose largest value exceeds the smallest by more have logarithmic colours."""
@@ -82,7 +86,7 @@ def curves(table: Cells, axes: Axes) -> Figure:
                 [one.mean() for one in values],
                 yerr=[one.std(ddof=1) if len(one) > 1 else 0.0 for one in values],
                 label=name,
-                color=f"C{number % 10}",
+                color=COLOURS[number % len(COLOURS)],
                 linestyle="--" if dashed else "-",
                 marker="o",
                 markersize=3,
