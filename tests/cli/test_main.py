@@ -18,7 +18,7 @@ def test_subcommand_help_names_the_subcommand(name, tmp_path):
     assert out.startswith(f"usage: mops_lightning {name} [-h]")
 
 
-@pytest.mark.parametrize("name", ["report", "downsample_files"])
+@pytest.mark.parametrize("name", ["report", "downsample_files", "compare"])
 def test_subcommand_module_help_names_the_module(name):
     command = [sys.executable, "-m", f"mops_lightning.{name}", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -27,13 +27,17 @@ def test_subcommand_module_help_names_the_module(name):
 
 @pytest.mark.parametrize(
     "arguments",
-    [["report", "nowhere"], ["downsample", "nowhere", "out", "--method=fps", "--m=4"]],
+    [
+        ["report", "nowhere"],
+        ["downsample", "nowhere", "out", "--method=fps", "--m=4"],
+        ["compare", "nowhere", "--m=4"],
+    ],
     ids=COMMANDS,
 )
 def test_subcommand_error_names_the_subcommand(arguments, tmp_path):
     status, _, err = call(arguments, tmp_path)
     assert status == 2
-    assert err.startswith(f"mops_lightning {arguments[0]}: nowhere: ")
+    assert err.startswith(f"mops_lightning {arguments[0]}: nowhere")
 
 
 def test_version_is_that_of_the_package(tmp_path):

@@ -22,6 +22,9 @@ COMMANDS = {
     "downsample": Command(
         "mops_lightning.downsample_files.cli", "downsample clouds and meshes from files"
     ),
+    "compare": Command(
+        "mops_lightning.compare.cli", "what methods of downsampling are worth on your own files"
+    ),
 }
 
 

@@ -3,7 +3,7 @@
 import base64
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -21,7 +21,8 @@ PLOTLY = "package_data/plotly.min.js"
 IMAGE_TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
 
 VIEW = """<h2>Sampled clouds</h2>
-<p><label>Run <select id="run"></select></label><label>Cloud <select id="shape"></select></label>
+<p><label>{choice} <select id="run"></select></label>
+<label>Cloud <select id="shape"></select></label>
 Drag to rotate; click a name in the legend to hide it.</p>
 <div id="view"></div>"""
 
@@ -34,17 +35,48 @@ def page(report: Report, folder: Path, plots: Sequence[Path]) -> str:
         folder: the folder of the report; its name is the title.
         plots: SVG or PNG files.
     """
-    clouds = _clouds(report, folder)
+    return render(
+        folder.resolve().name,
+        report.grids,
+        _clouds(report, folder),
+        report.remarks,
+        "How the runs were made",
+        plots,
+    )
+
+
+def render(
+    title: str,
+    grids: Sequence[Grid],
+    clouds: Sequence[Mapping[str, Any]],
+    remarks: Sequence[str],
+    remarks_title: str,
+    plots: Sequence[Path] = (),
+    choice: str = "Run",
+) -> str:
+    """Return a page.
+
+    Args:
+        title: its heading.
+        grids: its tables.
+        clouds: groups of clouds with ``name``, ``titles`` of its K clouds, and ``points``
+            ``(K, n, 3)`` and ``colours`` by readout, y up; a click shows ``hidden`` readouts.
+        remarks: lines at the end.
+        remarks_title: their heading.
+        plots: SVG or PNG files.
+        choice: what a group of clouds is called.
+    """
     template = Template(files("mops_lightning.report").joinpath("page.html").read_text())
     return template.substitute(
-        title=html.escape(folder.resolve().name),
-        tables="\n".join(map(_table, report.grids)),
+        title=html.escape(title),
+        tables="\n".join(map(_table, grids)),
         plots="\n".join(map(_image, plots)),
-        clouds=VIEW if clouds else "",
-        remarks="".join(map(_remark, filter(None, report.remarks))),
+        clouds=VIEW.format(choice=html.escape(choice)) if clouds else "",
+        remarks_title=html.escape(remarks_title),
+        remarks="".join(map(_remark, filter(None, remarks))),
         plotly=files("plotly").joinpath(PLOTLY).read_text() if clouds else "",
         # "</script>" in a title must not end the script.
-        data=json.dumps(clouds).replace("<", "\\u003c"),
+        data=json.dumps(list(clouds)).replace("<", "\\u003c"),
     )
 
 
@@ -96,6 +128,8 @@ def _clouds(report: Report, folder: Path) -> list[dict[str, Any]]:
                 "titles": titles,
                 "points": {name: a.astype(float).round(3).tolist() for name, a in arrays.items()},
                 "colours": {name: f"rgb{colours.get(name, COLOURS['sampled'])}" for name in arrays},
+                # Completed sets contain the matched points and would hide them.
+                "hidden": ["completed"],
             }
         )
     return found

@@ -1,0 +1,1 @@
+"""Comparing methods of downsampling on a user's own files."""

@@ -1,0 +1,81 @@
+import contextlib
+import csv
+import io
+import re
+
+import numpy as np
+import pytest
+
+from mops_lightning.compare.cli import main
+from mops_lightning.data.formats.registry import WRITERS
+from mops_lightning.data.formats.table import Table
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.zoo import weights
+
+
+def call(*arguments):
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            return stop.code, out.getvalue(), err.getvalue()
+    return 0, out.getvalue(), err.getvalue()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scans")
+    random = np.random.default_rng(0)
+    for name in ("one.ply", "two.pcd"):
+        points = random.normal(size=(700, 3)) * [5, 3, 1] + [400_000, 0, 0]
+        WRITERS[f".{name[-3:]}"](folder / name, Table(points, {"intensity": points[:, 0] / 3}))
+    node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 32}
+    weights.save(folder / "weights.pt", FMOPSNet(32), {"learn": "sampler", "sampler": node}, {})
+    return folder
+
+
+def test_compare_writes_table_and_page(folder, tmp_path):
+    arguments = [folder / "one.ply", folder / "two.pcd", "--m", 60, 90, "--out", tmp_path]
+    status, out, err = call(*arguments, "--weights", folder, "--tile", 128)
+    assert (status, err) == (0, "")
+    assert "one.ply: 60 of 700 points" in out
+    assert "two.pcd: 90 of 700 points" in out
+    assert "The trained sampler is " in out
+    with (tmp_path / "table.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["method"] for row in rows} == {"random", "voxel", "fps", "poisson", "trained"}
+    assert {row["measure"] for row in rows} >= {"chamfer", "hausdorff", "density", "intensity"}
+    largest = {row["method"]: float(row["value"]) for row in rows if row["measure"] == "hausdorff"}
+    assert largest["fps"] < largest["random"]
+    assert (tmp_path / "table.md").read_text() in out
+    page = (tmp_path / "compare.html").read_text()
+    assert "two.pcd, 90 points" in page
+    assert "How to read this" in page
+
+
+def test_compare_page_opens_without_errors(folder, tmp_path, opened):
+    call(folder / "one.ply", "--m", 30, "--methods", "random", "--out", tmp_path)
+    page, errors, requests = opened((tmp_path / "compare.html").as_uri())
+    page.wait_for_selector("#view .legend", timeout=60_000)
+    assert page.locator("#view .legendtext").all_text_contents() == ["input", "fps", "random"]
+    assert (errors, len(requests)) == ([], 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--m", 5, "--tile", 64], "give --weights"),
+        (["--m", 5, "--methods", "fsp"], "--methods: unknown 'fsp'.*'fps'"),
+        (["--m", 0], "--m must be"),
+        (["--m", 701], "fewer than --m 701"),
+        (["--m", 60, "--weights", "FOLDER"], "trained for up to 32 points, got 60"),
+        (["--m", 5, "--out", "FOLDER/one.ply"], "--out must be a folder"),
+    ],
+)
+def test_compare_mistake_ends_in_one_line(arguments, said, folder):
+    arguments = [str(argument).replace("FOLDER", str(folder)) for argument in arguments]
+    status, out, err = call(folder / "one.ply", *arguments)
+    assert (status, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert re.search(said, err)
