@@ -6,7 +6,7 @@ WORKERS ?= 2
 # Examples of each kind that `make fuzz` tries.
 EXAMPLES ?= 1000
 
-.PHONY: setup run test fuzz check clean
+.PHONY: setup run test fuzz check site clean
 
 setup: .venv/.installed
 
@@ -26,7 +26,11 @@ test: setup
 fuzz: setup
 	MOPS_FUZZ=$(EXAMPLES) $(BIN)/python -m pytest tests/fuzz -s
 
-check: setup
+# The documentation as pages in build/site. Fails on any broken link.
+site: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+check: setup site
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

@@ -64,7 +64,7 @@ class SampleOutput(NamedTuple):
         soft_projected: ``(B, M, 3)`` points on which the task net is trained in place of
             ``points``, or None; only in training, never a test result.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import SampleOutput
         >>> points = torch.rand(2, 8, 3)

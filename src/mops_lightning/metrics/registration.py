@@ -17,7 +17,7 @@ class RotationError(TableMetric):
         quantile: between 0 and 1; None takes the mean.
         factor: multiplies the angles.
 
-    Example:
+    Examples:
         >>> from mops_lightning.ops.rigid import Motion
         >>> still = Motion(torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3))
         >>> half_turn = Motion(torch.tensor([[0.0, 1, 0, 0]]), torch.zeros(1, 3))

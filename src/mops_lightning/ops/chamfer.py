@@ -21,7 +21,7 @@ def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
     Raises:
         UserError: the shapes do not match, or a cloud is empty.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import chamfer_distance
         >>> chamfer_distance(torch.zeros(1, 4, 3), torch.ones(1, 2, 3))

@@ -46,7 +46,7 @@ def earth_movers_distance(
     Raises:
         UserError: the shapes differ, an argument is out of range, or a worker process died.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import earth_movers_distance
         >>> points = torch.rand(2, 16, 3)

@@ -42,7 +42,7 @@ def farthest_point_sample(
     Raises:
         UserError: ``points`` has another shape, or ``m`` or ``start`` is out of range.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import farthest_point_sample
         >>> line = torch.tensor([[[0.0], [1.0], [2.0], [9.0]]])  # (B, N, C)

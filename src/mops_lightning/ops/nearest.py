@@ -41,7 +41,7 @@ def nearest(queries: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     Raises:
         UserError: the shapes do not match, or N is 0.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import nearest
         >>> queries, points = torch.tensor([[[0.0], [4.0]]]), torch.tensor([[[1.0], [6.0]]])

@@ -25,7 +25,7 @@ def match(generated: Tensor, points: Tensor) -> Tensor:
     Raises:
         UserError: the shapes do not match, or a cloud is empty.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import match
         >>> points = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]])
@@ -66,7 +66,7 @@ def complete(indices: Tensor, points: Tensor) -> Tensor:
     Raises:
         UserError: a shape or dtype is wrong, or M is larger than N.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import complete
         >>> points = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [5, 0, 0]]])

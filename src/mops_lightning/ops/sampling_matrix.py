@@ -34,7 +34,7 @@ class SamplingMatrix(NamedTuple):
         keys: ``(B, N, C)``, the input of that layer.
         tau: temperature τ of the softmax.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import SamplingMatrix
         >>> queries, keys = torch.rand(8, 16), torch.rand(2, 64, 16)

@@ -23,7 +23,7 @@ class Sampler(nn.Module):
     Raises:
         UserError: ``m`` is not a whole number of at least 1.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import SampleOutput, Sampler
         >>> class FirstPoints(Sampler):

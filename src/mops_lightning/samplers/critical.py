@@ -27,7 +27,7 @@ class CriticalSampler(TaskNetSampler):
     Raises:
         UserError: ``net`` is missing or unsuitable.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import CriticalSampler
         >>> from mops_lightning.nets.pointnet import PointNetVanilla

@@ -32,7 +32,7 @@ class FMOPSNet(MOPSNet):
     Raises:
         UserError: an argument is out of range.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import FMOPSNet
         >>> sampler = FMOPSNet(m_max=32).eval()

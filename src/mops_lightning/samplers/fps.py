@@ -25,7 +25,7 @@ class FPSSampler(Sampler):
     Raises:
         UserError: ``start`` is negative or, when sampling, at least N.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import FPSSampler
         >>> line = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]]])  # (B, N, 3)

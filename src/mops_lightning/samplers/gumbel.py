@@ -35,7 +35,7 @@ class GumbelSampler(Sampler):
     Raises:
         UserError: an argument is out of range.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import GumbelSampler
         >>> GumbelSampler(m=8).eval()(torch.rand(2, 64, 3)).points.shape  # (B, m, 3)

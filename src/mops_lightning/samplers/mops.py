@@ -40,7 +40,7 @@ class MOPSNet(Sampler):
     Raises:
         UserError: an argument is out of range.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import MOPSNet
         >>> points = torch.rand(2, 64, 3)  # (B, N, 3)

@@ -32,7 +32,7 @@ class PoissonSampler(Sampler):
         m: largest number of points to return.
         seed: determines how ties are broken.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import PoissonSampler
         >>> output = PoissonSampler(m=8)(torch.rand(2, 64, 3))  # (B, N, 3)

@@ -17,7 +17,7 @@ class RandomSampler(Sampler):
         m: largest number of points to return.
         seed: determines the order in which points are chosen.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import RandomSampler
         >>> output = RandomSampler(m=8)(torch.rand(2, 64, 3))  # (B, N, 3)

@@ -60,7 +60,7 @@ class SampleNet(SNet):
     Raises:
         UserError: an argument is out of range.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import SampleNet
         >>> output = SampleNet(m=8)(torch.rand(2, 64, 3))  # (B, N, 3), in training mode
@@ -121,7 +121,7 @@ class SampleNet(SNet):
 class ProgressiveSampleNet(Progressive, SampleNet):
     """SampleNet with nested samples; arguments are those of ``Progressive`` and ``SampleNet``.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import ProgressiveSampleNet
         >>> sampler = ProgressiveSampleNet(m_max=32).eval()

@@ -32,7 +32,7 @@ class SNet(Sampler):
     Raises:
         UserError: an argument is out of range.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import SNet
         >>> SNet(m=8).eval()(torch.rand(2, 64, 3)).points.shape  # (B, N, 3) to (B, m, 3)
@@ -135,7 +135,7 @@ class Progressive(Sampler):
 class ProgressiveSNet(Progressive, SNet):
     """S-Net with nested samples; arguments are those of ``Progressive`` and ``SNet``.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import ProgressiveSNet
         >>> sampler = ProgressiveSNet(m_max=32).eval()

@@ -30,7 +30,7 @@ class SubmodularSampler(TaskNetSampler):
     Raises:
         UserError: ``net`` is missing or unsuitable, or ``weighting`` is unknown.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import SubmodularSampler
         >>> from mops_lightning.nets.pointnet import PointNetVanilla

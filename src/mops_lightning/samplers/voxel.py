@@ -51,7 +51,7 @@ class VoxelSampler(Sampler):
     Raises:
         UserError: ``pick`` is unknown.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import VoxelSampler
         >>> points = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [1, 1, 1]]])

@@ -57,7 +57,7 @@ def load(path: str | Path) -> Sampler:
     Raises:
         UserError: the file is missing, damaged, not a sampler's, or does not match the sampler.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from mops_lightning import load
         >>> sampler = load("outputs/my_run")

@@ -1,0 +1,111 @@
+"""MkDocs hooks: pages from outside docs/, links that work in the repository and on the site."""
+
+import posixpath
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+import mops_lightning
+
+ROOT = Path(__file__).parents[2]
+DOCS = "docs/"
+HOME = "README.md"
+MAX_BYTES = 1_000_000
+"""Larger files are not copied; a link to one becomes plain text."""
+
+LINK = re.compile(r"(?P<mark>!?)\[(?P<text>[^\]]*)\]\((?P<target>[^)\s]+)\)")
+FENCE = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages from outside docs/, the reference, and every file that a page links to."""
+    outside = [ROOT / HOME, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
+    outside += [ROOT / "benchmarks" / HOME, ROOT / "weights" / HOME, *ROOT.glob("results/*/*.md")]
+    outside += ROOT.glob("results/*/*/*.md")
+    pages = [path for path in outside if path.is_file()]
+    for path in pages:
+        files.append(File.generated(config, _site(_name(path)), abs_src_path=str(path)))
+    files.append(File.generated(config, "reference.md", content=_reference()))
+    linked = {
+        target
+        for path in [*pages, *(ROOT / "docs").glob("*.md")]
+        for link in LINK.finditer(FENCE.sub("", path.read_text(encoding="utf-8")))
+        if (target := _target(_name(path), link["target"])) and _is_copied(target)
+    }
+    for name in sorted(linked):
+        if files.get_file_from_path(_site(name)) is None:
+            files.append(File.generated(config, _site(name), abs_src_path=str(ROOT / name)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, files: Files, **_: Any) -> str:
+    """Turn links between files of the repository into links between pages of the site."""
+    source = _repository(page.file.src_uri)
+
+    def rewrite(link: re.Match[str]) -> str:
+        target = _target(source, link["target"])
+        if target is None:
+            return link[0]
+        anchor = link["target"].partition("#")[2]
+        if files.get_file_from_path(_site(target)) is None:
+            return link["text"]
+        start = posixpath.dirname(page.file.src_uri) or "."
+        there = posixpath.relpath(_site(target), start) + (f"#{anchor}" if anchor else "")
+        return f"{link['mark']}[{link['text']}]({there})"
+
+    parts, last = [], 0
+    for fence in FENCE.finditer(markdown):  # code is left as it is
+        parts += [LINK.sub(rewrite, markdown[last : fence.start()]), fence[0]]
+        last = fence.end()
+    return "".join([*parts, LINK.sub(rewrite, markdown[last:])])
+
+
+def _target(source: str, link: str) -> str | None:
+    """Return the repository path that a link of a file means; None for other links."""
+    path = link.partition("#")[0]
+    if not path or ":" in path:
+        return None
+    target = posixpath.normpath(posixpath.join(posixpath.dirname(source), path))
+    if (ROOT / target).is_dir():
+        target = posixpath.join(target, HOME)
+    return target
+
+
+def _is_copied(name: str) -> bool:
+    path = ROOT / name
+    return path.is_file() and path.stat().st_size <= MAX_BYTES
+
+
+def _name(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def _site(name: str) -> str:
+    """Return where a file of the repository is on the site."""
+    return "index.md" if name in (HOME, DOCS + HOME) else name.removeprefix(DOCS)
+
+
+def _repository(uri: str) -> str:
+    """Return the file of the repository that is at a place of the site."""
+    if uri == "index.md":
+        return HOME
+    return uri if (ROOT / uri).is_file() else DOCS + uri
+
+
+def _reference() -> str:
+    """Return a page with every public name, by package."""
+    lines = [
+        "# Reference",
+        "",
+        "Public names, which `from mops_lightning import NAME` imports.",
+        "",
+    ]
+    packages: dict[str, list[str]] = {}
+    for name in mops_lightning.__all__:
+        module = getattr(mops_lightning, name).__module__
+        packages.setdefault(module.split(".")[1], []).append(f"::: {module}.{name}")
+    for package in sorted(packages):
+        lines += [f"## {package}", "", *(line for one in packages[package] for line in (one, ""))]
+    return "\n".join(lines)
