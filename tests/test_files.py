@@ -1,10 +1,11 @@
+import resource
 import zipfile
 
 import numpy as np
 import pytest
 
 from mops_lightning import files
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, file_error
 from mops_lightning.files import (
     atomic_write,
     is_temporary,
@@ -81,3 +82,18 @@ def test_load_npz_member_that_is_no_array_is_refused(tmp_path):
         packed.writestr("points.npy", b"no array")
     with pytest.raises(UserError, match="points is not an array"):
         load_npz(tmp_path / "a.npz")
+
+
+def test_atomic_write_on_full_disk_names_the_file(tmp_path):
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OSError, match="too large") as error, atomic_write(path) as temporary:
+            temporary.write_bytes(b"x" * 2000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert file_error(error.value).startswith(f"{path}: File too large. Free some space")
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,6 +1,8 @@
 """The errors that users see, and how a command ends: one line on stderr and an exit status."""
 
+import errno
 import os
+import re
 import select
 import sys
 from collections.abc import Iterable, Iterator
@@ -60,6 +62,22 @@ def printable(text: str) -> str:
         one if one.isprintable() or one in "\n\t" else one.encode("unicode_escape").decode()
         for one in text
     )
+
+
+def file_error(error: OSError) -> str:
+    """Return one line about a file or folder that cannot be read or written."""
+    name = f"{error.filename}: " if error.filename else ""
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    hint = " Free some space, or give another folder, and run the same command again."
+    return f"{name}{error.strerror or error}.{hint if full else ''}"
+
+
+def memory_error(error: BaseException) -> str | None:
+    """Return one line if an error says that there is not enough memory; None for other errors."""
+    text = " ".join(str(error).split())
+    if isinstance(error, MemoryError) or re.search(r"(can't|not enough|out of) .*memory", text):
+        return f"out of memory: {text[-200:]} Try a smaller batch_size, or smaller clouds."
+    return None
 
 
 def end(name: str, message: str, status: int) -> NoReturn:

@@ -50,6 +50,11 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         with temporary.open("rb+") as file:  # on disk before it takes the place of the old file
             os.fsync(file.fileno())
         temporary.replace(path)
+    except OSError as error:
+        # An error of a full disk names no file, others name the temporary one.
+        if error.filename in (None, str(temporary)):
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -59,13 +64,15 @@ def is_temporary(path: Path) -> bool:
     return path.name.startswith(TEMPORARY)
 
 
-def remove_temporary(folder: Path) -> None:
-    """Remove what killed processes left of ``atomic_write`` in a folder and below it.
+def remove_temporary(folder: Path, below: bool = True) -> None:
+    """Remove what killed processes left of ``atomic_write`` in a folder.
 
     Args:
         folder: no other process may write into it at the same time; it need not exist.
+        below: also in all folders below it.
     """
-    for path in folder.rglob(f"{TEMPORARY}*"):
+    pattern = f"{TEMPORARY}*"
+    for path in folder.rglob(pattern) if below else folder.glob(pattern):
         path.unlink(missing_ok=True)
 
 

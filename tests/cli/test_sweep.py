@@ -9,9 +9,10 @@ from filelock import FileLock
 
 from mops_lightning.cli.sweep import run_cell
 from mops_lightning.config.compose import compose
+from mops_lightning.files import TEMPORARY
 from mops_lightning.records import run_record
 from mops_lightning.records.attempts import ASIDE, FAILED
-from tests.support.command_line import TINY
+from tests.support.command_line import TINY, call
 
 
 @pytest.fixture
@@ -150,3 +151,20 @@ def test_run_cell_program_error_continues_sweep(start, tmp_path, monkeypatch, ca
     assert math.isnan(start("sampler=fps", "weights=null"))
     assert (tmp_path / "cell" / FAILED).read_text() == "RuntimeError: out of something\n"
     assert "Traceback" in caplog.text
+
+
+def test_sweep_with_cell_in_another_process_exits_with_zero(tmp_path):
+    cell = tmp_path / "sweep" / "0"
+    cell.mkdir(parents=True)
+    with FileLock(cell / ".lock"):
+        status, out, err = call(["-m", *TINY, "m=4", "hydra.sweep.dir=sweep"], tmp_path)
+    assert status == 0, err
+    assert "1 cells: 1 left to another process; in sweep" in out
+
+
+def test_run_cell_removes_temporary_files(start, tmp_path):
+    left = tmp_path / "cell" / "checkpoints" / f"{TEMPORARY}last-x.ckpt"
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"half")
+    start("sampler=fps", "weights=null")
+    assert not left.exists()

@@ -2,6 +2,8 @@
 
 import pytest
 
+from mops_lightning.config.explain import refuse_plain_groups
+from mops_lightning.errors import UserError
 from tests.support.command_line import TINY, TINY_WITH_PICTURES, call
 
 
@@ -78,3 +80,25 @@ def test_broken_yaml_ends_in_one_line(tmp_path):
     assert status == 2
     assert "mine.yaml, line 2: not valid YAML: " in err
     assert len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("out=null", "out must be a text, got None"),
+        ("out=5", "out must be a text, got 5"),
+        ("out=a,5", "out must be a text, got 5"),
+        ("cache=true", "cache must be a text, got True"),
+        ("weights=3", "weights must be a text or null, got 3"),
+        ("weights=[a]", "weights must be a text or null"),
+        ("ckpt_path=1.5", "ckpt_path must be a text or null, got 1.5"),
+        ("sampler=fps,null", "sampler=fps,null: choose one"),
+    ],
+)
+def test_refuse_plain_groups_other_type_raises(override, said):
+    with pytest.raises(UserError, match=said):
+        refuse_plain_groups([override])
+
+
+def test_refuse_plain_groups_takes_text_and_null():
+    refuse_plain_groups(["out='5'", "weights=null", "ckpt_path=last,null", "sampler=fps,mops"])

@@ -131,6 +131,14 @@ def test_rival_samplers_have_published_settings():
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
+        (["sampler=mops", "sampler.alpha=nan"], "sampler.alpha must be finite, got nan"),
+        (["task_lr_scale=inf"], "task_lr_scale must be .*got inf"),
+        (["optimizer.lr=1e400"], "optimizer.lr must be finite, got inf"),
+        (["+optimizer.betas=[nan,1]"], "optimizer.betas must be finite, got nan"),
+        (["trainer.gradient_clip_val=nan"], "trainer.gradient_clip_val must be .*got nan"),
+        (["trainer.gradient_clip_val=-1"], "trainer.gradient_clip_val must be .*got -1"),
+        (["trainer.log_every_n_steps=0"], "trainer.log_every_n_steps must be .*at least 1, got 0"),
+        (["seed=18446744073709551616"], r"seed must be below 2\*\*63, got one of 65 bits"),
         (["m=0"], "m must be a whole number of at least 1, got 0"),
         (["m=2.5"], "m must be a whole number"),
         (["m=2000"], r"m must be at most dataset.n_points=1024, got m=2000"),

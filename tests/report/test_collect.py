@@ -1,3 +1,7 @@
+import json
+
+import pytest
+
 from tests.support.reports import put, put_cell, rows, table
 
 
@@ -24,4 +28,36 @@ def test_collect_lists_unreadable_record(tmp_path):
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
     (tmp_path / "bad").mkdir()
     (tmp_path / "bad" / "result.json").write_text("")
-    assert f"- {tmp_path}/bad: not readable" in table(tmp_path)
+    assert f"- {tmp_path}/bad: {tmp_path}/bad/result.json: not a run record" in table(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"config": {"m": 3}}, "config: 'learn' is a required property"),
+        ({"config": 3}, "not a run record: 3 is not of type 'object'"),
+        ({"metrics": {"test/sampled/accuracy": "x"}}, "not a run record"),
+        ({"notes": {"metrics": {"accuracy": {"scale": "x"}}}}, "notes.metrics.accuracy.scale"),
+        ({"notes": {"evaluated": {"seed": "x"}}}, "notes.evaluated.seed"),
+    ],
+    ids=str,
+)
+def test_collect_lists_record_without_what_tables_need(tmp_path, change, said):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    put(tmp_path, "random", 32, {"test/sampled/accuracy": 0.2})
+    path = tmp_path / "random-32-pointnet" / "result.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    text = table(tmp_path)
+    assert "1 of 2 runs is not completed" in text
+    assert said in text
+    assert "fps" in text
+
+
+def test_collect_lists_bytes_that_are_no_text(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    for name, content in (("bytes", b"\xff\xfe"), ("deep", b"[" * 100_000)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "result.json").write_bytes(content)
+    (tmp_path / "folder" / "result.json").mkdir(parents=True)
+    text = table(tmp_path)
+    assert "3 of 4 runs are not completed" in text

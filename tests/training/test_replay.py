@@ -120,3 +120,21 @@ def test_command_line_user_may_give_what_a_record_may_not(tmp_path):
     folder = write_run(tmp_path / "run", ["sampler._target_=os.system"])
     given = "sampler._target_=mops_lightning.samplers.fmops.FMOPSNet"
     assert command_line([f"evaluate={folder}", given])[-1] == given
+
+
+@pytest.mark.parametrize(
+    "argument",
+    ["task_lr_scale=3", "trainer.max_epochs=5", "optimizer=exponential", "++optimizer.lr=1"],
+)
+def test_command_line_setting_without_effect_raises(run, argument):
+    for more in ([], ["weights=auto"]):
+        with pytest.raises(UserError, match="has no effect with evaluate"):
+            command_line([f"evaluate={run}", argument, *more])
+
+
+def test_command_line_pretraining_takes_its_settings(run):
+    with pytest.raises(UserError, match=r"pretrain.max_epochs=2: has no effect"):
+        command_line([f"evaluate={run}", "pretrain.max_epochs=2"])
+    assert "pretrain.max_epochs=2" in overrides_after(
+        f"evaluate={run}", "pretrain.max_epochs=2", "weights=auto", "trainer=cpu"
+    )

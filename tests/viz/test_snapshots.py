@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 
@@ -19,3 +20,26 @@ def test_load_clouds_other_file_is_refused(tmp_path):
     (tmp_path / "clouds.npz").write_text("text")
     with pytest.raises(UserError, match=r"clouds\.npz: cannot read saved clouds"):
         load_clouds(tmp_path / "clouds.npz")
+
+
+@pytest.mark.parametrize("damage", ["cut", "objects", "nan", "flat", "titles", "no samples"])
+def test_load_clouds_damaged_file_is_refused(tmp_path, rng, damage):
+    path = tmp_path / "clouds.npz"
+    points = torch.rand(2, 50, 3, generator=rng)
+    save_clouds(path, points, {"generated": points[:, :4]}, ["a", "b"])
+    arrays = dict(np.load(path))
+    changes = {
+        "objects": {"generated": np.array([{}, {}], dtype=object)},
+        "nan": {"generated": np.full((2, 4, 3), np.nan, np.float32)},
+        "flat": {"input": np.zeros((2, 3), np.float32)},
+        "titles": {"titles": np.array(["a"])},
+    }
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:-200])
+    elif damage == "no samples":
+        del arrays["generated"]
+        np.savez(path, **arrays)
+    else:
+        np.savez(path, **{**arrays, **changes[damage]})
+    with pytest.raises(UserError, match=r"clouds\.npz: cannot read saved clouds: .+\.$"):
+        load_clouds(path)

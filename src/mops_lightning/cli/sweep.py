@@ -7,21 +7,21 @@ again with the same command at any time.
 import logging
 import math
 import os
+import sys
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
+from mops_lightning.cli.start import begin, make
 from mops_lightning.config import settings
 from mops_lightning.config.declaration import Affects
-from mops_lightning.errors import USER_ERROR, Interrupted, UserError, end
+from mops_lightning.errors import Interrupted, UserError, file_error, memory_error
 from mops_lightning.files import remove_temporary, set_aside
 from mops_lightning.records import run_record
 from mops_lightning.records.attempts import ASIDE, FAILED
@@ -34,6 +34,9 @@ MOVING = "moving"
 
 STAYS = (ASIDE, ".hydra", ".lock", "mops_lightning.log")
 """Files that belong to the cell, not to an attempt."""
+
+ELSEWHERE = "left to another process"
+"""State of a cell that another process runs."""
 
 log = logging.getLogger(__name__)
 
@@ -82,12 +85,18 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
         raise
     except Busy:
         log.warning(f"{folder}: skipped, because another process runs this cell")
-    except UserError as error:
-        (folder / FAILED).write_text(f"{error}\n")
-        log.error(f"{folder} failed: {error}")
+    except (UserError, OSError) as error:
+        text = file_error(error) if isinstance(error, OSError) else str(error)
+        log.error(f"{folder} failed: {text}")
+        with suppress(OSError):  # the disk may be full
+            (folder / FAILED).write_text(f"{text}\n")
     except Exception as error:
-        (folder / FAILED).write_text(f"{type(error).__name__}: {error}\n")
-        log.exception(f"{folder} failed")
+        text = memory_error(error) or f"{type(error).__name__}: {error}"
+        (folder / FAILED).write_text(f"{text}\n")
+        if memory_error(error):
+            log.error(f"{folder} failed: {text}")
+        else:
+            log.exception(f"{folder} failed")
     return math.nan
 
 
@@ -192,6 +201,11 @@ class Busy(Exception):
 
 
 def _state(cell: Path) -> str:
+    try:
+        with _claimed(cell):
+            pass
+    except Busy:
+        return ELSEWHERE
     if (cell / FAILED).exists():
         return "failed"
     try:
@@ -200,31 +214,17 @@ def _state(cell: Path) -> str:
         return "not started"
 
 
-def _make(folder: Path) -> None:
-    """Make a folder, or end the program: Hydra only warns of other exceptions of callbacks."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        text = f"out: cannot write to {folder}: {error.strerror}."
-        end("mops_lightning", text, USER_ERROR)
-
-
 class SweepSummary(Callback):
     """Prints the states of a sweep's cells at its end; the exit status is 1 if any failed."""
 
     def on_run_start(self, config: DictConfig, **extra: Any) -> None:
-        """Make the folder of a single run before Hydra does, for a better error."""
-        HydraConfig.instance().set_config(config)  # the folder's name is made from it
-        try:
-            folder = Path(config.hydra.run.dir)
-        except OmegaConfBaseException:
-            return  # Hydra raises it again
-        _make(folder)
+        """Check the settings and claim the folder of a single run before Hydra writes into it."""
+        begin(config, sys.argv[1:])
 
     def on_multirun_start(self, config: DictConfig, **extra: Any) -> None:
         """Mark the start, on the clock of the folder's file system."""
         folder = Path(config.hydra.sweep.dir)
-        _make(folder)
+        make(folder)
         (folder / BEGUN).touch()
 
     def on_multirun_end(self, config: DictConfig, **extra: Any) -> None:
@@ -240,6 +240,6 @@ class SweepSummary(Callback):
         counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
         print(f"{sum(states.values())} cells: {counts}; in {folder}")
         print(f"Table: python -m mops_lightning report {folder}")
-        if set(states) != {"completed"}:
+        if set(states) - {"completed", ELSEWHERE} or not states:
             print(f"To repeat the rest: the same command with hydra.sweep.dir={folder}")
             raise SystemExit(1)

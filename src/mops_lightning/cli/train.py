@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 from mops_lightning.cli.commands import help_lines
 from mops_lightning.config.composition import conf_dir
 from mops_lightning.config.overrides import key
-from mops_lightning.errors import INTERRUPTED, USER_ERROR, Interrupted, UserError, end
+from mops_lightning.errors import (
+    INTERRUPTED,
+    USER_ERROR,
+    Interrupted,
+    UserError,
+    end,
+    file_error,
+    memory_error,
+)
 from mops_lightning.records.migrate import answer
 
 if TYPE_CHECKING:
@@ -52,6 +60,10 @@ def _run() -> None:
         if show_traceback:
             raise
         end(NAME, explain(error, sys.argv[1:]), USER_ERROR)
+    except OSError as error:
+        if show_traceback or isinstance(error, BrokenPipeError):
+            raise
+        end(NAME, file_error(error), USER_ERROR)
 
 
 def _refuse_old_settings(arguments: list[str]) -> None:
@@ -85,11 +97,17 @@ def _job(cfg: "DictConfig") -> float | None:
         if hydra_cfg.mode == RunMode.MULTIRUN:
             distributed.check_multirun(cfg)
             return run_cell(cfg, folder, overrides)
-        distributed.check_start(cfg, hydra_cfg.overrides.hydra)
-        return run(cfg, folder, overrides).score
+        return run(cfg, folder, overrides, claimed=True).score
     except UserError as error:
         # Exit here, before Hydra adds lines of its own.
         end(NAME, str(error), USER_ERROR)
+    except OSError as error:
+        end(NAME, file_error(error), USER_ERROR)
+    except (MemoryError, RuntimeError) as error:
+        text = memory_error(error)
+        if text is None:
+            raise
+        end(NAME, text, USER_ERROR)
     except Interrupted as stop:
         if distributed.is_worker_rank(cfg):
             sys.exit(INTERRUPTED)  # rank 0 prints the message

@@ -14,6 +14,10 @@ from mops_lightning.errors import UserError
 logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
 
 
+REJECTIONS = (ValueError, TypeError, OverflowError, ZeroDivisionError)
+"""What constructors of other libraries raise at settings that they do not take."""
+
+
 def build(node: Any, where: str = "", **extra: Any) -> Any:
     """Make the object that a node describes, with the objects of the nodes below it.
 
@@ -42,7 +46,9 @@ def build(node: Any, where: str = "", **extra: Any) -> Any:
     }
     try:
         made = instantiate(node, **below, **extra, _convert_="all")
-    except InstantiationException as error:
+    except (InstantiationException, *REJECTIONS) as error:
+        if isinstance(error, UserError):
+            raise
         known = _known_cause(error, node, where)
         if known is None:
             raise
@@ -76,8 +82,17 @@ def _known_cause(error: BaseException, node: Any, where: str) -> UserError | Non
         if type(cause).__name__ == "MisconfigurationException":
             # Lightning's word for a trainer that this machine cannot run, such as trainer=gpu.
             return UserError(f"trainer: {cause} Try trainer=auto or trainer=cpu.")
+        if isinstance(cause, REJECTIONS) and cause.__cause__ is None:
+            return _rejected(cause, node, where)
         cause = cause.__cause__
     return None
+
+
+def _rejected(cause: Exception, node: Any, where: str) -> UserError:
+    """Return the error about a value that a constructor of another library rejects."""
+    target = node.get("_target_", node) if isinstance(node, DictConfig) else node
+    text = " ".join(str(cause).split())[:300].rstrip(".")
+    return UserError(f"{where}: {target} does not take these settings: {text}.")
 
 
 def _call(function: Any, node: DictConfig, where: str, /, *args: Any, **kwargs: Any) -> Any:
@@ -86,6 +101,8 @@ def _call(function: Any, node: DictConfig, where: str, /, *args: Any, **kwargs: 
     except UserError as error:
         named = list(signature(str(node["_target_"]), where))[: len(args)]
         raise _with_path(error, node, where, (*named, *kwargs)) from error.__cause__
+    except REJECTIONS as error:
+        raise _rejected(error, node, where) from error
 
 
 def _with_path(error: UserError, node: Any, where: str, extra: tuple[str, ...]) -> UserError:

@@ -3,12 +3,13 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 from yaml import MarkedYAMLError  # type: ignore[import-untyped]
 
 from mops_lightning.config import settings
+from mops_lightning.config.annotations import misfit
 from mops_lightning.config.build import signature
 from mops_lightning.config.composition import composed, conf_dir
 from mops_lightning.config.overrides import key as key_of
@@ -32,19 +33,39 @@ OTHERWISE = {
 def refuse_plain_groups(arguments: Sequence[str]) -> None:
     """Refuse ``logger=null`` and the like, at which Hydra raises an error without the key.
 
+    Also ``out=5``, which OmegaConf would take as a folder of this name.
+
     Raises:
-        UserError: a group of choices is set to something else than a name.
+        UserError: a group of choices is set to something else than a name, or a setting that is a
+            text to something else.
     """
     groups = _groups()
+    texts = {name: kind for name, kind in get_type_hints(settings.SCHEMA).items() if _is_text(kind)}
     for argument in arguments:
         override = parse(argument)
-        if override is None or override.is_delete() or key_of(argument) not in groups:
-            continue
-        if override.is_sweep_override() or isinstance(override.value(), str | list | dict):
-            continue
         name = key_of(argument)
-        hint = OTHERWISE.get(name, "")
-        raise UserError(f"{argument}: choose one with {name}=NAME{hint}.")
+        if override is None or override.is_delete() or name not in {*groups, *texts}:
+            continue
+        for value in _values(override):
+            if name in texts:
+                if misfit(value, texts[name]):
+                    raise settings.refusal(name, value)
+            elif not isinstance(value, str | list | dict):
+                hint = OTHERWISE.get(name, "")
+                raise UserError(f"{argument}: choose one with {name}=NAME{hint}.")
+
+
+def _is_text(kind: Any) -> bool:
+    return kind in (str, str | None)
+
+
+def _values(override: Any) -> list[Any]:
+    """Return the value of an override, or the choices of a sweep."""
+    if not override.is_sweep_override():
+        values = [override.value()]
+    else:
+        values = list(override.value().list) if override.is_choice_sweep() else []
+    return [str(value) if type(value).__name__ == "QuotedString" else value for value in values]
 
 
 def explain(error: BaseException, arguments: Sequence[str]) -> str:

@@ -49,6 +49,12 @@ WHOLE_OR_NULL = or_null(whole(1))
 SHARE_OR_NULL = or_null(number("between 0 and 1", lambda x: 0 <= x <= 1))
 
 
+CLIPS = Limits(
+    "null or a number above 0",
+    lambda x: x is None or (isinstance(x, int | float) and not isinstance(x, bool) and x > 0),
+)
+
+
 @dataclass
 class RunSettings:
     """The top level of the configuration."""
@@ -276,7 +282,8 @@ INSIDE: dict[str, dict[str, Any]] = {
     "trainer.devices": _NOTHING,
     "trainer.num_nodes": _NOTHING,
     "trainer.strategy": _NOTHING,
-    "trainer.log_every_n_steps": _NOTHING,
+    "trainer.log_every_n_steps": {**_NOTHING, "limits": whole(1)},
+    "trainer.gradient_clip_val": {"limits": CLIPS},
 }
 """Settings inside groups: how they differ from their group."""
 

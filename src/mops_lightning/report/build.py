@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from mops_lightning.errors import UserError
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import FULL
@@ -16,6 +17,7 @@ from mops_lightning.report.nets import nets_grid
 from mops_lightning.report.provenance import provenance, without_result
 from mops_lightning.report.text import PAPER, Grid
 from mops_lightning.report.windows import equal_ratios
+from mops_lightning.viz.snapshots import load_clouds
 
 
 @dataclass(frozen=True)
@@ -53,10 +55,11 @@ def build(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Rep
         UserError: there is no record, or the results are not comparable.
     """
     found = collect(folder)
+    without_clouds = _without_bad_clouds(found.done)
     scored = [record for record in found.done if record["config"]["learn"] != "task"]
     if not scored:
         grid = nets_grid(found.done, list(metrics), mixed)
-        remarks = [*provenance(found.done, ""), *without_result(found)]
+        remarks = [*provenance(found.done, ""), *without_result(found), *without_clouds]
         return Report(found, [], {}, Axes(), [], [grid], remarks)
     names = shared_names(scored, mixed)
     layout = axes(scored, names["net"], mixed)
@@ -64,8 +67,22 @@ def build(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Rep
     tables = [make_cells(scored, metric, names["net"], layout) for metric in chosen]
     grids = [grid for table in tables for grid in _grids(scored, table, names, layout)]
     same = [r for r in found.done if r["config"]["names"]["task"] == names["task"]]
-    remarks = [*provenance(same, names["net"]), *without_result(found)]
+    remarks = [*provenance(same, names["net"]), *without_result(found), *without_clouds]
     return Report(found, scored, names, layout, tables, grids, remarks)
+
+
+def _without_bad_clouds(found: list[Record]) -> list[str]:
+    """Take clouds that cannot be read from the records, and return a line for each."""
+    lines = []
+    for record in found:
+        path = Path(record["folder"]) / record["files"].get("clouds", "")
+        try:
+            if path.is_file():
+                load_clouds(path)
+        except (OSError, UserError) as error:
+            del record["files"]["clouds"]
+            lines.append(f"- {error}")
+    return ["", "Saved clouds that are not shown:", "", *lines] if lines else []
 
 
 def _grids(found: list[Record], table: Cells, names: dict[str, str], layout: Axes) -> list[Grid]:

@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from mops_lightning.errors import USER_ERROR, UserError, end, quiet_on_closed_pipe
-from mops_lightning.files import atomic_write
+from mops_lightning.errors import USER_ERROR, UserError, end, file_error, quiet_on_closed_pipe
+from mops_lightning.files import atomic_write, remove_temporary
 from mops_lightning.report.build import Report, build
 from mops_lightning.report.text import latex, long_csv, markdown
 
@@ -33,6 +33,8 @@ def main(arguments: list[str] | None = None, prog: str = "python -m mops_lightni
             written = write(report, chosen.folder)
         except UserError as error:
             end(prog.removeprefix("python -m "), str(error), USER_ERROR)
+        except OSError as error:
+            end(prog.removeprefix("python -m "), file_error(error), USER_ERROR)
         print(markdown(report.grids, report.remarks))
         print(f"files in {chosen.folder}/: {', '.join(written)}")
 
@@ -62,6 +64,7 @@ def write(report: Report, folder: Path) -> list[str]:
     from mops_lightning.report.plots import plots
     from mops_lightning.viz.figures import save_figure, save_svg
 
+    remove_temporary(folder, below=False)
     layout = report.axes
     planes = layout.planes or {}
     keys = [layout.column] if layout.column != "m" else []

@@ -14,6 +14,64 @@ Record = dict[str, Any]
 """A run record, with its path under ``folder``."""
 
 
+_TEXT = {"type": ["string", "null"]}
+_WHOLE = {"type": "integer"}
+NEEDED = {
+    "properties": {
+        "config": {
+            "required": ["m", "learn", "names", "task", "trainer"],
+            "properties": {
+                "m": _WHOLE,
+                "learn": {"type": "string"},
+                "names": {
+                    "type": "object",
+                    "required": ["task", "net", "dataset", "sampler"],
+                    "additionalProperties": _TEXT,
+                },
+                "task": {"type": "object", "properties": {"net": {"type": ["object", "null"]}}},
+                "trainer": {
+                    "type": "object",
+                    "required": ["max_epochs"],
+                    "properties": {"max_epochs": _WHOLE},
+                },
+                "dataset": {"type": ["object", "null"]},
+            },
+        },
+        "git": {"properties": {"commit": _TEXT}},
+        "notes": {
+            "properties": {
+                "score": {"type": "string"},
+                "metrics": {
+                    "type": "object",
+                    "additionalProperties": {
+                        "type": "object",
+                        "properties": {
+                            "label": {"type": "string"},
+                            "unit": {"type": "string"},
+                            "scale": {"type": "number"},
+                            "summary_order": {"type": ["integer", "null"]},
+                            "full_cloud_metric": _TEXT,
+                        },
+                    },
+                },
+                "parameters": {"type": "object", "additionalProperties": _WHOLE},
+                "evaluated": {
+                    "type": ["object", "null"],
+                    "properties": {
+                        "learn": {"type": "string"},
+                        "seed": _WHOLE,
+                        "max_epochs": {"type": ["integer", "null"]},
+                    },
+                },
+                "dataset_fingerprint": _TEXT,
+                "task_weights_sha256": _TEXT,
+            },
+        },
+    },
+}
+"""What tables read of a completed record, beyond the schema of all records."""
+
+
 @dataclass(frozen=True)
 class Found:
     """The runs below a folder.
@@ -48,19 +106,41 @@ def collect(folder: Path) -> Found:
     for run in runs:
         try:
             record = run_record.read(run)
-        except UserError:
-            text = (run / FAILED).read_text() if (run / FAILED).exists() else "not readable"
-            undone[str(run)] = text.strip()
-            continue
-        if record["status"] == "completed":
-            done.append({**record, "folder": str(run)})
-        else:
+            if record["status"] == "completed":
+                _check(record, run)
+                done.append({**record, "folder": str(run)})
+                continue
             why = f": {record['error']}" if record["error"] else ""
             undone[str(run)] = record["status"] + why
+        except UserError as error:
+            undone[str(run)] = _failure(run) or str(error)
     if not done:
         listed = "; ".join(f"{run} ({why})" for run, why in list(undone.items())[:3])
         raise UserError(f"{folder}: none of its {len(runs)} runs is completed: {listed}.")
     return Found(done, undone, len(runs))
+
+
+def _check(record: Record, run: Path) -> None:
+    """Reject a record without what tables need, which one table with others would fail at.
+
+    Raises:
+        UserError: something is missing or of another type.
+    """
+    import jsonschema
+
+    try:
+        jsonschema.validate(record, NEEDED)
+    except jsonschema.ValidationError as error:
+        place = ".".join(map(str, error.absolute_path)) or "record"
+        raise UserError(f"{run / run_record.FILE}: {place}: {error.message[:200]}") from None
+
+
+def _failure(run: Path) -> str:
+    """Return why the last start of a sweep's cell failed; empty if nothing says so."""
+    try:
+        return (run / FAILED).read_text(errors="replace").strip()
+    except OSError:
+        return ""
 
 
 def trained_with(record: Record) -> str:

@@ -33,13 +33,22 @@ def markdown(grids: list[Grid], remarks: list[str]) -> str:
     """Return all tables and the remarks."""
     lines: list[str] = []
     for grid in grids:
-        lines += [grid.title, "", _line(grid.head), "|---|" + "--:|" * (len(grid.head) - 1)]
-        lines += [*map(_line, grid.rows), "", *grid.below, *([""] if grid.below else [])]
-    return "\n".join([*lines, *remarks]) + "\n"
+        title, *below = map(_escaped, (grid.title, *grid.below))
+        lines += [title, "", _line(grid.head), "|---|" + "--:|" * (len(grid.head) - 1)]
+        lines += [*map(_line, grid.rows), "", *below, *([""] if below else [])]
+    return "\n".join([*lines, *map(_escaped, remarks)]) + "\n"
 
 
 def _line(cells: list[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+    return f"| {' | '.join(cell if cell == PAPER else _escaped(cell) for cell in cells)} |"
+
+
+SPECIAL = {letter: f"&#{ord(letter)};" for letter in "&|<*`["}
+"""Characters with a meaning in Markdown, which names may contain."""
+
+
+def _escaped(text: str) -> str:
+    return " ".join(text.splitlines()).translate(str.maketrans(SPECIAL))
 
 
 TEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "°": r"$^\circ$", "±": r"$\pm$"}
@@ -57,7 +66,7 @@ def latex(grids: list[Grid], remarks: list[str]) -> str:
             f"{' & '.join(map(_tex, grid.head))} \\\\\n\\midrule\n{body}\n\\bottomrule\n"
             "\\end{tabular}\n\\end{table}\n" + "".join(f"% {line}\n" for line in grid.below)
         )
-    return "\n".join(parts) + "".join(f"% {line}\n" for line in remarks)
+    return "\n".join(parts) + "".join(f"% {' '.join(line.split())}\n" for line in remarks)
 
 
 def _tex(text: str) -> str:

@@ -3,10 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 
-from mops_lightning.files import atomic_write
+from mops_lightning.zoo.weights import write_plain
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -26,5 +25,4 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             path: of a local file.
             storage_options: not used.
         """
-        with atomic_write(path) as temporary:
-            torch.save(checkpoint, temporary)
+        write_plain(path, checkpoint)

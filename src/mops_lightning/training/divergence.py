@@ -12,6 +12,9 @@ from mops_lightning.zoo.weights import first_nonfinite
 
 HINT = "Try a lower learning rate (optimizer.lr) or other weights of the losses."
 
+SAVED = ("state_dict", "current_model_state", "optimizer_states")
+"""Parts of a checkpoint that hold tensors of the training; the second is of a moving average."""
+
 
 class Diverged(UserError):
     """The loss or the weights contain NaN or infinity."""
@@ -44,7 +47,7 @@ def check_checkpoint(checkpoint: dict[str, Any], strategy: Strategy) -> None:
     Raises:
         Diverged: weights or the optimizer's state contain NaN or infinity.
     """
-    parts = {key: checkpoint.get(key) for key in ("state_dict", "optimizer_states")}
+    parts = {key: checkpoint.get(key) for key in SAVED}
     name = first_nonfinite(parts)
     if strategy.reduce_boolean_decision(name is not None, all=False):
         raise Diverged(f"training diverged: {name or 'a tensor'} is not finite.")

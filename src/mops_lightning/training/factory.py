@@ -3,6 +3,7 @@
 from typing import Any
 
 import lightning as L
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config.build import accepted, build
@@ -41,6 +42,8 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     elif sampler is not None and sampler.flexible:
         sampler = build(cfg.sampler, "sampler", m=max(sizes), **own)
     make_optimizer, make_schedule = optimizer_makers(cfg.optimizer)
+    if cfg.learn != "nothing":
+        _try_optimizer(make_optimizer, make_schedule)
     return Experiment(
         task,
         sampler,
@@ -79,6 +82,13 @@ def _make_baseline(name: str, node: DictConfig, m: int, seed: int, net: dict[str
     """Build an index sampler for ``m`` points, with the run's seed unless it has its own."""
     own = accepted(node, net if "seed" in node else {**net, "seed": seed})
     return build(node, f"baselines.{name}", m=m, **own)
+
+
+def _try_optimizer(make_optimizer: Any, make_schedule: Any) -> None:
+    """Make an optimizer of nothing, so that its mistakes end a run before a net is pretrained."""
+    optimizer = make_optimizer([torch.nn.Parameter(torch.zeros(1))])
+    if make_schedule:
+        make_schedule(optimizer, total_steps=2)
 
 
 def optimizer_makers(node: DictConfig) -> tuple[Any, Any]:

@@ -66,7 +66,8 @@ def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str
         Rows of the test split, at most ``number``, and the names of their classes.
     """
     labels = dataset.test.labels
-    wanted = torch.linspace(0, len(dataset.class_names) - 1, max(number, 1)).round().long()
+    classes = len(dataset.class_names)
+    wanted = torch.linspace(0, classes - 1, min(max(number, 1), classes)).round().long()
     rows = [int((labels == label).nonzero()[0]) for label in wanted.unique() if label in labels]
     rows = rows[:number]
     names = [dataset.class_names[int(labels[row])] for row in rows]

@@ -11,6 +11,7 @@ from mops_lightning.config import distributed
 from mops_lightning.errors import Interrupted
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
+from mops_lightning.training.workers import at_end
 
 
 @contextmanager
@@ -30,8 +31,14 @@ def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[Ru
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     record = RunRecord.begin(config, overrides, cfg.seed)
     writes = not distributed.is_worker_rank(cfg)
+
+    def ended(text: str) -> None:
+        record.status, record.error = "interrupted", text
+        run_record.write(folder, record.plain())
+
     if writes:
         run_record.write(folder, record.plain())
+        at_end.append(ended)
     try:
         with record.timed("total"):
             yield record
@@ -44,4 +51,5 @@ def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[Ru
         raise
     finally:
         if writes:
+            at_end.remove(ended)
             run_record.write(folder, record.plain())

@@ -16,6 +16,17 @@ from mops_lightning.training.callbacks import CHECKPOINT
 KEY = "evaluate"
 OF_RUN = "run"
 """``weights=run``: the task net that the evaluated run was trained with."""
+OF_SAMPLER = (
+    *("optimizer", "task_lr_scale", "recipe", "trainer.max_epochs", "epochs.sampler"),
+    "augment.sampler",
+)
+"""Settings of the training of a sampler."""
+OF_TRAINING = (
+    *OF_SAMPLER,
+    *("pretrain", "val_fraction", "augment", "epochs", "ckpt_path", "trainer.gradient_clip_val"),
+    *("trainer.gradient_clip_algorithm", "trainer.accumulate_grad_batches"),
+)
+"""Settings of any training."""
 NAME = re.compile(r"[A-Za-z0-9_-]+")
 """What a choice of a group may be called; a path could lead out of conf/."""
 
@@ -39,6 +50,7 @@ def command_line(arguments: list[str]) -> list[str]:
     folder = Path(chosen).expanduser()
     record = trained_run(folder)
     names = record["config"]["names"]
+    _refuse_without_effect(arguments, folder)
     groups = {"task": names["task"], "dataset": names["dataset"], "sampler": names["sampler"]}
     typed = [a for i, a in enumerate(arguments) if i not in places and overrides.key(a)]
     # Choosing the run's own group again changes nothing; the settings below it stay too.
@@ -75,6 +87,23 @@ def _chosen(argument: str) -> str | None:
         raise UserError(f"{argument}: {KEY} takes one run. Start one evaluation for each.")
     value = override.value()
     return None if value is None else str(value)
+
+
+def _refuse_without_effect(arguments: list[str], folder: Path) -> None:
+    """Refuse settings of a training, of which there is none in an evaluation.
+
+    Raises:
+        UserError: there is one.
+    """
+    # weights=auto may train a task net, with settings of its own.
+    inert = OF_SAMPLER if "weights=auto" in arguments else OF_TRAINING
+    for argument in arguments:
+        path = overrides.path(argument)
+        if any(path == one or path.startswith(f"{one}.") for one in inert):
+            raise UserError(
+                f"{argument}: has no effect with {KEY}, which trains nothing. Leave it out, or "
+                f"train with the settings of {folder} and without {KEY}."
+            )
 
 
 def _data_are_here(kept: list[str], folder: Path) -> None:

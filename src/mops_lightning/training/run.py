@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import torch
 from omegaconf import DictConfig
 
 from mops_lightning.config import distributed
@@ -22,13 +23,16 @@ STARTED = ".started"
 """Empty file in the folder of a run that has begun."""
 
 
-def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> RunRecord:
+def run(
+    cfg: DictConfig, folder: Path, overrides: list[str] | None = None, claimed: bool = False
+) -> RunRecord:
     """Do what a configuration asks for and leave ``result.json`` in ``folder``.
 
     Args:
         cfg: a composed configuration.
         folder: the run's folder; must not hold a result yet.
         overrides: what the user changed, for the record.
+        claimed: whether ``claim`` was called for the folder.
 
     Returns:
         The record, as written.
@@ -38,8 +42,8 @@ def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> Ru
     """
     check(cfg)
     leads = not distributed.is_worker_rank(cfg)
-    if leads:
-        _begin(folder)
+    if leads and not claimed:
+        claim(folder)
     with recorded(cfg, folder, overrides or []) as record:
         with record.timed("data"):
             dataset = _load_data(cfg)
@@ -55,7 +59,12 @@ def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> Ru
     return record
 
 
-def _begin(folder: Path) -> None:
+def claim(folder: Path) -> None:
+    """Make a run's folder and mark it as begun.
+
+    Raises:
+        UserError: the folder contains a run already, or cannot be written to.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -84,4 +93,8 @@ def _load_data(cfg: DictConfig) -> CloudDataset:
     if cfg.m > points:
         raise UserError(f"m must be at most the {points} points of a cloud, got m={cfg.m}.")
     test_points = noisy(dataset.test.points, cfg.test_noise_std)
+    if not torch.isfinite(test_points).all():
+        raise UserError(
+            f"test_noise_std={cfg.test_noise_std} makes coordinates infinite. Lower it."
+        )
     return replace(dataset, test=dataset.test._replace(points=test_points))

@@ -21,6 +21,7 @@ from mops_lightning.training.checkpoint_io import AtomicCheckpointIO
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.loaders import clouds_to_draw, score_loader
 from mops_lightning.training.malloc import keep_freed_memory
+from mops_lightning.training.workers import watch_workers
 
 HARMLESS = (
     ".*does not have many workers.*",  # the data are in memory; workers would only copy them
@@ -47,6 +48,7 @@ def make_trainer(
     """
     _silence_lightning()
     keep_freed_memory()
+    watch_workers()
     task = experiment.task
     logger = build(cfg.logger, "logger", save_dir=str(folder)) if cfg.get("logger") else False
     score = task.score if cfg.learn != "task" else task.full_score or task.score

@@ -49,8 +49,14 @@ def load_clouds(path: Path) -> tuple[list[str], dict[str, NDArray[np.float32]]]:
     except UserError as error:
         raise UserError(f"{path}: cannot read saved clouds: {error}") from None
     titles = arrays.pop(TITLES, np.zeros(()))
-    shapes = [a.shape for a in arrays.values() if a.dtype.kind == "f" and a.ndim == 3]
-    right = len(shapes) == len(arrays) and all(s[0] == len(titles) and s[2] == 3 for s in shapes)
-    if titles.ndim != 1 or INPUT not in arrays or not right:
+    clouds = {name: arrays[name] for name in (INPUT, *arrays) if name in arrays}
+    shapes = [a.shape for a in clouds.values() if a.dtype.kind == "f" and a.ndim == 3]
+    right = len(shapes) == len(clouds) > 1 and titles.ndim == 1 and len(titles) > 0
+    if INPUT not in clouds or not right:
         raise UserError(f"{path}: cannot read saved clouds: arrays of other names or shapes.")
-    return [str(title) for title in titles], arrays
+    for name, cloud in clouds.items():
+        if len(cloud) != len(titles) or not cloud.shape[1] or cloud.shape[2] != 3:
+            raise UserError(f"{path}: cannot read saved clouds: {name} has shape {cloud.shape}.")
+        if not np.isfinite(cloud).all():
+            raise UserError(f"{path}: cannot read saved clouds: {name} is not finite.")
+    return [str(title) for title in titles], clouds

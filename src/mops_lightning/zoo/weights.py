@@ -1,6 +1,7 @@
 """Weights files: plain tensors and plain data, checked when read."""
 
 import hashlib
+import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -49,8 +50,19 @@ def save(
         "sha256": digest(state),
         "state": state,
     }
+    write_plain(path, content)
+
+
+def write_plain(path: str | Path, content: dict[str, Any]) -> None:
+    """Write plain tensors and plain data; an existing file is replaced when all is written.
+
+    Raises:
+        OSError: the file cannot be written. ``torch.save`` raises other errors at a full disk.
+    """
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
     with atomic_write(path) as temporary:
-        torch.save(content, temporary)
+        temporary.write_bytes(buffer.getbuffer())
 
 
 def read(path: str | Path) -> dict[str, Any]:

@@ -1,0 +1,54 @@
+"""What is checked before Hydra writes anything into the folder of a single run."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from mops_lightning.config import distributed
+from mops_lightning.config.explain import explain
+from mops_lightning.config.paths import check_paths
+from mops_lightning.config.validate import check
+from mops_lightning.errors import USER_ERROR, UserError, end, file_error
+
+
+def begin(config: DictConfig, arguments: Sequence[str]) -> None:
+    """Check the settings of a run and claim its folder, so that a refused run leaves nothing.
+
+    Args:
+        config: with Hydra's own settings.
+        arguments: of the command line.
+
+    Raises:
+        SystemExit: a setting is wrong, or the folder contains a run; one line says so.
+    """
+    from mops_lightning.training.run import claim
+
+    HydraConfig.instance().set_config(config)  # the folder's name is made from it
+    cfg = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    try:
+        folder = Path(config.hydra.run.dir)
+        check(cfg)
+        check_paths(cfg)
+        distributed.check_start(cfg, config.hydra.overrides.hydra)
+        if not distributed.is_worker_rank(cfg):
+            claim(folder)
+    except (UserError, OmegaConfBaseException) as error:
+        end("mops_lightning", explain(error, arguments), USER_ERROR)
+    except OSError as error:
+        end("mops_lightning", file_error(error), USER_ERROR)
+
+
+def make(folder: Path) -> None:
+    """Make the folder of a sweep, or end the program.
+
+    Raises:
+        SystemExit: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        text = f"out: cannot write to {folder}: {error.strerror}."
+        end("mops_lightning", text, USER_ERROR)

@@ -1,0 +1,31 @@
+import pytest
+
+from mops_lightning.config.compose import compose
+from mops_lightning.config.paths import check_paths
+from mops_lightning.errors import UserError
+
+
+@pytest.mark.parametrize("name", ["out", "cache", "weights", "ckpt_path", "dataset.cache"])
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        ("n" * 300, r"n \.\.\. \(300 characters\): File name too long"),
+        ("loop/below", "loop/below: Too many levels of symbolic links"),
+        ("file/below", "file/below: Not a directory"),
+    ],
+    ids=["long", "loop", "file"],
+)
+def test_check_paths_impossible_path_names_setting(name, value, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=f"^{name}: .*{said}"):
+        check_paths(compose([f"{name}={value}"]))
+
+
+@pytest.mark.parametrize("name", ["weights", "ckpt_path"])
+def test_check_paths_missing_input_raises(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=rf"^{name}: no .* nowhere\.pt\. Give"):
+        check_paths(compose([f"{name}=nowhere.pt"]))
+    check_paths(compose(["out=new", "cache=new"]))
