@@ -43,12 +43,12 @@ def _line(cells: list[str]) -> str:
     return f"| {' | '.join(cell if cell == PAPER else _escaped(cell) for cell in cells)} |"
 
 
-SPECIAL = {letter: f"&#{ord(letter)};" for letter in "&|<*`["}
+SPECIAL = {ord(letter): f"&#{ord(letter)};" for letter in "&|<*`["}
 """Characters with a meaning in Markdown, which names may contain."""
 
 
 def _escaped(text: str) -> str:
-    return " ".join(text.splitlines()).translate(str.maketrans(SPECIAL))
+    return " ".join(text.splitlines()).translate(SPECIAL)
 
 
 TEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "°": r"$^\circ$", "±": r"$\pm$"}

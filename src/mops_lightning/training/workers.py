@@ -4,13 +4,15 @@ import os
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from lightning.pytorch.strategies.launchers import subprocess_script
 
 from mops_lightning.errors import INTERRUPTED, Interrupted, UserError
+
+Processes = list[subprocess.Popen[Any]]
 
 PATIENCE = 20.0
 """Seconds that a process may wait for a dead one, such as in NCCL, before it is ended."""
@@ -24,14 +26,14 @@ at_end: list[Callable[[str], None]] = []
 
 def watch_workers() -> None:
     """Replace Lightning's observer, which kills this process before it has written its record."""
-    subprocess_script._launch_process_observer = _watch  # type: ignore[attr-defined]
+    subprocess_script._launch_process_observer = _watch
 
 
-def _watch(processes: list[subprocess.Popen[bytes]]) -> None:
-    threading.Thread(target=_observe, args=(processes,), daemon=True).start()
+def _watch(child_processes: Processes) -> None:
+    threading.Thread(target=_observe, args=(child_processes,), daemon=True).start()
 
 
-def _observe(processes: list[subprocess.Popen[bytes]]) -> None:
+def _observe(processes: Processes) -> None:
     while any(process.poll() != 0 for process in processes):
         if (text := _ended(processes)) is not None:
             for process in processes:
@@ -44,7 +46,7 @@ def _observe(processes: list[subprocess.Popen[bytes]]) -> None:
         time.sleep(POLL)
 
 
-def _ended(processes: Sequence[subprocess.Popen[bytes]]) -> str | None:
+def _ended(processes: Processes) -> str | None:
     """Return what happened to the first worker that ended with an error."""
     for number, process in enumerate(processes, start=1):
         code = process.poll()
