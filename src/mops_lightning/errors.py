@@ -47,7 +47,7 @@ def did_you_mean(name: str, allowed: Iterable[str]) -> str:
     return hint + listed
 
 
-def one_line(error: Exception) -> str:
+def one_line(error: BaseException) -> str:
     """Return the type and the message of a parser's error, short and on one line."""
     said = " ".join(str(error).split())
     return f"{type(error).__name__}: {said[:MESSAGE]}{'…' if len(said) > MESSAGE else ''}"

@@ -82,3 +82,12 @@ def test_laz_with_extra_bytes_reads(form, tmp_path):
     cloud["depth"] = np.arange(300)
     cloud.write(path)
     np.testing.assert_array_equal(read(path, 9, 0).columns["depth"], np.arange(300))
+
+
+def test_laz_without_items_is_broken(tmp_path):
+    path = tmp_path / "a.laz"
+    content = written(path, 3)
+    struct.pack_into("<H", content, content.index(b"laszip encoded") - 2 + 54 + 32, 0)
+    path.write_bytes(content)
+    with pytest.raises(UserError, match="points of 34 bytes, items of 0 bytes"):
+        read(path, 9, 0)

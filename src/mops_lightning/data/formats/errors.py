@@ -20,13 +20,13 @@ def naming_file(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except UserError:
+    except (UserError, KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
     except MemoryError as error:
         raise BadCloudError(
             f"{path} is broken or too large for the memory: {one_line(error)}."
         ) from None
-    except Exception as error:
+    except BaseException as error:  # a panic in lazrs is no Exception
         raise BadCloudError(f"{path} is broken: {one_line(error)}.") from None
 
 

@@ -49,10 +49,12 @@ def check(path: Path) -> None:
             if number * length > size - start:
                 raise ends_early(path, (size - start) // length)
         elif number:
-            _check_compressed(path, file, start, size, number)
+            _check_compressed(path, file, start, size, number, length)
 
 
-def _check_compressed(path: Path, file: IO[bytes], start: int, size: int, number: int) -> None:
+def _check_compressed(
+    path: Path, file: IO[bytes], start: int, size: int, number: int, length: int
+) -> None:
     """Compare the chunks of a LAZ file with its length and its number of points."""
     import laspy
     import lazrs
@@ -61,6 +63,10 @@ def _check_compressed(path: Path, file: IO[bytes], start: int, size: int, number
     vlrs = laspy.LasHeader.read_from(file, read_evlrs=False).vlrs
     record = vlrs[vlrs.index("LasZipVlr")].record_data
     vlr = lazrs.LazVlr(record)
+    if vlr.item_size() != length:
+        raise BadCloudError(
+            f"{path} is broken: points of {length} bytes, items of {vlr.item_size()} bytes."
+        )
     file.seek(start)
     (table,) = struct.unpack("<q", file.read(8))
     if table == -1:  # written by a program that could not go back; the offset is at the end
@@ -76,14 +82,14 @@ def _check_compressed(path: Path, file: IO[bytes], start: int, size: int, number
         raise BadCloudError(f"{path} is broken: {chunks} chunks cannot hold {number} points.")
     layers = _layers(record)
     place = start + 8
-    for _, length in found:
-        _within(path, "a chunk", place + length, table)
+    for _, used in found:
+        _within(path, "a chunk", place + used, table)
         if layers:
             file.seek(place + vlr.item_size() + 4)
             sizes = struct.unpack(f"<{layers}I", file.read(4 * layers))
             needed = vlr.item_size() + 4 + 4 * layers + sum(sizes)
-            _within(path, "a chunk's layers", place + needed, place + length)
-        place += length
+            _within(path, "a chunk's layers", place + needed, place + used)
+        place += used
 
 
 def _layers(record: Any) -> int:
