@@ -1,13 +1,16 @@
 """Copies of one net's first pointwise layers in another."""
 
 import copy
+from typing import Any
 
 import torch
 from torch import nn
 
 from mops_lightning.nets.layers import PointFeatures, PointMLP
-from mops_lightning.nets.warm_start import copy_pointwise_layers
+from mops_lightning.nets.warm_start import copy_pointwise_layers, copy_tensors
+from mops_lightning.samplers.mops import MOPSNet
 
+SIZES: Any = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
 POINTS = torch.randn(4, 60, 3, generator=torch.Generator().manual_seed(0))
 
 
@@ -40,3 +43,26 @@ def test_copy_pointwise_layers_without_counterpart_copies_none():
     assert copy_pointwise_layers(nn.Linear(3, 8), PointMLP([3, 8]), POINTS) == 0
     assert copy_pointwise_layers(PointMLP([3, 8]), PointMLP([3, 4]), POINTS) == 0
     assert copy_pointwise_layers(PointMLP([3, 8]), PointMLP([3, 8], norm=False), POINTS) == 0
+
+
+def test_copy_tensors_takes_the_rows_that_both_have():
+    torch.manual_seed(0)
+    large, small = MOPSNet(12, **SIZES), MOPSNet(8, **SIZES)
+    for source, target in ((large, small), (small, large)):
+        target = copy.deepcopy(target)
+        before = copy.deepcopy(target.state_dict())
+        state = source.state_dict()
+        assert set(copy_tensors(state, target)) == set(state)
+        rows = target.queries.weight
+        assert torch.equal(rows[:8], source.queries.weight[:8])
+        assert torch.equal(rows[8:], before["queries.weight"][8:])
+        assert torch.equal(target.rho_local.weight, source.rho_local.weight)
+
+
+def test_copy_tensors_leaves_other_shapes_and_names():
+    torch.manual_seed(0)
+    source, target = nn.Linear(3, 4), nn.Linear(5, 4)
+    before = target.weight.clone()
+    assert copy_tensors(source.state_dict(), target) == ["bias"]
+    assert torch.equal(target.weight, before)
+    assert copy_tensors({"other": torch.ones(4)}, target) == []

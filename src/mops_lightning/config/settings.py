@@ -264,7 +264,9 @@ INSIDE: dict[str, dict[str, Any]] = {
     "sampler.seed": {"compare": False},
     "recipe.train_points": {"limits": WHOLE_OR_NULL},
     "recipe.all_points_from": {"limits": SHARE_OR_NULL},
-    "recipe.warm_start": {"limits": Limits("true or false", lambda x: isinstance(x, bool))},
+    "recipe.warm_start": {
+        "limits": Limits("true, false or a weights file", lambda x: isinstance(x, bool | str))
+    },
     "recipe.distillation": {"limits": number("of at least 0", lambda x: x >= 0)},
     "recipe.straight_through": {"limits": SHARE_OR_NULL},
     "recipe.ema_span": {"limits": SHARE_OR_NULL},

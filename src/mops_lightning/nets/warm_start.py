@@ -1,4 +1,4 @@
-"""Starting one net's pointwise layers as copies of another's."""
+"""Starting a net with copies of another net's layers."""
 
 from itertools import pairwise
 
@@ -47,6 +47,34 @@ def copy_pointwise_layers(source: nn.Module, target: nn.Module, points: Tensor) 
             )
         rows = rows.relu_()
         copied += 1
+    return copied
+
+
+@torch.no_grad()
+def copy_tensors(source: dict[str, Tensor], target: nn.Module) -> list[str]:
+    """Copy tensors of one net to those of another that have the same name.
+
+    Where only the number of rows differs, as between samplers of two sizes, the rows that both
+    have are copied. Tensors that differ in more are left.
+
+    Args:
+        source: a ``state_dict``.
+        target: the net to copy to.
+
+    Returns:
+        The names of the tensors that got values.
+    """
+    copied = []
+    for name, mine in target.state_dict().items():
+        theirs = source.get(name)
+        if theirs is None or theirs.shape[1:] != mine.shape[1:] or theirs.ndim != mine.ndim:
+            continue
+        if mine.ndim == 0:
+            mine.copy_(theirs)
+        else:
+            rows = min(len(mine), len(theirs))
+            mine[:rows] = theirs[:rows].to(mine.dtype)
+        copied.append(name)
     return copied
 
 

@@ -26,7 +26,8 @@ class Recipe:
         train_points: points of a cloud that a training step sees, drawn in every step, and at
             least twice the sampled ones; None: all. Validation and test always see all.
         all_points_from: share from which on training steps see all points; None: never.
-        warm_start: whether the sampler's first layers start as copies of the task net's.
+        warm_start: whether the sampler's first layers start as copies of the task net's; or the
+            weights file of a trained sampler, of any size, to start from.
         distillation: weight of the disagreement between the frozen task net's predictions on the
             sample and on all points; see ``Task.disagreement``. Only with ``learn="sampler"``.
         straight_through: share from which on the task net also sees the matched points, whose
@@ -40,7 +41,7 @@ class Recipe:
 
     train_points: int | None = None
     all_points_from: float | None = None
-    warm_start: bool = False
+    warm_start: bool | str = False
     distillation: float = 0.0
     straight_through: float | None = None
     ema_span: float | None = None

@@ -11,7 +11,6 @@ from torch import nn
 
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import Interrupted, UserError
-from mops_lightning.nets.warm_start import copy_pointwise_layers
 from mops_lightning.records.metric_info import described
 from mops_lightning.records.readout_names import parse
 from mops_lightning.records.run_record import RunRecord
@@ -23,6 +22,7 @@ from mops_lightning.training.job import Job
 from mops_lightning.training.loaders import augmentation, score_loader, split
 from mops_lightning.training.recipe import Recipe
 from mops_lightning.training.trainer import log_hparams
+from mops_lightning.training.warm_start import warm_start
 from mops_lightning.training.workers import dead_workers_reported
 from mops_lightning.viz.snapshots import CLOUDS
 from mops_lightning.zoo import weights
@@ -34,9 +34,6 @@ OUTPUTS = {
     "tensorboard": "tensorboard",
 }
 """What callbacks and loggers may have written."""
-
-WARM_START_CLOUDS = 64
-"""Clouds whose statistics BatchNorm takes where the task net has none."""
 
 
 def fit_and_test(job: Job, record: RunRecord, task_weights: Path | None) -> None:
@@ -54,7 +51,7 @@ def fit_and_test(job: Job, record: RunRecord, task_weights: Path | None) -> None
     if job.trains:
         if job.experiment.recipe != Recipe():
             record.notes["recipe"] = {"name": job.cfg.names.recipe, **asdict(job.experiment.recipe)}
-        _warm_start(job, record)
+        warm_start(job, record)
         with record.timed("fit"):
             _fit(job)
         record.notes["validation"] = {
@@ -84,17 +81,6 @@ def _load_weights(job: Job, record: RunRecord, task_weights: Path | None) -> Non
             evaluate.same_classes(content["classes"], job.dataset, f"weights: {task_weights}")
     if job.cfg.evaluate:
         record.notes["evaluated"] = evaluate.load(job.cfg, job.experiment, job.dataset)
-
-
-def _warm_start(job: Job, record: RunRecord) -> None:
-    """Copy the task net's first layers to the sampler, unless the run is resumed."""
-    experiment = job.experiment
-    if experiment.recipe.warm_start and experiment.sampler is not None and job.resumed is None:
-        typical = job.dataset.train.points[:WARM_START_CLOUDS]
-        copied = copy_pointwise_layers(experiment.task.net, experiment.sampler, typical)
-        record.notes["warm_start_layers"] = copied
-        if copied and job.trainer.is_global_zero:
-            print(f"Warm start: the first {copied} layers are copies of {job.cfg.names.net}'s.")
 
 
 def _fit(job: Job) -> None:
