@@ -1,5 +1,7 @@
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pcrnet import PCRNet
@@ -43,6 +45,28 @@ def test_pcrnet_iterations_compose_motions(rng):
     for _ in range(2):
         total = one(total.apply(source), target).after(total)
     torch.testing.assert_close(three(source, target), total, atol=1e-5, rtol=1e-5)
+
+
+def homogeneous(motion):
+    """The 4×4 matrices of motions, by SciPy."""
+    matrices = np.tile(np.eye(4), (len(motion.quaternion), 1, 1))
+    scalar_last = np.roll(motion.quaternion.detach().numpy(), -1, 1)
+    matrices[:, :3, :3] = Rotation.from_quat(scalar_last).as_matrix()
+    matrices[:, :3, 3] = motion.translation.detach().numpy()
+    return matrices
+
+
+def test_pcrnet_pose_is_product_of_homogeneous_matrices(rng):
+    source, target = torch.randn(2, 4, 60, 3, generator=rng)
+    one, three = net(), net(iterations=3)
+    total, moved = np.tile(np.eye(4), (4, 1, 1)), source
+    for _ in range(3):
+        step = homogeneous(one(moved, target))
+        assert np.abs(step - np.eye(4)).max() > 0.1
+        total = step @ total
+        rotated = source.numpy() @ total[:, :3, :3].swapaxes(1, 2) + total[:, None, :3, 3]
+        moved = torch.from_numpy(rotated).float()
+    np.testing.assert_allclose(homogeneous(three(source, target)), total, atol=1e-5)
 
 
 def spread(module, rng):

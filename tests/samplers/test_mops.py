@@ -47,13 +47,19 @@ class PlainMOPS(nn.Module):
 def test_mops_equals_published_form(training, rng):
     fast = small(tau_min=0.3).double().train(training)
     plain = PlainMOPS(fast).double().train(training)
-    points = torch.randn(3, 20, 3, dtype=torch.float64, generator=rng)
+    points = torch.randn(3, 20, 3, dtype=torch.float64, generator=rng, requires_grad=True)
     matrix, sampled = plain(points)
     output = fast(points)
     # The plain twin has a bias in its last layer, which the softmax must cancel.
     assert plain.last.bias.abs().min() > 0
     torch.testing.assert_close(output.points, sampled)
     torch.testing.assert_close(output.matrix.dense(), matrix)
+    weights = torch.randn(3, 5, 3, dtype=torch.float64, generator=rng)
+    shared = [points, *fast.features.parameters()]
+    got = torch.autograd.grad((output.points * weights).sum(), [*shared, fast.queries.weight])
+    want = torch.autograd.grad((sampled * weights).sum(), [*shared, plain.last.weight])
+    assert all(gradient.abs().max() > 0 for gradient in want[:2])
+    torch.testing.assert_close(got, want)
 
 
 def test_mops_has_published_layers():

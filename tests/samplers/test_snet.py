@@ -34,6 +34,33 @@ def test_snet_has_published_layers_for_reconstruction():
     assert sum(isinstance(m, nn.BatchNorm1d) for m in net.modules()) == 5
 
 
+def plain_snet(net, points):
+    """The formulas: linear layers with BatchNorm and ReLU, the maximum over points, the head."""
+    linears = [m for m in net.modules() if isinstance(m, nn.Linear)]
+    norms = [m for m in net.modules() if isinstance(m, nn.BatchNorm1d)]
+    hidden = points
+    for number, (linear, norm) in enumerate(zip(linears, norms, strict=True)):
+        hidden = hidden @ linear.weight.mT + (0 if linear.bias is None else linear.bias)
+        assert norm.running_var is not None
+        scale = norm.weight / (norm.running_var + 1e-5).sqrt()
+        hidden = (hidden - norm.running_mean) * scale + norm.bias
+        if number < len(linears) - 1:
+            hidden = hidden.clamp(min=0)
+        if number == 1:  # the last pointwise layer
+            hidden = hidden.max(1).values
+    return hidden.reshape(len(points), -1, 3)
+
+
+def test_snet_equals_written_out_formulas(rng):
+    torch.manual_seed(0)
+    net = SNet(6, feature_channels=(8, 10), head_channels=(12, 9)).double().train()
+    points = torch.randn(4, 20, 3, generator=rng, dtype=torch.float64)
+    for _ in range(3):  # so that the running statistics differ from their initial values
+        net(points)
+    net.eval()
+    torch.testing.assert_close(net(points).points, plain_snet(net, points))
+
+
 def test_snet_loss_is_weighted_and_in_training_only(rng):
     net = SNet(6, alpha=3.0, coverage=0.5, coverage_per_point=0.25).train()
     points = torch.randn(4, 20, 3, generator=rng)
