@@ -6,7 +6,7 @@ WORKERS ?= 2
 # Examples of each kind that `make fuzz` tries.
 EXAMPLES ?= 1000
 
-.PHONY: setup run test fuzz check site clean
+.PHONY: setup run test fuzz mutants check site clean
 
 setup: .venv/.installed
 
@@ -25,6 +25,10 @@ test: setup
 # The long round of tests/fuzz; `make test` contains a short one.
 fuzz: setup
 	MOPS_FUZZ=$(EXAMPLES) $(BIN)/python -m pytest tests/fuzz -s
+
+# Takes hours: MODULES="samplers/mops ops/readout" takes some modules, SAMPLE=20 a part of each.
+mutants: setup
+	OMP_NUM_THREADS=1 nice $(BIN)/python -m tests.mutation $(MODULES) $(if $(SAMPLE),--sample $(SAMPLE))
 
 # The documentation as pages in build/site. Fails on any broken link.
 site: setup

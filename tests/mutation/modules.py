@@ -1,0 +1,50 @@
+"""Which tests belong to which module: few and quick ones, so that a mutant takes seconds."""
+
+PROMISES = (
+    "training/test_experiment_scores",
+    "training/test_experiment_steps",
+    "training/test_stages",
+)
+"""Tests through the real path, with a recording task net."""
+
+TESTS: dict[str, tuple[str, ...]] = {
+    "training/readouts": ("training/test_readouts", *PROMISES),
+    "training/experiment": (*PROMISES, "training/test_experiment", "training/test_sizes"),
+    "training/scores": ("training/test_scores", *PROMISES),
+    "training/loaders": ("training/test_loaders", *PROMISES),
+    "training/recipe": ("training/test_recipe",),
+    "data/loader": ("data/test_loader", "config/test_distributed", *PROMISES),
+    "samplers/base": ("samplers/test_contract", *PROMISES),
+    "samplers/mops": ("samplers/test_mops", "samplers/test_contract", *PROMISES),
+    "samplers/fmops": ("samplers/test_fmops", "samplers/test_contract", *PROMISES),
+    "samplers/samplenet": ("samplers/test_samplenet", "samplers/test_contract", *PROMISES),
+    "samplers/snet": ("samplers/test_snet", "samplers/test_contract", *PROMISES),
+    "ops/readout": ("ops/test_readout", "training/test_readouts"),
+    "ops/sampling_matrix": ("ops/test_sampling_matrix", "samplers/test_mops"),
+    "ops/attention": ("ops/test_attention", "ops/test_sampling_matrix", "samplers/test_streaming"),
+    "losses/subset": ("losses/test_subset", "samplers/test_snet"),
+    "losses/registration": ("losses/test_registration",),
+    "metrics/base": ("metrics/test_base", "metrics/test_info"),
+    "metrics/classification": ("metrics/test_classification", "metrics/test_info"),
+    "metrics/reconstruction": ("metrics/test_reconstruction", "tasks/test_reconstruction"),
+    "metrics/registration": ("metrics/test_registration", "tasks/test_registration"),
+    "metrics/sampled_set": ("metrics/test_sampled_set",),
+    "samplers/fps": ("samplers/test_fps", "samplers/test_contract"),
+    "samplers/random": ("samplers/test_random", "samplers/test_contract"),
+    "samplers/voxel": ("samplers/test_voxel", "samplers/test_contract"),
+    "samplers/poisson": ("samplers/test_poisson", "samplers/test_contract"),
+    "samplers/ordering": ("samplers/test_ordering", "samplers/test_random"),
+    "samplers/fused": ("samplers/test_fused", "samplers/test_mops"),
+    "samplers/streaming": ("samplers/test_streaming",),
+    "samplers/critical": ("samplers/test_critical", "samplers/test_contract"),
+    "samplers/gumbel": ("samplers/test_gumbel", "samplers/test_contract"),
+    "samplers/submodular": ("samplers/test_submodular", "samplers/test_contract"),
+    "ops/facility_location": ("ops/test_facility_location",),
+    "ops/chamfer": ("ops/test_chamfer",),
+    "ops/emd": ("ops/test_emd",),
+    "ops/assignment": ("ops/test_emd",),
+    "ops/rigid": ("ops/test_rigid",),
+    "ops/fps": ("ops/test_fps", "ops/test_fps_cpu", "ops/test_readout"),
+    "ops/nearest": ("ops/test_nearest",),
+}
+"""By path below ``src/mops_lightning``, in the order in which ``make mutants`` takes them."""
