@@ -2,13 +2,14 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
 from mops_lightning.config.compose import compose
 from mops_lightning.config.composition import conf_dir
 from mops_lightning.config.validate import check
-from tests.support.command_line import TINY, call, runs
+from tests.support.command_line import TINY, TINY_ANY_DATA, call, runs
 
 TASKS = ("classification", "registration", "reconstruction")
 
@@ -76,7 +77,9 @@ def test_snet_rate_depends_on_task_and_learn(task, learn, rate):
         (["dataset=modelnet40"], (30, 8)),
         (["dataset=modelnet40", "task=reconstruction"], (200, 60)),
         (["dataset=shapenet_core", "task=reconstruction"], (100, 30)),
+        (["dataset=clouds", "dataset.root=x", "task=reconstruction"], (100, 30)),
         (["experiment=reconstruction_paper"], (400, 250)),
+        (["experiment=own_scans", "dataset.root=x"], (30, 10)),
     ],
 )
 def test_epochs_depend_on_dataset_and_task(overrides, epochs):
@@ -142,3 +145,18 @@ def test_baselines_are_left_out_added_and_checked(tmp_path):
 def test_run_label_names_net_or_sampler(learn, label):
     cfg = compose([f"learn={learn}", "sampler=fmops", "+logger.name2=${run_label:}"])
     assert cfg.logger.name2 == label
+
+
+def test_own_scans_needs_a_folder_and_gives_a_sampler_for_tiles(tmp_path):
+    (tmp_path / "scans").mkdir()
+    for seed in range(4):
+        points = np.random.default_rng(seed).normal(size=(300, 3)) + 1000
+        np.save(tmp_path / "scans" / f"{seed}.npy", points)
+    chosen = ["experiment=own_scans", "dataset.root=scans", "dataset.crops=4", "sizes=[8]"]
+    status, _, err = call([*chosen, *TINY_ANY_DATA, "sampler.m_max=16"], tmp_path)
+    assert status == 0, err
+    (run,) = runs(tmp_path)
+    arguments = ["scans/0.npy", "small.npy", "--weights", str(run), "--tile", "64", "--m", "70"]
+    status, out, err = call(["downsample", *arguments], tmp_path)
+    assert (status, err) == (0, "")
+    assert len(np.unique(np.load(tmp_path / "small.npy"), axis=0)) == 70
