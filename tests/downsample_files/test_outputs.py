@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from mops_lightning.downsample_files.outputs import jobs
+from mops_lightning.downsample_files.outputs import check_writable, jobs
 from mops_lightning.errors import UserError
 from mops_lightning.files import TEMPORARY
 
@@ -72,3 +72,9 @@ def test_outputs_links_and_temporary_files_are_no_inputs(inputs):
     Path(f"in/{TEMPORARY}a-x.npy").touch()
     found = jobs(Path("in"), Path("out"), None, False)
     assert [str(path) for path, _ in found] == ["in/a.npy", "in/c.stl", "in/deep/b.ply"]
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder that is never writable")
+def test_check_writable_read_only_folder_raises():
+    with pytest.raises(UserError, match=r"OUT: cannot write into /proc/nowhere"):
+        check_writable(Path("/proc/nowhere"))

@@ -43,3 +43,20 @@ def test_load_clouds_damaged_file_is_refused(tmp_path, rng, damage):
         np.savez(path, **{**arrays, **changes[damage]})
     with pytest.raises(UserError, match=r"clouds\.npz: cannot read saved clouds: .+\.$"):
         load_clouds(path)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"titles": np.array([0x7FFFFFFF] * 2, "<u4").view("<U1")},
+        {"titles": np.array(["a"])},
+        {"titles": np.array([1, 2])},
+        {"generated": np.zeros((2, 3))},
+        {"generated": np.zeros((2, 3, 3), "U1")},
+    ],
+)
+def test_load_clouds_other_arrays_are_refused(changes, tmp_path):
+    arrays = {"titles": np.array(["a", "b"]), "input": np.zeros((2, 9, 3), "f4"), **changes}
+    np.savez(tmp_path / "clouds.npz", **arrays)
+    with pytest.raises(UserError, match=r"clouds\.npz: cannot read saved clouds"):
+        load_clouds(tmp_path / "clouds.npz")

@@ -16,6 +16,7 @@ from typing import Any
 from rich.progress import track
 
 from mops_lightning.data.formats import limits
+from mops_lightning.downsample_files.outputs import check_writable
 from mops_lightning.downsample_files.processes import Died, processes
 from mops_lightning.downsample_files.settings import Settings
 from mops_lightning.errors import UserError, one_line, printable
@@ -94,6 +95,8 @@ def process_folder(
     done: Counter[str] = Counter()
     todo = [job for job in jobs if overwrite or not job[1].exists()]
     failures, dropped = {}, 0
+    if todo:
+        check_writable(target)
     results = _results(todo, settings, workers, engine)
     with closing(results):  # ends the processes when the user interrupts
         for (source, _), result in track(

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from mops_lightning.data.formats.registry import READABLE, WRITERS
 from mops_lightning.errors import UserError, one_line
@@ -58,6 +59,22 @@ def _jobs(source: Path, target: Path, file_format: str | None, keep_attributes: 
     if target.suffix.lower() not in WRITERS:
         raise UserError(f"OUT must end in one of {', '.join(WRITERS)}, got {target}.")
     return [(source, target)]
+
+
+def check_writable(folder: Path) -> None:
+    """Create a folder for outputs, unless it exists.
+
+    Raises:
+        UserError: no file can be written there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise UserError(
+            f"OUT: cannot write into {folder} ({error.strerror}). Give another OUT."
+        ) from None
 
 
 def _inputs(source: Path, target: Path) -> list[Path]:

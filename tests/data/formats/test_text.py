@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mops_lightning.data.formats.registry import read
+from mops_lightning.errors import UserError
 
 
 @pytest.mark.parametrize(
@@ -25,3 +26,9 @@ def test_text_dialect_is_read(text, tmp_path):
     path = tmp_path / "a.xyz"
     path.write_text(text, encoding="utf-8")
     np.testing.assert_array_equal(read(path, 9, 0).points, [[1, 2, 3], [4, 5, 6]])
+
+
+def test_text_with_header_only_is_broken(tmp_path):
+    (tmp_path / "a.xyz").write_text("not a cloud\n")
+    with pytest.raises(UserError, match="holds no points"):
+        read(tmp_path / "a.xyz", 9, 0)

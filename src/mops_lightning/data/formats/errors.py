@@ -1,5 +1,6 @@
 """Errors of cloud files, which name the file."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +20,9 @@ def naming_file(path: Path) -> Iterator[None]:
         BadCloudError: in place of every error except ``UserError``.
     """
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the error says what is wrong
+            yield
     except (UserError, KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
     except MemoryError as error:

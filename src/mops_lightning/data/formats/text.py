@@ -29,6 +29,8 @@ def read(path: Path) -> Table:
         lines.pop(0)  # the number of points
     if not any(map(_is_number, lines[0].split(separator))):
         lines.pop(0)  # a header
+    if not lines:
+        raise BadCloudError(f"{path} holds no points.")
     try:
         array = np.loadtxt(lines, delimiter=separator, ndmin=2)
     except ValueError as error:
