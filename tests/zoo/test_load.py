@@ -130,3 +130,9 @@ def test_samplers_of_the_package_can_all_be_loaded():
     for path in (ROOT / "conf" / "sampler").glob("*.yaml"):
         node: Any = OmegaConf.load(path)
         assert node.get("sampler", node)["_target_"] in known, path
+
+
+@pytest.mark.parametrize("node", [5, ["a"], "fps", {1: 2}])
+def test_load_sampler_that_is_no_group_raises(node, save):
+    with pytest.raises(UserError, match="sampler"):
+        load(save(node))

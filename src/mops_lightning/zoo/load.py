@@ -80,7 +80,12 @@ def _build(config: dict[str, Any], path: Path) -> Sampler:
     """Build the untrained sampler that a file's configuration describes."""
     if config.get("learn") == "task":
         raise UserError(f"{path} holds a task net, not a sampler. {HINT}")
-    arguments = dict(config.get("sampler") or {})
+    node = config.get("sampler") or {}
+    if not isinstance(node, dict) or not all(isinstance(name, str) for name in node):
+        raise UserError(
+            f"{path}: its setting sampler must be a group of settings, got {node!r:.99}."
+        )
+    arguments = dict(node)
     target = arguments.pop("_target_", None)
     classes = {f"{cls.__module__}.{cls.__qualname__}": cls for cls in SAMPLERS}
     if not isinstance(target, str) or target not in classes:
