@@ -113,11 +113,15 @@ def replace_functions(code: CodeType, path: str) -> None:
     """Give every function of a module, wherever it is referred to, the code of a changed module."""
     changed = {(one.co_qualname, one.co_firstlineno): one for one in _nested(code)}
     for function in gc.get_objects():
-        if isinstance(function, FunctionType) and function.__code__.co_filename == path:
+        # isinstance would ask lazy proxies for their class.
+        if type(function) is FunctionType and function.__code__.co_filename == path:
             own = function.__code__
             other = changed.get((own.co_qualname, own.co_firstlineno))
-            if other is not None and other.co_freevars == own.co_freevars:
-                function.__code__ = other
+            if other is None:
+                continue
+            if not other.co_freevars:  # the fault took out the call of super
+                other = other.replace(co_freevars=own.co_freevars)
+            function.__code__ = other
 
 
 def _nested(code: CodeType) -> list[CodeType]:
@@ -131,6 +135,8 @@ def replace_values(code: CodeType, module: ModuleType) -> None:
     exec(code, changed)
     for name, new in changed.items():
         old = getattr(module, name, None)
+        if new is old:  # imported
+            continue
         if isinstance(new, type) and isinstance(old, type):
             for attribute, value in vars(new).items():
                 if isinstance(value, FunctionType):

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from lightning.pytorch.callbacks import Callback
 
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.losses.subset import simplification_loss, subset_loss
@@ -15,6 +16,7 @@ from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.schedules import exponential
 from tests.support.recording import Fingerprint, RecordingTask, numbered_clouds
 from tests.support.training import quiet_trainer
 
@@ -130,6 +132,35 @@ def test_losses_over_sizes_are_summed_or_averaged(how, make, name, loss, calls):
     parts = [value for key, value in logged.items() if key.startswith("train/loss/")]
     assert 2 * logged["train/loss/total"] == pytest.approx(sum(parts), rel=1e-4)
     assert logged["train/mean_loss"] == pytest.approx(logged["train/loss/total"], rel=1e-4)
+    assert logged["loss"] == pytest.approx(logged["train/loss/total"], rel=1e-4)
+    assert logged.get("train/tau") == (1.0 if isinstance(sampler, FMOPSNet) else None)
+    readout = "soft_projected" if isinstance(sampler, SampleNet) else "generated"
+    prints = torch.stack([module.task.net(call.points).detach() for call in calls]).mean()
+    assert logged[f"train/{readout}/fingerprint"] == pytest.approx(float(prints), abs=1e-4)
+
+
+class Rates(Callback):
+    """Notes the learning rate of every step."""
+
+    def __init__(self):
+        self.seen = []
+
+    def on_before_optimizer_step(self, trainer, pl_module, optimizer):
+        self.seen.append(optimizer.param_groups[0]["lr"])
+
+
+def test_schedule_sets_rate_of_each_step_of_the_run():
+    module = Experiment(
+        RecordingTask(Fingerprint()),
+        learn="task",
+        make_optimizer=lambda parameters: torch.optim.SGD(parameters, lr=1e-3),
+        make_schedule=partial(exponential, end_lr=1e-5),
+    )
+    rates, data = Rates(), numbered_clouds()
+    loaders = CloudLoader(data.train, 4, shuffle=True), CloudLoader(data.test, 4)
+    quiet_trainer(2, callbacks=[rates], limit_val_batches=0).fit(module, *loaders)
+    # 2 epochs of 4 batches.
+    assert rates.seen == pytest.approx([1e-3 * 0.01 ** (step / 7) for step in range(8)])
 
 
 @pytest.mark.parametrize("learn", ["sampler", "joint", "task"])
