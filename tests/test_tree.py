@@ -1,21 +1,21 @@
-"""The files that git tracks: a small tree, with all weights in one folder."""
+"""The files that git tracks: a small tree, with all weights in the models of the package."""
 
-import hashlib
 import json
 import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
-import torch
 
-from mops_lightning.zoo import weights
+from mops_lightning.zoo import model_file, names
 
 ROOT = Path(__file__).parents[1]
 TREE = 25_000_000
+MODELS = 20_000_000
 PICTURE = 300_000
 PICTURES = {".png", ".svg", ".jpg", ".jpeg", ".gif", ".webp"}
 WEIGHTS = {".pt", ".pth", ".ckpt", ".safetensors", ".onnx"}
+KINDS = ("weights", "task_weights")
 
 
 @pytest.fixture(scope="module")
@@ -39,28 +39,17 @@ def test_pictures_stay_below_300_kb(tracked):
     assert {path: size for path, size in sizes.items() if size >= PICTURE} == {}
 
 
-def test_weights_are_in_their_folder_and_listed_with_sha256(tracked):
+def test_weights_are_models_of_the_package(tracked):
     files = [path for path in tracked if path.suffix in WEIGHTS]
-    assert {path.parent for path in files} == {ROOT / "weights"}
-    listed = (ROOT / "weights" / "README.md").read_text()
-    sums = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-    assert [name for name, digest in sums.items() if f"{digest}  {name}\n" not in listed] == []
-    assert [name for name in sums if f"| `{name}` |" not in listed] == []
+    assert {path.parent for path in files} == {names.SHIPPED}
+    assert sum(path.stat().st_size for path in files) < MODELS
+    for path in files:
+        assert model_file.read(path)["card"]["name"] == path.stem
 
 
-def test_weights_files_are_intact(tracked):
-    for path in tracked:
-        if path.suffix in WEIGHTS:
-            content = torch.load(path, weights_only=True)
-            assert weights.digest(content["state"]) == content["sha256"], path
-
-
-def test_records_name_weights_that_exist(tracked):
-    named: dict[Path, Path] = {}
-    for path in tracked:
-        if path.name == "result.json":
-            files = json.loads(path.read_text())["files"]
-            named |= {path.parent / files[k]: path for k in files if k.endswith("weights")}
-    assert {path: record for path, record in named.items() if not path.is_file()} == {}
-    kept = set((ROOT / "weights").glob("*.pt"))
-    assert {path.resolve() for path in named} == kept
+def test_records_and_models_name_models_that_exist(tracked):
+    records = [json.loads(path.read_text()) for path in tracked if path.name == "result.json"]
+    records += [model_file.read_card(path)["record"] for path in tracked if path.suffix in WEIGHTS]
+    named = {record["files"][k] for record in records for k in record["files"] if k in KINDS}
+    found = {names.find(name) for name in named}
+    assert found == {path for path in tracked if path.suffix in WEIGHTS}

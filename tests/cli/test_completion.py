@@ -57,6 +57,7 @@ def test_tab_completes_settings_subcommands_and_files(press_tab):
         "mops-lightning sampler=fm": ["sampler=fmops"],
         "mops-lightning sampler=fmops sampler.m_m": ["sampler.m_max="],
         "mops-lightning rep": ["report"],
+        "mops-lightning mode": ["models"],
         "mops-lightning report rep": ["reports.csv"],
     }
     assert press_tab(expected) == expected
@@ -68,5 +69,8 @@ def test_tab_completes_options_of_subcommands(press_tab):
         "mops-lightning report . --m": ["--metric", "--mixed"],
         "mops-lightning downsample a b --method f": ["fps"],
         "mops-lightning downsample a b --readout=m": ["--readout=matched"],
+        "mops-lightning models pointnet.": ["pointnet.modelnet40"],
+        "mops-lightning export mops.": ["mops.modelnet40-m32"],
+        "mops-lightning models add --over": ["--overwrite"],
     }
     assert press_tab(expected) == expected

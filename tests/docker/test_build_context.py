@@ -76,7 +76,6 @@ def test_pip_install_uses_the_constraints(name):
         "data/modelnet40_ply_hdf5_2048/ply_data_train0.h5",
         "outputs/classification/result.json",
         "results/main_job/result.json",
-        "weights/classification-fmops-modelnet40.pt",
         "src/mops_lightning/__pycache__/cli.cpython-312.pyc",
         "src/mops_lightning/samplers/__pycache__/base.cpython-312.pyc",
     ],

@@ -9,7 +9,7 @@ from tests.support.downsample import call
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--m", 5], "either --weights FILE"),
+        (["--m", 5], "either --weights MODEL"),
         (["--m", 5, "--method", "fps", "--weights", "w.pt"], "not both"),
         (["--method", "fps"], "--m must be"),
         (["--m", 0, "--method", "fps"], "--m must be"),

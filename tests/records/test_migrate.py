@@ -5,15 +5,12 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from mops_lightning.config.build import build
 from mops_lightning.config.compose import compose
 from mops_lightning.records import run_record
 from mops_lightning.records.migrate import OLD, answer, upgraded_config, upgraded_overrides
-from mops_lightning.zoo import weights
 from tests.support.command_line import call
 
 RESULTS = Path(__file__).parents[2] / "results"
-WEIGHTS = Path(__file__).parents[2] / "weights"
 SAMPLERS = ("mops", "fmops", "snet", "samplenet", "snet_progressive", "samplenet_progressive")
 
 
@@ -116,9 +113,3 @@ def test_read_committed_records_get_present_names():
         keys = run_record.dotted(record["config"])
         assert [key for key in keys if answer(key)] == [], path
         assert upgraded_overrides(record["overrides"]) == record["overrides"], path
-
-
-@pytest.mark.parametrize("path", sorted(WEIGHTS.glob("*-*mops-*.pt")), ids=lambda path: path.stem)
-def test_committed_sampler_is_built_from_its_weights_file(path):
-    sampler = build(OmegaConf.create(weights.read(path)["config"]["sampler"]), "sampler")
-    weights.load_into(sampler, path)

@@ -109,17 +109,17 @@ def test_load_task_net_or_missing_file_is_refused(save, tmp_path):
         load(None)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    ("name", "m"),
-    [("fmops-modelnet40", 512), ("mops-modelnet40-m32", 32), ("snet-modelnet40-m32", 32)],
-)
-def test_load_kept_weights_samples_points(name, m):
-    sampler = load(ROOT / "weights" / f"classification-{name}.pt")
-    assert sampler(torch.rand(1, 600, 3)).points.shape == (1, m, 3)
-
-
 def test_load_run_folder_follows_its_record():
     assert load(ROOT / "results" / "classification" / "runs" / "fmops").m == 512
+
+
+def test_load_model_by_name_or_unknown_name():
+    sampler = load("mops.modelnet40-m32")
+    assert (sampler.m, sampler.training) == (32, False)
+    with pytest.raises(UserError, match=r"no file or model.*Did you mean 'mops\.modelnet40-m32'"):
+        load("mops.modelnet-m32")
+    with pytest.raises(UserError, match=r"pointnet\.modelnet40.*holds a task net"):
+        load("pointnet.modelnet40")
 
 
 def test_samplers_of_the_package_can_all_be_loaded():

@@ -25,6 +25,9 @@ COMMANDS = {
     "compare": Command(
         "mops_lightning.compare.cli", "what methods of downsampling are worth on your own files"
     ),
+    "models": Command(
+        "mops_lightning.cli.models", "trained models: list, show a card, publish a run as one"
+    ),
 }
 
 

@@ -101,8 +101,8 @@ class RunSettings:
     weights: str | None = field(
         default="auto",
         metadata=about(
-            "task net: auto (cached, else trained first), a weights file, or null (untrained); "
-            "with learn=task the file that training starts from",
+            "task net: auto (cached, else trained first), a model, a weights file, or null "
+            "(untrained); with learn=task the file that training starts from",
             nullable=True,
             by_content=True,
             repeat=False,
@@ -120,7 +120,7 @@ class RunSettings:
     evaluate: str | None = field(
         default=None,
         metadata=about(
-            "test this trained run again, with other sizes=, dataset= or weights=; trains nothing",
+            "test this run or model again, with other sizes=, dataset= or weights=; trains nothing",
             nullable=True,
             repeat=False,
             compare=False,

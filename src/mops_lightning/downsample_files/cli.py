@@ -61,7 +61,7 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
     add("target", metavar="OUT", type=Path, help="a file or a folder")
     add("--m", type=int, help="number of points to keep; default: as the weights were trained for")
     add("--ratio", type=float, help="with tiles: the share of the points to keep, instead of --m")
-    add("--weights", type=Path, help="weights.pt of a trained sampler, or the folder of its run")
+    add("--weights", help="a trained sampler: a model's name, a weights.pt or the folder of a run")
     add("--method", choices=METHODS, help="an untrained method, instead of --weights")
     add(
         "--readout",

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 from mops_lightning.errors import UserError
 from mops_lightning.records.readout_names import GENERATED_READOUTS
@@ -17,7 +16,7 @@ class Settings:
 
     Attributes:
         m: number of points to keep; None: as many as the weights were trained for.
-        weights: of a trained sampler: a weights file, or the folder of its run.
+        weights: of a trained sampler: a model, a weights file, or the folder of its run.
         method: one of ``METHODS``, instead of weights.
         readout: of a trained sampler: generated, matched or completed.
         keep_attributes: keep colours, normals and the like of the kept points.
@@ -30,7 +29,7 @@ class Settings:
     """
 
     m: int | None
-    weights: Path | None = None
+    weights: str | None = None
     method: str | None = None
     readout: str = "completed"
     keep_attributes: bool = False
@@ -50,7 +49,7 @@ class Settings:
         """Reject values out of range and options that exclude each other."""
         if (self.weights is None) == (self.method is None):
             raise UserError(
-                "give either --weights FILE of a trained sampler or --method "
+                "give either --weights MODEL of a trained sampler or --method "
                 f"{'|'.join(METHODS)}, not both."
             )
         self._check_tiles()

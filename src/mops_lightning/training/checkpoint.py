@@ -38,7 +38,7 @@ def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
 
 def _given_weights(cfg: DictConfig) -> dict[str, str]:
     """Return the hash of the weights file that the user gave, if any."""
-    if cfg.weights in (None, "auto", "run") or not Path(cfg.weights).expanduser().is_file():
+    if cfg.weights in (None, "auto", "run"):
         return {}
     try:
         return {"weights": str(weights.read(cfg.weights)["sha256"])}

@@ -19,7 +19,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.callbacks import CHECKPOINT
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.replay import KEY, OF_RUN, trained_run
+from mops_lightning.training.replay import KEY, OF_RUN, place, trained_run
 from mops_lightning.zoo import weights
 
 
@@ -32,20 +32,20 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
     Raises:
         UserError: settings, classes or files do not match the run.
     """
-    record = trained_run(Path(cfg.evaluate))
-    folder = Path(cfg.evaluate.removesuffix(run_record.FILE))
-    _same_settings(cfg, record, folder, experiment.task)
+    record, folder = trained_run(cfg.evaluate), place(cfg.evaluate)
+    run = cfg.evaluate.removesuffix(f"/{run_record.FILE}")
+    _same_settings(cfg, record, run, experiment.task)
     notes = record["notes"]
     told = experiment.task.requires_same_classes
     if told and cfg.weights == OF_RUN and notes.get("dataset_fingerprint") != dataset.fingerprint:
-        same_classes(notes.get("class_names"), dataset, f"{KEY}: {folder}")
+        same_classes(notes.get("class_names"), dataset, f"{KEY}: {run}")
     learned = experiment.task if cfg.learn == "task" else experiment.sampler
     what = "task net" if cfg.learn == "task" else "sampler"
     assert learned is not None  # learn=nothing builds a sampler
     try:
         content = weights.load_into(learned, weights.of_run(folder))
     except UserError as error:
-        raise UserError(f"{KEY}: the {what} of {folder} cannot be loaded: {error}") from None
+        raise UserError(f"{KEY}: the {what} of {run} cannot be loaded: {error}") from None
     has_weights = any(True for _ in experiment.task.parameters())
     if cfg.learn != "task" and cfg.weights == OF_RUN and has_weights:
         try:
@@ -53,7 +53,7 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
         except UserError as error:
             raise UserError(f"{KEY}: {error}{_other_net(cfg, record)}") from None
     return {
-        "run": str(folder),
+        "run": run,
         "commit": record["git"]["commit"],
         "max_epochs": record["config"]["trainer"]["max_epochs"],
         "learn": record["config"]["learn"],
@@ -93,9 +93,8 @@ def same_classes(names: list[str] | None, dataset: CloudDataset, what: str) -> N
 
 def _load_task(task: torch.nn.Module, folder: Path, record: dict[str, Any]) -> None:
     """Load the task net from a jointly trained run's weights, or from the run's checkpoint."""
-    name = record["files"].get("task_weights")
-    if name is not None:
-        weights.load_into(task, folder / name)
+    if "task_weights" in record["files"]:
+        weights.load_into(task, weights.of_run(folder, "task_weights"))
         return
     path = folder / "checkpoints" / CHECKPOINT
     if not path.is_file():
@@ -122,29 +121,29 @@ def _other_net(cfg: DictConfig, record: dict[str, Any]) -> str:
 
 
 def _same_settings(
-    cfg: DictConfig, record: dict[str, Any], folder: Path, task: torch.nn.Module
+    cfg: DictConfig, record: dict[str, Any], run: str, task: torch.nn.Module
 ) -> None:
     there = record["config"]
     here: Any = OmegaConf.to_container(cfg, resolve=True)
     if (cfg.learn == "task") != (there["learn"] == "task"):
         raise UserError(
-            f"{KEY}: {folder} was made with learn={there['learn']}; leave learn out. To test a "
+            f"{KEY}: {run} was made with learn={there['learn']}; leave learn out. To test a "
             "sampler with this task net, evaluate the sampler's run with "
-            f"weights={weights.of_run(folder)}."
+            f"weights={weights.of_run(place(run))}."
         )
     if cfg.learn == "task" and cfg.weights != OF_RUN:
-        raise UserError(f"{KEY}: {folder} trained a task net; leave weights out.")
+        raise UserError(f"{KEY}: {run} trained a task net; leave weights out.")
     for group in ("task",) if cfg.learn == "task" else ("task", "sampler"):
         old, new = there["names"][group], here["names"][group]
         if old != new:
             raise UserError(
-                f"{KEY}: {folder} was trained with {group}={old}, got {group}={new}. "
+                f"{KEY}: {run} was trained with {group}={old}, got {group}={new}. "
                 f"Leave {group} out, or give a run with {group}={new}."
             )
     weightless = not any(True for _ in task.parameters())
     if here["names"]["net"] != there["names"]["net"] and cfg.weights == OF_RUN and not weightless:
         raise UserError(
-            f"{KEY}: the task net of {folder} is {there['names']['net']}; for "
+            f"{KEY}: the task net of {run} is {there['names']['net']}; for "
             f"task/net={here['names']['net']} also give its weights: weights=auto or weights=FILE."
         )
     for key in sorted({*there["sampler"], *here["sampler"]}) if cfg.learn != "task" else ():
@@ -156,6 +155,6 @@ def _same_settings(
                 else " For other sizes of a sampler for many sizes give sizes=[...]."
             )
             raise UserError(
-                f"{KEY}: sampler.{key} must be {old}, as in {folder}, got {new}. "
+                f"{KEY}: sampler.{key} must be {old}, as in {run}, got {new}. "
                 f"Leave it out, or train a sampler with it.{hint}"
             )

@@ -21,12 +21,12 @@ from mops_lightning.training.job import Job, prepare
 from mops_lightning.training.recording import recorded
 from mops_lightning.training.replay import OF_RUN
 from mops_lightning.training.stages import fit_and_test
-from mops_lightning.zoo import weights
+from mops_lightning.zoo import names, weights
 from mops_lightning.zoo.weights import FILE
 
 
 def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
-    """Return the file that ``weights`` means; ``auto`` trains the net when it is not cached.
+    """Return the file that ``weights`` names; ``auto`` trains the net when it is not cached.
 
     With ``learn=task``, training starts from the given file; with ``auto`` from scratch.
 
@@ -39,7 +39,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
     if cfg.weights == "auto" and cfg.learn == "task":
         return None
     if cfg.weights != "auto":
-        return Path(cfg.weights)
+        return names.resolve(cfg.weights)
     folder = cache_folder(cfg, dataset)
     if not _is_good(folder / FILE):
         if distributed.started_together(cfg):

@@ -1,7 +1,8 @@
 """The command line of ``evaluate=RUN``: RUN's overrides, then the user's.
 
-A run's record may come from anybody. Only settings that this program declares are taken from it,
-and only plain values: nothing that names code or a file of Hydra's.
+RUN is a folder, or a model, whose card contains a record. A record may come from anybody. Only
+settings that this program declares are taken from it, and only plain values: nothing that names
+code or a file of Hydra's.
 """
 
 import re
@@ -12,6 +13,7 @@ from mops_lightning.config import overrides, settings
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.callbacks import CHECKPOINT
+from mops_lightning.zoo import model_file, names
 
 KEY = "evaluate"
 OF_RUN = "run"
@@ -47,11 +49,12 @@ def command_line(arguments: list[str]) -> list[str]:
     chosen = _chosen(arguments[places[-1]]) if places else None
     if not chosen:
         return arguments
-    folder = Path(chosen).expanduser()
+    path = Path(chosen).expanduser()
+    folder = str(path) if path.exists() else chosen
     record = trained_run(folder)
-    names = record["config"]["names"]
+    chosen_groups = record["config"]["names"]
     _refuse_without_effect(arguments, folder)
-    groups = {"task": names["task"], "dataset": names["dataset"], "sampler": names["sampler"]}
+    groups = {key: chosen_groups[key] for key in ("task", "dataset", "sampler")}
     typed = [a for i, a in enumerate(arguments) if i not in places and overrides.key(a)]
     # Choosing the run's own group again changes nothing; the settings below it stay too.
     typed_keys = [
@@ -69,7 +72,7 @@ def command_line(arguments: list[str]) -> list[str]:
         _check_recorded(argument, folder)
     _data_are_here(kept, folder)
     learn = "task" if record["config"]["learn"] == "task" else "nothing"
-    own = [*kept, f"learn={learn}", f"weights={OF_RUN}", f"{KEY}={overrides.quote(str(folder))}"]
+    own = [*kept, f"learn={learn}", f"weights={OF_RUN}", f"{KEY}={overrides.quote(folder)}"]
     # All in one place: argparse accepts flags before or after all overrides, not between them.
     before = [a for i, a in enumerate(arguments[: places[0]]) if i not in places]
     behind = [a for i, a in enumerate(arguments) if i > places[0] and i not in places]
@@ -89,7 +92,7 @@ def _chosen(argument: str) -> str | None:
     return None if value is None else str(value)
 
 
-def _refuse_without_effect(arguments: list[str], folder: Path) -> None:
+def _refuse_without_effect(arguments: list[str], folder: str) -> None:
     """Refuse settings of a training, of which there is none in an evaluation.
 
     Raises:
@@ -106,7 +109,7 @@ def _refuse_without_effect(arguments: list[str], folder: Path) -> None:
             )
 
 
-def _data_are_here(kept: list[str], folder: Path) -> None:
+def _data_are_here(kept: list[str], folder: str) -> None:
     """Reject a relative data folder that does not exist from the current folder."""
     for argument in kept:
         override = overrides.parse(argument)
@@ -126,7 +129,7 @@ def _is_repeated(path: str) -> bool:
     return known and settings.of(path).repeated
 
 
-def _check_recorded(argument: str, folder: Path) -> None:
+def _check_recorded(argument: str, folder: str) -> None:
     """Reject an override of a record that could run code.
 
     Raises:
@@ -161,17 +164,35 @@ def _names_code(value: Any) -> bool:
     return "${" in str(value)
 
 
-def trained_run(folder: Path) -> dict[str, Any]:
-    """Return the record of a completed run that trained something.
+def place(run: str) -> Path:
+    """Return the folder or the model file that ``evaluate=RUN`` means.
+
+    Raises:
+        UserError: there is none.
+    """
+    try:
+        path = names.resolve(run)
+    except UserError as error:
+        raise UserError(f"{KEY}: {error}") from None
+    if path.name == run_record.FILE:
+        path = path.parent
+    if not path.is_dir() and not (path.is_file() and path.suffix == model_file.SUFFIX):
+        raise UserError(
+            f"{KEY}: no folder {path}. Give a model, or the folder of a run, with result.json."
+        )
+    return path
+
+
+def trained_run(run: str) -> dict[str, Any]:
+    """Return the record of a completed run that trained something, or of a model.
 
     Raises:
         UserError: it is not such a run.
     """
-    if folder.name == run_record.FILE:
-        folder = folder.parent
-    if not folder.is_dir():
-        raise UserError(f"{KEY}: no folder {folder}. Give the folder of a run, with result.json.")
+    folder = place(run)
     try:
+        if folder.is_file():
+            return dict(model_file.read_card(folder)["record"])
         record = run_record.read(folder)
     except UserError as error:
         raise UserError(f"{KEY}: {error}") from None

@@ -1,4 +1,4 @@
-"""Samplers from weights files, without Hydra."""
+"""Samplers by name or from weights files, without Hydra."""
 
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.samplers.voxel import VoxelSampler
-from mops_lightning.zoo import weights
+from mops_lightning.zoo import names, weights
 
 SAMPLERS: tuple[type[Sampler], ...] = (
     MOPSNet,
@@ -37,17 +37,18 @@ SAMPLERS: tuple[type[Sampler], ...] = (
 )
 """What ``load`` can build. A file's ``_target_`` is compared with this list and never imported."""
 
-HINT = "Give the weights.pt of a run with learn=sampler or learn=joint."
+HINT = "Give a sampler, or the weights.pt of a run with learn=sampler or learn=joint."
 
 
 def load(path: str | Path) -> Sampler:
-    """Load a trained sampler from a weights file.
+    """Load a trained sampler by its name, or from a weights file.
 
     Nothing in the file is executed: it holds tensors and plain data, and only samplers of this
     package are built. Torch's random state is left as it is.
 
     Args:
-        path: a ``weights.pt``, or the folder of a run whose record names one.
+        path: a model's name (``mops-lightning models`` lists them), a weights file, the folder of
+            a run, or ``hf://OWNER/REPO/FILE.safetensors@sha256:HASH``.
 
     Returns:
         The sampler in eval mode on the CPU. It maps points ``(B, N, 3)`` to a ``SampleOutput`` with
@@ -60,16 +61,16 @@ def load(path: str | Path) -> Sampler:
     Examples:
         >>> import torch
         >>> from mops_lightning import load
-        >>> sampler = load("outputs/my_run")
+        >>> sampler = load("mops.modelnet40-m32")
         >>> sampler(torch.rand(2, 64, 3)).points.shape
-        torch.Size([2, 8, 3])
+        torch.Size([2, 32, 3])
     """
     if not isinstance(path, str | Path):
         raise UserError(f"path must be a string or a Path, got {path!r}.")
-    path = Path(path).expanduser()
+    path = names.resolve(path)
     path = weights.of_run(path) if path.is_dir() else path
     if not path.is_file():
-        raise UserError(f"no file {path}. Give a weights.pt, or the folder of its run.")
+        raise UserError(f"no file {path}. Give a model, a weights.pt or the folder of its run.")
     content = weights.read(path)
     sampler = _build(content["config"], path)
     weights.fit_state(sampler, content["state"], path, HINT)

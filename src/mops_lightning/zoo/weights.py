@@ -1,6 +1,5 @@
 """Weights files: plain tensors and plain data, checked when read."""
 
-import hashlib
 import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,7 +13,8 @@ from mops_lightning.errors import UserError
 from mops_lightning.files import atomic_write
 from mops_lightning.records import run_record
 from mops_lightning.records.migrate import upgraded_config
-from mops_lightning.zoo import bounds
+from mops_lightning.zoo import bounds, model_file, names
+from mops_lightning.zoo.digest import digest
 
 SCHEMA = "mops_lightning/weights/1"
 FILE = "weights.pt"
@@ -66,7 +66,10 @@ def write_plain(path: str | Path, content: dict[str, Any]) -> None:
 
 
 def read(path: str | Path) -> dict[str, Any]:
-    """Read a weights file and verify it.
+    """Read a weights file or a model and verify it.
+
+    Args:
+        path: a weights file, or what ``names.resolve`` takes.
 
     Returns:
         The content as saved: ``config``, ``metrics``, ``classes``, ``sha256`` and ``state``;
@@ -76,9 +79,13 @@ def read(path: str | Path) -> dict[str, Any]:
         UserError: the file is missing.
         Damaged: it is damaged or not a weights file, or its tensors are not finite.
     """
-    path = Path(path).expanduser()
+    path = names.resolve(path)
     if not path.is_file():
         raise UserError(f"no file {path}. Give a weights.pt, or weights=auto.")
+    if path.suffix == model_file.SUFFIX:
+        content = model_file.read(path)
+        check_state(content["state"], path)
+        return content
     content = read_plain(path, "a weights file")
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise Damaged(
@@ -150,18 +157,31 @@ def read_plain(path: Path, what: str) -> Any:
         ) from None
 
 
-def of_run(folder: Path) -> Path:
-    """Return the weights file of a run: the one its record names, otherwise ``weights.pt``.
+def of_run(run: Path, kind: str = "weights") -> Path:
+    """Return the file with the weights of a run.
 
     Args:
-        folder: the run's folder; its record gives the path relative to this folder.
+        run: the run's folder, or a model file. The record of the run names a file relative to its
+            folder, or a model.
+        kind: ``weights``, of what was trained, or ``task_weights``, of the task net.
+
+    Returns:
+        Without a record, or if the record names no file: ``weights.pt`` or ``task_weights.pt``.
 
     Raises:
-        UserError: the folder contains a ``result.json`` that is not a run record.
+        UserError: the folder contains a ``result.json`` that is not a run record, or the model that
+            it names now has other weights.
     """
-    has_record = (folder / run_record.FILE).is_file()
-    files = run_record.read(folder)["files"] if has_record else {}
-    return folder / files.get("weights", FILE)
+    if run.is_file():
+        if kind == "weights":
+            return run
+        files, run = model_file.read_card(run)["record"]["files"], run.parent
+    else:
+        has_record = (run / run_record.FILE).is_file()
+        files = run_record.read(run)["files"] if has_record else {}
+    named = files.get(kind, f"{kind}.pt")
+    path = run / named
+    return path if path.exists() else names.find(named) or path
 
 
 def load_into(module: nn.Module, path: str | Path) -> dict[str, Any]:
@@ -217,13 +237,3 @@ def first_nonfinite(state: Any, name: str = "") -> str | None:
         parts = enumerate(state)
     named = ((f"{name}.{key}" if name else str(key), value) for key, value in parts)
     return next(filter(None, (first_nonfinite(value, path) for path, value in named)), None)
-
-
-def digest(state: dict[str, Tensor]) -> str:
-    """Return the sha256 of the names, shapes, types and bytes of tensors, in any order."""
-    total = hashlib.sha256()
-    for name in sorted(state):
-        value = state[name].detach().cpu().contiguous()
-        total.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
-        total.update(value.view(-1).view(torch.uint8).numpy().tobytes())
-    return total.hexdigest()

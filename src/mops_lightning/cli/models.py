@@ -1,0 +1,194 @@
+"""The subcommand ``models``."""
+
+import argparse
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from mops_lightning.errors import USER_ERROR, UserError, end, quiet_on_closed_pipe
+from mops_lightning.zoo import model_file, names
+
+DESCRIPTION = f"""List trained models, show the card of one, or publish a run as one.
+
+  models                list all models: those of this package and those in ${names.VARIABLE}
+  models NAME           show a card
+  models add RUN NAME   write the net that RUN trained to a folder, as NAME.safetensors
+
+A name can be given wherever a weights file or a run can: weights=NAME, evaluate=NAME,
+downsample --weights NAME, export NAME. ${names.VARIABLE} is a list of folders, as in PATH."""
+
+
+def main(arguments: list[str], prog: str) -> None:
+    """Do what the arguments say.
+
+    Args:
+        arguments: those of the command line.
+        prog: what the user typed to start this command.
+    """
+    with quiet_on_closed_pipe():
+        chosen = make_parser(prog).parse_args(arguments)
+        try:
+            print("\n".join(_run(chosen)))
+        except UserError as error:
+            end(prog.removeprefix("python -m "), str(error), USER_ERROR)
+
+
+def make_parser(prog: str) -> argparse.ArgumentParser:
+    """Return the parser of this command's arguments."""
+    parser = argparse.ArgumentParser(
+        prog=prog, description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    words: Any = add("words", nargs="*", metavar="NAME | add RUN NAME", help="see above")
+    words.completer = complete_names
+    add("--json", action="store_true", help="print the card of NAME as JSON, with the record")
+    new = parser.add_argument_group("options of add")
+    new.add_argument("--folder", type=Path, help=f"where to; default: first of ${names.VARIABLE}")
+    new.add_argument("--task-net", metavar="NAME", help="model of the sampler's task net")
+    new.add_argument("--tested", type=Path, metavar="RUN", help="run that has the test figures")
+    new.add_argument(
+        "--precision",
+        choices=("float32", "float16", "bfloat16"),
+        default="float32",
+        help="of weight matrices with at least 4,096 entries",
+    )
+    new.add_argument("--licence", default="MIT", help="default: MIT")
+    new.add_argument("--notes", default="", help="what a user must know besides")
+    new.add_argument("--overwrite", action="store_true", help="replace a model of this name")
+    new.add_argument(
+        "--record", type=Path, metavar="FOLDER", help="let the record in FOLDER name the model"
+    )
+    return parser
+
+
+def complete_names(prefix: str, **_: Any) -> list[str]:
+    """Return the names of models that start with a prefix, for the shell."""
+    return [name for name in names.available() if name.startswith(prefix)]
+
+
+def _run(chosen: argparse.Namespace) -> list[str]:
+    """Return the lines to print."""
+    match chosen.words:
+        case []:
+            return _table()
+        case ["add", run, name]:
+            return _add(chosen, Path(run).expanduser(), name)
+        case ["add", *_]:
+            raise UserError("add takes a run and a name: models add RUN NAME.")
+        case [name]:
+            path = names.resolve(name)
+            card = model_file.read_card(path)
+            return [json.dumps(card, indent=1)] if chosen.json else _card(card, path)
+    raise UserError(f"give one NAME, or add RUN NAME, got {' '.join(chosen.words)}.")
+
+
+def _add(chosen: argparse.Namespace, run: Path, name: str) -> list[str]:
+    from mops_lightning.zoo import publish
+
+    own = os.environ.get(names.VARIABLE)
+    folder = chosen.folder or (names.folders()[0] if own else None)
+    if folder is None:
+        raise UserError(
+            f"give --folder FOLDER, or set ${names.VARIABLE} to the folder of your models."
+        )
+    path = publish.add(
+        run,
+        name,
+        folder,
+        task_net=chosen.task_net,
+        tested=chosen.tested,
+        precision=chosen.precision,
+        licence=chosen.licence,
+        notes=chosen.notes,
+        overwrite=chosen.overwrite,
+    )
+    if chosen.record is not None:
+        publish.point_to(chosen.record, path)
+    lines = [f"{path}: {_megabytes(path)} MB"]
+    record = model_file.read_card(path)["record"]
+    if record["config"]["learn"] != "task" and "task_weights" not in record["files"]:
+        lines.append(f"Its task net is no model: evaluate={name} also needs weights=FILE.")
+    if names.available().get(name) != path:
+        lines.append(f"To find it by name, set {names.VARIABLE}={folder}.")
+    return lines
+
+
+def _table() -> list[str]:
+    rows = [("name", "task", "sizes", "test figures", "licence", "MB")]
+    for name, path in names.available().items():
+        card = model_file.read_card(path)
+        rows.append(
+            (
+                name,
+                card["record"]["config"]["names"]["task"],
+                _sizes(card),
+                _figures(card),
+                card["licence"].partition(";")[0],
+                _megabytes(path),
+            )
+        )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+def _card(card: dict[str, Any], path: Path) -> list[str]:
+    record = card["record"]
+    config, commit = record["config"], record["git"]["commit"]
+    chosen = config["names"]
+    classes = config["dataset"].get("classes")
+    data = chosen["dataset"] + (f" ({', '.join(classes)})" if classes else "")
+    points = config["dataset"].get("n_points")
+    wide = f", wide layers in {card['precision']}" if card["precision"] != "float32" else ""
+    lines = {
+        "name": card["name"],
+        "net": _net(card),
+        "task": f"{chosen['task']} by {chosen['net']}",
+        "sizes": _sizes(card),
+        "input": "clouds in the unit sphere (centroid at the origin, largest distance from it 1)",
+        "test figures": _figures(card),
+        "data": data + (f", {points} points per cloud in training" if points else ""),
+        "recipe": " ".join(record["overrides"]) or "the defaults",
+        "epochs": str(config["trainer"]["max_epochs"]),
+        "seed": str(record["seed"]),
+        "commit": (commit or "unknown") + (" (changed)" if record["git"]["dirty"] else ""),
+        "task net": record["files"].get("task_weights", "").partition(names.PIN)[0],
+        "classes": ", ".join(card["classes"]),
+        "licence": card["licence"],
+        "notes": card["notes"],
+        "file": f"{path}, {_megabytes(path)} MB{wide}",
+        "sha256": f"{card['sha256']} (of the tensors)",
+    }
+    width = max(map(len, lines)) + 2
+    return [f"{key:<{width}}{value}" for key, value in lines.items() if value]
+
+
+def _net(card: dict[str, Any]) -> str:
+    config = card["record"]["config"]
+    kind = "task_net" if config["learn"] == "task" else "sampler"
+    chosen = config["names"]["net" if kind == "task_net" else "sampler"]
+    return f"{chosen} ({kind.replace('_', ' ')})"
+
+
+def _sizes(card: dict[str, Any]) -> str:
+    config = card["record"]["config"]
+    if config["learn"] == "task":
+        return ""
+    largest = config["sampler"].get("m_max")
+    return f"1-{largest}" if largest else str(config["sampler"]["m"])
+
+
+def _figures(card: dict[str, Any]) -> str:
+    own = card["figures"]
+    values = own["values"]
+    if own["m"] is None:
+        return f"{own['metric']}: {values['full']} on all points"
+    listed = ", ".join(f"{value} {readout}" for readout, value in values.items())
+    return f"{own['metric']}, m={own['m']}: {listed}"
+
+
+def _megabytes(path: Path) -> str:
+    return f"{path.stat().st_size / 1e6:.2f}"

@@ -1,0 +1,88 @@
+"""Models by name: where they are, and what a user's name, file or address means."""
+
+import os
+import re
+from pathlib import Path
+
+from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.zoo import hub, model_file
+
+SHIPPED = Path(__file__).parent / "models"
+"""The models that the package contains."""
+VARIABLE = "MOPS_MODELS"
+"""Environment variable: folders with models of the user's own."""
+NAME = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)+")
+FILES = (".pt", ".pth", ".ckpt", ".safetensors", ".json")
+"""Suffixes of files; a name does not end in one."""
+PIN = "@sha256:"
+"""Between a name and the sha256 that its tensors must have."""
+
+
+def folders() -> list[Path]:
+    """Return the folders with models: those in ``MOPS_MODELS`` first, then the package's own."""
+    given = os.environ.get(VARIABLE, "").split(os.pathsep)
+    return [*(Path(one).expanduser() for one in given if one), SHIPPED]
+
+
+def available() -> dict[str, Path]:
+    """Return the files of all models by name, sorted."""
+    found: dict[str, Path] = {}
+    for folder in reversed(folders()):
+        files = folder.glob(f"*{model_file.SUFFIX}")
+        found |= {path.stem: path for path in files if is_name(path.stem)}
+    return dict(sorted(found.items()))
+
+
+def is_name(text: str) -> bool:
+    """Return whether a model can be called this."""
+    return bool(NAME.fullmatch(text)) and not text.endswith(FILES) and len(text) <= 100
+
+
+def pinned(name: str, sha256: str) -> str:
+    """Return a reference to a model that holds for these tensors only."""
+    return f"{name}{PIN}{sha256}"
+
+
+def find(reference: str) -> Path | None:
+    """Return the file of a model, or None if there is no model of this name.
+
+    Args:
+        reference: ``NAME``, or ``NAME@sha256:HASH`` with the hash of its tensors.
+
+    Raises:
+        UserError: the model has another hash.
+    """
+    name, _, sha256 = reference.partition(PIN)
+    path = available().get(name)
+    if path is not None and sha256 and model_file.read_card(path)["sha256"] != sha256:
+        raise UserError(
+            f"{name}: the model now has other weights than those with sha256 {sha256}, which are "
+            "not kept. Install the version of mops_lightning that has them, or give a file."
+        )
+    return path
+
+
+def resolve(given: str | Path) -> Path:
+    """Return the path that a user means: an existing file or folder, a model or an address.
+
+    Args:
+        given: a path, the name of a model, or ``hf://OWNER/REPO/FILE@sha256:HASH``.
+
+    Returns:
+        A path. It may not exist if it contains a folder or ends like a file.
+
+    Raises:
+        UserError: there is no file and no model of this name; the nearest names are listed.
+    """
+    text = str(given)
+    if text.startswith(hub.SCHEME):
+        return hub.fetch(text)
+    path = Path(text).expanduser()
+    if path.exists():
+        return path
+    found = find(text)
+    if found is not None:
+        return found
+    if path.name != text or text.endswith(FILES):
+        return path
+    raise UserError(f"no file or model {text!r}.{did_you_mean(text, available())}")

@@ -1,0 +1,155 @@
+"""From a run to a model: the card is written from the run's record."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mops_lightning.errors import UserError
+from mops_lightning.records import run_record
+from mops_lightning.records.metric_info import metric_info
+from mops_lightning.records.readout_names import ROWS, MetricName, parse
+from mops_lightning.zoo import model_file, names, weights
+
+PRECISIONS = ("float32", "float16", "bfloat16")
+WIDE = 4096
+"""Weight matrices with this number of entries may be stored in 16 bits."""
+
+
+def add(
+    run: Path,
+    name: str,
+    folder: Path,
+    *,
+    task_net: str | None = None,
+    tested: Path | None = None,
+    precision: str = "float32",
+    licence: str = "MIT",
+    notes: str = "",
+    overwrite: bool = False,
+) -> Path:
+    """Write the net that a run trained as a model.
+
+    Args:
+        run: folder of a completed run with weights.
+        name: the model's name, such as ``fmops.chairs-m64``.
+        folder: where ``NAME.safetensors`` is written.
+        task_net: the model of a sampler's task net; None looks for the one that was used.
+        tested: the run whose test figures the card shows; None: ``run``.
+        precision: of weight matrices with at least ``WIDE`` entries, one of ``PRECISIONS``;
+            tensors that are in 16 bits already stay so.
+        licence: of the model.
+        notes: what a user must know besides.
+        overwrite: replace a model of this name.
+
+    Returns:
+        The file.
+
+    Raises:
+        UserError: the name is not allowed or taken, or the run has no weights.
+    """
+    if not names.is_name(name):
+        raise UserError(
+            f"NAME must be words of a-z, 0-9, _ and - with dots between, such as "
+            f"fmops.chairs-m64, got {name!r}."
+        )
+    path = folder / f"{name}{model_file.SUFFIX}"
+    if path.exists() and not overwrite:
+        raise UserError(f"{path} exists. Give another NAME, or --overwrite.")
+    record = run_record.read(run)
+    if record["status"] != "completed" or "weights" not in record["files"]:
+        raise UserError(f"{run}: not a completed run that kept its weights. Give another RUN.")
+    content = weights.read(weights.of_run(run))
+    state = {key: _stored(value, precision) for key, value in content["state"].items()}
+    files = {"weights": name}
+    if record["config"]["learn"] == "sampler":
+        used = _task_net(task_net, record["notes"])
+        files |= {"task_weights": used} if used else {}
+    card = {
+        "name": name,
+        "transform": "unit_sphere",
+        "licence": licence,
+        "precision": _precision(state),
+        "notes": notes,
+        "classes": _classes(content.get("classes", []), record),
+        "figures": figures(run_record.read(tested) if tested else record),
+        "record": {**record, "files": files},
+    }
+    model_file.write(path, card, state)
+    return path
+
+
+def point_to(run: Path, model: Path) -> None:
+    """Let the record in a folder name a model in place of its own weights files.
+
+    Args:
+        run: the folder of the record, such as one below ``results/``.
+        model: the file of the model.
+    """
+    card = model_file.read_card(model)
+    run_record.read(run)  # reports its mistakes
+    record = json.loads((run / run_record.FILE).read_text())
+    record["files"]["weights"] = names.pinned(card["name"], card["sha256"])
+    task_net = card["record"]["files"].get("task_weights")
+    if task_net:
+        record["files"]["task_weights"] = task_net
+    run_record.write(run, record)
+
+
+def figures(record: dict[str, Any]) -> dict[str, Any]:
+    """Return a record's score by readout, at the run's own size, for a card."""
+    scores = {key: value for key, value in record["metrics"].items() if value is not None}
+    named = record["notes"].get("score")
+    found = {key: part for key in scores if (part := parse(key))}
+    if named not in found:  # records of the first version do not name it
+        named = next(key for key in found if scores[key] == record["score"])
+    main = found[named]
+    info = metric_info(main.metric, [record])
+    shown = {MetricName(main.m, readout, main.metric) for readout in _readouts(main)}
+    return {
+        "metric": info.title,
+        "m": None if main.readout == ROWS[-1] else main.m or record["config"]["m"],
+        "points": record["config"]["dataset"].get("n_points"),
+        "values": {
+            part.readout: info.format(scores[key]) for key, part in found.items() if part in shown
+        },
+    }
+
+
+def _readouts(main: MetricName) -> tuple[str, ...]:
+    return ROWS[-1:] if main.readout == ROWS[-1] else ROWS[:-1]
+
+
+def _task_net(given: str | None, notes: dict[str, Any]) -> str | None:
+    """Return a reference to the model of a sampler's task net, or None if it is no model."""
+    if given is not None:
+        path = names.find(given)
+        if path is None:
+            raise UserError(f"--task-net: no model {given!r}.")
+        return names.pinned(given, model_file.read_card(path)["sha256"])
+    used = {notes.get("weights_loaded"), notes.get("task_weights_sha256")}
+    for name, path in names.available().items():
+        sha256 = model_file.read_card(path)["sha256"]
+        if sha256 in used:
+            return names.pinned(name, sha256)
+    return None
+
+
+def _classes(own: list[str], record: dict[str, Any]) -> list[str]:
+    """Return the classes of a classifier's outputs, as its file or its record says."""
+    config = record["config"]
+    if own or config["learn"] != "task" or config["names"]["task"] != "classification":
+        return list(own)
+    return list(record["notes"].get("class_names") or [])
+
+
+def _stored(value: Tensor, precision: str) -> Tensor:
+    wide = value.ndim == 2 and value.numel() >= WIDE and value.dtype == torch.float32
+    return value.to(getattr(torch, precision)).contiguous() if wide else value.contiguous()
+
+
+def _precision(state: dict[str, Tensor]) -> str:
+    used = {str(value.dtype).removeprefix("torch.") for value in state.values()}
+    return next(name for name in reversed(PRECISIONS) if name in used)

@@ -1,0 +1,66 @@
+import json
+
+import pytest
+
+from mops_lightning.cli.models import main
+from mops_lightning.zoo import model_file, names
+from tests.support import commands
+from tests.support.models import write_run
+
+
+def call(*arguments):
+    return commands.call(main, "mops-lightning models", *arguments)
+
+
+def test_models_lists_name_task_sizes_figures_licence_and_size():
+    status, out, err = call()
+    assert (status, err) == (0, "")
+    lines = {line.split()[0]: " ".join(line.split()) for line in out.splitlines()[1:]}
+    assert set(lines) == set(names.available())
+    assert lines["fmops.modelnet40-m512"].startswith(
+        "fmops.modelnet40-m512 classification 1-512 accuracy (%), m=32: 75.73 generated, "
+        "72.49 matched, 72.29 completed MIT"
+    )
+    assert "accuracy (%): 87.88 on all points" in lines["pointnet.modelnet40"]
+
+
+@pytest.mark.parametrize("name", names.available())
+def test_models_shows_the_card_of_every_model(name):
+    status, out, _ = call(name)
+    assert status == 0
+    shown = dict(line.split(maxsplit=1) for line in out.splitlines())
+    assert shown["name"] == name
+    for key in ("input", "data", "recipe", "commit", "licence", "test", "sha256"):
+        assert shown[key], key
+    assert json.loads(call(name, "--json")[1]) == model_file.read_card(names.available()[name])
+
+
+def test_models_add_publishes_a_run(tmp_path, monkeypatch):
+    write_run(tmp_path / "run")
+    status, _, err = call("add", tmp_path / "run", "fmops.mine")
+    assert status == 2
+    assert "--folder" in err
+    status, out, _ = call("add", tmp_path / "run", "fmops.mine", "--folder", tmp_path / "models")
+    assert status == 0
+    assert "evaluate=fmops.mine also needs weights=FILE" in out
+    assert f"set {names.VARIABLE}={tmp_path}/models" in out
+    monkeypatch.setenv(names.VARIABLE, str(tmp_path / "models"))
+    assert "fmops.mine" in call()[1]
+    assert "exists" in call("add", tmp_path / "run", "fmops.mine")[2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["pointnet.modelnet"], "Did you mean 'pointnet.modelnet40'"),
+        (["add", "run"], "add takes a run and a name"),
+        (["a.b", "c.d"], "give one NAME"),
+        (["add", "nowhere", "a.b", "--folder", "."], "no run record"),
+    ],
+)
+def test_models_mistakes_are_one_line(arguments, words):
+    status, out, err = call(*arguments)
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert err.startswith("mops-lightning models: ")
+    assert words in err

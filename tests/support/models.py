@@ -1,0 +1,38 @@
+"""A small run with weights, and the models made from it."""
+
+import torch
+
+from mops_lightning.records import run_record
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.zoo import weights
+from tests.support.records import record
+
+NODE = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 16}
+NAMES = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": "fmops"}
+
+
+def write_run(folder, node=NODE, learn="sampler", **fields):
+    """Write a completed run of an untrained FMOPS-Net; return the net."""
+    torch.manual_seed(0)
+    net = FMOPSNet(16).eval()
+    config = {
+        "learn": learn,
+        "m": 8,
+        "names": NAMES,
+        "sampler": node,
+        "dataset": {"n_points": 64},
+        "trainer": {"max_epochs": 3},
+    }
+    metrics = {"test/m8/generated/accuracy": 0.5, "test/m8/fps/accuracy": 0.25}
+    content = {
+        "config": config,
+        "metrics": metrics,
+        "score": 0.5,
+        "files": {"weights": "weights.pt"},
+        "notes": {"score": "test/m8/generated/accuracy"},
+        **fields,
+    }
+    folder.mkdir(parents=True)
+    run_record.write(folder, record(**content))
+    weights.save(folder / "weights.pt", net, config, metrics)
+    return net

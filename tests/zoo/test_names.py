@@ -1,0 +1,67 @@
+import os
+
+import pytest
+
+from mops_lightning.errors import UserError
+from mops_lightning.zoo import names
+from tests.support.models import write_run
+
+SHA256 = "0" * 64
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A folder with a file called like a model, named by MOPS_MODELS after an empty folder."""
+    folder = tmp_path / "own"
+    folder.mkdir()
+    (folder / "fmops.mine.safetensors").touch()
+    monkeypatch.setenv(names.VARIABLE, os.pathsep.join([str(tmp_path / "empty"), str(folder)]))
+    monkeypatch.chdir(tmp_path)
+    return folder
+
+
+def test_available_lists_own_folders_and_package(own):
+    found = names.available()
+    assert list(found) == sorted(found)
+    assert found["fmops.mine"] == own / "fmops.mine.safetensors"
+    assert found["pointnet.modelnet40"].parent == names.SHIPPED
+
+
+def test_own_model_comes_before_one_of_the_package(own):
+    (own / "pointnet.modelnet40.safetensors").touch()
+    assert names.find("pointnet.modelnet40") == own / "pointnet.modelnet40.safetensors"
+
+
+def test_resolve_prefers_existing_path(own, tmp_path):
+    assert names.resolve("fmops.mine") == own / "fmops.mine.safetensors"
+    (tmp_path / "fmops.mine").mkdir()
+    assert str(names.resolve("fmops.mine")) == "fmops.mine"
+
+
+@pytest.mark.parametrize("given", ["nowhere/run", "weights.pt", "net.safetensors"])
+def test_resolve_missing_path_is_returned(given):
+    assert str(names.resolve(given)) == given
+
+
+@pytest.mark.parametrize("given", ["pointnet.modelnet", "pointnet-modelnet40"])
+def test_resolve_unknown_name_lists_near_ones(given):
+    with pytest.raises(UserError, match=r"no file or model.*Did you mean 'pointnet\.modelnet40'"):
+        names.resolve(given)
+
+
+def test_find_refuses_other_weights():
+    assert names.find(f"nothing.here@sha256:{SHA256}") is None
+    with pytest.raises(UserError, match=f"now has other weights than those with sha256 {SHA256}"):
+        names.find(names.pinned("pointnet.modelnet40", SHA256))
+
+
+def test_record_cannot_name_an_address(tmp_path, monkeypatch):
+    from mops_lightning.zoo import weights
+
+    address = f"hf://owner/repo/net.safetensors@sha256:{SHA256}"
+    write_run(tmp_path / "run", files={"weights": address})
+    monkeypatch.chdir(tmp_path / "run")
+    for run in (tmp_path / "run", tmp_path / "run" / ".."):
+        assert not weights.of_run(run).exists()
+    with pytest.raises(UserError, match="no file"):
+        weights.read(weights.of_run(tmp_path / "run"))

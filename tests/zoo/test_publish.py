@@ -1,0 +1,93 @@
+import pytest
+import torch
+
+from mops_lightning import load
+from mops_lightning.errors import UserError
+from mops_lightning.records import run_record
+from mops_lightning.zoo import model_file, names, publish, weights
+from tests.support.models import write_run
+
+
+@pytest.fixture
+def run(tmp_path):
+    write_run(tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_added_model_gives_the_same_points(tmp_path, monkeypatch):
+    net = write_run(tmp_path / "run")
+    publish.add(tmp_path / "run", "fmops.mine", tmp_path / "models")
+    monkeypatch.setenv(names.VARIABLE, str(tmp_path / "models"))
+    points = torch.rand(2, 40, 3)
+    with torch.no_grad():
+        assert torch.equal(load("fmops.mine")(points, 5).points, net(points, 5).points)
+
+
+def test_card_is_written_from_the_record(run, tmp_path):
+    card = model_file.read_card(publish.add(run, "fmops.mine", tmp_path, licence="CC0"))
+    figures = {"metric": "accuracy (%)", "m": 8, "points": 64, "values": {"generated": "50.00"}}
+    assert card["figures"] == figures
+    assert (card["licence"], card["precision"], card["name"]) == ("CC0", "float32", "fmops.mine")
+    assert card["record"]["metrics"] == run_record.read(run)["metrics"]
+
+
+def test_task_net_is_found_by_hash_or_name(run, tmp_path):
+    for notes in ("weights_loaded", "task_weights_sha256"):
+        sha256 = model_file.read_card(names.available()["pointnet.modelnet40"])["sha256"]
+        other = tmp_path / notes
+        write_run(other, notes={"score": "test/m8/generated/accuracy", notes: sha256})
+        card = model_file.read_card(publish.add(other, f"fmops.{notes}", tmp_path))
+        reference = names.pinned("pointnet.modelnet40", sha256)
+        assert card["record"]["files"]["task_weights"] == reference
+    card = model_file.read_card(publish.add(run, "fmops.none", tmp_path))
+    assert "task_weights" not in card["record"]["files"]
+    path = publish.add(run, "fmops.given", tmp_path, task_net="pointnet.modelnet40")
+    assert model_file.read_card(path)["record"]["files"]["task_weights"] == reference
+    assert weights.of_run(path, "task_weights") == names.available()["pointnet.modelnet40"]
+
+
+def test_half_precision_is_for_wide_layers(run, tmp_path):
+    path = publish.add(run, "fmops.half", tmp_path, precision="float16")
+    content = model_file.read(path)
+    assert content["card"]["precision"] == "float16"
+    assert content["state"]["rho_local.weight"].dtype == torch.float16
+    assert content["state"]["queries.weight"].dtype == torch.float32  # 2,048 entries
+    assert load(path).rho_local.weight.dtype == torch.float32  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("name", ["mine", "Fmops.mine", "../a.b", "a.pt", "a..b", "a.b/c", ""])
+def test_other_names_are_refused(run, tmp_path, name):
+    with pytest.raises(UserError, match="NAME must be words"):
+        publish.add(run, name, tmp_path)
+
+
+def test_taken_name_is_refused_unless_overwritten(run, tmp_path):
+    publish.add(run, "fmops.mine", tmp_path)
+    with pytest.raises(UserError, match=r"exists.*--overwrite"):
+        publish.add(run, "fmops.mine", tmp_path)
+    publish.add(run, "fmops.mine", tmp_path, overwrite=True)
+
+
+@pytest.mark.parametrize("fields", [{"status": "failed"}, {"files": {}}])
+def test_runs_without_weights_are_refused(tmp_path, fields):
+    write_run(tmp_path / "run", **fields)
+    with pytest.raises(UserError, match="not a completed run that kept its weights"):
+        publish.add(tmp_path / "run", "fmops.mine", tmp_path)
+
+
+def test_record_that_points_to_a_model_gives_its_weights(run, tmp_path, monkeypatch):
+    monkeypatch.setenv(names.VARIABLE, str(tmp_path))
+    path = publish.add(run, "fmops.mine", tmp_path, task_net="pointnet.modelnet40")
+    publish.point_to(run, path)
+    (run / "weights.pt").unlink()
+    assert weights.of_run(run) == path
+    assert weights.of_run(run, "task_weights") == names.available()["pointnet.modelnet40"]
+    write_run(tmp_path / "other", learn="joint")
+    torch.manual_seed(1)
+    content = torch.load(tmp_path / "other" / "weights.pt", weights_only=True)
+    content["state"]["queries.weight"] += 1
+    content["sha256"] = weights.digest(content["state"])
+    torch.save(content, tmp_path / "other" / "weights.pt")
+    publish.add(tmp_path / "other", "fmops.mine", tmp_path, overwrite=True)
+    with pytest.raises(UserError, match="now has other weights"):
+        weights.of_run(run)
