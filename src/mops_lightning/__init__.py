@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from mops_lightning.samplers.voxel import VoxelSampler
     from mops_lightning.types import SampleOutput
     from mops_lightning.zoo.load import load
+    from mops_lightning.zoo.methods import downsample
 
 __all__ = [
     "CriticalSampler",
@@ -48,6 +49,7 @@ __all__ = [
     "VoxelSampler",
     "chamfer_distance",
     "complete",
+    "downsample",
     "earth_movers_distance",
     "farthest_point_sample",
     "load",
@@ -76,6 +78,7 @@ _MODULES = {
     "samplers.voxel": ("VoxelSampler",),
     "types": ("SampleOutput",),
     "zoo.load": ("load",),
+    "zoo.methods": ("downsample",),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -2,7 +2,7 @@
 
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,13 +18,10 @@ from mops_lightning.downsample_files.unit_sphere import largest_distance, sum_of
 from mops_lightning.errors import UserError
 from mops_lightning.ops.readout import complete
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.poisson import PoissonSampler
-from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.streaming import stream_match, stream_sample
-from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.zoo.load import load
+from mops_lightning.zoo.methods import untrained
 
 CHUNK = 65536
 """Number of points that a learned sampler processes at a time; it bounds the memory of features."""
@@ -59,14 +56,7 @@ def sampler_of(settings: Settings) -> Sampler:
     """
     torch.manual_seed(settings.seed)
     if settings.method:
-        classes: Any = {
-            "fps": FPSSampler,
-            "random": RandomSampler,
-            "voxel": VoxelSampler,
-            "poisson": PoissonSampler,
-        }
-        own = {} if settings.method == "voxel" else {"seed": settings.seed}
-        return classes[settings.method](settings.m or ANY_SIZE, **own)
+        return untrained(settings.method, settings.m or ANY_SIZE, settings.seed)
     assert settings.weights is not None
     try:
         sampler = load(settings.weights)

@@ -1,13 +1,17 @@
 """Base class of all samplers."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.ops.readout import complete, match
+from mops_lightning.samplers.ragged import select_points
 from mops_lightning.types import SampleOutput
+
+READOUTS = ("generated", "matched", "completed")
 
 
 class Sampler(nn.Module):
@@ -68,6 +72,64 @@ class Sampler(nn.Module):
         """
         m = self.m if m is None else m
         return self.sample_sizes(points, (m,))[m]
+
+    @torch.no_grad()
+    def downsample(
+        self,
+        points: Any,
+        m: int | None = None,
+        readout: str = "completed",
+        lengths: Any = None,
+        batch: Any = None,
+    ) -> tuple[Any, Any]:
+        """Sample clouds in their own unit: normalised as in training, sampled, mapped back.
+
+        Args:
+            points: ``(N, 3)``, ``(B, N, 3)``, or ``(P, 3)`` with ``batch``; a tensor or an array.
+            m: number of points to return of each cloud; None means ``self.m``.
+            readout: of generated points: ``generated``, ``matched`` (the nearest input points,
+                perhaps repeated) or ``completed`` (m different input points).
+            lengths: ``(B,)`` numbers of points, where clouds of several sizes are padded to
+                ``(B, N, 3)``.
+            batch: ``(P,)`` the cloud of every point, ascending from 0, where clouds of several
+                sizes are one after the other.
+
+        Returns:
+            The points, and their indices in the input, or None for generated points; tensors or
+            arrays like the input. For ``(N, 3)`` points ``(m, 3)`` and ``(m,)``, for ``(B, N, 3)``
+            ``(B, m, 3)`` and ``(B, m)``, with ``batch`` both of all clouds one after the other.
+            A cloud with fewer than m points is returned whole; with ``lengths`` it is padded with
+            zeros, and its indices with −1.
+
+        Raises:
+            UserError: an argument is invalid, or the sampler is in training mode.
+
+        Example:
+            >>> import torch
+            >>> from mops_lightning import FPSSampler
+            >>> points, indices = FPSSampler(m=8).downsample(100 * torch.rand(64, 3))
+            >>> points.shape, indices.shape
+            (torch.Size([8, 3]), torch.Size([8]))
+        """
+        m = self.m if m is None else m
+        if not isinstance(m, int) or m < 1:
+            raise UserError(f"m must be a whole number of at least 1, got {m!r}.")
+        self.check_m(m)
+        if readout not in READOUTS:
+            raise UserError(f"readout: unknown {readout!r}.{did_you_mean(readout, READOUTS)}")
+        if self.learned and self.training:
+            raise UserError("downsample needs a sampler in eval mode: call eval() first.")
+
+        def select(clouds: Tensor, m: int) -> tuple[Tensor | None, Tensor]:
+            output = self(clouds, m)
+            if not self.generates:
+                return output.indices, output.points
+            if readout == "generated":
+                return None, output.points
+            rows = match(output.points, clouds)
+            return complete(rows, clouds) if readout == "completed" else rows, output.points
+
+        return select_points(select, points, m, lengths, batch)
 
     def _checked(self, points: Tensor, m: int) -> SampleOutput:
         """Check the points and sample them, without losses."""

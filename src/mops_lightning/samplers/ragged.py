@@ -1,0 +1,169 @@
+"""Clouds as people have them: arrays or tensors, one or many, of one or several sizes."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mops_lightning.errors import UserError
+from mops_lightning.ops.points import gather_points
+
+Select = Callable[[Tensor, int], tuple[Tensor | None, Tensor]]
+"""``select(points, m)`` maps ``(B, N, 3)`` float32 in the unit sphere to rows ``(B, m)``, or None
+for generated points, and the points ``(B, m, 3)``."""
+
+
+class Rows(NamedTuple):
+    """What is selected of one cloud.
+
+    Attributes:
+        points: ``(m, 3)`` in the cloud's own unit.
+        rows: ``(m,)`` rows of the cloud, or None for generated points.
+    """
+
+    points: Tensor
+    rows: Tensor | None
+
+
+def select_points(
+    select: Select, points: Any, m: int, lengths: Any = None, batch: Any = None
+) -> tuple[Any, Any]:
+    """Move clouds into the unit sphere, select points, and map them back.
+
+    Args:
+        select: see ``Select``.
+        points: ``(N, 3)``, ``(B, N, 3)``, or ``(P, 3)`` with ``batch``; a tensor or an array.
+        m: number of points to return of each cloud.
+        lengths: ``(B,)`` numbers of points of the clouds in ``(B, N, 3)``, the rest being padding.
+        batch: ``(P,)`` the cloud of every point, ascending from 0.
+
+    Returns:
+        See ``Sampler.downsample``.
+
+    Raises:
+        UserError: an argument has a wrong type, shape or value.
+    """
+    as_array = isinstance(points, np.ndarray)
+    tensor = _floating(_tensor("points", points))
+    if lengths is not None and batch is not None:
+        raise UserError("lengths and batch exclude each other. Give lengths for (B, N, 3) points.")
+    if batch is not None:
+        found = _flat(select, tensor, m, _tensor("batch", batch))
+    elif lengths is not None:
+        found = _padded(select, tensor, m, _tensor("lengths", lengths))
+    elif tensor.ndim == 2:
+        _check_shape(tensor, 2, "(N, 3) or (B, N, 3)")
+        one = _selected(select, tensor[None], m)
+        found = one[0][0], None if one[1] is None else one[1][0]
+    else:
+        _check_shape(tensor, 3, "(N, 3) or (B, N, 3)")
+        found = _selected(select, tensor, m)
+    if not as_array:
+        return found
+    return found[0].numpy(), None if found[1] is None else found[1].numpy()
+
+
+def _tensor(name: str, value: Any) -> Tensor:
+    if isinstance(value, np.ndarray):
+        try:
+            return torch.from_numpy(np.ascontiguousarray(value))
+        except TypeError:
+            raise UserError(f"{name} must hold numbers, got dtype {value.dtype}.") from None
+    if isinstance(value, list | tuple) and name != "points":
+        return torch.tensor(value)
+    if not isinstance(value, Tensor):
+        raise UserError(f"{name} must be a tensor or an array, got {type(value).__name__}.")
+    return value
+
+
+def _floating(points: Tensor) -> Tensor:
+    if not points.is_floating_point():
+        raise UserError(f"points must be floating point, got {points.dtype}. Try points.float().")
+    return points
+
+
+def _check_shape(points: Tensor, ndim: int, wanted: str) -> None:
+    if points.ndim != ndim or points.shape[-1] != 3:
+        raise UserError(f"points must have shape {wanted}, got {tuple(points.shape)}.")
+
+
+def _padded(
+    select: Select, points: Tensor, m: int, lengths: Tensor
+) -> tuple[Tensor, Tensor | None]:
+    """Select from padded clouds; the result is padded with zeros, its rows with −1."""
+    _check_shape(points, 3, "(B, N, 3) with lengths")
+    number = points.shape[1]
+    _whole("lengths", lengths, len(points), f"B={len(points)}")
+    if len(lengths) and (int(lengths.min()) < 1 or int(lengths.max()) > number):
+        raise UserError(f"lengths must be from 1 to N={number}, got {lengths.tolist()}.")
+    clouds = [cloud[:length] for cloud, length in zip(points, lengths.tolist(), strict=True)]
+    found = _each(select, clouds, m)
+    chosen = points.new_zeros(len(clouds), m, 3)
+    rows = torch.full((len(clouds), m), -1, dtype=torch.int64, device=points.device)
+    for cloud, one in enumerate(found):
+        chosen[cloud, : len(one.points)] = one.points
+        if one.rows is not None:
+            rows[cloud, : len(one.rows)] = one.rows
+    return chosen, None if any(one.rows is None for one in found) else rows
+
+
+def _flat(select: Select, points: Tensor, m: int, batch: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Select from clouds one after the other; rows count through all clouds."""
+    _check_shape(points, 2, "(P, 3) with batch")
+    _whole("batch", batch, len(points), f"P={len(points)}")
+    if len(batch) and (int(batch.min()) < 0 or bool((batch[1:] < batch[:-1]).any())):
+        raise UserError("batch must be ascending and at least 0. Sort the points by cloud.")
+    counts = batch.bincount().tolist()
+    if 0 in counts:
+        raise UserError(f"batch: cloud {counts.index(0)} has no points. Number clouds from 0.")
+    found = _each(select, list(points.split(counts)), m)
+    starts = np.cumsum([0, *counts[:-1]]).tolist()
+    chosen = torch.cat([one.points for one in found])
+    parts = zip(found, starts, strict=True)
+    rows = [one.rows + start for one, start in parts if one.rows is not None]
+    return chosen, torch.cat(rows) if len(rows) == len(found) else None
+
+
+def _whole(name: str, values: Tensor, size: int, wanted: str) -> None:
+    if values.ndim != 1 or len(values) != size or values.is_floating_point():
+        raise UserError(
+            f"{name} must be whole numbers of shape ({wanted},), got {values.dtype} of shape "
+            f"{tuple(values.shape)}."
+        )
+
+
+def _each(select: Select, clouds: list[Tensor], m: int) -> list[Rows]:
+    """Select from every cloud; clouds of one size are processed together."""
+    if not clouds:
+        raise UserError("points must have at least one cloud.")
+    found: dict[int, Rows] = {}
+    for size in sorted({len(cloud) for cloud in clouds}):
+        members = [i for i, cloud in enumerate(clouds) if len(cloud) == size]
+        if size < m:
+            everything = torch.arange(size, device=clouds[0].device)
+            found |= {i: Rows(clouds[i], everything) for i in members}
+            continue
+        points, rows = _selected(select, torch.stack([clouds[i] for i in members]), m)
+        for place, i in enumerate(members):
+            found[i] = Rows(points[place], None if rows is None else rows[place])
+    return [found[i] for i in range(len(clouds))]
+
+
+def _selected(select: Select, points: Tensor, m: int) -> tuple[Tensor, Tensor | None]:
+    """Select from clouds of one size, in their own unit."""
+    if not bool(torch.isfinite(points).all()):
+        raise UserError("points must be finite, got NaN or infinity.")
+    if points.shape[0] == 0 or points.shape[1] == 0:
+        raise UserError(
+            f"points must have at least one cloud and one point, got shape {tuple(points.shape)}."
+        )
+    exact = points.double()
+    centre = exact.mean(1, keepdim=True)
+    radius = torch.linalg.vector_norm(exact - centre, dim=2, keepdim=True).amax(1, keepdim=True)
+    radius = torch.where(radius > 0, radius, 1.0)
+    rows, generated = select(((exact - centre) / radius).float(), m)
+    if rows is not None:
+        return gather_points(points, rows), rows
+    return (generated.double() * radius + centre).to(points.dtype), None

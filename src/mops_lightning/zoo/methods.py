@@ -1,0 +1,116 @@
+"""Downsampling by the name of a method or of a model."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.poisson import PoissonSampler
+from mops_lightning.samplers.random import RandomSampler
+from mops_lightning.samplers.voxel import VoxelSampler
+from mops_lightning.zoo import hub, names, weights
+from mops_lightning.zoo.load import load
+
+UNTRAINED: dict[str, Callable[..., Sampler]] = {
+    "fps": FPSSampler,
+    "random": RandomSampler,
+    "voxel": VoxelSampler,
+    "poisson": PoissonSampler,
+}
+"""Methods without weights."""
+
+
+def downsample(
+    points: Any,
+    m: int,
+    method: str | Path = "fmops.modelnet40-m512",
+    readout: str = "completed",
+    lengths: Any = None,
+    batch: Any = None,
+    start: int | None = None,
+    seed: int | None = None,
+) -> tuple[Any, Any]:
+    """Downsample clouds by a method or a model.
+
+    Clouds are moved into the unit sphere, as in training, and the result is mapped back.
+
+    Args:
+        points: ``(N, 3)``, ``(B, N, 3)``, or ``(P, 3)`` with ``batch``; a tensor or an array,
+            floating point, in any unit.
+        m: number of points to return of each cloud.
+        method: ``random``, ``voxel``, ``fps`` or ``poisson``, or what ``load`` takes, such as the
+            name of a model.
+        readout: of a model: ``generated``, ``matched`` or ``completed``; see
+            ``Sampler.downsample``.
+        lengths: ``(B,)`` numbers of points, where clouds of several sizes are padded to
+            ``(B, N, 3)``, as in PyTorch3D.
+        batch: ``(P,)`` the cloud of every point, ascending from 0, as in PyTorch Geometric.
+        start: with ``fps``, the row of the first point in every cloud.
+        seed: of random choices; None means 0.
+
+    Returns:
+        The points, and their indices in the input, or None for generated points; tensors or arrays
+        like the input. See ``Sampler.downsample`` for the shapes.
+
+    Raises:
+        UserError: an argument is invalid, or there is no such method or model.
+
+    Example:
+        >>> import torch
+        >>> from mops_lightning import downsample
+        >>> points, indices = downsample(torch.rand(64, 3), 8, method="fps")
+        >>> points.shape, indices.shape
+        (torch.Size([8, 3]), torch.Size([8]))
+    """
+    if start is not None and method != "fps":
+        raise UserError(f"start is for method='fps', got method={str(method)!r}.")
+    sampler = sampler_of(method, m, seed or 0, start, getattr(points, "device", "cpu"))
+    return sampler.downsample(points, m, readout, lengths, batch)
+
+
+def sampler_of(
+    method: str | Path, m: int, seed: int = 0, start: int | None = None, device: Any = "cpu"
+) -> Sampler:
+    """Return the sampler of a method, or a model, which is loaded once.
+
+    Args:
+        method: as for ``downsample``.
+        m: number of points.
+        seed: of random choices.
+        start: with ``fps``, the row of the first point.
+        device: of the sampler.
+
+    Raises:
+        UserError: there is no such method or model.
+    """
+    if method in UNTRAINED:
+        return untrained(str(method), m, seed, **({} if start is None else {"start": start}))
+    known = {*UNTRAINED, *names.available()}
+    text = str(method)
+    if text.startswith(hub.SCHEME) or text in known:
+        path = names.resolve(text)
+    else:
+        path = Path(text).expanduser()
+        if not path.exists():
+            raise UserError(f"method: unknown {text!r}.{did_you_mean(text, known)}")
+        path = weights.of_run(path)
+    return _model(path, path.stat().st_mtime_ns, str(device))
+
+
+def untrained(method: str, m: int, seed: int = 0, **arguments: Any) -> Sampler:
+    """Return the sampler of one of the ``UNTRAINED`` methods; ``voxel`` has no seed."""
+    if method != "voxel":
+        arguments["seed"] = seed
+    return UNTRAINED[method](m, **arguments)
+
+
+@lru_cache(maxsize=4)
+def _model(path: Path, changed: int, device: str) -> Sampler:
+    """Load a sampler; a file that has changed since is loaded again."""
+    sampler = load(path)
+    return sampler.to(torch.device(device))

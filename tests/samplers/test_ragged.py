@@ -1,0 +1,140 @@
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning.errors import UserError
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.snet import SNet
+
+
+@pytest.fixture
+def net():
+    torch.manual_seed(0)
+    return MOPSNet(8).eval()
+
+
+@pytest.fixture
+def clouds():
+    """Three clouds of 20, 40 and 20 points, far from the origin and large."""
+    rng = torch.Generator().manual_seed(0)
+    return [50 + 10 * torch.rand(number, 3, generator=rng) for number in (20, 40, 20)]
+
+
+def padded(clouds):
+    points = torch.full((len(clouds), 40, 3), 1e6)
+    for row, cloud in zip(points, clouds, strict=True):
+        row[: len(cloud)] = cloud
+    return points, torch.tensor([len(cloud) for cloud in clouds])
+
+
+def one_by_one(net, clouds, **arguments):
+    return [net.downsample(cloud, **arguments) for cloud in clouds]
+
+
+@pytest.mark.parametrize("readout", ["matched", "completed"])
+def test_indices_are_rows_of_the_input(net, clouds, readout):
+    for cloud in clouds:
+        points, indices = net.downsample(cloud, readout=readout)
+        assert points.shape == (8, 3)
+        assert torch.equal(points, cloud[indices])
+        assert len(indices.unique()) == 8 or readout == "matched"
+
+
+def test_generated_points_are_in_the_unit_of_the_input(net, clouds):
+    cloud = clouds[1]
+    centre = cloud.double().mean(0)
+    radius = (cloud - centre).norm(dim=1).max()
+    points, indices = net.downsample(cloud, readout="generated")
+    with torch.no_grad():
+        expected = net(((cloud - centre) / radius).float()[None]).points[0] * radius + centre
+    assert indices is None
+    assert points.dtype == torch.float32
+    assert torch.allclose(points, expected.float(), atol=1e-4)
+
+
+def test_shift_and_scale_change_nothing(net, clouds):
+    _, indices = net.downsample(clouds[0].double())
+    points, moved = net.downsample(clouds[0].double() * 1000 + 1e6)
+    assert torch.equal(moved, indices)
+    assert points.dtype == torch.float64
+
+
+@pytest.mark.parametrize("readout", ["generated", "completed"])
+def test_lengths_and_batch_give_what_single_clouds_give(net, clouds, readout):
+    single = one_by_one(net, clouds, readout=readout)
+    points, indices = net.downsample(padded(clouds)[0], None, readout, padded(clouds)[1])
+    batch = torch.arange(3).repeat_interleave(torch.tensor([20, 40, 20]))
+    flat, flat_indices = net.downsample(torch.cat(clouds), None, readout, batch=batch)
+    for i, (expected, rows) in enumerate(single):
+        assert torch.allclose(points[i], expected)
+        assert torch.allclose(flat[8 * i : 8 * i + 8], expected)
+        assert rows is None or torch.equal(indices[i], rows)
+    if readout == "generated":
+        assert (indices, flat_indices) == (None, None)
+    else:
+        assert torch.equal(torch.cat(clouds)[flat_indices], flat)
+
+
+def test_small_clouds_are_returned_whole(net, clouds):
+    sampler = FPSSampler(30)
+    points, indices = sampler.downsample(padded(clouds)[0], lengths=[20, 40, 20])
+    assert torch.equal(points[0, :20], clouds[0])
+    assert indices[0].tolist() == [*range(20), *[-1] * 10]
+    assert not points[0, 20:].any()
+    assert len(indices[1].unique()) == 30
+    batch = torch.arange(3).repeat_interleave(torch.tensor([20, 40, 20]))
+    _, rows = sampler.downsample(torch.cat(clouds), batch=batch)
+    assert batch[rows].bincount().tolist() == [20, 30, 20]
+
+
+def test_arrays_in_arrays_out(net, clouds):
+    points, indices = net.downsample(clouds[0].numpy())
+    expected = net.downsample(clouds[0])
+    assert isinstance(points, np.ndarray)
+    assert np.array_equal(points, expected[0].numpy())
+    assert np.array_equal(indices, expected[1].numpy())
+    points, indices = net.downsample(clouds[0].double().numpy(), readout="generated")
+    assert (points.dtype, indices) == (np.float64, None)
+    batch = np.repeat(np.arange(2), 10)
+    assert net.downsample(clouds[0].numpy(), batch=batch)[0].shape == (16, 3)
+
+
+def test_learned_sampler_in_training_mode_is_refused():
+    with pytest.raises(UserError, match=r"call eval\(\)"):
+        SNet(8).downsample(torch.rand(20, 3))
+
+
+POINTS = torch.rand(2, 20, 3)
+MISTAKES: dict[str, tuple[tuple[Any, ...], dict[str, Any], str]] = {
+    "type": (([1.0],), {}, "points must be a tensor or an array, got list"),
+    "integers": ((POINTS.long(),), {}, r"floating point, got torch.int64. Try"),
+    "objects": ((np.array([["a"] * 3]),), {}, "points must hold numbers"),
+    "shape": ((POINTS[0, 0],), {}, r"shape \(N, 3\) or \(B, N, 3\), got \(3,\)"),
+    "columns": ((torch.rand(20, 4),), {}, r"got \(20, 4\)"),
+    "empty": ((torch.rand(0, 3),), {}, "at least one cloud and one point"),
+    "not finite": ((POINTS / 0,), {}, "finite"),
+    "too few": ((POINTS[:, :5],), {}, "number of points N=5, got m=8"),
+    "m": ((POINTS, 9), {}, "m must be 8"),
+    "m text": ((POINTS, "9"), {}, "m must be a whole number"),
+    "readout": ((POINTS, 8, "matchd"), {}, "Did you mean 'matched'"),
+    "both": ((POINTS,), {"lengths": [9, 9], "batch": [0]}, "exclude each other"),
+    "lengths size": ((POINTS,), {"lengths": [20]}, r"shape \(B=2,\), got .* \(1,\)"),
+    "lengths type": ((POINTS,), {"lengths": torch.ones(2)}, "lengths must be whole numbers"),
+    "lengths range": ((POINTS,), {"lengths": [20, 21]}, r"from 1 to N=20, got \[20, 21\]"),
+    "lengths and one": ((POINTS[0],), {"lengths": [20]}, "with lengths"),
+    "batch and many": ((POINTS,), {"batch": [0] * 20}, "with batch"),
+    "batch size": ((POINTS[0],), {"batch": [0]}, r"shape \(P=20,\)"),
+    "batch order": ((POINTS[0],), {"batch": [1, *[0] * 19]}, "ascending"),
+    "batch gap": ((POINTS[0],), {"batch": [*[0] * 10, *[2] * 10]}, "cloud 1 has no points"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistakes_are_one_line(net, mistake):
+    arguments, named, words = MISTAKES[mistake]
+    with pytest.raises(UserError, match=words) as refused:
+        net.downsample(*arguments, **named)
+    assert "\n" not in str(refused.value)
