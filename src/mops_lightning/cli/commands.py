@@ -28,6 +28,7 @@ COMMANDS = {
     "models": Command(
         "mops_lightning.cli.models", "trained models: list, show a card, publish a run as one"
     ),
+    "export": Command("mops_lightning.cli.export", "write a trained sampler as .onnx or .pt2"),
 }
 
 

@@ -1,0 +1,54 @@
+"""The subcommand ``export``."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from mops_lightning.cli.models import complete_names
+from mops_lightning.errors import USER_ERROR, UserError, end, quiet_on_closed_pipe
+
+DESCRIPTION = """Write a trained sampler as ONNX (.onnx) or as a PyTorch program (.pt2).
+
+The file maps points (batch, points, 3), float32 in the unit sphere, to generated points
+(batch, m, 3), for any number of clouds and points, and runs without mops_lightning. It is compared
+with the sampler before it is written."""
+
+
+def main(arguments: list[str], prog: str) -> None:
+    """Write the file and print how far its points are from the sampler's.
+
+    Args:
+        arguments: those of the command line.
+        prog: what the user typed to start this command.
+    """
+    with quiet_on_closed_pipe():
+        chosen = make_parser(prog).parse_args(arguments)
+        try:
+            _run(chosen)
+        except UserError as error:
+            end(prog.removeprefix("python -m "), str(error), USER_ERROR)
+
+
+def make_parser(prog: str) -> argparse.ArgumentParser:
+    """Return the parser of this command's arguments."""
+    parser = argparse.ArgumentParser(
+        prog=prog, description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    sampler: Any = add("sampler", metavar="SAMPLER", help="a model's name, a run or a weights file")
+    sampler.completer = complete_names
+    add("target", metavar="OUT", type=Path, help="a file that ends in .onnx or .pt2")
+    add("--m", type=int, help="number of points; default: as the sampler was trained for")
+    add("--overwrite", action="store_true", help="replace an existing file")
+    return parser
+
+
+def _run(chosen: argparse.Namespace) -> None:
+    if chosen.target.exists() and not chosen.overwrite:
+        raise UserError(f"{chosen.target} exists. Give another OUT, or --overwrite.")
+    from mops_lightning.zoo.export import export
+    from mops_lightning.zoo.load import load
+
+    difference = export(load(chosen.sampler), chosen.target, chosen.m)
+    size = chosen.target.stat().st_size / 1e6
+    print(f"{chosen.target}: {size:.2f} MB; largest difference from the sampler {difference:.1e}")

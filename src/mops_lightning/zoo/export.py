@@ -1,0 +1,185 @@
+"""Export of learned samplers as plain layers: torch.export (.pt2) and ONNX (.onnx)."""
+
+import logging
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_linear_bn_eval
+
+from mops_lightning.errors import UserError
+from mops_lightning.files import atomic_write
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.snet import SNet
+
+SUFFIXES = (".onnx", ".pt2")
+TOLERANCE = 1e-5
+"""Largest difference between points of the file and of the sampler, in the unit sphere."""
+CHECKED = ((1, 1), (3, 2), (2, 7))
+"""Numbers of clouds, and of points as multiples of m, at which a file is compared."""
+
+
+class PlainMOPSNet(nn.Module):
+    """MOPS-Net in evaluation as one softmax attention over the points, without blocks.
+
+    Maps ``(B, N, 3)`` points in the unit sphere to ``(B, m, 3)`` generated points.
+
+    Args:
+        sampler: trained.
+        m: number of points.
+    """
+
+    def __init__(self, sampler: MOPSNet, m: int) -> None:
+        super().__init__()
+        norm = sampler.rho_first[0]
+        assert isinstance(norm, nn.BatchNorm1d)
+        self.features = fused_layers(sampler.features.mlp.layers)
+        self.rho_local = fuse_linear_bn_eval(sampler.rho_local, norm)
+        self.rho_global = fuse_linear_bn_eval(sampler.rho_global, norm)
+        self.rho_global.register_parameter("bias", None)  # the shift applies to the sum once
+        self.rho = fused_layers(sampler.rho)
+        self.register_buffer("queries", sampler.queries.weight.detach()[:m] / sampler.tau_min)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Return the generated points."""
+        local = self.features(points)
+        hidden = self.rho_local(local) + self.rho_global(local.amax(1, keepdim=True))
+        keys = self.rho(hidden.relu())
+        return (self.queries @ keys.mT).softmax(2) @ points
+
+
+class PlainSNet(nn.Module):
+    """S-Net or SampleNet in evaluation; arguments and shapes as for ``PlainMOPSNet``."""
+
+    def __init__(self, sampler: SNet, m: int) -> None:
+        super().__init__()
+        last = [sampler.pool.linear, *([sampler.pool.norm] if sampler.pool.norm else [])]
+        self.features = fused_layers([*sampler.features.layers, *last])
+        self.head = fused_layers(sampler.head)
+        self.m = m
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Return the generated points."""
+        pooled = self.features(points).amax(1).relu()
+        return self.head(pooled).unflatten(1, (-1, 3))[:, : self.m]
+
+
+def fused_layers(layers: Iterable[nn.Module]) -> nn.Sequential:
+    """Return linear layers and ReLUs, with BatchNorm fused into the linear layer before it."""
+    plain: list[nn.Module] = []
+    for layer in layers:
+        if isinstance(layer, nn.BatchNorm1d):
+            before = plain[-1]
+            assert isinstance(before, nn.Linear)
+            plain[-1] = fuse_linear_bn_eval(before, layer)
+        else:
+            plain.append(nn.ReLU() if isinstance(layer, nn.ReLU) else layer)
+    return nn.Sequential(*plain)
+
+
+def plain_net(sampler: Sampler, m: int | None = None) -> nn.Module:
+    """Return a learned sampler as plain layers.
+
+    Args:
+        sampler: trained, in eval mode.
+        m: number of points; None means ``sampler.m``.
+
+    Raises:
+        UserError: the sampler has no weights, selects input points, or does not return m points.
+    """
+    m = sampler.m if m is None else m
+    sampler.check_m(m)
+    if isinstance(sampler, MOPSNet) and sampler.generates:
+        return PlainMOPSNet(sampler, m).eval()
+    if isinstance(sampler, SNet) and sampler.generates:
+        return PlainSNet(sampler, m).eval()
+    raise UserError(
+        f"{type(sampler).__name__} cannot be exported. MOPS-Net, FMOPS-Net, S-Net and SampleNet "
+        "can."
+    )
+
+
+def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
+    """Write a sampler as a program that runs without this package, and compare both.
+
+    Input ``points`` are ``(batch, points, 3)`` float32 in the unit sphere, with any number of
+    clouds and points; output ``generated`` is ``(batch, m, 3)``.
+
+    Args:
+        sampler: trained, in eval mode.
+        path: ends in ``.onnx`` or ``.pt2``.
+        m: number of points; None means ``sampler.m``.
+
+    Returns:
+        The largest difference between the points of the file and of the sampler.
+
+    Raises:
+        UserError: the sampler cannot be exported, the extra ``onnx`` is not installed, or the
+            points differ by more than ``TOLERANCE``.
+    """
+    if path.suffix not in SUFFIXES:
+        raise UserError(f"OUT must end in {' or '.join(SUFFIXES)}, got {path}.")
+    net, m = plain_net(sampler, m), m or sampler.m
+    example = torch.rand(2, 2 * m + 3, 3, generator=torch.Generator().manual_seed(0))
+    dynamic = ({0: torch.export.Dim("batch"), 1: torch.export.Dim("points")},)
+    with torch.no_grad(), atomic_write(path) as temporary:
+        program = torch.export.export(net, (example,), dynamic_shapes=dynamic)
+        if path.suffix == ".pt2":
+            torch.export.save(program, temporary)
+            run: Callable[[Tensor], Tensor] = torch.export.load(temporary).module()
+        else:
+            _to_onnx(program, temporary)
+            run = _onnx_session(temporary)
+        difference = max(
+            float((run(points) - sampler(points, m).points).abs().max()) for points in _clouds(m)
+        )
+        if difference > TOLERANCE:
+            raise UserError(
+                f"{path}: its points differ from the sampler's by up to {difference:.1e}, more "
+                f"than {TOLERANCE:.0e}; nothing was written. Export in the other format."
+            )
+    return difference
+
+
+def _clouds(m: int) -> Iterable[Tensor]:
+    rng = torch.Generator().manual_seed(1)
+    for clouds, times in CHECKED:
+        points = torch.randn(clouds, times * m + 5, 3, generator=rng)
+        yield points / points.norm(dim=2).amax(1)[:, None, None]
+
+
+def _to_onnx(program: Any, path: Path) -> None:
+    try:
+        import onnxscript  # noqa: F401, torch.onnx needs it
+    except ModuleNotFoundError:
+        raise _missing() from None
+    # It warns that torchvision, which is not needed, is missing.
+    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
+    torch.onnx.export(
+        program,
+        (),
+        path,
+        input_names=["points"],
+        output_names=["generated"],
+        dynamo=True,
+        external_data=False,
+        verbose=False,
+    )
+
+
+def _onnx_session(path: Path) -> Callable[[Tensor], Tensor]:
+    try:
+        import onnxruntime
+    except ModuleNotFoundError:
+        raise _missing() from None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    return lambda points: torch.from_numpy(session.run(None, {"points": points.numpy()})[0])
+
+
+def _missing() -> UserError:
+    return UserError(".onnx files need an extra: pip install 'mops-lightning[onnx]'.")

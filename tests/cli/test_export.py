@@ -1,0 +1,42 @@
+import pytest
+import torch
+
+from mops_lightning import load
+from mops_lightning.cli.export import main
+from tests.support import commands
+
+
+def call(*arguments):
+    return commands.call(main, "mops-lightning export", *arguments)
+
+
+def test_export_of_a_model_writes_a_file_that_runs(tmp_path):
+    target = tmp_path / "net.pt2"
+    status, out, err = call("samplenet.modelnet40-m32", target)
+    assert (status, err) == (0, "")
+    assert out.startswith(f"{target}: ")
+    points = torch.rand(3, 77, 3)
+    with torch.no_grad():
+        expected = load("samplenet.modelnet40-m32")(points).points
+        assert torch.allclose(torch.export.load(target).module()(points), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["mops.modelnet", "net.onnx"], "Did you mean 'mops.modelnet40-m32'"),
+        (["pointnet.modelnet40", "net.onnx"], "holds a task net"),
+        (["mops.modelnet40-m32", "net.txt"], "OUT must end in .onnx or .pt2"),
+        (["mops.modelnet40-m32", "net.onnx", "--m", 31], "m must be 32"),
+        (["mops.modelnet40-m32", "old.onnx"], "old.onnx exists"),
+    ],
+)
+def test_export_mistakes_are_one_line(arguments, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "old.onnx").touch()
+    status, out, err = call(*arguments)
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert err.startswith("mops-lightning export: ")
+    assert words in err
+    assert [path.name for path in tmp_path.iterdir()] == ["old.onnx"]

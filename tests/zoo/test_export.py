@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning.errors import UserError
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.samplenet import SampleNet
+from mops_lightning.samplers.snet import SNet
+from mops_lightning.zoo.export import export, plain_net
+from mops_lightning.zoo.load import load
+
+SMALL = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
+SIZES = ((1, 12), (4, 100), (2, 257))
+
+
+def clouds(number, points):
+    return torch.rand(number, points, 3, generator=torch.Generator().manual_seed(points)) - 0.5
+
+
+@pytest.mark.parametrize(
+    ("sampler", "m"),
+    [
+        (MOPSNet(8, **SMALL), None),
+        (FMOPSNet(12, **SMALL), 5),
+        (SNet(8, feature_channels=(8, 8), head_channels=(8,)), None),
+        (SNet(8, feature_channels=(8, 8), head_channels=(8,), head_norm=False), None),
+        (SampleNet(8, feature_channels=(8, 8), head_channels=(8,), output_norm=False), None),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_plain_net_equals_the_sampler(sampler, m):
+    sampler(clouds(4, 50)).points.sum()  # running statistics
+    sampler.eval()
+    net = plain_net(sampler, m)
+    with torch.no_grad():
+        for shape in SIZES:
+            points = clouds(*shape)
+            assert torch.allclose(net(points), sampler(points, m).points, atol=1e-5)
+
+
+def test_pt2_file_equals_the_model_at_any_size(tmp_path):
+    sampler = load("fmops.modelnet40-m512")
+    assert export(sampler, tmp_path / "net.pt2", m=10) < 1e-5
+    net = torch.export.load(tmp_path / "net.pt2").module()
+    with torch.no_grad():
+        for shape in SIZES:
+            points = clouds(*shape)
+            assert torch.allclose(net(points), sampler(points, 10).points, atol=1e-5)
+
+
+def test_onnx_file_equals_the_model_at_any_size(tmp_path):
+    pytest.importorskip("onnxscript", reason="extra onnx")
+    onnxruntime = pytest.importorskip("onnxruntime", reason="extra onnx")
+    sampler = load("mops.modelnet40-m32")
+    assert export(sampler, tmp_path / "net.onnx") < 1e-5
+    session = onnxruntime.InferenceSession(tmp_path / "net.onnx")
+    for shape in SIZES:
+        points = clouds(*shape) if shape[1] >= 32 else clouds(1, 32)
+        (generated,) = session.run(["generated"], {"points": points.numpy()})
+        with torch.no_grad():
+            assert np.allclose(generated, sampler(points).points.numpy(), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("sampler", "name", "m", "words"),
+    [
+        (FPSSampler(8), "net.onnx", None, "FPSSampler cannot be exported"),
+        (MOPSNet(8), "net.pt", None, r"OUT must end in \.onnx or \.pt2, got .*net\.pt"),
+        (MOPSNet(8), "net.pt2", 9, "m must be 8"),
+    ],
+)
+def test_mistakes_are_one_line(tmp_path, sampler, name, m, words):
+    with pytest.raises(UserError, match=words):
+        export(sampler.eval(), tmp_path / name, m)
+    assert not list(tmp_path.iterdir())
