@@ -29,6 +29,7 @@ COMMANDS = {
         "mops_lightning.cli.models", "trained models: list, show a card, publish a run as one"
     ),
     "export": Command("mops_lightning.cli.export", "write a trained sampler as .onnx or .pt2"),
+    "schema": Command("mops_lightning.cli.schema", "JSON schema of the configuration, for editors"),
 }
 
 
