@@ -22,7 +22,7 @@ FENCE = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages from outside docs/, the reference, and every file that a page links to."""
     outside = [ROOT / HOME, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
-    outside += [ROOT / "benchmarks" / HOME, ROOT / "weights" / HOME, *ROOT.glob("results/*/*.md")]
+    outside += [ROOT / "benchmarks" / HOME, *ROOT.glob("results/*/*.md")]
     outside += ROOT.glob("results/*/*/*.md")
     pages = [path for path in outside if path.is_file()]
     for path in pages:

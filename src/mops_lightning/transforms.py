@@ -1,6 +1,7 @@
 """Downsampling as a transform of PyTorch Geometric's data and of dictionaries."""
 
 import copy
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,9 @@ from mops_lightning.errors import UserError
 from mops_lightning.zoo.methods import downsample
 
 try:
-    from torch_geometric.transforms import BaseTransform
+    with warnings.catch_warnings():  # it uses functions that torch has deprecated
+        warnings.simplefilter("ignore")
+        from torch_geometric.transforms import BaseTransform
 except ModuleNotFoundError:  # dictionaries need none of it
     BaseTransform = object
 

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,7 @@ from mops_lightning.samplers.snet import SNet
 from mops_lightning.zoo.export import export, plain_net
 from mops_lightning.zoo.load import load
 
-SMALL = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
+SMALL: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
 SIZES = ((1, 12), (4, 100), (2, 257))
 
 

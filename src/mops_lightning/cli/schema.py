@@ -24,7 +24,7 @@ def main(arguments: list[str], prog: str) -> None:
         chosen = make_parser(prog).parse_args(arguments)
         from mops_lightning.config.schema import schema
 
-        text = json.dumps(schema(), indent=1, ensure_ascii=False)
+        text = json.dumps(schema(), ensure_ascii=False, separators=(",", ":"))
         if chosen.target is None:
             print(text)
             return

@@ -50,7 +50,7 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
     add = parser.add_argument
     add("files", metavar="FILE", type=Path, nargs="+", help="clouds or meshes")
     add("--m", type=int, nargs="+", required=True, help="numbers of points to keep")
-    add("--weights", type=Path, help="weights.pt of a trained sampler, or the folder of its run")
+    add("--weights", help="a trained sampler: a model's name, a weights.pt or the folder of a run")
     add("--methods", nargs="+", default=list(METHODS), help="untrained methods; default: all")
     add("--tile", type=int, metavar="POINTS", help="the trained sampler by tiles, as in downsample")
     add("--tile-size", type=float, metavar="SIDE", help="the same with cubes")

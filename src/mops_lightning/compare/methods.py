@@ -1,7 +1,6 @@
 """The methods that are compared."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from mops_lightning.downsample_files.settings import METHODS, Settings
 
@@ -13,7 +12,7 @@ FPS = "fps"
 def methods(
     m: int,
     names: Sequence[str],
-    weights: Path | None,
+    weights: str | None,
     tile: int | None,
     tile_size: float | None,
     seed: int,
