@@ -133,8 +133,8 @@ def test_command_line_setting_without_effect_raises(run, argument):
 
 
 def test_command_line_pretraining_takes_its_settings(run):
-    with pytest.raises(UserError, match=r"pretrain.max_epochs=2: has no effect"):
-        command_line([f"evaluate={run}", "pretrain.max_epochs=2"])
-    assert "pretrain.max_epochs=2" in overrides_after(
-        f"evaluate={run}", "pretrain.max_epochs=2", "weights=auto", "trainer=cpu"
+    with pytest.raises(UserError, match=r"epochs.task=2: has no effect"):
+        command_line([f"evaluate={run}", "epochs.task=2"])
+    assert "epochs.task=2" in overrides_after(
+        f"evaluate={run}", "epochs.task=2", "weights=auto", "trainer=cpu"
     )

@@ -15,6 +15,7 @@ from mops_lightning.errors import (
     one_line,
     quiet_on_closed_pipe,
 )
+from mops_lightning.files import remove_temporary
 from mops_lightning.records.readout_names import GENERATED_READOUTS
 
 DESCRIPTION = """Downsample clouds and meshes from files.
@@ -114,6 +115,7 @@ def _run(chosen: argparse.Namespace) -> int:
         if not is_folder:
             process_file(*found[0], settings, engine)
             return 0
+        remove_temporary(chosen.target)  # of a run that was killed
         workers = 1 if chosen.cluster else chosen.workers
         failed = process_folder(found, settings, chosen.target, workers, chosen.overwrite, engine)
         return 1 if failed else 0

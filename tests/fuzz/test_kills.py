@@ -1,0 +1,187 @@
+"""kill -9 at writes and at random moments: the same command again gives the same bits.
+
+A short round in the suite; ``make fuzz`` kills at every write and at random moments.
+"""
+
+import contextlib
+import io
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mops_lightning.cli.sweep import run_cell
+from mops_lightning.config.compose import compose
+from mops_lightning.downsample_files.cli import main as downsample
+from mops_lightning.files import TEMPORARY
+from mops_lightning.records import run_record
+from mops_lightning.records.attempts import ASIDE
+from mops_lightning.training.run import run
+from mops_lightning.zoo import weights
+from tests.support.command_line import TINY
+
+LONG = int(os.environ.get("MOPS_FUZZ", "0"))
+"""Command lines of the long round; a tenth of it: kills at random moments; 0: the short round."""
+pytestmark = [
+    pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork"),
+    # Python 3.12 warns of it in processes with threads, of which nothing is used here.
+    pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning"),
+]
+
+TWO_EPOCHS = [*TINY, "trainer.max_epochs=2", "epochs.task=2", "baselines={}"]
+
+
+def single(folder):
+    """One run without a pretrained net, resumed where there is a checkpoint."""
+    overrides = [*TWO_EPOCHS, "weights=null", f"out={folder}/out", f"cache={folder}/cache"]
+    if any(folder.glob("out/*/checkpoints/last.ckpt")):
+        overrides.append("ckpt_path=last")
+    number = len(list(folder.glob("out/*")))
+    run(compose(overrides), folder / "out" / str(number), overrides)
+
+
+def cell(folder):
+    """One cell of a sweep, which pretrains its task net."""
+    overrides = [*TWO_EPOCHS, f"cache={folder}/cache"]
+    run_cell(compose(overrides), folder / "cell", overrides)
+
+
+def files(folder):
+    """A folder of clouds."""
+    arguments = [f"{folder}/in", f"{folder}/out", "--method=fps", "--m=8"]
+    with contextlib.suppress(SystemExit):
+        downsample(arguments)
+
+
+WORK = {"single": single, "cell": cell, "files": files}
+
+
+def results(folder, work):
+    """What must be equal, bit for bit."""
+    if work == "files":
+        return {path.name: path.read_bytes() for path in (folder / "out").iterdir()}
+    found = {}
+    for path in sorted(folder.rglob("weights.pt")):
+        if ASIDE not in path.parts:
+            content = weights.read(path)
+            found[content["config"]["learn"]] = (content["sha256"], content["metrics"])
+    records = [run_record.read(path.parent) for path in folder.rglob(run_record.FILE)]
+    assert any(record["status"] == "completed" for record in records)
+    return found
+
+
+def prepare(folder, work):
+    folder.mkdir()
+    if work == "files":
+        (folder / "in").mkdir()
+        for number in range(3):
+            points = np.random.default_rng(number).random((50, 3), dtype=np.float32)
+            np.save(folder / "in" / f"{number}.npy", points)
+
+
+def attempt(folder, work, at_write=0, after=0.0):
+    """Work in a process of its own; kill it before a write, or after some seconds.
+
+    Returns:
+        Its exit status, negative if it was killed, and the number of its writes.
+    """
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            tempfile.tempdir = None
+            os.environ["TMPDIR"] = "/dev/shm" if Path("/dev/shm").is_dir() else str(folder)
+            writes = count_writes(folder, at_write)
+            with contextlib.redirect_stdout(io.StringIO()):
+                WORK[work](folder)
+            os.write(writer, str(len(writes)).encode())
+            status = 0
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(status)
+    os.close(writer)
+    if after:
+        time.sleep(after)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    with os.fdopen(reader) as pipe:
+        text = pipe.read()
+    return os.waitstatus_to_exitcode(status), int(text or 0)
+
+
+def count_writes(folder, kill_at):
+    """Note each change of a file below a folder; kill this process before a given one."""
+    writes: list[str] = []
+
+    def hook(event, arguments):
+        if event == "open":
+            changes = isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)
+        else:
+            changes = event in ("os.rename", "os.mkdir", "os.remove", "os.chmod", "os.truncate")
+        if changes and str(arguments[0]).startswith(str(folder)):
+            writes.append(event)
+            if len(writes) == kill_at:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.addaudithook(hook)
+    return writes
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    """Results, number of writes and seconds of undisturbed work, by kind."""
+    found = {}
+
+    def of(work):
+        if work not in found:
+            folder = tmp_path_factory.mktemp("unbroken") / work
+            prepare(folder, work)
+            start = time.monotonic()
+            status, writes = attempt(folder, work)
+            assert status == 0
+            found[work] = results(folder, work), writes, time.monotonic() - start
+        return found[work]
+
+    return of
+
+
+def check(folder, work, want, **kill):
+    prepare(folder, work)
+    status, _ = attempt(folder, work, **kill)
+    assert status in (0, -signal.SIGKILL)
+    if status or work == "files":
+        assert attempt(folder, work)[0] == 0
+    assert results(folder, work) == want, kill
+    # A single run that was killed has a folder of its own, which no later run uses.
+    left = [path for path in folder.rglob(f"{TEMPORARY}*") if work != "single"]
+    assert left == [], kill
+
+
+@pytest.mark.parametrize("work", ["single", "cell"])  # files are written by another process
+def test_kill_at_write_same_command_gives_same_bits(unbroken, tmp_path, work):
+    want, writes, _ = unbroken(work)
+    assert want
+    assert writes > 8
+    numbers = range(1, writes + 1) if LONG else (2 * writes // 3,)
+    for number in numbers:
+        check(tmp_path / str(number), work, want, at_write=number)
+
+
+@pytest.mark.skipif(not LONG, reason="the long round: make fuzz")
+@pytest.mark.parametrize("work", WORK)
+def test_kill_at_random_moment_same_command_gives_same_bits(unbroken, tmp_path, work):
+    want, _, seconds = unbroken(work)
+    rng = random.Random(LONG)
+    for number in range(max(LONG // 10, 1)):
+        check(tmp_path / str(number), work, want, after=0.01 + rng.random() * seconds)
