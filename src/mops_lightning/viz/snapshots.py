@@ -59,4 +59,7 @@ def load_clouds(path: Path) -> tuple[list[str], dict[str, NDArray[np.float32]]]:
             raise UserError(f"{path}: cannot read saved clouds: {name} has shape {cloud.shape}.")
         if not np.isfinite(cloud).all():
             raise UserError(f"{path}: cannot read saved clouds: {name} is not finite.")
-    return [str(title) for title in titles], clouds
+    try:
+        return [str(title) for title in titles], clouds
+    except SystemError:  # numpy's, for characters that do not exist
+        raise UserError(f"{path}: cannot read saved clouds: damaged titles.") from None
