@@ -1,5 +1,7 @@
 """MkDocs hooks: pages from outside docs/, links that work in the repository and on the site."""
 
+import base64
+import json
 import posixpath
 import re
 from pathlib import Path
@@ -28,6 +30,9 @@ def on_files(files: Files, config: Any) -> Files:
     for path in pages:
         files.append(File.generated(config, _site(_name(path)), abs_src_path=str(path)))
     files.append(File.generated(config, "reference.md", content=_reference()))
+    for path in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
+        for uri, content in _notebook(path).items():
+            files.append(File.generated(config, uri, content=content))
     linked = {
         target
         for path in [*pages, *(ROOT / "docs").glob("*.md")]
@@ -84,7 +89,9 @@ def _name(path: Path) -> str:
 
 def _site(name: str) -> str:
     """Return where a file of the repository is on the site."""
-    return "index.md" if name in (HOME, DOCS + HOME) else name.removeprefix(DOCS)
+    if name in (HOME, DOCS + HOME):
+        return "index.md"
+    return name.removeprefix(DOCS).replace(".ipynb", ".md")
 
 
 def _repository(uri: str) -> str:
@@ -92,6 +99,28 @@ def _repository(uri: str) -> str:
     if uri == "index.md":
         return HOME
     return uri if (ROOT / uri).is_file() else DOCS + uri
+
+
+def _notebook(path: Path) -> dict[str, str | bytes]:
+    """Return a notebook as a page and its pictures, by their places on the site."""
+    made: dict[str, str | bytes] = {}
+    lines: list[str] = []
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            lines += [source, ""]
+            continue
+        lines += ["```python", source, "```", ""]
+        for output in cell["outputs"]:
+            data = output.get("data", {})
+            if "image/png" in data:
+                name = f"{path.stem}-{len(made)}.png"
+                made[f"notebooks/{name}"] = base64.b64decode(data["image/png"])
+                lines += [f"![output]({name})", ""]
+            else:
+                text = "".join(output.get("text") or data["text/plain"])
+                lines += ["```text", text.rstrip(), "```", ""]
+    return {f"notebooks/{path.stem}.md": "\n".join(lines), **made}
 
 
 def _reference() -> str:
