@@ -48,6 +48,26 @@ def test_columns_follow_declared_order_and_hide_the_rest():
     assert cells(text)[0] == ["sampled by", "c", "a"]
 
 
+def test_further_nets_have_table_of_their_own():
+    metrics = {"test/full/accuracy": 0.9}
+    for m in (8, 32):
+        for readout in ("generated", "fps"):
+            metrics[f"test/m{m}/{readout}/accuracy"] = m / 100
+            metrics[f"transfer/dgcnn seed 0/m{m}/{readout}/accuracy"] = m / 200
+    metrics |= {"transfer/dgcnn seed 0/full/accuracy": 0.8, "transfer/dgcnn seed 0/full/x": 0.1}
+    text = printed(metrics, "test/m32/generated/accuracy")
+    first, second = text.split("the same samples under other nets, accuracy (%)")
+    assert "dgcnn" not in first
+    assert cells(second) == [
+        ["sampled by", "pointnet of the training", "dgcnn seed 0"],
+        ["m=8 fps", "8.00", "4.00"],
+        ["m=8 mops generated", "8.00", "4.00"],
+        ["m=32 fps", "32.00", "16.00"],
+        ["m=32 mops generated", "32.00", "16.00"],
+        ["all points", "90.00", "80.00"],
+    ]
+
+
 def test_readout_without_task_metrics_has_no_row():
     metrics = {
         "test/sampled/accuracy": 0.5,

@@ -71,6 +71,18 @@ def test_command_line_without_evaluate_is_unchanged():
     assert command_line(["--help"]) == ["--help"]
 
 
+def test_command_line_adds_settings_of_evaluate(run):
+    for given in ("task_nets=[a,b]", "+task_nets=[a,b]"):
+        chosen = command_line([given, f"evaluate={run}"])
+        assert compose(chosen).task_nets == ["a", "b"]
+    assert "task_nets" not in compose(command_line([f"evaluate={run}"]))
+
+
+def test_command_line_does_not_repeat_task_nets(tmp_path):
+    folder = write_run(tmp_path / "run", [*OVERRIDES, "+task_nets=[a]"])
+    assert not any("task_nets" in argument for argument in command_line([f"evaluate={folder}"]))
+
+
 ATTACKS = {
     "target": ["sampler._target_=os.system"],
     "added target": ["+task.net.extra._target_=os.system"],

@@ -89,7 +89,7 @@ def test_load_nested_arguments_are_refused(save, value):
     [
         ({"colour": 3}, "colour"),
         ({"m_max": -1}, "at least 1, got -1"),
-        ({"m_max": None}, "at least 1, got None"),
+        ({"m_max": None}, "a whole number, got None"),
         ({"tau_min": "low"}, "cannot build"),
         ({"m_max": 17}, r"queries.weight is \(16, 128\) instead of \(17, 128\)"),
     ],

@@ -133,6 +133,8 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     groups = _groups()
     if said := answer(key):
         return said
+    if key in settings.ON_DEMAND:
+        return str(settings.needs_evaluate(key))
     if "/" in key or "@" in key:
         return f"{key}: no such group of choices.{did_you_mean(key, groups)}"
     cfg = _composed(groups, arguments)
@@ -154,7 +156,7 @@ def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
 
 def _known_keys(cfg: DictConfig) -> list[str]:
     """List every key of a configuration, dotted."""
-    keys = list(settings.declared())
+    keys = [*settings.declared(), *settings.ON_DEMAND]
 
     def walk(node: DictConfig, prefix: str) -> None:
         for key in node:

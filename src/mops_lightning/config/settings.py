@@ -45,6 +45,10 @@ SIZES = Limits(
     ),
 )
 
+FILES = Limits(
+    "a list of weights files or run folders, such as [FILE,RUN]",
+    lambda x: isinstance(x, list) and bool(x) and all(type(one) is str for one in x),
+)
 WHOLE_OR_NULL = or_null(whole(1))
 SHARE_OR_NULL = or_null(number("between 0 and 1", lambda x: 0 <= x <= 1))
 
@@ -249,6 +253,17 @@ class RunSettings:
 SCHEMA: type = RunSettings
 """The declaration in use."""
 
+ON_DEMAND: dict[str, Setting] = {
+    "task_nets": Setting(
+        "with evaluate=RUN, further task nets that score the same samples: [FILE,RUN,...]",
+        Affects.SCORES,
+        limits=FILES,
+        repeat=False,
+        compare=False,
+    ),
+}
+"""Settings of ``evaluate=RUN`` that a configuration contains only where they are given."""
+
 _NOTHING = {"affects": Affects.NOTHING}
 INSIDE: dict[str, dict[str, Any]] = {
     "callbacks.learning_rate": _NOTHING,
@@ -303,7 +318,7 @@ def of(path: str) -> Setting:
 @cache
 def _of(schema: type, path: str) -> Setting:
     top = {one.name: one.metadata["setting"] for one in fields(schema)}
-    found = top.get(path.partition(".")[0], Setting())
+    found = {**ON_DEMAND, **top}.get(path.partition(".")[0], Setting())
     for inner, changes in INSIDE.items():
         if path == inner or path.startswith(f"{inner}."):
             # A run is evaluated with its groups as they were.
@@ -313,7 +328,7 @@ def _of(schema: type, path: str) -> Setting:
 
 def limited() -> dict[str, Limits]:
     """Return the limits of all settings that have some, by dotted name."""
-    names = [*declared(), *INSIDE]
+    names = [*declared(), *ON_DEMAND, *INSIDE]
     found = {name: of(name).limits for name in names}
     return {name: limits for name, limits in found.items() if limits is not None}
 
@@ -326,9 +341,16 @@ def refusal(path: str, value: Any) -> UserError:
     return UserError(f"{path} must be {allowed}, got {value!r}.{near.partition(' Allowed:')[0]}")
 
 
+def needs_evaluate(name: str) -> UserError:
+    """Return the error about a setting that counts only where a sampler's run is evaluated."""
+    return UserError(
+        f"{name} tests the sampler of a trained run: give evaluate=RUN, the run of a sampler, too."
+    )
+
+
 def help_lines() -> str:
     """Return the run-level keys with their texts, for ``--help``."""
-    shown = {name: one for name, one in declared().items() if not one.group}
+    shown = {name: one for name, one in declared().items() if not one.group} | ON_DEMAND
     width = max(map(len, shown)) + 2
     return "\n".join(
         textwrap.fill(

@@ -28,8 +28,8 @@ def check(cfg: DictConfig) -> None:
     """
     declared = settings.declared()
     for key in map(str, cfg):
-        if key not in declared:
-            hint = did_you_mean(key, declared)
+        if key not in declared and key not in settings.ON_DEMAND:
+            hint = did_you_mean(key, [*declared, *settings.ON_DEMAND])
             raise UserError(migrate.answer(key) or f"{key}: no such setting.{hint}")
     for name, setting in declared.items():
         if name not in cfg:
@@ -123,6 +123,9 @@ def _check_evaluation(cfg: DictConfig) -> None:
             f"evaluate: trains nothing, got learn={cfg.learn}. Leave learn out, or train "
             "without evaluate."
         )
+    for name in settings.ON_DEMAND:
+        if name in cfg and not (cfg.evaluate and cfg.learn == "nothing"):
+            raise settings.needs_evaluate(name)
     if not cfg.evaluate and cfg.weights == "run":
         raise UserError("weights=run means the run named by evaluate=RUN, which is not given.")
     if cfg.learn == "nothing" and cfg.ckpt_path is not None:

@@ -7,7 +7,15 @@ from rich.console import Console
 from rich.table import Table
 
 from mops_lightning.records.metric_info import in_summary_order, metric_info
-from mops_lightning.records.readout_names import FULL, REFINED, ROWS, parse
+from mops_lightning.records.readout_names import (
+    FULL,
+    REFINED,
+    ROWS,
+    MetricName,
+    parse,
+    parse_transfer,
+    size_prefix,
+)
 from mops_lightning.records.run_record import FILE
 
 Rows = dict[str, dict[str, float | None]]
@@ -49,6 +57,9 @@ def closing_lines(folder: Path, record: dict[str, Any], console: Console | None 
     title, table = results_table(record)
     console.print(title, soft_wrap=True, highlight=False, style="italic")
     console.print(table)
+    if transferred := transfer_table(record):
+        console.print(transferred[0], soft_wrap=True, highlight=False, style="italic")
+        console.print(transferred[1])
     files = ", ".join([FILE, *sorted(record["files"].values())])
     seconds = record["seconds"]["total"]
     console.print(
@@ -82,11 +93,51 @@ def results_table(record: dict[str, Any]) -> tuple[str, Table]:
         values = {column: row.get(column) for column in columns}
         if all(value is None for value in values.values()):
             continue  # metrics of the sampled set only
-        label = f"{names['sampler']} {readout}" if readout in ROWS[:-1] else readout
-        label += " (with the task net)" if readout == REFINED else ""
         cells = [
             "" if value is None else columns[column][1].format(value)
             for column, value in values.items()
         ]
-        table.add_row("all points" if readout == FULL else label, *cells)
+        table.add_row(_label(readout, names["sampler"]), *cells)
     return f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test", table
+
+
+def transfer_table(record: dict[str, Any]) -> tuple[str, Table] | None:
+    """Return a title and the scores of the same samples under further task nets.
+
+    Returns:
+        None for a record of a run without ``task_nets``.
+    """
+    names, score = record["config"]["names"], parse(record["notes"].get("score", ""))
+    values: dict[MetricName, dict[str, float | None]] = {}
+    for name, value in record["metrics"].items():
+        found = parse_transfer(name)
+        if found and score and found[1].metric == score.metric:
+            values.setdefault(found[1], {})[found[0]] = value
+    if not values or score is None:
+        return None
+    info = metric_info(score.metric, [record])
+    nets = list(next(iter(values.values())))
+    order = {name: position for position, name in enumerate(ROWS)}
+    table = Table("sampled by")
+    for head in (f"{names['net']} of the training", *nets):
+        table.add_column(head, justify="right")
+    # By size; full clouds, which have none, last.
+    for parts in sorted(
+        values, key=lambda one: (one.readout == FULL, one.m or 0, order.get(one.readout, -1))
+    ):
+        size = f"m={parts.m} " if parts.m else ""
+        own = record["metrics"].get(f"test/{size_prefix(parts.m)}{parts.readout}/{parts.metric}")
+        cells = [own, *(values[parts].get(net) for net in nets)]
+        table.add_row(
+            size + _label(parts.readout, names["sampler"]),
+            *("" if cell is None else info.format(cell) for cell in cells),
+        )
+    return f"the same samples under other nets, {info.title}", table
+
+
+def _label(readout: str, sampler: str) -> str:
+    """Return the label of a readout's row."""
+    if readout == FULL:
+        return "all points"
+    label = f"{sampler} {readout}" if readout in ROWS[:-1] else readout
+    return f"{label} (with the task net)" if readout == REFINED else label

@@ -16,6 +16,7 @@ from mops_lightning.report.comparable import shared_names
 from mops_lightning.report.nets import nets_grid
 from mops_lightning.report.provenance import provenance, without_result
 from mops_lightning.report.text import PAPER, Grid
+from mops_lightning.report.transfer import transfer_grid
 from mops_lightning.report.windows import equal_ratios
 from mops_lightning.viz.snapshots import load_clouds
 
@@ -96,7 +97,8 @@ def _grids(found: list[Record], table: Cells, names: dict[str, str], layout: Axe
         grids[-1].below += _full_lines(found, names, table.metric)
     else:
         grids[-1].rows.append(_full_row(found, table, layout))
-    return grids
+    transferred = transfer_grid(found, table, names, layout)
+    return [*grids, *([transferred] if transferred else [])]
 
 
 def _by_column(table: Cells, names: dict[str, str], layout: Axes) -> Grid:

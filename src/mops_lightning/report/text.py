@@ -4,7 +4,7 @@ import csv
 import io
 from dataclasses import dataclass, field
 
-from mops_lightning.records.readout_names import parse
+from mops_lightning.records.readout_names import parse, parse_transfer
 from mops_lightning.report.axes import row, value
 from mops_lightning.report.collect import Record, epochs, seed, trained_with
 
@@ -78,6 +78,8 @@ def _tex(text: str) -> str:
 def long_csv(found: list[Record], net: str, keys: list[str]) -> str:
     """Return one line for every test value of every record.
 
+    The column ``net`` is there if some values are those of further task nets (``task_nets``).
+
     Args:
         found: completed records.
         net: the table's task net.
@@ -86,10 +88,11 @@ def long_csv(found: list[Record], net: str, keys: list[str]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     fixed = ["folder", "sampler", "learn", "seed", "epochs", "m", "readout", "metric", "value"]
-    writer.writerow([*fixed, *keys, "commit", "device"])
+    several = any(map(parse_transfer, {name for record in found for name in record["metrics"]}))
+    writer.writerow([*fixed, *keys, *["net"] * several, "commit", "device"])
     for record in found:
         for name, figure in record["metrics"].items():
-            parts = parse(name)
+            other, parts = parse_transfer(name) or (record["config"]["names"]["net"], parse(name))
             if parts is None or figure is None:
                 continue
             writer.writerow(
@@ -104,6 +107,7 @@ def long_csv(found: list[Record], net: str, keys: list[str]) -> str:
                     parts.metric,
                     repr(figure),
                     *(value(record, key) for key in keys),
+                    *[other] * several,
                     record["git"]["commit"],
                     record["device"],
                 ]

@@ -25,7 +25,7 @@ from mops_lightning.training.divergence import check_checkpoint, check_loss
 from mops_lightning.training.learn import Learn, check_learn
 from mops_lightning.training.readouts import readout_names, readouts
 from mops_lightning.training.recipe import Recipe, draw_points, straight_through
-from mops_lightning.training.scores import Scores
+from mops_lightning.training.scores import Scores, TransferScores
 from mops_lightning.types import Batch, SampleOutput
 
 CHECKPOINT_KEY = "mops_lightning"
@@ -85,6 +85,7 @@ class Experiment(L.LightningModule):
         self.recipe = recipe or Recipe()
         self.distills = self.recipe.distillation > 0 and learn == "sampler"
         self.full_predictions: Tensor | None = None
+        self.transfer: TransferScores | None = None  # set for tests with further task nets
         self.total_steps = 1
         self.started = False  # whether a checkpoint, if any, was restored
         for module in self._frozen():
@@ -274,6 +275,20 @@ class Experiment(L.LightningModule):
             if self.sampler is not None:  # without one, the full clouds are scored already
                 self._score("test/", "", batch, {FULL: batch.points}, reference)
             self._score_sets("test/", self.prefixes, batch.points, outputs)
+            self._score_transfer(batch, samples)
+
+    def _score_transfer(self, batch: Batch, samples: Mapping[int, Mapping[str, Tensor]]) -> None:
+        """Update the metrics of all readouts under further task nets; loggers get none of them."""
+        if self.transfer is None:
+            return
+        keyed = {
+            f"{prefix}{readout}": points
+            for m, prefix in self.prefixes.items()
+            for readout, points in samples[m].items()
+        }
+        updated = self.transfer.update(batch, {**keyed, FULL: batch.points})
+        for name, metric in updated.items():
+            self.log(name, metric, batch_size=len(batch.points), logger=False)
 
     def _score(
         self, stage: str, prefix: str, batch: Batch, samples: Mapping[str, Tensor], reference: Any

@@ -5,6 +5,7 @@ from typing import Any
 import lightning as L
 import torch
 from omegaconf import DictConfig, OmegaConf
+from torch import nn
 
 from mops_lightning.config.build import accepted, build
 from mops_lightning.data.clouds import CloudDataset
@@ -68,9 +69,14 @@ def _recipe(cfg: DictConfig) -> Recipe:
 
 def _make_task(cfg: DictConfig, num_classes: int) -> Task:
     L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
-    offered = {"num_classes": num_classes}
-    net = build(cfg.task.net, "task.net", **accepted(cfg.task.net, offered))
-    return build(cfg.task, "task", net=net, **accepted(cfg.task, offered))
+    offered = accepted(cfg.task.net, {"num_classes": num_classes})
+    net = build(cfg.task.net, "task.net", **offered)
+    return task_with(cfg, net, num_classes)
+
+
+def task_with(cfg: DictConfig, net: nn.Module, num_classes: int) -> Task:
+    """Build the task that a configuration describes, with the given net."""
+    return build(cfg.task, "task", net=net, **accepted(cfg.task, {"num_classes": num_classes}))
 
 
 def _make_baselines(cfg: DictConfig, m: int, net: dict[str, Any]) -> dict[str, Sampler]:

@@ -1,9 +1,6 @@
 """Samplers by name or from weights files, without Hydra."""
 
 from pathlib import Path
-from typing import Any
-
-import torch
 
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.base import Sampler
@@ -19,6 +16,7 @@ from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.zoo import names, weights
+from mops_lightning.zoo.closed_list import ClosedList
 
 SAMPLERS: tuple[type[Sampler], ...] = (
     MOPSNet,
@@ -35,7 +33,14 @@ SAMPLERS: tuple[type[Sampler], ...] = (
     SubmodularSampler,
     CriticalSampler,
 )
-"""What ``load`` can build. A file's ``_target_`` is compared with this list and never imported."""
+"""What ``load`` can build."""
+
+LISTED = ClosedList(
+    SAMPLERS,
+    "sampler",
+    "sampler",
+    "For a sampler of your own, build it and call mops_lightning.zoo.weights.load_into.",
+)
 
 HINT = "Give a sampler, or the weights.pt of a run with learn=sampler or learn=joint."
 
@@ -72,42 +77,9 @@ def load(path: str | Path) -> Sampler:
     if not path.is_file():
         raise UserError(f"no file {path}. Give a model, a weights.pt or the folder of its run.")
     content = weights.read(path)
-    sampler = _build(content["config"], path)
-    weights.fit_state(sampler, content["state"], path, HINT)
-    return sampler.eval()
-
-
-def _build(config: dict[str, Any], path: Path) -> Sampler:
-    """Build the untrained sampler that a file's configuration describes."""
+    config = content["config"]
     if config.get("learn") == "task":
         raise UserError(f"{path} holds a task net, not a sampler. {HINT}")
-    node = config.get("sampler") or {}
-    if not isinstance(node, dict) or not all(isinstance(name, str) for name in node):
-        raise UserError(
-            f"{path}: its setting sampler must be a group of settings, got {node!r:.99}."
-        )
-    arguments = dict(node)
-    target = arguments.pop("_target_", None)
-    classes = {f"{cls.__module__}.{cls.__qualname__}": cls for cls in SAMPLERS}
-    if not isinstance(target, str) or target not in classes:
-        raise UserError(
-            f"{path}: sampler._target_ must be a sampler of mops_lightning, got {target!r}. "
-            "For a sampler of your own, build it and call mops_lightning.zoo.weights.load_into."
-        )
-    for name, value in arguments.items():
-        if not _is_plain(value):
-            raise UserError(
-                f"{path}: sampler.{name} must be a number, a string, a list of them or null, "
-                f"got {type(value).__name__}."
-            )
-    try:
-        with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
-            return classes[target](**arguments)
-    except (TypeError, UserError) as error:
-        raise UserError(f"{path}: cannot build {target}: {error}") from None
-
-
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, list):
-        return all(item is not None and _is_plain(item) for item in value)
-    return value is None or isinstance(value, bool | int | float | str)
+    sampler: Sampler = LISTED.build(config.get("sampler"), path)
+    weights.fit_state(sampler, content["state"], path, HINT)
+    return sampler.eval()
