@@ -25,6 +25,7 @@ EXTRA = {
     "dataset=meshes": ["dataset.root=somewhere"],
     "dataset=hdf5": ["dataset.root=somewhere"],
     "dataset=clouds": ["dataset.root=somewhere"],
+    "experiment=own_scans": ["dataset.root=somewhere"],
     "dataset=mesh_sequence": ["dataset.root=somewhere"],
     "task/loss=quaternion": ["task=registration"],
     "task/loss=frobenius_chamfer": ["task=registration"],

@@ -53,13 +53,12 @@ def code_cells(notebook: dict[str, Any]) -> list[dict[str, Any]]:
 def _execute(source: str, name: str, names: dict[str, Any]) -> Any:
     """Run a cell and return the value of its last line, if that is an expression."""
     tree = ast.parse(source)
-    last = tree.body.pop() if tree.body and isinstance(tree.body[-1], ast.Expr) else None
-    exec(compile(tree, name, "exec"), names)
-    if last is None:
+    last = tree.body[-1]
+    if source.rstrip().endswith(";") or not isinstance(last, ast.Expr):
+        exec(compile(tree, name, "exec"), names)
         return None
-    silent = source.rstrip().endswith(";")
-    value = eval(compile(ast.Expression(last.value), name, "eval"), names)
-    return None if silent else value
+    exec(compile(ast.Module(tree.body[:-1], []), name, "exec"), names)
+    return eval(compile(ast.Expression(last.value), name, "eval"), names)
 
 
 def _picture(figure: Any) -> dict[str, Any]:

@@ -99,7 +99,8 @@ def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):
     metrics = {f"test/full/{metric}": value for metric, value in metrics.items()}
     config = {
         "learn": "task",
-        "names": {"task": task, "net": net, "dataset": "modelnet40"},
+        "m": 32,
+        "names": {"task": task, "net": net, "dataset": "modelnet40", "sampler": "mops"},
         "trainer": {"max_epochs": 3},
         "task": {"net": {"_target_": net, "n_points": points, **settings}},
         "dataset": {"n_points": points},

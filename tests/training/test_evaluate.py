@@ -111,7 +111,7 @@ def test_evaluate_joint_run_uses_its_task_net(tmp_path):
         ("dataset.classes=[vase,chair,bed]", "classes, which are not the"),
         ("learn=sampler", "trains nothing, got learn=sampler"),
         ("sizes=[33]", "at most sampler.m_max=32"),
-        ("ckpt_path=last", "give evaluate=RUN"),
+        ("ckpt_path=last", "ckpt_path=last: has no effect with evaluate"),
     ],
 )
 def test_evaluate_mismatch_raises(trained, tmp_path, argument, named):

@@ -36,8 +36,14 @@ def test_task_net_from_file_is_not_published(tmp_path):
 
 
 def test_weights_file_for_net_without_weights_raises(tmp_path):
-    with pytest.raises(UserError, match=r"weights: icp.*got some.pt"):
-        train(tmp_path, "task=registration", "task/net=icp", "sampler=fps", "weights=some.pt")
+    with pytest.raises(UserError, match=r"weights: icp.*got pointnet"):
+        train(
+            tmp_path,
+            "task=registration",
+            "task/net=icp",
+            "sampler=fps",
+            "weights=pointnet.modelnet40",
+        )
 
 
 def test_resumed_run_from_file_is_not_published(tmp_path):

@@ -2,8 +2,11 @@
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
+import lightning as L
 import torch
+from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
 from mops_lightning.data.clouds import Clouds
@@ -12,6 +15,29 @@ from mops_lightning.errors import UserError
 from mops_lightning.files import atomic_write
 from mops_lightning.tasks.base import Task
 from mops_lightning.zoo import weights
+
+
+class FullPredictions(Callback):
+    """Gives an experiment the table when training starts.
+
+    Not earlier, because a resumed run has its task net from the checkpoint.
+
+    Args:
+        clouds: the training clouds, without augmentation.
+        batch_size: clouds per batch.
+        cache: folder for the file.
+    """
+
+    def __init__(self, clouds: Clouds, batch_size: int, cache: Path) -> None:
+        self.clouds = clouds
+        self.batch_size = batch_size
+        self.cache = cache
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: Any) -> None:
+        """Read or compute the table."""
+        pl_module.full_predictions = full_predictions(
+            pl_module.task, self.clouds, self.batch_size, self.cache, pl_module.device
+        )
 
 
 def full_predictions(

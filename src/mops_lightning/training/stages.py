@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
+from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import nn
 
@@ -17,7 +18,7 @@ from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training import evaluate
 from mops_lightning.training.divergence import Diverged, with_checkpoint
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.full_predictions import full_predictions
+from mops_lightning.training.full_predictions import FullPredictions
 from mops_lightning.training.job import Job
 from mops_lightning.training.loaders import augmentation, score_loader, split
 from mops_lightning.training.recipe import Recipe
@@ -107,9 +108,9 @@ def _fit(job: Job) -> None:
         part=job.part,
     )
     if experiment.distills and task.clouds_are_batches and not augment.active:
-        experiment.full_predictions = full_predictions(
-            task, train, cfg.batch_size, Path(cfg.cache).expanduser(), trainer.strategy.root_device
-        )
+        cache = Path(cfg.cache).expanduser()
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        callbacks.insert(0, FullPredictions(train, cfg.batch_size, cache))
     validation = None
     if len(held_out.labels):
         validation = score_loader(held_out, cfg.batch_size, task, job.part)

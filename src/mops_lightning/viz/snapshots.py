@@ -2,13 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.files import atomic_write, load_npz
+
+if TYPE_CHECKING:  # reports, which import this module, do not wait for torch
+    from torch import Tensor
 
 CLOUDS = "clouds.npz"
 INPUT = "input"
@@ -18,7 +21,7 @@ MAX_INPUT_POINTS = 8192
 
 
 def save_clouds(
-    path: Path, points: Tensor, sampled: Mapping[str, Tensor], titles: Sequence[str]
+    path: Path, points: "Tensor", sampled: "Mapping[str, Tensor]", titles: Sequence[str]
 ) -> None:
     """Write clouds and their samples.
 
