@@ -193,3 +193,10 @@ def test_rival_samplers_have_published_settings():
 def test_check_mistake_names_setting(overrides, said):
     with pytest.raises(UserError, match=said):
         check(compose(overrides))
+
+
+@pytest.mark.parametrize("value", ["much", "-1", "nan", "null"])
+@pytest.mark.parametrize("part", ["task", "sampler"])
+def test_jitter_that_is_no_standard_deviation_is_refused(part, value):
+    with pytest.raises(UserError, match=rf"augment\.{part}\.jitter must be a number of at least 0"):
+        check(compose([f"augment.{part}.jitter={value}"]))

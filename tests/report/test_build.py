@@ -60,3 +60,13 @@ def test_build_joint_registration_shows_paper_joint_table(tmp_path):
     notes = {"task_weights_sha256": None, "evaluated": {"learn": "joint", "max_epochs": 9}}
     put_pairs(tmp_path, "mops", 32, 6.0, notes=notes)
     assert ["*the paper's*", "6.74 / 9.18 / 9.65"] in rows(table(tmp_path))
+
+
+def test_recipes_have_rows_of_their_own_with_the_papers_values(tmp_path):
+    put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.5})
+    (tmp_path / "more").mkdir()
+    fast = {"recipe": {"name": "fast", "train_points": 256}}
+    put(tmp_path / "more", "mops", 32, {"test/generated/accuracy": 0.6}, notes=fast)
+    paper = ["*the paper's*", "84.28 / 79.01 / 79.74"]
+    found = rows(table(tmp_path))
+    assert found[1:] == [["mops", "50.00"], paper, ["mops fast", "60.00"], paper]

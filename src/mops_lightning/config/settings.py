@@ -2,7 +2,7 @@
 
 Help, validation, resuming, the cache of pretrained task nets, sweeps, ``evaluate`` and ``report``
 read it. A new setting is one field of ``RunSettings``; one inside a group that differs from its
-group is one line of ``INSIDE``.
+group is one line of ``inside.INSIDE``.
 """
 
 import textwrap
@@ -22,16 +22,14 @@ from mops_lightning.config.declaration import (
     group,
     number,
     one_of,
-    or_null,
     table,
     whole,
 )
+from mops_lightning.config.inside import INSIDE
 from mops_lightning.errors import UserError, did_you_mean
 
 LEARN = ("task", "sampler", "joint", "nothing")
 """What a run may train."""
-PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
-"""What ``trainer.precision`` may be; Lightning has more."""
 WITH_SAMPLER = ("sampler", "joint", "nothing")
 NAME = "run_settings"
 """What the schema is called in the defaults list of ``conf/config.yaml``."""
@@ -48,14 +46,6 @@ SIZES = Limits(
 FILES = Limits(
     "a list of weights files or run folders, such as [FILE,RUN]",
     lambda x: isinstance(x, list) and bool(x) and all(type(one) is str for one in x),
-)
-WHOLE_OR_NULL = or_null(whole(1))
-SHARE_OR_NULL = or_null(number("between 0 and 1", lambda x: 0 <= x <= 1))
-
-
-CLIPS = Limits(
-    "null or a number above 0",
-    lambda x: x is None or (isinstance(x, int | float) and not isinstance(x, bool) and x > 0),
 )
 
 
@@ -263,46 +253,6 @@ ON_DEMAND: dict[str, Setting] = {
     ),
 }
 """Settings of ``evaluate=RUN`` that a configuration contains only where they are given."""
-
-_NOTHING = {"affects": Affects.NOTHING}
-INSIDE: dict[str, dict[str, Any]] = {
-    "callbacks.learning_rate": _NOTHING,
-    "callbacks.checkpoint": _NOTHING,
-    "callbacks.progress": _NOTHING,
-    "callbacks.pictures": _NOTHING,
-    "dataset.cache": _NOTHING,
-    "dataset.workers": _NOTHING,
-    "task.emd_workers": _NOTHING,
-    "task.pairs.test_seed": {"affects": Affects.SCORES},
-    "sampler.m": {"compare": False},
-    "sampler.m_max": {"compare": False, "limits": whole(1)},
-    "sampler.seed": {"compare": False},
-    "recipe.train_points": {"limits": WHOLE_OR_NULL},
-    "recipe.all_points_from": {"limits": SHARE_OR_NULL},
-    "recipe.warm_start": {
-        "limits": Limits("true, false or a weights file", lambda x: isinstance(x, bool | str))
-    },
-    "recipe.distillation": {"limits": number("of at least 0", lambda x: x >= 0)},
-    "recipe.straight_through": {"limits": SHARE_OR_NULL},
-    "recipe.ema_span": {"limits": SHARE_OR_NULL},
-    "sampler.threshold": {
-        "affects": Affects.SCORES,
-        "limits": number("of at least 0 and below 1", lambda x: 0 <= x < 1),
-    },
-    # Before the settings that take their values from them, so that an error names these.
-    "epochs.task": {"limits": whole(1)},
-    "epochs.sampler": {"limits": whole(0)},
-    "trainer.max_epochs": {"limits": whole(0)},
-    "trainer.precision": {"limits": one_of(*PRECISIONS, others=("32", 32, None))},
-    "trainer._target_": _NOTHING,
-    "trainer.accelerator": _NOTHING,
-    "trainer.devices": _NOTHING,
-    "trainer.num_nodes": _NOTHING,
-    "trainer.strategy": _NOTHING,
-    "trainer.log_every_n_steps": {**_NOTHING, "limits": whole(1)},
-    "trainer.gradient_clip_val": {"limits": CLIPS},
-}
-"""Settings inside groups: how they differ from their group."""
 
 
 def declared() -> dict[str, Setting]:

@@ -32,7 +32,8 @@ class Augmentation:
 
     def __post_init__(self) -> None:
         """Check the arguments."""
-        if self.jitter < 0 or self.jitter_clip < 0:
+        given = (self.jitter, self.jitter_clip)
+        if not all(isinstance(one, int | float) and one >= 0 for one in given):
             raise UserError(
                 "augment: jitter and jitter_clip must be at least 0, "
                 f"got {self.jitter} and {self.jitter_clip}."

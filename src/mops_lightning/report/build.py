@@ -11,7 +11,7 @@ from mops_lightning.records.readout_names import FULL
 from mops_lightning.report import paper
 from mops_lightning.report.axes import Axes, axes, value
 from mops_lightning.report.cells import Cells, make_cells, sort_key
-from mops_lightning.report.collect import Found, Record, collect, score, trained_with
+from mops_lightning.report.collect import Found, Record, collect, sampler_row, score, trained_with
 from mops_lightning.report.comparable import shared_names
 from mops_lightning.report.nets import nets_grid
 from mops_lightning.report.provenance import provenance, without_result
@@ -92,7 +92,7 @@ def _grids(found: list[Record], table: Cells, names: dict[str, str], layout: Axe
         compared = equal_ratios(table, layout.planes)
         grids = [*_planes(table, names, layout), *([compared] if compared else [])]
     else:
-        grids = [_by_column(table, names, layout)]
+        grids = [_by_column(found, table, names, layout)]
     if layout.column == "m":
         grids[-1].below += _full_lines(found, names, table.metric)
     else:
@@ -101,17 +101,19 @@ def _grids(found: list[Record], table: Cells, names: dict[str, str], layout: Axe
     return [*grids, *([transferred] if transferred else [])]
 
 
-def _by_column(table: Cells, names: dict[str, str], layout: Axes) -> Grid:
+def _by_column(found: list[Record], table: Cells, names: dict[str, str], layout: Axes) -> Grid:
     columns = table.columns()
     if layout.column != "m":
         columns = columns[::-1]
     published = paper.table(
         names["task"], names["dataset"], table.metric.name, names["learned"] == "joint"
     )
+    samplers = {sampler_row(one): one["config"]["names"]["sampler"] for one in found}
     rows = []
     for name in table.rows():
         rows.append([name, *(table.text(name, column) for column in columns)])
-        theirs = published.get("rows", {}).get(name, {}) if layout.column == "m" else {}
+        sampler = samplers.get(name, name)
+        theirs = published.get("rows", {}).get(sampler, {}) if layout.column == "m" else {}
         if any(str(column) in theirs for column in columns):
             values = [theirs.get(str(column), []) for column in columns]
             rows.append([PAPER, *(" / ".join(f"{one:.2f}" for one in cell) for cell in values)])

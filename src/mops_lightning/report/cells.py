@@ -164,6 +164,7 @@ ORDER = (
 def sort_key(row: str) -> tuple[int, str]:
     """Return a key that sorts rows as the paper's tables do."""
     plain = row.removesuffix(WITH_NET)
-    name = plain.rsplit(" ", 1)[-1]  # after "icp on"
+    _, other_net, sampler = plain.rpartition(" on ")  # such as "icp on mops fast"
+    name = sampler.split()[0]  # without its recipe
     number = ORDER.index(name) if name in ORDER else len(ORDER)
-    return number + len(ORDER) * (name != plain) * 2, row
+    return number + len(ORDER) * bool(other_net) * 2, row
