@@ -87,8 +87,9 @@ def test_page_opens_without_errors_and_with_its_pictures(address, opened, name):
 
 def test_search_finds_a_setting(address, opened):
     page, errors, _ = opened(f"{address}/index.html")
-    page.locator("input.md-search__input").fill("test_noise_std")
-    page.wait_for_selector(".md-search-result__item", timeout=20_000)
+    page.wait_for_load_state("networkidle")
+    page.locator("input.md-search__input").press_sequentially("test_noise_std")
+    page.locator(".md-search-result__item").first.wait_for(state="attached", timeout=60_000)
     assert errors == []
 
 

@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import Checkpoint, ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 
-from mops_lightning.config.build import build
+from mops_lightning.config.build import accepted, build
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import dotted
@@ -50,7 +50,7 @@ def make_trainer(
     keep_freed_memory()
     watch_workers()
     task = experiment.task
-    logger = build(cfg.logger, "logger", save_dir=str(folder)) if cfg.get("logger") else False
+    logger = _logger(cfg.logger, folder) if cfg.get("logger") else False
     score = task.score if cfg.learn != "task" else task.full_score or task.score
     offered = {"folder": folder, "checkpoint": folder / "checkpoints" / CHECKPOINT, "score": score}
     rows, titles = clouds_to_draw(dataset, cfg.pictures)
@@ -79,6 +79,12 @@ def make_trainer(
             "bf16-mixed."
         )
     return trainer
+
+
+def _logger(node: DictConfig, folder: Path) -> Any:
+    """Build the logger, which writes into the run's folder itself unless it has a name."""
+    unnamed = {} if "name" in node else accepted(node, {"name": ""})
+    return build(node, "logger", save_dir=str(folder), **unnamed)
 
 
 def _silence_lightning() -> None:
