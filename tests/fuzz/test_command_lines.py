@@ -19,7 +19,7 @@ from tests.support.command_line import TINY, call
 hypothesis = pytest.importorskip("hypothesis", reason="hypothesis is in the extra test")
 from hypothesis import strategies as st  # noqa: E402
 
-LINES = int(os.environ.get("MOPS_FUZZ", "5"))
+LINES = int(os.environ.get("MOPS_FUZZ", "2"))
 
 GROUPS = {
     "sampler": (
