@@ -91,6 +91,30 @@ def end(name: str, message: str, status: int) -> NoReturn:
 
 
 @contextmanager
+def one_line_endings(prog: str) -> Iterator[None]:
+    """End a subcommand in one line for mistakes, files that cannot be used, and Ctrl-C.
+
+    Args:
+        prog: what the user typed to start the subcommand.
+
+    Raises:
+        SystemExit: instead of these errors, and see ``quiet_on_closed_pipe``.
+    """
+    name = prog.removeprefix("python -m ")
+    with quiet_on_closed_pipe():
+        try:
+            yield
+        except UserError as error:
+            end(name, str(error), USER_ERROR)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            end(name, file_error(error), USER_ERROR)
+        except KeyboardInterrupt:
+            end(name, "interrupted.", INTERRUPTED)
+
+
+@contextmanager
 def quiet_on_closed_pipe() -> Iterator[None]:
     """Exit without a traceback when the reader of the output has ended, such as ``| head``.
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from mops_lightning.cli.models import complete_names
-from mops_lightning.errors import USER_ERROR, UserError, end, quiet_on_closed_pipe
+from mops_lightning.errors import UserError, one_line_endings
 
 DESCRIPTION = """Write a trained sampler as ONNX (.onnx) or as a PyTorch program (.pt2).
 
@@ -21,12 +21,8 @@ def main(arguments: list[str], prog: str) -> None:
         arguments: those of the command line.
         prog: what the user typed to start this command.
     """
-    with quiet_on_closed_pipe():
-        chosen = make_parser(prog).parse_args(arguments)
-        try:
-            _run(chosen)
-        except UserError as error:
-            end(prog.removeprefix("python -m "), str(error), USER_ERROR)
+    with one_line_endings(prog):
+        _run(make_parser(prog).parse_args(arguments))
 
 
 def make_parser(prog: str) -> argparse.ArgumentParser:

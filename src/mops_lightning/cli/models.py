@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from mops_lightning.errors import USER_ERROR, UserError, end, quiet_on_closed_pipe
+from mops_lightning.errors import UserError, one_line_endings
 from mops_lightning.zoo import model_file, names
 
 DESCRIPTION = f"""List trained models, show the card of one, or publish a run as one.
@@ -26,12 +26,8 @@ def main(arguments: list[str], prog: str) -> None:
         arguments: those of the command line.
         prog: what the user typed to start this command.
     """
-    with quiet_on_closed_pipe():
-        chosen = make_parser(prog).parse_args(arguments)
-        try:
-            print("\n".join(_run(chosen)))
-        except UserError as error:
-            end(prog.removeprefix("python -m "), str(error), USER_ERROR)
+    with one_line_endings(prog):
+        print("\n".join(_run(make_parser(prog).parse_args(arguments))))
 
 
 def make_parser(prog: str) -> argparse.ArgumentParser:

@@ -4,7 +4,7 @@ import argparse
 import json
 from pathlib import Path
 
-from mops_lightning.errors import USER_ERROR, UserError, end, quiet_on_closed_pipe
+from mops_lightning.errors import UserError, one_line_endings
 from mops_lightning.files import atomic_write
 
 DESCRIPTION = """Print a JSON schema of the configuration, for editors, or write it to OUT.
@@ -20,7 +20,7 @@ def main(arguments: list[str], prog: str) -> None:
         arguments: those of the command line.
         prog: what the user typed to start this command.
     """
-    with quiet_on_closed_pipe():
+    with one_line_endings(prog):
         chosen = make_parser(prog).parse_args(arguments)
         from mops_lightning.config.schema import schema
 
@@ -28,10 +28,7 @@ def main(arguments: list[str], prog: str) -> None:
         if chosen.target is None:
             print(text)
             return
-        try:
-            _write(chosen.target, text)
-        except UserError as error:
-            end(prog.removeprefix("python -m "), str(error), USER_ERROR)
+        _write(chosen.target, text)
 
 
 def make_parser(prog: str) -> argparse.ArgumentParser:

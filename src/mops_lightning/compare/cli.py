@@ -5,14 +5,7 @@ from pathlib import Path
 
 from mops_lightning.compare.methods import methods
 from mops_lightning.downsample_files.settings import METHODS
-from mops_lightning.errors import (
-    INTERRUPTED,
-    USER_ERROR,
-    UserError,
-    did_you_mean,
-    end,
-    quiet_on_closed_pipe,
-)
+from mops_lightning.errors import UserError, did_you_mean, one_line_endings
 
 DESCRIPTION = """Compare methods of downsampling on your own files.
 
@@ -31,15 +24,8 @@ def main(
         arguments: those of the command line; None: ``sys.argv``.
         prog: what the user typed to start this command.
     """
-    name = prog.removeprefix("python -m ")
-    with quiet_on_closed_pipe():
-        chosen = make_parser(prog).parse_args(arguments)
-        try:
-            _run(chosen)
-        except UserError as error:
-            end(name, str(error), USER_ERROR)
-        except KeyboardInterrupt:
-            end(name, "interrupted.", INTERRUPTED)
+    with one_line_endings(prog):
+        _run(make_parser(prog).parse_args(arguments))
 
 
 def make_parser(prog: str) -> argparse.ArgumentParser:

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from mops_lightning.errors import USER_ERROR, UserError, end, file_error, quiet_on_closed_pipe
+from mops_lightning.errors import one_line_endings
 from mops_lightning.files import atomic_write, remove_temporary
 from mops_lightning.report.build import Report, build
 from mops_lightning.report.text import latex, long_csv, markdown
@@ -26,15 +26,10 @@ def main(arguments: list[str] | None = None, prog: str = "python -m mops_lightni
         arguments: those of the command line; None: ``sys.argv``.
         prog: what the user typed to start this command.
     """
-    with quiet_on_closed_pipe():
+    with one_line_endings(prog):
         chosen = make_parser(prog).parse_args(arguments)
-        try:
-            report = build(chosen.folder, chosen.metric, chosen.mixed)
-            written = write(report, chosen.folder)
-        except UserError as error:
-            end(prog.removeprefix("python -m "), str(error), USER_ERROR)
-        except OSError as error:
-            end(prog.removeprefix("python -m "), file_error(error), USER_ERROR)
+        report = build(chosen.folder, chosen.metric, chosen.mixed)
+        written = write(report, chosen.folder)
         print(markdown(report.grids, report.remarks))
         print(f"files in {chosen.folder}/: {', '.join(written)}")
 
