@@ -20,7 +20,7 @@ run: setup
 	$(BIN)/python -m mops_lightning
 
 test: setup
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 # The long round of tests/fuzz; `make test` contains a short one.
 fuzz: setup

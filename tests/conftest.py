@@ -16,6 +16,27 @@ if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(2)
 
 
+SLOW_FILES = (
+    *("cli/test_train", "cli/test_resume", "config/test_distributed", "cli/test_launchers"),
+    *("training/test_workers", "training/test_pretrain", "training/test_tensorboard"),
+    *("docs/test_notebooks", "docs/test_site", "report/test_page", "fuzz/test_command_lines"),
+    *("samplers/test_memory", "training/test_precision", "training/test_evaluate", "test_wheel"),
+    *("downsample_files/test_cluster", "zoo/test_export", "training/test_warm_start"),
+)
+"""Files of few tests that take long. They begin first, or one process would end alone with one."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Order the files: slow ones, then the rest; with several processes, each takes the next."""
+    tests = Path(__file__).parent
+
+    def rank(item: pytest.Item) -> int:
+        name = item.path.relative_to(tests).with_suffix("").as_posix()
+        return SLOW_FILES.index(name) if name in SLOW_FILES else len(SLOW_FILES)
+
+    items.sort(key=rank)
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of real data that the user names; tests on it are skipped without one."""

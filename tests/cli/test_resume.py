@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from mops_lightning.records import run_record
-from tests.support.command_line import TINY_WITH_PICTURES, call, runs, start
+from tests.support.command_line import TINY, call, runs, start
 
 
 def final_state(run):
     return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
 
 
-LONGER = [*TINY_WITH_PICTURES, "trainer.max_epochs=6", "dataset.train_per_class=12"]
+LONGER = [*TINY, "trainer.max_epochs=6", "dataset.train_per_class=12"]
 
 
 @pytest.fixture(scope="module")
