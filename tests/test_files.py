@@ -54,6 +54,15 @@ def test_remove_temporary_removes_what_a_kill_left(tmp_path):
     assert not is_temporary(path)
 
 
+def test_remove_temporary_keeps_what_is_being_written(tmp_path):
+    path = tmp_path / "file.txt"
+    with atomic_write(path) as temporary:
+        temporary.write_text("text")
+        remove_temporary(tmp_path)
+    assert path.read_text() == "text"
+    remove_temporary(path / "below")  # no folder
+
+
 def test_set_aside_keeps_every_damaged_file(tmp_path):
     path = tmp_path / "last.ckpt"
     for text in ("first", "second", "third"):

@@ -9,6 +9,7 @@ import torch
 
 from mops_lightning.data.meshes import meshes
 from mops_lightning.errors import UserError
+from mops_lightning.files import TEMPORARY
 from tests.support.meshes import BALL, write_mesh
 
 
@@ -101,9 +102,10 @@ def test_sampling_damaged_cache_is_replaced(
     kept = {path: path.read_bytes() for path in (tmp_path / "cache").iterdir()}
     for path in kept:
         path.write_bytes(damage)
+    (tmp_path / "cache" / f"{TEMPORARY}left by a kill.npy").touch()
     again = meshes(mesh_layout, n_points=20, cache=tmp_path / "cache")
     assert torch.equal(again.train.points, first.train.points)
-    assert {path: path.read_bytes() for path in kept} == kept
+    assert {path: path.read_bytes() for path in (tmp_path / "cache").iterdir()} == kept
 
 
 def test_sampling_unwritable_cache_raises(mesh_layout: Path, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from mops_lightning.data.procedural.builders import BUILDERS
 from mops_lightning.data.procedural.mesh_parts import join, turned
 from mops_lightning.data.shapes import shapes
 from mops_lightning.errors import UserError
+from mops_lightning.files import TEMPORARY
 
 SMALL: dict[str, Any] = {
     "n_points": 64,
@@ -214,7 +215,9 @@ def test_shapes_damaged_cache_is_replaced(tmp_path: Path) -> None:
         assert same(shapes(**SMALL, cache=tmp_path), fresh)
         assert list(tmp_path.iterdir()) == [path]
     path.write_bytes(damaged[1])
+    (tmp_path / f"{TEMPORARY}left by a kill.npz").touch()
     shapes(**SMALL, cache=tmp_path)
+    assert list(tmp_path.iterdir()) == [path]
     assert path.read_bytes() == whole
 
 

@@ -2,6 +2,7 @@
 
 import torch
 
+from mops_lightning.files import TEMPORARY
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.full_predictions import full_predictions
@@ -46,4 +47,6 @@ def test_full_predictions_damaged_file_is_computed_again(tmp_path):
     torch.save(found[:-1], path)
     torch.testing.assert_close(predictions(tmp_path)[0], found)
     torch.save(found * float("nan"), path)
+    path.with_name(f"{TEMPORARY}left by a kill.pt").touch()
     torch.testing.assert_close(predictions(tmp_path)[0], found)
+    assert list(path.parent.iterdir()) == [path]

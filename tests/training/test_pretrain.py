@@ -7,6 +7,7 @@ from filelock import FileLock
 from mops_lightning.config.build import build
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
+from mops_lightning.files import TEMPORARY
 from mops_lightning.training.pretrain import cache_folder
 from mops_lightning.training.run import run
 from mops_lightning.zoo import weights
@@ -47,8 +48,13 @@ def test_weights_file_for_net_without_weights_raises(tmp_path):
 
 
 def test_resumed_run_from_file_is_not_published(tmp_path):
+    cfg = compose([*TINY, f"cache={tmp_path}/cache", "learn=task", "task=registration"])
+    folder = cache_folder(cfg, build(cfg.dataset, "dataset"))
+    folder.mkdir(parents=True)
+    (folder / f"{TEMPORARY}left by a kill.pt").touch()
     train(tmp_path, "learn=task", "task=registration")
-    first = tmp_path / "run0" / "weights.pt"
+    assert [path.name for path in folder.iterdir()] == [weights.FILE]
+    (first,) = tmp_path.glob("run*/weights.pt")
     given = ["learn=task", "task=registration", f"weights={first}"]
     train(tmp_path, *given)
     for path in (tmp_path / "cache" / "weights").rglob("weights.pt"):
@@ -130,7 +136,10 @@ def test_damaged_cache_is_set_aside_and_trained_again(tmp_path, capsys, damage):
 def test_test_seed_keeps_cached_task_net(tmp_path):
     train(tmp_path, "task=registration", "sampler=fps")
     (first,) = files(tmp_path, "cache/weights/*/weights.pt")
+    (folder,) = tmp_path.glob("cache/weights/*/")
+    (folder / f"{TEMPORARY}left by a kill.json").touch()
     train(tmp_path, "task=registration", "sampler=fps", "task.pairs.test_seed=5")
+    assert not list(folder.glob(f"{TEMPORARY}*"))
     assert [one["sha256"] for one in files(tmp_path, "cache/weights/*/weights.pt")] == [
         first["sha256"]
     ]

@@ -20,6 +20,7 @@ from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
 from mops_lightning.data.mesh_io import VERSION, BrokenMeshError, Result, cloud_or_error
 from mops_lightning.data.split_list import SPLITS
 from mops_lightning.errors import UserError
+from mops_lightning.files import remove_temporary
 
 
 def mesh_root(root: str | Path, minima: dict[str, tuple[int, int]]) -> Path:
@@ -77,6 +78,8 @@ def sample_meshes(
     labels: dict[str, list[int]] = {split: [] for split in SPLITS}
     skipped = 0
     folder = Path(cache).expanduser() if cache else None
+    if folder is not None:
+        remove_temporary(folder, below=False)
     sample = partial(cloud_or_error, n_points=n_points, seed=seed, cache=folder)
     results = _sample_all(sample, [root / name for name, _ in rows], workers)
     for (name, split), result in zip(rows, results, strict=True):

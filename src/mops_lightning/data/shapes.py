@@ -21,7 +21,7 @@ from rich.progress import track
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
 from mops_lightning.data.procedural.builders import BUILDERS
 from mops_lightning.errors import UserError
-from mops_lightning.files import atomic_write
+from mops_lightning.files import atomic_write, remove_temporary
 
 GENERATOR_VERSION = 1
 """Part of the fingerprint; increment it with every change of the shapes."""
@@ -185,6 +185,7 @@ def _load(path: Path, expected: Sequence[tuple[int, int, int]]) -> list[NDArray[
 
 
 def _save(path: Path, points: Sequence[NDArray[np.float32]]) -> None:
+    remove_temporary(path.parent, below=False)
     try:
         with atomic_write(path) as temporary:
             np.savez(temporary, train=points[0], test=points[1])

@@ -12,7 +12,7 @@ from torch import Tensor
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
-from mops_lightning.files import atomic_write
+from mops_lightning.files import atomic_write, remove_temporary
 from mops_lightning.tasks.base import Task
 from mops_lightning.zoo import weights
 
@@ -63,6 +63,7 @@ def full_predictions(
     found = _read(path, len(clouds.points))
     if found is None:
         found = _predict(task, clouds, batch_size, device)
+        remove_temporary(path.parent, below=False)
         with atomic_write(path) as temporary:
             torch.save(found, temporary)
     return found

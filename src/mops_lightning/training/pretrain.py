@@ -41,6 +41,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
     if cfg.weights != "auto":
         return names.resolve(cfg.weights)
     folder = cache_folder(cfg, dataset)
+    remove_temporary(folder)
     if not _is_good(folder / FILE):
         if distributed.started_together(cfg):
             raise UserError(
@@ -114,6 +115,7 @@ def publish(job: Job, record: RunRecord) -> None:
             return
     target = cache_folder(cfg, job.dataset) / FILE
     if not _is_good(target):
+        remove_temporary(target.parent, below=False)
         with atomic_write(target) as temporary:
             shutil.copyfile(job.folder / FILE, temporary)
 
@@ -141,7 +143,6 @@ def _locked(folder: Path, net: str) -> Iterator[None]:
 def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
     """Train the task net in its cache folder, or resume a training that was interrupted there."""
     own = task_config(cfg)
-    remove_temporary(folder)
     if (folder / FILE).exists():
         print(f"{folder / FILE} is damaged. Renamed to {set_aside(folder / FILE).name}.")
     path = folder / "checkpoints" / CHECKPOINT
