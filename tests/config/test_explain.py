@@ -13,6 +13,8 @@ from tests.support.command_line import TINY, TINY_WITH_PICTURES, call
         (["sampler.alhpa=3"], "sampler.alpha"),
         (["sampler=mosp"], "mops"),
         (["task=registration", "task/lss=quaternion"], "Did you mean 'task/loss'"),
+        (["sampler/mops=registration"], "chosen by other groups"),
+        (["task/nets=pointnet"], "Did you mean 'task/net'"),
         (["sampler.log=2"], "sampler.log: no such setting"),
         (["noise=0.1"], "noise is now called test_noise_std"),
         (["sampler.feature_channels=[8]"], "Write +sampler.feature_channels=..."),

@@ -41,8 +41,8 @@ def test_specialised_files_belong_to_groups_that_exist():
         *root.glob("sampler/*/*"),
         *root.glob("optimizer/*/*"),
     ]:
-        experiment = path.stem.removeprefix("experiment_")
-        assert path.stem in TASKS or (root / "experiment" / f"{experiment}.yaml").is_file()
+        group, _, choice = path.stem.partition("_")
+        assert path.stem in TASKS or (root / group / f"{choice}.yaml").is_file()
 
 
 @pytest.mark.parametrize(

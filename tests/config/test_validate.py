@@ -102,9 +102,8 @@ def test_paper_experiments_have_paper_settings():
     assert cfg.trainer.max_epochs == 250
     assert cfg.names.dataset == "modelnet40"
     assert cfg.val_fraction == 0
-    for task in ("classification", "registration", "reconstruction"):
-        cfg = compose([f"experiment={task}_paper", "sampler=fmops"])
-        assert cfg.sampler.size_sampling == "uniform"
+    for chosen in ("experiment=classification_paper", "recipe=paper"):
+        assert compose([chosen, "sampler=fmops"]).sampler.size_sampling == "uniform"
 
 
 def test_rival_samplers_have_published_settings():

@@ -120,6 +120,13 @@ def _groups() -> list[str]:
     return [path for path in paths if not path.startswith("hydra")]
 
 
+def _is_offered(group: str) -> bool:
+    """Return whether users choose from a group; of some, other choices choose the file."""
+    top = group.partition("/")[0]
+    named = top in settings.declared() or top == "experiment"
+    return named and not (conf_dir() / f"{group}.yaml").is_file()
+
+
 def _names_there(cause: Any, arguments: Sequence[str]) -> str:
     """Name the configurations in the folder of --config-dir."""
     places = [i for i, a in enumerate(arguments) if a in ("--config-dir", "-cd")]
@@ -135,8 +142,11 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
         return said
     if key in settings.ON_DEMAND:
         return str(settings.needs_evaluate(key))
+    if key in groups:
+        return f"{key}: its files are chosen by other groups. --cfg job shows the settings in force."
     if "/" in key or "@" in key:
-        return f"{key}: no such group of choices.{did_you_mean(key, groups)}"
+        offered = [group for group in groups if _is_offered(group)]
+        return f"{key}: no such group of choices.{did_you_mean(key, offered)}"
     cfg = _composed(groups, arguments)
     node, _, name = key.rpartition(".")
     target = OmegaConf.select(cfg, f"{node}._target_")
