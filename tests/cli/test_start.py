@@ -1,7 +1,9 @@
 """What a refused run leaves."""
 
 from mops_lightning.training.run import claim
+from mops_lightning.zoo import publish
 from tests.support.command_line import TINY, call
+from tests.support.models import write_run
 
 
 def listing(folder):
@@ -29,3 +31,25 @@ def test_run_in_unwritable_folder_ends_in_one_line(tmp_path):
         status, _, err = call([*TINY, "sampler=fps", f"hydra.run.dir={place}"], tmp_path)
         assert (status, err.count("\n")) == (2, 1)
         assert f"out: cannot write to {place}" in err
+
+
+def test_weights_of_a_model_pass_every_check(tmp_path):
+    place = "hydra.run.dir=/proc/none/run"  # refused by the last check
+    _, _, err = call([*TINY, "sampler=fps", "weights=pointnet.modelnet40", place], tmp_path)
+    assert "out: cannot write to /proc/none/run" in err
+    _, _, err = call([*TINY, "sampler=fps", "weights=pointnet.modelnet", place], tmp_path)
+    assert "weights: no file or model" in err
+    assert "'pointnet.modelnet40'" in err
+
+
+def test_models_path_finds_own_models(tmp_path):
+    write_run(tmp_path / "run")
+    publish.add(tmp_path / "run", "fmops.mine", tmp_path / "own")
+    arguments = ["evaluate=fmops.mine", "models.path=own", "--cfg", "job"]
+    status, out, err = call(arguments, tmp_path)
+    assert (status, err) == (0, "")
+    assert "fmops.FMOPSNet" in out
+    assert "models:\n  path: own" in out
+    assert "no file or model" in call(arguments[:1], tmp_path)[2]
+    assert "no folder none" in call(["models.path=none"], tmp_path)[2]
+    assert "models.path=FOLDER" in call(["models.path=null"], tmp_path)[2]

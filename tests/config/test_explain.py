@@ -62,6 +62,15 @@ def test_dataset_of_another_type_ends_in_one_line(tmp_path):
     )
 
 
+def test_unknown_setting_in_a_file_ends_in_one_line(tmp_path):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text("# @package _global_\nsede: 3\n")
+    status, _, err = call(["--config-dir", str(tmp_path), "experiment=mine"], tmp_path)
+    assert status == 2
+    assert err.startswith("mops_lightning: experiment/mine.yaml: sede: no such setting.")
+    assert "'seed'" in err
+
+
 @pytest.mark.parametrize("name", ["EarlyStopping", "ModelCheckpoint"])
 def test_callback_with_an_unknown_metric_ends_in_one_line(name, tmp_path):
     added = [

@@ -123,9 +123,12 @@ def test_of_a_path_gives_the_nearest_declaration(path, affects, repeated, compar
         (["+task_nets=[1]", "evaluate=x", "learn=nothing"], "must be a list of weights files"),
         (["+task_nets=[]", "evaluate=x", "learn=nothing"], "must be a list of weights files"),
         (["+task_net=[a]"], "Did you mean 'task_nets'"),
+        (["+models.paht=a"], r"models\.paht: no such setting\. Did you mean 'models\.path'"),
+        (["+models.path=5"], r"models\.path must be a text, got 5"),
+        (["+models=5"], "models must be settings"),
     ],
 )
-def test_setting_of_evaluate_alone_is_validated(overrides, words):
+def test_setting_on_demand_is_validated(overrides, words):
     with pytest.raises(UserError, match=words):
         check(compose(overrides))
 

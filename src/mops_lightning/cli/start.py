@@ -12,6 +12,7 @@ from mops_lightning.config.explain import explain
 from mops_lightning.config.paths import check_paths
 from mops_lightning.config.validate import check
 from mops_lightning.errors import USER_ERROR, UserError, end, file_error
+from mops_lightning.zoo import names
 
 
 def begin(config: DictConfig, arguments: Sequence[str]) -> None:
@@ -32,6 +33,7 @@ def begin(config: DictConfig, arguments: Sequence[str]) -> None:
         folder = Path(config.hydra.run.dir)
         check(cfg)
         check_paths(cfg)
+        _check_weights(cfg.weights)
         distributed.check_start(cfg, config.hydra.overrides.hydra)
         if not distributed.is_worker_rank(cfg):
             claim(folder)
@@ -39,6 +41,22 @@ def begin(config: DictConfig, arguments: Sequence[str]) -> None:
         end("mops_lightning", explain(error, arguments), USER_ERROR)
     except OSError as error:
         end("mops_lightning", file_error(error), USER_ERROR)
+
+
+def _check_weights(given: str | None) -> None:
+    """Check that there is a file, run or model where ``weights`` names one.
+
+    Raises:
+        UserError: there is none.
+    """
+    if given in (None, "auto", "run"):
+        return
+    try:
+        path = names.resolve(given)
+    except UserError as error:
+        raise UserError(f"weights: {error}") from None
+    if not path.exists():
+        raise UserError(f"weights: no file {path}. Give a weights.pt, a model, or weights=auto.")
 
 
 def make(folder: Path) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from mops_lightning.cli.commands import help_lines
 from mops_lightning.config.composition import conf_dir
-from mops_lightning.config.overrides import key
+from mops_lightning.config.overrides import added, key, parse
 from mops_lightning.errors import (
     INTERRUPTED,
     USER_ERROR,
@@ -18,6 +18,7 @@ from mops_lightning.errors import (
     memory_error,
 )
 from mops_lightning.records.migrate import answer
+from mops_lightning.zoo import names
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -50,10 +51,12 @@ def _run() -> None:
     try:
         _refuse_old_settings(sys.argv[1:])
         refuse_plain_groups(sys.argv[1:])
+        _search_models(sys.argv[1:])
         if any(key(argument) == "evaluate" for argument in sys.argv[1:]):
             from mops_lightning.training.replay import command_line
 
             sys.argv[1:] = command_line(sys.argv[1:])
+        sys.argv[1:] = map(added, sys.argv[1:])
         app = hydra.main(config_path=str(conf_dir()), config_name="config", version_base="1.3")
         app(_job)()
     except (UserError, HydraException, OmegaConfBaseException, YAMLError) as error:
@@ -77,6 +80,22 @@ def _refuse_old_settings(arguments: list[str]) -> None:
         said = answer(match.group(1) or match.group(2)) if match else None
         if said:
             raise UserError(said)
+
+
+def _search_models(arguments: list[str]) -> None:
+    """Search the folders of ``models.path`` for models, before any setting names one.
+
+    Raises:
+        UserError: there is no such folder, or the value is none.
+    """
+    for argument in arguments:
+        override = parse(argument) if key(argument) == "models.path" else None
+        if override is None or override.is_delete():
+            continue
+        value = None if override.is_sweep_override() else override.value()
+        if not isinstance(value, str):
+            raise UserError(f"{argument}: give folders as in $MOPS_MODELS: models.path=FOLDER.")
+        names.search_first(value)
 
 
 def _job(cfg: "DictConfig") -> float | None:

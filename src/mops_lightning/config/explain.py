@@ -106,6 +106,9 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
         if "Could not override '" in text:
             key = text.split("Could not override '")[1].split("'")[0]
             return _no_such_setting(key, arguments)
+        if unknown := re.search(r"In '(.+)': ConfigKeyError .*\nKey '(\w+)' not in 'Run", text):
+            hint = did_you_mean(unknown.group(2), settings.declared())
+            return f"{unknown.group(1)}.yaml: {unknown.group(2)}: no such setting.{hint}"
         if removed := re.search(r"Key '(\w+)' not in 'RunSettings'", text):
             return f"{removed.group(1)} cannot be removed."
     # Hydra's and OmegaConf's own messages, without their notes for developers.
@@ -140,7 +143,7 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     groups = _groups()
     if said := answer(key):
         return said
-    if key in settings.ON_DEMAND:
+    if key in settings.OF_EVALUATE:
         return str(settings.needs_evaluate(key))
     if key in groups:
         return f"{key}: its files are chosen by other groups. --cfg job shows the settings in force."

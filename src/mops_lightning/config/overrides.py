@@ -3,6 +3,8 @@
 from functools import cache
 from typing import TYPE_CHECKING
 
+from mops_lightning.config import settings
+
 if TYPE_CHECKING:
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.core.override_parser.types import Override
@@ -37,6 +39,12 @@ def path(argument: str) -> str:
     """Return the dotted place in the configuration that an override changes."""
     name, _, package = key(argument).partition("@")
     return package or name.replace("/", ".")
+
+
+def added(argument: str) -> str:
+    """Return an argument with a ``+`` before a setting that no file contains."""
+    missing = key(argument) in settings.ON_DEMAND and argument[0] not in "+~"
+    return f"+{readable(argument)}" if missing else argument
 
 
 def quote(text: str) -> str:

@@ -14,10 +14,7 @@ INPUTS = {
 }
 """Settings that name what must exist, with values that are no paths."""
 OUTPUTS = ("out", "cache", "dataset.cache")
-MISSING = {
-    "weights": "no file {}. Give a weights.pt, or weights=auto.",
-    "ckpt_path": "no checkpoint {}. Give a run's folder, a .ckpt file, or last.",
-}
+MISSING = {"ckpt_path": "no checkpoint {}. Give a run's folder, a .ckpt file, or last."}
 """Errors of inputs that nothing else checks before a run begins."""
 
 

@@ -1,5 +1,6 @@
 """A JSON schema of the configuration, for editors of YAML files."""
 
+import json
 import types
 from dataclasses import fields
 from pathlib import Path
@@ -134,7 +135,8 @@ def _typed(annotation: Any) -> Schema:
     if annotation in PLAIN:
         return {"type": PLAIN[annotation]}
     if origin in (Union, types.UnionType):
-        parts = [_typed(part) for part in inner]
+        # typing takes Union[int, float] for Union[float, int], whichever was written first.
+        parts = sorted((_typed(part) for part in inner), key=json.dumps)
         return {"anyOf": parts} if all(parts) else {}
     if origin is Literal:
         return {"enum": list(inner)}

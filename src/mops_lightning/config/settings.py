@@ -251,8 +251,16 @@ ON_DEMAND: dict[str, Setting] = {
         repeat=False,
         compare=False,
     ),
+    "models.path": Setting(
+        "folders with models of your own, searched before those of MOPS_MODELS",
+        Affects.NOTHING,
+        limits=Limits("a text", lambda x: isinstance(x, str)),
+    ),
 }
-"""Settings of ``evaluate=RUN`` that a configuration contains only where they are given."""
+"""Settings that a configuration contains only where the command line gives them."""
+
+OF_EVALUATE = ("task_nets",)
+"""Those of ``ON_DEMAND`` that count only with ``evaluate=RUN``."""
 
 
 def declared() -> dict[str, Setting]:
@@ -268,7 +276,7 @@ def of(path: str) -> Setting:
 @cache
 def _of(schema: type, path: str) -> Setting:
     top = {one.name: one.metadata["setting"] for one in fields(schema)}
-    found = {**ON_DEMAND, **top}.get(path.partition(".")[0], Setting())
+    found = ON_DEMAND.get(path) or {**ON_DEMAND, **top}.get(path.partition(".")[0], Setting())
     for inner, changes in INSIDE.items():
         if path == inner or path.startswith(f"{inner}."):
             # A run is evaluated with its groups as they were.

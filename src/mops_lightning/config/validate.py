@@ -27,8 +27,9 @@ def check(cfg: DictConfig) -> None:
             ``_target_`` that cannot be imported or does not take one of its arguments.
     """
     declared = settings.declared()
+    on_demand = {name.partition(".")[0] for name in settings.ON_DEMAND}
     for key in map(str, cfg):
-        if key not in declared and key not in settings.ON_DEMAND:
+        if key not in declared and key not in on_demand:
             hint = did_you_mean(key, [*declared, *settings.ON_DEMAND])
             raise UserError(migrate.answer(key) or f"{key}: no such setting.{hint}")
     for name, setting in declared.items():
@@ -38,6 +39,7 @@ def check(cfg: DictConfig) -> None:
             raise UserError(f"{name} cannot be removed. Choose another one with {name}=...")
         if setting.group or name in TABLES:
             _check_table(cfg.get(name), name)
+    _check_models(cfg.get("models"))
     if not isinstance(cfg.task.get("net"), DictConfig):
         raise UserError("task.net cannot be removed. Choose another one with task/net=NAME.")
     _check_limits(cfg)
@@ -91,6 +93,13 @@ def _check_table(value: Any, name: str) -> None:
             )
 
 
+def _check_models(node: Any) -> None:
+    _check_table(node, "models")
+    for key in node or ():
+        if f"models.{key!s}" not in settings.ON_DEMAND:
+            raise UserError(f"models.{key!s}: no such setting. Did you mean 'models.path'?")
+
+
 def _check_numbers(value: Any, path: str) -> None:
     """Refuse NaN, infinity and whole numbers beyond 64 bits, which no setting allows."""
     if isinstance(value, dict):
@@ -123,7 +132,7 @@ def _check_evaluation(cfg: DictConfig) -> None:
             f"evaluate: trains nothing, got learn={cfg.learn}. Leave learn out, or train "
             "without evaluate."
         )
-    for name in settings.ON_DEMAND:
+    for name in settings.OF_EVALUATE:
         if name in cfg and not (cfg.evaluate and cfg.learn == "nothing"):
             raise settings.needs_evaluate(name)
     if not cfg.evaluate and cfg.weights == "run":

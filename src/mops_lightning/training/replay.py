@@ -78,13 +78,7 @@ def command_line(arguments: list[str]) -> list[str]:
     behind = [a for i, a in enumerate(arguments) if i > places[0] and i not in places]
     given = {overrides.key(a) for a in typed}
     defaults = [a for a in own if overrides.key(a) not in given]
-    return [*map(_added, before), *defaults, *map(_added, behind)]
-
-
-def _added(argument: str) -> str:
-    """Return an argument with a ``+`` before a setting that is not in the configuration yet."""
-    missing = overrides.key(argument) in settings.ON_DEMAND and argument[0] not in "+~"
-    return f"+{overrides.readable(argument)}" if missing else argument
+    return [*map(overrides.added, before), *defaults, *map(overrides.added, behind)]
 
 
 def _chosen(argument: str) -> str | None:
