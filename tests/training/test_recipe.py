@@ -64,10 +64,38 @@ def test_recipe_paper_and_fast_are_valid_and_differ():
     assert Recipe(**fast) != Recipe()
 
 
+class NetSeenBy(PointNetVanilla):
+    """Notes how many points it is given, in training and in evaluation."""
+
+    def __init__(self) -> None:
+        super().__init__(3)
+        self.seen: dict[bool, set[int]] = {True: set(), False: set()}
+
+    def forward(self, points: torch.Tensor) -> torch.Tensor:
+        self.seen[self.training].add(points.shape[1])
+        return super().forward(points)
+
+
+def test_task_points_are_drawn_for_task_net_alone():
+    net, data = NetSeenBy(), small_dataset(points=POINTS)
+    module = Experiment(
+        Classification(net, 3),
+        learn="task",
+        make_optimizer=torch.optim.Adam,
+        recipe=Recipe(task_points=16),
+    )
+    quiet_trainer(1).fit(module, CloudLoader(data.train, 6), CloudLoader(data.test, 6))
+    assert net.seen == {True: {16}, False: {POINTS}}
+    sampler = trained(Recipe(task_points=16)).sampler
+    assert isinstance(sampler, SeenBy)
+    assert set(sampler.seen[True]) == {POINTS}
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
         ("train_points", 0),
+        ("task_points", 0),
         ("all_points_from", 1.5),
         ("straight_through", -0.1),
         ("ema_span", float("nan")),

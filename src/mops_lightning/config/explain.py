@@ -146,7 +146,7 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     if key in settings.OF_EVALUATE:
         return str(settings.needs_evaluate(key))
     if key in groups:
-        return f"{key}: its files are chosen by other groups. --cfg job shows the settings in force."
+        return f"{key}: its files are chosen by other groups. --cfg job shows what they set."
     if "/" in key or "@" in key:
         offered = [group for group in groups if _is_offered(group)]
         return f"{key}: no such group of choices.{did_you_mean(key, offered)}"

@@ -33,6 +33,7 @@ INSIDE: dict[str, dict[str, Any]] = {
     "augment.task.jitter": {"limits": STANDARD_DEVIATION},
     "augment.sampler.jitter": {"limits": STANDARD_DEVIATION},
     "recipe.train_points": {"limits": WHOLE_OR_NULL},
+    "recipe.task_points": {"limits": WHOLE_OR_NULL, "learn": None},
     "recipe.all_points_from": {"limits": SHARE_OR_NULL},
     "recipe.warm_start": {
         "limits": Limits("true, false or a weights file", lambda x: isinstance(x, bool | str))

@@ -58,13 +58,17 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         m=cfg.m,
         task_lr_scale=cfg.task_lr_scale,
         refine=cfg.refine,
-        recipe=_recipe(cfg) if sampler is not None and sampler.learned else None,
+        recipe=_recipe(cfg, sampler),
     )
 
 
-def _recipe(cfg: DictConfig) -> Recipe:
+def _recipe(cfg: DictConfig, sampler: Sampler | None) -> Recipe:
+    """Return what is in force in this run; the task net's training has a record of its own."""
     settings: Any = OmegaConf.to_container(cfg.recipe, resolve=True)
-    return Recipe(**settings)
+    task_points = settings.pop("task_points")
+    if sampler is None:
+        return Recipe(task_points=task_points)
+    return Recipe(**settings) if sampler.learned else Recipe()
 
 
 def _make_task(cfg: DictConfig, num_classes: int) -> Task:

@@ -25,6 +25,7 @@ class Recipe:
     Attributes:
         train_points: points of a cloud that a training step sees, drawn in every step, and at
             least twice the sampled ones; None: all. Validation and test always see all.
+        task_points: the same for the task net, trained alone, also before a sampler's training.
         all_points_from: share from which on training steps see all points; None: never.
         warm_start: whether the sampler's first layers start as copies of the task net's; or the
             weights file of a trained sampler, of any size, to start from.
@@ -40,6 +41,7 @@ class Recipe:
     """
 
     train_points: int | None = None
+    task_points: int | None = None
     all_points_from: float | None = None
     warm_start: bool | str = False
     distillation: float = 0.0
@@ -48,8 +50,10 @@ class Recipe:
 
     def __post_init__(self) -> None:
         """Check the attributes."""
-        if self.train_points is not None and self.train_points < 1:
-            raise UserError(f"train_points must be at least 1 or null, got {self.train_points}.")
+        for name in ("train_points", "task_points"):
+            points = getattr(self, name)
+            if points is not None and points < 1:
+                raise UserError(f"{name} must be at least 1 or null, got {points}.")
         for name in ("all_points_from", "straight_through", "ema_span"):
             share = getattr(self, name)
             if share is not None and not 0 <= share <= 1:
@@ -63,8 +67,11 @@ class Recipe:
         Args:
             progress: share of the training before this step.
             available: points per cloud.
-            largest: the largest number of points that this step samples.
+            largest: the largest number of points that this step samples; 0: the task net is
+                trained alone.
         """
+        if not largest:
+            return min(available, self.task_points or available)
         if self.train_points is None or reached(self.all_points_from, progress):
             return available
         return min(available, max(self.train_points, POINTS_PER_SAMPLE * largest))

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
@@ -51,7 +52,7 @@ def fit_and_test(job: Job, record: RunRecord, task_weights: Path | None) -> None
     _load_weights(job, record, task_weights)
     if job.trains:
         if job.experiment.recipe != Recipe():
-            record.notes["recipe"] = {"name": job.cfg.names.recipe, **asdict(job.experiment.recipe)}
+            record.notes["recipe"] = _recipe_notes(job)
         warm_start(job, record)
         with record.timed("fit"):
             _fit(job)
@@ -68,6 +69,13 @@ def fit_and_test(job: Job, record: RunRecord, task_weights: Path | None) -> None
         record.metrics = _test(job)
     if job.trainer.is_global_zero:
         _save(job, record)
+
+
+def _recipe_notes(job: Job) -> dict[str, Any]:
+    recipe = job.experiment.recipe
+    if job.experiment.sampler is None:
+        return {"task_points": recipe.task_points}
+    return {"name": job.cfg.names.recipe, **asdict(recipe)}
 
 
 def _load_weights(job: Job, record: RunRecord, task_weights: Path | None) -> None:

@@ -36,6 +36,9 @@ HARMLESS = (
 )
 """Warnings about what is intended."""
 
+LOGGER_FOLDERS = {"TensorBoardLogger": "tensorboard", "CSVLogger": "csv"}
+"""Where a logger writes below the run's folder."""
+
 
 def make_trainer(
     cfg: DictConfig, folder: Path, dataset: CloudDataset, experiment: Experiment
@@ -83,8 +86,11 @@ def make_trainer(
 
 def _logger(node: DictConfig, folder: Path) -> Any:
     """Build the logger, which writes into the run's folder itself unless it has a name."""
-    unnamed = {} if "name" in node else accepted(node, {"name": ""})
-    return build(node, "logger", save_dir=str(folder), **unnamed)
+    own = accepted(node, {"name": ""})
+    if below := LOGGER_FOLDERS.get(node["_target_"].rpartition(".")[2]):
+        own["version"] = below
+    unset = {name: value for name, value in own.items() if name not in node}
+    return build(node, "logger", save_dir=str(folder), **unset)
 
 
 def _silence_lightning() -> None:
