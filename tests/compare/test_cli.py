@@ -1,6 +1,4 @@
-import contextlib
 import csv
-import io
 import re
 
 import numpy as np
@@ -11,16 +9,11 @@ from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
+from tests.support.captured import captured
 
 
 def call(*arguments):
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            main([str(argument) for argument in arguments])
-        except SystemExit as stop:
-            return stop.code, out.getvalue(), err.getvalue()
-    return 0, out.getvalue(), err.getvalue()
+    return captured(main, arguments)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,16 @@
+"""A command's main function in this process."""
+
+import contextlib
+import io
+
+
+def captured(main, arguments):
+    """Exit status and what it printed."""
+    out, err = io.StringIO(), io.StringIO()
+    status = 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            status = stop.code
+    return status, out.getvalue(), err.getvalue()
