@@ -1,7 +1,9 @@
 import pytest
 import torch
 
-from mops_lightning.data.noise import noisy
+from mops_lightning.data.clouds import Clouds
+from mops_lightning.data.noise import noisy, noisy_clouds
+from mops_lightning.types import TruePairs
 
 
 def test_noisy_has_standard_deviation(rng):
@@ -19,3 +21,13 @@ def test_noisy_depends_on_position_and_scales(rng):
     torch.testing.assert_close(10 * small, large, atol=1e-5, rtol=1e-4)
     assert not torch.equal(small[0], small[1])
     assert torch.equal(noisy(points, 0.0), points)
+
+
+def test_noisy_clouds_of_pairs_differ(rng):
+    points, rest = torch.randn(4, 30, 3, generator=rng), torch.ones(4)
+    clouds = Clouds(points, rest, pairs=TruePairs(points, rest, rest, rest, rest))
+    added = noisy_clouds(clouds, 0.1)
+    torch.testing.assert_close(added.points, noisy(points, 0.1))
+    assert added.pairs is not None
+    assert (added.pairs.target - points).std() > 0.08
+    assert not torch.allclose(added.pairs.target, added.points, atol=0.05)

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -8,6 +9,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.training.factory import make_experiment
+from mops_lightning.types import TruePairs
 from tests.support.training import small_dataset
 
 BASELINE = "+baselines.submodular._target_=mops_lightning.samplers.submodular.SubmodularSampler"
@@ -26,6 +28,15 @@ def test_factory_net_without_point_features_raises():
     cfg = compose(["sampler=critical", "task=registration", "task/net=icp", "m=8"])
     with pytest.raises(UserError, match=r"net must have features of single points.*got ICP"):
         make_experiment(cfg, small_dataset(), {})
+
+
+def test_factory_task_without_use_for_pairs_raises():
+    data = small_dataset()
+    one = torch.ones(len(data.train.labels))
+    pairs = TruePairs(data.train.points, *(one for _ in range(4)))
+    data = replace(data, train=data.train._replace(pairs=pairs))
+    with pytest.raises(UserError, match="task=classification does not use the pairs"):
+        make_experiment(compose(["m=8"]), data, {})
 
 
 def test_factory_sampler_sees_weights_loaded_later(rng):

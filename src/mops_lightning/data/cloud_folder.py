@@ -13,13 +13,13 @@ from rich.console import Console
 from rich.progress import track
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
-from mops_lightning.data.crops import CROPS, Crop, random_crops
+from mops_lightning.data.crops import Crop, check_crop, random_crops
 from mops_lightning.data.file_splits import Box, class_of, split_by_folder, split_by_share
 from mops_lightning.data.formats.registry import READABLE, read
 from mops_lightning.data.hdf5 import choose_and_fingerprint
 from mops_lightning.data.mesh_sampling import mesh_root
 from mops_lightning.data.split_list import SPLITS, read_split_list
-from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.errors import UserError
 from mops_lightning.ops.points import normalize_unit_sphere
 from mops_lightning.seeding import derive_seed
 
@@ -80,7 +80,7 @@ def cloud_folder(
     listed = None
     if split_file:
         listed = dict(read_split_list(folder, Path(split_file).expanduser(), READABLE, False))
-    names = sorted(listed) if listed else _files(folder)
+    names = sorted(listed) if listed else cloud_files(folder)
     chosen = choose_classes(classes, sorted(set(map(class_of, names))))
     names = [name for name in names if class_of(name) in chosen]
     by_folder = split_by_folder(names) if listed is None else None
@@ -113,30 +113,30 @@ def cloud_folder(
 def _check(test_share: float, crop: str, crop_size: float | None, surface: int | None) -> None:
     if not 0 < test_share < 1:
         raise UserError(f"test_share must be between 0 and 1, got {test_share}.")
-    if crop not in CROPS:
-        raise UserError(f"crop: unknown {crop!r}.{did_you_mean(crop, CROPS)}")
-    if (crop == "cube") != (crop_size is not None):
-        raise UserError(
-            "crop_size is the side of the cubes of crop=cube: give both or neither, got "
-            f"crop={crop} and crop_size={crop_size}."
-        )
-    if crop_size is not None and not 0 < crop_size < float("inf"):
-        raise UserError(f"crop_size must be above 0 and finite, got {crop_size}.")
+    check_crop(crop, crop_size)
     if surface is not None and surface < 1:
         raise UserError(f"surface must be at least 1, got {surface}.")
 
 
-def _files(folder: Path) -> list[PurePosixPath]:
-    """Return the relative paths of the clouds and meshes in a folder and its subfolders."""
+def cloud_files(folder: Path, pattern: str = "*") -> list[PurePosixPath]:
+    """Return the relative paths of the clouds and meshes in a folder and its subfolders, sorted.
+
+    Args:
+        folder: the folder.
+        pattern: of the ends of the paths, as in ``velodyne/*.bin``.
+
+    Raises:
+        UserError: there is none.
+    """
     names = sorted(
         PurePosixPath(path.relative_to(folder).as_posix())
-        for path in folder.rglob("*")
+        for path in folder.rglob(pattern)
         if path.suffix.lower() in READABLE and path.is_file()
     )
     names = [name for name in names if not any(part.startswith(".") for part in name.parts)]
     if not names:
         raise UserError(
-            f"root: no cloud in {folder} or its subfolders. Looked for files that end in "
+            f"root: no cloud in {folder} or its subfolders. Looked for {pattern} ending in "
             f"{', '.join(READABLE)}."
         )
     return names

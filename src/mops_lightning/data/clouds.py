@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.types import TruePairs
 
 
 class Clouds(NamedTuple):
@@ -18,11 +19,22 @@ class Clouds(NamedTuple):
         labels: ``(S,)`` int64, positions in ``CloudDataset.class_names``.
         sources: ``(S,)`` int64, the same number for clouds that must be in the same split, such as
             the crops of a file; None: no two must.
+        pairs: S targets, if ``points`` are the sources of pairs with known motions; else None.
     """
 
     points: Tensor
     labels: Tensor
     sources: Tensor | None = None
+    pairs: TruePairs | None = None
+
+    def take(self, rows: Tensor) -> "Clouds":
+        """Return the clouds of the given rows, or of a mask, with all that belongs to them."""
+        return Clouds(
+            self.points[rows],
+            self.labels[rows],
+            None if self.sources is None else self.sources[rows],
+            None if self.pairs is None else self.pairs.take(rows),
+        )
 
 
 @dataclass(frozen=True)
@@ -81,4 +93,4 @@ def select_classes(clouds: Clouds, known: Sequence[str], chosen: Sequence[str]) 
         table[list(known).index(name)] = position
     labels = table[clouds.labels]
     keep = labels >= 0
-    return Clouds(clouds.points[keep], labels[keep])
+    return clouds.take(keep)._replace(labels=labels[keep])

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mops_lightning.data.formats.errors import BadCloudError
+from mops_lightning.errors import UserError, did_you_mean
 
 Cloud = NDArray[np.float64]
 Crop = Literal["nearest", "cube", "whole"]
@@ -44,13 +45,9 @@ def random_crops(
     Raises:
         BadCloudError: the cloud has fewer than ``n_points`` points, or no cube with as many.
     """
-    if len(points) < n_points:
-        raise BadCloudError(
-            f"{path} has {len(points)} points, fewer than n_points={n_points}. Lower n_points, or "
-            "leave the file out."
-        )
+    check_number(points, n_points, path)
     draw: Callable[[], Cloud] = {
-        "nearest": lambda: _nearest(points, n_points, rng),
+        "nearest": lambda: nearest(points, points[rng.integers(len(points))], n_points),
         "cube": lambda: _cube(points, n_points, crop_size or 0.0, rng),
         "whole": lambda: points[rng.choice(len(points), n_points, replace=False)],
     }[crop]
@@ -77,16 +74,50 @@ def _usable(draw: Callable[[], Cloud], n_points: int, side: float | None, path: 
     raise BadCloudError(f"{path}: the {n_points} points of a crop coincide. Clean the file.")
 
 
-def _nearest(points: Cloud, n_points: int, rng: np.random.Generator) -> Cloud:
-    centre = points[rng.integers(len(points))]
+def check_crop(crop: str, crop_size: float | None) -> None:
+    """Check how crops are to be drawn.
+
+    Raises:
+        UserError: the kind is unknown, or the size does not belong to it or is out of range.
+    """
+    if crop not in CROPS:
+        raise UserError(f"crop: unknown {crop!r}.{did_you_mean(crop, CROPS)}")
+    if (crop == "cube") != (crop_size is not None):
+        raise UserError(
+            "crop_size is the side of the cubes of crop=cube: give both or neither, got "
+            f"crop={crop} and crop_size={crop_size}."
+        )
+    if crop_size is not None and not 0 < crop_size < float("inf"):
+        raise UserError(f"crop_size must be above 0 and finite, got {crop_size}.")
+
+
+def check_number(points: Cloud, n_points: int, path: Path) -> None:
+    """Reject a cloud of fewer points than a crop has.
+
+    Raises:
+        BadCloudError: it has fewer.
+    """
+    if len(points) < n_points:
+        raise BadCloudError(
+            f"{path} has {len(points)} points, fewer than n_points={n_points}. Lower n_points, or "
+            "leave the file out."
+        )
+
+
+def nearest(points: Cloud, centre: Cloud, n_points: int) -> Cloud:
+    """Return the points ``(n_points, 3)`` nearest to a place ``(3,)``, in their order."""
     distance = np.square(points - centre).sum(1)
     return points[np.sort(np.argpartition(distance, n_points - 1)[:n_points])]
 
 
 def _cube(points: Cloud, n_points: int, side: float, rng: np.random.Generator) -> Cloud:
     """Return random points of a cube, or all of them if there are too few."""
-    centre = points[rng.integers(len(points))]
-    inside = np.flatnonzero((np.abs(points - centre) <= side / 2).all(1))
+    inside = in_cube(points, points[rng.integers(len(points))], side)
     if len(inside) < n_points:
         return points[inside]
     return points[rng.choice(inside, n_points, replace=False)]
+
+
+def in_cube(points: Cloud, centre: Cloud, side: float) -> NDArray[np.int64]:
+    """Return the rows of the points in a cube around a place ``(3,)``, ascending."""
+    return np.flatnonzero((np.abs(points - centre) <= side / 2).all(1))

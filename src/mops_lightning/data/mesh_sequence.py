@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.mesh_io import SUFFIXES
@@ -54,7 +54,7 @@ def mesh_sequence(
     rows: list[tuple[PurePosixPath, str]] = []
     for sequence in sorted(path for path in folder.iterdir() if path.is_dir()):
         frames = (path for path in sequence.iterdir() if path.suffix.lower() in SUFFIXES)
-        paths = sorted(frames, key=_by_time)
+        paths = sorted(frames, key=by_number)
         splits = _split_frames(sequence, len(paths), test_share, gap)
         names = [PurePosixPath(path.relative_to(folder).as_posix()) for path in paths]
         rows += [(name, split) for name, split in zip(names, splits, strict=True) if split]
@@ -79,7 +79,7 @@ def _split_frames(sequence: Path, frames: int, test_share: float, gap: int) -> l
     return ["train"] * n_train + [""] * gap + ["test"] * n_test
 
 
-def _by_time(path: Path) -> tuple[list[tuple[int, str]], str]:
+def by_number(path: PurePath) -> tuple[list[tuple[int, str]], str]:
     """Return a sort key that puts frame_9 before frame_10."""
     parts = re.split(r"(\d+)", path.stem)
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts], path.name

@@ -3,13 +3,22 @@
 import torch
 from torch import Tensor
 
+from mops_lightning.data.clouds import Clouds
 from mops_lightning.seeding import generator
 
-NOISE = 13
-"""Random stream of the noise."""
+NOISE, TARGET_NOISE = 13, 14
+"""Random streams of the noise."""
 
 
-def noisy(points: Tensor, noise: float) -> Tensor:
+def noisy_clouds(clouds: Clouds, noise: float) -> Clouds:
+    """Add noise to all clouds of a split, of pairs to both; see ``noisy``."""
+    pairs = clouds.pairs
+    if pairs is not None:
+        pairs = pairs._replace(target=noisy(pairs.target, noise, TARGET_NOISE))
+    return clouds._replace(points=noisy(clouds.points, noise), pairs=pairs)
+
+
+def noisy(points: Tensor, noise: float, stream: int = NOISE) -> Tensor:
     """Add Gaussian noise to every coordinate, without clipping.
 
     The noise of a cloud depends on its position in the split only, so that every method is tested
@@ -18,6 +27,7 @@ def noisy(points: Tensor, noise: float) -> Tensor:
     Args:
         points: ``(S, N, 3)`` clouds of a split.
         noise: standard deviation in units of the coordinates; 0.1 is 10 % in the paper.
+        stream: of the random numbers.
 
     Returns:
         ``(S, N, 3)``.
@@ -25,6 +35,6 @@ def noisy(points: Tensor, noise: float) -> Tensor:
     if not noise:
         return points
     drawn = [
-        torch.randn(points.shape[1:], generator=generator(NOISE, s)) for s in range(len(points))
+        torch.randn(points.shape[1:], generator=generator(stream, s)) for s in range(len(points))
     ]
     return points + noise * torch.stack(drawn)

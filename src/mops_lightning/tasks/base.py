@@ -36,6 +36,9 @@ class Task(nn.Module):
     clouds_are_batches: bool = True
     """Whether ``make_batch`` leaves clouds as they are, so that their predictions can be kept."""
 
+    takes_pairs: bool = False
+    """Whether the task uses the pairs of data that are pairs with known motions."""
+
     net_takes: tuple[str, ...] = ("points",)
     """Names of the arguments of the net's ``forward``."""
 

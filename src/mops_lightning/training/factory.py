@@ -4,11 +4,13 @@ from typing import Any
 
 import lightning as L
 import torch
+from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from mops_lightning.config.build import accepted, build
 from mops_lightning.data.clouds import CloudDataset
+from mops_lightning.errors import UserError
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
@@ -28,6 +30,12 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     Raises:
         UserError: a setting that its part or the data do not allow.
     """
+    takes_pairs = getattr(get_object(cfg.task._target_), "takes_pairs", False)
+    if dataset.train.pairs is not None and not takes_pairs:
+        raise UserError(
+            f"task={cfg.names.task} does not use the pairs of dataset={cfg.names.dataset}. Add "
+            "task=registration, or read the scans with dataset=clouds."
+        )
     task = _make_task(cfg, len(dataset.class_names))
     # A seed of its own: the sampler's initial weights must not depend on the task net's size.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)

@@ -53,10 +53,7 @@ def split(clouds: Clouds, fraction: float, seed: int) -> tuple[Clouds, Clouds]:
         The clouds to train on and the held-out clouds, each in their original order.
     """
     chosen = held_out_mask(clouds, fraction, seed)
-    return (
-        Clouds(clouds.points[~chosen], clouds.labels[~chosen]),
-        Clouds(clouds.points[chosen], clouds.labels[chosen]),
-    )
+    return clouds.take(~chosen), clouds.take(chosen)
 
 
 def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str]]:

@@ -10,7 +10,7 @@ from mops_lightning.config import distributed
 from mops_lightning.config.build import build
 from mops_lightning.config.validate import check
 from mops_lightning.data.clouds import CloudDataset
-from mops_lightning.data.noise import noisy
+from mops_lightning.data.noise import noisy_clouds
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import closing_lines
@@ -92,9 +92,9 @@ def _load_data(cfg: DictConfig) -> CloudDataset:
     points = dataset.train.points.shape[1]
     if cfg.m > points:
         raise UserError(f"m must be at most the {points} points of a cloud, got m={cfg.m}.")
-    test_points = noisy(dataset.test.points, cfg.test_noise_std)
-    if not torch.isfinite(test_points).all():
+    test = noisy_clouds(dataset.test, cfg.test_noise_std)
+    if not torch.isfinite(test.points).all():
         raise UserError(
             f"test_noise_std={cfg.test_noise_std} makes coordinates infinite. Lower it."
         )
-    return replace(dataset, test=dataset.test._replace(points=test_points))
+    return replace(dataset, test=test)
