@@ -35,6 +35,14 @@ def test_matrix_figure_shows_ideal_matrix_as_diagonal():
     np.testing.assert_array_equal(np.asarray(right), np.eye(4))
 
 
+def test_matrix_figure_of_many_points_keeps_every_large_entry():
+    dense = torch.zeros(1000, 4)
+    dense[torch.tensor([500, 3, 999, 7]), torch.arange(4)] = 1.0
+    drawn = matrix_figure(dense, dense.T @ dense, "chair").axes[0].images[0]
+    assert np.asarray(drawn.get_array()).max(0).tolist() == [1.0] * 4
+    assert list(drawn.get_extent()) == [-0.5, 3.5, 999.5, -0.5]
+
+
 def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, rng):
     points = F.normalize(torch.randn(8192, 3, generator=rng), dim=1)
     far = points[points[:, 0] < -0.3][:100]

@@ -105,7 +105,8 @@ def _add(chosen: argparse.Namespace, run: Path, name: str) -> list[str]:
     record = model_file.read_card(path)["record"]
     if record["config"]["learn"] != "task" and "task_weights" not in record["files"]:
         lines.append(f"Its task net is no model: evaluate={name} also needs weights=FILE.")
-    if names.available().get(name) != path:
+    found = names.available().get(name)
+    if found is None or not found.samefile(path):
         lines.append(f"To find it by name, set {names.VARIABLE}={folder}.")
     return lines
 

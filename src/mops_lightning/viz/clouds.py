@@ -1,11 +1,13 @@
 """Figures of sampled clouds and of the sampling matrix."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
+from torch.nn.functional import adaptive_max_pool1d
 
 from mops_lightning.viz.figures import cloud_axes, new_figure
 
@@ -17,6 +19,8 @@ COLOURS = {
 }
 """RGB, 0 to 255. Blue, red and orange as in the paper; green for index samplers."""
 INPUT_COLOUR = (190, 190, 190)
+MATRIX_ROWS = 256
+"""Most rows of a drawn matrix: single points of more would not be visible."""
 LARGE_MARKER_SAMPLES = 256
 """Above this number of samples, markers shrink."""
 
@@ -78,17 +82,21 @@ def matrix_figure(dense: Tensor, gram: Tensor, title: str) -> Figure:
 
     Args:
         dense: ``(N, M)``. Rows are sorted by their strongest column, so that an ideal matrix
-            shows as a diagonal.
+            shows as a diagonal. Of more than ``MATRIX_ROWS`` rows, the largest entries of
+            consecutive ones are drawn.
         gram: ``(M, M)``.
         title: the cloud and sampler of the matrix.
     """
     values = dense.detach().cpu()
     order = values.argmax(1).mul(2.0).sub(values.amax(1)).argsort()
+    rows = adaptive_max_pool1d(values[order].T, min(MATRIX_ROWS, len(values))).T
+    extent = (-0.5, values.shape[1] - 0.5, len(values) - 0.5, -0.5)
+    scale: dict[str, Any] = {"vmin": 0, "vmax": 1, "cmap": "viridis"}
     figure = new_figure(9, 4.4)
-    left, right = figure.subplots(1, 2)
+    left, right = figure.subplots(1, 2, gridspec_kw={"wspace": 0.08})
     images = [
-        left.imshow(values[order].numpy(), aspect="auto", vmin=0, vmax=1, cmap="viridis"),
-        right.imshow(gram.detach().cpu().numpy(), vmin=0, vmax=1, cmap="viridis"),
+        left.imshow(rows.numpy(), aspect="auto", interpolation="nearest", extent=extent, **scale),
+        right.imshow(gram.detach().cpu().numpy(), **scale),
     ]
     left.set(title="S (points sorted by strongest column)", xlabel="column", ylabel="point")
     right.set(title="SᵀS", xlabel="column", ylabel="column")

@@ -1,6 +1,7 @@
 """Export of learned samplers as plain layers: torch.export (.pt2) and ONNX (.onnx)."""
 
 import logging
+import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -158,16 +159,19 @@ def _to_onnx(program: Any, path: Path) -> None:
         raise _missing() from None
     # It warns that torchvision, which is not needed, is missing.
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
-    torch.onnx.export(
-        program,
-        (),
-        path,
-        input_names=["points"],
-        output_names=["generated"],
-        dynamo=True,
-        external_data=False,
-        verbose=False,
-    )
+    with warnings.catch_warnings():
+        # torch 2.13 uses a class name that it has deprecated.
+        warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.*", FutureWarning)
+        torch.onnx.export(
+            program,
+            (),
+            path,
+            input_names=["points"],
+            output_names=["generated"],
+            dynamo=True,
+            external_data=False,
+            verbose=False,
+        )
 
 
 def _onnx_session(path: Path) -> Callable[[Tensor], Tensor]:
