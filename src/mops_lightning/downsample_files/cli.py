@@ -111,11 +111,12 @@ def _run(chosen: argparse.Namespace) -> int:
     is_folder = chosen.source.is_dir()
     if not is_folder and found[0][1].exists() and not chosen.overwrite:
         raise UserError(f"{found[0][1]} exists. Give another OUT, or --overwrite.")
+    # Of a run that was killed.
+    remove_temporary(chosen.target if is_folder else found[0][1].parent, below=is_folder)
     with _engine(chosen) as engine:
         if not is_folder:
             process_file(*found[0], settings, engine)
             return 0
-        remove_temporary(chosen.target)  # of a run that was killed
         workers = 1 if chosen.cluster else chosen.workers
         failed = process_folder(found, settings, chosen.target, workers, chosen.overwrite, engine)
         return 1 if failed else 0
