@@ -64,20 +64,20 @@ def test_registration_loss_weights_scale_terms():
         Motion(quaternions(1), torch.ones(50, 3)),
     )
     cloud = torch.zeros(50, 4, 3).double()
-    one, two = (
-        quaternion_loss(other, true, cloud, cloud, translation_weight=w)["translation"]
-        for w in (1.0, 2.0)
+    one, none, two = (
+        quaternion_loss(other, true, cloud, cloud, *w)["translation"] for w in ((), (0.0,), (2.0,))
     )
     torch.testing.assert_close(one, torch.tensor(3.0).sqrt())
     torch.testing.assert_close(two, 2 * one)
-    one, two = (
-        frobenius_chamfer_loss(
-            other._replace(translation=other.translation.double()), true, cloud, cloud, w
-        )["chamfer"]
-        for w in (1.0, 2.0)
+    assert none == 0
+    other = other._replace(translation=other.translation.double())
+    one, none, two = (
+        frobenius_chamfer_loss(other, true, cloud, cloud, *w)["chamfer"]
+        for w in ((), (0.0,), (2.0,))
     )
     torch.testing.assert_close(one, torch.tensor(6.0).double())
     torch.testing.assert_close(two, 2 * one)
+    assert none == 0
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,8 @@ def test_simplification_loss_equals_double_loop(coverage, per_point, rng):
     value = float(simplification_loss(points, samples, coverage, per_point))
     expected = plain_simplification_loss(points, samples, coverage, per_point)
     assert value == pytest.approx(expected, rel=1e-5)
+    default = plain_simplification_loss(points, samples, 1.0, 0.0)
+    assert float(simplification_loss(points, samples)) == pytest.approx(default, rel=1e-5)
 
 
 def test_simplification_loss_gradcheck(rng):

@@ -1,7 +1,13 @@
 import pytest
+import torch
+from torchmetrics.classification import MulticlassAccuracy
 
 from mops_lightning.metrics import classification, reconstruction, registration, sampled_set
-from mops_lightning.metrics.base import TableMetric
+from mops_lightning.metrics.base import TableMetric, collection
+from mops_lightning.metrics.info import MetricInfo
+from mops_lightning.metrics.reconstruction import Distances
+from mops_lightning.metrics.registration import RotationError, TranslationError
+from mops_lightning.ops.rigid import Motion
 
 METRICS = [
     value
@@ -11,12 +17,92 @@ METRICS = [
 ]
 
 
+# What tables and records contain: name, title, 0.5 as text, whether higher is better, place in the
+# closing table, name for full clouds.
+SHOWN = """
+accuracy: accuracy (%), 50.00, True, 1, None
+mean_class_accuracy: mean class accuracy (%), 50.00, True, 2, None
+chamfer: chamfer, 0.5, False, 3, None
+emd: emd, 0.5, False, 4, None
+nre_cd: nre cd, 0.5, False, 1, chamfer
+nre_emd: nre emd, 0.5, False, 2, emd
+nre_cd_of_means: nre cd of means, 0.5, False, None, chamfer
+nre_emd_of_means: nre emd of means, 0.5, False, None, emd
+rotation_error_deg: rotation error (°), 0.50, False, 1, None
+rotation_error_p90_deg: rotation error p90 (°), 0.50, False, 2, None
+rotation_error_doubled_deg: rotation error doubled (°), 0.50, False, None, None
+rotation_recall_5deg: rotation recall 5deg (%), 50.00, True, 3, None
+rotation_recall_10deg: rotation recall 10deg (%), 50.00, True, 4, None
+translation_error: translation error, 0.5, False, 5, None
+subset_distance: subset distance, 0.5, False, None, None
+unique_points: unique points, 0.5, True, None, None
+nonzero_percent: non-zero entries of S (%), 0.50, False, None, None
+orthogonality_error: orthogonality error, 0.5, False, None, None
+"""
+
+
+def shown(metric):
+    info = MetricInfo.of(metric.name, metric)
+    return (
+        f"{info.name}: {info.title}, {info.format(0.5)}, {info.higher_is_better}, "
+        f"{info.summary_order}, {info.full_cloud_metric}"
+    )
+
+
+def test_metrics_declare_what_tables_show():
+    assert [shown(metric) for metric in METRICS] == SHOWN.strip().splitlines()
+
+
 @pytest.mark.parametrize("metric", METRICS)
-def test_metric_declares_direction_and_documents_itself(metric):
-    assert isinstance(metric.higher_is_better, bool)
+def test_metric_documents_itself(metric):
     assert "__doc__" in vars(metric)
 
 
-def test_metric_names_are_unique():
-    names = [metric.name for metric in METRICS]
-    assert len(set(names)) == len(names) > 0
+def batch(metric):
+    """What a metric is updated with."""
+    turned = torch.nn.functional.normalize(torch.tensor([[1.0, 0.02, 0, 0]]))
+    still = torch.eye(4)[:1]
+    return {
+        "classification": (torch.eye(3), torch.tensor([0, 1, 1])),
+        "reconstruction": tuple(Distances(torch.rand(3), torch.rand(3)) for _ in range(2)),
+        "registration": (Motion(turned, torch.rand(1, 3)), Motion(still, torch.rand(1, 3))),
+        "sampled_set": (torch.rand(3),),
+    }[metric.__module__.rpartition(".")[2]]
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_metric_of_two_processes_with_equal_data_equals_that_of_one(metric):
+    classes = (3,) if issubclass(metric, MulticlassAccuracy) else ()
+    alone = metric(*classes)
+    shared = metric(
+        *classes,
+        dist_sync_fn=lambda state, group=None: [state, state],
+        distributed_available_fn=lambda: True,
+    )
+    given = batch(metric)
+    for one in (alone, shared):
+        one.update(*given)
+    torch.testing.assert_close(shared.compute(), alone.compute())
+    assert alone.compute() > 0
+
+
+def test_collection_metrics_equal_after_first_batch_stay_apart():
+    turned = torch.tensor([[0.0, 1.0, 0.0, 0.0]])
+    still, half_turn = (Motion(q, torch.zeros(1, 3)) for q in (torch.eye(4)[:1], turned))
+    metrics = collection(RotationError(), TranslationError(), TwiceTheError())
+    for predicted in (still, half_turn):
+        metrics.update(predicted, still)
+    found = {name: value.item() for name, value in metrics.compute().items()}
+    assert found == pytest.approx(
+        {"rotation_error_deg": 90, "translation_error": 0, "twice": 180}, abs=1e-3
+    )
+
+
+class TwiceTheError(TranslationError):
+    """Has the state of another metric until the first error."""
+
+    name = "twice"
+
+    def update(self, predicted, true):
+        self.total += 2 * RotationError.of(predicted, true).sum()
+        self.pairs += len(predicted.quaternion)

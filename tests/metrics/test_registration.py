@@ -8,6 +8,8 @@ from mops_lightning.metrics.registration import (
     RotationError,
     RotationErrorP90,
     RotationRecall,
+    RotationRecall5,
+    RotationRecall10,
     TranslationError,
 )
 from mops_lightning.ops.rigid import Motion
@@ -81,6 +83,14 @@ def test_recall_includes_limit():
     exact = motions(Rotation.from_euler("x", [[0.0], [90.0]], degrees=True))
     still = motions(Rotation.identity(2))
     assert recall(0.0)(exact, still) == 0.5
+
+
+def test_recalls_have_limits_of_5_and_10_degrees():
+    angles = [[4.9], [5.1], [9.9], [10.1]]
+    turned = motions(Rotation.from_euler("x", angles, degrees=True))
+    still = motions(Rotation.identity(4))
+    assert RotationRecall5()(turned, still) == 1 / 4
+    assert RotationRecall10()(turned, still) == 3 / 4
 
 
 def test_reset_clears_state():

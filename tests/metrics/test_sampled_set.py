@@ -62,6 +62,23 @@ def test_matrix_metrics_match_ideal_and_uniform_matrix(clouds):
         torch.testing.assert_close(got, torch.full((3,), want), atol=1e-5, rtol=1e-5)
 
 
+def test_nonzero_percent_counts_each_column(clouds):
+    # Column j of S has j + 1 equal entries.
+    columns = 50 * torch.ones(5, 40).tril()
+    matrix = SamplingMatrix(columns, torch.eye(40).expand(3, 40, 40), 1.0)
+    output = SampleOutput(clouds[:, :5], None, {}, matrix)
+    found = SET_METRICS["matrix/nonzero_percent"].measure(clouds, output, (5, 2)) or {}
+    assert found[5].tolist() == pytest.approx([100 * (1 + 2 + 3 + 4 + 5) / 5 / 40] * 3)
+    assert found[2].tolist() == pytest.approx([100 * (1 + 2) / 2 / 40] * 3)
+
+
+def test_set_metric_of_nan_is_nan():
+    for metric in SET_METRICS.values():
+        mean = metric()
+        mean.update(torch.tensor([1.0, float("nan")]))
+        assert mean.compute().isnan()
+
+
 def test_matrix_metrics_without_matrix_are_none(clouds):
     output = SampleOutput(clouds[:, :5], None, {})
     assert values("matrix/nonzero_percent", clouds, output) is None

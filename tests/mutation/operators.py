@@ -70,7 +70,10 @@ def mutants(source: str) -> Iterator[Mutant]:
     """Yield every fault of a module, one at a time."""
     tree = ast.parse(source)
     for number, place in enumerate(places(tree)):
-        for variant in range(len(list(variants(place)))):
+        same = ast.dump(place.node)
+        for variant, node in enumerate(variants(place)):
+            if ast.dump(node) == same:  # equal elements swapped
+                continue
             changed = copy.deepcopy(tree)
             there = places(changed)[number]
             before = _header(there.statement)

@@ -51,15 +51,22 @@ class Runner:
         if forked(lambda: self._try(unchanged, session.items), limit) != 0:
             raise pytest.UsageError("the tests fail when nothing is changed")
         for mutant in self.mutants:
-            items = self._ordered(session.items, mutant.function)
+            items = self._chosen(session.items, mutant)
             if forked(partial(self._try, mutant, items), limit) == 0:
                 self.report(mutant)
         return True
 
-    def _ordered(self, items: Sequence[pytest.Item], function: str) -> list[pytest.Item]:
-        """Return the tests that call a function, quick ones first, then all others."""
-        calling = self.calls[function]
-        return sorted(items, key=lambda i: (i.nodeid not in calling, self.seconds[i.nodeid]))
+    def _chosen(self, items: Sequence[pytest.Item], mutant: Mutant) -> list[pytest.Item]:
+        """Return the tests that call the function with the fault, quick ones first.
+
+        A constant or a default argument may be noticed without a call, so all others follow. So
+        they do where no call is seen, which may be in another process.
+        """
+        calling = self.calls[mutant.function]
+        some = (
+            items if mutant.is_value or not calling else [i for i in items if i.nodeid in calling]
+        )
+        return sorted(some, key=lambda i: (i.nodeid not in calling, self.seconds[i.nodeid]))
 
     def _measure(self, items: Sequence[pytest.Item]) -> None:
         """Note how long each test takes, and which functions of the module it calls."""

@@ -9,6 +9,7 @@ from tests.mutation.operators import mutants
 SOURCE = '''
 """A module."""
 LIMIT = 3
+EQUAL = 64, 64
 
 
 def first(points, m=2):
@@ -24,6 +25,8 @@ def test_mutants_cover_operators_constants_and_calls():
     returned = "return (points[:m].mean(), {'m': m})"
     assert changes == {
         "LIMIT = 3  ->  LIMIT = 4",
+        "EQUAL = (64, 64)  ->  EQUAL = (65, 64)",
+        "EQUAL = (64, 64)  ->  EQUAL = (64, 65)",
         "m=2):  ->  m=3):",
         "if m < 1:  ->  if m <= 1:",
         "if m < 1:  ->  if m >= 1:",

@@ -37,6 +37,13 @@ def test_facility_location_is_nested(rng):
     assert torch.equal(facility_location(features, 4)[0], facility_location(features, 9)[0][:, :4])
 
 
+def test_facility_location_of_one_point():
+    with torch.device("meta"):  # the default device is not used
+        chosen, given = facility_location(torch.ones(2, 1, 6, device="cpu"), 1)
+    assert chosen.tolist() == [[0], [0]]
+    assert given.tolist() == [1, 1]
+
+
 def test_facility_location_without_gain_chooses_one():
     chosen, given = facility_location(torch.zeros(2, 40, 6), 5)
     assert chosen.shape == (2, 5)

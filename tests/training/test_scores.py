@@ -1,9 +1,12 @@
 import pytest
 import torch
+from torch import nn
 
 from mops_lightning.metrics.base import collection
 from mops_lightning.metrics.classification import Accuracy
-from mops_lightning.training.scores import Scores
+from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.tasks.classification import Classification
+from mops_lightning.training.scores import Scores, TransferScores
 from mops_lightning.types import SampleOutput, TaskOutput
 
 
@@ -16,6 +19,11 @@ def test_scores_loss_uneven_batches_is_mean_over_clouds():
     made.update_loss("test/loss/x", torch.tensor(1.0), 8)
     metric = made.update_loss("test/loss/x", torch.tensor(4.0), 4)
     assert float(metric.compute()) == pytest.approx((8 * 1.0 + 4 * 4.0) / 12)
+
+
+def test_scores_loss_of_nan_is_nan():
+    metric = scores().update_loss("test/loss/x", torch.tensor(torch.nan), 2)
+    assert metric.compute().isnan()
 
 
 def test_scores_readouts_are_kept_apart():
@@ -41,3 +49,21 @@ def test_scores_sets_nested_measure_first_points(rng):
     found = scores(("m8/", "m4/")).update_sets(points, outputs, True, {8: "m8/", 4: "m4/"})
     assert float(found["m4/generated/subset_distance"].compute()) == 0
     assert float(found["m8/generated/subset_distance"].compute()) > 1
+
+
+def test_scores_sets_not_nested_measure_each_size(rng):
+    points = torch.randn(2, 20, 3, generator=rng)
+    outputs = {
+        8: SampleOutput(points[:, :8] + 10, None, {}),
+        4: SampleOutput(points[:, :4], None, {}),
+    }
+    found = scores(("m8/", "m4/")).update_sets(points, outputs, False, {8: "m8/", 4: "m4/"})
+    assert float(found["m4/generated/subset_distance"].compute()) == 0
+    assert float(found["m8/generated/subset_distance"].compute()) > 1
+
+
+def test_transfer_nets_are_frozen():
+    made = TransferScores({"net": Classification(PointNetVanilla(3), 3)}, ("generated",))
+    for scored in (made, made.train(), nn.Sequential(made).train()[0]):
+        assert not any(module.training for module in scored.modules())
+        assert not any(parameter.requires_grad for parameter in scored.parameters())

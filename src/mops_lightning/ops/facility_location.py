@@ -43,7 +43,7 @@ def facility_location(features: Tensor, m: int) -> tuple[Tensor, Tensor]:
                 break
         chosen[active, step] = best
         covered[active] = torch.maximum(covered[active], features[active, best])
-        bounds[active, best] = -1.0  # never chosen again
+        bounds[active, best] = 0.0  # it has nothing more to add
     return chosen, given
 
 
@@ -69,8 +69,7 @@ def _best(features: Tensor, covered: Tensor, bounds: Tensor, active: Tensor) -> 
             (rows == (first := bounds[cloud].argmax(1))[:, None]).any(1), rows[:, -1], first
         )
         gains = (features[cloud[:, None], rows] - covered[cloud][:, None]).relu_().sum(2)
-        chosen_before = bounds[cloud[:, None], rows] < 0
-        bounds[cloud[:, None], rows] = gains.masked_fill_(chosen_before, -1.0)
+        bounds[cloud[:, None], rows] = gains
         top = bounds[cloud].argmax(1)
         done = (rows == top[:, None]).any(1)
         best[pending[done]] = top[done]
