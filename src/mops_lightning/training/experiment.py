@@ -195,11 +195,12 @@ class Experiment(L.LightningModule):
         with restrict_autocast_to_pointwise(self.device.type):
             taught = self._full_prediction(batch) if self.distills else None
             available = batch.points.shape[1]
-            batch = draw_points(batch, self.recipe.points_at(self._progress, available, max(sizes)))
-            outputs = self._sample(batch.points, sizes)
+            n = self.recipe.points_at(self._progress, available, max(sizes))
+            seen = draw_points(batch, n).points
+            outputs = self._sample(seen, sizes)
             terms: dict[str, list[Tensor]] = defaultdict(list)
             for m in sizes:
-                for name, value in self._losses(batch, outputs[m], taught).items():
+                for name, value in self._losses(batch, seen, outputs[m], taught).items():
                     terms[name].append(value)
             mean = self.sampler is not None and self.sampler.size_reduction == "mean"
             share = 1 / len(sizes) if mean else 1.0
@@ -219,12 +220,17 @@ class Experiment(L.LightningModule):
         with torch.no_grad():
             return self.task.predict(batch, batch.points)
 
-    def _losses(self, batch: Batch, sampled: SampleOutput, taught: Any) -> dict[str, Tensor]:
-        """Return the loss terms at one size: the task's, distillation and the sampler's own."""
+    def _losses(
+        self, batch: Batch, seen: Tensor, sampled: SampleOutput, taught: Any
+    ) -> dict[str, Tensor]:
+        """Return the loss terms at one size: the task's, distillation and the sampler's own.
+
+        The task's target is the whole batch, also where the sampler has seen a part of its points.
+        """
         soft = sampled.soft_projected
         inputs = [sampled.points if soft is None else soft]
         if self.recipe.sees_matched(self._progress):
-            inputs.append(straight_through(sampled, batch.points))
+            inputs.append(straight_through(sampled, seen))
         terms: dict[str, Tensor] = {}
         for points in inputs:
             result = self.task.step(batch, points)
