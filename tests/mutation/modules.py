@@ -32,7 +32,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "samplers/fps": ("samplers/test_fps", "samplers/test_contract"),
     "samplers/random": ("samplers/test_random", "samplers/test_contract"),
     "samplers/voxel": ("samplers/test_voxel", "samplers/test_contract"),
-    "samplers/poisson": ("samplers/test_poisson", "samplers/test_contract"),
+    "samplers/poisson": ("samplers/test_poisson", "ops/test_compiled", "samplers/test_contract"),
     "samplers/ordering": ("samplers/test_ordering", "samplers/test_random"),
     "samplers/fused": ("samplers/test_fused", "samplers/test_mops"),
     "samplers/streaming": ("samplers/test_streaming",),
@@ -45,6 +45,6 @@ TESTS: dict[str, tuple[str, ...]] = {
     "ops/assignment": ("ops/test_emd",),
     "ops/rigid": ("ops/test_rigid",),
     "ops/fps": ("ops/test_fps", "ops/test_fps_cpu", "ops/test_readout"),
-    "ops/nearest": ("ops/test_nearest",),
+    "ops/nearest": ("ops/test_nearest", "ops/test_compiled"),
 }
 """By path below ``src/mops_lightning``, in the order in which ``make mutants`` takes them."""

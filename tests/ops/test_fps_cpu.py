@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from mops_lightning.ops import fps, fps_cpu
+from mops_lightning.ops import compiled, fps, fps_cpu
 from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample
 
 KINDS = ["sphere", "normal", "grid", "line", "copies", "one point", "offset", "tiny", "huge"]
@@ -31,14 +31,21 @@ def cloud(kind, n, dtype, rng):
     return points
 
 
-@pytest.fixture(params=["groups", "table"])
+@pytest.fixture(params=["groups", "table", "compiled"])
 def both(request, monkeypatch):
-    """Return a function that calls another with groups or a table, and with neither."""
+    """Return a function that calls another in one of the fast forms, and in the plain one."""
+    if request.param == "compiled":
+        pytest.importorskip("numba", reason="needs mops-lightning[fast]")
+        monkeypatch.setattr(compiled, "FARTHEST_LEAF", 40)  # several levels
+    module = compiled.kernels()
 
     def call(function, *arguments, **options):
         results = []
         for fast in (True, False):
-            groups, table = (fast and request.param == variant for variant in ("groups", "table"))
+            groups, table, numba = (
+                fast and request.param == variant for variant in ("groups", "table", "compiled")
+            )
+            monkeypatch.setattr(compiled, "kernels", lambda on=numba: module if on else None)
             monkeypatch.setattr(fps, "GROUPS_MIN_POINTS", 1 if groups else 10**9)
             monkeypatch.setattr(fps, "GROUPS_MIN_STEPS", 1)
             monkeypatch.setattr(fps, "TABLE_MAX_POINTS", 10**9 if table else 0)
@@ -87,7 +94,24 @@ def test_sample_half_precision_equals_exhaustive_search(rng, both):
     assert torch.equal(fast, plain)
 
 
+def test_sample_non_contiguous_equals_exhaustive_search(rng, both):
+    points = torch.rand(3, 600, 2, generator=rng).transpose(0, 2)[:, ::2]
+    start = torch.tensor([5, 0])
+    fast, plain = both(farthest_point_sample, points, 200, start=start)
+    assert torch.equal(fast, plain)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_sample_in_threads_equals_exhaustive_search(threads, rng, both, monkeypatch):
+    monkeypatch.setattr(compiled, "THREADS_MIN_WORK", 1)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    points = torch.rand(5, 300, 3, generator=rng)
+    fast, plain = both(farthest_point_sample, points, 100)
+    assert torch.equal(fast, plain)
+
+
 def test_sample_large_cloud_equals_exhaustive_search(rng, monkeypatch):
+    monkeypatch.setattr(compiled, "kernels", lambda: None)
     points, m = torch.rand(1, fps.GROUPS_MIN_POINTS, 3, generator=rng), fps.GROUPS_MIN_STEPS
     taken = farthest_point_sample(points, m, start=5)
     monkeypatch.setattr(fps, "GROUPS_MIN_STEPS", m + 1)
@@ -105,6 +129,7 @@ def test_sample_uses_table_for_few_small_clouds(clouds, n, m, tables, rng, monke
         sizes.append(len(points))
         return fps_cpu.farthest_by_distance_table(points, distances, steps)
 
+    monkeypatch.setattr(compiled, "kernels", lambda: None)
     monkeypatch.setattr(fps, "farthest_by_distance_table", counted)
     points = torch.rand(clouds, n, 3, generator=rng)
     taken = farthest_point_sample(points, m)

@@ -5,6 +5,7 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
+from mops_lightning.ops import compiled
 from mops_lightning.ops.extreme import blocked_argextreme
 from mops_lightning.ops.fps_cpu import (
     farthest_by_distance_table,
@@ -56,9 +57,14 @@ def farthest_point_sample(
         raise UserError(f"m must be between 1 and the number of points N={n}, got {m}.")
     if start is None and generator is not None:
         start = torch.randint(n, (clouds,), generator=generator, device=generator.device)
-    first = torch.as_tensor(0 if start is None else start, device=points.device).expand(clouds)
-    if bool(((first < 0) | (first >= n)).any()):
+    start = 0 if start is None else start
+    outside = (start < 0) | (start >= n)
+    if outside if isinstance(outside, bool) else bool(outside.any()):
         raise UserError(f"start must be between 0 and N-1={n - 1}, got {start}.")
+    fast = compiled.farthest(points, m, start)
+    if fast is not None:
+        return fast
+    first = torch.as_tensor(start, device=points.device).expand(clouds)
     dtype = distance_dtype(points)
     distances = points.new_full((clouds, n), torch.finfo(dtype).max, dtype=dtype)
     return _farthest(points, distances.scatter_(1, first[:, None], torch.inf), m)
@@ -83,9 +89,12 @@ def farthest_point_fill(points: Tensor, indices: Tensor, given: Tensor) -> Tenso
         return indices
     slot = torch.arange(wanted, device=indices.device)
     chosen = torch.where(slot < given[:, None], indices, indices[:, :1])
-    distances, _ = nearest(points.detach(), gather_points(points.detach(), chosen))
+    distinct = chosen[:, : int(given.max())]
+    distances, _ = nearest(points.detach(), gather_points(points.detach(), distinct))
     distances = distances.to(distance_dtype(points)).scatter_(1, chosen, -1.0)
-    added = _farthest(points, distances, missing)
+    added = compiled.farthest(points, missing, distances=distances)
+    if added is None:
+        added = _farthest(points, distances, missing)
     # Clouds that lack fewer points write the surplus beyond column M, which is then cut off.
     filled = torch.cat([chosen, added], 1)
     return filled.scatter_(1, given[:, None] + slot[:missing], added)[:, :wanted]

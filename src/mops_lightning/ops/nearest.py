@@ -12,11 +12,15 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mops_lightning.errors import UserError
+from mops_lightning.ops import compiled
 from mops_lightning.ops.extreme import blocked_argextreme
 from mops_lightning.ops.points import distance_dtype, gather_points, to_planes
 
 BLOCK = {"cpu": 2**19, "other": 2**24}
 """Distances in memory at a time: a CPU keeps these in its cache; 64 MiB on other devices."""
+
+COMPILED_MIN_PAIRS, COMPILED_MAX_CHANNELS = 2**16, 4
+"""Minimum number of pairs per cloud, and maximum number of channels, for compiled code."""
 
 KD_TREE_MIN_PAIRS = 2**24
 """Minimum number of query-point pairs for using a KD-tree."""
@@ -131,6 +135,11 @@ def _check_shapes(queries: Tensor, points: Tensor) -> None:
 
 def _search(queries: Tensor, points: Tensor, k: int) -> Tensor:
     """Return the ``(B, M, k)`` nearest rows; planes of coordinates keep every step vectorised."""
+    large = queries.shape[1] * points.shape[1] >= COMPILED_MIN_PAIRS
+    if k == 1 and large and points.shape[2] <= COMPILED_MAX_CHANNELS:
+        found = compiled.nearest(queries, points)
+        if found is not None:
+            return found[..., None]
     dtype = distance_dtype(points)
     rows = to_planes(queries.to(dtype))[..., None]  # (C, B, M, 1)
     columns = to_planes(points.to(dtype), padding=torch.inf)[:, :, None]  # (C, B, 1, N)

@@ -1,0 +1,349 @@
+"""Farthest and nearest points in loops that numba compiles; ``ops.compiled`` calls them.
+
+Points are sorted into a tree of boxes, and far boxes are skipped, as in QuickFPS (Han et al., IEEE
+TCAD 2023). The distance to a box is never above the distance to a point in it, because both are
+computed by the same operations in the same order, each of which is monotonic.
+
+Arrays have one dimension, which halves the time of compilation. Coordinates of C channels and N
+points are ``(C·N,)``, one channel after the other. All functions are in this file, because numba
+does not notice that a cached function calls one that has changed in another file.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numba import extending, njit
+
+jit: Any = partial(njit, nogil=True, error_model="numpy")
+"""Compile; never with ``fastmath``, which could change distances."""
+
+intrinsic: Any = extending.intrinsic
+
+
+def cached(function: Any) -> Any:
+    """Compile, and keep the compiled form in a file next to this one or in the user's cache."""
+    try:
+        return jit(function, cache=True)
+    except RuntimeError:  # neither folder can be written to
+        return jit(function)
+
+
+FANOUT, PROBES = 8, 8
+"""Maximum number of children of a node, and sampled coordinates per child for where to split."""
+
+
+@intrinsic
+def _fused(typing, a, b, c):
+    """Return a·b + c, rounded once."""
+
+    def generate(context, builder, signature, arguments):
+        return builder.fma(*arguments)
+
+    return a(a, a, a), generate
+
+
+@jit
+def _all_finite(values):
+    """Return whether all values are finite."""
+    wrong = 0
+    for i in range(len(values)):
+        wrong += values[i] - values[i] != 0  # NaN
+    return wrong == 0
+
+
+@jit
+def _write_distances(planes, size, start, stop, point, fused, out):
+    """Write the squared distances from a point to the rows from start to stop."""
+    for axis in range(len(point)):
+        line, at = planes[axis * size + start : axis * size + stop], point[axis]
+        if axis == 0:
+            for i in range(len(line)):
+                d = line[i] - at
+                out[i] = d * d
+        else:
+            for i in range(len(line)):
+                d = line[i] - at
+                out[i] = _fused(d, d, out[i]) if fused else d * d + out[i]
+
+
+@jit
+def _distance_to_box(boxes, node, point, fused):
+    """Return the squared distance from a point to the box of a node."""
+    channels = len(point)
+    first = 2 * channels * node
+    total = zero = point.dtype.type(0)
+    for axis in range(channels):
+        d = max(boxes[first + axis] - point[axis], point[axis] - boxes[first + channels + axis])
+        d = max(d, zero)
+        total = _fused(d, d, total) if fused else d * d + total
+    return total
+
+
+@jit
+def _build(planes, channels, leaf):
+    """Sort points into a tree.
+
+    Rows keep their order within a leaf, so that its first row is the lowest one.
+
+    Args:
+        planes: ``(C·N,)``, sorted in place.
+        channels: C.
+        leaf: maximum number of points of a leaf, unless all of them coincide.
+
+    Returns:
+        The original rows ``(N,)``, nodes ``(4·K,)`` with the first row, the end of the rows, the
+        first child and the number of children (0 for a leaf), and boxes ``(2·C·K,)`` with the
+        lowest and the highest coordinates.
+    """
+    size = len(planes) // channels
+    rows = np.empty(size, np.int64)
+    for i in range(size):
+        rows[i] = i
+    # A node has at least two children or none, hence fewer than 2·N nodes. Unused memory of large
+    # arrays is never touched.
+    nodes = np.empty(8 * size, np.int64)
+    boxes = np.empty(4 * channels * size, planes.dtype)
+    child = np.empty(size, np.uint8)
+    moved, moved_rows = np.empty(size, planes.dtype), np.empty(size, np.int64)
+    counts, places = np.empty(FANOUT, np.int64), np.empty(FANOUT, np.int64)
+    nodes[0], nodes[1] = 0, size
+    node, known = 0, 1
+    while node < known:
+        nodes[4 * node + 3] = 0
+        start, stop = nodes[4 * node], nodes[4 * node + 1]
+        axis = _write_box(planes, channels, start, stop, boxes, node)
+        box = 2 * channels * node + axis
+        low, high = boxes[box], boxes[box + channels]
+        if stop - start > leaf and low < high:
+            line = planes[axis * size + start : axis * size + stop]
+            _split(line, low, high, child, counts)
+            nodes[4 * node + 2] = known
+            for k in range(FANOUT):
+                if counts[k]:
+                    nodes[4 * known] = start
+                    start += counts[k]
+                    nodes[4 * known + 1] = start
+                    known += 1
+            nodes[4 * node + 3] = known - nodes[4 * node + 2]
+            start = nodes[4 * node]
+            for c in range(channels):
+                _move(planes[c * size + start : c * size + stop], child, counts, places, moved)
+            _move(rows[start:stop], child, counts, places, moved_rows)
+        node += 1
+    return rows, nodes[: 4 * known], boxes
+
+
+@jit
+def _write_box(planes, channels, start, stop, boxes, node):
+    """Write the box of a node and return its longest axis."""
+    size = len(planes) // channels
+    longest, length = 0, planes.dtype.type(0)
+    for axis in range(channels):
+        line = planes[axis * size + start : axis * size + stop]
+        low = high = line[0]
+        for i in range(len(line)):
+            low, high = min(low, line[i]), max(high, line[i])
+        boxes[2 * channels * node + axis] = low
+        boxes[2 * channels * node + channels + axis] = high
+        if high - low > length:
+            longest, length = axis, high - low
+    return longest
+
+
+@jit
+def _split(line, low, high, child, counts):
+    """Write the number of every point's child and count the points of every child."""
+    samples = np.empty(PROBES * FANOUT - 1, line.dtype)
+    for i in range(len(samples)):
+        value = line[(2 * i + 1) * len(line) // (2 * len(samples))]
+        j = i
+        while j > 0 and samples[j - 1] > value:
+            samples[j] = samples[j - 1]
+            j -= 1
+        samples[j] = value
+    middle = low / 2 + high / 2
+    if not low <= middle < high:
+        middle = low
+    for i in range(len(line)):
+        child[i] = 0
+    for k in range(FANOUT - 1):  # the first cut is below the highest coordinate
+        cut = samples[PROBES * (k + 1) - 1] if samples[PROBES - 1] < high else middle
+        for i in range(len(line)):
+            child[i] += line[i] > cut
+    for k in range(FANOUT):
+        counts[k] = 0
+    for i in range(len(line)):
+        counts[child[i]] += 1
+
+
+@jit
+def _move(line, child, counts, places, moved):
+    """Sort values by the number of the child."""
+    begin = 0
+    for k in range(FANOUT):
+        places[k] = begin
+        begin += counts[k]
+    for i in range(len(line)):
+        moved[places[child[i]]] = line[i]
+        places[child[i]] += 1
+    for i in range(len(line)):
+        line[i] = moved[i]
+
+
+@jit
+def _lower(bits, new):
+    """Lower distances to new ones and return the place of the first of the largest."""
+    # The bits of floats ≥ 0, read as integers, have the same order, and numba vectorises the
+    # maximum of integers only.
+    top = min(bits[0], new[0])
+    for i in range(len(bits)):
+        bits[i] = min(bits[i], new[i])
+        top = max(top, bits[i])
+    return _place(bits, top)
+
+
+@jit
+def _place(bits, wanted):
+    """Return the first place of a value that occurs."""
+    start, found = 0, 0
+    while not found:
+        part = bits[start : start + 64]
+        for i in range(len(part)):
+            found += part[i] == wanted
+        start += 0 if found else 64
+    while bits[start] != wanted:
+        start += 1
+    return start
+
+
+@cached
+def farthest(planes, distances, steps, channels, leaf, fused):
+    """Repeatedly choose the point with the largest distance and update the distances.
+
+    Args:
+        planes: ``(C·N,)`` coordinates, sorted in place.
+        distances: ``(N,)`` initial squared distances, their bits read as integers; a negative
+            number marks points that are never chosen.
+        steps: number of points to choose, at most the number of points that are not chosen.
+        channels: C.
+        leaf: maximum number of points of a leaf.
+        fused: whether distances are computed by fused multiply-add.
+
+    Returns:
+        ``(steps,)`` rows, the lowest row in case of ties; none if a coordinate is not finite.
+    """
+    size = len(distances)
+    if not _all_finite(planes):
+        return np.empty(0, np.int64)
+    rows, nodes, boxes = _build(planes, channels, leaf)
+    known = len(nodes) // 4
+    left, new = np.empty(size, planes.dtype), np.empty(size, planes.dtype)
+    bits, new_bits = left.view(distances.dtype), new.view(distances.dtype)
+    for i in range(size):
+        bits[i] = new_bits[i] = distances[rows[i]]
+    peaks = np.empty(known, np.int64)  # the place of the farthest point of every node
+    for node in range(known - 1, -1, -1):
+        if nodes[4 * node + 3]:
+            _choose_child(nodes, peaks, left, rows, node)
+        else:
+            start, stop = nodes[4 * node], nodes[4 * node + 1]
+            peaks[node] = start + _lower(bits[start:stop], new_bits[start:stop])
+    chosen, point = np.empty(steps, np.int64), np.empty(channels, planes.dtype)
+    stack = np.empty(known + FANOUT, np.int64)
+    for step in range(steps):
+        place = peaks[0]
+        chosen[step] = rows[place]
+        left[place] = -1
+        for axis in range(channels):
+            point[axis] = planes[axis * size + place]
+        stack[0], depth = 0, 1
+        while depth:
+            depth -= 1
+            node = stack[depth]
+            if node < 0:  # all children are up to date
+                _choose_child(nodes, peaks, left, rows, ~node)
+            elif nodes[4 * node + 3]:
+                stack[depth] = ~node
+                depth += 1
+                for k in range(nodes[4 * node + 2], nodes[4 * node + 2] + nodes[4 * node + 3]):
+                    near = _distance_to_box(boxes, k, point, fused) < left[peaks[k]]
+                    if near or nodes[4 * k] <= place < nodes[4 * k + 1]:
+                        stack[depth] = k
+                        depth += 1
+            else:
+                start, stop = nodes[4 * node], nodes[4 * node + 1]
+                _write_distances(planes, size, start, stop, point, fused, new)
+                peaks[node] = start + _lower(bits[start:stop], new_bits)
+    return chosen
+
+
+@jit
+def _choose_child(nodes, peaks, left, rows, node):
+    """Take over the farthest point among those of the children."""
+    first = nodes[4 * node + 2]
+    best = peaks[first]
+    for k in range(first + 1, first + nodes[4 * node + 3]):
+        other = peaks[k]
+        if left[other] > left[best] or (left[other] == left[best] and rows[other] < rows[best]):
+            best = other
+    peaks[node] = best
+
+
+@cached
+def nearest(planes, queries, scratch, channels, leaf, fused):
+    """Find the nearest point for every query.
+
+    Args:
+        planes: ``(C·N,)`` coordinates, sorted in place.
+        queries: ``(M·C,)`` coordinates, one query after the other.
+        scratch: ``(N,)`` integers of the same width, overwritten.
+        channels: C.
+        leaf: maximum number of points of a leaf.
+        fused: whether distances are computed by fused multiply-add.
+
+    Returns:
+        ``(M,)`` rows, the lowest row in case of ties; none if a coordinate is not finite.
+    """
+    size = len(planes) // channels
+    if not (_all_finite(planes) and _all_finite(queries)):
+        return np.empty(0, np.int64)
+    rows, nodes, boxes = _build(planes, channels, leaf)
+    known = len(nodes) // 4
+    found = np.empty(len(queries) // channels, np.int64)
+    distances, point = scratch.view(planes.dtype), np.empty(channels, planes.dtype)
+    bounds, stack = np.empty(known + FANOUT, planes.dtype), np.empty(known + FANOUT, np.int64)
+    for query in range(len(found)):
+        for axis in range(channels):
+            point[axis] = queries[query * channels + axis]
+        best, row = planes.dtype.type(np.inf), np.int64(size)
+        stack[0], bounds[0], depth = 0, 0, 1
+        while depth:
+            depth -= 1
+            node = stack[depth]
+            if bounds[depth] > best:
+                continue
+            if nodes[4 * node + 3]:
+                bottom = depth
+                for k in range(nodes[4 * node + 2], nodes[4 * node + 2] + nodes[4 * node + 3]):
+                    bound = _distance_to_box(boxes, k, point, fused)
+                    if bound <= best:  # the nearest child is visited first
+                        place = depth
+                        while place > bottom and bounds[place - 1] < bound:
+                            bounds[place], stack[place] = bounds[place - 1], stack[place - 1]
+                            place -= 1
+                        bounds[place], stack[place] = bound, k
+                        depth += 1
+            else:
+                start, stop = nodes[4 * node], nodes[4 * node + 1]
+                _write_distances(planes, size, start, stop, point, fused, distances)
+                low = scratch[0]
+                for i in range(stop - start):
+                    low = min(low, scratch[i])
+                i = _place(scratch[: stop - start], low)
+                if distances[i] < best or (distances[i] == best and rows[start + i] < row):
+                    best, row = distances[i], rows[start + i]
+        found[query] = row
+    return found
