@@ -1,3 +1,6 @@
+import math
+from itertools import chain
+
 import pytest
 import torch
 
@@ -76,6 +79,19 @@ def test_augmentation_jitter_is_clipped(rng):
     assert wide.std().item() == pytest.approx(0.01, rel=0.02)
 
 
+def test_augmentation_equals_written_out_formulas():
+    points = clouds(300).points
+    rng = torch.Generator().manual_seed(3)
+    got = Augmentation(rotate_up=True, jitter=0.04)(points, rng)
+    rng.manual_seed(3)
+    angles = torch.rand(300, generator=rng) * 2 * math.pi
+    noise = 0.04 * torch.randn(points.shape, generator=rng)
+    x, y, z = points.unbind(2)
+    cos, sin = angles.cos()[:, None], angles.sin()[:, None]
+    turned = torch.stack([x * cos - z * sin, y, x * sin + z * cos], 2)
+    torch.testing.assert_close(got, turned + noise.clamp(-0.05, 0.05))
+
+
 def test_augmentation_default_is_identity(rng):
     points = clouds().points
     assert torch.equal(Augmentation()(points, rng), points)
@@ -99,3 +115,60 @@ def test_loader_pairs_belong_to_their_rows():
     CloudLoader(data, 4, augment=Augmentation())
     with pytest.raises(UserError, match="augment: changes one cloud of a pair"):
         CloudLoader(data, 4, augment=Augmentation(jitter=0.01))
+
+
+@pytest.mark.parametrize("shuffle", [False, True])
+def test_loader_processes_share_every_cloud_once(shuffle):
+    whole = CloudLoader(clouds(12), 6, shuffle, seed=5)
+    parts = [CloudLoader(clouds(12), 6, shuffle, seed=5, part=(rank, 3)) for rank in range(3)]
+    shares = [labels(part) for part in parts]
+    assert [[len(batch) for batch in share] for share in shares] == [[2, 2]] * 3
+    if shuffle:  # each batch is shared
+        together = [list(chain(*batches)) for batches in zip(*shares, strict=True)]
+        assert together == labels(whole)
+    else:  # the split is shared
+        assert list(chain(*chain(*shares))) == list(range(12))
+
+
+def test_loader_uneven_shares_without_shuffle_differ_by_one_cloud():
+    shares = [labels(CloudLoader(clouds(11), 4, part=(rank, 3))) for rank in range(3)]
+    assert [sum(len(batch) for batch in share) for share in shares] == [4, 4, 3]
+    assert [len(share) for share in shares] == [3, 3, 3]
+    assert list(chain(*chain(*shares))) == list(range(11))
+
+
+def test_loader_position_counts_batches_and_epochs():
+    loader = CloudLoader(clouds(), 4, shuffle=True)
+    positions = [
+        (state["epoch"], state["position"]) for _ in loader for state in [loader.state_dict()]
+    ]
+    assert positions == [(0, 1), (0, 2), (1, 0)]
+    loader.set_epoch(3)
+    assert loader.state_dict() == {"epoch": 3, "position": 0}
+    loader.load_state_dict({"epoch": 3, "position": 2})
+    loader.set_epoch(3)
+    assert len(labels(loader)) == 1
+
+
+def drawn(loader):
+    """The number that the task draws for each cloud, by label."""
+    return {label: number for batch in loader for label, number in batch}
+
+
+@pytest.mark.parametrize("shuffle", [False, True])
+def test_loader_task_draws_by_cloud_and_in_training_by_epoch(shuffle):
+    def make_batch(batch, generators):
+        numbers = [float(torch.rand((), generator=one)) for one in generators()]
+        return list(zip(batch.labels.tolist(), numbers, strict=True))
+
+    def loader(batch_size=4, seed=5):
+        return CloudLoader(clouds(), batch_size, shuffle, make_batch=make_batch, seed=seed)
+
+    first = loader()
+    epochs = [drawn(first), drawn(first)]
+    assert len(set(epochs[0].values())) == 10
+    assert (epochs[0] == epochs[1]) != shuffle
+    assert drawn(loader(batch_size=3)) == epochs[0]
+    assert drawn(loader(seed=6)) != epochs[0]
+    if not shuffle:
+        assert loader().batch_of(torch.tensor([7, 2])) == [(row, epochs[0][row]) for row in (7, 2)]

@@ -33,7 +33,9 @@ def survivors(module: str, chosen: Sequence[Mutant]) -> int:
         found += 1
         print(f"  {module}.py:{mutant.line} {mutant.change}", flush=True)
 
-    files = [f"tests/{file}.py" for file in TESTS[module]]
+    tests = [name.rstrip("]").partition("[") for name in TESTS[module]]
+    files = [f"tests/{file}.py" for file, _, _ in tests]
+    parts = [f"(not {Path(file).name} or {word})" for file, _, word in tests if word]
     # Pytest's plugins are imported already when the second module begins.
     options = [
         "-q",
@@ -42,6 +44,7 @@ def survivors(module: str, chosen: Sequence[Mutant]) -> int:
         "no:cacheprovider",
         "-W",
         "ignore::pytest.PytestAssertRewriteWarning",
+        *(["-k", " and ".join(parts)] if parts else []),
     ]
     if status := pytest.main([*options, *files], plugins=[Runner(module, chosen, report)]):
         raise SystemExit(f"{module}: pytest ended with {status}.")

@@ -63,10 +63,9 @@ class Runner:
         they do where no call is seen, which may be in another process.
         """
         calling = self.calls[mutant.function]
-        some = (
-            items if mutant.is_value or not calling else [i for i in items if i.nodeid in calling]
-        )
-        return sorted(some, key=lambda i: (i.nodeid not in calling, self.seconds[i.nodeid]))
+        if calling and not mutant.is_value:
+            items = [item for item in items if item.nodeid in calling]
+        return sorted(items, key=lambda i: (i.nodeid not in calling, self.seconds[i.nodeid]))
 
     def _measure(self, items: Sequence[pytest.Item]) -> None:
         """Note how long each test takes, and which functions of the module it calls."""

@@ -191,6 +191,7 @@ def test_other_size_needs_flexible_sampler(make, clouds):
         return
     for m in (1, M - 3, M):
         assert sampler(clouds, m).points.shape == (B, m, 3)
+        assert sampler.sample(clouds, m).points.shape == (B, m, 3)
         torch.testing.assert_close(sampler(clouds, m).points, make(m)(clouds).points)
 
 

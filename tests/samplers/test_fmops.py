@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -46,8 +48,8 @@ def test_fmops_sizes_share_one_forward_pass(rng):
         torch.testing.assert_close(output.losses["subset"], expected)
 
 
-def drawn(number, **settings):
-    net = small(512, **settings)
+def drawn(number, m_max=512, **settings):
+    net = small(m_max, **settings)
     torch.manual_seed(1)
     return [net.training_sizes() for _ in range(number)]
 
@@ -56,12 +58,15 @@ def test_training_sizes_have_documented_distribution():
     uniform = torch.tensor(drawn(4000, size_sampling="uniform")).flatten().double()
     assert (uniform.min(), uniform.max()) == (1, 512)
     assert uniform.mean() == pytest.approx(256.5, rel=0.03)
-    log = torch.tensor(drawn(4000, size_sampling="log_uniform")).flatten()
+    log = torch.tensor(drawn(4000, size_sampling="log_uniform"))
+    assert log.shape == (4000, 1)
     assert log.min() == 1
     assert 500 <= log.max() <= 512
     # floor(513^u) is m with the probability log((m + 1) / m) / log 513.
     assert (log == 1).double().mean() == pytest.approx(0.1111, abs=0.02)
     assert (log <= 22).double().mean() == pytest.approx(0.5025, abs=0.03)
+    few = torch.tensor(drawn(4000, 3, size_sampling="log_uniform"))
+    assert (few == 3).double().mean() == pytest.approx(math.log(4 / 3, 4), abs=0.02)
     nested = drawn(300, num_sizes=4)
     assert all(list(sizes) == sorted(set(sizes)) for sizes in nested)
     assert all(1 <= sizes[0] <= 4 and 107 <= sizes[-1] <= 512 for sizes in nested)

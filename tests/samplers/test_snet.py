@@ -46,14 +46,14 @@ def plain_snet(net, points):
         hidden = (hidden - norm.running_mean) * scale + norm.bias
         if number < len(linears) - 1:
             hidden = hidden.clamp(min=0)
-        if number == 1:  # the last pointwise layer
+        if number == 2:  # the last pointwise layer
             hidden = hidden.max(1).values
     return hidden.reshape(len(points), -1, 3)
 
 
 def test_snet_equals_written_out_formulas(rng):
     torch.manual_seed(0)
-    net = SNet(6, feature_channels=(8, 10), head_channels=(12, 9)).double().train()
+    net = SNet(6, feature_channels=(8, 11, 10), head_channels=(12, 9, 7)).double().train()
     points = torch.randn(4, 20, 3, generator=rng, dtype=torch.float64)
     for _ in range(3):  # so that the running statistics differ from their initial values
         net(points)

@@ -1,6 +1,19 @@
+from dataclasses import replace
+
 import torch
 
-from mops_lightning.training.loaders import clouds_to_draw, held_out_mask, split
+from mops_lightning.config.compose import compose
+from mops_lightning.data.pairs import Pairs
+from mops_lightning.losses.registration import quaternion_loss
+from mops_lightning.nets.icp import ICP
+from mops_lightning.tasks.registration import Registration
+from mops_lightning.training.loaders import (
+    augmentation,
+    clouds_to_draw,
+    held_out_mask,
+    score_loader,
+    split,
+)
 from tests.support.training import small_dataset
 
 
@@ -46,3 +59,34 @@ def test_split_holds_out_whole_sources():
     mask = held_out_mask(clouds, 0.4, seed=5)
     assert mask.view(5, 4).sum(1).sort().values.tolist() == [0, 0, 0, 4, 4]
     assert len(split(clouds, 0.4, seed=5)[1].points) == 8
+
+
+def test_clouds_to_draw_leaves_out_classes_without_test_clouds():
+    dataset = small_dataset()
+    test = dataset.test.take(dataset.test.labels != 0)
+    chosen, names = clouds_to_draw(replace(dataset, test=test), 3)
+    assert names == ["tall", "round"]
+    assert test.labels[chosen].tolist() == [1, 2]
+
+
+def test_score_loader_repeats_its_pairs_in_every_epoch():
+    clouds = small_dataset().test
+    task = Registration(ICP(), Pairs(test_seed=3), quaternion_loss)
+    first = score_loader(clouds, 4, task)
+    epochs = [[batch.points for batch in first] for _ in range(2)]
+    assert [len(points) for points in epochs[0]] == [8, 8, 4]  # sources and targets
+    for one, again in zip(*epochs, strict=True):
+        assert torch.equal(one, again)
+    shares = [list(score_loader(clouds, 4, task, (rank, 2))) for rank in range(2)]
+    assert [sum(batch.num_clouds for batch in share) for share in shares] == [5, 5]
+    other = score_loader(clouds, 4, Registration(ICP(), Pairs(test_seed=4), quaternion_loss))
+    assert not torch.equal(next(iter(other)).points, epochs[0][0])
+
+
+def test_augmentation_of_joint_training_is_that_of_the_sampler():
+    changed = ["augment.task.jitter=0.01", "augment.sampler.jitter=0.02"]
+    found = {
+        learn: augmentation(compose([*changed, f"learn={learn}"])).jitter
+        for learn in ("task", "sampler", "joint")
+    }
+    assert found == {"task": 0.01, "sampler": 0.02, "joint": 0.02}

@@ -112,6 +112,30 @@ def test_recipe_value_out_of_range_raises(name, value):
         check(compose([f"recipe.{name}={value}"]))
 
 
+def test_recipe_default_is_that_of_the_publication():
+    assert Recipe() == Recipe(None, None, None, False, 0.0, None, None)
+
+
+def test_recipe_accepts_limits():
+    for share in (0.0, 1.0):
+        Recipe(all_points_from=share, straight_through=share, ema_span=share)
+    Recipe(train_points=1, task_points=1)
+
+
+def test_shares_of_the_training_include_their_first_step():
+    recipe = Recipe(train_points=64, all_points_from=0.5, straight_through=0.25)
+    assert [recipe.points_at(progress, 1024, 8) for progress in (0.49, 0.5)] == [64, 1024]
+    assert [recipe.sees_matched(progress) for progress in (0.24, 0.25)] == [False, True]
+    assert not Recipe().sees_matched(1.0)
+
+
+def test_points_at_of_task_net_alone_are_task_points():
+    recipe = Recipe(train_points=64, task_points=128)
+    assert recipe.points_at(0, 1024, 0) == 128
+    assert recipe.points_at(0, 100, 0) == 100
+    assert Recipe(train_points=64).points_at(0, 1024, 0) == 1024
+
+
 def test_training_sees_drawn_points_then_all_and_validation_always_all():
     module = trained(Recipe(train_points=20, all_points_from=0.5))
     assert isinstance(module.sampler, SeenBy)

@@ -67,5 +67,5 @@ class FMOPSNet(MOPSNet):
         parts = self.num_sizes if self.size_sampling == "nested" else 1
         exponents = (torch.arange(parts) + torch.rand(parts)).double() / parts
         # floor((m_max + 1)^u) ranges from 1 to m_max, with probabilities ∝ log(1 + 1/m).
-        sizes = ((self.m + 1) ** exponents).floor().long().clamp(1, self.m)
+        sizes = ((self.m + 1) ** exponents).long().clamp(1, self.m)
         return tuple(sizes.unique().tolist())
