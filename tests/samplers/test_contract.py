@@ -78,6 +78,8 @@ LIMITS: list[tuple[type[Sampler], dict[str, Any]]] = [
     (ProgressiveSNet, {"min_size": 1}),
 ]
 """The smallest and largest allowed arguments."""
+NOT_FLEXIBLE = (GumbelSampler, MOPSNet, SNet, SampleNet)
+FLEXIBLE_NOT_NESTED = (VoxelSampler, PoissonSampler)
 SEEDED = ["random", "fps", "poisson"]
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 B, N, M = 3, 60, 8
@@ -152,6 +154,21 @@ def test_constructor_has_documented_defaults(sampler):
     arguments = signature(sampler.__init__).parameters.values()
     found = {a.name: a.default for a in arguments if a.default is not Parameter.empty}
     assert found == DEFAULTS[sampler]
+
+
+@pytest.mark.parametrize("sampler", DEFAULTS)
+def test_sampler_declares_sizes(sampler):
+    assert sampler.flexible == (sampler not in NOT_FLEXIBLE)
+    assert sampler.nested == (sampler not in (*NOT_FLEXIBLE, *FLEXIBLE_NOT_NESTED))
+
+
+def test_nested_samples_are_first_points_of_larger_ones(make, clouds):
+    sampler = make()
+    if sampler.nested:
+        whole = sampler(clouds).points
+        for m, output in sampler.sample_sizes(clouds, (M, 1, M - 3)).items():
+            torch.testing.assert_close(output.points, whole[:, :m])
+            torch.testing.assert_close(sampler(clouds, m).points, whole[:, :m])
 
 
 @pytest.mark.parametrize(("sampler", "arguments"), LIMITS)
