@@ -73,7 +73,7 @@ class Quiet(SimpleHTTPRequestHandler):
         """Print nothing."""
 
 
-@pytest.mark.parametrize("name", ["index", "gallery", "reference"])
+@pytest.mark.parametrize("name", ["index", "gallery", "reference", "notebooks/quickstart"])
 def test_page_opens_without_errors_and_with_its_pictures(address, opened, name):
     page, errors, requests = opened(f"{address}/{name}.html")
     assert page.locator("h1").first.is_visible()

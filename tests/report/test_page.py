@@ -24,9 +24,11 @@ def names(page):
     return [row[0].splitlines()[0] for row in cells(page)]
 
 
-@pytest.fixture
-def reported(tmp_path, rng):
-    """A folder of records, two with clouds, and its report."""
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory):
+    """The report of a folder of records, two with clouds."""
+    tmp_path = tmp_path_factory.mktemp("reported")
+    rng = torch.Generator().manual_seed(0)
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3, "test/full/accuracy": 0.9})
     put(tmp_path, "fps", 8, {"test/sampled/accuracy": 0.4})
     put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.8, "test/matched/accuracy": 0.77})
@@ -77,6 +79,25 @@ def test_page_clouds_can_be_selected(reported, opened):
     assert page.locator("#view").screenshot() != drawn, "the canvas must show the points"
     assert errors == []
     assert {url.split(":")[0] for url in requests} <= {"file", "data", "blob"}
+
+
+def test_page_is_dark_where_the_browser_is(reported, opened):
+    page, errors, _ = opened(f"file://{reported}")
+    page.wait_for_selector("#view canvas")
+
+    def brightness(name, part="body"):
+        found = page.locator(part).first.evaluate(f"one => getComputedStyle(one).{name}")
+        return sum(map(int, found.removeprefix("rgb(").removesuffix(")").split(",")))
+
+    legend = "#view .legendtext"
+    assert brightness("backgroundColor") > 700 > 200 > brightness("color")
+    assert brightness("fill", legend) < 200
+    page.emulate_media(color_scheme="dark")
+    assert brightness("backgroundColor") < 200 < 500 < brightness("color")
+    page.wait_for_function(
+        f"getComputedStyle(document.querySelector('{legend}')).fill.startsWith('rgb(2')"
+    )
+    assert errors == []
 
 
 def test_page_planes_have_table_and_plot(tmp_path, opened):
