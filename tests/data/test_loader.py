@@ -7,6 +7,7 @@ import torch
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
+from mops_lightning.seeding import generator
 from mops_lightning.types import TruePairs
 
 
@@ -166,7 +167,12 @@ def test_loader_task_draws_by_cloud_and_in_training_by_epoch(shuffle):
 
     first = loader()
     epochs = [drawn(first), drawn(first)]
-    assert len(set(epochs[0].values())) == 10
+    # Test pairs stay the same for ever, training pairs for a seed and an epoch.
+    streams = [(12, 5, epoch) if shuffle else (11, 5) for epoch in range(2)]
+    assert epochs == [
+        {row: float(torch.rand((), generator=generator(*stream, row))) for row in range(10)}
+        for stream in streams
+    ]
     assert (epochs[0] == epochs[1]) != shuffle
     assert drawn(loader(batch_size=3)) == epochs[0]
     assert drawn(loader(seed=6)) != epochs[0]

@@ -9,12 +9,17 @@ PROMISES = (
 
 TESTS: dict[str, tuple[str, ...]] = {
     "training/readouts": ("training/test_readouts", *PROMISES),
-    "training/experiment": (*PROMISES, "training/test_experiment", "training/test_sizes"),
-    "training/scores": ("training/test_scores", *PROMISES),
-    "training/loaders": ("training/test_loaders", *PROMISES),
+    "training/experiment": (
+        "training/test_experiment",
+        "training/test_experiment_scores",
+        "training/test_experiment_steps",
+        "training/test_sizes",
+    ),
+    "training/scores": ("training/test_scores", "training/test_experiment_scores"),
+    "training/loaders": ("training/test_loaders",),
     "training/recipe": ("training/test_recipe",),
     "data/loader": ("data/test_loader", "training/test_loaders", "training/test_experiment_steps"),
-    "samplers/base": ("samplers/test_contract", *PROMISES),
+    "samplers/base": ("samplers/test_contract[mops]", "samplers/test_ragged"),
     "samplers/mops": ("samplers/test_mops", "samplers/test_fused", "samplers/test_contract[mops]"),
     "samplers/fmops": ("samplers/test_fmops", "samplers/test_contract[fmops]"),
     "samplers/samplenet": ("samplers/test_samplenet", "samplers/test_contract[samplenet]"),

@@ -1,3 +1,5 @@
+from inspect import Parameter, signature
+
 import pytest
 import torch
 
@@ -155,6 +157,18 @@ def test_test_refine_adds_readout():
 def test_fit_same_seed_gives_same_weights():
     first, second = (fit(experiment("joint")).state_dict() for _ in range(2))
     assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_experiment_has_documented_defaults():
+    arguments = signature(Experiment.__init__).parameters.values()
+    found = {a.name: a.default for a in arguments if a.default not in (Parameter.empty, None)}
+    assert found == {"learn": "sampler", "seed": 0, "task_lr_scale": 1.0, "refine": 0}
+
+
+def test_experiment_without_optimizer_only_tests():
+    module = Experiment(Classification(PointNetVanilla(3), 3), FPSSampler(8), "nothing")
+    with pytest.raises(UserError, match="built without an optimizer"):
+        module.configure_optimizers()
 
 
 def test_learn_unknown_or_without_sampler_raises():

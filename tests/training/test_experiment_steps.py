@@ -139,6 +139,24 @@ def test_losses_over_sizes_are_summed_or_averaged(how, make, name, loss, calls):
     assert logged[f"train/{readout}/fingerprint"] == pytest.approx(float(prints), abs=1e-4)
 
 
+def test_training_logs_means_over_clouds_of_uneven_batches():
+    module = Experiment(
+        RecordingTask(Fingerprint()),
+        learn="task",
+        make_optimizer=lambda parameters: torch.optim.SGD(parameters, lr=0.0),
+    )
+    data, trainer = numbered_clouds(), quiet_trainer(1, limit_val_batches=0)
+    trainer.fit(module, CloudLoader(data.train, 6), CloudLoader(data.test, 4))
+    prints = module.task.net(data.train.points).detach()
+    logged = trainer.callback_metrics
+    torch.testing.assert_close(logged["train/mean_loss"], prints.square().mean())
+    torch.testing.assert_close(logged["train/full/fingerprint"], prints.mean())
+    # Of the last batch.
+    torch.testing.assert_close(logged["train/loss/total"], prints[12:].square().mean())
+    assert set(trainer.progress_bar_metrics) == {"loss"}
+    assert "loss" not in trainer.logged_metrics
+
+
 class Rates(Callback):
     """Notes the learning rate of every step."""
 

@@ -49,6 +49,7 @@ def test_clouds_to_draw_spreads_over_classes():
     chosen, names = clouds_to_draw(dataset, 2)
     assert names == ["long", "round"]
     assert dataset.test.labels[chosen].tolist() == [0, 2]
+    assert chosen.tolist() == [0, 2]  # the first of each class
     assert clouds_to_draw(dataset, 9)[1] == ["long", "tall", "round"]
     assert clouds_to_draw(dataset, 0)[1] == []
 
