@@ -93,6 +93,8 @@ def test_scan_pairs_return_the_motions_put_in(tmp_path, scan, layout):
         true = np.linalg.inv(POSES[end]) @ POSES[start]
         rotation = quaternion_to_matrix(pairs.quaternion[row].double()).numpy()
         np.testing.assert_allclose(rotation, true[:3, :3], atol=1e-6)
+        stated = data.notes[("train_pairs", "test_pairs")[row]]["translation"]
+        assert stated == pytest.approx([np.linalg.norm(true[:3, 3])] * 3, rel=1e-3)
         # The translation in the files' own coordinates: q = s·q' + b, and p = 0 at the origin.
         place = rotation @ pairs.origin[row].double().numpy() + pairs.translation[row].numpy()
         b = moved(scan, np.linalg.inv(POSES[end])).mean(0)

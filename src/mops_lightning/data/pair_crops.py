@@ -48,13 +48,16 @@ class PairCrops(NamedTuple):
         source: ``(K, n_points, 3)`` float32, centred and scaled.
         pairs: the targets and the true motions.
         overlap: share of the source scan's points that have a target point near them.
-        crop_overlaps: ``(K,)`` the same of the crops, before points are drawn from them.
+        crop_overlaps: ``(K,)`` the same of the crops, before points are drawn from the target's.
+        shifts: ``(K,)`` how far the motion moves the place where translation errors are measured,
+            in the scans' own unit: the error of predicting no motion.
     """
 
     source: torch.Tensor
     pairs: TruePairs
     overlap: float
     crop_overlaps: NDArray[np.float64]
+    shifts: NDArray[np.float64]
 
 
 def moved(points: Cloud, motion: Matrix) -> Cloud:
@@ -97,13 +100,15 @@ def crop_pair(
             "the motions, or leave such pairs out: dataset.min_overlap=0.1."
         )
     places = probes[near]
-    crops, overlaps = [], []
+    crops, overlaps, shifts = [], [], []
     for _ in range(rules.number):
-        crop, overlap = _usable(source, target, motion, rules, places, limit, rng)
+        crop, centre, overlap = _usable(source, target, motion, rules, places, limit, rng)
         crops.append(crop)
         overlaps.append(near.mean() if overlap is None else overlap)
+        shifts.append(np.linalg.norm(moved(centre, motion) - centre))
     own, *others = (torch.stack(parts) for parts in zip(*crops, strict=True))
-    return PairCrops(own, TruePairs(*others), float(near.mean()), np.array(overlaps))
+    pairs = TruePairs(*others)
+    return PairCrops(own, pairs, float(near.mean()), np.array(overlaps), np.array(shifts))
 
 
 def _extent(points: Cloud) -> float:
@@ -123,11 +128,11 @@ def _usable(
     places: Cloud,
     limit: float,
     rng: np.random.Generator,
-) -> tuple[tuple[torch.Tensor, ...], float | None]:
+) -> tuple[tuple[torch.Tensor, ...], Cloud, float | None]:
     """Draw until both crops have enough points that do not all coincide.
 
     Returns:
-        A crop of ``_normalised``, and its overlap; None if the crops are whole scans.
+        A crop of ``_normalised``, its centre and its overlap; None if the crops are whole scans.
     """
     largest = 0
     for _ in range(DRAWS):
@@ -148,7 +153,7 @@ def _usable(
         overlap = None
         if rules.crop != "whole":
             overlap = _near(moved(own, motion), cKDTree(regions[1]), limit).mean()
-        return _normalised(own, other, motion, centre), overlap
+        return _normalised(own, other, motion, centre), centre, overlap
     if rules.size is not None and largest < rules.n_points:
         raise BadCloudError(
             f"{source.path} and {target.path}: crop_size={rules.size:g} is too small for n_points="

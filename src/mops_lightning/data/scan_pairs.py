@@ -4,10 +4,9 @@ import math
 import sys
 import zlib
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,16 +17,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from mops_lightning.data.cloud_folder import cloud_files
 from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.data.crops import Crop, check_crop
-from mops_lightning.data.file_splits import split_by_folder
 from mops_lightning.data.formats.registry import read
 from mops_lightning.data.hdf5 import choose_and_fingerprint
 from mops_lightning.data.mesh_sampling import mesh_root
-from mops_lightning.data.mesh_sequence import by_number
-from mops_lightning.data.motions import PoseRules, ScanPair, read_motions
+from mops_lightning.data.motions import PoseRules, ScanPair
 from mops_lightning.data.pair_crops import CropRules, PairCrops, Scan, crop_pair
+from mops_lightning.data.scan_scenes import Listed, list_scans, split_scans
 from mops_lightning.data.split_list import SPLITS
 from mops_lightning.errors import UserError
 from mops_lightning.ops.rigid import quaternion_from_matrix, rotation_angle
@@ -36,22 +33,6 @@ from mops_lightning.types import TruePairs
 
 KEPT_SCANS = 16
 """Scans in memory while pairs are read; pairs of poses up to this gap read each scan once."""
-
-
-class Listed(NamedTuple):
-    """The scans of all scenes, and their pairs.
-
-    Attributes:
-        scans: paths relative to the root, in the order of scenes and names.
-        scenes: position of every scan's scene in ``names``.
-        names: of the scenes.
-        pairs: positions are those in ``scans``.
-    """
-
-    scans: list[PurePosixPath]
-    scenes: list[int]
-    names: list[str]
-    pairs: list[ScanPair]
 
 
 def scan_pairs(
@@ -113,8 +94,8 @@ def scan_pairs(
     check_crop(crop, crop_size)
     _check(test_share, overlap_distance, min_overlap)
     poses = PoseRules(Path(calib).expanduser() if calib else None, gap, distance)
-    listed = _listed(folder, Path(motions).expanduser(), scans, poses)
-    splits = _splits(listed, test_share)
+    listed = list_scans(folder, Path(motions).expanduser(), scans, poses)
+    splits = split_scans(listed, test_share)
     kept = [pair for pair in listed.pairs if splits[pair.source] == splits[pair.target]]
     rules = CropRules(n_points, crops, crop, crop_size, overlap_distance, min_overlap)
     drawn = _crops(folder, listed.scans, kept, rules, seed)
@@ -128,75 +109,6 @@ def _check(test_share: float, overlap_distance: float | None, min_overlap: float
         raise UserError(f"overlap_distance must be above 0 and finite, got {overlap_distance}.")
     if not 0 <= min_overlap < 1:
         raise UserError(f"min_overlap must be at least 0 and below 1, got {min_overlap}.")
-
-
-def _listed(folder: Path, motions: Path, pattern: str | None, poses: PoseRules) -> Listed:
-    """Find the scenes of a folder and read their motions."""
-    if pattern is not None and (not pattern or Path(pattern).is_absolute()):
-        raise UserError(f"scans must be a pattern such as 'velodyne/*.bin', got {pattern!r}.")
-    listed = Listed([], [], [], [])
-    for place, path in _scene_folders(folder, motions):
-        calib = poses.calib and _first_file(poses.calib, folder, place)
-        own = {path.resolve(), calib and calib.resolve()}
-        names = cloud_files(place, pattern or "*")
-        names = [name for name in names if (place / name).resolve() not in own]
-        names.sort(key=lambda name: (name.parent.parts, by_number(name)))
-        pairs = read_motions(path, len(names), replace(poses, calib=calib))
-        first = len(listed.scans)
-        inner = PurePosixPath(place.relative_to(folder).as_posix())
-        listed.scenes.extend([len(listed.names)] * len(names))
-        listed.names.append(str(inner) if inner.parts else folder.resolve().name)
-        listed.scans.extend(inner / name for name in names)
-        listed.pairs.extend(
-            ScanPair(first + pair.source, first + pair.target, pair.motion) for pair in pairs
-        )
-    return listed
-
-
-def _scene_folders(folder: Path, motions: Path) -> list[tuple[Path, Path]]:
-    """Return the folders of the scenes, each with its file of motions."""
-    for path in (motions, folder / motions):
-        if path.is_file():
-            return [(folder, path)]
-    depth = len(motions.parts)
-    found = sorted(folder.rglob(motions.name)) if motions.name else []
-    found = [path for path in found if path.parts[-depth:] == motions.parts and path.is_file()]
-    if not found:
-        raise UserError(f"motions: no file {motions}, also not in {folder} or its subfolders.")
-    return [(path.parents[depth - 1], path) for path in found]
-
-
-def _first_file(path: Path, *folders: Path) -> Path:
-    """Return a file as given, or in the first of the folders that has it."""
-    for one in (path, *(folder / path for folder in folders)):
-        if one.is_file():
-            return one
-    raise UserError(f"calib: no file {path}, also not in {' or '.join(map(str, folders))}.")
-
-
-def _splits(listed: Listed, test_share: float) -> list[str]:
-    """Return the split of every scan.
-
-    The border between training and test scans is where the number of test pairs comes nearest to
-    the share; of equal ones, where most training pairs are left.
-    """
-    by_folder = split_by_folder(listed.scans)
-    if by_folder is not None:
-        return by_folder
-    ends = np.sort([(pair.source, pair.target) for pair in listed.pairs], axis=1)
-    borders = np.arange(1, len(listed.scans))
-    train = np.searchsorted(np.sort(ends[:, 1]), borders)
-    test = len(ends) - np.searchsorted(np.sort(ends[:, 0]), borders)
-    off = np.abs(test - test_share * len(ends))
-    off[(train == 0) | (test == 0)] = np.inf
-    best = np.lexsort((-train, off))[0]
-    if not np.isfinite(off[best]):
-        raise UserError(
-            f"motions: the {len(ends)} pairs of {len(listed.scans)} scans cannot be split, because "
-            "a scan is in one split only. Give more scans and pairs, or put scenes into folders "
-            "named train and test."
-        )
-    return ["train" if i < borders[best] else "test" for i in range(len(listed.scans))]
 
 
 def _crops(
@@ -266,7 +178,7 @@ def _facts(pairs: Sequence[ScanPair], crops: Sequence[PairCrops]) -> dict[str, A
         "overlap": np.array([one.overlap for one in crops]),
         "crop_overlap": np.concatenate([one.crop_overlaps for one in crops]),
         "rotation_deg": angles.numpy(),
-        "translation": np.array([np.linalg.norm(pair.motion[:3, 3]) for pair in pairs]),
+        "translation": np.concatenate([one.shifts for one in crops]),
     }
     spread = {
         name: [float(f"{f(one):.4g}") for f in (np.min, np.mean, np.max)]
@@ -276,8 +188,16 @@ def _facts(pairs: Sequence[ScanPair], crops: Sequence[PairCrops]) -> dict[str, A
 
 
 def _said(split: str, facts: dict[str, Any]) -> str:
-    overlap, rotation, shift = (facts[name] for name in ("overlap", "rotation_deg", "translation"))
+    """Say a split's facts in two sentences."""
+    ranges = {
+        name: f"{facts[name][0]:.3g} to {facts[name][2]:.3g}"
+        for name in ("overlap", "crop_overlap", "rotation_deg", "translation")
+    }
+    differ = facts["crop_overlap"] != facts["overlap"]
+    crops = f" (crops: {ranges['crop_overlap']})" if differ else ""
     return (
-        f"{split} pairs: {facts['number']}, overlap {overlap[0]:.2f} to {overlap[2]:.2f}, rotation "
-        f"{rotation[0]:.3g}° to {rotation[2]:.3g}°, translation {shift[0]:.3g} to {shift[2]:.3g}."
+        f"{split} pairs: {facts['number']}, overlap {ranges['overlap']}"
+        f"{crops}, rotation "
+        f"{ranges['rotation_deg']}°, translation {ranges['translation']}. Errors of predicting no "
+        f"motion: {facts['rotation_deg'][1]:.3g}° and {facts['translation'][1]:.3g}."
     )
