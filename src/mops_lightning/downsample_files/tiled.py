@@ -167,7 +167,7 @@ def _refill(
         cloud: see ``by_tiles``.
         rows: the part.
         tiling: how it is cut.
-        kept: the kept points of all parts.
+        kept: the kept points of all parts, in the order of their places.
         lost: the tile of every point that was dropped.
     """
     here = lost[(lost >= rows.start) & (lost < rows.stop)]
@@ -176,11 +176,27 @@ def _refill(
     table = cloud.read(rows)
     tiles = tiling.cut(table.points)
     starts = rows.start + np.cumsum([0, *(len(tile) for tile in tiles)])[:-1]
-    around = cKDTree(kept.points)
     at, numbers = np.unique(here, return_counts=True)
+    lost_from = [tiles[int(np.searchsorted(starts, start))] for start in at.tolist()]
+    first, last = np.searchsorted(kept.place, [rows.start, rows.stop])
+    of_part = kept.take(np.arange(first, last))
+    own = [of_part.place[of_part.tile == start] - rows.start for start in at.tolist()]
+    near = kept.points
+    if all(map(len, own)):
+        near = _near(near, [table.points[tile] for tile in lost_from])
+    around = cKDTree(near)
     found = []
-    for start, number in zip(at.tolist(), numbers.tolist(), strict=True):
-        tile = tiles[int(np.searchsorted(starts, start))]
-        own = np.searchsorted(tile, kept.place[kept.tile == start] - rows.start)
-        found.append(tile[farthest_rows(table.points[tile], number, own, around)])
+    for tile, number, left in zip(lost_from, numbers.tolist(), own, strict=True):
+        rows_kept = np.searchsorted(tile, left)
+        found.append(tile[farthest_rows(table.points[tile], number, rows_kept, around)])
     return _chosen(table, rows.start, found, at)
+
+
+def _near(kept: NDArray[np.float64], tiles: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return the kept points that can be nearest to a point of a tile; every tile has some."""
+    lows = np.stack([tile.min(0) for tile in tiles])
+    highs = np.stack([tile.max(0) for tile in tiles])
+    # No point is farther from a kept point of its tile than the tile is long.
+    reach = float(np.linalg.norm(highs - lows, axis=1).max()) * (1 + 1e-9)
+    near = (kept >= lows.min(0) - reach) & (kept <= highs.max(0) + reach)
+    return kept[near.all(1)]
