@@ -17,6 +17,14 @@ HOME = "README.md"
 MAX_BYTES = 1_000_000
 """Larger files are not copied; a link to one becomes plain text."""
 
+IN_MODULES = (
+    "mops_lightning.transforms.Downsample",
+    "mops_lightning.config.compose.compose",
+    "mops_lightning.training.run.run",
+    "mops_lightning.zoo.weights.load_into",
+)
+"""Public names that are not imported from the package itself."""
+
 LINK = re.compile(r"(?P<mark>!?)\[(?P<text>[^\]]*)\]\((?P<target>[^)\s]+)\)")
 FENCE = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
 
@@ -128,7 +136,7 @@ def _reference() -> str:
     lines = [
         "# Reference",
         "",
-        "Public names, which `from mops_lightning import NAME` imports.",
+        "`from mops_lightning import NAME` imports all names except those of the last section.",
         "",
     ]
     packages: dict[str, list[str]] = {}
@@ -137,4 +145,7 @@ def _reference() -> str:
         packages.setdefault(module.split(".")[1], []).append(f"::: {module}.{name}")
     for package in sorted(packages):
         lines += [f"## {package}", "", *(line for one in packages[package] for line in (one, ""))]
+    lines += ["## In modules of their own", ""]
+    for name in IN_MODULES:
+        lines += [f"`from {' import '.join(name.rsplit('.', 1))}`", "", f"::: {name}", ""]
     return "\n".join(lines)

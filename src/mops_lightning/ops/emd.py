@@ -29,6 +29,8 @@ def earth_movers_distance(
 ) -> Tensor:
     """Return the earth mover's distance between clouds with the same number of points.
 
+    EMD(P, Q) = min over bijections φ of 1/N Σ_i ‖p_i − q_φ(i)‖.
+
     Args:
         points: ``(B, N, 3)`` clouds P.
         others: ``(B, N, 3)`` clouds Q.

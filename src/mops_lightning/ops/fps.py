@@ -30,6 +30,8 @@ def farthest_point_sample(
 ) -> Tensor:
     """Choose m points, each as far as possible from the points chosen before it.
 
+    Eldar et al., "The Farthest Point Strategy for Progressive Image Sampling", IEEE TIP 1997.
+
     Args:
         points: ``(B, N, C)``.
         m: number of points to choose, 1 ≤ m ≤ N.

@@ -27,7 +27,7 @@ GRAM_ROWS = 256
 
 
 class SamplingMatrix(NamedTuple):
-    """Sampling matrices S of a batch of clouds.
+    """Sampling matrices S of a batch of clouds (paper Eq. 5), as scaled dot-product attention.
 
     Attributes:
         queries: ``(M, C)``, the weights of the last layer of ρ.

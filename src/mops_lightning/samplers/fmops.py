@@ -16,6 +16,8 @@ DISTRIBUTIONS = ("nested", "uniform", "log_uniform")
 class FMOPSNet(MOPSNet):
     """MOPS-Net whose left-most m columns of S are trained for every m.
 
+    Paper section "Flexible MOPS-Net for Arbitrary Ratios".
+
     One net serves all 1 ≤ m ≤ m_max: the first m points of the largest sample are the sample of
     size m.
 

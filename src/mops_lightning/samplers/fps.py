@@ -13,6 +13,8 @@ from mops_lightning.types import SampleOutput
 class FPSSampler(Sampler):
     """Choose input points, each as far as possible from the points chosen before it.
 
+    Eldar et al., "The Farthest Point Strategy for Progressive Image Sampling", IEEE TIP 1997.
+
     Flexible and nested. The seeded order of the cloud (see ``ordering``) determines the first point
     and breaks ties, so that the sample depends on the seed and the cloud only: neither on the rest
     of the batch nor, unless ``start`` is given, on the order of the points.

@@ -20,6 +20,9 @@ BLOCK = 2**22
 class PoissonSampler(Sampler):
     """Start from all points and remove the most crowded one until m points remain.
 
+    Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets", Computer Graphics Forum
+    2015.
+
     The crowding of a point is Σ (1 − d/d_max)⁸ over the remaining points nearer than d_max. The
     publication computes d_max from the area of the surface, which is unknown for a cloud. Here,
     d_max is twice the distance at which farthest point sampling chooses its m-th point, an upper
@@ -34,6 +37,9 @@ class PoissonSampler(Sampler):
     Args:
         m: largest number of points to return.
         seed: determines how ties are broken.
+
+    Raises:
+        UserError: ``m`` is not a whole number of at least 1.
 
     Examples:
         >>> import torch

@@ -17,6 +17,9 @@ class RandomSampler(Sampler):
         m: largest number of points to return.
         seed: determines the order in which points are chosen.
 
+    Raises:
+        UserError: ``m`` is not a whole number of at least 1.
+
     Examples:
         >>> import torch
         >>> from mops_lightning import RandomSampler

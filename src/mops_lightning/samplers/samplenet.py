@@ -45,6 +45,8 @@ def soft_projection(queries: Tensor, points: Tensor, k: int, sigma: Tensor | flo
 class SampleNet(SNet):
     """S-Net with a soft projection of its points onto the cloud during training.
 
+    Lang, Manor and Avidan, "SampleNet: Differentiable Point Cloud Sampling", CVPR 2020.
+
     In training, the task net receives the projected points. In evaluation nothing is projected: the
     generated points are those of S-Net, matched and completed as usual.
 
@@ -119,7 +121,18 @@ class SampleNet(SNet):
 
 
 class ProgressiveSampleNet(Progressive, SampleNet):
-    """SampleNet with nested samples; arguments are those of ``Progressive`` and ``SampleNet``.
+    """SampleNet with nested samples: the first m points are the sample of size m.
+
+    SampleNetProgressive of Lang, Manor and Avidan, "SampleNet", CVPR 2020.
+
+    Args:
+        m_max: largest number of points.
+        min_size: smallest training size, see ``ProgressiveSNet``.
+        size_reduction: ``sum`` or ``mean`` of the losses at all sizes.
+        **settings: arguments of ``SampleNet``.
+
+    Raises:
+        UserError: an argument is out of range.
 
     Examples:
         >>> import torch

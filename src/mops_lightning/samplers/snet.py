@@ -17,7 +17,9 @@ from mops_lightning.types import SampleOutput
 
 
 class SNet(Sampler):
-    """Pointwise layers, maximum over points, and a head with all 3m coordinates as output.
+    """S-Net: pointwise layers, maximum over points, and a head with all 3m coordinates as output.
+
+    Dovrat, Lang and Avidan, "Learning to Sample", CVPR 2019.
 
     Args:
         m: number of points to generate.
@@ -133,7 +135,19 @@ class Progressive(Sampler):
 
 
 class ProgressiveSNet(Progressive, SNet):
-    """S-Net with nested samples; arguments are those of ``Progressive`` and ``SNet``.
+    """S-Net with nested samples: the first m points are the sample of size m.
+
+    ProgressiveNet of Dovrat, Lang and Avidan, "Learning to Sample", CVPR 2019.
+
+    Args:
+        m_max: largest number of points; 1,024 in the publication.
+        min_size: smallest training size, or m_max if that is smaller; training sizes are m_max and
+            the powers of two from here on.
+        size_reduction: ``sum`` or ``mean`` of the losses at all sizes.
+        **settings: arguments of ``SNet``.
+
+    Raises:
+        UserError: an argument is out of range.
 
     Examples:
         >>> import torch
