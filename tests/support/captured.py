@@ -2,12 +2,13 @@
 
 import contextlib
 import io
+from typing import Any
 
 
 def captured(main, arguments):
     """Exit status and what it printed."""
     out, err = io.StringIO(), io.StringIO()
-    status = 0
+    status: Any = 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             main([str(argument) for argument in arguments])
