@@ -18,6 +18,9 @@ from torch import Tensor
 Calls = dict[str, Callable[[], Any]]
 """Functions to time, by name."""
 
+EXHAUSTIVE = 2**28
+"""Maximum number of distances for libraries that compute all of them."""
+
 
 def installed(name: str) -> Any:
     """Return a library, or None if it is not installed."""
@@ -30,7 +33,7 @@ def installed(name: str) -> Any:
 def versions() -> dict[str, str]:
     """Return the versions of the installed libraries, by their names in pip."""
     found = {}
-    for name in ("scipy", "fpsample", "open3d", "open3d-cpu", "point-cloud-utils"):
+    for name in ("scipy", "numba", "fpsample", "open3d", "open3d-cpu", "point-cloud-utils"):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
@@ -45,11 +48,16 @@ def farthest(points: Tensor, m: int) -> Calls:
     """
     array, calls = points.numpy(), Calls()
     if fpsample := installed("fpsample"):
-        calls["fpsample, plain"] = lambda: array[fpsample.fps_sampling(array, m, 0)]
-        calls["fpsample, buckets"] = lambda: array[
-            fpsample.bucket_fps_kdline_sampling(array, m, 7, 0)
-        ]
-    if open3d := installed("open3d"):
+        for height in (3, 5, 7, 9):  # 2^height buckets; the fastest height depends on the size
+
+            def by_buckets(height: int = height) -> NDArray[np.float32]:
+                rows = fpsample.bucket_fps_kdline_sampling(array, m, height, 0)
+                return np.asarray(array[rows])
+
+            calls[f"fpsample, {2**height} buckets"] = by_buckets
+        if len(array) * m <= EXHAUSTIVE:
+            calls["fpsample, plain"] = lambda: array[fpsample.fps_sampling(array, m, 0)]
+    if len(array) * m <= EXHAUSTIVE and (open3d := installed("open3d")):
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(array.astype(float)))
         calls["Open3D"] = lambda: np.asarray(cloud.farthest_point_down_sample(m, 0).points)
     return calls
