@@ -2,10 +2,12 @@
 
 import argparse
 import json
+import time
 from pathlib import Path
 from typing import Any
 
 import libraries
+import measure
 import torch
 from cases import ALL
 from measure import ceiling, machine
@@ -27,15 +29,21 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "cpu")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument(
+        "--cpu-time", action="store_true", help="processor time, for one thread on a busy machine"
+    )
     chosen = parser.parse_args()
     unknown = [name for name in chosen.cases if name not in ALL]
     if unknown:
         parser.error(f"unknown benchmark: {', '.join(unknown)}. Allowed: {', '.join(ALL)}")
     torch.set_num_threads(chosen.threads)
+    if chosen.cpu_time:
+        measure.clock = time.process_time
     torch.manual_seed(0)
     peak = ceiling(chosen.rounds)
     hardware = {**machine(), "others": libraries.versions()}
     record: dict[str, Any] = {"machine": hardware, "ceiling": peak, "cases": {}}
+    record["clock"] = measure.clock.__name__
     print(f"ceiling: {peak['flops'] / 1e9:.0f} GFLOP/s, {peak['bytes'] / 1e9:.1f} GB/s", flush=True)
     for name in chosen.cases or ALL:
         record["cases"][name] = ALL[name](peak, chosen.rounds)
@@ -56,6 +64,7 @@ def markdown(record: dict[str, Any]) -> str:
         f"{' with changes' if where['git']['dirty'] else ''}. Ceiling in this run: "
         f"{peak['flops'] / 1e9:.0f} GFLOP/s (float32 products), {peak['bytes'] / 1e9:.1f} GB/s "
         "(copies). Medians per cloud; spread: distance between the quartiles over all rounds."
+        f"{' Processor time.' if record.get('clock') == 'process_time' else ''}"
     ]
     for name, rows in record["cases"].items():
         parts += [f"## {name}", (ALL[name].__doc__ or "").strip(), table(rows)]
