@@ -13,6 +13,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         "training/test_experiment",
         "training/test_experiment_scores",
         "training/test_experiment_steps",
+        "training/test_recipe",
         "training/test_sizes",
     ),
     "training/scores": ("training/test_scores", "training/test_experiment_scores"),
