@@ -44,7 +44,6 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
 FEATURES: dict[str, Any] = {"feature_channels": (64, 64, 64, 128, 128)}
 MOPS: dict[str, Any] = {
     **{"alpha": 30.0, "tau_min": 0.1, "annealing": "exponential", "threshold": 0.0},
-    **{"tau_max": 1.0},
     **{"rho_channels": (512, 256, 128), **FEATURES},
 }
 SNET: dict[str, Any] = {

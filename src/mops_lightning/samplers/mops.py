@@ -28,9 +28,7 @@ class MOPSNet(Sampler):
     Args:
         m: number of points to generate.
         alpha: weight α of the subset loss (Eq. 11).
-        tau_min: temperature at the end of training and in evaluation.
-        tau_max: temperature at the start of training; a trained sampler that is trained further
-            starts best at ``tau_min``.
+        tau_min: temperature at the end of training and in evaluation; training starts at 1.
         annealing: how tau decreases with the training progress, ``exponential`` or ``linear``.
         feature_channels: sizes of the pointwise layers; the last is that of the local and the
             global feature.
@@ -64,13 +62,10 @@ class MOPSNet(Sampler):
         feature_channels: Sequence[int] = (64, 64, 64, 128, 128),
         rho_channels: Sequence[int] = (512, 256, 128),
         threshold: float = 0.0,
-        tau_max: float = 1.0,
     ) -> None:
         super().__init__(m)
         if not 0 < tau_min <= 1:
             raise UserError(f"tau_min must be above 0 and at most 1, got {tau_min}.")
-        if not tau_min <= tau_max <= 1:
-            raise UserError(f"tau_max must be from tau_min={tau_min} to 1, got {tau_max}.")
         if alpha < 0:
             raise UserError(f"alpha must be at least 0, got {alpha}.")
         if annealing not in ANNEALINGS:
@@ -84,8 +79,7 @@ class MOPSNet(Sampler):
         self.threshold = threshold
         self.tau_min = tau_min
         self.annealing = annealing
-        self.tau_max = tau_max
-        self.training_tau = tau_max
+        self.training_tau = 1.0
         local = feature_channels[-1]
         self.features = PointFeatures(feature_channels)
         # The first layer of ρ acts on [local, global]. The product with the global feature is the
@@ -103,12 +97,12 @@ class MOPSNet(Sampler):
         return self.training_tau if self.training else self.tau_min
 
     def anneal(self, progress: float) -> None:
-        """Set the training temperature for a progress from 0 (tau_max) to 1 (tau_min)."""
+        """Set the training temperature for a progress from 0 (tau = 1) to 1 (tau = tau_min)."""
         progress = min(max(progress, 0.0), 1.0)
         if self.annealing == "exponential":
-            self.training_tau = self.tau_max * (self.tau_min / self.tau_max) ** progress
+            self.training_tau = self.tau_min**progress
         else:
-            self.training_tau = self.tau_max + (self.tau_min - self.tau_max) * progress
+            self.training_tau = 1 + (self.tau_min - 1) * progress
 
     def sampling_matrix(self, points: Tensor) -> SamplingMatrix:
         """Return the sampling matrices S of ``(B, N, 3)`` points."""
