@@ -19,7 +19,7 @@ def board(tmp_path_factory):
     """The address of a TensorBoard that shows one small run."""
     folder = tmp_path_factory.mktemp("board")
     logged = [one for one in TINY if not one.startswith(("pictures", "logger"))]
-    overrides = [*logged, "sampler=mops", "weights=null", "pictures=1", "trainer.max_epochs=2"]
+    overrides = [*logged, "sampler=mops", "weights=null", "pictures=3", "trainer.max_epochs=2"]
     overrides += ["val_fraction=0.2", f"cache={folder}/cache"]
     run(compose(overrides), folder / "run", overrides)
     with socket.socket() as free:
@@ -47,12 +47,17 @@ def test_tensorboard_shows_curves_settings_images_meshes(board, opened):
         for one in what:
             found = page.locator(one) if one == "canvas" else page.get_by_text(one)
             found.first.wait_for(state="attached", timeout=30_000)
-        return errors, requests
+        return page, errors, requests
 
     see("?tagFilter=mean_loss#timeseries", "mean_loss", "canvas")
     see("#hparams", "tau_min")
     see("#images", "matrix")
-    errors, requests = see("#mesh", "run/tensorboard", "canvas")
+    page, errors, requests = see("#mesh", "run/tensorboard", "canvas")
+    meshes = page.locator("canvas")
+    meshes.nth(5).wait_for(state="attached", timeout=30_000)  # two clouds, three readouts
+    context = "(canvas.getContext('webgl2') || canvas.getContext('webgl'))"
+    lost = meshes.evaluate_all(f"all => all.filter(canvas => {context}.isContextLost()).length")
+    assert lost == 0, "the browser stopped drawing some"
     hosts = {urlparse(url).hostname for url in requests if urlparse(url).scheme.startswith("http")}
     assert hosts == {"127.0.0.1"}
     assert errors == []

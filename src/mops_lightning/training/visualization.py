@@ -26,6 +26,8 @@ from mops_lightning.viz.snapshots import CLOUDS, save_clouds
 
 DENSE_PIXELS = 2**20
 """Most entries of S that are drawn: 1,024 points by 1,024 columns."""
+MESHES = 2
+"""Clouds in TensorBoard's mesh tab. With four, Chromium stopped drawing the first of 12 views."""
 
 
 class CloudVisualization(Callback):
@@ -107,9 +109,9 @@ def _add_meshes(
     titles: Sequence[str],
     step: int,
 ) -> None:
-    """Show every cloud with each readout, to be turned with the mouse."""
+    """Show ``MESHES`` clouds with each readout, to be turned with the mouse."""
     for name, chosen in samples.items():
-        for number, title in enumerate(titles):
+        for number, title in enumerate(titles[:MESHES]):
             vertices, colours = _coloured(points[number], chosen[number], name)
             board.experiment.add_mesh(
                 f"{name}/{number}_{title}",
