@@ -20,7 +20,11 @@ TESTS: dict[str, tuple[str, ...]] = {
     "training/loaders": ("training/test_loaders",),
     "training/recipe": ("training/test_recipe",),
     "data/loader": ("data/test_loader", "training/test_loaders", "training/test_experiment_steps"),
-    "samplers/base": ("samplers/test_contract[mops]", "samplers/test_ragged"),
+    "samplers/base": (
+        "samplers/test_contract[mops or voxel or without]",
+        "samplers/test_ragged",
+        "samplers/test_fmops",
+    ),
     "samplers/mops": ("samplers/test_mops", "samplers/test_fused", "samplers/test_contract[mops]"),
     "samplers/fmops": ("samplers/test_fmops", "samplers/test_contract[fmops]"),
     "samplers/samplenet": ("samplers/test_samplenet", "samplers/test_contract[samplenet]"),

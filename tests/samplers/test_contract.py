@@ -162,13 +162,19 @@ def test_sampler_declares_sizes(sampler):
     assert sampler.nested == (sampler not in (*NOT_FLEXIBLE, *FLEXIBLE_NOT_NESTED))
 
 
-def test_nested_samples_are_first_points_of_larger_ones(make, clouds):
+def test_several_sizes_equal_single_sizes_and_are_nested_where_declared(make, clouds):
     sampler = make()
-    if sampler.nested:
+    if sampler.flexible:
         whole = sampler(clouds).points
-        for m, output in sampler.sample_sizes(clouds, (M, 1, M - 3)).items():
-            torch.testing.assert_close(output.points, whole[:, :m])
-            torch.testing.assert_close(sampler(clouds, m).points, whole[:, :m])
+        for m, output in sampler.sample_sizes(clouds, (M, M - 3)).items():
+            torch.testing.assert_close(output.points, sampler(clouds, m).points)
+            if sampler.nested:
+                torch.testing.assert_close(output.points, whole[:, :m])
+
+
+def test_sampler_without_sample_raises(clouds):
+    with pytest.raises(NotImplementedError):
+        Sampler(M)(clouds)
 
 
 @pytest.mark.parametrize(("sampler", "arguments"), LIMITS)
@@ -223,6 +229,7 @@ def test_other_size_needs_flexible_sampler(make, clouds):
         (torch.zeros(B, N, 3, dtype=torch.int64), "floating point, got torch.int64"),
         (torch.full((B, N, 3), torch.nan), "finite"),
         (torch.full((B, N, 3), -torch.inf), "finite"),
+        (torch.zeros(B, N, 3).index_fill(1, torch.tensor(5), torch.nan), "finite"),
     ],
 )
 def test_invalid_input_raises(make, points, named):

@@ -10,6 +10,7 @@ from lightning.pytorch.callbacks import Callback
 
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.losses.subset import simplification_loss, subset_loss
+from mops_lightning.metrics.base import collection
 from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
@@ -17,7 +18,12 @@ from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.schedules import exponential
-from tests.support.recording import Fingerprint, RecordingTask, numbered_clouds
+from tests.support.recording import (
+    Fingerprint,
+    MeanFingerprint,
+    RecordingTask,
+    numbered_clouds,
+)
 from tests.support.training import quiet_trainer
 
 MOPS: dict[str, Any] = {"feature_channels": (8, 6), "rho_channels": (12, 10), "alpha": 2.0}
@@ -139,9 +145,20 @@ def test_losses_over_sizes_are_summed_or_averaged(how, make, name, loss, calls):
     assert logged[f"train/{readout}/fingerprint"] == pytest.approx(float(prints), abs=1e-4)
 
 
+class InTests(MeanFingerprint):
+    """Nothing that training computes."""
+
+    name = "in_tests"
+
+
+class WithMoreInTests(RecordingTask):
+    def metrics(self, training=False):
+        return collection(MeanFingerprint(), *([] if training else [InTests()]))
+
+
 def test_training_logs_means_over_clouds_of_uneven_batches():
     module = Experiment(
-        RecordingTask(Fingerprint()),
+        WithMoreInTests(Fingerprint()),
         learn="task",
         make_optimizer=lambda parameters: torch.optim.SGD(parameters, lr=0.0),
     )
@@ -151,6 +168,7 @@ def test_training_logs_means_over_clouds_of_uneven_batches():
     logged = trainer.callback_metrics
     torch.testing.assert_close(logged["train/mean_loss"], prints.square().mean())
     torch.testing.assert_close(logged["train/full/fingerprint"], prints.mean())
+    assert "train/full/in_tests" not in logged
     # Of the last batch.
     torch.testing.assert_close(logged["train/loss/total"], prints[12:].square().mean())
     assert set(trainer.progress_bar_metrics) == {"loss"}

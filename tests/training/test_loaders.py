@@ -6,6 +6,7 @@ from mops_lightning.config.compose import compose
 from mops_lightning.data.pairs import Pairs
 from mops_lightning.losses.registration import quaternion_loss
 from mops_lightning.nets.icp import ICP
+from mops_lightning.seeding import generator
 from mops_lightning.tasks.registration import Registration
 from mops_lightning.training.loaders import (
     augmentation,
@@ -30,6 +31,8 @@ def test_split_holds_out_fraction_in_order():
     assert sorted([*kept, *out]) == list(range(20))
     assert (kept, out) == (sorted(kept), sorted(out))
     assert torch.equal(held_out.labels, clouds.labels[out])
+    # The stream of random numbers stays, so that old runs can be repeated.
+    assert out == sorted(torch.randperm(20, generator=generator(5, 2))[:4].tolist())
 
 
 def test_split_other_seed_holds_out_others():
@@ -51,6 +54,7 @@ def test_clouds_to_draw_spreads_over_classes():
     assert dataset.test.labels[chosen].tolist() == [0, 2]
     assert chosen.tolist() == [0, 2]  # the first of each class
     assert clouds_to_draw(dataset, 9)[1] == ["long", "tall", "round"]
+    assert clouds_to_draw(dataset, 1)[1] == ["long"]
     assert clouds_to_draw(dataset, 0)[1] == []
 
 
