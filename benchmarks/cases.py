@@ -224,7 +224,9 @@ def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
             for name, call in others.items()
         }
         _equal_rows(own(), plain(own))
-        setup = f"from cases import *\npoints = cloud({number})\nfarthest_point_sample(points, 2)"
+        setup = (
+            f"from cases import *\npoints = cloud({number})\nfarthest_point_sample(cloud(64), 2)"
+        )
         for row in _rows("sampler", calls | others, {"N": number, "m": m}, rounds, peak):
             row["points as ours"] = shared.get(row["sampler"], m)
             if row["sampler"] == "fps" and number >= 40_960:

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.ops.compiled import kernels
+from mops_lightning.ops import compiled
 
 FINEST = 2**20
 """Maximum number of cells along an axis: three positions fit into an integer of 64 bits."""
@@ -27,7 +27,7 @@ def eliminate_by_cells(points: Tensor, m: int, reach: float, scale: float) -> Te
     Returns:
         ``(m,)`` int64 rows, ascending; None where the plain form must be used.
     """
-    if kernels() is None or points.device.type != "cpu" or points.shape[1] != 3:
+    if compiled.kernels() is None or points.device.type != "cpu" or points.shape[1] != 3:
         return None
     from mops_lightning.ops.elimination_kernels import eliminate
 
