@@ -45,6 +45,19 @@ def test_gumbel_anneals_exponentially(sampler):
     assert sampler.eval().tau == 0.1
 
 
-def test_gumbel_temperature_out_of_range_raises():
-    with pytest.raises(UserError, match="tau_min must be above 0 and at most 1, got 0"):
-        GumbelSampler(4, tau_min=0)
+def test_gumbel_training_starts_at_temperature_1(sampler):
+    assert sampler.train().tau == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"tau_min": 0}, "^tau_min must be above 0 and at most 1, got 0"),
+        ({"tau_min": 1.5}, "^tau_min must be above 0 and at most 1, got 1.5"),
+        ({"feature_channels": ()}, "^feature_channels must be sizes"),
+        ({"key_channels": (0,)}, "^key_channels must be"),
+    ],
+)
+def test_gumbel_invalid_argument_raises(arguments, message):
+    with pytest.raises(UserError, match=message):
+        GumbelSampler(4, **arguments)
