@@ -72,7 +72,7 @@ def test_snet_rate_depends_on_task_and_learn(task, learn, rate):
 @pytest.mark.parametrize(
     ("overrides", "epochs"),
     [
-        ([], (12, 6)),
+        ([], (12, 10)),
         (["task=registration"], (40, 10)),
         (["dataset=modelnet40"], (30, 8)),
         (["dataset=modelnet40", "task=reconstruction"], (200, 60)),
