@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from tests.support.command_line import TINY_WITH_PICTURES, call, call_anew
+from tests.support.command_line import TINY, call, call_anew
 
 LAUNCHERS = {
     "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
@@ -16,10 +16,9 @@ LAUNCHERS = {
 @pytest.mark.parametrize("name", LAUNCHERS)
 def test_cells_run_side_by_side(name, tmp_path):
     fixed = [
-        *TINY_WITH_PICTURES,
+        *TINY,
         "sampler=random",
         "weights=null",
-        "pictures=0",
         "hydra.sweep.dir=cells",
     ]
     command = ["-m", *LAUNCHERS[name], *fixed, "m=4,8"]
@@ -42,10 +41,8 @@ def test_optuna_searches_and_keeps_every_trial(tmp_path):
         "hydra.sweeper.direction=maximize",
     ]
     settings = [
-        *TINY_WITH_PICTURES,
+        *TINY,
         "weights=null",
-        "pictures=0",
-        "logger=none",
         "hydra.sweep.dir=trials",
     ]
     command = ["-m", *search, *settings, "sampler.alpha=interval(0.1,30)"]

@@ -9,6 +9,7 @@ import pytest
 from mops_lightning.records import run_record
 from mops_lightning.zoo import weights
 from tests.support.command_line import (
+    TINY,
     TINY_ANY_DATA,
     TINY_WITH_PICTURES,
     call,
@@ -90,9 +91,7 @@ def test_second_run_uses_cached_task_net(main_job):
 def test_sweep_with_failed_cell_completes_the_rest(main_job):
     folder, *_ = main_job
     fixed = ["out=sweep", "hydra.sweep.dir=sweep/cells"]
-    status, out, err = call(
-        ["-m", *TINY_WITH_PICTURES, "sampler=random", "m=4,65,8", *fixed], folder
-    )
+    status, out, err = call(["-m", *TINY, "sampler=random", "m=4,65,8", *fixed], folder)
     assert status == 1
     assert "sweep/cells/1 failed: m must be at most dataset.n_points=64, got m=65" in out
     assert "3 cells: 2 completed, 1 failed; in sweep/cells" in out
@@ -100,14 +99,14 @@ def test_sweep_with_failed_cell_completes_the_rest(main_job):
     found = sorted((folder / "sweep").rglob("result.json"))
     assert [json.loads(p.read_text())["config"]["m"] for p in found] == [4, 8]
     # Only the cells of this start count, not what an earlier one has left.
-    status, out, err = call(["-m", *TINY_WITH_PICTURES, "sampler=random", "m=4", *fixed], folder)
+    status, out, err = call(["-m", *TINY, "sampler=random", "m=4", *fixed], folder)
     assert status == 0, out + err
     assert "1 cells: 1 completed; in sweep/cells" in out
 
 
 def test_joint_training_starts_from_cached_task_net(main_job):
     folder, *_ = main_job
-    status, out, err = call([*TINY_WITH_PICTURES, "learn=joint", "out=joint"], folder)
+    status, out, err = call([*TINY, "learn=joint", "out=joint"], folder)
     assert status == 0, err
     assert "training it first" not in out
     (path,) = (folder / "joint").rglob("result.json")
@@ -144,7 +143,7 @@ def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
     )
     assert status == 0, err
     assert "registration by icp" in out
-    status, _, err = call(["task=registration", "task/net=icp", *TINY_WITH_PICTURES], tmp_path)
+    status, _, err = call(["task=registration", "task/net=icp", *TINY], tmp_path)
     assert status == 2
     assert "learn=sampler: ICP has no weights" in err
 
@@ -207,7 +206,7 @@ def test_folder_of_meshes_trains(tmp_path):
 
 def test_flexible_sampler_is_tested_at_all_sizes_and_evaluated(main_job):
     folder, *_ = main_job
-    status, out, err = call([*TINY_WITH_PICTURES, "sampler=fmops", "sampler.m_max=32"], folder)
+    status, out, err = call([*TINY, "sampler=fmops", "sampler.m_max=32"], folder)
     assert status == 0, err
     for word in ("m=8", "m=16", "m=32", "fmops completed", "all points"):
         assert word in out
@@ -230,7 +229,7 @@ def test_weights_of_another_net_are_rejected(main_job):
     folder, run, *_ = main_job
     other = next((folder / "cache" / "weights").rglob("weights.pt"))
     settings = [
-        *TINY_WITH_PICTURES,
+        *TINY,
         f"weights={other}",
         "dataset.classes=[chair,table]",
         "out=other",

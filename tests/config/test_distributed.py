@@ -10,7 +10,7 @@ from mops_lightning.config.distributed import check_shares, check_start
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
-from tests.support.command_line import TINY_WITH_PICTURES, call, call_anew
+from tests.support.command_line import TINY, call, call_anew
 
 
 def clouds(number):
@@ -78,7 +78,7 @@ def test_check_start_unexpected_processes_raise(monkeypatch):
 
 def test_wrong_batch_size_fails_before_pretraining(tmp_path):
     devices = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
-    arguments = [*TINY_WITH_PICTURES[1:], *devices, "val_fraction=0", "batch_size=15"]
+    arguments = [*TINY[1:], *devices, "val_fraction=0", "batch_size=15"]
     status, out, err = call(arguments, tmp_path)
     assert status == 2
     assert "Try batch_size=16" in err
@@ -86,7 +86,8 @@ def test_wrong_batch_size_fails_before_pretraining(tmp_path):
 
 
 REGISTRATION = [
-    *TINY_WITH_PICTURES,
+    *TINY,
+    "logger=tensorboard",
     "task=registration",
     "learn=task",
     "trainer.max_epochs=2",
@@ -119,6 +120,6 @@ def test_two_processes_equal_one_and_rank_zero_writes(tmp_path):
 
 
 def test_sweep_on_several_devices_raises(tmp_path):
-    status, _, err = call(["-m", *TINY_WITH_PICTURES, "trainer.devices=2", "m=4,8"], tmp_path)
+    status, _, err = call(["-m", *TINY, "trainer.devices=2", "m=4,8"], tmp_path)
     assert status == 2
     assert "hydra/launcher=joblib" in err
