@@ -58,6 +58,8 @@ def main(modules: Sequence[str], sample: int) -> int:
         start = time.monotonic()
         known = listed(module)
         made = list(mutants(Path(f"src/mops_lightning/{module}.py").read_text()))
+        if unknown := known - {mutant.change for mutant in made}:
+            raise SystemExit(f"{EQUIVALENT.name}: {module} has no {min(unknown)!r}.")
         chosen = [mutant for mutant in made if mutant.change not in known]
         if len(chosen) > sample:
             chosen = random.Random(0).sample(chosen, sample)

@@ -1,3 +1,4 @@
+import ast
 from pathlib import Path
 
 import pytest
@@ -46,5 +47,7 @@ def test_listed_modules_and_mutants_exist(module):
     files = [root / "tests" / f"{name.partition('[')[0]}.py" for name in TESTS[module]]
     assert [file for file in files if not file.is_file()] == []
     source = (root / "src" / "mops_lightning" / f"{module}.py").read_text()
-    known = listed(module)
-    assert known <= ({mutant.change for mutant in mutants(source)} if known else set())
+    # That the mutants themselves exist is checked by `make mutants`, for making them takes seconds.
+    plain = ast.unparse(ast.parse(source))
+    changed = [change.partition(": ")[2].split("  ->  ")[0] for change in listed(module)]
+    assert [before for before in changed if before not in plain] == []
