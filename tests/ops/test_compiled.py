@@ -7,29 +7,9 @@ from mops_lightning.ops import compiled, nearest
 from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.ops.nearest import nearest as nearest_points
 from mops_lightning.samplers.poisson import eliminate
+from tests.support.clouds import cloud_of
 
 KINDS = ["sphere", "grid", "copies", "one point", "offset", "tiny", "huge", "outlier"]
-
-
-def cloud(kind, shape, dtype, rng):
-    points = torch.randn(*shape, 3, dtype=dtype, generator=rng)
-    if kind == "sphere":
-        points = torch.nn.functional.normalize(points, dim=2)
-    if kind == "grid":  # many ties
-        points = points.mul(3).round()
-    if kind == "copies":
-        points[:, shape[1] // 2 :] = points[:, : shape[1] - shape[1] // 2]
-    if kind == "one point":
-        points[:] = 0.25
-    if kind == "offset":
-        points = points + 1000
-    if kind == "tiny":
-        points = points * torch.finfo(dtype).tiny
-    if kind == "huge":  # squares of differences overflow
-        points = points.clamp(-3, 3) / 3 * torch.finfo(dtype).max
-    if kind == "outlier":
-        points[:, 0] = 1e6
-    return points
 
 
 @pytest.fixture
@@ -55,7 +35,7 @@ def both(monkeypatch):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("m", "n"), [(1, 1), (70, 9), (30, 800)])
 def test_nearest_equals_plain_form(m, n, kind, dtype, rng, both):
-    points, queries = cloud(kind, (2, n), dtype, rng), cloud(kind, (2, m), dtype, rng)
+    points, queries = cloud_of(kind, (2, n), dtype, rng), cloud_of(kind, (2, m), dtype, rng)
     queries[:, : min(m, n) // 2] = points[:, : min(m, n) // 2]
     (fast, rows), (plain, expected) = both(nearest_points, queries, points)
     assert torch.equal(rows, expected)
@@ -64,7 +44,7 @@ def test_nearest_equals_plain_form(m, n, kind, dtype, rng, both):
 
 def test_nearest_of_centre_equals_plain_form(rng, both):
     """All points are almost equally far away, so that no box can be skipped."""
-    points = cloud("sphere", (1, 500), torch.float32, rng)
+    points = cloud_of("sphere", (1, 500), torch.float32, rng)
     fast, plain = both(nearest_points, torch.zeros(1, 20, 3), points)
     assert torch.equal(fast[1], plain[1])
 
@@ -99,7 +79,7 @@ def test_nearest_gradients_equal_plain_form(rng, both):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (40, 39), (40, 40), (300, 1), (300, 20), (300, 150)])
 def test_eliminate_equals_plain_form(n, m, kind, rng, both):
-    points = cloud(kind, (2, n), torch.float32, rng)
+    points = cloud_of(kind, (2, n), torch.float32, rng)
     fast, plain = both(eliminate, points, m)
     assert torch.equal(fast, plain)
 

@@ -2,33 +2,12 @@
 
 import pytest
 import torch
-from torch.nn import functional as F
 
 from mops_lightning.ops import compiled, fps, fps_cpu
 from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample
+from tests.support.clouds import cloud_of
 
 KINDS = ["sphere", "normal", "grid", "line", "copies", "one point", "offset", "tiny", "huge"]
-
-
-def cloud(kind, n, dtype, rng):
-    points = torch.randn(2, n, 3, dtype=dtype, generator=rng)
-    if kind == "sphere":
-        points = F.normalize(points, dim=2)
-    if kind == "grid":  # many ties
-        points = points.mul(3).round()
-    if kind == "line":
-        points[..., 1:] = 0
-    if kind == "copies":
-        points[:, n // 2 :] = points[:, : n - n // 2]
-    if kind == "one point":
-        points[:] = 0.25
-    if kind == "offset":
-        points = points + 1000
-    if kind == "tiny":
-        points = points * torch.finfo(dtype).tiny
-    if kind == "huge":  # squares of differences overflow, and some differences
-        points = points.clamp(-3, 3) / 3 * torch.finfo(dtype).max
-    return points
 
 
 @pytest.fixture(params=["groups", "table", "compiled"])
@@ -59,7 +38,7 @@ def both(request, monkeypatch):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (90, 90), (128, 60), (1500, 700)])
 def test_sample_equals_exhaustive_search(n, m, kind, dtype, rng, both):
-    points = cloud(kind, n, dtype, rng)
+    points = cloud_of(kind, (2, n), dtype, rng)
     start = torch.randint(n, (2,), generator=rng)
     fast, plain = both(farthest_point_sample, points, m, start=start)
     assert torch.equal(fast, plain)
@@ -67,7 +46,7 @@ def test_sample_equals_exhaustive_search(n, m, kind, dtype, rng, both):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_fill_equals_exhaustive_search(kind, rng, both):
-    points = cloud(kind, 700, torch.float32, rng)
+    points = cloud_of(kind, (2, 700), torch.float32, rng)
     indices = torch.stack([torch.randperm(700, generator=rng)[:200] for _ in range(2)])
     fast, plain = both(farthest_point_fill, points, indices, torch.tensor([1, 150]))
     assert torch.equal(fast, plain)

@@ -4,6 +4,7 @@ import shutil
 import pytest
 
 from mops_lightning.config.compose import compose
+from mops_lightning.config.overrides import added
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.replay import command_line
@@ -21,6 +22,7 @@ def trained(tmp_path_factory):
 
 def evaluated(trained, tmp_path, *arguments):
     chosen = command_line([f"evaluate={trained[0]}", "pictures=0", "logger=none", *arguments])
+    chosen = [added(argument) for argument in chosen]
     return run(compose(chosen), tmp_path / "new", chosen)
 
 

@@ -166,20 +166,20 @@ def test_draw_points_returns_distinct_rows_new_in_every_draw():
     cloud = torch.arange(POINTS * 3.0).view(1, POINTS, 3)
     batch = Batch(cloud.repeat(2, 1, 1), torch.zeros(2))
     torch.manual_seed(0)
-    first, second = (draw_points(batch, 30).points[..., 0] / 3 for _ in range(2))
+    first, second = (draw_points(batch, 30)[..., 0] / 3 for _ in range(2))
     for rows in (*first, *second):
         assert len(rows.unique()) == 30
         assert set(rows.tolist()) <= set(range(POINTS))
     assert not torch.equal(first[0].sort().values, first[1].sort().values)
     assert not torch.equal(first, second)
-    assert draw_points(batch, POINTS) is batch
+    assert draw_points(batch, POINTS) is batch.points
 
 
 def test_draw_points_keeps_the_rows_of_a_pair():
     points = torch.randn(3, POINTS, 3)
     pairs = Pairs()(points, [torch.Generator().manual_seed(i) for i in range(3)])
     drawn = draw_points(pairs, 10)
-    source, target = drawn.points.chunk(2)
+    source, target = drawn.chunk(2)
     full_source, full_target = pairs.points.chunk(2)
     rows = [torch.cdist(a, b).argmin(2) for a, b in ((source, full_source), (target, full_target))]
     assert torch.equal(*rows)

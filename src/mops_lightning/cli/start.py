@@ -9,7 +9,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mops_lightning.config import distributed
 from mops_lightning.config.explain import explain
-from mops_lightning.config.paths import check_paths
+from mops_lightning.config.paths import INPUTS, check_paths
 from mops_lightning.config.validate import check
 from mops_lightning.errors import USER_ERROR, UserError, end, file_error
 from mops_lightning.zoo import names
@@ -49,7 +49,7 @@ def _check_weights(given: str | None) -> None:
     Raises:
         UserError: there is none.
     """
-    if given in (None, "auto", "run"):
+    if given is None or given in INPUTS["weights"]:
         return
     try:
         path = names.resolve(given)

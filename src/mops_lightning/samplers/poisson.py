@@ -79,11 +79,15 @@ def eliminate(points: Tensor, m: int) -> Tensor:
     reach = spacing_bound(points, m).clamp_min(torch.finfo(points.dtype).tiny)
     # Sums of integers do not depend on the order of the points.
     scale = 2.0 ** min(50, 62 - number.bit_length())
-    clouds = zip(points, reach.flatten().tolist(), strict=True)
-    fast = [eliminate_by_cells(cloud, m, bound, scale) for cloud, bound in clouds]
-    rows = [row for row in fast if row is not None]
-    if batch and len(rows) == batch:
-        return torch.stack(rows)
+    rows = []
+    for cloud, bound in zip(points, reach.flatten().tolist(), strict=True):
+        row = eliminate_by_cells(cloud, m, bound, scale)
+        if row is None:
+            break
+        rows.append(row)
+    else:
+        if batch:
+            return torch.stack(rows)
     planes = points.permute(2, 0, 1).contiguous()  # every step runs along memory
     crowding = _crowding(planes, reach, scale)
     for _ in range(number - m):

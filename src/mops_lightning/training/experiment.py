@@ -196,7 +196,7 @@ class Experiment(L.LightningModule):
             taught = self._full_prediction(batch) if self.distills else None
             available = batch.points.shape[1]
             n = self.recipe.points_at(self._progress, available, max(sizes))
-            seen = draw_points(batch, n).points
+            seen = draw_points(batch, n)
             outputs = self._sample(seen, sizes)
             terms: dict[str, list[Tensor]] = defaultdict(list)
             for m in sizes:

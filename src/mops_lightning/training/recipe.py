@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -86,8 +85,8 @@ def reached(share: float | None, progress: float) -> bool:
     return share is not None and progress >= share
 
 
-def draw_points(batch: Any, n: int) -> Any:
-    """Return a batch with ``n`` random points of every cloud, without repetition.
+def draw_points(batch: Batch | PairBatch, n: int) -> Tensor:
+    """Return ``n`` random points of every cloud of a batch, without repetition.
 
     The clouds of a pair keep the same rows. Random numbers are from torch's global generator.
 
@@ -95,14 +94,13 @@ def draw_points(batch: Any, n: int) -> Any:
         batch: ``Batch`` or ``PairBatch``.
         n: at most the number of points.
     """
-    assert isinstance(batch, Batch | PairBatch)
     points = batch.points
     if n >= points.shape[1]:
-        return batch
+        return points
     clouds = batch.num_clouds
     rows = torch.rand(clouds, points.shape[1], device=points.device).topk(n).indices
     rows = rows.repeat(len(points) // clouds, 1)
-    return batch._replace(points=gather_points(points, rows))
+    return gather_points(points, rows)
 
 
 def straight_through(sampled: SampleOutput, points: Tensor) -> Tensor:

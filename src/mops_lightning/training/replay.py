@@ -78,7 +78,7 @@ def command_line(arguments: list[str]) -> list[str]:
     behind = [a for i, a in enumerate(arguments) if i > places[0] and i not in places]
     given = {overrides.key(a) for a in typed}
     defaults = [a for a in own if overrides.key(a) not in given]
-    return [*map(overrides.added, before), *defaults, *map(overrides.added, behind)]
+    return [*before, *defaults, *behind]
 
 
 def _chosen(argument: str) -> str | None:
