@@ -9,6 +9,7 @@ import pytest
 from mops_lightning.records import run_record
 from mops_lightning.zoo import weights
 from tests.support.command_line import (
+    SMALL_PCRNET,
     TINY,
     TINY_ANY_DATA,
     TINY_WITH_PICTURES,
@@ -118,7 +119,7 @@ def test_joint_training_starts_from_cached_task_net(main_job):
 def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
     settings = [
         *TINY_WITH_PICTURES,
-        "task=registration",
+        *SMALL_PCRNET,
         "sampler=fmops",
         "sampler.m_max=16",
         "pictures=1",

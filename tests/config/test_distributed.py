@@ -10,7 +10,7 @@ from mops_lightning.config.distributed import check_shares, check_start
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
-from tests.support.command_line import TINY, call, call_anew
+from tests.support.command_line import SMALL_PCRNET, TINY, call, call_anew
 
 
 def clouds(number):
@@ -88,7 +88,7 @@ def test_wrong_batch_size_fails_before_pretraining(tmp_path):
 REGISTRATION = [
     *TINY,
     "logger=tensorboard",
-    "task=registration",
+    *SMALL_PCRNET,
     "learn=task",
     "trainer.max_epochs=2",
     "batch_size=8",

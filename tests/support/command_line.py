@@ -34,6 +34,13 @@ TINY = [
 ]
 """The smallest job that runs every stage, on procedural shapes."""
 
+SMALL_PCRNET = [
+    "task=registration",
+    "+task.net.feature_channels=[16,32]",
+    "+task.net.head_channels=[32]",
+]
+"""Registration by a net that is written to disk in no time."""
+
 TINY_WITH_PICTURES = [*TINY, "pictures=2", "logger=tensorboard"]
 
 

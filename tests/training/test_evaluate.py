@@ -9,7 +9,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.replay import command_line
 from mops_lightning.training.run import run
-from tests.support.command_line import TINY
+from tests.support.command_line import SMALL_PCRNET, TINY
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +190,7 @@ def test_evaluate_missing_weights_raises(trained, tmp_path):
 
 
 def test_command_line_other_net_drops_its_settings(tmp_path):
-    overrides = [*TINY, "task=registration", "task.net.iterations=2", f"cache={tmp_path}/cache"]
+    overrides = [*TINY, *SMALL_PCRNET, "task.net.iterations=2", f"cache={tmp_path}/cache"]
     overrides += ["sampler=mops", "task/loss=frobenius_chamfer", "task.loss.chamfer_weight=0.5"]
     run(compose(overrides), tmp_path / "run", overrides)
     for other in (["task/net=icp"], ["task/loss=quaternion"]):

@@ -11,7 +11,7 @@ from mops_lightning.files import TEMPORARY
 from mops_lightning.training.pretrain import cache_folder
 from mops_lightning.training.run import run
 from mops_lightning.zoo import weights
-from tests.support.command_line import TINY, start
+from tests.support.command_line import SMALL_PCRNET, TINY, start
 
 
 def train(folder, *arguments):
@@ -24,12 +24,10 @@ def files(folder, pattern):
 
 
 def test_task_net_from_file_is_not_published(tmp_path):
-    train(tmp_path, "learn=task", "task=registration")
+    train(tmp_path, "learn=task", *SMALL_PCRNET)
     (published,) = files(tmp_path, "cache/weights/*/weights.pt")
     first = tmp_path / "run0" / "weights.pt"
-    record = train(
-        tmp_path, "learn=task", "task=registration", f"weights={first}", "optimizer.lr=0"
-    )
+    record = train(tmp_path, "learn=task", *SMALL_PCRNET, f"weights={first}", "optimizer.lr=0")
     assert record.notes["weights_loaded"] == published["sha256"]
     own, again = (weights.read(path)["state"] for path in sorted(tmp_path.glob("run*/weights.pt")))
     assert all(torch.equal(own[name], again[name]) for name in own)  # at a rate of 0 nothing moves
@@ -48,14 +46,14 @@ def test_weights_file_for_net_without_weights_raises(tmp_path):
 
 
 def test_resumed_run_from_file_is_not_published(tmp_path):
-    cfg = compose([*TINY, f"cache={tmp_path}/cache", "learn=task", "task=registration"])
+    cfg = compose([*TINY, f"cache={tmp_path}/cache", "learn=task", *SMALL_PCRNET])
     folder = cache_folder(cfg, build(cfg.dataset, "dataset"))
     folder.mkdir(parents=True)
     (folder / f"{TEMPORARY}left by a kill.pt").touch()
-    train(tmp_path, "learn=task", "task=registration")
+    train(tmp_path, "learn=task", *SMALL_PCRNET)
     assert [path.name for path in folder.iterdir()] == [weights.FILE]
     (first,) = tmp_path.glob("run*/weights.pt")
-    given = ["learn=task", "task=registration", f"weights={first}"]
+    given = ["learn=task", *SMALL_PCRNET, f"weights={first}"]
     train(tmp_path, *given)
     for path in (tmp_path / "cache" / "weights").rglob("weights.pt"):
         path.unlink()
@@ -64,7 +62,7 @@ def test_resumed_run_from_file_is_not_published(tmp_path):
 
 
 def test_resume_other_weights_raises(tmp_path):
-    task = ["learn=task", "task=registration"]
+    task = ["learn=task", *SMALL_PCRNET]
     train(tmp_path, *task)
     anew = tmp_path / "run0"
     given = f"weights={anew / 'weights.pt'}"
@@ -77,7 +75,7 @@ def test_resume_other_weights_raises(tmp_path):
 
 def test_diverged_training_fails_without_weights(tmp_path):
     with pytest.raises(UserError, match=r"training diverged: the loss is nan .*No weights"):
-        train(tmp_path, "learn=task", "task=registration", "optimizer.lr=1e30")
+        train(tmp_path, "learn=task", *SMALL_PCRNET, "optimizer.lr=1e30")
     assert not files(tmp_path, "**/weights.pt")
     record = json.loads((tmp_path / "run0" / "result.json").read_text())
     assert record["status"] == "failed"
@@ -106,7 +104,7 @@ def test_mistake_fails_before_pretraining(settings, said, tmp_path):
 
 @pytest.mark.parametrize("damage", ["cut", "nan", "not restorable"])
 def test_damaged_cache_is_set_aside_and_trained_again(tmp_path, capsys, damage):
-    settings = ["task=registration", "sampler=fps", "epochs.task=2"]
+    settings = [*SMALL_PCRNET, "sampler=fps", "epochs.task=2"]
     train(tmp_path, *settings)
     (path,) = tmp_path.glob("cache/weights/*/weights.pt")
     checkpoint = path.parent / "checkpoints" / "last.ckpt"
@@ -134,11 +132,11 @@ def test_damaged_cache_is_set_aside_and_trained_again(tmp_path, capsys, damage):
 
 
 def test_test_seed_keeps_cached_task_net(tmp_path):
-    train(tmp_path, "task=registration", "sampler=fps")
+    train(tmp_path, *SMALL_PCRNET, "sampler=fps")
     (first,) = files(tmp_path, "cache/weights/*/weights.pt")
     (folder,) = tmp_path.glob("cache/weights/*/")
     (folder / f"{TEMPORARY}left by a kill.json").touch()
-    train(tmp_path, "task=registration", "sampler=fps", "task.pairs.test_seed=5")
+    train(tmp_path, *SMALL_PCRNET, "sampler=fps", "task.pairs.test_seed=5")
     assert not list(folder.glob(f"{TEMPORARY}*"))
     assert [one["sha256"] for one in files(tmp_path, "cache/weights/*/weights.pt")] == [
         first["sha256"]
@@ -167,7 +165,7 @@ def test_same_task_net_in_two_processes_is_trained_once(tmp_path):
 
 
 def test_resume_with_fewer_epochs_than_done_raises(tmp_path):
-    task = ["learn=task", "task=registration"]
+    task = ["learn=task", *SMALL_PCRNET]
     train(tmp_path, *task, "trainer.max_epochs=3")
     checkpoint = f"ckpt_path={tmp_path / 'run0'}"
     with pytest.raises(UserError, match=r"max_epochs must be at least 3.*last\.ckpt, got 2"):
