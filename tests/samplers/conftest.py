@@ -9,7 +9,7 @@ from mops_lightning.samplers.mops import MOPSNet
 def trained(request, rng):
     """A sampler with running statistics from data and BatchNorm weights of both signs."""
     torch.manual_seed(5)
-    made = request.param(24)
+    made = request.param(24, feature_channels=(64, 48, 80), rho_channels=(96, 72, 40))
     made.train()
     for _ in range(3):
         made(torch.randn(4, 100, 3, generator=rng) * 2 + 1)

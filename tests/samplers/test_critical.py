@@ -1,7 +1,10 @@
+import pytest
 import torch
 
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.critical import CriticalSampler
+from mops_lightning.samplers.ordering import seeded_order
+from tests.support.plain import plain_farthest
 
 
 @torch.no_grad()
@@ -19,10 +22,32 @@ def test_critical_equals_plain_ranking(rng):
         assert chosen[:number] == want[:number]
 
 
-def test_critical_fills_up_by_farthest_points():
-    class FirstAxis(torch.nn.Module):
-        def point_features(self, points):
-            return points[..., :1].relu()
+class FirstAxis(torch.nn.Module):
+    """Its only channel is the first coordinate where that is positive."""
 
-    line = torch.tensor([[[1.0, 0, 0], [2, 0, 0], [3, 0, 0], [-9, 0, 0]]])
-    assert CriticalSampler(3, FirstAxis())(line).indices.tolist() == [[2, 3, 0]]
+    def point_features(self, points):
+        return points[..., :1].relu()
+
+
+@pytest.mark.parametrize(
+    ("line", "chosen"),
+    [
+        ([1.0, 2, 3, -9, 0.5, 1.5, 2.5, -1], [2, 3, 7]),
+        ([-1.0, -2, -9, -3, -4, -5, -6, -8], None),  # no point is critical
+    ],
+)
+def test_critical_fills_up_by_farthest_points(line, chosen):
+    points = torch.tensor(line)[None, :, None] * torch.tensor([1.0, 0, 0])
+    rows = CriticalSampler(3, FirstAxis())(points).indices[0].tolist()
+    assert rows == (chosen or plain_farthest(points[0], rows[:1], 3))
+
+
+def test_critical_ties_keep_seeded_order(rng):
+    class OwnChannels(torch.nn.Module):
+        def point_features(self, points):
+            return torch.eye(points.shape[1]).expand(len(points), -1, -1)
+
+    points = torch.randn(2, 60, 3, generator=rng)
+    for seed in (0, 1):
+        rows = CriticalSampler(20, OwnChannels(), seed)(points).indices
+        assert torch.equal(rows, seeded_order(points, seed)[:, :20])

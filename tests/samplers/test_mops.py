@@ -133,7 +133,8 @@ def test_mops_gradcheck(rng):
         ({"feature_channels": ()}, "^feature_channels must be sizes of at least 1 layer,"),
         ({"rho_channels": (8, 0)}, "^rho_channels must be sizes"),
         ({"threshold": 1.0}, "^threshold must be at least 0 and below 1, got 1.0"),
-        ({"alpha": -1.0}, "^alpha must be at least 0, got -1.0"),
+        ({"alpha": -1.0}, "^alpha must be a number of at least 0, got -1.0"),
+        ({"alpha": float("inf")}, "^alpha must be a number"),
         ({"annealing": "exponentail"}, "^annealing: unknown 'exponentail'.*exponential"),
     ],
 )

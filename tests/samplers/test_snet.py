@@ -92,8 +92,9 @@ def test_progressive_samples_are_nested(rng):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"alpha": -1.0}, "^alpha must be at least 0, got -1.0"),
-        ({"coverage": -1.0}, "^coverage must be at least 0"),
+        ({"alpha": -1.0}, "^alpha must be a number of at least 0, got -1.0"),
+        ({"alpha": float("nan")}, "^alpha must be a number"),
+        ({"coverage": -1.0}, "^coverage must be a number of at least 0"),
         ({"feature_channels": (8,)}, "^feature_channels must be sizes of at least 2 layers"),
         ({"head_channels": (0,)}, "^head_channels must be .* each at least 1, got .0."),
         ({"min_size": 0}, "^min_size must be at least 1, got 0"),

@@ -58,3 +58,8 @@ def test_stream_sample_is_nested(rng):
 def test_stream_sample_invalid_input_raises(make, chunks, message):
     with pytest.raises(UserError, match=message):
         stream_sample(make().eval(), lambda: chunks)
+
+
+def test_stream_sample_of_more_than_largest_size_raises():
+    with pytest.raises(UserError, match="m must be between 1 and 4, got 5"):
+        stream_sample(FMOPSNet(4).eval(), lambda: [torch.zeros(9, 3)], 5)

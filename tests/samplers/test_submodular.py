@@ -35,14 +35,18 @@ def test_submodular_reaches_result_of_all_points(net, rng):
 
 
 def test_submodular_gradient_weights_decide(net, rng):
-    points = torch.randn(1, 40, 3, generator=rng)
-    features = net.point_features(points)[0].detach()
-    pooled = features.amax(0, keepdim=True).requires_grad_()
-    log_p = net.from_pooled(pooled).log_softmax(1).max()
-    weights = torch.autograd.grad(log_p, pooled)[0][0].abs()
+    points = torch.randn(2, 40, 3, generator=rng)
     with torch.inference_mode():  # as in Lightning's tests
-        row = SubmodularSampler(1, net, weighting="gradient")(points).indices.item()
-    assert row == (features @ weights).argmax()
+        chosen = SubmodularSampler(6, net, weighting="gradient")(points).indices
+    for features, rows in zip(net.point_features(points).detach(), chosen, strict=True):
+        pooled = features.amax(0, keepdim=True).requires_grad_()
+        log_p = net.from_pooled(pooled).log_softmax(1).max()
+        weights = torch.autograd.grad(log_p, pooled)[0][0].abs()
+        covered = torch.zeros_like(weights)
+        for row in rows:
+            gains = (features - covered).relu() @ weights
+            torch.testing.assert_close(gains[row], gains.max())
+            covered = torch.maximum(covered, features[row])
 
 
 def test_submodular_leaves_net_as_it_is(net, rng):

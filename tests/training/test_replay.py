@@ -104,6 +104,12 @@ def test_command_line_record_with_code_raises(attack, tmp_path):
     assert ATTACKS[attack][0].partition("=")[0].lstrip("+") in str(refused.value)
 
 
+@pytest.mark.parametrize("nothing", ["{}", "[]", "null"])
+def test_command_line_record_with_emptied_group_is_repeated(nothing, tmp_path):
+    folder = write_run(tmp_path / "run", [*OVERRIDES, f"baselines={nothing}"])
+    assert f"baselines={nothing}" in command_line([f"evaluate={folder}"])
+
+
 @pytest.mark.parametrize("group", ["task", "dataset", "sampler"])
 def test_command_line_record_with_path_as_group_raises(group, tmp_path):
     folder = write_run(tmp_path / "run", [], **{group: "../../../tmp/evil"})

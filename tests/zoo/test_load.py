@@ -91,6 +91,9 @@ def test_load_nested_arguments_are_refused(save, value):
         ({"m_max": -1}, "at least 1, got -1"),
         ({"m_max": None}, "a whole number, got None"),
         ({"tau_min": "low"}, "cannot build"),
+        ({"feature_channels": [8] * 1000}, "cannot build .* more than the [0-9]+ tensors"),
+        ({"feature_channels": [10**6] * 2}, "another net's weights"),  # 4 TB
+        ({"m_max": 2**70}, "cannot build"),
         ({"m_max": 17}, r"queries.weight is \(16, 128\) instead of \(17, 128\)"),
     ],
 )

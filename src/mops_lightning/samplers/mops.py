@@ -1,5 +1,6 @@
 """MOPS-Net, the learned sampler of the paper."""
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -66,8 +67,8 @@ class MOPSNet(Sampler):
         super().__init__(m)
         if not 0 < tau_min <= 1:
             raise UserError(f"tau_min must be above 0 and at most 1, got {tau_min}.")
-        if alpha < 0:
-            raise UserError(f"alpha must be at least 0, got {alpha}.")
+        if not 0 <= alpha < math.inf:
+            raise UserError(f"alpha must be a number of at least 0, got {alpha}.")
         if annealing not in ANNEALINGS:
             hint = did_you_mean(annealing, ANNEALINGS)
             raise UserError(f"annealing: unknown {annealing!r}.{hint}")

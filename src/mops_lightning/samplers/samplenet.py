@@ -4,6 +4,7 @@ Lang, Manor and Avidan, "SampleNet: Differentiable Point Cloud Sampling", CVPR 2
 the paper's tables.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -81,8 +82,8 @@ class SampleNet(SNet):
     ) -> None:
         super().__init__(m, **settings)
         for name, value in {"beta": beta, "gamma": gamma or 0, "sigma_min": sigma_min}.items():
-            if value < 0:
-                raise UserError(f"{name} must be at least 0, got {value}.")
+            if not 0 <= value < math.inf:
+                raise UserError(f"{name} must be a number of at least 0, got {value}.")
         if k < 1:
             raise UserError(f"k must be at least 1, got {k}.")
         self.k = k

@@ -3,6 +3,7 @@
 Dovrat, Lang and Avidan, "Learning to Sample", CVPR 2019; a baseline in the paper's tables.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -57,8 +58,8 @@ class SNet(Sampler):
         super().__init__(m)
         weights = {"alpha": alpha, "coverage": coverage, "coverage_per_point": coverage_per_point}
         for name, value in weights.items():
-            if value < 0:
-                raise UserError(f"{name} must be at least 0, got {value}.")
+            if not 0 <= value < math.inf:
+                raise UserError(f"{name} must be a number of at least 0, got {value}.")
         check_channels("feature_channels", feature_channels, 2)
         check_channels("head_channels", head_channels)
         self.alpha = alpha

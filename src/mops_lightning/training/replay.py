@@ -141,7 +141,7 @@ def _check_recorded(argument: str, folder: str) -> None:
     key = overrides.key(argument)
     declared = settings.declared().get(key)
     is_group = "/" in key or "@" in key or key == "experiment" or (declared and declared.group)
-    choices = value if isinstance(value, list) else [value]
+    choices = value if isinstance(value, list) else [value] if value else []
     if (
         override is None
         or override.is_sweep_override()

@@ -1,15 +1,20 @@
 """Building a module that a file describes, from a list of classes; the file imports nothing."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from mops_lightning.config.annotations import misfit
 from mops_lightning.errors import UserError
+from mops_lightning.zoo.weights import check_shapes, fit_state
 
 
 @dataclass(frozen=True)
@@ -28,16 +33,24 @@ class ClosedList:
     what: str
     hint: str
 
-    def build(self, node: Any, path: str | Path, **offered: Any) -> Any:
-        """Build the untrained module that a file describes; torch's random state stays as it is.
+    def build(
+        self, node: Any, state: dict[str, Tensor], path: str | Path, hint: str, **offered: Any
+    ) -> Any:
+        """Build the module that a file describes; torch's random state stays as it is.
 
         Args:
             node: the class's name under ``_target_``, and its arguments.
+            state: the file's tensors by name.
             path: the file, for errors.
+            hint: what to try next if the tensors are not the module's, for errors.
             **offered: further arguments, for classes that take them.
 
+        Returns:
+            The module with these tensors.
+
         Raises:
-            UserError: the class is not in the list, or an argument is not plain or not the class's.
+            UserError: the class is not in the list, an argument is not plain or not the class's, or
+                the tensors do not match the module.
         """
         node = node or {}
         if not isinstance(node, dict) or not all(isinstance(name, str) for name in node):
@@ -61,14 +74,47 @@ class ClosedList:
                 )
             wanted = misfit(value, parameters[name].annotation) if name in parameters else None
             if wanted:
-                raise UserError(f"{path}: {self.where}.{name} must be {wanted}, got {value!r}.")
-        given = {name: value for name, value in offered.items() if name in parameters}
-        try:
-            with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
-                return known[target](**{**arguments, **given})
-        except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: beyond memory
-            reason = str(error).partition("\n")[0]
-            raise UserError(f"{path}: cannot build {target}: {reason}") from None
+                raise UserError(f"{path}: {self.where}.{name} must be {wanted}, got {value!r:.99}.")
+        arguments |= {name: value for name, value in offered.items() if name in parameters}
+        make = partial(_built, known[target], arguments, path)
+        with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
+            # Without memory first: a small file can describe a large net.
+            with torch.device("meta"), at_most(len(state)):
+                check_shapes(make(), state, path, hint)
+            module = make()
+        fit_state(module, state, path, hint)
+        return module
+
+
+def _built(cls: type[nn.Module], arguments: dict[str, Any], path: str | Path) -> nn.Module:
+    try:
+        return cls(**arguments)
+    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: sizes beyond 64 bits
+        reason = str(error).partition("\n")[0]
+        name = f"{cls.__module__}.{cls.__qualname__}"
+        raise UserError(f"{path}: cannot build {name}: {reason}") from None
+
+
+@contextmanager
+def at_most(number: int) -> Iterator[None]:
+    """Limit the number of parameters of the modules that are built.
+
+    Raises:
+        ValueError: there are more.
+    """
+    left = number
+
+    def count(*_: Any) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise ValueError(f"it has more than the {number} tensors of the file")
+
+    hook = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    finally:
+        hook.remove()
 
 
 def _is_plain(value: Any) -> bool:

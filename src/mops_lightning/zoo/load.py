@@ -80,6 +80,5 @@ def load(path: str | Path) -> Sampler:
     config = content["config"]
     if config.get("learn") == "task":
         raise UserError(f"{path} holds a task net, not a sampler. {HINT}")
-    sampler: Sampler = LISTED.build(config.get("sampler"), path)
-    weights.fit_state(sampler, content["state"], path, HINT)
+    sampler: Sampler = LISTED.build(config.get("sampler"), content["state"], path, HINT)
     return sampler.eval()

@@ -74,10 +74,10 @@ def load_net(path: str | Path, task: str, num_classes: int) -> LoadedNet:
     trained_for = below(config, "names").get("task")
     if trained_for != task:
         raise UserError(f"{path} holds a net for {trained_for}, not for {task}. Give a net for it.")
-    net = LISTED.build(below(config, "task").get("net"), path, num_classes=num_classes)
     # The file is a task's, whose only part with weights is the net.
     state = {name.removeprefix("net."): value for name, value in content["state"].items()}
-    weights.fit_state(net, state, path, HINT)
+    described = below(config, "task").get("net")
+    net = LISTED.build(described, state, path, HINT, num_classes=num_classes)
     kind = next(name for name, cls in NETS.items() if type(net) is cls)
     return LoadedNet(net.eval(), kind, content)
 

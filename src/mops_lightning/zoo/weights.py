@@ -212,6 +212,14 @@ def fit_state(
     Raises:
         UserError: names or shapes differ from the module's.
     """
+    check_shapes(module, state, path, hint)
+    module.load_state_dict(state, strict=True)
+
+
+def check_shapes(
+    module: nn.Module, state: dict[str, Tensor], path: str | Path, hint: str = OTHER_NET
+) -> None:
+    """Reject tensors whose names or shapes are not a module's; see ``fit_state``."""
     expected = module.state_dict()
     wrong = [f"{name} is missing" for name in expected if name not in state]
     wrong += [f"{name} is unknown" for name in state if name not in expected]
@@ -223,7 +231,6 @@ def fit_state(
     if wrong:
         more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
         raise UserError(f"{path} holds another net's weights: {'; '.join(wrong[:3])}{more}. {hint}")
-    module.load_state_dict(state, strict=True)
 
 
 def first_nonfinite(state: Any, name: str = "") -> str | None:

@@ -1,0 +1,108 @@
+"""Assignments against brute force, and the sizes of the exact problems that a round solves."""
+
+import itertools
+
+import numpy as np
+import ot
+import pytest
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+
+from mops_lightning.ops import assignment
+from mops_lightning.ops.assignment import approximate_assignment, solve_assignment
+
+RECORDED = [218.255914, 210.018198, 208.054227, 207.526908, 206.56343]
+"""Costs of ``clouds(200)`` after 0 to 4 rounds: distances in committed records depend on them."""
+
+
+def clouds(n, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(n, 3)), rng.normal(size=(n, 3)) * [1, 2, 0.5]
+
+
+def cost(p, q, rows):
+    return np.linalg.norm(p - q[rows], axis=1).sum()
+
+
+@pytest.fixture
+def solved(monkeypatch):
+    """Return a list of the exact problems that are solved: the points of both clouds."""
+    problems = []
+
+    def recorded(p, q):
+        problems.append((p, q))
+        return solve_assignment(p, q)
+
+    monkeypatch.setattr(assignment, "solve_assignment", recorded)
+    return problems
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_solve_equals_best_of_all_permutations(n):
+    p, q = clouds(n)
+    best = min(cost(p, q, list(rows)) for rows in itertools.permutations(range(n)))
+    assert cost(p, q, solve_assignment(p, q)) == pytest.approx(best)
+
+
+@pytest.mark.parametrize("limit", [1, 10**9])
+def test_solve_by_either_solver_is_exact(limit, monkeypatch):
+    monkeypatch.setattr(assignment, "NETWORK_SIMPLEX_MIN_POINTS", limit)
+    p, q = clouds(70)
+    rows = solve_assignment(p, q)
+    assert rows.dtype == np.int64
+    assert np.array_equal(rows, linear_sum_assignment(cdist(p, q))[1])
+
+
+def test_solve_of_plan_that_is_no_bijection_is_exact(monkeypatch):
+    monkeypatch.setattr(assignment, "NETWORK_SIMPLEX_MIN_POINTS", 1)
+    monkeypatch.setattr(ot, "emd", lambda a, b, cost, **_: np.ones_like(cost))
+    p, q = clouds(20)
+    assert np.array_equal(solve_assignment(p, q), linear_sum_assignment(cdist(p, q))[1])
+
+
+def test_approximate_without_rounds_assigns_halves_along_longest_axis(solved):
+    p, q = clouds(64)
+    rows = approximate_assignment(p, q, 32, 0)
+    assert [len(part) for part, _ in solved] == [32, 32]
+    # The second axis has the largest variance of both clouds together.
+    low = [set(np.argsort(cloud[:, 1])[:32].tolist()) for cloud in (p, q)]
+    assert {int(rows[row]) for row in low[0]} == low[1]
+
+
+@pytest.mark.parametrize(("n", "sizes"), [(64, [16] * 4), (70, [8, 9, 9, 9, 8, 9, 9, 9])])
+@pytest.mark.parametrize("rounds", [1, 2, 3])
+def test_approximate_solves_blocks_that_cover_all_points_in_every_round(n, sizes, rounds, solved):
+    p, q = clouds(n)
+    rows = approximate_assignment(p, q, 16, rounds)
+    assert sorted(rows.tolist()) == list(range(n))
+    counts = len(sizes)
+    assert len(solved) == counts * (rounds + 1)
+    for start in range(0, len(solved), counts):
+        parts = solved[start : start + counts]
+        assert sorted(len(part) for part, _ in parts) == sorted(sizes)
+        for number, cloud in enumerate((p, q)):
+            found = np.concatenate([part[number] for part in parts])
+            assert np.array_equal(np.sort(found, 0), np.sort(cloud, 0))
+
+
+def test_approximate_blocks_are_compact_in_each_cloud_in_turn(solved):
+    p, q = clouds(256)
+    approximate_assignment(p, q, 16, 2)
+    spread = [np.mean([part[number].std(0).mean() for part in solved[16:32]]) for number in (0, 1)]
+    again = [np.mean([part[number].std(0).mean() for part in solved[32:]]) for number in (0, 1)]
+    assert spread[0] < 0.7 * p.std(0).mean()
+    assert again[1] < 0.7 * q.std(0).mean()
+
+
+def test_approximate_cost_never_increases_and_is_fixed():
+    p, q = clouds(200)
+    costs = [cost(p, q, approximate_assignment(p, q, 32, rounds)) for rounds in range(5)]
+    assert costs == sorted(costs, reverse=True)
+    assert costs == pytest.approx(RECORDED, rel=1e-6)
+
+
+def test_approximate_in_one_block_is_exact(solved):
+    p, q = clouds(40)
+    rows = approximate_assignment(p, q, 40, 5)
+    assert len(solved) == 1
+    assert np.array_equal(rows, solve_assignment(p, q))
