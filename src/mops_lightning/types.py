@@ -1,7 +1,8 @@
 """Types that data, samplers, tasks and metrics exchange, and the letters of their shapes.
 
 ``B`` clouds in a batch, ``N`` input points, ``M`` sampled points, ``C`` channels, ``S`` shapes in
-a split. Points are float32 ``(B, N, 3)`` in the unit sphere, without unit.
+a split. Points are float32 ``(B, N, 3)`` in the unit sphere, without unit. Where clouds have C
+attributes, such as intensities, these follow as further channels, ``(B, N, 3 + C)``.
 """
 
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
@@ -42,7 +43,7 @@ class Batch(NamedTuple):
     """One batch of clouds.
 
     Attributes:
-        points: ``(B, N, 3)``.
+        points: ``(B, N, 3)``, or ``(B, N, 3 + C)`` with attributes.
         labels: ``(B,)`` int64 class numbers.
         rows: ``(B,)`` int64 rows of the clouds in their split, or None.
         pairs: the targets of these clouds, for data that are pairs with known motions; or None.
@@ -89,7 +90,7 @@ class SampleOutput(NamedTuple):
     """The output of every sampler; a NamedTuple, which device transfer and collation support.
 
     Attributes:
-        points: ``(B, M, 3)`` the sampled points.
+        points: ``(B, M, 3)`` the sampled points, or ``(B, M, 3 + C)`` with attributes.
         indices: ``(B, M)`` int64 rows of the input, or None when the points are generated.
         losses: the sampler's own weighted loss terms, to add to the task loss.
         matrix: the sampling matrix S that generated the points, or None.

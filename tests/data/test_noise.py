@@ -31,3 +31,10 @@ def test_noisy_clouds_of_pairs_differ(rng):
     assert added.pairs is not None
     assert (added.pairs.target - points).std() > 0.08
     assert not torch.allclose(added.pairs.target, added.points, atol=0.05)
+
+
+def test_noisy_leaves_attributes(rng):
+    points = torch.randn(5, 30, 4, generator=rng)
+    added = noisy(points, 0.1)
+    assert torch.equal(added[..., 3], points[..., 3])
+    assert torch.equal(added[..., :3], noisy(points[..., :3], 0.1))

@@ -99,3 +99,8 @@ def test_graph_encoder_accepts_fewer_points_than_neighbours(rng):
 def test_foldingnet_invalid_argument_raises(make, message):
     with pytest.raises(UserError, match=message):
         make()
+
+
+def test_graph_encoder_with_attributes_raises():
+    with pytest.raises(UserError, match=r"encoder must be mlp with attributes \(red\)"):
+        MFoldingNet(64, encoder="graph", attributes=["red"])

@@ -44,7 +44,7 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
 FEATURES: dict[str, Any] = {"feature_channels": (64, 64, 64, 128, 128)}
 MOPS: dict[str, Any] = {
     **{"alpha": 30.0, "tau_min": 0.1, "annealing": "exponential", "threshold": 0.0},
-    **{"rho_channels": (512, 256, 128), **FEATURES},
+    **{"rho_channels": (512, 256, 128), "attributes": (), **FEATURES},
 }
 SNET: dict[str, Any] = {
     **{"alpha": 30.0, "coverage": 1.0, "coverage_per_point": 0.0, **FEATURES},
@@ -57,7 +57,7 @@ DEFAULTS: dict[type[Sampler], dict[str, Any]] = {
     PoissonSampler: {"seed": 0},
     SubmodularSampler: {"net": None, "weighting": "none", "seed": 0},
     CriticalSampler: {"net": None, "seed": 0},
-    GumbelSampler: {"tau_min": 0.1, "key_channels": (256, 128), **FEATURES},
+    GumbelSampler: {"tau_min": 0.1, "key_channels": (256, 128), "attributes": (), **FEATURES},
     MOPSNet: MOPS,
     FMOPSNet: {"m_max": 512, "size_sampling": "nested", "num_sizes": 4},
     SNet: SNET,

@@ -101,7 +101,7 @@ def _timed(
 def _rows(path: Path, table: Table, sampler: Sampler, settings: Settings) -> NDArray[np.int64]:
     if settings.tiled:
         return sample_table(path, table, sampler, settings)[0].row
-    numbered = Table(table.points, {ROW: np.arange(len(table.points))})
+    numbered = Table(table.points, {**table.columns, ROW: np.arange(len(table.points))})
     rows: NDArray[np.int64] = sampled(
         path, numbered, sampler, settings.m or sampler.m, settings
     ).columns[ROW]

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from mops_lightning.data.clouds import Clouds
+from mops_lightning.ops.points import coordinates, with_coordinates
 from mops_lightning.seeding import generator
 
 NOISE, TARGET_NOISE = 13, 14
@@ -25,16 +26,17 @@ def noisy(points: Tensor, noise: float, stream: int = NOISE) -> Tensor:
     on the same noisy clouds. Other standard deviations scale the same noise.
 
     Args:
-        points: ``(S, N, 3)`` clouds of a split.
+        points: ``(S, N, 3)`` clouds of a split, perhaps with attributes, which stay as they are.
         noise: standard deviation in units of the coordinates; 0.1 is 10 % in the paper.
         stream: of the random numbers.
 
     Returns:
-        ``(S, N, 3)``.
+        The points with noise.
     """
     if not noise:
         return points
+    exact = coordinates(points)
     drawn = [
-        torch.randn(points.shape[1:], generator=generator(stream, s)) for s in range(len(points))
+        torch.randn(exact.shape[1:], generator=generator(stream, s)) for s in range(len(exact))
     ]
-    return points + noise * torch.stack(drawn)
+    return with_coordinates(points, exact + noise * torch.stack(drawn))

@@ -28,6 +28,7 @@ from mops_lightning.downsample_files.seams import (
     to_drop,
 )
 from mops_lightning.errors import UserError
+from mops_lightning.ops.points import coordinates
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.samplers.base import Sampler
 
@@ -40,21 +41,36 @@ ROUNDS = 3
 ROW = "row"
 """The column of a point's row in the user's file."""
 
+VALUES = "values"
+"""The column, ``(N, C)``, of the attributes that the sampler takes, if there are any."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class InMemory(CloudFile):
     """A cloud in memory, in the form that an engine takes."""
 
     points: NDArray[np.float64]
+    values: NDArray[np.float64]
 
     def _parse(self, rows: range) -> Table:
-        place = np.arange(rows.start, rows.stop)
-        return Table(self.points[rows.start : rows.stop], {ROW: place})
+        part = slice(rows.start, rows.stop)
+        columns = {ROW: np.arange(rows.start, rows.stop), VALUES: self.values[part]}
+        return Table(self.points[part], columns)
 
 
-def in_memory(points: NDArray[np.float64], path: Path) -> tuple[CloudFile, list[range]]:
-    """Return a cloud in the form that ``by_tiles`` takes."""
-    cloud = InMemory(path=path, number=len(points), points=points)
+def in_memory(
+    points: NDArray[np.float64], path: Path, values: NDArray[np.float64] | None = None
+) -> tuple[CloudFile, list[range]]:
+    """Return a cloud in the form that ``by_tiles`` takes.
+
+    Args:
+        points: ``(N, 3)``.
+        path: the file, for errors.
+        values: ``(N, C)`` the attributes that the sampler takes; None: none.
+    """
+    if values is None:
+        values = np.empty((len(points), 0))
+    cloud = InMemory(path=path, number=len(points), points=points, values=values)
     return cloud, cloud.row_ranges(len(points))
 
 
@@ -69,7 +85,8 @@ def by_tiles(
     """Sample every tile of a cloud.
 
     Args:
-        cloud: its column ``ROW`` has the rows of the user's file.
+        cloud: its column ``ROW`` has the rows of the user's file, and ``VALUES`` the attributes of
+            a sampler that takes some.
         parts: ranges that are cut into tiles on their own, in order and without gaps.
         tiling: how they are cut.
         sampler: a flexible sampler.
@@ -124,8 +141,11 @@ def _sample(cloud: CloudFile, rows: range, tiling: Tiling, sampler: Sampler) -> 
     for (n, m), members in same.items():
         for first in range(0, len(members) if m else 0, step := max(BATCH // n, 1)):
             batch = members[first : first + step]
-            points = np.stack([table.points[tiles[i]] for i in batch])
-            rows_of = _rows(sampler, _normalised(points, cloud.path), m).numpy()
+            points = _normalised(np.stack([table.points[tiles[i]] for i in batch]), cloud.path)
+            if sampler.attributes:
+                values = np.stack([table.columns[VALUES][tiles[i]] for i in batch])
+                points = torch.cat([points, torch.from_numpy(values).float()], 2)
+            rows_of = _rows(sampler, points, m).numpy()
             for i, chosen in zip(batch, rows_of, strict=True):
                 found[i] = tiles[i][chosen]
     return _chosen(table, rows.start, found, starts)
@@ -149,13 +169,14 @@ def _normalised(points: NDArray[np.float64], path: Path) -> Tensor:
 
 @torch.no_grad()
 def _rows(sampler: Sampler, points: Tensor, m: int) -> Tensor:
-    """Return m different rows ``(B, m)`` of every tile ``(B, n, 3)``."""
+    """Return m different rows ``(B, m)`` of every tile ``(B, n, 3 + C)``."""
     if m == points.shape[1]:
         return torch.arange(m).expand(len(points), m)
     output = sampler(points, m)
     if output.indices is not None:
         return output.indices
-    return complete(match(output.points, points), points)
+    places = coordinates(points)
+    return complete(match(coordinates(output.points), places), places)
 
 
 def _refill(

@@ -9,7 +9,12 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
+from mops_lightning.nets.layers import (
+    PointMLP,
+    attribute_scale,
+    check_channels,
+    linear_norm_relu,
+)
 from mops_lightning.nets.max_pool import PointMaxPool
 
 
@@ -19,27 +24,34 @@ class PointEncoder(nn.Module):
     Args:
         codeword: size d of the codeword, the last layer.
         channels: sizes of the layers before it.
+        attributes: number of attributes of every point.
 
     Raises:
         UserError: a layer has no channels.
     """
 
-    def __init__(self, codeword: int = 128, channels: Sequence[int] = (64, 128, 128, 256)) -> None:
+    def __init__(
+        self,
+        codeword: int = 128,
+        channels: Sequence[int] = (64, 128, 128, 256),
+        attributes: int = 0,
+    ) -> None:
         super().__init__()
         if codeword < 1:
             raise UserError(f"codeword must be at least 1, got {codeword}.")
         check_channels("channels", channels)
         self.codeword = codeword
-        self.features = PointMLP([3, *channels])
+        self.scale = attribute_scale(attributes)
+        self.features = PointMLP([3 + attributes, *channels])
         self.pool = PointMaxPool(channels[-1], codeword)
 
     def forward(self, points: Tensor) -> Tensor:
         """Map ``(B, N, 3)`` points to ``(B, d)`` codewords, any N."""
-        return self.pool(self.features(points))
+        return self.pool(self.features(self.scale(points)))
 
     def point_features(self, points: Tensor) -> Tensor:
         """Return the features ``(B, N, d)`` whose maxima over points are the codeword."""
-        return self.pool.values(self.features(points))
+        return self.pool.values(self.features(self.scale(points)))
 
 
 class AutoEncoder(nn.Module):
@@ -50,6 +62,8 @@ class AutoEncoder(nn.Module):
         codeword: size d of the codeword.
         encoder_channels: sizes of the encoder's layers before the codeword.
         decoder_channels: sizes of the decoder's hidden layers, with ReLU and without BatchNorm.
+        attributes: names of C attributes that the points have as further channels, in the files'
+            own unit. The encoder takes them; coordinates alone are rebuilt.
 
     Raises:
         UserError: an argument is out of range.
@@ -61,6 +75,7 @@ class AutoEncoder(nn.Module):
         codeword: int = 128,
         encoder_channels: Sequence[int] = (64, 128, 128, 256),
         decoder_channels: Sequence[int] = (256, 256),
+        attributes: Sequence[str] = (),
     ) -> None:
         super().__init__()
         if n_points < 1:
@@ -68,7 +83,8 @@ class AutoEncoder(nn.Module):
         check_channels("encoder_channels", encoder_channels)
         check_channels("decoder_channels", decoder_channels)
         self.n_points = n_points
-        self.encoder = PointEncoder(codeword, encoder_channels)
+        self.attributes = tuple(attributes)
+        self.encoder = PointEncoder(codeword, encoder_channels, len(attributes))
         self.decoder = nn.Sequential(
             *linear_norm_relu([codeword, *decoder_channels], norm=False),
             nn.Linear(decoder_channels[-1], 3 * n_points),

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.losses.subset import subset_losses
 from mops_lightning.nets.layers import PointFeatures, check_channels, linear_norm_relu
+from mops_lightning.ops.points import coordinates
 from mops_lightning.ops.precision import pointwise_autocast
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.base import Sampler
@@ -37,6 +38,8 @@ class MOPSNet(Sampler):
         threshold: in evaluation, entries of S below it count as zero, as ``SamplingMatrix.sparse``
             drops them (paper section "Efficient Regression of the Sampled Set", with 0.01); 0 keeps
             all. Sampling in chunks keeps all.
+        attributes: names of C attributes, see ``Sampler.attributes``. The features are those of all
+            3 + C channels, and SᵀP has them all.
 
     Raises:
         UserError: an argument is out of range.
@@ -63,6 +66,7 @@ class MOPSNet(Sampler):
         feature_channels: Sequence[int] = (64, 64, 64, 128, 128),
         rho_channels: Sequence[int] = (512, 256, 128),
         threshold: float = 0.0,
+        attributes: Sequence[str] = (),
     ) -> None:
         super().__init__(m)
         if not 0 < tau_min <= 1:
@@ -82,7 +86,8 @@ class MOPSNet(Sampler):
         self.annealing = annealing
         self.training_tau = 1.0
         local = feature_channels[-1]
-        self.features = PointFeatures(feature_channels)
+        self.attributes = tuple(attributes)
+        self.features = PointFeatures(feature_channels, len(attributes))
         # The first layer of ρ acts on [local, global]. The product with the global feature is the
         # same for all points of a cloud, so it is computed once per cloud.
         self.rho_local = nn.Linear(local, rho_channels[0], bias=False)
@@ -124,7 +129,8 @@ class MOPSNet(Sampler):
         assert isinstance(norm, nn.BatchNorm1d)
         queries = self.queries.weight.detach() / self.tau_min
         layers = self.features.mlp.layers
-        return fuse(layers, self.rho_local, self.rho_global, norm, self.rho, queries)
+        net = fuse(layers, self.rho_local, self.rho_global, norm, self.rho, queries)
+        return net._replace(scale=self.features.scale) if self.attributes else net
 
     def _fused_matrix(self, points: Tensor) -> SamplingMatrix:
         """Return S without gradients, with the fused network."""
@@ -148,5 +154,5 @@ class MOPSNet(Sampler):
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]
     ) -> dict[int, dict[str, Tensor]]:
         """Return α times the subset loss at every size (section "Joint Training Loss", Eq. 11)."""
-        losses = subset_losses(points, output.points, sizes)
+        losses = subset_losses(coordinates(points), coordinates(output.points), sizes)
         return {m: {"subset": self.alpha * loss} for m, loss in losses.items()}

@@ -44,7 +44,7 @@ def stream_sample(sampler: MOPSNet, chunks: Chunks, m: int | None = None) -> Ten
     m = sampler.m if m is None else m
     sampler.check_m(m)
     net = sampler.fused()
-    peaks = (global_part(net, chunk) for chunk in _checked(chunks, m))
+    peaks = (global_part(net, chunk) for chunk in _checked(chunks, m, sampler.attributes))
     global_ = reduce(torch.maximum, peaks)
     return reduce(Partial.merge, (sum_part(net, chunk, global_, m) for chunk in chunks())).result()
 
@@ -98,10 +98,10 @@ def stream_match(generated: Tensor, chunks: Chunks) -> Tensor:
     return rows
 
 
-def _checked(chunks: Chunks, m: int) -> Iterable[Tensor]:
+def _checked(chunks: Chunks, m: int, attributes: tuple[str, ...]) -> Iterable[Tensor]:
     number = 0
     for chunk in chunks():
-        check_points(chunk[None])
+        check_points(chunk[None], attributes=attributes)
         number += len(chunk)
         yield chunk
     if number < m:

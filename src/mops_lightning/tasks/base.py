@@ -36,6 +36,9 @@ class Task(nn.Module):
     clouds_are_batches: bool = True
     """Whether ``make_batch`` leaves clouds as they are, so that their predictions can be kept."""
 
+    takes_attributes: bool = False
+    """Whether the points may have attributes, as channels after the coordinates."""
+
     takes_pairs: bool = False
     """Whether the task uses the pairs of data that are pairs with known motions."""
 

@@ -21,6 +21,7 @@ from mops_lightning.metrics.reconstruction import (
 )
 from mops_lightning.ops.chamfer import chamfer_distance
 from mops_lightning.ops.emd import earth_movers_distance
+from mops_lightning.ops.points import coordinates
 from mops_lightning.tasks.base import Task
 from mops_lightning.types import Batch, TaskOutput
 
@@ -37,7 +38,7 @@ class Reconstruction(Task):
     The loss is the chamfer distance plus ``emd_weight`` times the earth mover's distance. In
     training the latter is computed by blocks (see ``ops.emd``), because exact matching would take
     most of the time. In scores it is exact up to ``exact_up_to`` points, and by larger blocks
-    above.
+    above. The net may see attributes of the points; coordinates alone are rebuilt.
 
     Args:
         net: maps ``(B, M, 3)`` points and a number n to ``(B, n, 3)``.
@@ -55,6 +56,7 @@ class Reconstruction(Task):
     score = NormalizedChamfer.name
     full_score = NormalizedChamfer.full_cloud_metric
     net_takes = ("points", "n_points")
+    takes_attributes = True
 
     def __init__(
         self,
@@ -97,12 +99,12 @@ class Reconstruction(Task):
         Returns:
             The loss terms, and the distances of the reconstructions without a reference.
         """
-        built = self.predict(batch, points)
-        chamfer = chamfer_distance(built, batch.points)
+        built, clouds = self.predict(batch, points), coordinates(batch.points)
+        chamfer = chamfer_distance(built, clouds)
         losses = {"chamfer": chamfer.mean()}
         emd = torch.zeros_like(chamfer)
         if self.emd_weight:
-            emd = self._emd(built, batch.points, self.emd_block, self.emd_rounds)
+            emd = self._emd(built, clouds, self.emd_block, self.emd_rounds)
             losses["emd"] = self.emd_weight * emd.mean()
         return TaskOutput(losses, Distances(chamfer, emd), None, built)
 
@@ -130,7 +132,7 @@ class Reconstruction(Task):
         return TaskOutput(losses, found, reference)
 
     def _distances(self, batch: Batch, points: Tensor) -> Distances:
-        clouds = batch.points
+        clouds = coordinates(batch.points)
         built = self.predict(batch, points)
         exact = clouds.shape[1] <= self.exact_up_to
         emd = self._emd(built, clouds, None if exact else SCORED_BLOCK, SCORED_ROUNDS)
@@ -151,17 +153,17 @@ class Reconstruction(Task):
         """
         from mops_lightning.viz.reconstruction import ReconstructionResult, reconstruction_grid
 
-        n = batch.points.shape[1]
+        clouds, n = coordinates(batch.points), batch.points.shape[1]
         full = self.net(batch.points, n)
-        reference = chamfer_distance(full, batch.points)
+        reference = chamfer_distance(full, clouds)
         columns = {}
         for name, chosen in samples.items():
             if chosen.shape == batch.points.shape:
                 continue  # all points have a column of their own
             built = self.net(chosen, n)
-            ratios = chamfer_distance(built, batch.points) / reference
-            columns[name] = ReconstructionResult(chosen, built, ratios.tolist())
-        return {"reconstructions": reconstruction_grid(batch.points, full, columns, titles)}
+            ratios = (chamfer_distance(built, clouds) / reference).tolist()
+            columns[name] = ReconstructionResult(coordinates(chosen), built, ratios)
+        return {"reconstructions": reconstruction_grid(clouds, full, columns, titles)}
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return mean distances and, except in training, which has no reference, NRE."""

@@ -11,7 +11,9 @@ from torch import nn
 from mops_lightning.config.build import accepted, build
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
+from mops_lightning.nets.layers import fit_attribute_scales
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.task_net import TaskNetSampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
 from mops_lightning.training.experiment import Experiment
@@ -36,12 +38,13 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
             f"task={cfg.names.task} does not use the pairs of dataset={cfg.names.dataset}. Add "
             "task=registration, or read the scans with dataset=clouds."
         )
-    task = _make_task(cfg, len(dataset.class_names))
+    attributes = dataset.attributes
+    task = _make_task(cfg, len(dataset.class_names), attributes)
     # A seed of its own: the sampler's initial weights must not depend on the task net's size.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
     # For samplers that select points by the task net's features.
     net = {"net": task.net}
-    own = accepted(cfg.sampler, net)
+    own = accepted(cfg.sampler, _with_attributes(net, attributes))
     sampler = build(cfg.sampler, "sampler", **own) if cfg.learn != "task" else None
     points = task.points_of(dataset.test.points.shape[1])
     sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, points, training=cfg.learn != "nothing")
@@ -50,6 +53,11 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         baselines = _make_baselines(cfg, max(sizes), net)
     elif sampler is not None and sampler.flexible:
         sampler = build(cfg.sampler, "sampler", m=max(sizes), **own)
+    if attributes:
+        for one in (sampler, *baselines.values()):
+            _check_attributes(one, attributes)
+        for module in (task, *([sampler] if sampler is not None else [])):
+            fit_attribute_scales(module, dataset.train.points)
     make_optimizer, make_schedule = optimizer_makers(cfg.optimizer)
     if cfg.learn != "nothing":
         _try_optimizer(make_optimizer, make_schedule)
@@ -79,9 +87,43 @@ def _recipe(cfg: DictConfig, sampler: Sampler | None) -> Recipe:
     return Recipe(**settings) if sampler.learned else Recipe()
 
 
-def _make_task(cfg: DictConfig, num_classes: int) -> Task:
+def _with_attributes(offered: dict[str, Any], attributes: tuple[str, ...]) -> dict[str, Any]:
+    """Return arguments with ``attributes``, if there are any."""
+    return {**offered, "attributes": attributes} if attributes else offered
+
+
+def _check_attributes(sampler: Sampler | None, attributes: tuple[str, ...]) -> None:
+    """Refuse a sampler whose points would have no attributes.
+
+    Raises:
+        UserError: it generates points from coordinates alone, or uses the task net.
+    """
+    if sampler is None or sampler.attributes:
+        return
+    if sampler.generates or isinstance(sampler, TaskNetSampler):
+        raise UserError(
+            f"dataset.features={_listed(attributes)}: {type(sampler).__name__} takes coordinates "
+            "only. Choose sampler=fmops, mops, gumbel or fps, or leave dataset.features out."
+        )
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    return f"[{','.join(names)}]"
+
+
+def _make_task(cfg: DictConfig, num_classes: int, attributes: tuple[str, ...]) -> Task:
     L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
-    offered = accepted(cfg.task.net, {"num_classes": num_classes})
+    if attributes and not getattr(get_object(cfg.task._target_), "takes_attributes", False):
+        raise UserError(
+            f"dataset.features={_listed(attributes)}: task={cfg.names.task} takes coordinates "
+            "only. Choose task=reconstruction, or leave dataset.features out."
+        )
+    offered = accepted(cfg.task.net, _with_attributes({"num_classes": num_classes}, attributes))
+    if attributes and "attributes" not in offered:
+        raise UserError(
+            f"dataset.features={_listed(attributes)}: task/net={cfg.names.net} takes coordinates "
+            "only. Choose task/net=autoencoder, mfoldingnet or atlasnet."
+        )
     net = build(cfg.task.net, "task.net", **offered)
     return task_with(cfg, net, num_classes)
 

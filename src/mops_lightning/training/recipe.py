@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.points import coordinates, gather_points
 from mops_lightning.ops.readout import match
 from mops_lightning.types import Batch, PairBatch, SampleOutput
 
@@ -110,5 +110,6 @@ def straight_through(sampled: SampleOutput, points: Tensor) -> Tensor:
         sampled: generated points ``(B, M, 3)``.
         points: ``(B, N, 3)`` the clouds.
     """
-    matched = gather_points(points, match(sampled.points, points))
+    rows = match(coordinates(sampled.points), coordinates(points))
+    matched = gather_points(points, rows)
     return sampled.points + (matched - sampled.points).detach()

@@ -82,6 +82,9 @@ def _load_weights(job: Job, record: RunRecord, task_weights: Path | None) -> Non
     task = job.experiment.task
     if task_weights is not None:
         try:
+            evaluate.same_attributes(
+                weights.read(task_weights)["config"], job.dataset, str(task_weights)
+            )
             content = weights.load_into(task, task_weights)
         except UserError as error:
             raise UserError(f"weights: {error}") from None

@@ -10,7 +10,7 @@ from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.tasks.base import Task
-from mops_lightning.training.evaluate import same_classes
+from mops_lightning.training.evaluate import same_attributes, same_classes
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.factory import task_with
 from mops_lightning.training.scores import TransferScores
@@ -48,6 +48,7 @@ def add_task_nets(experiment: Experiment, cfg: DictConfig, dataset: CloudDataset
 def _load(path: str, experiment: Experiment, cfg: DictConfig, dataset: CloudDataset) -> LoadedNet:
     try:
         found = load_net(path, cfg.names.task, len(dataset.class_names))
+        same_attributes(found.content["config"], dataset, path)
         # As for the task net of a run: files of early versions do not name their classes.
         if experiment.task.requires_same_classes and found.content["classes"]:
             same_classes(found.content["classes"], dataset, path)

@@ -13,7 +13,9 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from mops_lightning.ops.points import coordinates
 from mops_lightning.records.readout_names import FULL
+from mops_lightning.samplers.base import sample_with_attributes
 from mops_lightning.training.readouts import readouts
 from mops_lightning.viz.clouds import (
     COLOURS,
@@ -69,32 +71,37 @@ class CloudVisualization(Callback):
         module.train(training)
         task: Any = module.task
         titles = task.cloud_titles(self.titles)
+        places = coordinates(batch.points)
         if folder is not None:
             if samples:
-                save_clouds(folder / CLOUDS, batch.points, samples, titles)
+                save_clouds(folder / CLOUDS, places, samples, titles)
             for name, figure in figures.items():
                 save_figure(figure, folder / f"{name}.png")
         if board is not None:
             for name, figure in figures.items():
                 board.experiment.add_figure(name, figure, trainer.global_step)
-            _add_meshes(board, batch.points, samples, titles, trainer.global_step)
+            _add_meshes(board, places, samples, titles, trainer.global_step)
 
     @torch.no_grad()
     def _figures(
         self, module: Any, batch: Any, with_baselines: bool
     ) -> tuple[dict[str, Figure], dict[str, Tensor]]:
-        """Return the figures by name, and the sampler's readouts of the batch."""
+        """Return the figures by name, and the coordinates of the sampler's readouts."""
         points, sampler, m = batch.points, module.sampler, module.m
         # Baselines do not change in training, so they are drawn once, at the end.
         baselines = module.baselines.items() if with_baselines else ()
-        methods = {name: baseline(points, m).points for name, baseline in baselines}
+        methods = {
+            name: sample_with_attributes(baseline, points, (m,))[m].points
+            for name, baseline in baselines
+        }
         if sampler is None:
             return module.task.figures(batch, {**methods, FULL: points}, self.titles), {}
-        output = sampler(points, m)
+        output = sample_with_attributes(sampler, points, (m,))[m]
         samples = readouts(points, {m: output}, sampler)[m]
         figures = module.task.figures(batch, {**methods, **samples}, self.titles)
         titles = module.task.cloud_titles(self.titles)
-        figures["clouds"] = cloud_grid(points, samples, titles)
+        samples = {name: coordinates(chosen) for name, chosen in samples.items()}
+        figures["clouds"] = cloud_grid(coordinates(points), samples, titles)
         matrix = output.matrix
         if matrix is not None and points.shape[1] * len(matrix.queries) <= DENSE_PIXELS:
             first = matrix._replace(keys=matrix.keys[:1])

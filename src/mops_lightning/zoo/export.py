@@ -89,10 +89,16 @@ def plain_net(sampler: Sampler, m: int | None = None) -> nn.Module:
         m: number of points; None means ``sampler.m``.
 
     Raises:
-        UserError: the sampler has no weights, selects input points, or does not return m points.
+        UserError: the sampler has no weights, selects input points, takes attributes, or does not
+            return m points.
     """
     m = sampler.m if m is None else m
     sampler.check_m(m)
+    if sampler.attributes:
+        raise UserError(
+            f"the sampler takes attributes ({', '.join(sampler.attributes)}) and cannot be "
+            "exported. Export one that was trained without dataset.features."
+        )
     if isinstance(sampler, MOPSNet) and sampler.generates:
         return PlainMOPSNet(sampler, m).eval()
     if isinstance(sampler, SNet) and sampler.generates:
