@@ -155,8 +155,17 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     target = OmegaConf.select(cfg, f"{node}._target_")
     if target and name in signature(target, node):
         return f"{key}: {target} accepts it, but no file sets it. Write +{key}=..."
+    choices = _choices_with(node, name)
+    if choices:
+        return f"{key}: no such setting here. It belongs to {' and '.join(choices)}."
     hint = did_you_mean(key, [known for known in _known_keys(cfg) if known != key])
     return f"{key}: no such setting.{hint} --cfg job shows all of them."
+
+
+def _choices_with(group: str, name: str) -> list[str]:
+    """Return the choices of a group, such as ``dataset=clouds``, whose files set a key."""
+    files = sorted(conf_dir().joinpath(group).glob("*.yaml")) if group in _groups() else []
+    return [f"{group}={file.stem}" for file in files if name in (OmegaConf.load(file) or {})]
 
 
 def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
