@@ -58,6 +58,8 @@ TESTS: dict[str, tuple[str, ...]] = {
     "ops/emd": ("ops/test_emd",),
     "ops/assignment": ("ops/test_assignment",),
     "ops/rigid": ("ops/test_rigid",),
+    "ops/elimination": ("ops/test_compiled[eliminate]", "samplers/test_poisson"),
+    "ops/fps_cpu": ("ops/test_fps_cpu",),
     "ops/fps": ("ops/test_fps", "ops/test_fps_cpu", "ops/test_readout"),
     "ops/nearest": ("ops/test_nearest", "ops/test_compiled"),
 }

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from mops_lightning.config.compose import compose
+from mops_lightning.config.overrides import added
 from mops_lightning.errors import UserError
 from mops_lightning.training.replay import command_line
 from tests.support.command_line import TINY
@@ -73,7 +74,7 @@ def test_command_line_without_evaluate_is_unchanged():
 
 def test_command_line_adds_settings_of_evaluate(run):
     for given in ("task_nets=[a,b]", "+task_nets=[a,b]"):
-        chosen = command_line([given, f"evaluate={run}"])
+        chosen = [added(one) for one in command_line([given, f"evaluate={run}"])]
         assert compose(chosen).task_nets == ["a", "b"]
     assert "task_nets" not in compose(command_line([f"evaluate={run}"]))
 
@@ -108,6 +109,22 @@ def test_command_line_record_with_code_raises(attack, tmp_path):
 def test_command_line_record_with_emptied_group_is_repeated(nothing, tmp_path):
     folder = write_run(tmp_path / "run", [*OVERRIDES, f"baselines={nothing}"])
     assert f"baselines={nothing}" in command_line([f"evaluate={folder}"])
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        *("cache=/evil", "dataset.cache=/evil", "out=/evil", "++dataset.download=true"),
+        *("dataset.mirrors=[http://evil]", "dataset.archive_hash=null", "hydra.run.dir=/evil"),
+        *("logger=mlflow", "logger.tracking_uri=http://evil", "+logger.save_dir=/evil"),
+        *("+task_nets=[hf://evil]", "weights=hf://evil", "+models.path=[/evil]"),
+        *("+trainer.default_root_dir=/evil", "+callbacks.checkpoint.dirpath=/evil"),
+    ],
+)
+def test_command_line_record_chooses_no_address_and_no_folder_to_write(override, tmp_path):
+    run, other = tmp_path / "run", tmp_path / "other"
+    plain = overrides_after(f"evaluate={write_run(run, OVERRIDES)}")
+    assert overrides_after(f"evaluate={write_run(other, [*OVERRIDES, override])}") == plain
 
 
 @pytest.mark.parametrize("group", ["task", "dataset", "sampler"])

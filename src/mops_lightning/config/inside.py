@@ -23,7 +23,11 @@ INSIDE: dict[str, dict[str, Any]] = {
     "callbacks.checkpoint": _NOTHING,
     "callbacks.progress": _NOTHING,
     "callbacks.pictures": _NOTHING,
-    "dataset.cache": _NOTHING,
+    # A record may come from anybody: it chooses neither addresses nor where files are written.
+    "dataset.cache": {**_NOTHING, "repeat": False},
+    "dataset.download": {"repeat": False},
+    "dataset.mirrors": {"repeat": False},
+    "dataset.archive_hash": {"repeat": False},
     "dataset.workers": _NOTHING,
     "task.emd_workers": _NOTHING,
     "task.pairs.test_seed": {"affects": Affects.SCORES},

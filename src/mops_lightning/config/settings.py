@@ -181,7 +181,6 @@ class RunSettings:
         metadata=about(
             "folder for generated data and pretrained task nets, shared between runs",
             Affects.NOTHING,
-            repeat=True,  # where the run's data and task net are
         ),
     )
     epochs: Any = field(
@@ -237,7 +236,7 @@ class RunSettings:
         default=None,
         metadata=group(Affects.TRAINING, nullable=True, repeat=False, compare=False),
     )
-    logger: Any = field(default=None, metadata=group(Affects.NOTHING, nullable=True, repeat=True))
+    logger: Any = field(default=None, metadata=group(Affects.NOTHING, nullable=True))
 
 
 SCHEMA: type = RunSettings

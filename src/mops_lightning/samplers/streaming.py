@@ -71,9 +71,7 @@ def sum_part(net: FusedMOPSNet, points: Tensor, global_: Tensor, m: int) -> Part
         global_: ``(D,)``, the global feature of the whole cloud.
         m: number of points to generate.
     """
-    with torch.no_grad():
-        keys = net.keys(net.local_features(points), global_)
-        return attend(net.queries[:m], keys, points)
+    return attend(net.queries[:m], net.keys(net.local_features(points), global_), points)
 
 
 def stream_match(generated: Tensor, chunks: Chunks) -> Tensor:
