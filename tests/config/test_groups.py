@@ -73,7 +73,7 @@ def test_snet_rate_depends_on_task_and_learn(task, learn, rate):
     ("overrides", "epochs"),
     [
         ([], (12, 10)),
-        (["task=registration"], (40, 10)),
+        (["task=registration"], (40, 15)),
         (["dataset=modelnet40"], (30, 8)),
         (["dataset=modelnet40", "task=reconstruction"], (200, 60)),
         (["dataset=shapenet_core", "task=reconstruction"], (100, 30)),
@@ -87,6 +87,35 @@ def test_epochs_depend_on_dataset_and_task(overrides, epochs):
     assert (cfg.epochs.task, cfg.epochs.sampler) == epochs
     lengths = {learn: compose([*overrides, f"learn={learn}"]).trainer.max_epochs for learn in LEARN}
     assert lengths == {"task": epochs[0], "sampler": epochs[1], "joint": epochs[1], "nothing": 0}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        ([], "pcrnet.modelnet40"),
+        (["learn=joint"], "pcrnet.modelnet40"),
+        (["learn=task"], "auto"),
+        (["task/net=icp"], "auto"),
+        (["task.net.iterations=2"], "auto"),
+        (["+task.net.feature_channels=[8,16]"], "auto"),
+        (["task.pairs.rotation=90"], "auto"),
+        (["task.pairs.jitter=0.01"], "auto"),
+        (["dataset=modelnet40"], "auto"),
+        (["weights=auto"], "auto"),
+        (["weights=null"], None),
+    ],
+)
+def test_registration_of_shapes_is_under_shipped_net(overrides, expected):
+    assert compose(["task=registration", *overrides]).weights == expected
+
+
+def test_fmops_under_shipped_pcrnet_starts_from_shipped_sampler():
+    chosen = ["task=registration", "sampler=fmops"]
+    cfg = compose(chosen)
+    assert (cfg.recipe.warm_start, cfg.sampler.m_max) == ("fmops.pairs-m64", 64)
+    assert compose([*chosen, "weights=auto"]).recipe.warm_start is True
+    assert compose([*chosen, "recipe=paper"]).recipe.warm_start is False
+    assert compose(["sampler=fmops"]).sampler.m_max == 512
 
 
 LEARN = ("task", "sampler", "joint", "nothing")

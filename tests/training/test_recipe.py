@@ -18,7 +18,13 @@ from mops_lightning.tasks.classification import Classification
 from mops_lightning.tasks.reconstruction import Reconstruction
 from mops_lightning.training.averaging import MovingAverage
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.recipe import Recipe, draw_points, straight_through
+from mops_lightning.training.recipe import (
+    Recipe,
+    draw_points,
+    feature_distance,
+    pooled_features,
+    straight_through,
+)
 from mops_lightning.types import Batch, SampleOutput
 from tests.support.training import quiet_trainer, small_dataset
 
@@ -103,17 +109,18 @@ def test_task_points_are_drawn_for_task_net_alone():
         ("ema_span", float("nan")),
         ("distillation", -1.0),
         ("distillation", float("inf")),
+        ("feature_distillation", -1.0),
     ],
 )
 def test_recipe_value_out_of_range_raises(name, value):
     with pytest.raises(UserError, match=rf"{name} must be .* got"):
         Recipe(**{name: value})
     with pytest.raises(UserError, match=rf"recipe.{name} must be .* got"):
-        check(compose([f"recipe.{name}={value}"]))
+        check(compose([f"++recipe.{name}={value}"]))
 
 
 def test_recipe_default_is_that_of_the_publication():
-    assert Recipe() == Recipe(None, None, None, False, 0.0, None, None)
+    assert Recipe() == Recipe(None, None, None, False, 0.0, 0.0, None, None)
 
 
 def test_recipe_accepts_limits():
@@ -195,11 +202,30 @@ def test_straight_through_has_matched_values_and_gradients_of_generated():
     torch.testing.assert_close(generated.grad, weight)
 
 
-def test_distillation_is_logged_with_its_weight_and_only_then():
-    assert "train/loss/distillation" not in logged(Recipe())
-    light, heavy = (logged(Recipe(distillation=w))["train/loss/distillation"] for w in (1e-6, 2e-6))
+@pytest.mark.parametrize("name", ["distillation", "feature_distillation"])
+def test_distillation_is_logged_with_its_weight_and_only_then(name):
+    key = f"train/loss/{name}"
+    assert key not in logged(Recipe())
+    given: list[dict[str, Any]] = [{name: 1e-6}, {name: 2e-6}]
+    light, heavy = (logged(Recipe(**one))[key] for one in given)
     assert light > 0
     assert heavy == pytest.approx(2 * light, rel=1e-3)
+
+
+def test_feature_distance_is_relative_to_the_reference():
+    found = torch.tensor([[1.0, 2.0], [0.0, 3.0]])
+    reference = torch.tensor([[3.0, 4.0], [0.0, 3.0]])
+    assert feature_distance(found, reference) == pytest.approx((8 / 25 + 0) / 2)
+
+
+def test_pooled_features_are_maxima_over_points():
+    net, points = PointNetVanilla(3).eval(), torch.randn(2, 7, 3)
+    torch.testing.assert_close(net.from_pooled(pooled_features(net, points)), net(points))
+
+
+def test_feature_distillation_of_net_without_point_features_raises():
+    with pytest.raises(UserError, match=r"feature_distillation must be 0 .* got Linear"):
+        pooled_features(torch.nn.Linear(3, 3), torch.randn(2, 7, 3))
 
 
 def test_distillation_with_kept_predictions_trains_the_same():

@@ -43,6 +43,7 @@ INSIDE: dict[str, dict[str, Any]] = {
         "limits": Limits("true, false or a weights file", lambda x: isinstance(x, bool | str))
     },
     "recipe.distillation": {"limits": number("of at least 0", lambda x: x >= 0)},
+    "recipe.feature_distillation": {"limits": number("of at least 0", lambda x: x >= 0)},
     "recipe.straight_through": {"limits": SHARE_OR_NULL},
     "recipe.ema_span": {"limits": SHARE_OR_NULL},
     "sampler.threshold": {

@@ -25,6 +25,15 @@ def group_choices() -> DictConfig:
     return OmegaConf.create({name: choices.get(group) for name, group in groups.items()})
 
 
+def model_for(model: str, settings: Mapping[str, Any], _root_: DictConfig) -> str:
+    """Return a model that fits a run with these settings, and ``auto`` for other runs.
+
+    A run that trains the task net alone gets ``auto``, because it would start from the model.
+    """
+    fits = all(OmegaConf.select(_root_, key) == value for key, value in settings.items())
+    return model if fits and _root_.learn != "task" else "auto"
+
+
 def run_label(_root_: DictConfig) -> str:
     """Return what a run's folder is called: the net it trains, or the sampler, its size and more.
 
@@ -61,7 +70,7 @@ def selectable_groups() -> str:
 
 def register() -> None:
     """Register all resolvers."""
-    for resolver in (choose, group_choices, run_label, selectable_groups):
+    for resolver in (choose, group_choices, model_for, run_label, selectable_groups):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
 
 

@@ -24,7 +24,13 @@ from mops_lightning.tasks.refinement import Refinement
 from mops_lightning.training.divergence import check_checkpoint, check_loss
 from mops_lightning.training.learn import Learn, check_learn
 from mops_lightning.training.readouts import readout_names, readouts
-from mops_lightning.training.recipe import Recipe, draw_points, straight_through
+from mops_lightning.training.recipe import (
+    Recipe,
+    draw_points,
+    feature_distance,
+    pooled_features,
+    straight_through,
+)
 from mops_lightning.training.scores import Scores, TransferScores
 from mops_lightning.types import Batch, SampleOutput
 
@@ -84,6 +90,7 @@ class Experiment(L.LightningModule):
         self.task_lr_scale = task_lr_scale
         self.recipe = recipe or Recipe()
         self.distills = self.recipe.distillation > 0 and learn == "sampler"
+        self.distills_features = self.recipe.feature_distillation > 0 and learn == "sampler"
         self.full_predictions: Tensor | None = None
         self.transfer: TransferScores | None = None  # set for tests with further task nets
         self.total_steps = 1
@@ -197,10 +204,12 @@ class Experiment(L.LightningModule):
             available = batch.points.shape[1]
             n = self.recipe.points_at(self._progress, available, max(sizes))
             seen = draw_points(batch, n)
+            features = self._full_features(seen) if self.distills_features else None
             outputs = self._sample(seen, sizes)
             terms: dict[str, list[Tensor]] = defaultdict(list)
             for m in sizes:
-                for name, value in self._losses(batch, seen, outputs[m], taught).items():
+                found = self._losses(batch, seen, outputs[m], taught, features)
+                for name, value in found.items():
                     terms[name].append(value)
             mean = self.sampler is not None and self.sampler.size_reduction == "mean"
             share = 1 / len(sizes) if mean else 1.0
@@ -220,8 +229,18 @@ class Experiment(L.LightningModule):
         with torch.no_grad():
             return self.task.predict(batch, batch.points)
 
+    def _full_features(self, seen: Tensor) -> Tensor:
+        """Return the task net's pooled features of all points that the step sees."""
+        with torch.no_grad():
+            return pooled_features(self.task.net, seen)
+
     def _losses(
-        self, batch: Batch, seen: Tensor, sampled: SampleOutput, taught: Any
+        self,
+        batch: Batch,
+        seen: Tensor,
+        sampled: SampleOutput,
+        taught: Any,
+        features: Tensor | None,
     ) -> dict[str, Tensor]:
         """Return the loss terms at one size: the task's, distillation and the sampler's own.
 
@@ -240,6 +259,9 @@ class Experiment(L.LightningModule):
             if taught is not None:
                 apart = self.task.disagreement(result.output, taught).mean()
                 losses["distillation"] = self.recipe.distillation * apart
+            if features is not None:
+                apart = feature_distance(pooled_features(self.task.net, points), features)
+                losses["feature_distillation"] = self.recipe.feature_distillation * apart
             for name, value in losses.items():
                 terms[name] = terms.get(name, 0) + value / len(inputs)
         return {**terms, **sampled.losses}
