@@ -60,3 +60,10 @@ def test_fill_equals_double_loop(rng):
     for b in range(3):
         chosen = indices[b, : given[b]].tolist()
         assert filled[b].tolist() == plain_farthest(points[b], chosen, 12)
+
+
+def test_fill_of_points_with_gradients_equals_fill_without(rng):
+    points = torch.randn(2, 40, 3, generator=rng)
+    indices, given = torch.arange(10).expand(2, -1), torch.tensor([2, 5])
+    filled = farthest_point_fill(points.clone().requires_grad_(), indices, given)
+    assert torch.equal(filled, farthest_point_fill(points, indices, given))

@@ -1,6 +1,8 @@
 import pytest
 import torch
 
+from mops_lightning.ops import compiled
+from mops_lightning.samplers import poisson
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.poisson import PoissonSampler, eliminate, spacing_bound
 from mops_lightning.samplers.random import RandomSampler
@@ -28,6 +30,30 @@ def test_eliminate_equals_plain_form(m, rng):
     assert eliminate(points, m).tolist() == expected
 
 
+def test_eliminate_to_one_point_has_reach_of_bounding_box(rng):
+    points = torch.randn(1, 24, 3, generator=rng, dtype=torch.float64)
+    reach = float((points[0].amax(0) - points[0].amin(0)).norm())
+    assert eliminate(points, 1).tolist() == [plain_eliminate(points[0], 1, reach)]
+
+
+def test_eliminate_in_blocks_equals_whole(rng, monkeypatch):
+    monkeypatch.setattr(compiled, "kernels", lambda: None)
+    points = torch.randn(2, 24, 3, generator=rng)
+    whole = eliminate(points, 9)
+    monkeypatch.setattr(poisson, "BLOCK", 24 * 5)
+    assert torch.equal(eliminate(points, 9), whole)
+
+
+def test_eliminate_of_many_copies_does_not_overflow():
+    assert eliminate(torch.zeros(1, 8200, 3), 8199).tolist() == [list(range(1, 8200))]
+
+
+def test_poisson_of_points_with_gradients_equals_points_without(rng):
+    points = torch.randn(1, 30, 3, generator=rng, dtype=torch.float64)
+    found = PoissonSampler(5)(points.clone().requires_grad_())
+    assert torch.equal(found.indices, PoissonSampler(5)(points).indices)
+
+
 @pytest.mark.parametrize("m", [2, 5, 12])
 def test_spacing_bound_is_upper_bound(m, rng):
     points = torch.randn(20, 30, 3, generator=rng, dtype=torch.float64)
@@ -47,6 +73,6 @@ def spacing(points):
 
 def test_poisson_is_more_even_than_random(rng):
     flat = torch.rand(8, 600, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.0])
-    poisson = spacing(PoissonSampler(60)(flat).points)
-    assert poisson > 4 * spacing(RandomSampler(60)(flat).points)
-    assert poisson > 0.8 * spacing(FPSSampler(60)(flat).points)
+    even = spacing(PoissonSampler(60)(flat).points)
+    assert even > 4 * spacing(RandomSampler(60)(flat).points)
+    assert even > 0.8 * spacing(FPSSampler(60)(flat).points)
