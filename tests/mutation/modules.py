@@ -58,6 +58,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "ops/emd": ("ops/test_emd",),
     "ops/assignment": ("ops/test_assignment",),
     "ops/rigid": ("ops/test_rigid",),
+    "ops/compiled": ("ops/test_compiled", "ops/test_fps_cpu[compiled]"),
     "ops/elimination": ("ops/test_compiled[eliminate]", "samplers/test_poisson"),
     "ops/fps_cpu": ("ops/test_fps_cpu",),
     "ops/fps": ("ops/test_fps", "ops/test_fps_cpu", "ops/test_readout"),
@@ -65,4 +66,6 @@ TESTS: dict[str, tuple[str, ...]] = {
 }
 """``FILE[WORD]``: of this file only the tests with the word in their name.
 
-By path below ``src/mops_lightning``, in the order in which ``make mutants`` takes them."""
+By path below ``src/mops_lightning``, in the order in which ``make mutants`` takes them. The loops that
+numba compiles (``ops/kernels``, ``ops/elimination_kernels``) are not among them: a fork keeps their
+compiled form, and to compile them for each mutant would take many times longer than the tests."""

@@ -115,3 +115,17 @@ def test_sample_uses_table_for_few_small_clouds(clouds, n, m, tables, rng, monke
     assert sizes == [n] * tables
     monkeypatch.setattr(fps, "TABLE_MAX_POINTS", 0)
     assert torch.equal(taken, farthest_point_sample(points, m))
+
+
+def test_groups_are_compact_so_that_a_step_updates_few_points(rng, monkeypatch):
+    def counted(planes):
+        updated.append(planes[0].numel())
+        return sum_of_squares_(planes)
+
+    sum_of_squares_, updated = fps_cpu.sum_of_squares_, []
+    monkeypatch.setattr(fps_cpu, "sum_of_squares_", counted)
+    points = torch.rand(6000, 3, generator=rng) * 5 - 2
+    first = torch.full((6000,), torch.finfo(torch.float32).max)
+    fps_cpu.farthest_by_groups(points, first, 200)
+    assert len(updated) == 200
+    assert sum(updated) < 0.35 * 200 * 6000

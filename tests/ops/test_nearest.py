@@ -40,7 +40,7 @@ def test_nearest_gradcheck(rng):
     assert torch.autograd.gradcheck(lambda q, p: nearest(q, p)[0], leaves)
 
 
-@pytest.mark.parametrize("block", [1, 100, 1000])
+@pytest.mark.parametrize("block", [1, 100, 1000, 1500])
 def test_nearest_block_size_changes_nothing(block, rng, monkeypatch):
     queries = torch.randn(3, 11, 3, generator=rng)
     points = torch.randn(3, 40, 3, generator=rng)
