@@ -66,6 +66,7 @@ TESTS: dict[str, tuple[str, ...]] = {
 }
 """``FILE[WORD]``: of this file only the tests with the word in their name.
 
-By path below ``src/mops_lightning``, in the order in which ``make mutants`` takes them. The loops that
-numba compiles (``ops/kernels``, ``ops/elimination_kernels``) are not among them: a fork keeps their
-compiled form, and to compile them for each mutant would take many times longer than the tests."""
+By path below ``src/mops_lightning``, in the order in which ``make mutants`` takes them. The loops
+that numba compiles (``ops/kernels``, ``ops/elimination_kernels``) are not among them: a fork keeps
+their compiled form, and compiling them for each mutant would take many times longer than the
+tests."""
