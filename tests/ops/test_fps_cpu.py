@@ -118,11 +118,13 @@ def test_sample_uses_table_for_few_small_clouds(clouds, n, m, tables, rng, monke
 
 
 def test_groups_are_compact_so_that_a_step_updates_few_points(rng, monkeypatch):
+    updated: list[int] = []
+    sum_of_squares_ = fps_cpu.sum_of_squares_
+
     def counted(planes):
         updated.append(planes[0].numel())
         return sum_of_squares_(planes)
 
-    sum_of_squares_, updated = fps_cpu.sum_of_squares_, []
     monkeypatch.setattr(fps_cpu, "sum_of_squares_", counted)
     points = torch.rand(6000, 3, generator=rng) * 5 - 2
     first = torch.full((6000,), torch.finfo(torch.float32).max)
