@@ -266,3 +266,25 @@ def test_moving_average_ends_with_the_average_of_all_steps():
         expected = decay * expected + (1 - decay) * weights
     torch.testing.assert_close(module.state_dict()["sampler.queries.weight"], expected)
     assert not torch.allclose(expected, steps[-1])
+
+
+def test_moving_average_keeps_frozen_net_and_counters_of_batches():
+    before: dict[str, torch.Tensor] = {}
+
+    class Count(MovingAverage):
+        def on_train_start(self, trainer: Any, pl_module: Any) -> None:
+            super().on_train_start(trainer, pl_module)
+            for buffer in pl_module.task.buffers():
+                if not buffer.is_floating_point():
+                    buffer.fill_(6140)
+            assert self._average_model is not None
+            self._average_model.module.load_state_dict(pl_module.state_dict())
+            before.update({k: v.clone() for k, v in pl_module.task.state_dict().items()})
+
+    module = trained(Recipe(), callbacks=[Count(0.7)])
+    after = module.task.state_dict()
+    assert any(name.endswith("num_batches_tracked") for name in before)
+    assert all(torch.equal(after[name], value) for name, value in before.items())
+    assert module.sampler is not None
+    counters = [b for b in module.sampler.buffers() if not b.is_floating_point()]
+    assert {int(counter) for counter in counters} == {module.total_steps}

@@ -1,6 +1,9 @@
 """A moving average of the weights, which is validated, tested and saved in their place."""
 
+from typing import Any
+
 import lightning as L
+import torch
 from lightning.pytorch.callbacks import WeightAveraging
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
@@ -20,4 +23,12 @@ class MovingAverage(WeightAveraging):
         """Choose the decay per step for the length of this training."""
         steps = self.span * trainer.estimated_stepping_batches
         assert self._average_model is not None
-        self._average_model.multi_avg_fn = get_ema_multi_avg_fn(1 - 1 / max(steps, 1.0))
+        average = get_ema_multi_avg_fn(1 - 1 / max(steps, 1.0))
+
+        def update(averaged: Any, current: Any, number: Any) -> None:
+            if averaged[0].is_floating_point():
+                average(averaged, current, number)
+            else:  # counters of batches: an average is cut off, also one of equal numbers
+                torch._foreach_copy_(averaged, current)
+
+        self._average_model.multi_avg_fn = update
