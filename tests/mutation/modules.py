@@ -59,7 +59,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "ops/assignment": ("ops/test_assignment",),
     "ops/rigid": ("ops/test_rigid",),
     "ops/compiled": ("ops/test_compiled", "ops/test_fps_cpu[compiled]"),
-    "ops/elimination": ("ops/test_compiled[eliminate]", "samplers/test_poisson"),
+    "ops/elimination": ("ops/test_elimination", "ops/test_compiled[eliminate]"),
     "ops/fps_cpu": ("ops/test_fps_cpu",),
     "ops/fps": ("ops/test_fps", "ops/test_fps_cpu", "ops/test_readout"),
     "ops/nearest": ("ops/test_nearest", "ops/test_compiled"),

@@ -4,6 +4,7 @@ from scipy.spatial import cKDTree
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
+from mops_lightning.ops import compiled
 from mops_lightning.ops import nearest as search
 from mops_lightning.ops.nearest import k_nearest, nearest, nearest_distances
 from mops_lightning.ops.points import gather_points
@@ -48,6 +49,20 @@ def test_nearest_block_size_changes_nothing(block, rng, monkeypatch):
     monkeypatch.setitem(search.BLOCK, "cpu", block)
     for part, expected in zip(nearest(queries, points), whole, strict=True):
         assert torch.equal(part, expected)
+
+
+@pytest.mark.parametrize(
+    ("m", "n", "channels", "k", "used"),
+    [
+        *((256, 256, 3, 1, True), (255, 257, 3, 1, False), (2, 2**15, 4, 1, True)),
+        *((2, 2**15, 5, 1, False), (256, 256, 3, 2, False)),
+    ],
+)
+def test_nearest_uses_compiled_form_for_many_pairs(m, n, channels, k, used, rng, monkeypatch):
+    calls = []
+    monkeypatch.setattr(compiled, "nearest", lambda *given: calls.append(given))
+    k_nearest(torch.rand(1, m, channels, generator=rng), torch.rand(1, n, channels), k)
+    assert bool(calls) == used
 
 
 @pytest.mark.parametrize("offset", [0.0, 30.0])

@@ -108,7 +108,7 @@ def at_most(number: int) -> Iterator[None]:
         nonlocal left
         left -= 1
         if left < 0:
-            raise ValueError(f"it has more than the {number} tensors of the file")
+            raise ValueError(f"it has more than the {number} tensors of the file.")
 
     hook = register_module_parameter_registration_hook(count)
     try:
