@@ -90,6 +90,18 @@ def test_eliminate_non_contiguous_equals_plain_form(rng, both):
     assert torch.equal(fast, plain)
 
 
+def test_compiled_forms_take_finite_points_on_cpu(rng):
+    pytest.importorskip("numba", reason="needs mops-lightning[fast]")
+    points = torch.rand(1, 30, 3, generator=rng)
+    found, chosen = compiled.nearest(points[:, :5], points), compiled.farthest(points, 4)
+    assert found is not None
+    assert chosen is not None
+    assert found.tolist() == [list(range(5))]
+    points[0, 7, 0] = torch.nan
+    assert compiled.nearest(points[:, :5], points) is None
+    assert compiled.farthest(points, 4) is None
+
+
 def test_kernels_other_rounding_returns_plain_form(rng, monkeypatch):
     """Distances that torch rounds in a third way are not computed by compiled code."""
     points = torch.rand(2, 100, 3, generator=rng)
