@@ -105,6 +105,8 @@ def test_broken_yaml_ends_in_one_line(tmp_path):
         ("weights=[a]", "weights must be a text or null"),
         ("ckpt_path=1.5", "ckpt_path must be a text or null, got 1.5"),
         ("sampler=fps,null", "sampler=fps,null: choose one"),
+        ("optimizer=[nan]", r"optimizer=\[nan\]: choose one"),
+        ("optimizer=[one_cycle,null]", "choose one with optimizer=NAME"),
     ],
 )
 def test_refuse_plain_groups_other_type_raises(override, said):
@@ -114,3 +116,4 @@ def test_refuse_plain_groups_other_type_raises(override, said):
 
 def test_refuse_plain_groups_takes_text_and_null():
     refuse_plain_groups(["out='5'", "weights=null", "ckpt_path=last,null", "sampler=fps,mops"])
+    refuse_plain_groups(["optimizer=[one_cycle]", "optimizer=['one_cycle']"])

@@ -50,9 +50,16 @@ def refuse_plain_groups(arguments: Sequence[str]) -> None:
             if name in texts:
                 if misfit(value, texts[name]):
                     raise settings.refusal(name, value)
-            elif not isinstance(value, str | list | dict):
+            elif not isinstance(value, str | list | dict) or not _names_only(value):
                 hint = OTHERWISE.get(name, "")
                 raise UserError(f"{argument}: choose one with {name}=NAME{hint}.")
+
+
+def _names_only(value: Any) -> bool:
+    """Return whether a list, with which Hydra takes several choices, contains names only."""
+    return not isinstance(value, list) or all(
+        isinstance(one, str) or type(one).__name__ == "QuotedString" for one in value
+    )
 
 
 def _is_text(kind: Any) -> bool:
