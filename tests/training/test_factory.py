@@ -10,6 +10,7 @@ from mops_lightning.nets.layers import AttributeScale
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.training.factory import make_experiment
+from mops_lightning.training.recipe import Recipe
 from mops_lightning.types import TruePairs
 from tests.support.training import small_dataset
 
@@ -38,6 +39,15 @@ def test_factory_task_without_use_for_pairs_raises():
     data = replace(data, train=data.train._replace(pairs=pairs))
     with pytest.raises(UserError, match="task=classification does not use the pairs"):
         make_experiment(compose(["m=8"]), data, {})
+
+
+@pytest.mark.parametrize("learn", ["task", "sampler"])
+def test_factory_recipe_without_a_setting_is_that_of_the_publication(learn):
+    named = [name for name, value in compose().recipe.items() if value is not None]
+    for name in named:  # Hydra deletes no key that is null
+        cfg = compose([f"~recipe.{name}", f"learn={learn}", "m=8"])
+        made = make_experiment(cfg, small_dataset(), {})
+        assert getattr(made.recipe, name) == getattr(Recipe(), name)
 
 
 def test_factory_sampler_sees_weights_loaded_later(rng):

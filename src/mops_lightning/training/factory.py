@@ -81,7 +81,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
 def _recipe(cfg: DictConfig, sampler: Sampler | None) -> Recipe:
     """Return what is in force in this run; the task net's training has a record of its own."""
     settings: Any = OmegaConf.to_container(cfg.recipe, resolve=True)
-    task_points = settings.pop("task_points")
+    task_points = settings.pop("task_points", None)
     if sampler is None:
         return Recipe(task_points=task_points)
     return Recipe(**settings) if sampler.learned else Recipe()
