@@ -19,6 +19,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "training/scores": ("training/test_scores", "training/test_experiment_scores"),
     "training/loaders": ("training/test_loaders",),
     "training/recipe": ("training/test_recipe",),
+    "training/distillation": ("training/test_distillation", "training/test_recipe"),
     "data/loader": ("data/test_loader", "training/test_loaders", "training/test_experiment_steps"),
     "samplers/base": (
         "samplers/test_contract[mops or voxel or without]",

@@ -166,7 +166,7 @@ def test_several_sizes_equal_single_sizes_and_are_nested_where_declared(make, cl
     sampler = make()
     if sampler.flexible:
         whole = sampler(clouds).points
-        for m, output in sampler.sample_sizes(clouds, (M, M - 3)).items():
+        for m, output in sampler.sample_sizes(clouds, (M, 1, M - 3)).items():
             torch.testing.assert_close(output.points, sampler(clouds, m).points)
             if sampler.nested:
                 torch.testing.assert_close(output.points, whole[:, :m])

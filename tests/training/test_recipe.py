@@ -18,13 +18,7 @@ from mops_lightning.tasks.classification import Classification
 from mops_lightning.tasks.reconstruction import Reconstruction
 from mops_lightning.training.averaging import MovingAverage
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.recipe import (
-    Recipe,
-    draw_points,
-    feature_distance,
-    pooled_features,
-    straight_through,
-)
+from mops_lightning.training.recipe import Recipe, draw_points, straight_through
 from mops_lightning.types import Batch, SampleOutput
 from tests.support.training import quiet_trainer, small_dataset
 
@@ -52,7 +46,8 @@ def trained(recipe: Recipe, epochs: int = 2, table: Any = None, **more: Any) -> 
         make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
         recipe=recipe,
     )
-    module.full_predictions = table
+    assert module.distillation is not None
+    module.distillation.table = table
     data = small_dataset(points=POINTS)
     trainer = quiet_trainer(epochs, **more)
     trainer.fit(module, CloudLoader(data.train, 6, shuffle=True), CloudLoader(data.test, 6))
@@ -210,22 +205,6 @@ def test_distillation_is_logged_with_its_weight_and_only_then(name):
     light, heavy = (logged(Recipe(**one))[key] for one in given)
     assert light > 0
     assert heavy == pytest.approx(2 * light, rel=1e-3)
-
-
-def test_feature_distance_is_relative_to_the_reference():
-    found = torch.tensor([[1.0, 2.0], [0.0, 3.0]])
-    reference = torch.tensor([[3.0, 4.0], [0.0, 3.0]])
-    assert feature_distance(found, reference) == pytest.approx((8 / 25 + 0) / 2)
-
-
-def test_pooled_features_are_maxima_over_points():
-    net, points = PointNetVanilla(3).eval(), torch.randn(2, 7, 3)
-    torch.testing.assert_close(net.from_pooled(pooled_features(net, points)), net(points))
-
-
-def test_feature_distillation_of_net_without_point_features_raises():
-    with pytest.raises(UserError, match=r"feature_distillation must be 0 .* got Linear"):
-        pooled_features(torch.nn.Linear(3, 3), torch.randn(2, 7, 3))
 
 
 def test_distillation_with_kept_predictions_trains_the_same():

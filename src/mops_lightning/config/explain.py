@@ -50,16 +50,16 @@ def refuse_plain_groups(arguments: Sequence[str]) -> None:
             if name in texts:
                 if misfit(value, texts[name]):
                     raise settings.refusal(name, value)
-            elif not isinstance(value, str | list | dict) or not _names_only(value):
+            elif not _is_choice(value):
                 hint = OTHERWISE.get(name, "")
                 raise UserError(f"{argument}: choose one with {name}=NAME{hint}.")
 
 
-def _names_only(value: Any) -> bool:
-    """Return whether a list, with which Hydra takes several choices, contains names only."""
-    return not isinstance(value, list) or all(
-        isinstance(one, str) or type(one).__name__ == "QuotedString" for one in value
-    )
+def _is_choice(value: Any) -> bool:
+    """Return whether Hydra takes a value as a choice of a group: a name, or a list of names."""
+    if isinstance(value, list):
+        return all(isinstance(_unquoted(one), str) for one in value)
+    return isinstance(value, str | dict)
 
 
 def _is_text(kind: Any) -> bool:
@@ -72,7 +72,11 @@ def _values(override: Any) -> list[Any]:
         values = [override.value()]
     else:
         values = list(override.value().list) if override.is_choice_sweep() else []
-    return [str(value) if type(value).__name__ == "QuotedString" else value for value in values]
+    return [_unquoted(value) for value in values]
+
+
+def _unquoted(value: Any) -> Any:
+    return str(value) if type(value).__name__ == "QuotedString" else value
 
 
 def explain(error: BaseException, arguments: Sequence[str]) -> str:

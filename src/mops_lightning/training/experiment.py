@@ -21,16 +21,11 @@ from mops_lightning.samplers.base import Sampler, sample_with_attributes
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
 from mops_lightning.tasks.refinement import Refinement
+from mops_lightning.training.distillation import Distillation, Targets
 from mops_lightning.training.divergence import check_checkpoint, check_loss
 from mops_lightning.training.learn import Learn, check_learn
 from mops_lightning.training.readouts import readout_names, readouts
-from mops_lightning.training.recipe import (
-    Recipe,
-    draw_points,
-    feature_distance,
-    pooled_features,
-    straight_through,
-)
+from mops_lightning.training.recipe import Recipe, draw_points, straight_through
 from mops_lightning.training.scores import Scores, TransferScores
 from mops_lightning.types import Batch, SampleOutput
 
@@ -89,9 +84,7 @@ class Experiment(L.LightningModule):
         self.identity = identity
         self.task_lr_scale = task_lr_scale
         self.recipe = recipe or Recipe()
-        self.distills = self.recipe.distillation > 0 and learn == "sampler"
-        self.distills_features = self.recipe.feature_distillation > 0 and learn == "sampler"
-        self.full_predictions: Tensor | None = None
+        self.distillation = Distillation(task, self.recipe) if learn == "sampler" else None
         self.transfer: TransferScores | None = None  # set for tests with further task nets
         self.total_steps = 1
         self.started = False  # whether a checkpoint, if any, was restored
@@ -200,16 +193,14 @@ class Experiment(L.LightningModule):
         if rank:  # processes draw the same sizes, but random numbers of their own
             torch.manual_seed(derive_seed(self.seed, self.current_epoch, batch_idx, rank))
         with restrict_autocast_to_pointwise(self.device.type):
-            taught = self._full_prediction(batch) if self.distills else None
             available = batch.points.shape[1]
             n = self.recipe.points_at(self._progress, available, max(sizes))
             seen = draw_points(batch, n)
-            features = self._full_features(seen) if self.distills_features else None
+            targets = self.distillation.targets(batch, seen) if self.distillation else None
             outputs = self._sample(seen, sizes)
             terms: dict[str, list[Tensor]] = defaultdict(list)
             for m in sizes:
-                found = self._losses(batch, seen, outputs[m], taught, features)
-                for name, value in found.items():
+                for name, value in self._losses(batch, seen, outputs[m], targets).items():
                     terms[name].append(value)
             mean = self.sampler is not None and self.sampler.size_reduction == "mean"
             share = 1 / len(sizes) if mean else 1.0
@@ -221,26 +212,8 @@ class Experiment(L.LightningModule):
         self._log_training({**losses, "total": total}, readout, len(batch.points))
         return total
 
-    def _full_prediction(self, batch: Batch) -> Any:
-        """Return what the task net predicts for all points, from the table if there is one."""
-        if self.full_predictions is not None and batch.rows is not None:
-            self.full_predictions = self.full_predictions.to(batch.rows.device)
-            return self.full_predictions[batch.rows]
-        with torch.no_grad():
-            return self.task.predict(batch, batch.points)
-
-    def _full_features(self, seen: Tensor) -> Tensor:
-        """Return the task net's pooled features of all points that the step sees."""
-        with torch.no_grad():
-            return pooled_features(self.task.net, seen)
-
     def _losses(
-        self,
-        batch: Batch,
-        seen: Tensor,
-        sampled: SampleOutput,
-        taught: Any,
-        features: Tensor | None,
+        self, batch: Batch, seen: Tensor, sampled: SampleOutput, targets: Targets | None
     ) -> dict[str, Tensor]:
         """Return the loss terms at one size: the task's, distillation and the sampler's own.
 
@@ -256,12 +229,8 @@ class Experiment(L.LightningModule):
             if points is inputs[0]:
                 self.train_scores.update(result.predictions, result.targets)
             losses = dict(result.losses)
-            if taught is not None:
-                apart = self.task.disagreement(result.output, taught).mean()
-                losses["distillation"] = self.recipe.distillation * apart
-            if features is not None:
-                apart = feature_distance(pooled_features(self.task.net, points), features)
-                losses["feature_distillation"] = self.recipe.feature_distillation * apart
+            if self.distillation is not None and targets is not None:
+                losses |= self.distillation.losses(points, result.output, targets)
             for name, value in losses.items():
                 terms[name] = terms.get(name, 0) + value / len(inputs)
         return {**terms, **sampled.losses}

@@ -44,7 +44,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
     # For samplers that select points by the task net's features.
     net = {"net": task.net}
-    own = accepted(cfg.sampler, _with_attributes(net, attributes))
+    own = accepted(cfg.sampler, {**net, "attributes": attributes})
     sampler = build(cfg.sampler, "sampler", **own) if cfg.learn != "task" else None
     points = task.points_of(dataset.test.points.shape[1])
     sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, points, training=cfg.learn != "nothing")
@@ -87,11 +87,6 @@ def _recipe(cfg: DictConfig, sampler: Sampler | None) -> Recipe:
     return Recipe(**settings) if sampler.learned else Recipe()
 
 
-def _with_attributes(offered: dict[str, Any], attributes: tuple[str, ...]) -> dict[str, Any]:
-    """Return arguments with ``attributes``, if there are any."""
-    return {**offered, "attributes": attributes} if attributes else offered
-
-
 def _check_attributes(sampler: Sampler | None, attributes: tuple[str, ...]) -> None:
     """Refuse a sampler whose points would have no attributes.
 
@@ -101,29 +96,24 @@ def _check_attributes(sampler: Sampler | None, attributes: tuple[str, ...]) -> N
     if sampler is None or sampler.attributes:
         return
     if sampler.generates or isinstance(sampler, TaskNetSampler):
-        raise UserError(
-            f"dataset.features={_listed(attributes)}: {type(sampler).__name__} takes coordinates "
-            "only. Choose sampler=fmops, mops, gumbel or fps, or leave dataset.features out."
-        )
+        others = "sampler=fmops, mops, gumbel or fps, or leave dataset.features out"
+        raise _no_attributes(attributes, type(sampler).__name__, others)
 
 
-def _listed(names: tuple[str, ...]) -> str:
-    return f"[{','.join(names)}]"
+def _no_attributes(attributes: tuple[str, ...], taken_by: str, others: str) -> UserError:
+    given = f"dataset.features=[{','.join(attributes)}]"
+    return UserError(f"{given}: {taken_by} takes coordinates only. Choose {others}.")
 
 
 def _make_task(cfg: DictConfig, num_classes: int, attributes: tuple[str, ...]) -> Task:
     L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
     if attributes and not getattr(get_object(cfg.task._target_), "takes_attributes", False):
-        raise UserError(
-            f"dataset.features={_listed(attributes)}: task={cfg.names.task} takes coordinates "
-            "only. Choose task=reconstruction, or leave dataset.features out."
-        )
-    offered = accepted(cfg.task.net, _with_attributes({"num_classes": num_classes}, attributes))
+        others = "task=reconstruction, or leave dataset.features out"
+        raise _no_attributes(attributes, f"task={cfg.names.task}", others)
+    offered = accepted(cfg.task.net, {"num_classes": num_classes, "attributes": attributes})
     if attributes and "attributes" not in offered:
-        raise UserError(
-            f"dataset.features={_listed(attributes)}: task/net={cfg.names.net} takes coordinates "
-            "only. Choose task/net=autoencoder, mfoldingnet or atlasnet."
-        )
+        others = "task/net=autoencoder, mfoldingnet or atlasnet"
+        raise _no_attributes(attributes, f"task/net={cfg.names.net}", others)
     net = build(cfg.task.net, "task.net", **offered)
     return task_with(cfg, net, num_classes)
 

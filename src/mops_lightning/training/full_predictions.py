@@ -18,7 +18,7 @@ from mops_lightning.zoo import weights
 
 
 class FullPredictions(Callback):
-    """Gives an experiment the table when training starts.
+    """Gives an experiment's distillation the table when training starts.
 
     Not earlier, because a resumed run has its task net from the checkpoint.
 
@@ -35,7 +35,7 @@ class FullPredictions(Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Any) -> None:
         """Read or compute the table."""
-        pl_module.full_predictions = full_predictions(
+        pl_module.distillation.table = full_predictions(
             pl_module.task, self.clouds, self.batch_size, self.cache, pl_module.device
         )
 

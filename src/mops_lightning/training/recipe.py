@@ -4,12 +4,12 @@ import math
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import coordinates, gather_points
 from mops_lightning.ops.readout import match
-from mops_lightning.types import Batch, PairBatch, PointFeatureNet, SampleOutput
+from mops_lightning.types import Batch, PairBatch, SampleOutput
 
 POINTS_PER_SAMPLE = 2
 """A training step sees at least this many times the number of sampled points."""
@@ -31,7 +31,7 @@ class Recipe:
         distillation: weight of the disagreement between the frozen task net's predictions on the
             sample and on all points; see ``Task.disagreement``. Only with ``learn="sampler"``.
         feature_distillation: weight of the distance between the frozen task net's max-pooled
-            features of the sample and of the points that the step sees; see ``feature_distance``.
+            features of the sample and of the points that the step sees.
             Only with ``learn="sampler"`` and a net with ``point_features``.
         straight_through: share from which on the task net also sees the matched points, whose
             gradients go to the generated ones; None: never.
@@ -119,23 +119,3 @@ def straight_through(sampled: SampleOutput, points: Tensor) -> Tensor:
     rows = match(coordinates(sampled.points), coordinates(points))
     matched = gather_points(points, rows)
     return sampled.points + (matched - sampled.points).detach()
-
-
-def pooled_features(net: nn.Module, points: Tensor) -> Tensor:
-    """Return the task net's features ``(B, C)`` of clouds ``(B, N, 3)``: maxima over the points.
-
-    Raises:
-        UserError: the net has none.
-    """
-    if not isinstance(net, PointFeatureNet):
-        raise UserError(
-            "recipe.feature_distillation must be 0 with a task net that has no features of single "
-            f"points under a maximum (point_features), got {type(net).__name__}."
-        )
-    return net.point_features(points).amax(1)
-
-
-def feature_distance(found: Tensor, reference: Tensor) -> Tensor:
-    """Return ‖f − r‖² / ‖r‖², the mean over clouds, of pooled features ``(B, C)``."""
-    apart = (found - reference).square().sum(1)
-    return (apart / reference.square().sum(1).clamp_min(1e-12)).mean()

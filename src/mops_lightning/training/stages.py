@@ -82,10 +82,9 @@ def _load_weights(job: Job, record: RunRecord, task_weights: Path | None) -> Non
     task = job.experiment.task
     if task_weights is not None:
         try:
-            evaluate.same_attributes(
-                weights.read(task_weights)["config"], job.dataset, str(task_weights)
-            )
-            content = weights.load_into(task, task_weights)
+            content = weights.read(task_weights)
+            evaluate.same_attributes(content["config"], job.dataset, str(task_weights))
+            weights.fit_state(task, content["state"], task_weights)
         except UserError as error:
             raise UserError(f"weights: {error}") from None
         record.notes["weights_loaded"] = content["sha256"]
@@ -118,7 +117,8 @@ def _fit(job: Job) -> None:
         seed=cfg.seed,
         part=job.part,
     )
-    if experiment.distills and task.clouds_are_batches and not augment.active:
+    distills = experiment.distillation is not None and experiment.distillation.predicts
+    if distills and task.clouds_are_batches and not augment.active:
         cache = Path(cfg.cache).expanduser()
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         callbacks.insert(0, FullPredictions(train, cfg.batch_size, cache))

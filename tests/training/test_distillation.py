@@ -1,0 +1,24 @@
+"""Distances between what the task net makes of a sample and of the whole cloud."""
+
+import pytest
+import torch
+
+from mops_lightning.errors import UserError
+from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.training.distillation import feature_distance, pooled_features
+
+
+def test_feature_distance_is_relative_to_the_reference():
+    found = torch.tensor([[1.0, 2.0], [0.0, 3.0]])
+    reference = torch.tensor([[3.0, 4.0], [0.0, 3.0]])
+    assert feature_distance(found, reference) == pytest.approx((8 / 25 + 0) / 2)
+
+
+def test_pooled_features_are_maxima_over_points():
+    net, points = PointNetVanilla(3).eval(), torch.randn(2, 7, 3)
+    torch.testing.assert_close(net.from_pooled(pooled_features(net, points)), net(points))
+
+
+def test_feature_distillation_of_net_without_point_features_raises():
+    with pytest.raises(UserError, match=r"feature_distillation must be 0 .* got Linear"):
+        pooled_features(torch.nn.Linear(3, 3), torch.randn(2, 7, 3))
