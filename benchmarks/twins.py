@@ -19,7 +19,8 @@ class PlainMOPS(nn.Module):
         joined = torch.cat([sampler.rho_local.weight, sampler.rho_global.weight], 1)
         first = nn.Conv1d(joined.shape[1], joined.shape[0], 1, bias=False)
         first.weight.data.copy_(joined[:, :, None])
-        last = nn.Conv1d(sampler.queries.in_features, sampler.queries.out_features, 1)
+        m, channels = sampler.queries.weight.shape
+        last = nn.Conv1d(channels, m, 1)
         last.weight.data.copy_(sampler.queries.weight[:, :, None])
         norm = sampler.rho_first[0]
         self.rho = nn.Sequential(first, norm, nn.ReLU(), _convolutions(sampler.rho), last)

@@ -27,3 +27,13 @@ def folder(tmp_path_factory):
     weights.save(folder / "weights.pt", FMOPSNet(40), config, {})
     weights.save(folder / "task.pt", FMOPSNet(40), {**config, "learn": "task"}, {})
     return folder
+
+
+@pytest.fixture(scope="module")
+def anchored(tmp_path_factory):
+    """The folder of a sampler whose anchors are farthest points."""
+    folder = tmp_path_factory.mktemp("anchored")
+    node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 40, "anchors": "fps"}
+    config = {"learn": "sampler", "sampler": node}
+    weights.save(folder / "weights.pt", FMOPSNet(40, anchors="fps"), config, {})
+    return folder

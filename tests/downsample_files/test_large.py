@@ -54,3 +54,14 @@ def test_truncated_file_is_reported(folder, tmp_path):
     path.write_bytes(path.read_bytes()[:-5])
     settings = ["--weights", folder, "--readout", "matched", "--chunk", 60]
     assert "ends after 89 points" in call(path, tmp_path / "out.ply", *settings)[2]
+
+
+def test_sampler_with_anchors_takes_whole_files_only(anchored, tmp_path):
+    path = tmp_path / "a.npy"
+    np.save(path, np.random.default_rng(1).normal(size=(90, 3)))
+    settings = ["--weights", anchored, "--readout", "matched", "--m", 20]
+    assert call(path, tmp_path / "out.npy", *settings)[0] == 0
+    assert np.load(tmp_path / "out.npy").shape == (20, 3)
+    status, _, err = call(path, tmp_path / "none.npy", *settings, "--chunk", 60)
+    assert status == 2
+    assert "anchors=fps" in err

@@ -115,6 +115,27 @@ def test_nonzero_counts_and_gram_equal_dense(path):
     torch.testing.assert_close(matrix.gram(), dense.mT @ dense)
 
 
+def test_queries_of_every_cloud_equal_matrices_of_single_clouds(path):
+    matrix, points = random_matrix()
+    rng = torch.Generator().manual_seed(3)
+    queries = torch.randn(2, 11, 8, dtype=torch.float64, generator=rng, requires_grad=True)
+    both = SamplingMatrix(queries, matrix.keys, 0.3)
+    alone = [SamplingMatrix(queries[b], matrix.keys[b : b + 1], 0.3) for b in range(2)]
+    want = torch.cat([one.sample(points[b : b + 1]) for b, one in enumerate(alone)])
+    torch.testing.assert_close(both.sample(points), want)
+    weight = torch.randn(2, 11, 3, dtype=torch.float64, generator=rng)
+    got = torch.autograd.grad((both.sample(points) * weight).sum(), queries)
+    torch.testing.assert_close(got, torch.autograd.grad((want * weight).sum(), queries))
+    dense = torch.cat([one.dense() for one in alone]).detach()
+    torch.testing.assert_close(both.dense(), dense)
+    torch.testing.assert_close(both.sparse(0.0).to_dense(), dense)
+    torch.testing.assert_close(both.gram(), dense.mT @ dense)
+    torch.testing.assert_close(both.nonzero_counts(0.05), (dense >= 0.05).to(dense).sum(1))
+    torch.testing.assert_close(both.leftmost(4).dense(), dense[..., :4])
+    torch.testing.assert_close(both.first_cloud().dense(), dense[:1])
+    assert both.leftmost(4).m == 4
+
+
 def test_leftmost_is_first_columns():
     matrix, points = random_matrix()
     torch.testing.assert_close(matrix.leftmost(4).dense(), matrix.dense()[:, :, :4])

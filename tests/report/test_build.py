@@ -67,6 +67,16 @@ def test_recipes_have_rows_of_their_own_with_the_papers_values(tmp_path):
     (tmp_path / "more").mkdir()
     fast = {"recipe": {"name": "fast", "train_points": 256}}
     put(tmp_path / "more", "mops", 32, {"test/generated/accuracy": 0.6}, notes=fast)
+    (tmp_path / "third").mkdir()
+    put(
+        tmp_path / "third",
+        "mops",
+        32,
+        {"test/generated/accuracy": 0.7},
+        notes=fast,
+        of={"anchors": "fps"},
+    )
     paper = ["*the paper's*", "84.28 / 79.01 / 79.74"]
     found = rows(table(tmp_path))
-    assert found[1:] == [["mops", "50.00"], paper, ["mops fast", "60.00"], paper]
+    anchored = [["mops anchored fast", "70.00"], paper]
+    assert found[1:] == [["mops", "50.00"], paper, *anchored, ["mops fast", "60.00"], paper]

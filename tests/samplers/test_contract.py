@@ -23,6 +23,17 @@ from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.samplers.voxel import VoxelSampler
 
 SMALL: dict[str, Any] = {"feature_channels": (8, 6), "head_channels": (12, 10)}
+MOPS_LAYERS: dict[str, Any] = {"feature_channels": (8, 6), "rho_channels": (12, 10)}
+
+
+def moved(sampler: MOPSNet) -> MOPSNet:
+    """Give a sampler with anchors weights that differ from those of its start."""
+    for weights in sampler.queries.parameters():
+        values = torch.arange(weights.numel()).sin() / 2
+        weights.data = values.reshape(weights.shape)
+    return sampler
+
+
 SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "random": lambda m, **kw: RandomSampler(m, **kw),
     "fps": lambda m, **kw: FPSSampler(m, **kw),
@@ -33,8 +44,10 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "submodular-gradient": lambda m: SubmodularSampler(m, PointNetVanilla(3), "gradient"),
     "critical": lambda m, **kw: CriticalSampler(m, PointNetVanilla(3), **kw),
     "gumbel": lambda m: GumbelSampler(m, feature_channels=(8, 6), key_channels=(12, 10)),
-    "mops": lambda m: MOPSNet(m, feature_channels=(8, 6), rho_channels=(12, 10)),
-    "fmops": lambda m: FMOPSNet(m, feature_channels=(8, 6), rho_channels=(12, 10)),
+    "mops": lambda m: MOPSNet(m, **MOPS_LAYERS),
+    "fmops": lambda m: FMOPSNet(m, **MOPS_LAYERS),
+    "mops-anchors": lambda m: moved(MOPSNet(m, anchors="fps", **MOPS_LAYERS)),
+    "fmops-anchors": lambda m: moved(FMOPSNet(m, anchors="fps", **MOPS_LAYERS)),
     "snet": lambda m: SNet(m, **SMALL),
     "snet-without-norm": lambda m: SNet(m, head_norm=False, output_norm=False, **SMALL),
     "samplenet": lambda m: SampleNet(m, k=3, **SMALL),
@@ -44,7 +57,7 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
 FEATURES: dict[str, Any] = {"feature_channels": (64, 64, 64, 128, 128)}
 MOPS: dict[str, Any] = {
     **{"alpha": 30.0, "tau_min": 0.1, "annealing": "exponential", "threshold": 0.0},
-    **{"rho_channels": (512, 256, 128), "attributes": (), **FEATURES},
+    **{"rho_channels": (512, 256, 128), "attributes": (), "anchors": None, **FEATURES},
 }
 SNET: dict[str, Any] = {
     **{"alpha": 30.0, "coverage": 1.0, "coverage_per_point": 0.0, **FEATURES},

@@ -27,7 +27,7 @@ class PlainMOPS(nn.Module):
         for number, layer in enumerate(fast.rho):
             rho[3 + number].load_state_dict(layer.state_dict())
         self.rho = rho
-        self.last = nn.Linear(fast.queries.in_features, fast.m)
+        self.last = nn.Linear(fast.queries.weight.shape[1], fast.m)
         self.last.weight.data = fast.queries.weight.data
         self.tau = fast.tau
 

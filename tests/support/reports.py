@@ -21,6 +21,7 @@ def put(folder, sampler, m, metrics, task="classification", net="pointnet", **ch
         "names": names,
         "trainer": {"max_epochs": 3},
         "task": changes.pop("settings", {}),
+        "sampler": changes.pop("of", {}),
     }
     notes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **changes.pop("notes", {})}
     target = folder / f"{sampler}-{m}-{net}"

@@ -130,7 +130,7 @@ def _chosen(
 ) -> tuple[Tensor | None, Tensor]:
     """Return the rows ``(m,)`` of the points to keep, or None, and the generated points."""
     places = coordinates(points)
-    if isinstance(sampler, MOPSNet):
+    if isinstance(sampler, MOPSNet) and sampler.streams:
         generated = stream_sample(sampler, lambda: list(points.split(CHUNK)), m)
     else:
         output = sampler(points[None], m)

@@ -108,6 +108,7 @@ def by_chunks(
     if not isinstance(sampler, MOPSNet):
         raise UserError(f"--chunk works with MOPS-Net and FMOPS-Net, not {type(sampler).__name__}.")
     sampler.check_m(m)
+    net = sampler.fused()
     whole = open_cloud_file(source)
     cloud, row_ranges = replace(whole, header=None), whole.row_ranges(size)
 
@@ -122,7 +123,6 @@ def by_chunks(
     check_size(source, number, m)
     centre = summed / number
     sphere = unit_sphere(centre, max(over("radius", _largest_distance, centre)), source)
-    net = sampler.fused()
     global_ = reduce(torch.maximum, over("global feature", _global, sphere, net))
     sums: Partial = reduce(Partial.merge, over("sampling", _sum, sphere, net, global_, m))
     generated = sums.result()

@@ -154,18 +154,24 @@ def _sums_from_maxima(powers: Tensor, keys: Tensor, extended: Tensor) -> tuple[T
     return whole.level, whole.weighted
 
 
+def per_cloud(queries: Tensor, clouds: int) -> list[Tensor]:
+    """Return the queries ``(M, C)`` of every cloud: views of ``(M, C)`` or ``(B, M, C)``."""
+    return [queries] * clouds if queries.ndim == 2 else list(queries)
+
+
 def attend_batch(queries: Tensor, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
     """Return the softmax attention of every cloud and the logarithms of its denominators.
 
     Args:
-        queries: ``(M, C)``, already divided by the temperature.
+        queries: ``(M, C)`` or ``(B, M, C)``, already divided by the temperature.
         keys: ``(B, N, C)``.
         values: ``(B, N, V)``.
 
     Returns:
         ``(B, M, V)``, and ``(B, M)`` to the base 2; without gradients.
     """
-    sums = [attend(queries, *cloud) for cloud in zip(keys, values, strict=True)]
+    clouds = zip(per_cloud(queries, len(keys)), keys, values, strict=True)
+    sums = [attend(*cloud) for cloud in clouds]
     results = torch.stack([cloud.result() for cloud in sums])
     return results, torch.stack([cloud.level + cloud.total.log2() for cloud in sums])
 
@@ -174,7 +180,7 @@ def streamed_attention(queries: Tensor, keys: Tensor, values: Tensor) -> Tensor:
     """Return the softmax attention of every cloud, computed in blocks in both passes.
 
     Args:
-        queries: ``(M, C)``, already divided by the temperature.
+        queries: ``(M, C)`` or ``(B, M, C)``, already divided by the temperature.
         keys: ``(B, N, C)``.
         values: ``(B, N, V)``.
 
@@ -200,17 +206,20 @@ class _StreamedAttention(torch.autograd.Function):
         grad_values = torch.zeros_like(values)
         # Backward pass of the softmax: dS = S ∘ (dA − ⟨dQ, Q⟩), with dA = dQ·Pᵀ.
         inner = (grad * result).sum(-1)
-        powers, size = queries * LOG2_E, blocks_on(keys.device)
-        for cloud in range(len(keys)):
-            for columns in slices(len(queries), size.queries):
+        clouds, size = len(keys), blocks_on(keys.device)
+        each, powers = per_cloud(queries, clouds), per_cloud(queries * LOG2_E, clouds)
+        grad_each = per_cloud(grad_queries, clouds)
+        for cloud in range(clouds):
+            for columns in slices(queries.shape[-2], size.queries):
                 for rows in slices(keys.shape[1], size.points):
                     key = keys[cloud, rows]
-                    weights = softmax_weights(powers[columns], key, log_sum[cloud, columns])
+                    level = log_sum[cloud, columns]
+                    weights = softmax_weights(powers[cloud][columns], key, level)
                     if ctx.needs_input_grad[2]:
                         # A few rows on the left are faster than a few columns on the right.
                         grad_values[cloud, rows] += (grad[cloud, columns].mT @ weights).mT
                     change = grad[cloud, columns] @ values[cloud, rows].mT
                     change.sub_(inner[cloud, columns, None]).mul_(weights)
-                    grad_queries[columns] += change @ key
-                    grad_keys[cloud, rows] += change.mT @ queries[columns]
+                    grad_each[cloud][columns] += change @ key
+                    grad_keys[cloud, rows] += change.mT @ each[cloud][columns]
         return grad_queries, grad_keys, grad_values

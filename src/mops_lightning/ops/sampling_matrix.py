@@ -17,6 +17,7 @@ from mops_lightning.ops.attention import (
     LOG2_E,
     attend_batch,
     blocks_on,
+    per_cloud,
     slices,
     softmax_weights,
     streamed_attention,
@@ -30,7 +31,8 @@ class SamplingMatrix(NamedTuple):
     """Sampling matrices S of a batch of clouds (paper Eq. 5), as scaled dot-product attention.
 
     Attributes:
-        queries: ``(M, C)``, the weights of the last layer of ρ.
+        queries: ``(M, C)``, the weights of the last layer of ρ; or ``(B, M, C)``, queries of every
+            cloud.
         keys: ``(B, N, C)``, the input of that layer.
         tau: temperature τ of the softmax.
 
@@ -47,6 +49,11 @@ class SamplingMatrix(NamedTuple):
     keys: Tensor
     tau: float
 
+    @property
+    def m(self) -> int:
+        """Number of columns of S."""
+        return self.queries.shape[-2]
+
     def dense(self) -> Tensor:
         """Return S as ``(B, N, M)``: every column is non-negative and sums to 1."""
         return self._columns().mT
@@ -61,7 +68,7 @@ class SamplingMatrix(NamedTuple):
             ``(B, M, 3)``; differentiable in queries, keys and points. Above ``Blocks.dense``
             entries, S is computed block by block, and again in the backward pass.
         """
-        entries = self.keys.shape[0] * self.keys.shape[1] * self.queries.shape[0]
+        entries = self.keys.shape[0] * self.keys.shape[1] * self.m
         if entries <= blocks_on(self.keys.device).dense:
             # Values with contiguous columns halve the time of the product.
             return self._columns() @ points.mT.contiguous().mT
@@ -76,7 +83,7 @@ class SamplingMatrix(NamedTuple):
         Returns:
             Sparse ``(B, N, M)``, coalesced; without gradients.
         """
-        batch, number, m = self.keys.shape[0], self.keys.shape[1], len(self.queries)
+        batch, number, m = self.keys.shape[0], self.keys.shape[1], self.m
         coordinates, values = [], []
         with torch.no_grad():
             peak = torch.full((batch, m), -1.0, dtype=self.keys.dtype, device=self.keys.device)
@@ -108,7 +115,12 @@ class SamplingMatrix(NamedTuple):
 
     def leftmost(self, m: int) -> "SamplingMatrix":
         """Return the matrix of the first ``m`` columns (paper section "Flexible MOPS-Net")."""
-        return self._replace(queries=self.queries[:m])
+        return self._replace(queries=self.queries[..., :m, :])
+
+    def first_cloud(self) -> "SamplingMatrix":
+        """Return the matrix of the first cloud, as a batch of one."""
+        queries = self.queries if self.queries.ndim == 2 else self.queries[:1]
+        return self._replace(queries=queries, keys=self.keys[:1])
 
     def nonzero_counts(self, threshold: float = 0.01) -> Tensor:
         """Count the entries of every column that reach ``threshold``.
@@ -117,7 +129,7 @@ class SamplingMatrix(NamedTuple):
             ``(B, M)`` in the dtype of the keys; without gradients.
         """
         with torch.no_grad():
-            counts = self.keys.new_zeros(self.keys.shape[0], len(self.queries))
+            counts = self.keys.new_zeros(self.keys.shape[0], self.m)
             for cloud, _, columns, block in self._blocks():
                 counts[cloud, columns] += (block >= threshold).sum(1)
             return counts
@@ -128,7 +140,7 @@ class SamplingMatrix(NamedTuple):
         Returns:
             ``(B, M, M)``; without gradients.
         """
-        m = len(self.queries)
+        m = self.m
         with torch.no_grad():
             result = self.keys.new_zeros(self.keys.shape[0], m, m)
             for cloud, _, _, block in self._blocks(block_queries=m):
@@ -148,9 +160,10 @@ class SamplingMatrix(NamedTuple):
         queries = self.queries / self.tau
         no_values = self.keys.new_zeros(*self.keys.shape[:2], 0)
         _, log_sum = attend_batch(queries, self.keys, no_values)
-        powers, size = queries * LOG2_E, blocks_on(queries.device)
-        for cloud, keys in enumerate(self.keys):
-            for columns in slices(len(queries), block_queries or size.queries):
+        size = blocks_on(queries.device)
+        powers = per_cloud(queries * LOG2_E, len(self.keys))
+        for cloud, (power, keys) in enumerate(zip(powers, self.keys, strict=True)):
+            for columns in slices(self.m, block_queries or size.queries):
                 for rows in slices(len(keys), size.points):
                     level = log_sum[cloud, columns]
-                    yield cloud, rows, columns, softmax_weights(powers[columns], keys[rows], level)
+                    yield cloud, rows, columns, softmax_weights(power[columns], keys[rows], level)

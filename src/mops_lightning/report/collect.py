@@ -156,9 +156,14 @@ def recipe(record: Record) -> dict[str, Any]:
 
 
 def sampler_row(record: Record) -> str:
-    """Return the name of a record's sampler, with that of its recipe unless it is the paper's."""
-    sampler: str = record["config"]["names"]["sampler"]
-    return " ".join([sampler, *filter(None, [recipe(record).get("name")])])
+    """Return the name of a record's sampler, with what makes it a row of its own.
+
+    That is ``anchored`` for a MOPS-Net with anchors, and its recipe unless it is the paper's.
+    """
+    config = record["config"]
+    anchored = "anchored" if (config.get("sampler") or {}).get("anchors") else None
+    parts = [config["names"]["sampler"], anchored, recipe(record).get("name")]
+    return " ".join(filter(None, parts))
 
 
 def epochs(record: Record) -> int | None:

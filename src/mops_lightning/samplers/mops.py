@@ -11,8 +11,9 @@ from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.losses.subset import subset_losses
 from mops_lightning.nets.layers import PointFeatures, check_channels, linear_norm_relu
 from mops_lightning.ops.points import coordinates
-from mops_lightning.ops.precision import pointwise_autocast
+from mops_lightning.ops.precision import full_precision, pointwise_autocast
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
+from mops_lightning.samplers.anchors import FPSAnchors
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fused import FusedMOPSNet, fuse
 from mops_lightning.types import SampleOutput
@@ -40,6 +41,8 @@ class MOPSNet(Sampler):
             all. Sampling in chunks keeps all.
         attributes: names of C attributes, see ``Sampler.attributes``. The features are those of all
             3 + C channels, and SᵀP has them all.
+        anchors: ``fps`` lets the columns of S start as a soft choice of the cloud's farthest points
+            (see ``anchors``); None, as in the paper, lets them start at random.
 
     Raises:
         UserError: an argument is out of range.
@@ -67,6 +70,7 @@ class MOPSNet(Sampler):
         rho_channels: Sequence[int] = (512, 256, 128),
         threshold: float = 0.0,
         attributes: Sequence[str] = (),
+        anchors: Literal["fps"] | None = None,
     ) -> None:
         super().__init__(m)
         if not 0 < tau_min <= 1:
@@ -78,6 +82,8 @@ class MOPSNet(Sampler):
             raise UserError(f"annealing: unknown {annealing!r}.{hint}")
         check_channels("feature_channels", feature_channels)
         check_channels("rho_channels", rho_channels)
+        if anchors not in (None, "fps"):
+            raise UserError(f"anchors must be fps or null, got {anchors!r}.")
         if not 0 <= threshold < 1:
             raise UserError(f"threshold must be at least 0 and below 1, got {threshold}.")
         self.alpha = alpha
@@ -94,13 +100,22 @@ class MOPSNet(Sampler):
         self.rho_global = nn.Linear(local, rho_channels[0], bias=False)
         self.rho_first = nn.Sequential(nn.BatchNorm1d(rho_channels[0]), nn.ReLU(inplace=True))
         self.rho = linear_norm_relu(rho_channels)
-        # A bias would be constant within a column of S, where the softmax cancels it.
-        self.queries = nn.Linear(rho_channels[-1], m, bias=False)
+        self.queries: nn.Linear | FPSAnchors
+        if anchors is None:
+            # A bias would be constant within a column of S, where the softmax cancels it.
+            self.queries = nn.Linear(rho_channels[-1], m, bias=False)
+        else:
+            self.queries = FPSAnchors(m, rho_channels[-1])
 
     @property
     def tau(self) -> float:
         """The current temperature: annealed in training, ``tau_min`` in evaluation."""
         return self.training_tau if self.training else self.tau_min
+
+    @property
+    def streams(self) -> bool:
+        """Whether clouds can be sampled in chunks; farthest points need all points at once."""
+        return not isinstance(self.queries, FPSAnchors)
 
     def anneal(self, progress: float) -> None:
         """Set the training temperature for a progress from 0 (tau = 1) to 1 (tau = tau_min)."""
@@ -110,21 +125,38 @@ class MOPSNet(Sampler):
         else:
             self.training_tau = 1 + (self.tau_min - 1) * progress
 
-    def sampling_matrix(self, points: Tensor) -> SamplingMatrix:
-        """Return the sampling matrices S of ``(B, N, 3)`` points."""
+    def sampling_matrix(self, points: Tensor, m: int | None = None) -> SamplingMatrix:
+        """Return the sampling matrices S of ``(B, N, 3)`` points, with the first m columns."""
+        m, keys = self.m if m is None else m, self._keys(points)
+        if isinstance(self.queries, FPSAnchors):
+            return self.queries(points, keys, m, self.tau)
+        return SamplingMatrix(self.queries.weight, keys, self.tau).leftmost(m)
+
+    def _keys(self, points: Tensor) -> Tensor:
+        """Return the inputs of the last layer of ρ ``(B, N, C)``."""
         plain = self.training or torch.is_grad_enabled()
         if not plain and not torch.is_autocast_enabled(points.device.type):
-            return self._fused_matrix(points)
+            return self._fused_keys(points)
         local, global_ = self.features(points)
         with pointwise_autocast(points.device.type):
             hidden = self.rho_local(local).add_(self.rho_global(global_)[:, None])
             rows = self.rho(self.rho_first(hidden.flatten(0, 1)))
-        queries = self.queries.weight
-        keys = rows.to(queries).unflatten(0, points.shape[:2])
-        return SamplingMatrix(queries, keys, self.tau)
+        return rows.to(self.queries.weight).unflatten(0, points.shape[:2])
 
     def fused(self) -> FusedMOPSNet:
-        """Return the network for inference with BatchNorm fused, with copies of the weights."""
+        """Return the network for inference with BatchNorm fused, with copies of the weights.
+
+        Raises:
+            UserError: the sampler has anchors, which a part of a cloud does not determine.
+        """
+        if not self.streams:
+            raise UserError(
+                "a sampler with anchors=fps needs all points of a cloud at once and cannot sample "
+                "in chunks. Sample whole clouds, or use a sampler without anchors."
+            )
+        return self._fused()
+
+    def _fused(self) -> FusedMOPSNet:
         norm = self.rho_first[0]
         assert isinstance(norm, nn.BatchNorm1d)
         queries = self.queries.weight.detach() / self.tau_min
@@ -132,23 +164,30 @@ class MOPSNet(Sampler):
         net = fuse(layers, self.rho_local, self.rho_global, norm, self.rho, queries)
         return net._replace(scale=self.features.scale) if self.attributes else net
 
-    def _fused_matrix(self, points: Tensor) -> SamplingMatrix:
-        """Return S without gradients, with the fused network."""
-        net = self.fused()
+    def _fused_keys(self, points: Tensor) -> Tensor:
+        """Return the keys without gradients, from the fused network."""
+        net = self._fused()
         local = net.local_features(points.flatten(0, 1)).unflatten(0, points.shape[:2])
         keys = local.new_empty(*local.shape[:2], net.queries.shape[1])
         for cloud, peak, into in zip(local, local.amax(1), keys, strict=True):
             net.keys(cloud, peak, into)
-        return SamplingMatrix(self.queries.weight, keys, self.tau)
+        return keys
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Generate points; see ``Sampler.forward``."""
-        matrix = self.sampling_matrix(points).leftmost(m)
+        if isinstance(self.queries, FPSAnchors):
+            # Squared distances need full precision.
+            with full_precision(points.device.type):
+                matrix = self.sampling_matrix(points, m)
+                sampled = self._sampled(matrix, points.to(matrix.keys.dtype)).to(points.dtype)
+            return SampleOutput(sampled, None, {}, matrix)
+        matrix = self.sampling_matrix(points, m)
+        return SampleOutput(self._sampled(matrix, points), None, {}, matrix)
+
+    def _sampled(self, matrix: SamplingMatrix, points: Tensor) -> Tensor:
         if self.threshold and not self.training:
-            sampled = torch.bmm(matrix.sparse(self.threshold).mT, points)
-        else:
-            sampled = matrix.sample(points)
-        return SampleOutput(sampled, None, {}, matrix)
+            return torch.bmm(matrix.sparse(self.threshold).mT, points)
+        return matrix.sample(points)
 
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]

@@ -103,8 +103,8 @@ class CloudVisualization(Callback):
         samples = {name: coordinates(chosen) for name, chosen in samples.items()}
         figures["clouds"] = cloud_grid(coordinates(points), samples, titles)
         matrix = output.matrix
-        if matrix is not None and points.shape[1] * len(matrix.queries) <= DENSE_PIXELS:
-            first = matrix._replace(keys=matrix.keys[:1])
+        if matrix is not None and points.shape[1] * matrix.m <= DENSE_PIXELS:
+            first = matrix.first_cloud()
             figures["matrix"] = matrix_figure(first.dense()[0], first.gram()[0], titles[0])
         return figures, samples
 

@@ -99,6 +99,11 @@ def plain_net(sampler: Sampler, m: int | None = None) -> nn.Module:
             f"the sampler takes attributes ({', '.join(sampler.attributes)}) and cannot be "
             "exported. Export one that was trained without dataset.features."
         )
+    if isinstance(sampler, MOPSNet) and not sampler.streams:
+        raise UserError(
+            f"{type(sampler).__name__} with anchors=fps cannot be exported, as its farthest points "
+            "are found one by one. Export one without anchors."
+        )
     if isinstance(sampler, MOPSNet) and sampler.generates:
         return PlainMOPSNet(sampler, m).eval()
     if isinstance(sampler, SNet) and sampler.generates:

@@ -1,0 +1,116 @@
+"""MOPS-Net with anchors: the columns of S start as a soft choice of farthest points.
+
+Column j of S belongs to the j-th farthest point q_j of the cloud. Its logits are
+
+    ⟨w_j + A·h(q_j)/√C, h_i⟩ − |p_i − q_j|² / s_j²,
+
+with the keys h_i of the points. w and A start at zero, so that an untrained sampler returns
+weighted means around farthest points, and training moves them. The distances are products, too:
+−|p_i − q_j|² = 2⟨p_i, q_j⟩ − |p_i|² − |q_j|², whose last term is constant in a column, where the
+softmax cancels it. So S remains an attention, with four more channels and queries of every cloud.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from mops_lightning.ops.fps import farthest_point_sample
+from mops_lightning.ops.points import coordinates, distance_dtype, gather_points
+from mops_lightning.ops.sampling_matrix import SamplingMatrix
+from mops_lightning.samplers.ordering import seeded_order
+
+WIDTH = 0.5
+"""Width s_j before training, as a share of the spacing of m farthest points."""
+
+SPACING_POINTS = 64
+"""The unit of widths is the spacing of this number of farthest points of the cloud."""
+
+SMALLEST = 1e-3
+"""Lower bound of the width, for clouds with coincident points."""
+
+
+class FPSAnchors(nn.Module):
+    """Queries around the farthest points of a cloud.
+
+    The first point is the one farthest from the mean; a random order of the points, which depends
+    on the cloud only, breaks ties (see ``ordering``). So the anchors turn and move with the cloud,
+    and the first m of them are those of size m.
+
+    Args:
+        m: largest number of points.
+        channels: C, of the keys.
+    """
+
+    def __init__(self, m: int, channels: int) -> None:
+        super().__init__()
+        # Not named as the plain net's weight, of which a warm start would otherwise take copies.
+        self.slots = nn.Parameter(torch.zeros(m, channels))
+        self.relation = nn.Parameter(torch.zeros(channels, channels))
+        # On a surface the spacing of k points decreases as √(1/k).
+        width = WIDTH * math.sqrt(SPACING_POINTS / m)
+        self.log_width = nn.Parameter(torch.full((m,), math.log(width)))
+
+    @property
+    def weight(self) -> Tensor:
+        """The vectors w ``(m, C)``."""
+        return self.slots
+
+    def forward(self, points: Tensor, keys: Tensor, m: int, tau: float) -> SamplingMatrix:
+        """Return the first m columns of the sampling matrices.
+
+        Args:
+            points: ``(B, N, 3)``, or with attributes.
+            keys: ``(B, N, C)``, the output of the hidden layers of ρ.
+            m: number of columns.
+            tau: temperature.
+
+        Returns:
+            Matrices with queries ``(B, m, C + 4)``, in float32 at least.
+        """
+        dtype = distance_dtype(points)
+        places, keys = coordinates(points).to(dtype), keys.to(dtype)
+        # Distances are more precise around the mean.
+        centred = places - places.mean(1, keepdim=True)
+        count = min(SPACING_POINTS, places.shape[1])
+        rows = farthest_from_mean(places, max(m, count))
+        unit = squared_spacing(gather_points(centred, rows[:, :count]))
+        rows = rows[:, :m]
+        anchors = gather_points(centred, rows)
+        width = unit[:, None] * self.log_width[:m].to(dtype).mul(2).exp()
+        sharpness = width.clamp_min(SMALLEST**2).reciprocal()[..., None]
+        related = gather_points(keys, rows) @ self.relation.to(dtype).mT
+        content = self.slots[:m].to(dtype) + related / math.sqrt(keys.shape[2])
+        queries = torch.cat([content, 2 * sharpness * anchors, -sharpness], 2)
+        squares = centred.square().sum(2, keepdim=True)
+        return SamplingMatrix(queries, torch.cat([keys, centred, squares], 2), tau)
+
+
+def squared_spacing(farthest: Tensor) -> Tensor:
+    """Return the squared spacing ``(B,)`` of ``SPACING_POINTS`` farthest points.
+
+    It is the squared distance of the last point to those before it. Where a cloud has fewer points,
+    it is scaled as on a surface.
+
+    Args:
+        farthest: ``(B, K, 3)`` in the order of choice.
+    """
+    count = farthest.shape[1]
+    if count < 2:
+        return farthest.new_ones(len(farthest))
+    apart = (farthest[:, :-1] - farthest[:, -1:]).square().sum(2).amin(1)
+    return apart * (count / SPACING_POINTS)
+
+
+def farthest_from_mean(points: Tensor, m: int) -> Tensor:
+    """Return rows ``(B, m)`` of farthest points, the first being farthest from the mean.
+
+    Args:
+        points: ``(B, N, 3)``.
+        m: number of points.
+    """
+    order = seeded_order(points, 0)
+    # The mean of ordered points has the same rounding error for every order of the input.
+    ordered = gather_points(points.detach(), order)
+    start = (ordered - ordered.mean(1, keepdim=True)).square().sum(2).argmax(1)
+    return order.gather(1, farthest_point_sample(ordered, m, start=start))

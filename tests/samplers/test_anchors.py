@@ -1,0 +1,190 @@
+"""MOPS-Net with anchors against farthest points and a dense softmax of distances."""
+
+from typing import Any
+
+import pytest
+import torch
+
+from mops_lightning.errors import UserError
+from mops_lightning.nets.warm_start import copy_tensors
+from mops_lightning.ops import attention
+from mops_lightning.ops.fps import farthest_point_sample
+from mops_lightning.ops.points import gather_points
+from mops_lightning.samplers.anchors import SPACING_POINTS, WIDTH
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.streaming import stream_sample
+from mops_lightning.zoo.export import plain_net
+
+
+def small(kind=MOPSNet, m=6, moved=False, **settings):
+    torch.manual_seed(0)
+    layers = {"feature_channels": (8, 6), "rho_channels": (12, 10)}
+    net = kind(m, anchors="fps", **(layers | settings))
+    for weights in net.queries.parameters() if moved else ():
+        torch.nn.init.normal_(weights, std=0.5)
+    return net
+
+
+def farthest(points, m):
+    """Farthest points, the first being farthest from the mean, one cloud at a time."""
+    start = (points - points.mean(1, keepdim=True)).norm(dim=2).argmax(1)
+    return farthest_point_sample(points, m, start=start)
+
+
+def plain_dense(net, points, keys):
+    """S entry by entry of its definition: content of a slot, and distances to its anchor."""
+    count = min(SPACING_POINTS, points.shape[1])
+    chosen = gather_points(points, farthest(points, count))
+    unit = (chosen[:, :-1] - chosen[:, -1:]).norm(dim=2).amin(1) * (count / SPACING_POINTS) ** 0.5
+    columns = []
+    for j, row in enumerate(farthest(points, net.m).T):
+        own = keys[torch.arange(len(keys)), row]
+        query = net.queries.slots[j] + own @ net.queries.relation.T / keys.shape[2] ** 0.5
+        anchor = points[torch.arange(len(keys)), row]
+        width = unit * net.queries.log_width[j].exp()
+        apart = (points - anchor[:, None]).square().sum(2) / width[:, None] ** 2
+        columns.append((((keys * query[:, None]).sum(2) - apart) / net.tau).softmax(1))
+    return torch.stack(columns, 2)
+
+
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("number", [20, 90])
+def test_anchors_equal_dense_softmax_of_distances(training, number, rng):
+    net = small(moved=True, tau_min=0.3).double().train(training)
+    points = torch.randn(3, number, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+    output = net(points)
+    assert output.matrix is not None
+    want = plain_dense(net, points, output.matrix.keys[..., :10])
+    torch.testing.assert_close(output.matrix.dense(), want)
+    torch.testing.assert_close(output.points, want.mT @ points)
+    weights = torch.randn(3, 6, 3, dtype=torch.float64, generator=rng)
+    parameters = list(net.queries.parameters())
+    got = torch.autograd.grad((output.points * weights).sum(), parameters, retain_graph=True)
+    expected = torch.autograd.grad(((want.mT @ points) * weights).sum(), parameters)
+    assert all(gradient.abs().max() > 0 for gradient in expected)
+    torch.testing.assert_close(got, expected)
+
+
+@pytest.mark.parametrize("kind", [MOPSNet, FMOPSNet])
+def test_untrained_anchors_of_small_width_are_farthest_points(kind, rng):
+    points = torch.randn(3, 100, 3, generator=rng)
+    net = small(kind, m=32).eval()
+    net.queries.log_width.data.fill_(-4.0)
+    want = gather_points(points, farthest(points, 32))
+    torch.testing.assert_close(net(points).points, want, atol=1e-5, rtol=0)
+
+
+def test_untrained_anchors_are_near_farthest_points(rng):
+    points = torch.nn.functional.normalize(torch.randn(3, 1000, 3, generator=rng), dim=2)
+    net = small(m=50, tau_min=0.5).eval()
+    want = gather_points(points, farthest(points, 50))
+    apart = (net(points).points - want).norm(dim=2)
+    between = torch.cdist(want, want)[:, 49, :49].amin(1, keepdim=True)
+    assert (apart < WIDTH * between).all()
+    assert apart.max() > 0
+
+
+def test_anchors_turn_and_move_with_the_cloud(rng):
+    points = torch.randn(2, 80, 3, generator=rng)
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=rng)).Q
+    net = small().eval()
+    moved = net(points @ rotation + 0.3).points
+    torch.testing.assert_close(moved, net(points).points @ rotation + 0.3, atol=1e-5, rtol=0)
+
+
+def test_anchors_are_nested_in_size_and_weights(rng):
+    points = torch.randn(2, 80, 3, generator=rng)
+    net = small(FMOPSNet, m=16, moved=True).eval()
+    whole = net(points)
+    few = net(points, 5)
+    torch.testing.assert_close(few.points, whole.points[:, :5])
+    torch.testing.assert_close(few.matrix.dense(), whole.matrix.dense()[..., :5])
+    torch.testing.assert_close(whole.first(5).matrix.gram(), few.matrix.gram())
+    # More points than a smaller cloud has are not needed for fewer columns.
+    assert net(points[:, :7], 5).points.shape == (2, 5, 3)
+
+
+def test_anchors_of_large_clouds_are_computed_in_blocks(rng, monkeypatch):
+    points = torch.randn(2, 60, 3, generator=rng)
+    net = small(moved=True)
+    whole = net(points)
+    weights = torch.randn(2, 6, 3, generator=rng)
+    parameters = list(net.queries.parameters())
+    want = torch.autograd.grad((whole.points * weights).sum(), parameters)
+    monkeypatch.setitem(attention.BLOCKS, "cpu", attention.Blocks(0, 4, 10))
+    blocks = net(points)
+    torch.testing.assert_close(blocks.points, whole.points, atol=1e-5, rtol=0)
+    got = torch.autograd.grad((blocks.points * weights).sum(), parameters)
+    torch.testing.assert_close(got, want, atol=1e-4, rtol=1e-4)
+
+
+def test_anchors_with_fused_layers_equal_layers(rng):
+    net = small(moved=True)
+    for _ in range(3):
+        net(torch.randn(4, 50, 3, generator=rng))
+    net.eval()
+    points = torch.randn(2, 50, 3, generator=rng)
+    with torch.no_grad():
+        fast = net(points).points
+    torch.testing.assert_close(fast, net(points).points.detach(), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_anchors_in_half_precision_keep_distances(dtype, rng):
+    points = torch.randn(2, 100, 3, generator=rng).to(dtype)
+    net = small(m=32)
+    net.queries.log_width.data.fill_(-2.0)
+    want = net.eval()(points.float()).points
+    found = net.to(dtype)(points).points
+    assert found.dtype == dtype
+    torch.testing.assert_close(found.float(), want, atol=0.05, rtol=0)
+
+
+def test_anchors_under_autocast_keep_distances(rng):
+    points = torch.randn(2, 100, 3, generator=rng)
+    net = small(m=32, tau_min=0.1).eval()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = net(points).points
+    torch.testing.assert_close(found, net(points).points, atol=1e-3, rtol=0)
+
+
+def test_anchors_with_attributes_are_those_of_coordinates(rng):
+    points = torch.randn(2, 40, 5, generator=rng)
+    net = small(attributes=["intensity", "red"]).eval()
+    output = net(points)
+    assert output.matrix is not None
+    torch.testing.assert_close(output.points, output.matrix.dense().mT @ points)
+    torch.testing.assert_close(output.points[..., :3], small().eval()(points[..., :3]).points)
+
+
+def test_anchors_warm_start_keeps_their_start():
+    plain = MOPSNet(6, feature_channels=(8, 6), rho_channels=(12, 10))
+    net = small()
+    copied = copy_tensors(plain.state_dict(), net)
+    assert "rho_local.weight" in copied
+    assert not any(name.startswith("queries") for name in copied)
+    larger = small(m=9, moved=True)
+    assert "queries.slots" in copy_tensors(larger.state_dict(), net)
+    assert torch.equal(net.queries.slots, larger.queries.slots[:6])
+
+
+def test_anchors_refuse_chunks_and_export(rng):
+    net = small().eval()
+    with pytest.raises(UserError, match=r"anchors=fps needs all points .* chunks"):
+        stream_sample(net, lambda: torch.randn(50, 3, generator=rng).split(20))
+    with pytest.raises(UserError, match="MOPSNet with anchors=fps cannot be exported"):
+        plain_net(net)
+
+
+def test_anchors_downsample_selects_distinct_rows(rng):
+    points = 100 * torch.randn(70, 3, generator=rng)
+    chosen, rows = small().eval().downsample(points)
+    assert torch.equal(chosen, points[rows])
+    assert len(set(rows.tolist())) == 6
+
+
+def test_unknown_anchors_raise():
+    unknown: Any = "voxel"
+    with pytest.raises(UserError, match=r"^anchors must be fps or null, got 'voxel'"):
+        MOPSNet(4, anchors=unknown)
