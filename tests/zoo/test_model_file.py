@@ -7,6 +7,7 @@ from safetensors.torch import save_file
 
 from mops_lightning.errors import UserError
 from mops_lightning.zoo import model_file, names, publish
+from mops_lightning.zoo.digest import digest
 from tests.support.models import write_run
 
 
@@ -25,6 +26,17 @@ def rewrite(path, card=None, state=None):
 def test_read_changed_tensors_are_refused(path):
     rewrite(path, state={"queries.weight": torch.zeros(16, 128)})
     with pytest.raises(UserError, match=r"fmops\.mine\.safetensors is damaged \(sha256"):
+        model_file.read(path)
+
+
+@pytest.mark.parametrize(
+    "more", [{}, {"w.scale": torch.ones(3)}, {"w.scale": torch.ones(4, 1)}], ids=str
+)
+def test_read_8_bits_without_a_scale_for_every_row_are_refused(path, more):
+    state = {"w": torch.ones(4, 2, dtype=torch.int8), **more}
+    card = {"sha256": digest(state)}
+    save_file(state, path, {model_file.KEY: json.dumps({**model_file.read_card(path), **card})})
+    with pytest.raises(UserError, match=r"damaged or not a \.safetensors file"):
         model_file.read(path)
 
 

@@ -55,6 +55,18 @@ def test_half_precision_is_for_wide_layers(run, tmp_path):
     assert load(path).rho_local.weight.dtype == torch.float32  # type: ignore[union-attr]
 
 
+def test_8_bits_change_no_entry_by_more_than_half_a_step(run, tmp_path):
+    path = publish.add(run, "fmops.small", tmp_path, precision="int8")
+    plain = weights.read(run / "weights.pt")["state"]
+    content = model_file.read(path)
+    assert content["card"]["precision"] == "int8"
+    assert set(content["state"]) == set(plain)
+    for name, value in content["state"].items():
+        wide = value.ndim == 2 and value.numel() >= publish.WIDE
+        step = plain[name].abs().amax(1, keepdim=True) / 127 if wide else torch.zeros(())
+        assert ((value - plain[name]).abs() <= 0.501 * step).all()
+
+
 @pytest.mark.parametrize("name", ["mine", "Fmops.mine", "../a.b", "a.pt", "a..b", "a.b/c", ""])
 def test_other_names_are_refused(run, tmp_path, name):
     with pytest.raises(UserError, match="NAME must be words"):

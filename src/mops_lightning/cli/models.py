@@ -45,7 +45,7 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
     new.add_argument("--tested", type=Path, metavar="RUN", help="run that has the test figures")
     new.add_argument(
         "--precision",
-        choices=("float32", "float16", "bfloat16"),
+        choices=("float32", "float16", "bfloat16", "int8"),
         default="float32",
         help="of weight matrices with at least 4,096 entries",
     )

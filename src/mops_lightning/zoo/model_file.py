@@ -56,6 +56,8 @@ def read(path: Path) -> dict[str, Any]:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
+    from mops_lightning.zoo.packing import unpack
+
     card = read_card(path)
     try:
         state = load_file(path)
@@ -63,6 +65,10 @@ def read(path: Path) -> dict[str, Any]:
         raise _damaged(path) from None
     if digest(state) != card["sha256"]:
         raise UserError(f"{path} is damaged (sha256 differs). Install or publish it again.")
+    try:
+        state = unpack(state)
+    except ValueError:
+        raise _damaged(path) from None
     return {
         "config": card["record"]["config"],
         "metrics": card["record"]["metrics"],

@@ -12,10 +12,11 @@ from mops_lightning.records import run_record
 from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import ROWS, MetricName, parse
 from mops_lightning.zoo import model_file, names, weights
+from mops_lightning.zoo.packing import pack
 
-PRECISIONS = ("float32", "float16", "bfloat16")
+PRECISIONS = ("float32", "float16", "bfloat16", "int8")
 WIDE = 4096
-"""Weight matrices with this number of entries may be stored in 16 bits."""
+"""Weight matrices with this number of entries may be stored in fewer bits."""
 
 
 def add(
@@ -62,7 +63,7 @@ def add(
     if record["status"] != "completed" or "weights" not in record["files"]:
         raise UserError(f"{run}: not a completed run that kept its weights. Give another RUN.")
     content = weights.read(weights.of_run(run))
-    state = {key: _stored(value, precision) for key, value in content["state"].items()}
+    state = _stored(content["state"], precision)
     files = {"weights": name}
     if record["config"]["learn"] == "sampler":
         used = _task_net(task_net, record["notes"])
@@ -145,9 +146,15 @@ def _classes(own: list[str], record: dict[str, Any]) -> list[str]:
     return list(record["notes"].get("class_names") or [])
 
 
-def _stored(value: Tensor, precision: str) -> Tensor:
-    wide = value.ndim == 2 and value.numel() >= WIDE and value.dtype == torch.float32
-    return value.to(getattr(torch, precision)).contiguous() if wide else value.contiguous()
+def _stored(state: dict[str, Tensor], precision: str) -> dict[str, Tensor]:
+    found: dict[str, Tensor] = {}
+    for name, value in state.items():
+        wide = value.ndim == 2 and value.numel() >= WIDE and value.dtype == torch.float32
+        if wide and precision == "int8":
+            found |= pack(name, value)
+        else:
+            found[name] = (value.to(getattr(torch, precision)) if wide else value).contiguous()
+    return found
 
 
 def _precision(state: dict[str, Tensor]) -> str:
