@@ -10,7 +10,7 @@ from mops_lightning.nets.warm_start import copy_tensors
 from mops_lightning.ops import attention
 from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.ops.points import gather_points
-from mops_lightning.samplers.anchors import SPACING_POINTS, WIDTH
+from mops_lightning.samplers.anchors import SPACING_POINTS
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.streaming import stream_sample
@@ -75,14 +75,15 @@ def test_untrained_anchors_of_small_width_are_farthest_points(kind, rng):
     torch.testing.assert_close(net(points).points, want, atol=1e-5, rtol=0)
 
 
-def test_untrained_anchors_are_near_farthest_points(rng):
+@pytest.mark.parametrize("width", [0.3, 0.8])
+def test_untrained_anchors_are_near_farthest_points(width, rng):
     points = torch.nn.functional.normalize(torch.randn(3, 1000, 3, generator=rng), dim=2)
-    net = small(m=50, tau_min=0.5).eval()
+    net = small(m=50, tau_min=0.5, anchor_width=width).eval()
     want = gather_points(points, farthest(points, 50))
     apart = (net(points).points - want).norm(dim=2)
     between = torch.cdist(want, want)[:, 49, :49].amin(1, keepdim=True)
-    assert (apart < WIDTH * between).all()
-    assert apart.max() > 0
+    assert (apart < width * between).all()
+    assert apart.max() > width * between.mean() / 20
 
 
 def test_anchors_turn_and_move_with_the_cloud(rng):
@@ -188,3 +189,5 @@ def test_unknown_anchors_raise():
     unknown: Any = "voxel"
     with pytest.raises(UserError, match=r"^anchors must be fps or null, got 'voxel'"):
         MOPSNet(4, anchors=unknown)
+    with pytest.raises(UserError, match=r"^anchor_width must be a number above 0, got 0"):
+        small(anchor_width=0.0)

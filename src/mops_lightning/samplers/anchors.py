@@ -20,9 +20,6 @@ from mops_lightning.ops.points import coordinates, distance_dtype, gather_points
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.ordering import seeded_order
 
-WIDTH = 0.5
-"""Width s_j before training, as a share of the spacing of m farthest points."""
-
 SPACING_POINTS = 64
 """The unit of widths is the spacing of this number of farthest points of the cloud."""
 
@@ -40,16 +37,17 @@ class FPSAnchors(nn.Module):
     Args:
         m: largest number of points.
         channels: C, of the keys.
+        width: s_j before training, as a share of the spacing of m farthest points.
     """
 
-    def __init__(self, m: int, channels: int) -> None:
+    def __init__(self, m: int, channels: int, width: float = 0.5) -> None:
         super().__init__()
         # Not named as the plain net's weight, of which a warm start would otherwise take copies.
         self.slots = nn.Parameter(torch.zeros(m, channels))
         self.relation = nn.Parameter(torch.zeros(channels, channels))
         # On a surface the spacing of k points decreases as √(1/k).
-        width = WIDTH * math.sqrt(SPACING_POINTS / m)
-        self.log_width = nn.Parameter(torch.full((m,), math.log(width)))
+        first = width * math.sqrt(SPACING_POINTS / m)
+        self.log_width = nn.Parameter(torch.full((m,), math.log(first)))
 
     @property
     def weight(self) -> Tensor:

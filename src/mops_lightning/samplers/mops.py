@@ -43,6 +43,8 @@ class MOPSNet(Sampler):
             3 + C channels, and SᵀP has them all.
         anchors: ``fps`` lets the columns of S start as a soft choice of the cloud's farthest points
             (see ``anchors``); None, as in the paper, lets them start at random.
+        anchor_width: how soft that choice is before training: the width of the columns as a share
+            of the spacing of the farthest points.
 
     Raises:
         UserError: an argument is out of range.
@@ -71,6 +73,7 @@ class MOPSNet(Sampler):
         threshold: float = 0.0,
         attributes: Sequence[str] = (),
         anchors: Literal["fps"] | None = None,
+        anchor_width: float = 0.5,
     ) -> None:
         super().__init__(m)
         if not 0 < tau_min <= 1:
@@ -84,6 +87,8 @@ class MOPSNet(Sampler):
         check_channels("rho_channels", rho_channels)
         if anchors not in (None, "fps"):
             raise UserError(f"anchors must be fps or null, got {anchors!r}.")
+        if not 0 < anchor_width < math.inf:
+            raise UserError(f"anchor_width must be a number above 0, got {anchor_width}.")
         if not 0 <= threshold < 1:
             raise UserError(f"threshold must be at least 0 and below 1, got {threshold}.")
         self.alpha = alpha
@@ -105,7 +110,7 @@ class MOPSNet(Sampler):
             # A bias would be constant within a column of S, where the softmax cancels it.
             self.queries = nn.Linear(rho_channels[-1], m, bias=False)
         else:
-            self.queries = FPSAnchors(m, rho_channels[-1])
+            self.queries = FPSAnchors(m, rho_channels[-1], anchor_width)
 
     @property
     def tau(self) -> float:
