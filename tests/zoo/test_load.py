@@ -113,7 +113,7 @@ def test_load_task_net_or_missing_file_is_refused(save, tmp_path):
 
 
 def test_load_run_folder_follows_its_record():
-    assert load(ROOT / "results" / "classification" / "runs" / "fmops").m == 512
+    assert load(ROOT / "results" / "classification_fast" / "runs" / "fmops").m == 512
 
 
 def test_load_model_by_name_or_unknown_name():
