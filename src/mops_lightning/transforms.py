@@ -34,7 +34,7 @@ class Downsample(BaseTransform):
         readout: of a model: ``completed``, ``matched`` or, without attributes, ``generated``.
         points: the key of the coordinates ``(N, 3)`` in a dictionary.
         attributes: keys of a dictionary that follow the points; None: all with N rows.
-        start: with ``fps``, the row of the first point.
+        start: with ``fps``, the row of the first point, or ``"farthest"``; see ``FPSSampler``.
         seed: of random choices; None means 0.
 
     Raises:
@@ -57,7 +57,7 @@ class Downsample(BaseTransform):
         readout: str = "completed",
         points: str = "pos",
         attributes: Sequence[str] | None = None,
-        start: int | None = None,
+        start: int | str | None = None,
         seed: int | None = None,
     ) -> None:
         self.m = m

@@ -22,6 +22,18 @@ def test_fps_sampler_uses_start(rng):
     assert torch.equal(chosen, farthest_point_sample(points, 12, start=49))
 
 
+def test_fps_sampler_farthest_start_moves_with_the_cloud(rng):
+    points = torch.randn(3, 50, 3, generator=rng)
+    sampler = FPSSampler(12, start="farthest")
+    chosen = sampler(points).indices
+    first = (points - points.mean(1, keepdim=True)).norm(dim=2).argmax(1)
+    for b in range(3):
+        assert chosen[b].tolist() == plain_farthest(points[b], [int(first[b])], 12)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=rng)).Q
+    order = torch.randperm(50, generator=rng)
+    assert torch.equal(order[sampler(points[:, order] @ turn + 1).indices], chosen)
+
+
 def test_fps_sampler_seed_varies_start(rng):
     points = torch.randn(1, 50, 3, generator=rng)
     starts = {int(FPSSampler(1, seed)(points).indices) for seed in range(60)}
@@ -39,3 +51,9 @@ def test_fps_sampler_start_out_of_range_raises():
         FPSSampler(4, start=-1)
     with pytest.raises(UserError, match=r"^start must be less than .* N=9, got 9"):
         FPSSampler(4, start=9)(torch.zeros(1, 9, 3))
+
+
+@pytest.mark.parametrize("start", ["nearest", "", True, 1.0])
+def test_fps_sampler_start_of_another_kind_raises(start):
+    with pytest.raises(UserError, match=r"^start must be at least 0, farthest, or null.* got"):
+        FPSSampler(4, start=start)

@@ -15,10 +15,9 @@ import math
 import torch
 from torch import Tensor, nn
 
-from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.ops.points import coordinates, distance_dtype, gather_points
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
-from mops_lightning.samplers.ordering import seeded_order
+from mops_lightning.samplers.fps import farthest_from_mean
 
 SPACING_POINTS = 64
 """The unit of widths is the spacing of this number of farthest points of the cloud."""
@@ -98,17 +97,3 @@ def squared_spacing(farthest: Tensor) -> Tensor:
         return farthest.new_ones(len(farthest))
     apart = (farthest[:, :-1] - farthest[:, -1:]).square().sum(2).amin(1)
     return apart * (count / SPACING_POINTS)
-
-
-def farthest_from_mean(points: Tensor, m: int) -> Tensor:
-    """Return rows ``(B, m)`` of farthest points, the first being farthest from the mean.
-
-    Args:
-        points: ``(B, N, 3)``.
-        m: number of points.
-    """
-    order = seeded_order(points, 0)
-    # The mean of ordered points has the same rounding error for every order of the input.
-    ordered = gather_points(points.detach(), order)
-    start = (ordered - ordered.mean(1, keepdim=True)).square().sum(2).argmax(1)
-    return order.gather(1, farthest_point_sample(ordered, m, start=start))

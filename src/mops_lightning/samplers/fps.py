@@ -1,5 +1,8 @@
 """Farthest point sampling (FPS), a baseline in the paper's tables."""
 
+from typing import Final
+
+import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
@@ -8,6 +11,9 @@ from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import seeded_order
 from mops_lightning.types import SampleOutput
+
+FARTHEST: Final = "farthest"
+"""Start at the point farthest from the mean."""
 
 
 class FPSSampler(Sampler):
@@ -22,10 +28,12 @@ class FPSSampler(Sampler):
     Args:
         m: largest number of points to return.
         seed: determines the first point.
-        start: index of the first point in every cloud; None means that the seed determines it.
+        start: the first point in every cloud: an index, or ``"farthest"`` for the point farthest
+            from the mean, which turns and moves with the cloud; None means that the seed determines
+            it. With ``"farthest"``, both clouds of a registration pair start from the same point.
 
     Raises:
-        UserError: ``start`` is negative or, when sampling, at least N.
+        UserError: ``start`` is negative, another word or, when sampling, at least N.
 
     Examples:
         >>> import torch
@@ -38,24 +46,46 @@ class FPSSampler(Sampler):
     flexible = True
     nested = True
 
-    def __init__(self, m: int, seed: int = 0, start: int | None = None) -> None:
+    def __init__(self, m: int, seed: int = 0, start: int | str | None = None) -> None:
         super().__init__(m)
-        if start is not None and start < 0:
+        row = isinstance(start, int) and not isinstance(start, bool) and start >= 0
+        if not (row or start in (None, FARTHEST)):
             raise UserError(
-                f"start must be at least 0, or None to let the seed choose, got {start}."
+                f"start must be at least 0, {FARTHEST}, or null (None) to let the seed choose, "
+                f"got {start!r}."
             )
         self.seed = seed
         self.start = start
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice."""
-        if self.start is not None and self.start >= points.shape[1]:
-            raise UserError(
-                f"start must be less than the number of points N={points.shape[1]}, "
-                f"got {self.start}."
-            )
+        if self.start == FARTHEST:
+            indices = farthest_from_mean(points, m, self.seed)
+            return SampleOutput(gather_points(points, indices), indices, {})
         order = seeded_order(points, self.seed)
-        first = None if self.start is None else (order == self.start).byte().argmax(1)
+        first = None
+        if isinstance(self.start, int):
+            if self.start >= points.shape[1]:
+                raise UserError(
+                    f"start must be less than the number of points N={points.shape[1]}, "
+                    f"got {self.start}."
+                )
+            first = torch.eq(order, self.start).byte().argmax(1)
         chosen = farthest_point_sample(gather_points(points.detach(), order), m, start=first)
         indices = order.gather(1, chosen)
         return SampleOutput(gather_points(points, indices), indices, {})
+
+
+def farthest_from_mean(points: Tensor, m: int, seed: int = 0) -> Tensor:
+    """Return rows ``(B, m)`` of farthest points, the first being farthest from the mean.
+
+    Args:
+        points: ``(B, N, 3)``.
+        m: number of points.
+        seed: of the order that breaks ties.
+    """
+    order = seeded_order(points, seed)
+    # The mean of ordered points has the same rounding error for every order of the input.
+    ordered = gather_points(points.detach(), order)
+    start = (ordered - ordered.mean(1, keepdim=True)).square().sum(2).argmax(1)
+    return order.gather(1, farthest_point_sample(ordered, m, start=start))

@@ -32,7 +32,7 @@ def downsample(
     readout: str = "completed",
     lengths: Any = None,
     batch: Any = None,
-    start: int | None = None,
+    start: int | str | None = None,
     seed: int | None = None,
 ) -> tuple[Any, Any]:
     """Downsample clouds by a method or a model.
@@ -50,7 +50,8 @@ def downsample(
         lengths: ``(B,)`` numbers of points, where clouds of several sizes are padded to
             ``(B, N, 3)``, as in PyTorch3D.
         batch: ``(P,)`` the cloud of every point, ascending from 0, as in PyTorch Geometric.
-        start: with ``fps``, the row of the first point in every cloud.
+        start: with ``fps``, the row of the first point in every cloud, or ``"farthest"`` for the
+            point farthest from the mean.
         seed: of random choices; None means 0.
 
     Returns:
@@ -74,7 +75,7 @@ def downsample(
 
 
 def sampler_of(
-    method: str | Path, m: int, seed: int = 0, start: int | None = None, device: Any = "cpu"
+    method: str | Path, m: int, seed: int = 0, start: int | str | None = None, device: Any = "cpu"
 ) -> Sampler:
     """Return the sampler of a method, or a model, which is loaded once.
 
@@ -82,7 +83,7 @@ def sampler_of(
         method: as for ``downsample``.
         m: number of points.
         seed: of random choices.
-        start: with ``fps``, the row of the first point.
+        start: with ``fps``, the row of the first point, or ``"farthest"``; see ``FPSSampler``.
         device: of the sampler.
 
     Raises:
