@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from tests.support.command_line import TINY, call, call_anew
+from tests.support.command_line import TINY, call
 
 LAUNCHERS = {
     "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
@@ -22,7 +22,7 @@ def test_cells_run_side_by_side(name, tmp_path):
         "hydra.sweep.dir=cells",
     ]
     command = ["-m", *LAUNCHERS[name], *fixed, "m=4,8"]
-    status, out, err = call_anew(command, tmp_path)
+    status, out, err = call(command, tmp_path)
     assert status == 0, out + err
     assert "2 cells: 2 completed; in cells" in out
     found = [json.loads((tmp_path / "cells" / cell / "result.json").read_text()) for cell in "01"]

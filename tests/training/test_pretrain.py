@@ -11,7 +11,7 @@ from mops_lightning.files import TEMPORARY
 from mops_lightning.training.pretrain import cache_folder
 from mops_lightning.training.run import run
 from mops_lightning.zoo import weights
-from tests.support.command_line import SMALL_PCRNET, TINY, start
+from tests.support.command_line import SMALL_PCRNET, TINY, call, start
 
 
 def train(folder, *arguments):
@@ -150,15 +150,13 @@ def test_same_task_net_in_two_processes_is_trained_once(tmp_path):
     folder.parent.mkdir(parents=True)
     lock = folder.parent / f"{folder.name}.lock"
     with FileLock(lock):
-        processes = [start([*overrides, f"hydra.run.dir={one}"], tmp_path) for one in "ab"]
-        for process in processes:
-            lines = iter(process.stdout.readline, "")
-            assert any(
-                "Waiting for another process" in line and str(lock) in line for line in lines
-            )
-    results = [process.communicate(timeout=240) for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], results
-    assert sum(out.count("training it first") for out, _ in results) == 1
+        other = start([*overrides, "hydra.run.dir=a"], tmp_path)
+        lines = iter(other.stdout.readline, "")
+        assert any("Waiting for another process" in line and str(lock) in line for line in lines)
+    status, here, err = call([*overrides, "hydra.run.dir=b"], tmp_path)
+    there, other_err = other.communicate(timeout=240)
+    assert (status, other.returncode) == (0, 0), err + other_err
+    assert (here + there).count("training it first") == 1
     records = [json.loads((tmp_path / one / "result.json").read_text()) for one in "ab"]
     first, second = (record["notes"]["task_weights_sha256"] for record in records)
     assert first == second
