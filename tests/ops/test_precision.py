@@ -8,14 +8,10 @@ from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.layers import PointMLP
 from mops_lightning.nets.max_pool import PLAIN_MAX_POINTS, PointMaxPool
 from mops_lightning.nets.pcrnet import PCRNet
-from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
+from mops_lightning.ops.precision import full_precision
 from mops_lightning.ops.rigid import Motion
 from mops_lightning.samplers.mops import MOPSNet
-
-
-def mixed(function, *arguments):
-    with torch.autocast("cpu", torch.bfloat16), restrict_autocast_to_pointwise("cpu"):
-        return function(*arguments)
+from tests.support.mixed import mixed
 
 
 def seen_dtypes(module, call):

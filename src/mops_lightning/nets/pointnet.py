@@ -101,5 +101,6 @@ class PointNetTransform(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         """Map ``(B, N, 3)`` points to ``(B, num_classes)`` logits."""
         features = self.first(points @ self.point_transform(points))
-        features = features @ self.feature_transform(features)
+        transform = self.feature_transform(features)
+        features = features.to(transform.dtype) @ transform
         return self.head(self.pool(self.features(features)))
