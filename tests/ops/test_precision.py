@@ -99,8 +99,8 @@ def test_nets_under_plain_autocast_are_close(make, rng):
     points = torch.randn(4, 60, 3, generator=rng)
     arguments = (points, points + 0.1) if isinstance(net, PCRNet) else (points,)
     results = []
-    for mixed in (False, True):
-        with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+    for autocast in (False, True):
+        with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
             made = net(*arguments)
         result = (made.quaternion if isinstance(made, Motion) else made).float()
         net.zero_grad()
