@@ -42,6 +42,7 @@ def test_specialised_files_belong_to_groups_that_exist():
         *root.glob("optimizer/*/*"),
     ]:
         group, _, choice = path.stem.partition("_")
+        group = "recipe" if group in TASKS and choice else group
         assert path.stem in TASKS or (root / group / f"{choice}.yaml").is_file()
 
 
@@ -113,6 +114,8 @@ def test_fmops_under_shipped_pcrnet_starts_from_shipped_sampler():
     chosen = ["task=registration", "sampler=fmops"]
     cfg = compose(chosen)
     assert (cfg.recipe.warm_start, cfg.sampler.m_max) == ("fmops.pairs-m64", 64)
+    assert (cfg.sampler.anchors, cfg.recipe.train_points, cfg.epochs.sampler) == ("fps", 512, 8)
+    assert "anchors" not in compose([*chosen, "recipe=paper"]).sampler
     assert compose([*chosen, "weights=auto"]).recipe.warm_start is True
     assert compose([*chosen, "recipe=paper"]).recipe.warm_start is False
     assert compose(["sampler=fmops"]).sampler.m_max == 512

@@ -39,6 +39,18 @@ def test_command_line_flags_before_or_after(run):
     assert overrides_after(f"evaluate={run}", "m=4", "-m")[-2:] == ["m=4", "-m"]
 
 
+def test_command_line_added_setting_may_be_a_default_by_now(tmp_path):
+    added = ["task=registration", "+sampler.anchors=fps", "+sampler@baselines.own=submodular"]
+    names = {"task": "registration", "net": "pcrnet"}
+    run = write_run(tmp_path / "run", [*OVERRIDES, *added], **names)
+    repeated = overrides_after(f"evaluate={run}")
+    assert "++sampler.anchors=fps" in repeated
+    assert "+sampler@baselines.own=submodular" in repeated
+    cfg = compose(repeated)
+    assert cfg.sampler.anchors == "fps"
+    assert "own" in cfg.baselines
+
+
 def test_command_line_same_group_keeps_settings(run):
     plain = set(overrides_after(f"evaluate={run}"))
     named = overrides_after(f"evaluate={run}", "dataset=shapes", "sampler=fmops")

@@ -60,7 +60,9 @@ def command_line(arguments: list[str]) -> list[str]:
     typed_keys = [
         overrides.key(a) for a in typed if a not in [f"{k}={v}" for k, v in groups.items()]
     ]
-    earlier = [overrides.readable(a) for a in record["overrides"] if overrides.key(a) not in groups]
+    earlier = [
+        overrides.repeatable(a) for a in record["overrides"] if overrides.key(a) not in groups
+    ]
     earlier = [f"{group}={name}" for group, name in groups.items()] + earlier
     kept = [
         a
