@@ -114,7 +114,10 @@ def test_fmops_under_shipped_pcrnet_starts_from_shipped_sampler():
     chosen = ["task=registration", "sampler=fmops"]
     cfg = compose(chosen)
     assert (cfg.recipe.warm_start, cfg.sampler.m_max) == ("fmops.pairs-m64", 64)
-    assert (cfg.sampler.anchors, cfg.recipe.train_points, cfg.epochs.sampler) == ("fps", 512, 8)
+    assert (cfg.sampler.anchors, cfg.recipe.train_points) == ("fps", 512)
+    assert (cfg.epochs.sampler, cfg.optimizer.lr) == (3, 5e-5)
+    random = compose([*chosen, "recipe.warm_start=true"])
+    assert (random.epochs.sampler, random.optimizer.lr) == (15, 1e-3)
     assert "anchors" not in compose([*chosen, "recipe=paper"]).sampler
     assert compose([*chosen, "weights=auto"]).recipe.warm_start is True
     assert compose([*chosen, "recipe=paper"]).recipe.warm_start is False
