@@ -189,5 +189,15 @@ def test_unknown_anchors_raise():
     unknown: Any = "voxel"
     with pytest.raises(UserError, match=r"^anchors must be fps or null, got 'voxel'"):
         MOPSNet(4, anchors=unknown)
-    with pytest.raises(UserError, match=r"^anchor_width must be a number above 0, got 0"):
-        small(anchor_width=0.0)
+
+
+@pytest.mark.parametrize("width", [0.0, -1.0, float("nan"), 1e30])
+def test_anchor_width_out_of_range_raises(width):
+    with pytest.raises(UserError, match=r"^anchor_width must be above 0 and at most 100, got"):
+        small(anchor_width=width)
+
+
+def test_anchor_width_without_anchors_raises():
+    with pytest.raises(UserError, match=r"^anchor_width has no effect without anchors=fps"):
+        MOPSNet(4, anchor_width=0.3)
+    MOPSNet(4, anchor_width=0.5)

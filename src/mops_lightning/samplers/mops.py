@@ -20,6 +20,10 @@ from mops_lightning.types import SampleOutput
 
 ANNEALINGS = ("exponential", "linear")
 
+DEFAULT_WIDTH = 0.5
+MAX_WIDTH = 100
+"""Limit of ``anchor_width``. Columns are uniform long before; far above it, squares overflow."""
+
 
 class MOPSNet(Sampler):
     """MOPS-Net (paper sections "Feature Extraction" to "Joint Training Loss").
@@ -44,7 +48,7 @@ class MOPSNet(Sampler):
         anchors: ``fps`` lets the columns of S start as a soft choice of the cloud's farthest points
             (see ``anchors``); None, as in the paper, lets them start at random.
         anchor_width: how soft that choice is before training: the width of the columns as a share
-            of the spacing of the farthest points.
+            of the spacing of the farthest points. Only with anchors.
 
     Raises:
         UserError: an argument is out of range.
@@ -73,7 +77,7 @@ class MOPSNet(Sampler):
         threshold: float = 0.0,
         attributes: Sequence[str] = (),
         anchors: Literal["fps"] | None = None,
-        anchor_width: float = 0.5,
+        anchor_width: float = DEFAULT_WIDTH,
     ) -> None:
         super().__init__(m)
         if not 0 < tau_min <= 1:
@@ -87,8 +91,15 @@ class MOPSNet(Sampler):
         check_channels("rho_channels", rho_channels)
         if anchors not in (None, "fps"):
             raise UserError(f"anchors must be fps or null, got {anchors!r}.")
-        if not 0 < anchor_width < math.inf:
-            raise UserError(f"anchor_width must be a number above 0, got {anchor_width}.")
+        if not 0 < anchor_width <= MAX_WIDTH:
+            raise UserError(
+                f"anchor_width must be above 0 and at most {MAX_WIDTH}, got {anchor_width}."
+            )
+        if anchors is None and anchor_width != DEFAULT_WIDTH:
+            raise UserError(
+                f"anchor_width has no effect without anchors=fps, got {anchor_width}. Add "
+                "anchors=fps, or leave anchor_width out."
+            )
         if not 0 <= threshold < 1:
             raise UserError(f"threshold must be at least 0 and below 1, got {threshold}.")
         self.alpha = alpha
