@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 
@@ -53,7 +54,7 @@ def test_fps_sampler_start_out_of_range_raises():
         FPSSampler(4, start=9)(torch.zeros(1, 9, 3))
 
 
-@pytest.mark.parametrize("start", ["nearest", "", True, 1.0])
+@pytest.mark.parametrize("start", ["nearest", "", True, 1.0, [0], np.array([1, 2])])
 def test_fps_sampler_start_of_another_kind_raises(start):
     with pytest.raises(UserError, match=r"^start must be at least 0, farthest, or null.* got"):
         FPSSampler(4, start=start)

@@ -49,10 +49,11 @@ class FPSSampler(Sampler):
     def __init__(self, m: int, seed: int = 0, start: int | str | None = None) -> None:
         super().__init__(m)
         row = isinstance(start, int) and not isinstance(start, bool) and start >= 0
-        if not (row or start in (None, FARTHEST)):
+        word = isinstance(start, str) and start == FARTHEST
+        if not (row or word or start is None):
             raise UserError(
                 f"start must be at least 0, {FARTHEST}, or null (None) to let the seed choose, "
-                f"got {start!r}."
+                f"got {start!r:.99}."
             )
         self.seed = seed
         self.start = start
