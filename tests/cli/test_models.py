@@ -49,6 +49,25 @@ def test_models_add_publishes_a_run(tmp_path, monkeypatch):
     assert "exists" in call("add", tmp_path / "run", "fmops.mine")[2]
 
 
+def test_models_without_a_readable_record_writes_nothing(tmp_path):
+    write_run(tmp_path / "run")
+    given = ("--folder", tmp_path / "models", "--record", tmp_path / "nowhere")
+    status, _, err = call("add", tmp_path / "run", "fmops.mine", *given)
+    assert (status, "no run record" in err) == (2, True)
+    assert not (tmp_path / "models").exists()
+
+
+def test_models_lists_readable_files_next_to_a_damaged_one(tmp_path, monkeypatch):
+    (tmp_path / "fmops.damaged.safetensors").write_bytes(b"none")
+    monkeypatch.setenv(names.VARIABLE, str(tmp_path))
+    status, out, _ = call()
+    assert status == 0
+    assert "pointnet.modelnet40" in out
+    assert out.splitlines()[-1].startswith(f"Not listed: {tmp_path}/fmops.damaged.safetensors is")
+    write_run(tmp_path / "run")
+    assert call("add", tmp_path / "run", "fmops.mine")[0] == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -56,6 +75,10 @@ def test_models_add_publishes_a_run(tmp_path, monkeypatch):
         (["add", "run"], "add takes a run and a name"),
         (["a.b", "c.d"], "give one NAME"),
         (["add", "nowhere", "a.b", "--folder", "."], "no run record"),
+        (["pointnet.modelnet40", "--precision", "int8"], "--precision is an option of `models add"),
+        (["--task-net", "a.b"], "--task-net is an option of `models add RUN NAME`"),
+        (["--json"], "--json is an option of `models NAME`"),
+        (["add", "run", "a.b", "--json"], "--json is an option of `models NAME`"),
     ],
 )
 def test_models_mistakes_are_one_line(arguments, words):

@@ -46,6 +46,11 @@ def test_task_net_is_found_by_hash_or_name(run, tmp_path):
     assert weights.of_run(path, "task_weights") == names.available()["pointnet.modelnet40"]
 
 
+def test_sampler_as_task_net_is_refused(run, tmp_path):
+    with pytest.raises(UserError, match=r"--task-net: fmops\.pairs-m64 is a sampler"):
+        publish.add(run, "fmops.mine", tmp_path, task_net="fmops.pairs-m64")
+
+
 def test_half_precision_is_for_wide_layers(run, tmp_path):
     path = publish.add(run, "fmops.half", tmp_path, precision="float16")
     content = model_file.read(path)

@@ -27,7 +27,10 @@ def main(arguments: list[str], prog: str) -> None:
         prog: what the user typed to start this command.
     """
     with one_line_endings(prog):
-        print("\n".join(_run(make_parser(prog).parse_args(arguments))))
+        parser = make_parser(prog)
+        chosen = parser.parse_args(arguments)
+        _refuse_unused(chosen, parser)
+        print("\n".join(_run(chosen)))
 
 
 def make_parser(prog: str) -> argparse.ArgumentParser:
@@ -63,6 +66,27 @@ def complete_names(prefix: str, **_: Any) -> list[str]:
     return [name for name in names.available() if name.startswith(prefix)]
 
 
+def _refuse_unused(chosen: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """Refuse options that the words make no use of.
+
+    Raises:
+        UserError: there is one.
+    """
+    values = {name: value for name, value in vars(chosen).items() if name != "words"}
+    given = {name for name, value in values.items() if value != parser.get_default(name)}
+    match chosen.words:
+        case []:
+            unused = sorted(given)
+        case ["add", *_]:
+            unused = sorted(given & {"json"})
+        case _:
+            unused = sorted(given - {"json"})
+    if unused:
+        option = unused[0].replace("_", "-")
+        use = "models NAME" if option == "json" else "models add RUN NAME"
+        raise UserError(f"--{option} is an option of `{use}`. Leave it out.")
+
+
 def _run(chosen: argparse.Namespace) -> list[str]:
     """Return the lines to print."""
     match chosen.words:
@@ -80,6 +104,7 @@ def _run(chosen: argparse.Namespace) -> list[str]:
 
 
 def _add(chosen: argparse.Namespace, run: Path, name: str) -> list[str]:
+    from mops_lightning.records import run_record
     from mops_lightning.zoo import publish
 
     own = os.environ.get(names.VARIABLE)
@@ -88,6 +113,8 @@ def _add(chosen: argparse.Namespace, run: Path, name: str) -> list[str]:
         raise UserError(
             f"give --folder FOLDER, or set ${names.VARIABLE} to the folder of your models."
         )
+    if chosen.record is not None:
+        run_record.read(chosen.record)  # before anything is written
     path = publish.add(
         run,
         name,
@@ -113,8 +140,13 @@ def _add(chosen: argparse.Namespace, run: Path, name: str) -> list[str]:
 
 def _table() -> list[str]:
     rows = [("name", "task", "sizes", "test figures", "licence", "MB")]
+    unreadable = []
     for name, path in names.available().items():
-        card = model_file.read_card(path)
+        try:
+            card = model_file.read_card(path)
+        except UserError as error:
+            unreadable.append(f"Not listed: {error}")
+            continue
         rows.append(
             (
                 name,
@@ -126,10 +158,11 @@ def _table() -> list[str]:
             )
         )
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
+    lines = [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in rows
     ]
+    return lines + unreadable
 
 
 def _card(card: dict[str, Any], path: Path) -> list[str]:

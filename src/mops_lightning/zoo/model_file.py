@@ -109,7 +109,7 @@ def read_card(path: Path) -> dict[str, Any]:
 
 
 def _damaged(path: Path) -> UserError:
-    return UserError(f"{path} is damaged or not a {SUFFIX} file.")
+    return UserError(f"{path} is damaged or not a {SUFFIX} file. Install or publish it again.")
 
 
 @cache

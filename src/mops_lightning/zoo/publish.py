@@ -128,11 +128,19 @@ def _task_net(given: str | None, notes: dict[str, Any]) -> str | None:
     if given is not None:
         path = names.find(given)
         if path is None:
-            raise UserError(f"--task-net: no model {given!r}.")
-        return names.pinned(given, model_file.read_card(path)["sha256"])
+            raise UserError(
+                f"--task-net: no model {given!r}. `mops-lightning models` lists all of them."
+            )
+        card = model_file.read_card(path)
+        if card["record"]["config"]["learn"] != "task":
+            raise UserError(f"--task-net: {given} is a sampler. Give the model of a task net.")
+        return names.pinned(given, card["sha256"])
     used = {notes.get("weights_loaded"), notes.get("task_weights_sha256")}
     for name, path in names.available().items():
-        sha256 = model_file.read_card(path)["sha256"]
+        try:
+            sha256 = model_file.read_card(path)["sha256"]
+        except UserError:  # a damaged or foreign file is not the one that was used
+            continue
         if sha256 in used:
             return names.pinned(name, sha256)
     return None
