@@ -116,6 +116,9 @@ def test_fmops_under_shipped_pcrnet_starts_from_shipped_sampler():
     assert (cfg.recipe.warm_start, cfg.sampler.m_max) == ("fmops.pairs-m64", 64)
     assert (cfg.sampler.anchors, cfg.recipe.train_points) == ("fps", 512)
     assert (cfg.epochs.sampler, cfg.optimizer.lr) == (3, 5e-5)
+    plain = compose([*chosen, "sampler.anchors=null"])
+    assert (plain.recipe.warm_start, plain.recipe.train_points) == (True, 128)
+    assert (plain.epochs.sampler, plain.optimizer.lr) == (15, 1e-3)
     random = compose([*chosen, "recipe.warm_start=true"])
     assert (random.epochs.sampler, random.optimizer.lr) == (15, 1e-3)
     assert "anchors" not in compose([*chosen, "recipe=paper"]).sampler
