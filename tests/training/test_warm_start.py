@@ -4,6 +4,7 @@ import json
 
 import torch
 
+from mops_lightning.training.warm_start import described
 from mops_lightning.zoo import weights
 from tests.support.command_line import TINY, call
 
@@ -21,7 +22,7 @@ def test_sampler_of_another_size_continues_from_a_run(tmp_path):
     still = "optimizer.lr=1e-12"
     status, out, _ = run(tmp_path, "second", "m=5", f"recipe.warm_start={first}", still)
     assert status == 0
-    assert f"tensors are copies of {first}" in out
+    assert f"tensors are copies of {first}." in out
     one, two = (weights.read(tmp_path / name / "weights.pt") for name in ("first", "second"))
     rows = two["state"]["queries.weight"]
     torch.testing.assert_close(rows, one["state"]["queries.weight"][:5])
@@ -33,3 +34,9 @@ def test_sampler_of_another_size_continues_from_a_run(tmp_path):
     status, _, err = run(tmp_path, "fourth", f"recipe.warm_start={tmp_path / 'nothing.pt'}")
     assert status != 0
     assert "recipe.warm_start: no file" in err
+
+
+def test_described_names_tensors_that_are_not_copied():
+    assert described(["a"], ["a"], "FILE") == "1 of 1 tensors are copies of FILE"
+    assert described(["a"], ["a", "b"], "FILE").endswith("copies of FILE; not copied: b")
+    assert described(["a"], list("abcde"), "FILE").endswith("not copied: b, c, d, ...")

@@ -97,7 +97,7 @@ def _given(cfg: DictConfig, mine: dict[str, str]) -> Path:
         name = different[0]
         raise UserError(
             f"ckpt_path: {path} is from a run with other settings ({', '.join(different)}); "
-            f"{name} is {mine.get(name)} here and {theirs.get(name)} there. "
+            f"{name} is {mine.get(name, 'not set')} here and {theirs.get(name, 'not set')} there. "
             "Give the same settings, or leave ckpt_path out to start a new run."
         )
     return path

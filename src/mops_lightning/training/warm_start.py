@@ -1,5 +1,7 @@
 """What a sampler's weights start from; see ``Recipe.warm_start``."""
 
+from collections.abc import Sequence
+
 from torch import nn
 
 from mops_lightning.errors import UserError
@@ -42,11 +44,26 @@ def _from_file(given: str, sampler: nn.Module, record: RunRecord) -> str:
             f"recipe.warm_start: {given} holds a task net. Give the weights file of a sampler, or "
             "true for a start from the task net's first layers."
         )
-    copied, total = copy_tensors(content["state"], sampler), len(sampler.state_dict())
+    copied = copy_tensors(content["state"], sampler)
     if not copied:
         raise UserError(
             f"recipe.warm_start: no tensor of {given} fits this sampler. Give the weights file of "
             "a sampler of the same kind."
         )
     record.notes["warm_start"] = {"sha256": content["sha256"], "tensors": len(copied)}
-    return f"{len(copied)} of {total} tensors are copies of {given}"
+    return described(copied, list(sampler.state_dict()), given)
+
+
+def described(copied: Sequence[str], tensors: Sequence[str], given: str) -> str:
+    """Return how many of a sampler's tensors are copies, and which are not.
+
+    Between samplers with and without anchors, the last layer is not.
+
+    Args:
+        copied: names of the copies.
+        tensors: all names.
+        given: the file that the copies are from.
+    """
+    said = f"{len(copied)} of {len(tensors)} tensors are copies of {given}"
+    new = [name for name in tensors if name not in copied]
+    return f"{said}; not copied: {', '.join(new[:3])}{', ...' if new[3:] else ''}" if new else said
