@@ -103,6 +103,7 @@ def rewrite(path, **changes):
         {"state": {"a": 1}},
         {"state": {1: torch.ones(1)}},
         {"state": {"a": torch.ones(2).to_sparse()}},
+        {"state": {"a": torch.ones(2).to(torch.float8_e4m3fn)}},
         {"config": [1]},
         {"config": {"sampler": torch.ones(1)}},
         {"config": {"optimizer": 3, "baselines": [1]}},
