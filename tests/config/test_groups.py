@@ -121,6 +121,11 @@ def test_fmops_under_shipped_pcrnet_starts_from_shipped_sampler():
     assert (plain.epochs.sampler, plain.optimizer.lr) == (15, 1e-3)
     random = compose([*chosen, "recipe.warm_start=true"])
     assert (random.epochs.sampler, random.optimizer.lr) == (15, 1e-3)
+    started = "recipe.warm_start=fmops.pairs-m64"
+    for change in (["learn=joint"], ["learn=task"], ["weights=auto", started]):
+        other = compose([*chosen, *change])
+        assert other.epochs.sampler == 15
+        assert other.optimizer.lr == other.pretrain.lr == 1e-3
     assert "anchors" not in compose([*chosen, "recipe=paper"]).sampler
     assert compose([*chosen, "weights=auto"]).recipe.warm_start is True
     assert compose([*chosen, "recipe=paper"]).recipe.warm_start is False
