@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from mops_lightning.ops.points import coordinates, distance_dtype, gather_points
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
-from mops_lightning.samplers.fps import farthest_from_mean
+from mops_lightning.samplers.fps import FARTHEST, farthest_rows
 
 SPACING_POINTS = 64
 """The unit of widths is the spacing of this number of farthest points of the cloud."""
@@ -39,7 +39,7 @@ class FPSAnchors(nn.Module):
         width: s_j before training, as a share of the spacing of m farthest points.
     """
 
-    def __init__(self, m: int, channels: int, width: float = 0.5) -> None:
+    def __init__(self, m: int, channels: int, width: float) -> None:
         super().__init__()
         # Not named as the plain net's weight, of which a warm start would otherwise take copies.
         self.slots = nn.Parameter(torch.zeros(m, channels))
@@ -70,7 +70,7 @@ class FPSAnchors(nn.Module):
         # Distances are more precise around the mean.
         centred = places - places.mean(1, keepdim=True)
         count = min(SPACING_POINTS, places.shape[1])
-        rows = farthest_from_mean(places, max(m, count))
+        rows = farthest_rows(places, max(m, count), start=FARTHEST)
         unit = squared_spacing(gather_points(centred, rows[:, :count]))
         rows = rows[:, :m]
         anchors = gather_points(centred, rows)

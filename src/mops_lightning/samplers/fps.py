@@ -60,33 +60,30 @@ class FPSSampler(Sampler):
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice."""
-        if self.start == FARTHEST:
-            indices = farthest_from_mean(points, m, self.seed)
-            return SampleOutput(gather_points(points, indices), indices, {})
-        order = seeded_order(points, self.seed)
-        first = None
-        if isinstance(self.start, int):
-            if self.start >= points.shape[1]:
-                raise UserError(
-                    f"start must be less than the number of points N={points.shape[1]}, "
-                    f"got {self.start}."
-                )
-            first = torch.eq(order, self.start).byte().argmax(1)
-        chosen = farthest_point_sample(gather_points(points.detach(), order), m, start=first)
-        indices = order.gather(1, chosen)
+        if isinstance(self.start, int) and self.start >= points.shape[1]:
+            raise UserError(
+                f"start must be less than the number of points N={points.shape[1]}, "
+                f"got {self.start}."
+            )
+        indices = farthest_rows(points, m, self.seed, self.start)
         return SampleOutput(gather_points(points, indices), indices, {})
 
 
-def farthest_from_mean(points: Tensor, m: int, seed: int = 0) -> Tensor:
-    """Return rows ``(B, m)`` of farthest points, the first being farthest from the mean.
+def farthest_rows(points: Tensor, m: int, seed: int = 0, start: int | str | None = None) -> Tensor:
+    """Return rows ``(B, m)`` of farthest points in the order of choice.
 
     Args:
         points: ``(B, N, 3)``.
         m: number of points.
-        seed: of the order that breaks ties.
+        seed: of the order that breaks ties and, without ``start``, determines the first point.
+        start: the first point, as for ``FPSSampler``.
     """
     order = seeded_order(points, seed)
-    # The mean of ordered points has the same rounding error for every order of the input.
     ordered = gather_points(points.detach(), order)
-    start = (ordered - ordered.mean(1, keepdim=True)).square().sum(2).argmax(1)
-    return order.gather(1, farthest_point_sample(ordered, m, start=start))
+    first = None
+    if start == FARTHEST:
+        # The mean of ordered points has the same rounding error for every order of the input.
+        first = (ordered - ordered.mean(1, keepdim=True)).square().sum(2).argmax(1)
+    elif isinstance(start, int):
+        first = torch.eq(order, start).byte().argmax(1)
+    return order.gather(1, farthest_point_sample(ordered, m, start=first))
