@@ -220,7 +220,9 @@ def test_flexible_sampler_is_tested_at_all_sizes_and_evaluated(main_job):
     name = "test/m16/completed/accuracy"
     assert after["metrics"][name] == before["metrics"][name]
     assert "test/m3/matched/accuracy" in after["metrics"]
-    status, _, err = call([f"evaluate={run}", "sampler.tau_min=0.5"], folder)
+    status, _, err = call(
+        [f"evaluate={run}", "sampler.tau_min=0.5", "hydra.run.dir=refused"], folder
+    )
     assert status == 2
     assert err.count("\n") == 1
     assert "sampler.tau_min must be 0.1" in err
