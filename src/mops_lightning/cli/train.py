@@ -6,6 +6,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from mops_lightning.cli.commands import help_lines
+from mops_lightning.cli.flags import flags_first
 from mops_lightning.config.composition import conf_dir
 from mops_lightning.config.overrides import added, key, parse
 from mops_lightning.errors import (
@@ -49,6 +50,7 @@ def _run() -> None:
     # Makes Hydra raise instead of printing its own shortened traceback.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
+        sys.argv[1:] = flags_first(sys.argv[1:])
         _refuse_old_settings(sys.argv[1:])
         refuse_plain_groups(sys.argv[1:])
         _search_models(sys.argv[1:])
