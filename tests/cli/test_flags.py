@@ -9,10 +9,8 @@ from tests.support.command_line import call
     ("given", "ordered"),
     [
         ("m=8 --cfg job sampler=fps", "--cfg job m=8 sampler=fps"),
-        (
-            "m=8,16 -m --config-dir=sweeps ~x +y=2 --info",
-            "-m --config-dir=sweeps --info m=8,16 ~x +y=2",
-        ),
+        ("m=8,16 -m --config-dir=x ~x +y=2", "-m --config-dir=x m=8,16 ~x +y=2"),
+        ("m=8 --info", "--info m=8"),
         ("-m --config-dir sweeps m=8", "-m --config-dir sweeps m=8"),
         ("m=8 m=8 -p trainer m=8", "-p trainer m=8 m=8 m=8"),
         ("", ""),
