@@ -115,6 +115,14 @@ def test_nonzero_counts_and_gram_equal_dense(path):
     torch.testing.assert_close(matrix.gram(), dense.mT @ dense)
 
 
+def test_summaries_under_autocast_are_unchanged():
+    matrix, _ = random_matrix(dtype=torch.float32)
+    with torch.autocast("cpu", torch.bfloat16):
+        half = matrix.sparse(0.05).to_dense(), matrix.nonzero_counts(0.05), matrix.gram()
+    single = matrix.sparse(0.05).to_dense(), matrix.nonzero_counts(0.05), matrix.gram()
+    assert all(map(torch.equal, half, single))
+
+
 def test_queries_of_every_cloud_equal_matrices_of_single_clouds(path):
     matrix, points = random_matrix()
     rng = torch.Generator().manual_seed(3)

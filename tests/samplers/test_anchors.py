@@ -142,14 +142,6 @@ def test_anchors_in_half_precision_keep_distances(dtype, rng):
     torch.testing.assert_close(found.float(), want, atol=0.05, rtol=0)
 
 
-def test_anchors_under_autocast_keep_distances(rng):
-    points = torch.randn(2, 100, 3, generator=rng)
-    net = small(m=32, tau_min=0.1).eval()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = net(points).points
-    torch.testing.assert_close(found, net(points).points, atol=1e-3, rtol=0)
-
-
 def test_anchors_with_attributes_are_those_of_coordinates(rng):
     points = torch.randn(2, 40, 5, generator=rng)
     net = small(attributes=["intensity", "red"]).eval()

@@ -136,6 +136,17 @@ def test_input_of_wrong_type_raises(make, clouds):
         make(m=8.0)
 
 
+@pytest.mark.parametrize("training", [True, False])
+def test_autocast_keeps_dtype(make, training, clouds):
+    sampler = make().train(training)
+    with torch.autocast("cpu", torch.bfloat16):
+        half = sampler(clouds)
+        assert half.matrix is None or half.matrix.gram().isfinite().all()
+    assert half.points.dtype == torch.float32
+    if isinstance(sampler, MOPSNet | SNet):  # others choose, and may choose another point
+        torch.testing.assert_close(half.points, sampler(clouds).points, atol=0.05, rtol=0.05)
+
+
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_output_has_shape_dtype_and_device(make, clouds, dtype, device):

@@ -54,6 +54,7 @@ def test_stream_sample_is_nested(rng):
         (lambda: MOPSNet(4), [torch.zeros(2, 3), torch.zeros(1, 3)], "number of points N=3"),
         (lambda: MOPSNet(4), [torch.zeros(9, 2)], "shape"),
         (lambda: MOPSNet(4), [torch.zeros(9, 3) / 0], "finite"),
+        (lambda: MOPSNet(8), [torch.rand(9, 3).double()], "torch.float32 like the sampler's"),
     ],
 )
 def test_stream_sample_invalid_input_raises(make, chunks, message):

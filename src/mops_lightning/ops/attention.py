@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from mops_lightning.ops.precision import full_precision
+
 LOG2_E = 1 / math.log(2)
 """Logits in blocks are to the base 2, because exp2 is faster than exp."""
 
@@ -58,7 +60,8 @@ def softmax_weights(powers: Tensor, keys: Tensor, level: Tensor) -> Tensor:
     Returns:
         ``(M, N)``.
     """
-    return (powers @ keys.mT).sub_(level[:, None]).exp2_()
+    with full_precision(keys.device.type):
+        return (powers @ keys.mT).sub_(level[:, None]).exp2_()
 
 
 class Partial(NamedTuple):
@@ -116,14 +119,15 @@ def attend(queries: Tensor, keys: Tensor, values: Tensor) -> Partial:
     limit = math.sqrt(torch.finfo(extended.dtype).max)
     level = powers.new_empty(len(powers))
     sums = extended.new_empty(len(powers), extended.shape[1])
-    for columns in slices(len(powers), blocks_on(keys.device).queries):
-        here = powers[columns]
-        estimate = (here @ probes.mT).amax(1)
-        found = _sums(here, keys, extended, estimate)
-        unsure = ~((found[:, -1] > 0.5) & (found[:, -1] < limit))
-        if unsure.any():
-            estimate[unsure], found[unsure] = _sums_from_maxima(here[unsure], keys, extended)
-        level[columns], sums[columns] = estimate, found
+    with full_precision(keys.device.type):
+        for columns in slices(len(powers), blocks_on(keys.device).queries):
+            here = powers[columns]
+            estimate = (here @ probes.mT).amax(1)
+            found = _sums(here, keys, extended, estimate)
+            unsure = ~((found[:, -1] > 0.5) & (found[:, -1] < limit))
+            if unsure.any():
+                estimate[unsure], found[unsure] = _sums_from_maxima(here[unsure], keys, extended)
+            level[columns], sums[columns] = estimate, found
     return Partial(level, sums[:, -1], sums[:, :-1])
 
 

@@ -26,13 +26,15 @@ def full_precision(device: str) -> torch.autocast:
 
 @contextmanager
 def restrict_autocast_to_pointwise(device: str) -> Iterator[None]:
-    """Disable autocast except in ``pointwise_autocast``, which keeps its dtype; for training.
+    """Disable autocast except in ``pointwise_autocast``, which keeps its dtype.
+
+    Calls may be nested; the inner ones change nothing.
 
     Args:
         device: device type, such as ``cuda``.
     """
     mixed = torch.is_autocast_enabled(device)
-    token = _POINTWISE.set(torch.get_autocast_dtype(device) if mixed else None)
+    token = _POINTWISE.set(torch.get_autocast_dtype(device) if mixed else _POINTWISE.get())
     try:
         with full_precision(device):
             yield

@@ -22,6 +22,7 @@ from mops_lightning.ops.attention import (
     softmax_weights,
     streamed_attention,
 )
+from mops_lightning.ops.precision import full_precision
 
 GRAM_ROWS = 256
 """Rows of SᵀS that are computed together."""
@@ -141,7 +142,7 @@ class SamplingMatrix(NamedTuple):
             ``(B, M, M)``; without gradients.
         """
         m = self.m
-        with torch.no_grad():
+        with torch.no_grad(), full_precision(self.keys.device.type):
             result = self.keys.new_zeros(self.keys.shape[0], m, m)
             for cloud, _, _, block in self._blocks(block_queries=m):
                 # SᵀS is symmetric: the part left of the diagonal is not computed.

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.ops.points import coordinates, gather_points
+from mops_lightning.ops.precision import restrict_autocast_to_pointwise
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.samplers.ragged import described_shape, select_points
 from mops_lightning.types import SampleOutput
@@ -144,11 +145,11 @@ class Sampler(nn.Module):
         finite = not (self.training and points.is_cuda)
         check_points(points, at_least=m, finite=finite, attributes=self.attributes)
         dtype = next((p.dtype for p in self.parameters()), points.dtype)
-        if points.dtype != dtype and not torch.is_autocast_enabled(points.device.type):
-            raise UserError(
-                f"points must be {dtype} like the sampler's weights, got {points.dtype}."
-            )
-        return self.sample(points, m)
+        if not torch.is_autocast_enabled(points.device.type):
+            check_dtype(points, dtype)
+        with restrict_autocast_to_pointwise(points.device.type):
+            output = self.sample(points.to(dtype), m)
+        return output._replace(points=output.points.to(points.dtype))
 
     def sample_sizes(self, points: Tensor, sizes: Sequence[int]) -> dict[int, SampleOutput]:
         """Sample at several sizes; a nested sampler runs once, at the largest.
@@ -270,3 +271,13 @@ def check_points(
         )
     if finite and not bool(torch.isfinite(points).all()):
         raise UserError("points must be finite, got NaN or infinity.")
+
+
+def check_dtype(points: Tensor, weights: torch.dtype) -> None:
+    """Check that points have the dtype of a sampler's weights.
+
+    Raises:
+        UserError: they have another one.
+    """
+    if points.dtype != weights:
+        raise UserError(f"points must be {weights} like the sampler's weights, got {points.dtype}.")

@@ -11,7 +11,7 @@ from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.losses.subset import subset_losses
 from mops_lightning.nets.layers import PointFeatures, check_channels, linear_norm_relu
 from mops_lightning.ops.points import coordinates
-from mops_lightning.ops.precision import full_precision, pointwise_autocast
+from mops_lightning.ops.precision import pointwise_autocast, pointwise_autocast_dtype
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.anchors import FPSAnchors
 from mops_lightning.samplers.base import Sampler
@@ -151,7 +151,7 @@ class MOPSNet(Sampler):
     def _keys(self, points: Tensor) -> Tensor:
         """Return the inputs of the last layer of ρ ``(B, N, C)``."""
         plain = self.training or torch.is_grad_enabled()
-        if not plain and not torch.is_autocast_enabled(points.device.type):
+        if not plain and pointwise_autocast_dtype() is None:
             return self._fused_keys(points)
         local, global_ = self.features(points)
         with pointwise_autocast(points.device.type):
@@ -191,14 +191,10 @@ class MOPSNet(Sampler):
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Generate points; see ``Sampler.forward``."""
-        if isinstance(self.queries, FPSAnchors):
-            # Squared distances need full precision.
-            with full_precision(points.device.type):
-                matrix = self.sampling_matrix(points, m)
-                sampled = self._sampled(matrix, points.to(matrix.keys.dtype)).to(points.dtype)
-            return SampleOutput(sampled, None, {}, matrix)
         matrix = self.sampling_matrix(points, m)
-        return SampleOutput(self._sampled(matrix, points), None, {}, matrix)
+        # With anchors, S is at least float32, also where points and weights are half.
+        sampled = self._sampled(matrix, points.to(matrix.keys.dtype)).to(points.dtype)
+        return SampleOutput(sampled, None, {}, matrix)
 
     def _sampled(self, matrix: SamplingMatrix, points: Tensor) -> Tensor:
         if self.threshold and not self.training:

@@ -15,7 +15,7 @@ from torch import Tensor
 from mops_lightning.errors import UserError
 from mops_lightning.ops.attention import Partial, attend
 from mops_lightning.ops.nearest import nearest
-from mops_lightning.samplers.base import check_points
+from mops_lightning.samplers.base import check_dtype, check_points
 from mops_lightning.samplers.fused import FusedMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 
@@ -35,7 +35,8 @@ def stream_sample(sampler: MOPSNet, chunks: Chunks, m: int | None = None) -> Ten
         ``(m, 3)``, equal to ``sampler(points, m).points`` up to the rounding of sums.
 
     Raises:
-        UserError: the sampler is not a ``MOPSNet``, ``m`` is out of range, or a chunk is invalid.
+        UserError: the sampler is not a ``MOPSNet`` or has anchors, ``m`` is out of range, or a
+            chunk is invalid.
     """
     if not isinstance(sampler, MOPSNet):
         raise UserError(
@@ -44,7 +45,7 @@ def stream_sample(sampler: MOPSNet, chunks: Chunks, m: int | None = None) -> Ten
     m = sampler.m if m is None else m
     sampler.check_m(m)
     net = sampler.fused()
-    peaks = (global_part(net, chunk) for chunk in _checked(chunks, m, sampler.attributes))
+    peaks = (global_part(net, chunk) for chunk in _checked(chunks, m, sampler))
     global_ = reduce(torch.maximum, peaks)
     return reduce(Partial.merge, (sum_part(net, chunk, global_, m) for chunk in chunks())).result()
 
@@ -96,10 +97,11 @@ def stream_match(generated: Tensor, chunks: Chunks) -> Tensor:
     return rows
 
 
-def _checked(chunks: Chunks, m: int, attributes: tuple[str, ...]) -> Iterable[Tensor]:
+def _checked(chunks: Chunks, m: int, sampler: MOPSNet) -> Iterable[Tensor]:
     number = 0
     for chunk in chunks():
-        check_points(chunk[None], attributes=attributes)
+        check_points(chunk[None], attributes=sampler.attributes)
+        check_dtype(chunk, sampler.queries.weight.dtype)
         number += len(chunk)
         yield chunk
     if number < m:
