@@ -102,6 +102,32 @@ def test_arrays_in_arrays_out(net, clouds):
     assert net.downsample(clouds[0].numpy(), batch=batch)[0].shape == (16, 3)
 
 
+def test_arrays_of_any_byte_order_and_read_only_arrays(net, clouds):
+    array = clouds[0].numpy()
+    expected = net.downsample(array)[1]
+    read_only = array.copy()
+    read_only.flags.writeable = False
+    for same in (array.astype(">f4"), read_only, array[::-1][::-1]):
+        assert np.array_equal(net.downsample(same)[1], expected)
+
+
+@pytest.mark.parametrize("dtype", ["uint16", "uint32", "uint64", "int32"])
+def test_lengths_and_batch_of_any_whole_numbers(net, clouds, dtype):
+    points, lengths = padded(clouds)
+    found = net.downsample(points, lengths=lengths.numpy().astype(dtype))
+    assert torch.equal(found[1], net.downsample(points, lengths=lengths)[1])
+    batch = np.repeat(np.arange(2), 10)
+    found = net.downsample(clouds[0], batch=batch.astype(dtype))
+    assert torch.equal(found[1], net.downsample(clouds[0], batch=batch)[1])
+
+
+def test_double_precision_sampler_takes_any_points(net, clouds):
+    expected = net.downsample(clouds[0])
+    points, indices = net.double().downsample(clouds[0])
+    assert torch.equal(indices, expected[1])
+    assert points.dtype == torch.float32
+
+
 def test_learned_sampler_in_training_mode_is_refused():
     with pytest.raises(UserError, match=r"call eval\(\)"):
         SNet(8).downsample(torch.rand(20, 3))
@@ -123,6 +149,7 @@ MISTAKES: dict[str, tuple[tuple[Any, ...], dict[str, Any], str]] = {
     "both": ((POINTS,), {"lengths": [9, 9], "batch": [0]}, "exclude each other"),
     "lengths size": ((POINTS,), {"lengths": [20]}, r"shape \(B=2,\), got .* \(1,\)"),
     "lengths type": ((POINTS,), {"lengths": torch.ones(2)}, "lengths must be whole numbers"),
+    "lengths list": ((POINTS,), {"lengths": [[1], [2, 3]]}, "lengths must be whole numbers, got"),
     "lengths range": ((POINTS,), {"lengths": [20, 21]}, r"from 1 to N=20, got \[20, 21\]"),
     "lengths and one": ((POINTS[0],), {"lengths": [20]}, "with lengths"),
     "batch and many": ((POINTS,), {"batch": [0] * 20}, "with batch"),

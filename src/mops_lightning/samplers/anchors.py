@@ -86,8 +86,8 @@ class FPSAnchors(nn.Module):
 def squared_spacing(farthest: Tensor) -> Tensor:
     """Return the squared spacing ``(B,)`` of ``SPACING_POINTS`` farthest points.
 
-    It is the squared distance of the last point to those before it. Where a cloud has fewer points,
-    it is scaled as on a surface.
+    It is the squared distance of the last point to the nearest of those before it. Where a cloud
+    has fewer points, it is scaled as on a surface.
 
     Args:
         farthest: ``(B, K, 3)`` in the order of choice.

@@ -106,8 +106,8 @@ class Sampler(nn.Module):
             The points, and their indices in the input, or None for generated points; tensors or
             arrays like the input. For ``(N, 3)`` points ``(m, 3)`` and ``(m,)``, for ``(B, N, 3)``
             ``(B, m, 3)`` and ``(B, m)``, with ``batch`` both of all clouds one after the other.
-            A cloud with fewer than m points is returned whole; with ``lengths`` it is padded with
-            zeros, and its indices with −1.
+            With ``lengths`` or ``batch``, a cloud with fewer than m points is returned whole; with
+            ``lengths`` it is padded with zeros, and its indices with −1.
 
         Raises:
             UserError: an argument is invalid, or the sampler is in training mode.
@@ -129,14 +129,15 @@ class Sampler(nn.Module):
             raise UserError("downsample needs a sampler in eval mode: call eval() first.")
 
         def select(clouds: Tensor, m: int) -> tuple[Tensor | None, Tensor]:
-            output = self(clouds, m)
+            output = self(clouds.to(next(self.parameters(), clouds)), m)  # dtype and device
             if not self.generates:
                 return output.indices, output.points
+            generated = output.points.to(clouds.device)
             if readout == "generated":
-                return None, output.points
+                return None, generated
             places = coordinates(clouds)
-            rows = match(coordinates(output.points), places)
-            return complete(rows, places) if readout == "completed" else rows, output.points
+            rows = match(coordinates(generated), places)
+            return complete(rows, places) if readout == "completed" else rows, generated
 
         return select_points(select, points, m, lengths, batch, self.attributes)
 

@@ -23,7 +23,7 @@ class FPSSampler(Sampler):
 
     Flexible and nested. The seeded order of the cloud (see ``ordering``) determines the first point
     and breaks ties, so that the sample depends on the seed and the cloud only: neither on the rest
-    of the batch nor, unless ``start`` is given, on the order of the points.
+    of the batch nor, unless ``start`` is an index, on the order of the points.
 
     Args:
         m: largest number of points to return.

@@ -75,12 +75,17 @@ def select_points(
 
 def _tensor(name: str, value: Any) -> Tensor:
     if isinstance(value, np.ndarray):
+        native = value.astype(value.dtype.newbyteorder("="), copy=False)  # files may be big-endian
         try:
-            return torch.from_numpy(np.ascontiguousarray(value))
+            # torch takes neither negative strides nor memory that must not be written to.
+            return torch.from_numpy(np.require(native, requirements=("C", "W")))
         except TypeError:
             raise UserError(f"{name} must hold numbers, got dtype {value.dtype}.") from None
     if isinstance(value, list | tuple) and name != "points":
-        return torch.tensor(value)
+        try:
+            return torch.tensor(value)
+        except (RuntimeError, TypeError, ValueError):
+            raise UserError(f"{name} must be whole numbers, got {value!r:.99}.") from None
     if not isinstance(value, Tensor):
         raise UserError(f"{name} must be a tensor or an array, got {type(value).__name__}.")
     return value
@@ -110,7 +115,7 @@ def _padded(
 ) -> tuple[Tensor, Tensor | None]:
     """Select from padded clouds; the result is padded with zeros, its rows with −1."""
     number = points.shape[1]
-    _whole("lengths", lengths, len(points), f"B={len(points)}")
+    lengths = _whole("lengths", lengths, len(points), f"B={len(points)}")
     if len(lengths) and (int(lengths.min()) < 1 or int(lengths.max()) > number):
         raise UserError(f"lengths must be from 1 to N={number}, got {lengths.tolist()}.")
     clouds = [cloud[:length] for cloud, length in zip(points, lengths.tolist(), strict=True)]
@@ -126,7 +131,7 @@ def _padded(
 
 def _flat(select: Select, points: Tensor, m: int, batch: Tensor) -> tuple[Tensor, Tensor | None]:
     """Select from clouds one after the other; rows count through all clouds."""
-    _whole("batch", batch, len(points), f"P={len(points)}")
+    batch = _whole("batch", batch, len(points), f"P={len(points)}")
     if len(batch) and (int(batch.min()) < 0 or bool((batch[1:] < batch[:-1]).any())):
         raise UserError("batch must be ascending and at least 0. Sort the points by cloud.")
     counts = batch.bincount().tolist()
@@ -140,12 +145,14 @@ def _flat(select: Select, points: Tensor, m: int, batch: Tensor) -> tuple[Tensor
     return chosen, torch.cat(rows) if len(rows) == len(found) else None
 
 
-def _whole(name: str, values: Tensor, size: int, wanted: str) -> None:
+def _whole(name: str, values: Tensor, size: int, wanted: str) -> Tensor:
+    """Return whole numbers as int64; torch computes with few of the unsigned types."""
     if values.ndim != 1 or len(values) != size or values.is_floating_point():
         raise UserError(
             f"{name} must be whole numbers of shape ({wanted},), got {values.dtype} of shape "
             f"{tuple(values.shape)}."
         )
+    return values.long()
 
 
 def _each(select: Select, clouds: list[Tensor], m: int) -> list[Rows]:
