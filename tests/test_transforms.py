@@ -45,6 +45,8 @@ def test_generated_points_have_no_attributes(cloud):
         ({}, {"pos": None}, "points must be a tensor"),
         ({"points": "xyz"}, {}, "points under 'xyz', got"),
         ({"attributes": ["x"]}, {}, "the data have no 'x'"),
+        ({"attributes": ["label"]}, {}, "'label' must be an array or a tensor with a row"),
+        ({"attributes": ["row"]}, {"row": torch.arange(99)}, "'row' must be an array"),
         ({}, {"pos": torch.rand(2, 9, 3)}, r"shape \(N, 3\), got \(2, 9, 3\)"),
         ({"method": "fp"}, {}, "Did you mean 'fps'"),
     ],

@@ -98,20 +98,29 @@ class Downsample(BaseTransform):
         if self.points not in data:
             raise UserError(f"data must have points under {self.points!r}, got {list(data)}.")
         cloud = data[self.points]
-        number = len(cloud) if isinstance(cloud, Tensor | np.ndarray) and cloud.ndim else None
-        missing = [key for key in self.attributes or () if key not in data]
-        if missing:
-            raise UserError(f"attributes: the data have no {missing[0]!r}, only {list(data)}.")
+        number = _rows_in(cloud)
         names = [
             key
-            for key in (data if self.attributes is None else self.attributes)
-            if key != self.points
-            and isinstance(data[key], Tensor | np.ndarray)
-            and data[key].ndim
-            and len(data[key]) == number
+            for key, value in data.items()
+            if key != self.points and number is not None and _rows_in(value) == number
         ]
+        if self.attributes is not None:
+            self._check_attributes(data, [self.points, *names])
+            names = [key for key in names if key in self.attributes]
         points, rows = self._selected(cloud, names)
         return {**data, self.points: points, **{key: data[key][rows] for key in names}}
+
+    def _check_attributes(self, data: Mapping[str, Any], follow: Sequence[str]) -> None:
+        """Refuse an attribute that cannot follow the points, as it has not one row for each."""
+        for key in self.attributes or ():
+            if key not in data:
+                raise UserError(f"attributes: the data have no {key!r}, only {list(data)}.")
+            if key not in follow:
+                given = " ".join(repr(data[key]).split())
+                raise UserError(
+                    f"attributes: {key!r} must be an array or a tensor with a row for each point "
+                    f"of {self.points!r}, got {given:.99}."
+                )
 
     def _selected(self, points: Any, names: Iterable[str]) -> tuple[Any, Any]:
         """Return the points and rows of one cloud."""
@@ -130,3 +139,8 @@ class Downsample(BaseTransform):
     def __repr__(self) -> str:
         """Return the class with its main arguments."""
         return f"Downsample({self.m}, method={self.method!r}, readout={self.readout!r})"
+
+
+def _rows_in(value: Any) -> int | None:
+    """Return the number of rows of a tensor or an array; None for anything else."""
+    return len(value) if isinstance(value, Tensor | np.ndarray) and value.ndim else None

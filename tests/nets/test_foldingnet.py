@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 import torch
 from torch.nn import functional as F
@@ -99,6 +101,12 @@ def test_graph_encoder_accepts_fewer_points_than_neighbours(rng):
 def test_foldingnet_invalid_argument_raises(make, message):
     with pytest.raises(UserError, match=message):
         make()
+
+
+def test_unknown_encoder_raises():
+    settings: dict[str, Any] = {"encoder": "grpah"}
+    with pytest.raises(UserError, match=r"encoder: unknown 'grpah'.* 'graph'"):
+        MFoldingNet(64, **settings)
 
 
 def test_graph_encoder_with_attributes_raises():

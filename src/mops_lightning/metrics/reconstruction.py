@@ -13,7 +13,7 @@ class Distances(NamedTuple):
 
     Attributes:
         chamfer: ``(B,)``, see ``ops.chamfer.chamfer_distance``.
-        emd: ``(B,)``, see ``ops.emd.earth_mover_distance``.
+        emd: ``(B,)``, see ``ops.emd.earth_movers_distance``.
     """
 
     chamfer: Tensor

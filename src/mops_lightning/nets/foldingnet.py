@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.nets.autoencoder import PointEncoder
 from mops_lightning.nets.folding import Fold
 from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
@@ -22,12 +22,14 @@ from mops_lightning.ops.points import gather_points
 REACH = 0.3
 """The grid covers [-0.3, 0.3]², as in FoldingNet."""
 
+ENCODERS = ("mlp", "graph")
+
 
 def square_grid(n: int) -> Tensor:
     """Return n points of a regular grid over [-0.3, 0.3]², row by row.
 
     The grid has the most nearly square shape with n points. If its sides differ by more than a
-    factor of four, the first n points of the next larger square grid are returned.
+    factor of four, as for a prime number, the first n points of a nearly square grid are returned.
 
     Args:
         n: number of points.
@@ -165,6 +167,8 @@ class MFoldingNet(nn.Module):
         self.n_points = n_points
         self.attributes = tuple(attributes)
         self.encoder: GraphEncoder | PointEncoder
+        if encoder not in ENCODERS:
+            raise UserError(f"encoder: unknown {encoder!r}.{did_you_mean(encoder, ENCODERS)}")
         if encoder == "graph":
             if attributes:
                 raise UserError(
