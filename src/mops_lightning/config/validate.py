@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import ValidationError
 
 from mops_lightning.config import distributed, settings
@@ -42,12 +42,14 @@ def check(cfg: DictConfig) -> None:
     _check_models(cfg.get("models"))
     if not isinstance(cfg.task.get("net"), DictConfig):
         raise UserError("task.net cannot be removed. Choose another one with task/net=NAME.")
-    _check_limits(cfg)
-    _check_numbers(OmegaConf.to_container(cfg, resolve=True), "")
-    _check_evaluation(cfg)
+    # Resolved once: OmegaConf parses an interpolation each time it is read.
+    plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    _check_limits(plain)
+    _check_numbers(plain, "")
+    _check_evaluation(plain)
     for name, setting in declared.items():
-        if setting.counts(cfg.learn):
-            _check_node(cfg.get(name), name)
+        if setting.counts(plain["learn"]):
+            _check_node(plain.get(name), name)
     if cfg.learn != "nothing" and cfg.trainer.max_epochs < 1:
         raise UserError(
             "trainer.max_epochs must be a whole number of at least 1, got "
@@ -114,36 +116,37 @@ def _check_numbers(value: Any, path: str) -> None:
         raise UserError(f"{path} must be below 2**63, got one of {value.bit_length()} bits.")
 
 
-def _check_limits(cfg: DictConfig) -> None:
+def _check_limits(config: dict[str, Any]) -> None:
     for path, limits in settings.limited().items():
-        node, _, name = path.rpartition(".")
-        below = OmegaConf.select(cfg, node) if node else cfg
-        if not isinstance(below, DictConfig) or name not in below:
+        below: Any = config
+        *nodes, name = path.split(".")
+        for node in nodes:
+            below = below.get(node) if isinstance(below, dict) else None
+        if not isinstance(below, dict) or below.get(name, MISSING) == MISSING:
             continue
-        value = below[name]
-        value = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
-        if settings.of(path).counts(cfg.learn) and not limits.fits(value):
-            raise settings.refusal(path, value)
+        if settings.of(path).counts(config["learn"]) and not limits.fits(below[name]):
+            raise settings.refusal(path, below[name])
 
 
-def _check_evaluation(cfg: DictConfig) -> None:
-    if cfg.evaluate and cfg.learn not in ("nothing", "task"):
+def _check_evaluation(config: dict[str, Any]) -> None:
+    learn, evaluate = config["learn"], config["evaluate"]
+    if evaluate and learn not in ("nothing", "task"):
         raise UserError(
-            f"evaluate: trains nothing, got learn={cfg.learn}. Leave learn out, or train "
+            f"evaluate: trains nothing, got learn={learn}. Leave learn out, or train "
             "without evaluate."
         )
     for name in settings.OF_EVALUATE:
-        if name in cfg and not (cfg.evaluate and cfg.learn == "nothing"):
+        if name in config and not (evaluate and learn == "nothing"):
             raise settings.needs_evaluate(name)
-    if not cfg.evaluate and cfg.weights == "run":
+    if not evaluate and config["weights"] == "run":
         raise UserError("weights=run means the run named by evaluate=RUN, which is not given.")
-    if cfg.learn == "nothing" and cfg.ckpt_path is not None:
+    if learn == "nothing" and config["ckpt_path"] is not None:
         raise UserError("ckpt_path resumes training; to test a trained run give evaluate=RUN.")
 
 
 def _check_node(node: Any, where: str) -> None:
     """Compare every ``_target_`` below ``node`` with its constructor's signature."""
-    if not isinstance(node, DictConfig):
+    if not isinstance(node, dict):
         return
     if node.get("_target_") is not None:
         parameters = signature(str(node["_target_"]), where)
@@ -158,14 +161,11 @@ def _check_node(node: Any, where: str) -> None:
                     or f"{where}: {node['_target_']} takes no setting {name!r}."
                     f"{did_you_mean(name, parameters)}"
                 )
-            if OmegaConf.is_missing(node, key):
+            if node[key] == MISSING:
                 raise UserError(f"{where}.{name} must be set: try {where}.{name}=VALUE.")
-            if name in parameters and not isinstance(node[key], DictConfig):
-                value = node[key]
-                value = OmegaConf.to_container(value) if OmegaConf.is_list(value) else value
-                wanted = misfit(value, parameters[name].annotation)
+            if name in parameters and not isinstance(node[key], dict):
+                wanted = misfit(node[key], parameters[name].annotation)
                 if wanted:
-                    raise UserError(f"{where}.{name} must be {wanted}, got {value!r}.")
+                    raise UserError(f"{where}.{name} must be {wanted}, got {node[key]!r}.")
     for key in node:
-        if not OmegaConf.is_missing(node, key):
-            _check_node(node[key], f"{where}.{key!s}")
+        _check_node(node[key], f"{where}.{key!s}")

@@ -21,27 +21,30 @@ PARTS = {CHECKPOINT_KEY: dict, "state_dict": dict, "optimizer_states": list, "lo
 """What resuming needs of a checkpoint, with its types."""
 
 
-def identity(cfg: DictConfig, fingerprint: str) -> dict[str, str]:
+def identity(config: dict[str, Any], fingerprint: str) -> dict[str, str]:
     """Return the values that must be equal for a checkpoint to be resumed, as JSON by setting.
 
     These are the settings that affect training (see ``config.settings``), and hashes of the files
     that settings name. ``LENGTH`` may differ: a completed run can be extended.
 
     Args:
-        cfg: the run's settings.
+        config: the run's settings as plain data, interpolations resolved.
         fingerprint: the data set's fingerprint.
     """
-    plain: Any = OmegaConf.to_container(cfg, resolve=True)
-    parts = {**trained_with(plain), "dataset": fingerprint, **_given_weights(cfg)}
+    parts = {
+        **trained_with(config),
+        "dataset": fingerprint,
+        **_given_weights(config["weights"]),
+    }
     return {name: json.dumps(value, sort_keys=True) for name, value in parts.items()}
 
 
-def _given_weights(cfg: DictConfig) -> dict[str, str]:
+def _given_weights(given: str | None) -> dict[str, str]:
     """Return the hash of the weights file that the user gave, if any."""
-    if cfg.weights in (None, "auto", "run"):
+    if given in (None, "auto", "run"):
         return {}
     try:
-        return {"weights": str(weights.read(cfg.weights)["sha256"])}
+        return {"weights": str(weights.read(given)["sha256"])}
     except UserError as error:
         raise UserError(f"weights: {error}") from None
 

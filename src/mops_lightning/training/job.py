@@ -60,7 +60,7 @@ def prepare(cfg: DictConfig, folder: Path, dataset: CloudDataset, record: RunRec
     Raises:
         UserError: settings that do not fit each other, the data or the checkpoint to resume.
     """
-    identity = checkpoint.identity(cfg, dataset.fingerprint)
+    identity = checkpoint.identity(record.config, dataset.fingerprint)
     resumed = checkpoint.find(cfg, identity)
     record.notes |= {
         "dataset_fingerprint": dataset.fingerprint,

@@ -6,9 +6,10 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mops_lightning.config import distributed
 from mops_lightning.data.clouds import CloudDataset
@@ -91,7 +92,8 @@ def task_config(cfg: DictConfig) -> DictConfig:
 
 def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
     """Return the cache folder of the task net for these settings and data; it may not exist."""
-    key = checkpoint.identity(task_config(cfg), dataset.fingerprint)
+    own: Any = OmegaConf.to_container(task_config(cfg), resolve=True)
+    key = checkpoint.identity(own, dataset.fingerprint)
     digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:12]
     name = f"{cfg.names.task}-{cfg.names.net}-{cfg.names.dataset}-{digest}"
     return Path(cfg.cache).expanduser() / "weights" / name

@@ -66,7 +66,7 @@ def fit_and_test(job: Job, record: RunRecord, task_weights: Path | None) -> None
         digest = weights.digest(job.experiment.task.state_dict())
         record.notes["task_weights_sha256"] = digest
     with record.timed("test"):
-        record.metrics = _test(job)
+        record.metrics = _test(job, record.config)
     if job.trainer.is_global_zero:
         _save(job, record)
 
@@ -148,14 +148,19 @@ def _last_checkpoint(job: Job) -> Path | None:
     return own if own.is_file() else job.resumed
 
 
-def _test(job: Job) -> dict[str, float]:
-    """Score all test clouds and return the metrics by name."""
+def _test(job: Job, config: dict[str, Any]) -> dict[str, float]:
+    """Score all test clouds and return the metrics by name.
+
+    Args:
+        job: from ``job.prepare``.
+        config: the settings as plain data, for the logger.
+    """
     experiment, trainer = job.experiment, job.trainer
     with _interruptible(), dead_workers_reported(trainer):
         loader = score_loader(job.dataset.test, job.cfg.batch_size, experiment.task, job.part)
         trainer.test(experiment, loader, verbose=False)
     metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
-    log_hparams(trainer, job.cfg, _scores_at_own_size(metrics, experiment))
+    log_hparams(trainer, config, _scores_at_own_size(metrics, experiment))
     return metrics
 
 

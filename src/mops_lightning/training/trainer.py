@@ -9,7 +9,7 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Checkpoint, ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from mops_lightning.config.build import accepted, build
 from mops_lightning.data.clouds import CloudDataset
@@ -108,19 +108,18 @@ def device_name(trainer: L.Trainer) -> str:
     return torch.cuda.get_device_name(root) if root.type == "cuda" else root.type
 
 
-def log_hparams(trainer: L.Trainer, cfg: DictConfig, metrics: dict[str, float]) -> None:
+def log_hparams(trainer: L.Trainer, config: dict[str, Any], metrics: dict[str, float]) -> None:
     """Log the settings that distinguish runs, together with test metrics.
 
     Args:
         trainer: its logger gets them, if it has one.
-        cfg: the composed configuration.
+        config: the settings as plain data.
         metrics: by name; only TensorBoard takes them.
     """
-    plain: Any = OmegaConf.to_container(cfg, resolve=True)
     keys = ("names", "sampler", "optimizer", "augment", "m", "learn", "seed", "batch_size")
-    leaves = dotted({key: plain[key] for key in keys})
+    leaves = dotted({key: config[key] for key in keys})
     flat = {key: value for key, value in leaves.items() if key.rsplit(".", 1)[-1][:1] != "_"}
-    flat["max_epochs"] = plain["trainer"]["max_epochs"]
+    flat["max_epochs"] = config["trainer"]["max_epochs"]
     if isinstance(trainer.logger, TensorBoardLogger):
         trainer.logger.log_hyperparams(flat, {f"hparams/{k}": v for k, v in metrics.items()})
         # Lightning closed it after the test; this opened it again, with a thread of its own.
