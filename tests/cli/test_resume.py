@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from mops_lightning.records import run_record
-from tests.support.command_line import TINY, call, runs, start
+from tests.support.command_line import TINY, call, runs
+from tests.support.forked import start_fork
 
 
 def final_state(run):
@@ -32,7 +33,7 @@ def unbroken(tmp_path_factory):
 def test_run_stopped_mid_epoch_resumes_to_same_weights(unbroken, number, left):
     folder, want = unbroken
     out = f"stopped-{left}"
-    process = start([*LONGER, f"out={out}"], folder)
+    process = start_fork([*LONGER, f"out={out}"], folder)
     for line in process.stdout:
         if line.startswith("epoch 2/"):
             break

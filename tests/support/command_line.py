@@ -46,7 +46,7 @@ TINY_WITH_PICTURES = [*TINY, "pictures=2", "logger=tensorboard"]
 
 def start(arguments, folder, **extra):
     """Begin in a new process."""
-    environment = {**os.environ, **_variables(folder), **extra}
+    environment = {**os.environ, **variables(folder), **extra}
     environment.pop("HYDRA_FULL_ERROR", None)
     return subprocess.Popen(
         [sys.executable, "-m", "mops_lightning", *arguments],
@@ -70,7 +70,7 @@ def call(arguments, folder):
     out, err = io.StringIO(), io.StringIO()
     with (
         contextlib.chdir(folder),
-        patch.dict(os.environ, {**_variables(folder), "HYDRA_FULL_ERROR": ""}),
+        patch.dict(os.environ, {**variables(folder), "HYDRA_FULL_ERROR": ""}),
         patch.object(sys, "argv", ["mops_lightning", *arguments]),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
@@ -91,7 +91,8 @@ def runs(folder):
     return sorted(path.parent for path in (folder / "outputs").rglob("result.json"))
 
 
-def _variables(folder):
+def variables(folder):
+    """Return the environment variables of a command in a folder."""
     # As many threads there as here, for sums depend on it.
     threads = str(torch.get_num_threads())
     return {"MOPS_CACHE": str(folder / "cache"), "COLUMNS": "160", "OMP_NUM_THREADS": threads}

@@ -3,14 +3,15 @@ import os
 import signal
 from pathlib import Path
 
-from tests.support.command_line import TINY, start
+from tests.support.command_line import TINY
+from tests.support.forked import start_fork
 
 TWO = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
 
 
 def test_killed_worker_ends_run_as_interrupted(tmp_path):
     settings = ["learn=task", "trainer.max_epochs=1000", "val_fraction=0", "hydra.run.dir=run"]
-    process = start([*TINY[1:], *TWO, *settings], tmp_path)
+    process = start_fork([*TINY[1:], *TWO, *settings], tmp_path)
     for line in process.stdout:
         if line.startswith("epoch 1/"):
             break
