@@ -185,3 +185,15 @@ def test_emd_equals_pot(n, rng):
     cost = torch.cdist(points, others)[0].numpy()
     want = ot.emd2(np.full(n, 1 / n), np.full(n, 1 / n), cost)
     assert earth_movers_distance(points, others).item() == pytest.approx(want, rel=1e-9)
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("nan")])
+@pytest.mark.parametrize("block", [None, 16])
+def test_emd_of_cloud_that_is_not_finite_is_not_finite(value, block, rng):
+    points = torch.randn(2, 40, 3, generator=rng)
+    others = points.clone()
+    others[1, 7] = value
+    found = earth_movers_distance(points, others, block)
+    assert found[0] == 0
+    assert not found[1].isfinite()
+    assert points.isfinite().all()

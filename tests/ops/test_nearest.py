@@ -80,6 +80,17 @@ def test_nearest_far_from_origin_has_no_cancellation(offset, rng):
 
 
 @pytest.mark.usefixtures("argextreme_path")
+@pytest.mark.parametrize("value", [float("inf"), -float("inf"), float("nan")])
+def test_nearest_of_query_that_is_not_finite_is_a_row(value, rng):
+    points = torch.randn(1, 33, 3, generator=rng)
+    queries = points[:, :5] + 0.01
+    queries[0, 2] = value
+    distances, indices = nearest(queries, points)
+    assert not distances[0, 2].isfinite()
+    assert indices[0, [0, 1, 3, 4]].tolist() == [0, 1, 3, 4]
+    assert k_nearest(queries, points, 3)[1].max() < 33
+
+
 def test_nearest_of_ties_is_lowest_index():
     points = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0]]]).repeat(1, 20, 1)
     assert nearest(torch.zeros(1, 1, 3), points)[1].item() == 2

@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.errors import UserError
@@ -43,7 +44,7 @@ def earth_movers_distance(
 
     Returns:
         ``(B,)`` in units of the coordinates; the approximation is an upper bound. Gradients flow
-        to both clouds through the assigned pairs.
+        to both clouds through the assigned pairs. Not finite for clouds that are not.
 
     Raises:
         UserError: the shapes differ, an argument is out of range, or a worker process died.
@@ -92,7 +93,7 @@ def assignment(
         raise UserError(f"rounds must be at least 0, got {rounds}.")
     if workers is not None and workers < 1:
         raise UserError(f"workers must be at least 1, or None for one per thread, got {workers}.")
-    p, q = (cloud.detach().double().cpu().numpy() for cloud in (points, others))
+    p, q = _solvable(points), _solvable(others)
     solve = (
         partial(approximate_assignment, block=block, rounds=rounds) if block else solve_assignment
     )
@@ -110,3 +111,13 @@ def assignment(
                 "(task.emd_workers=1 on the command line)."
             ) from error
     return torch.from_numpy(np.stack(rows)).to(points.device)
+
+
+def _solvable(clouds: Tensor) -> NDArray[np.float64]:
+    """Return clouds ``(B, N, 3)`` as arrays, with zeros for those that are not finite.
+
+    No assignment exists for these, and any one gives a distance that is not finite.
+    """
+    exact = clouds.detach().double().cpu()
+    finite = exact.isfinite().flatten(1).all(1)
+    return torch.where(finite[:, None, None], exact, 0.0).numpy()

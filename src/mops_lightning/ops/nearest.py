@@ -166,4 +166,5 @@ def _search(queries: Tensor, points: Tensor, k: int) -> Tensor:
                 else flat.topk(k, largest=False)[1]
             )
             indices[b : b + depth, r : r + height] = winners.view(*shape[:2], k)
-    return indices
+    # Of a query that is not finite, the padding may be the nearest.
+    return indices.clamp_(max=points.shape[1] - 1)
