@@ -116,5 +116,5 @@ def farthest_rows(
         row = int(distance.argmax())
         chosen.append(row)
         distance = np.minimum(distance, np.linalg.norm(points - points[row], axis=1))
-        distance[[*kept, *chosen]] = -1
+        distance[row] = -1
     return np.array(chosen, np.int64)

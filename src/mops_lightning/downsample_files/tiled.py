@@ -139,7 +139,10 @@ def _sample(cloud: CloudFile, rows: range, tiling: Tiling, sampler: Sampler) -> 
         same[pair].append(i)
     found: list[NDArray[np.int64]] = [np.empty(0, np.int64)] * len(tiles)
     for (n, m), members in same.items():
-        for first in range(0, len(members) if m else 0, step := max(BATCH // n, 1)):
+        if m == 0:
+            continue
+        step = max(BATCH // n, 1)
+        for first in range(0, len(members), step):
             batch = members[first : first + step]
             points = _normalised(np.stack([table.points[tiles[i]] for i in batch]), cloud.path)
             if sampler.attributes:

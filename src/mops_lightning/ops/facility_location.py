@@ -65,9 +65,9 @@ def _best(features: Tensor, covered: Tensor, bounds: Tensor, active: Tensor) -> 
         cloud = active[pending]
         rows = bounds[cloud].topk(min(SHORTLIST, bounds.shape[1])).indices
         # In case of ties, topk may leave out the one that decides; evaluating it ends the loop.
-        rows[:, -1] = torch.where(
-            (rows == (first := bounds[cloud].argmax(1))[:, None]).any(1), rows[:, -1], first
-        )
+        first = bounds[cloud].argmax(1)
+        listed = (rows == first[:, None]).any(1)
+        rows[:, -1] = torch.where(listed, rows[:, -1], first)
         gains = (features[cloud[:, None], rows] - covered[cloud][:, None]).relu_().sum(2)
         bounds[cloud[:, None], rows] = gains
         top = bounds[cloud].argmax(1)

@@ -74,20 +74,29 @@ def eliminate(points: Tensor, m: int) -> Tensor:
     Returns:
         ``(B, m)`` int64 rows of ``points``, ascending.
     """
-    batch, number, _ = points.shape
+    number = points.shape[1]
     points = points.double()
     reach = spacing_bound(points, m).clamp_min(torch.finfo(points.dtype).tiny)
     # Sums of integers do not depend on the order of the points.
     scale = 2.0 ** min(50, 62 - number.bit_length())
+    rows = _compiled(points, m, reach, scale)
+    return _plain(points, m, reach, scale) if rows is None else rows
+
+
+def _compiled(points: Tensor, m: int, reach: Tensor, scale: float) -> Tensor | None:
+    """Return the rows ``(B, m)`` that remain; None where the plain form must be used."""
     rows = []
     for cloud, bound in zip(points, reach.flatten().tolist(), strict=True):
         row = eliminate_by_cells(cloud, m, bound, scale)
         if row is None:
-            break
+            return None
         rows.append(row)
-    else:
-        if batch:
-            return torch.stack(rows)
+    return torch.stack(rows) if rows else None
+
+
+def _plain(points: Tensor, m: int, reach: Tensor, scale: float) -> Tensor:
+    """Return the rows ``(B, m)`` that remain, from the distances to all points in every step."""
+    batch, number, _ = points.shape
     planes = points.permute(2, 0, 1).contiguous()  # every step runs along memory
     crowding = _crowding(planes, reach, scale)
     for _ in range(number - m):

@@ -139,11 +139,11 @@ class Registration(Task):
         columns = {}
         for name, points in samples.items():
             result = self.step(batch, points)
-            chosen = points.chunk(2)
-            motion = self.net(*chosen)
+            motion: Motion = result.output
+            of_source, of_target = points.chunk(2)
             errors = RotationError.of(result.predictions, result.targets)
             columns[name] = RegistrationResult(
-                motion.apply(source), motion.apply(chosen[0]), chosen[1], errors.tolist()
+                motion.apply(source), motion.apply(of_source), of_target, errors.tolist()
             )
         true = Motion(batch.quaternion, batch.translation)
         before = RotationError.of(identity_motion(source), true).tolist()

@@ -62,7 +62,7 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
         "recipe": notes.get("recipe"),
         "seed": record["seed"],
         "dataset": record["config"]["names"]["dataset"],
-        f"{what.split()[0]}_weights_sha256": content["sha256"],
+        f"{'task' if cfg.learn == 'task' else 'sampler'}_weights_sha256": content["sha256"],
     }
 
 
@@ -123,7 +123,9 @@ def _load_task(task: torch.nn.Module, folder: Path, record: dict[str, Any]) -> N
             f"{path}, which contains the run's task net, does not exist. Give weights=FILE."
         )
     state = weights.read_plain(path, "a checkpoint")["state_dict"]
-    own = {key.removeprefix("task."): value for key, value in state.items() if key[:5] == "task."}
+    own = {
+        key.removeprefix("task."): value for key, value in state.items() if key.startswith("task.")
+    }
     if weights.digest(own) != record["notes"].get("task_weights_sha256"):
         raise UserError(f"{path} does not belong to the run in its folder. Give weights=FILE.")
     weights.fit_state(task, own, path)
@@ -170,11 +172,7 @@ def _same_settings(
     for key in sorted({*there["sampler"], *here["sampler"]}) if cfg.learn != "task" else ():
         old, new = there["sampler"].get(key), here["sampler"].get(key)
         if old != new and Affects.TRAINING in settings.of(f"sampler.{key}").affects:
-            hint = (
-                ""
-                if key != "m"
-                else " For other sizes of a sampler for many sizes give sizes=[...]."
-            )
+            hint = " For other sizes of a flexible sampler give sizes=[...]." if key == "m" else ""
             raise UserError(
                 f"{KEY}: sampler.{key} must be {old}, as in {run}, got {new}. "
                 f"Leave it out, or train a sampler with it.{hint}"

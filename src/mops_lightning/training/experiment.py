@@ -297,7 +297,9 @@ class Experiment(L.LightningModule):
             result = self.task.scored(batch, points, reference)
             for name, metric in self.scores.update_readout(f"{prefix}{readout}", result).items():
                 self.log(f"{stage}{name}", metric, batch_size=clouds)
-            for name, value in result.losses.items() if readout == self.main_readout else ():
+            if readout != self.main_readout:
+                continue
+            for name, value in result.losses.items():
                 key = f"{stage}{prefix}loss/{name}"
                 mean, place = self.scores.update_loss(key, value, clouds), f"scores.losses.{key}"
                 self.log(key, mean, batch_size=clouds, metric_attribute=place)
