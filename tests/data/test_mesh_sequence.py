@@ -1,8 +1,10 @@
+from pathlib import PurePath
+
 import pytest
 import torch
 import trimesh
 
-from mops_lightning.data.mesh_sequence import mesh_sequence
+from mops_lightning.data.mesh_sequence import by_number, mesh_sequence
 from mops_lightning.errors import UserError
 
 
@@ -35,6 +37,12 @@ def test_mesh_sequence_splits_by_time_with_gap(folder):
     assert sorted(lengths(train.points[train.labels == 1])) == list(range(6))
     assert train.points.shape[1:] == (3000, 3)
     assert train.points.norm(dim=2).amax(1).allclose(torch.ones(13))
+
+
+def test_by_number_sorts_digits_that_are_no_numbers():
+    names = ["f_10", "f_9", "1²", "²"]
+    ordered = sorted((PurePath(f"{name}.ply") for name in names), key=by_number)
+    assert [path.stem for path in ordered] == ["1²", "f_9", "f_10", "²"]
 
 
 def test_mesh_sequence_class_and_cache(folder, tmp_path):

@@ -82,4 +82,4 @@ def _split_frames(sequence: Path, frames: int, test_share: float, gap: int) -> l
 def by_number(path: PurePath) -> tuple[list[tuple[int, str]], str]:
     """Return a sort key that puts frame_9 before frame_10."""
     parts = re.split(r"(\d+)", path.stem)
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts], path.name
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], path.name

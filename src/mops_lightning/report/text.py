@@ -88,8 +88,8 @@ def long_csv(found: list[Record], net: str, keys: list[str]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     fixed = ["folder", "sampler", "learn", "seed", "epochs", "m", "readout", "metric", "value"]
-    several = any(map(parse_transfer, {name for record in found for name in record["metrics"]}))
-    writer.writerow([*fixed, *keys, *["net"] * several, "commit", "device"])
+    has_nets = any(parse_transfer(name) for record in found for name in record["metrics"])
+    writer.writerow([*fixed, *keys, *(["net"] if has_nets else []), "commit", "device"])
     for record in found:
         for name, figure in record["metrics"].items():
             other, parts = parse_transfer(name) or (record["config"]["names"]["net"], parse(name))
@@ -107,7 +107,7 @@ def long_csv(found: list[Record], net: str, keys: list[str]) -> str:
                     parts.metric,
                     repr(figure),
                     *(value(record, key) for key in keys),
-                    *[other] * several,
+                    *([other] if has_nets else []),
                     record["git"]["commit"],
                     record["device"],
                 ]

@@ -37,8 +37,8 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
     run = cfg.evaluate.removesuffix(f"/{run_record.FILE}")
     _same_settings(cfg, record, run, experiment.task)
     notes = record["notes"]
-    told = experiment.task.requires_same_classes
-    if told and cfg.weights == OF_RUN and notes.get("dataset_fingerprint") != dataset.fingerprint:
+    own_data = notes.get("dataset_fingerprint") == dataset.fingerprint
+    if experiment.task.requires_same_classes and cfg.weights == OF_RUN and not own_data:
         same_classes(notes.get("class_names"), dataset, f"{KEY}: {run}")
     same_attributes(record["config"], dataset, f"{KEY}: {run}")
     learned = experiment.task if cfg.learn == "task" else experiment.sampler
