@@ -118,4 +118,6 @@ def frame_cloud(axes: Axes3D, cloud: np.ndarray) -> None:
         getattr(axes, f"set_{name}lim")(middle - reach, middle + reach)
     axes.set_box_aspect((1, 1, 1), zoom=1.3)
     axes.set_axis_off()
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.set_visible(False)  # matplotlib measures the ticks of hidden axes, too
     axes.view_init(elev=18, azim=-60)
