@@ -141,8 +141,9 @@ def _reference() -> str:
     ]
     packages: dict[str, list[str]] = {}
     for name in mops_lightning.__all__:
-        module = getattr(mops_lightning, name).__module__
-        packages.setdefault(module.split(".")[1], []).append(f"::: {module}.{name}")
+        module = mops_lightning._MODULE_OF[name]  # asking the object would import torch
+        entry = f"::: {mops_lightning.__name__}.{module}.{name}"
+        packages.setdefault(module.split(".")[0], []).append(entry)
     for package in sorted(packages):
         lines += [f"## {package}", "", *(line for one in packages[package] for line in (one, ""))]
     lines += ["## In modules of their own", ""]
