@@ -80,6 +80,17 @@ def browser() -> Iterator[Any]:
 @pytest.fixture
 def opened(browser: Any) -> Iterator[Any]:
     """A function that opens an address: the page, its errors, and all addresses it asked for."""
+    yield from opening(browser)
+
+
+@pytest.fixture(scope="module")
+def opened_once(browser: Any) -> Iterator[Any]:
+    """The same with one page for all tests of a file."""
+    yield from opening(browser)
+
+
+def opening(browser: Any) -> Iterator[Any]:
+    """Yield the function of ``opened``."""
     page = browser.new_page()
     errors: list[str] = []
     requests: list[str] = []

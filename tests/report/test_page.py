@@ -47,8 +47,16 @@ def reported(tmp_path_factory):
     return tmp_path / "report.html"
 
 
-def test_page_tables_sort_by_column(reported, opened):
-    page, errors, requests = opened(f"file://{reported}")
+@pytest.fixture(scope="module")
+def shown(reported, opened_once):
+    """The report in the browser; no test reads what another one changes."""
+    page, errors, requests = opened_once(f"file://{reported}")
+    page.wait_for_selector("#view canvas")
+    return page, errors, requests
+
+
+def test_page_tables_sort_by_column(shown):
+    page, errors, requests = shown
     before = cells(page)
     assert names(page) == ["voxel", "fps", "mops"]
     assert before[1] == ["fps\nthe paper's", "30.00\n34.08", "40.00\n11.02"]
@@ -63,9 +71,8 @@ def test_page_tables_sort_by_column(reported, opened):
     assert {url.split(":")[0] for url in requests} <= {"file", "data", "blob"}
 
 
-def test_page_clouds_can_be_selected(reported, opened):
-    page, errors, requests = opened(f"file://{reported}")
-    page.wait_for_selector("#view canvas")
+def test_page_clouds_can_be_selected(shown):
+    page, errors, requests = shown
     assert page.locator("#run option").all_inner_texts() == ["fps-32-pointnet", "mops-32-pointnet"]
     assert page.locator("#shape option").all_inner_texts() == ["0_chair", "1_</script>"]
     traces = "document.getElementById('view').data.map(trace => [trace.name, trace.x.length])"
@@ -77,13 +84,13 @@ def test_page_clouds_can_be_selected(reported, opened):
     page.evaluate("Plotly.restyle('view', {visible: false})")
     page.wait_for_timeout(300)
     assert page.locator("#view").screenshot() != drawn, "the canvas must show the points"
+    page.evaluate("Plotly.restyle('view', {visible: true})")  # for the tests that follow
     assert errors == []
     assert {url.split(":")[0] for url in requests} <= {"file", "data", "blob"}
 
 
-def test_page_is_dark_where_the_browser_is(reported, opened):
-    page, errors, _ = opened(f"file://{reported}")
-    page.wait_for_selector("#view canvas")
+def test_page_is_dark_where_the_browser_is(shown):
+    page, errors, _ = shown
 
     def brightness(name, part="body"):
         found = page.locator(part).first.evaluate(f"one => getComputedStyle(one).{name}")
