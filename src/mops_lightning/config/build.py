@@ -133,7 +133,11 @@ def accepted(node: DictConfig, offered: dict[str, Any]) -> dict[str, Any]:
 
 
 def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
-    """Return the parameters of a target; what a class hands on to its bases belongs to them."""
+    """Return the parameters of a target, with those that a class passes on to its bases.
+
+    Raises:
+        UserError: the target cannot be imported.
+    """
     from hydra.utils import get_object
 
     try:

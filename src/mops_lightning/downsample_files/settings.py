@@ -26,6 +26,9 @@ class Settings:
         tile: most points of a tile; None: no tiles of a number of points.
         tile_size: side of cubic tiles in the file's own unit; None: no cubic tiles.
         ratio: share of the points to keep, instead of m; with tiles only.
+
+    Raises:
+        UserError: a value is out of range, or options exclude each other.
     """
 
     m: int | None

@@ -107,7 +107,7 @@ class AutoEncoder(nn.Module):
         return self.encoder.point_features(points)
 
     def from_pooled(self, pooled: Tensor, n_points: int | None = None) -> Tensor:
-        """Map codewords ``(B, d)`` to ``(B, n, 3)``; ``n_points`` as for ``forward``."""
+        """Map codewords ``(B, d)`` to ``(B, n, 3)``; ``n_points`` and errors as for ``forward``."""
         if n_points not in (None, self.n_points):
             raise UserError(
                 f"n_points must be {self.n_points}, the size this AutoEncoder was made for, got "

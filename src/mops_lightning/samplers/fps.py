@@ -59,7 +59,11 @@ class FPSSampler(Sampler):
         self.start = start
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
-        """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice."""
+        """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice.
+
+        Raises:
+            UserError: ``start`` is not the index of a point.
+        """
         if isinstance(self.start, int) and self.start >= points.shape[1]:
             raise UserError(
                 f"start must be less than the number of points N={points.shape[1]}, "

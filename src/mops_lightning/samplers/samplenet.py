@@ -98,7 +98,11 @@ class SampleNet(SNet):
         return self.temperature.square().clamp(min=self.sigma_min)
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
-        """Generate points, in training together with their soft projection."""
+        """Generate points, in training together with their soft projection.
+
+        Raises:
+            UserError: there are fewer than k points.
+        """
         if self.k > points.shape[1]:
             raise UserError(
                 f"k must be at most the number of points N={points.shape[1]}, got {self.k}."

@@ -71,6 +71,9 @@ def sum_part(net: FusedMOPSNet, points: Tensor, global_: Tensor, m: int) -> Part
         points: ``(n, 3)``.
         global_: ``(D,)``, the global feature of the whole cloud.
         m: number of points to generate.
+
+    Returns:
+        Sums for m points, with values ``(m, 3)``.
     """
     return attend(net.queries[:m], net.keys(net.local_features(points), global_), points)
 

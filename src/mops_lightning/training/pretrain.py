@@ -15,7 +15,6 @@ from mops_lightning.config import distributed
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.files import atomic_write, remove_temporary, set_aside
-from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training import checkpoint
 from mops_lightning.training.callbacks import CHECKPOINT, added
 from mops_lightning.training.job import Job, prepare
@@ -99,7 +98,7 @@ def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
     return Path(cfg.cache).expanduser() / "weights" / name
 
 
-def publish(job: Job, record: RunRecord) -> None:
+def publish(job: Job) -> None:
     """Copy a task net that was trained with ``learn=task`` into the cache, unless one is there.
 
     Not from a run that was resumed with another number of epochs, whose learning rates differed,

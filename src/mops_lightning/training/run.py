@@ -53,7 +53,7 @@ def run(
             with record.timed("pretrain"):
                 task_weights = pretrain.task_weights(cfg, dataset)
         fit_and_test(job, record, task_weights)
-        pretrain.publish(job, record)
+        pretrain.publish(job)
     if leads:
         closing_lines(folder, record.plain())
     return record

@@ -223,7 +223,10 @@ def fit_state(
 def check_shapes(
     module: nn.Module, state: dict[str, Tensor], path: str | Path, hint: str = OTHER_NET
 ) -> None:
-    """Reject tensors whose names or shapes are not a module's; see ``fit_state``."""
+    """Reject tensors whose names or shapes are not a module's.
+
+    Arguments and errors are those of ``fit_state``.
+    """
     expected = module.state_dict()
     wrong = [f"{name} is missing" for name in expected if name not in state]
     wrong += [f"{name} is unknown" for name in state if name not in expected]

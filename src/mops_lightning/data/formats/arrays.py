@@ -48,7 +48,11 @@ def locate_npy(path: Path) -> BinaryCloudFile:
 
 
 def read_npz(path: Path) -> Table:
-    """Read the array named as in ``POINTS``, or the only one; the others are attributes."""
+    """Read the array named as in ``POINTS``, or the only one; the rest are attributes.
+
+    Raises:
+        UserError: the file is broken, or no array is the points.
+    """
     arrays = load_npz(path)
     chosen = next((name for name in POINTS if name in arrays), None)
     if chosen is None and len(arrays) == 1:

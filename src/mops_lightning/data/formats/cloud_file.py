@@ -63,6 +63,9 @@ class BinaryCloudFile(CloudFile):
     Attributes:
         kind: the data type of a row, with the names of the columns.
         offset: of the first row, in bytes.
+
+    Raises:
+        BadCloudError: the file is too short for its rows.
     """
 
     kind: np.dtype[Any]

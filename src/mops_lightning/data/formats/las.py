@@ -14,7 +14,11 @@ from mops_lightning.errors import UserError
 
 
 def read(path: Path) -> Table:
-    """Read all points with all their dimensions; coordinates are scaled and shifted."""
+    """Read all points with all their dimensions; coordinates are scaled and shifted.
+
+    Raises:
+        UserError: laspy is not installed, or the file is broken.
+    """
     laspy = _laspy(path)
     las_header.check(path)
     with laspy.open(path, read_evlrs=False) as file:

@@ -20,7 +20,11 @@ HEADER = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEW
 
 
 def read(path: Path) -> Table:
-    """Read a PCD file; fields with a COUNT above 1 are left out."""
+    """Read a PCD file; fields with a COUNT above 1 are left out.
+
+    Raises:
+        BadCloudError: the file is broken.
+    """
     data = path.read_bytes()
     header, start = _header(data, path)
     try:

@@ -28,7 +28,11 @@ TYPES = {kind: name for name, kind in KINDS.items() if not name[-1].isdigit()}
 
 
 def read(path: Path) -> Table | None:
-    """Read the vertices with all their properties; None for a mesh, which has faces as well."""
+    """Read the vertices with all their properties; None for a mesh, which has faces as well.
+
+    Raises:
+        BadCloudError: the file ends before its last vertex.
+    """
     from trimesh.exchange.ply import load_ply
 
     with np.errstate(all="ignore"):

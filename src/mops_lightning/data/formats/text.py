@@ -18,7 +18,11 @@ from mops_lightning.data.formats.table import (
 
 
 def read(path: Path) -> Table:
-    """Read rows of numbers separated by spaces, commas or semicolons, with or without a header."""
+    """Read rows of numbers separated by spaces, commas or semicolons, with or without a header.
+
+    Raises:
+        BadCloudError: the file holds no points, or something else than numbers.
+    """
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     lines = [re.split("#|//", line)[0].strip() for line in text.splitlines()]
     lines = [line for line in lines if line]
