@@ -78,8 +78,9 @@ class SamplingMatrix(NamedTuple):
     def sparse(self, threshold: float = 0.01) -> Tensor:
         """Return S in coordinate (COO) format, as the paper stores it for inference.
 
-        Entries below ``threshold`` are dropped, and columns are renormalised to sum 1. A column
-        without an entry above the threshold keeps its largest entry.
+        Paper section "Efficient Regression of the Sampled Set". Entries below ``threshold`` are
+        dropped. Columns are then renormalised to sum 1, and a column without an entry of this size
+        keeps its largest one; the paper says nothing about either.
 
         Returns:
             Sparse ``(B, N, M)``, coalesced; without gradients.
@@ -115,7 +116,10 @@ class SamplingMatrix(NamedTuple):
             ).coalesce()
 
     def leftmost(self, m: int) -> "SamplingMatrix":
-        """Return the matrix of the first ``m`` columns (paper section "Flexible MOPS-Net")."""
+        """Return the matrix of the first ``m`` columns, as FMOPS-Net takes them.
+
+        Paper section "Flexible MOPS-Net for Arbitrary Ratios".
+        """
         return self._replace(queries=self.queries[..., :m, :])
 
     def first_cloud(self) -> "SamplingMatrix":

@@ -1,4 +1,7 @@
-"""Reconstruction of dense clouds from sampled points (paper section "Reconstruction")."""
+"""Reconstruction of dense clouds from sampled points.
+
+Paper section "Reconstruction-oriented Downsampling".
+"""
 
 import math
 from collections.abc import Mapping, Sequence
