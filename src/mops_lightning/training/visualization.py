@@ -11,6 +11,7 @@ from lightning.fabric.utilities import move_data_to_device
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from matplotlib.figure import Figure
+from PIL import Image
 from torch import Tensor
 
 from mops_lightning.ops.points import coordinates
@@ -72,14 +73,18 @@ class CloudVisualization(Callback):
         task: Any = module.task
         titles = task.cloud_titles(self.titles)
         places = coordinates(batch.points)
-        if folder is not None:
-            if samples:
-                save_clouds(folder / CLOUDS, places, samples, titles)
-            for name, figure in figures.items():
-                save_figure(figure, folder / f"{name}.png")
-        if board is not None:
-            for name, figure in figures.items():
+        if folder is not None and samples:
+            save_clouds(folder / CLOUDS, places, samples, titles)
+        for name, figure in figures.items():
+            path = folder and save_figure(figure, folder / f"{name}.png")
+            if board is None:
+                continue
+            if path is None:
                 board.experiment.add_figure(name, figure, trainer.global_step)
+            else:  # what was drawn already
+                pixels = np.asarray(Image.open(path).convert("RGB"))
+                board.experiment.add_image(name, pixels, trainer.global_step, dataformats="HWC")
+        if board is not None:
             _add_meshes(board, places, samples, titles, trainer.global_step)
 
     @torch.no_grad()
