@@ -31,6 +31,7 @@ SLOW_FILES = (
     *("docs/test_notebooks", "docs/test_site", "report/test_page", "fuzz/test_command_lines"),
     *("samplers/test_memory", "training/test_precision", "training/test_evaluate", "test_wheel"),
     *("downsample_files/test_cluster", "zoo/test_export", "training/test_warm_start"),
+    *("cli/test_sweep", "downsample_files/test_batch", "zoo/test_models"),
 )
 """Files of few tests that take long. They begin first, or one process would end alone with one."""
 

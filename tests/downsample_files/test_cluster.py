@@ -167,7 +167,12 @@ def test_lost_scheduler_is_reported(scan):
     with (
         environment_kept(),
         distributed.LocalCluster(
-            n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=50
+            n_workers=1,
+            threads_per_worker=1,
+            processes=False,  # the scheduler is lost, not the worker
+            protocol="tcp://",
+            dashboard_address=":0",
+            silence_logs=50,
         ) as one,
         distributed.Client(one) as client,
     ):
