@@ -39,6 +39,13 @@ def test_step_loss_is_chamfer_plus_weighted_emd(rng):
             torch.testing.assert_close(losses["emd"], weight * emd)
 
 
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_training_metrics_are_those_that_are_computed(weight):
+    names = {"chamfer", "emd"} if weight else {"chamfer"}
+    assert set(task(emd_weight=weight).metrics(training=True)) == names
+    assert {"chamfer", "emd", "nre_emd"} < set(task(emd_weight=weight).metrics())
+
+
 def values_of(module, result):
     metrics = module.metrics()
     metrics.update(result.predictions, result.targets)

@@ -169,8 +169,13 @@ class Reconstruction(Task):
         return {"reconstructions": reconstruction_grid(clouds, full, columns, titles)}
 
     def metrics(self, training: bool = False) -> MetricCollection:
-        """Return mean distances and, except in training, which has no reference, NRE."""
-        metrics: list[TableMetric] = [MeanChamfer(), MeanEMD()]
+        """Return mean distances and, except in training, which has no reference, NRE.
+
+        Training computes the earth mover's distance only where it is in the loss.
+        """
+        metrics: list[TableMetric] = [MeanChamfer()]
+        if self.emd_weight or not training:
+            metrics += [MeanEMD()]
         if not training:
             metrics += [
                 NormalizedChamfer(),
