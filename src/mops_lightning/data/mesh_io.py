@@ -1,18 +1,20 @@
-"""Clouds from mesh files; the module does not import torch, so that workers start fast."""
+"""Clouds from mesh files; the module imports neither torch nor trimesh: workers start fast."""
 
 import hashlib
 import re
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from mops_lightning.data import glb_bounds, ply_header
 from mops_lightning.errors import UserError, one_line
 from mops_lightning.files import atomic_write
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 SUFFIXES = (".off", ".obj", ".ply", ".stl", ".glb")
 VERSION = 1
@@ -72,9 +74,11 @@ def cloud_from_file(
     cached = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.npy" if cache else None
     if cached is not None and (points := _load_cached(cached, n_points)) is not None:
         return digest, points
+    from trimesh.sample import sample_surface
+
     mesh = parse_mesh(data, path)
     random = np.random.default_rng([seed, int(digest[:16], 16)])
-    points = unit_sphere(trimesh.sample.sample_surface(mesh, n_points, seed=random)[0])
+    points = unit_sphere(sample_surface(mesh, n_points, seed=random)[0])
     if cached is not None:
         try:
             with atomic_write(cached) as temporary:
@@ -84,7 +88,7 @@ def cloud_from_file(
     return digest, points
 
 
-def parse_mesh(data: bytes, path: Path) -> trimesh.Trimesh:
+def parse_mesh(data: bytes, path: Path) -> "Trimesh":
     """Parse a mesh; the parts of a scene are transformed and joined.
 
     Headers of ModelNet files with the counts on the same line as ``OFF`` are accepted.
@@ -139,8 +143,10 @@ def unit_sphere(points: NDArray[np.floating]) -> NDArray[np.float32]:
     return (points / radius if radius > 0 else points).astype(np.float32)
 
 
-def _load(data: bytes, kind: str) -> trimesh.Trimesh:
+def _load(data: bytes, kind: str) -> "Trimesh":
     """Parse a file with trimesh and join the parts of a scene."""
+    import trimesh
+
     text = kind in (".off", ".obj")
     if kind == ".stl":
         count = int.from_bytes(data[80:84], "little")
@@ -162,11 +168,11 @@ def _load(data: bytes, kind: str) -> trimesh.Trimesh:
     scene: Any = trimesh.load(
         BytesIO(data), file_type=kind[1:], force="scene", process=False, **extra
     )
-    mesh: trimesh.Trimesh = scene.to_mesh()
+    mesh: Trimesh = scene.to_mesh()
     return mesh
 
 
-def _triangles_off(data: bytes) -> trimesh.Trimesh | None:
+def _triangles_off(data: bytes) -> "Trimesh | None":
     """Parse a plain OFF file of triangles, such as ModelNet's, 5 times faster than trimesh.
 
     Returns:
@@ -186,7 +192,9 @@ def _triangles_off(data: bytes) -> trimesh.Trimesh | None:
         return None
     if not (faces[:, 0] == 3).all():
         return None
-    return trimesh.Trimesh(vertices, faces[:, 1:], process=False)
+    from trimesh import Trimesh
+
+    return Trimesh(vertices, faces[:, 1:], process=False)
 
 
 def _is_utf8(data: bytes) -> bool:
