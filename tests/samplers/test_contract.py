@@ -134,6 +134,8 @@ def test_input_of_wrong_type_raises(make, clouds):
             make()(clouds.half())
     with pytest.raises(UserError, match="m must be a whole number"):
         make(m=8.0)
+    with pytest.raises(UserError, match="whole number, got 8"):
+        make()(clouds, 8.0)
 
 
 @pytest.mark.parametrize("training", [True, False])

@@ -99,7 +99,7 @@ def test_arrays_in_arrays_out(net, clouds):
     points, indices = net.downsample(clouds[0].double().numpy(), readout="generated")
     assert (points.dtype, indices) == (np.float64, None)
     batch = np.repeat(np.arange(2), 10)
-    assert net.downsample(clouds[0].numpy(), batch=batch)[0].shape == (16, 3)
+    assert net.downsample(clouds[0].numpy(), np.int64(8), batch=batch)[0].shape == (16, 3)
 
 
 def test_arrays_of_any_byte_order_and_read_only_arrays(net, clouds):

@@ -1,6 +1,7 @@
 """Base class of all samplers."""
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any, Literal
 
 import torch
@@ -120,8 +121,6 @@ class Sampler(nn.Module):
             (torch.Size([8, 3]), torch.Size([8]))
         """
         m = self.m if m is None else m
-        if not isinstance(m, int) or m < 1:
-            raise UserError(f"m must be a whole number of at least 1, got {m!r}.")
         self.check_m(m)
         if readout not in READOUTS:
             raise UserError(f"readout: unknown {readout!r}.{did_you_mean(readout, READOUTS)}")
@@ -210,6 +209,8 @@ class Sampler(nn.Module):
         Raises:
             UserError: it does not.
         """
+        if not isinstance(m, Integral):
+            raise UserError(f"m must be a whole number, got {m!r}.")
         if self.flexible and not 1 <= m <= self.m:
             raise UserError(f"m must be between 1 and {self.m}, got {m}.")
         if not self.flexible and m != self.m:
