@@ -15,7 +15,7 @@ from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
 from mops_lightning.records import run_record
 from mops_lightning.samplers.fmops import FMOPSNet
-from mops_lightning.training.experiment import CHECKPOINT_KEY
+from mops_lightning.training.checkpoint import CHECKPOINT_KEY
 from mops_lightning.viz.snapshots import save_clouds
 from mops_lightning.zoo import weights
 from tests.support.records import record

@@ -5,7 +5,7 @@ from lightning.pytorch.strategies import SingleDeviceStrategy
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-from mops_lightning.training.callbacks import CHECKPOINT
+from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.divergence import Diverged, check_checkpoint, check_loss
 from mops_lightning.training.run import run
 from mops_lightning.zoo import weights

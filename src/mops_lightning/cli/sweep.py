@@ -161,8 +161,7 @@ def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
 
     Neither a failed attempt nor any attempt before it is resumed.
     """
-    from mops_lightning.training.callbacks import CHECKPOINT
-    from mops_lightning.training.checkpoint import set_aside_if_damaged
+    from mops_lightning.training.checkpoint import CHECKPOINT, set_aside_if_damaged
 
     for attempt in sorted(_attempts(folder), key=lambda path: int(path.name), reverse=True):
         try:

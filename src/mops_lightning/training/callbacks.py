@@ -17,8 +17,6 @@ from omegaconf import DictConfig, OmegaConf
 from mops_lightning.config.build import accepted, build
 from mops_lightning.errors import Interrupted, UserError
 
-CHECKPOINT = "last.ckpt"
-
 STANDARD = ("learning_rate", "checkpoint", "progress", "pictures")
 """Names in ``conf/callbacks/default.yaml``. None of them changes what is learned."""
 

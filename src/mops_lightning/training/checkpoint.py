@@ -10,9 +10,11 @@ from mops_lightning.config.comparison import trained_with
 from mops_lightning.errors import UserError
 from mops_lightning.files import set_aside
 from mops_lightning.records import run_record
-from mops_lightning.training.callbacks import CHECKPOINT
-from mops_lightning.training.experiment import CHECKPOINT_KEY
 from mops_lightning.zoo import weights
+
+CHECKPOINT = "last.ckpt"
+CHECKPOINT_KEY = "mops_lightning"
+"""Where a checkpoint keeps the identity of its run."""
 
 LENGTH = "trainer.max_epochs"
 """The planned length of a run."""

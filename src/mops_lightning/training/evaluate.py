@@ -17,7 +17,7 @@ from mops_lightning.config.declaration import Affects
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-from mops_lightning.training.callbacks import CHECKPOINT
+from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.replay import KEY, OF_RUN, place, trained_run
 from mops_lightning.zoo import weights

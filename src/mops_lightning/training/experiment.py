@@ -21,6 +21,7 @@ from mops_lightning.samplers.base import Sampler, sample_with_attributes
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
 from mops_lightning.tasks.refinement import Refinement
+from mops_lightning.training.checkpoint import CHECKPOINT_KEY
 from mops_lightning.training.distillation import Distillation, Targets
 from mops_lightning.training.divergence import check_checkpoint, check_loss
 from mops_lightning.training.learn import Learn, check_learn
@@ -28,9 +29,6 @@ from mops_lightning.training.readouts import readout_names, readouts
 from mops_lightning.training.recipe import Recipe, draw_points, straight_through
 from mops_lightning.training.scores import Scores, TransferScores
 from mops_lightning.types import Batch, SampleOutput
-
-CHECKPOINT_KEY = "mops_lightning"
-"""Where a checkpoint keeps the identity of its run."""
 
 
 class Experiment(L.LightningModule):

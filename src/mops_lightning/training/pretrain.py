@@ -16,7 +16,8 @@ from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.files import atomic_write, remove_temporary, set_aside
 from mops_lightning.training import checkpoint
-from mops_lightning.training.callbacks import CHECKPOINT, added
+from mops_lightning.training.callbacks import added
+from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.job import Job, prepare
 from mops_lightning.training.recording import recorded
 from mops_lightning.training.replay import OF_RUN

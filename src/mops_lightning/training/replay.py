@@ -12,7 +12,7 @@ from typing import Any
 from mops_lightning.config import overrides, settings
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-from mops_lightning.training.callbacks import CHECKPOINT
+from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.zoo import model_file, names
 
 KEY = "evaluate"

@@ -16,7 +16,8 @@ from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import dotted
 from mops_lightning.training.averaging import MovingAverage
-from mops_lightning.training.callbacks import CHECKPOINT, StopBetweenSteps, build_callbacks
+from mops_lightning.training.callbacks import StopBetweenSteps, build_callbacks
+from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.checkpoint_io import AtomicCheckpointIO
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.loaders import clouds_to_draw, score_loader
