@@ -13,8 +13,6 @@ from typing import Any
 import pytest
 import torch
 
-from tests.support.quick_config import remember_conf
-
 if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(2)
 
@@ -22,7 +20,6 @@ if "OMP_NUM_THREADS" not in os.environ:
 # the time of these tests.
 gc.freeze()
 gc.set_threshold(50_000, 20, 50)
-remember_conf()
 
 
 SLOW_FILES = (
