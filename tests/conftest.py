@@ -16,8 +16,8 @@ import torch
 if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(2)
 
-# Composing makes many objects, and each full collection would search all of torch: a third of
-# the time of these tests.
+# Composing makes many objects, and each full collection would search all of torch: a fifth of
+# the time of tests that compose.
 gc.freeze()
 gc.set_threshold(50_000, 20, 50)
 

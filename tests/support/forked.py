@@ -6,6 +6,7 @@ import signal
 import sys
 import tempfile
 import traceback
+import warnings
 from threading import Timer
 
 import torch
@@ -31,7 +32,10 @@ class Forked:
         reader, writer = os.pipe()
         self.errors = tempfile.TemporaryFile("w+")  # noqa: SIM115, read by communicate
         self.returncode = None
-        self.pid = os.fork()
+        with warnings.catch_warnings():
+            # Python 3.12 warns of it in processes with threads, of which nothing is used here.
+            warnings.filterwarnings("ignore", ".*multi-threaded.*", DeprecationWarning)
+            self.pid = os.fork()
         if self.pid == 0:
             os.dup2(writer, 1)
             os.dup2(self.errors.fileno(), 2)

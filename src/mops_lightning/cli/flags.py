@@ -6,7 +6,7 @@ from mops_lightning.errors import UserError, did_you_mean
 
 
 def flags_first(arguments: list[str]) -> list[str]:
-    """Move Hydra's flags before the settings, because Hydra reads only one group of settings.
+    """Move Hydra's flags before the settings, because Hydra wants all settings in one place.
 
     Args:
         arguments: of the command line, such as ``["m=8", "--cfg", "job", "sampler=fps"]``.
@@ -32,16 +32,10 @@ def flags_first(arguments: list[str]) -> list[str]:
         hint = did_you_mean(flag.split("=")[0], known)
         raise UserError(f"no flag {flag!r}.{hint} Settings are KEY=VALUE, without dashes.")
     _check_combination(read)
-    settings = list(read.overrides)
-    flags = []
-    waiting = iter(settings)
-    following = next(waiting, None)
-    for argument in arguments:
-        if argument == following:
-            following = next(waiting, None)
-        else:
-            flags.append(argument)
-    return [*flags, *settings]
+    flags = list(arguments)
+    for setting in read.overrides:
+        flags.remove(setting)
+    return [*flags, *read.overrides]
 
 
 def _check_combination(read: argparse.Namespace) -> None:
@@ -54,5 +48,5 @@ def _check_combination(read: argparse.Namespace) -> None:
     if read.experimental_rerun:
         raise UserError(
             "--experimental-rerun is not available, because the pickle that it reads can run code. "
-            "Repeat the command of the run: it is in result.json, as overrides."
+            "Repeat the run with the overrides in its result.json."
         )

@@ -60,8 +60,8 @@ def selectable_groups() -> str:
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.object_type import ObjectType
 
-    # The loader's own methods copy all it has read for every question, and Hydra resolves the
-    # text of --help in every composition: two fifths of its time.
+    # Hydra resolves the text of --help twice per command, and the loader's own methods copy all
+    # configuration files for each group: 0.15 s each time.
     files = ConfigRepository(GlobalHydra.instance().config_loader().get_search_path())
     lines = []
     for top in (*(name for name, one in settings.declared().items() if one.group), "experiment"):
