@@ -109,3 +109,9 @@ def test_rows_are_baselines_readouts_full():
     order = ["fps", "random", "generated", "matched", "refined", "full"]
     assert list(readout_rows(metrics)) == order
     assert "mops refined (with the task net)" in printed(metrics, "test/generated/accuracy")
+
+
+def test_sampler_with_anchors_is_named_as_in_reports():
+    metrics = {"test/generated/accuracy": 0.5, "test/full/accuracy": 0.875}
+    text = printed(metrics, "test/generated/accuracy", sampler={"anchors": "fps"})
+    assert cells(text)[1] == ["mops anchored generated", "50.00"]

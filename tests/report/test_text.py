@@ -1,4 +1,4 @@
-from mops_lightning.report.text import PAPER, Grid, markdown
+from mops_lightning.report.text import PAPER, Grid, latex, markdown
 
 
 def test_markdown_escapes_names():
@@ -16,3 +16,16 @@ def test_markdown_escapes_names():
         "",
         "- folder&#124;one: line line",
     ]
+
+
+def test_latex_escapes_names():
+    grid = Grid(
+        "50 % of $x_1$", [r"a\b", "c"], [["{n}\nm & <o>", "1 ± 2"], [PAPER, "~3^"]], ["p\nq"]
+    )
+    text = latex([grid], ["- folder\nline"])
+    assert r"\caption{50 \% of \$x\_1\$}" in text
+    assert "a\\textbackslash{}b & c \\\\\n" in text
+    assert "\\{n\\} m \\& $<$o$>$ & 1 $\\pm$ 2 \\\\\n" in text
+    assert "\\emph{the paper's} & \\textasciitilde{}3\\textasciicircum{} \\\\\n" in text
+    assert "% p q\n" in text
+    assert text.endswith("% - folder line\n")

@@ -88,16 +88,20 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
     except (UserError, OSError) as error:
         text = file_error(error) if isinstance(error, OSError) else str(error)
         log.error(f"{folder} failed: {text}")
-        with suppress(OSError):  # the disk may be full
-            (folder / FAILED).write_text(f"{text}\n")
+        _note_failure(folder, text)
     except Exception as error:
         text = memory_error(error) or f"{type(error).__name__}: {error}"
-        (folder / FAILED).write_text(f"{text}\n")
+        _note_failure(folder, text)
         if memory_error(error):
             log.error(f"{folder} failed: {text}")
         else:
             log.exception(f"{folder} failed")
     return math.nan
+
+
+def _note_failure(folder: Path, text: str) -> None:
+    with suppress(OSError):  # the disk may be full
+        (folder / FAILED).write_text(f"{text}\n")
 
 
 @contextmanager

@@ -97,7 +97,7 @@ def results_table(record: dict[str, Any]) -> tuple[str, Table]:
             "" if value is None else columns[column][1].format(value)
             for column, value in values.items()
         ]
-        table.add_row(_label(readout, names["sampler"]), *cells)
+        table.add_row(_label(readout, sampler_name(config)), *cells)
     return f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test", table
 
 
@@ -129,10 +129,16 @@ def transfer_table(record: dict[str, Any]) -> tuple[str, Table] | None:
         own = record["metrics"].get(f"test/{size_prefix(parts.m)}{parts.readout}/{parts.metric}")
         cells = [own, *(values[parts].get(net) for net in nets)]
         table.add_row(
-            size + _label(parts.readout, names["sampler"]),
+            size + _label(parts.readout, sampler_name(record["config"])),
             *("" if cell is None else info.format(cell) for cell in cells),
         )
     return f"the same samples under other nets, {info.title}", table
+
+
+def sampler_name(config: dict[str, Any]) -> str:
+    """Return the name of a run's sampler; a MOPS-Net with anchors is ``mops anchored``."""
+    anchored = (config.get("sampler") or {}).get("anchors")
+    return config["names"]["sampler"] + (" anchored" if anchored else "")
 
 
 def _label(readout: str, sampler: str) -> str:

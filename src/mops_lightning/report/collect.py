@@ -9,6 +9,7 @@ from mops_lightning.records import run_record
 from mops_lightning.records.attempts import ASIDE, FAILED
 from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import parse
+from mops_lightning.records.summary import sampler_name
 
 Record = dict[str, Any]
 """A run record, with its path under ``folder``."""
@@ -160,9 +161,7 @@ def sampler_row(record: Record) -> str:
 
     That is ``anchored`` for a MOPS-Net with anchors, and its recipe unless it is the paper's.
     """
-    config = record["config"]
-    anchored = "anchored" if (config.get("sampler") or {}).get("anchors") else None
-    parts = [config["names"]["sampler"], anchored, recipe(record).get("name")]
+    parts = [sampler_name(record["config"]), recipe(record).get("name")]
     return " ".join(filter(None, parts))
 
 

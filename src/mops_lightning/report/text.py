@@ -51,7 +51,15 @@ def _escaped(text: str) -> str:
     return " ".join(text.splitlines()).translate(SPECIAL)
 
 
-TEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "°": r"$^\circ$", "±": r"$\pm$"}
+TEX = {letter: f"\\{letter}" for letter in "&%_#${}"} | {
+    "\\": r"\textbackslash{}",
+    "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}",
+    "<": "$<$",
+    ">": "$>$",
+    "°": r"$^\circ$",
+    "±": r"$\pm$",
+}
 
 
 def latex(grids: list[Grid], remarks: list[str]) -> str:
@@ -64,15 +72,19 @@ def latex(grids: list[Grid], remarks: list[str]) -> str:
             f"\\caption{{{_tex(grid.title)}}}\n"
             f"\\begin{{tabular}}{{l{'r' * (len(grid.head) - 1)}}}\n\\toprule\n"
             f"{' & '.join(map(_tex, grid.head))} \\\\\n\\midrule\n{body}\n\\bottomrule\n"
-            "\\end{tabular}\n\\end{table}\n" + "".join(f"% {line}\n" for line in grid.below)
+            "\\end{tabular}\n\\end{table}\n" + _comments(grid.below)
         )
-    return "\n".join(parts) + "".join(f"% {' '.join(line.split())}\n" for line in remarks)
+    return "\n".join(parts) + _comments(remarks)
+
+
+def _comments(lines: list[str]) -> str:
+    return "".join(f"% {' '.join(line.split())}\n" for line in lines)
 
 
 def _tex(text: str) -> str:
     if text.startswith("*") and text.endswith("*"):
         return f"\\emph{{{_tex(text[1:-1])}}}"
-    return "".join(TEX.get(letter, letter) for letter in text)
+    return "".join(TEX.get(letter, letter) for letter in " ".join(text.splitlines()))
 
 
 def long_csv(found: list[Record], net: str, keys: list[str]) -> str:
