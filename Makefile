@@ -1,8 +1,9 @@
 # Needs only Python >= 3.11 with venv, and make.
 PYTHON ?= python3
 BIN := .venv/bin
-# Test processes, each with one thread and about 1 GB.
-WORKERS ?= 2
+# Test processes, each with one thread and about 1 GB. On two cores a third one uses the time that
+# the others spend waiting for browsers, schedulers and processes that they start.
+WORKERS ?= 3
 # Examples of each kind that `make fuzz` tries.
 EXAMPLES ?= 1000
 
