@@ -1,7 +1,6 @@
 """What every sampler guarantees. A new sampler adds one line to SAMPLERS."""
 
 from collections.abc import Callable
-from inspect import Parameter, signature
 from typing import Any
 
 import pytest
@@ -54,46 +53,6 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "snet-progressive": lambda m: ProgressiveSNet(m, **SMALL),
     "samplenet-progressive": lambda m: ProgressiveSampleNet(m, k=3, **SMALL),
 }
-FEATURES: dict[str, Any] = {"feature_channels": (64, 64, 64, 128, 128)}
-MOPS: dict[str, Any] = {
-    **{"alpha": 30.0, "tau_min": 0.1, "annealing": "exponential", "threshold": 0.0},
-    **{"rho_channels": (512, 256, 128), "attributes": (), "anchors": None, **FEATURES},
-    "anchor_width": 0.5,
-}
-SNET: dict[str, Any] = {
-    **{"alpha": 30.0, "coverage": 1.0, "coverage_per_point": 0.0, **FEATURES},
-    **{"head_channels": (256, 256, 256), "head_norm": True, "output_norm": True},
-}
-DEFAULTS: dict[type[Sampler], dict[str, Any]] = {
-    RandomSampler: {"seed": 0},
-    FPSSampler: {"seed": 0, "start": None},
-    VoxelSampler: {"pick": "nearest"},
-    PoissonSampler: {"seed": 0},
-    SubmodularSampler: {"net": None, "weighting": "none", "seed": 0},
-    CriticalSampler: {"net": None, "seed": 0},
-    GumbelSampler: {"tau_min": 0.1, "key_channels": (256, 128), "attributes": (), **FEATURES},
-    MOPSNet: MOPS,
-    FMOPSNet: {"m_max": 512, "size_sampling": "nested", "num_sizes": 4},
-    SNet: SNET,
-    SampleNet: {"k": 7, "beta": 1.0, "gamma": None, "sigma_min": 0.0},
-    ProgressiveSNet: {"m_max": 1024, "min_size": 2, "size_reduction": "sum"},
-    ProgressiveSampleNet: {"m_max": 1024, "min_size": 2, "size_reduction": "sum"},
-}
-"""Of the constructors, as published or documented."""
-LIMITS: list[tuple[type[Sampler], dict[str, Any]]] = [
-    (FPSSampler, {"start": 0}),
-    (FPSSampler, {"start": 59}),
-    (GumbelSampler, {"tau_min": 1.0}),
-    (MOPSNet, {"alpha": 0.0, "tau_min": 1.0, "threshold": 0.0}),
-    (FMOPSNet, {"num_sizes": 1}),
-    (SNet, {"alpha": 0.0, "coverage": 0.0, "coverage_per_point": 0.0}),
-    (SampleNet, {"k": 1, "beta": 0.0, "gamma": 0.0, "sigma_min": 0.0}),
-    (SampleNet, {"k": 60}),
-    (ProgressiveSNet, {"min_size": 1}),
-]
-"""The smallest and largest allowed arguments."""
-NOT_FLEXIBLE = (GumbelSampler, MOPSNet, SNet, SampleNet)
-FLEXIBLE_NOT_NESTED = (VoxelSampler, PoissonSampler)
 SEEDED = ["random", "fps", "poisson"]
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 B, N, M = 3, 60, 8
@@ -178,19 +137,6 @@ def test_indices_are_distinct_rows_of_input(make, clouds, cloud, rng):
         assert len(set(output.indices[b].tolist())) == M
 
 
-@pytest.mark.parametrize("sampler", DEFAULTS)
-def test_constructor_has_documented_defaults(sampler):
-    arguments = signature(sampler.__init__).parameters.values()
-    found = {a.name: a.default for a in arguments if a.default is not Parameter.empty}
-    assert found == DEFAULTS[sampler]
-
-
-@pytest.mark.parametrize("sampler", DEFAULTS)
-def test_sampler_declares_sizes(sampler):
-    assert sampler.flexible == (sampler not in NOT_FLEXIBLE)
-    assert sampler.nested == (sampler not in (*NOT_FLEXIBLE, *FLEXIBLE_NOT_NESTED))
-
-
 def test_several_sizes_equal_single_sizes_and_are_nested_where_declared(make, clouds):
     sampler = make()
     if sampler.flexible:
@@ -204,12 +150,6 @@ def test_several_sizes_equal_single_sizes_and_are_nested_where_declared(make, cl
 def test_sampler_without_sample_raises(clouds):
     with pytest.raises(NotImplementedError):
         Sampler(M)(clouds)
-
-
-@pytest.mark.parametrize(("sampler", "arguments"), LIMITS)
-def test_constructor_accepts_limits(sampler, arguments, clouds):
-    made = sampler(M, **arguments)
-    assert made.train()(clouds).points.shape == (B, M, 3)
 
 
 def test_result_does_not_depend_on_default_device(make, clouds):
