@@ -28,7 +28,7 @@ def test_comparable_joint_runs_have_own_task_nets(tmp_path):
         put(tmp_path, name, 32, {**metrics, "test/full/accuracy": 0.9}, notes=notes)
     text = table(tmp_path)
     assert [row[0] for row in rows(text) if "paper" not in row[0]] == ["sampled by", "snet", "mops"]
-    assert "pointnet on all points after joint training with snet: 90.00" in text
+    assert "pointnet on all points after joint training with snet, m=32: 90.00" in text
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
     with pytest.raises(UserError, match=r"differ in what was trained"):
         table(tmp_path)

@@ -7,7 +7,7 @@ from pathlib import Path
 from mops_lightning.errors import UserError
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import metric_info
-from mops_lightning.records.readout_names import FULL
+from mops_lightning.records.readout_names import FULL, parse
 from mops_lightning.report import paper
 from mops_lightning.report.axes import Axes, axes, value
 from mops_lightning.report.cells import Cells, make_cells, sort_key
@@ -177,12 +177,16 @@ def _full_lines(found: list[Record], names: dict[str, str], metric: MetricInfo) 
         metric = metric_info(metric.full_cloud_metric, found)
         label = f"{metric.title} "
     lines: dict[str, None] = {}  # a dictionary as a set in order
-    for record in found:
+    for record in sorted(found, key=lambda one: (sampler_row(one), -one["config"]["m"])):
         figure = record["metrics"].get(f"test/{FULL}/{metric.name}")
         if figure is None:
             continue
-        net, sampler = (record["config"]["names"][key] for key in ("net", "sampler"))
-        after = f" after joint training with {sampler}" if trained_with(record) == "joint" else ""
+        net = record["config"]["names"]["net"]
+        after = ""
+        if trained_with(record) == "joint":
+            several = any(parts.m for parts in map(parse, record["metrics"]) if parts)
+            size = "" if several else f", m={record['config']['m']}"
+            after = f" after joint training with {sampler_row(record)}{size}"
         compared = published if net == names["net"] else ""
         lines[f"{net} on all points{after}: {label}{metric.format(figure)}{compared}."] = None
     return list(lines)

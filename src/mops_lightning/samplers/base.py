@@ -219,6 +219,13 @@ class Sampler(nn.Module):
                 f"m must be {self.m}, the size this {type(self).__name__} was made for, got {m}."
             )
 
+    def check_cloud_size(self, n: int) -> None:
+        """Check that the sampler's settings allow clouds of ``n`` points.
+
+        Raises:
+            UserError: they do not.
+        """
+
 
 def sample_with_attributes(
     sampler: Sampler, points: Tensor, sizes: Sequence[int]

@@ -58,17 +58,24 @@ class FPSSampler(Sampler):
         self.seed = seed
         self.start = start
 
+    def check_cloud_size(self, n: int) -> None:
+        """Check that ``start`` is the index of one of ``n`` points.
+
+        Raises:
+            UserError: it is not.
+        """
+        if isinstance(self.start, int) and self.start >= n:
+            raise UserError(
+                f"start must be less than the number of points N={n}, got {self.start}."
+            )
+
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice.
 
         Raises:
             UserError: ``start`` is not the index of a point.
         """
-        if isinstance(self.start, int) and self.start >= points.shape[1]:
-            raise UserError(
-                f"start must be less than the number of points N={points.shape[1]}, "
-                f"got {self.start}."
-            )
+        self.check_cloud_size(points.shape[1])
         indices = farthest_rows(points, m, self.seed, self.start)
         return SampleOutput(gather_points(points, indices), indices, {})
 

@@ -8,7 +8,7 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-from mops_lightning.config.build import accepted, build
+from mops_lightning.config.build import accepted, build, settings_named
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.nets.layers import fit_attribute_scales
@@ -53,6 +53,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         baselines = _make_baselines(cfg, max(sizes), net)
     elif sampler is not None and sampler.flexible:
         sampler = build(cfg.sampler, "sampler", m=max(sizes), **own)
+    _check_cloud_size(cfg, sampler, baselines, points)
     if attributes:
         for one in (sampler, *baselines.values()):
             _check_attributes(one, attributes)
@@ -132,6 +133,18 @@ def _make_baseline(name: str, node: DictConfig, m: int, seed: int, net: dict[str
     """Build an index sampler for ``m`` points, with the run's seed unless it has its own."""
     own = accepted(node, net if "seed" in node else {**net, "seed": seed})
     return build(node, f"baselines.{name}", m=m, **own)
+
+
+def _check_cloud_size(
+    cfg: DictConfig, sampler: Sampler | None, baselines: dict[str, Sampler], n: int
+) -> None:
+    """Let samplers refuse clouds of ``n`` points before anything is trained."""
+    if sampler is not None:
+        with settings_named(cfg.sampler, "sampler", "m"):
+            sampler.check_cloud_size(n)
+    for name, baseline in baselines.items():
+        with settings_named(cfg.baselines[name], f"baselines.{name}", "m", "seed"):
+            baseline.check_cloud_size(n)
 
 
 def _try_optimizer(make_optimizer: Any, make_schedule: Any) -> None:
