@@ -5,11 +5,13 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     # Workers share the cores; what they start inherits this. Read once, when torch is imported.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import random
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -42,6 +44,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return SLOW_FILES.index(name) if name in SLOW_FILES else len(SLOW_FILES)
 
     items.sort(key=rank)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Seed the global generators: which tests ran before in this process depends on the machine."""
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002  libraries use it
+    torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session")

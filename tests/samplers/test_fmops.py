@@ -74,6 +74,19 @@ def test_training_sizes_have_documented_distribution():
     assert {len(sizes) for sizes in nested} <= {3, 4}
 
 
+@pytest.mark.parametrize("size_sampling", ["uniform", "log_uniform", "nested"])
+def test_training_sizes_begin_at_min_size(size_sampling):
+    sizes = drawn(2000, 32, size_sampling=size_sampling, num_sizes=2, min_size=8)
+    assert {size for step in sizes for size in step} == set(range(8, 33))
+    assert set(small(4, size_sampling=size_sampling, min_size=8).training_sizes()) == {4}
+
+
+def test_nested_training_sizes_split_the_range_from_min_size():
+    for small_size, large_size in drawn(300, num_sizes=2, min_size=8):
+        # The middle of the range of logarithms: sqrt(8 · 513) = 64.06.
+        assert 8 <= small_size <= 64 <= large_size <= 512
+
+
 def test_training_sizes_depend_on_seed():
     assert drawn(20) == drawn(20)
     assert len(set(drawn(20))) > 15
@@ -89,6 +102,7 @@ def test_training_sizes_of_tiny_net_are_valid():
     [
         ({"size_sampling": "nestd"}, "^size_sampling: unknown 'nestd'.*nested"),
         ({"num_sizes": 0}, "^num_sizes must be at least 1, got 0"),
+        ({"min_size": 0}, "^min_size must be at least 1, got 0"),
         ({"tau_min": 0.0}, "^tau_min must"),
     ],
 )

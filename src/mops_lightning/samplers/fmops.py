@@ -23,12 +23,14 @@ class FMOPSNet(MOPSNet):
 
     Args:
         m_max: largest number of points.
-        size_sampling: how a training step chooses its sizes. ``uniform`` draws one m from 1 to
-            m_max, as in the paper; ``log_uniform`` draws one m with a uniform logarithm, which
+        size_sampling: how a training step chooses its sizes. ``uniform`` draws one m from min_size
+            to m_max, as in the paper; ``log_uniform`` draws one m with a uniform logarithm, which
             favours small sizes; ``nested`` splits the range of logarithms into ``num_sizes`` equal
             parts and draws one m from each. The sizes of a step share one forward pass of the
             sampler, and their losses are averaged.
         num_sizes: number of sizes with ``nested``.
+        min_size: smallest training size, or m_max if that is smaller. Smaller samples can be taken,
+            but are not trained for.
         **settings: arguments of ``MOPSNet``.
 
     Raises:
@@ -51,6 +53,7 @@ class FMOPSNet(MOPSNet):
         m_max: int = 512,
         size_sampling: Literal["nested", "uniform", "log_uniform"] = "nested",
         num_sizes: int = 4,
+        min_size: int = 1,
         **settings: Any,
     ) -> None:
         super().__init__(m_max, **settings)
@@ -59,15 +62,20 @@ class FMOPSNet(MOPSNet):
             raise UserError(f"size_sampling: unknown {size_sampling!r}.{hint}")
         if num_sizes < 1:
             raise UserError(f"num_sizes must be at least 1, got {num_sizes}.")
+        if min_size < 1:
+            raise UserError(f"min_size must be at least 1, got {min_size}.")
         self.size_sampling = size_sampling
         self.num_sizes = num_sizes
+        self.min_size = min_size
 
     def training_sizes(self) -> tuple[int, ...]:
         """Draw the sizes of one training step, ascending, from torch's global generator."""
+        smallest = min(self.min_size, self.m)
         if self.size_sampling == "uniform":
-            return (int(torch.randint(1, self.m + 1, ())),)
+            return (int(torch.randint(smallest, self.m + 1, ())),)
         parts = self.num_sizes if self.size_sampling == "nested" else 1
         exponents = (torch.arange(parts) + torch.rand(parts)).double() / parts
-        # floor((m_max + 1)^u) ranges from 1 to m_max, with probabilities ∝ log(1 + 1/m).
-        sizes = ((self.m + 1) ** exponents).long().clamp(1, self.m)
-        return tuple(sizes.unique().tolist())
+        # For a smallest size of 1, floor((m_max + 1)^u) ranges from 1 to m_max, with
+        # probabilities ∝ log(1 + 1/m).
+        sizes = smallest * ((self.m + 1) / smallest) ** exponents
+        return tuple(sizes.long().clamp(smallest, self.m).unique().tolist())
