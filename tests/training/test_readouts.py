@@ -30,9 +30,10 @@ def test_readouts_generating_sampler_matches_and_completes_every_size(sampler, s
     assert tuple(found) == sizes
     for m, samples in found.items():
         assert tuple(samples) == readout_names(sampler) == ("generated", "matched", "completed")
-        generated = sampler(points, m).points
+        generated = samples["generated"]
+        # Products of other shapes are rounded differently on some processors.
+        torch.testing.assert_close(generated, sampler(points, m).points)
         matched = match(generated, points)
-        assert torch.equal(samples["generated"], generated)
         assert torch.equal(samples["matched"], gather_points(points, matched))
         assert torch.equal(samples["completed"], gather_points(points, complete(matched, points)))
 
