@@ -65,6 +65,20 @@ def test_evaluate_old_record_accepts_renamed_settings(trained, tmp_path):
     assert again.metrics == record.metrics
 
 
+def test_evaluate_older_record_without_newer_setting(trained, tmp_path):
+    folder, record = trained
+    shutil.copytree(folder, tmp_path / "run")
+    sampler = {k: v for k, v in record.config["sampler"].items() if k != "min_size"}
+    assert sampler != record.config["sampler"]
+    run_record.write(
+        tmp_path / "run", {**record.plain(), "config": {**record.config, "sampler": sampler}}
+    )
+    again = evaluated((tmp_path / "run", record), tmp_path)
+    assert again.metrics == record.metrics
+    with pytest.raises(UserError, match=r"sampler\.min_size must be 1, as in .*, got 2"):
+        evaluated((tmp_path / "run", record), tmp_path / "other", "sampler.min_size=2")
+
+
 def test_evaluate_other_sizes_and_data(trained, tmp_path):
     record = evaluated(trained, tmp_path, "sizes=[5,20]", "dataset.n_points=100")
     sizes = {name.split("/")[1] for name in record.metrics if name.endswith("matched/accuracy")}

@@ -6,6 +6,7 @@ A run that trained only a task net is tested on full clouds.
 command line, trains nothing, and writes a record of its own.
 """
 
+from inspect import Parameter
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config import settings
+from mops_lightning.config.build import signature
 from mops_lightning.config.declaration import Affects
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
@@ -169,11 +171,25 @@ def _same_settings(
             f"{KEY}: the task net of {run} is {there['names']['net']}; for "
             f"task/net={here['names']['net']} also give its weights: weights=auto or weights=FILE."
         )
-    for key in sorted({*there["sampler"], *here["sampler"]}) if cfg.learn != "task" else ():
-        old, new = there["sampler"].get(key), here["sampler"].get(key)
+    if cfg.learn != "task":
+        _same_sampler(here["sampler"], there["sampler"], run)
+
+
+def _same_sampler(here: dict[str, Any], there: dict[str, Any], run: str) -> None:
+    parameters = signature(str(here["_target_"]), "sampler")
+    for key in sorted({*there, *here}):
+        old, new = (_sampler_setting(node, key, parameters) for node in (there, here))
         if old != new and Affects.TRAINING in settings.of(f"sampler.{key}").affects:
             hint = " For other sizes of a flexible sampler give sizes=[...]." if key == "m" else ""
             raise UserError(
                 f"{KEY}: sampler.{key} must be {old}, as in {run}, got {new}. "
                 f"Leave it out, or train a sampler with it.{hint}"
             )
+
+
+def _sampler_setting(node: dict[str, Any], key: str, parameters: dict[str, Parameter]) -> Any:
+    """Return a setting, by default the constructor's: older records lack newer settings."""
+    if key in node or key not in parameters:
+        return node.get(key)
+    default = parameters[key].default
+    return list(default) if isinstance(default, tuple) else default
