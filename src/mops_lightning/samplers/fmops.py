@@ -75,7 +75,6 @@ class FMOPSNet(MOPSNet):
             return (int(torch.randint(smallest, self.m + 1, ())),)
         parts = self.num_sizes if self.size_sampling == "nested" else 1
         exponents = (torch.arange(parts) + torch.rand(parts)).double() / parts
-        # For a smallest size of 1, floor((m_max + 1)^u) ranges from 1 to m_max, with
-        # probabilities ∝ log(1 + 1/m).
+        # floor(a·((m_max + 1)/a)^u) ranges from a to m_max, with probabilities ∝ log(1 + 1/m).
         sizes = smallest * ((self.m + 1) / smallest) ** exponents
         return tuple(sizes.long().clamp(smallest, self.m).unique().tolist())
