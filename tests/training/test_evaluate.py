@@ -65,18 +65,40 @@ def test_evaluate_old_record_accepts_renamed_settings(trained, tmp_path):
     assert again.metrics == record.metrics
 
 
+def changed_record(trained, folder, sampler):
+    """Copy a run, with other sampler's settings in its record."""
+    shutil.copytree(trained[0], folder)
+    record = trained[1]
+    run_record.write(folder, {**record.plain(), "config": {**record.config, "sampler": sampler}})
+    return folder, record
+
+
 def test_evaluate_older_record_without_newer_setting(trained, tmp_path):
-    folder, record = trained
-    shutil.copytree(folder, tmp_path / "run")
-    sampler = {k: v for k, v in record.config["sampler"].items() if k != "min_size"}
-    assert sampler != record.config["sampler"]
-    run_record.write(
-        tmp_path / "run", {**record.plain(), "config": {**record.config, "sampler": sampler}}
-    )
-    again = evaluated((tmp_path / "run", record), tmp_path)
-    assert again.metrics == record.metrics
+    sampler = {k: v for k, v in trained[1].config["sampler"].items() if k != "min_size"}
+    assert sampler != trained[1].config["sampler"]
+    older = changed_record(trained, tmp_path / "run", sampler)
+    again = evaluated(older, tmp_path)
+    assert again.metrics == trained[1].metrics
+    # The constructor's default, not that of today's configuration.
+    assert (again.config["sampler"]["min_size"], trained[1].config["sampler"]["min_size"]) == (1, 8)
     with pytest.raises(UserError, match=r"sampler\.min_size must be 1, as in .*, got 2"):
-        evaluated((tmp_path / "run", record), tmp_path / "other", "sampler.min_size=2")
+        evaluated(older, tmp_path / "other", "sampler.min_size=2")
+
+
+def test_evaluate_record_of_other_defaults(trained, tmp_path):
+    sampler = {**trained[1].config["sampler"], "tau_min": 1.0, "num_sizes": 2}
+    again = evaluated(changed_record(trained, tmp_path / "run", sampler), tmp_path)
+    assert again.config["sampler"] == sampler
+    assert again.metrics != trained[1].metrics
+
+
+def test_evaluate_takes_no_code_from_settings_of_record(trained, tmp_path):
+    target = {**trained[1].config["sampler"], "_target_": "pathlib.Path"}
+    with pytest.raises(UserError, match=r"sampler\._target_ must be pathlib\.Path, as in .*run"):
+        evaluated(changed_record(trained, tmp_path / "run", target), tmp_path)
+    resolved = {**trained[1].config["sampler"], "num_sizes": "${oc.env:HOME}"}
+    with pytest.raises(UserError, match=r"sampler\.num_sizes must be \$\{oc\.env:HOME\}"):
+        evaluated(changed_record(trained, tmp_path / "other", resolved), tmp_path / "new")
 
 
 def test_evaluate_other_sizes_and_data(trained, tmp_path):

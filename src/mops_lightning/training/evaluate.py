@@ -6,14 +6,14 @@ A run that trained only a task net is tested on full clouds.
 command line, trains nothing, and writes a record of its own.
 """
 
-from inspect import Parameter
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
-from mops_lightning.config import settings
+from mops_lightning.config import overrides, settings
 from mops_lightning.config.build import signature
 from mops_lightning.config.declaration import Affects
 from mops_lightning.data.clouds import CloudDataset
@@ -21,9 +21,41 @@ from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.replay import KEY, OF_RUN, place, trained_run
+from mops_lightning.training.replay import KEY, OF_RUN, names_code, place, trained_run
 from mops_lightning.zoo import weights
 from mops_lightning.zoo.closed_list import attributes_in
+
+
+def as_trained(cfg: DictConfig, given: list[str]) -> DictConfig:
+    """Return the configuration of an evaluation with its run's values of the sampler's settings.
+
+    The defaults may have changed since. Only plain values are taken from a record, as from its
+    overrides. What is given explicitly stays, for ``load`` to judge.
+
+    Args:
+        cfg: a composed configuration.
+        given: the overrides it was composed from.
+
+    Raises:
+        UserError: ``cfg.evaluate`` is not a completed run that trained something.
+    """
+    if not cfg.evaluate or cfg.learn == "task":
+        return cfg
+    there = trained_run(cfg.evaluate)["config"]
+    if there["names"]["sampler"] != cfg.names.sampler:
+        return cfg
+    here: Any = OmegaConf.to_container(cfg.sampler, resolve=True)
+    keys = {overrides.key(argument) for argument in given}
+    changed = {
+        key: old
+        for key, (old, _) in _differences(here, there["sampler"]).items()
+        if f"sampler.{key}" not in keys and not OmegaConf.is_interpolation(cfg.sampler, key)
+    }
+    plain = {key: old for key, old in changed.items() if not names_code({key: old})}
+    cfg = deepcopy(cfg)
+    with open_dict(cfg):
+        cfg.sampler.update(plain)
+    return cfg
 
 
 def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict[str, Any]:
@@ -176,20 +208,26 @@ def _same_settings(
 
 
 def _same_sampler(here: dict[str, Any], there: dict[str, Any], run: str) -> None:
-    parameters = signature(str(here["_target_"]), "sampler")
-    for key in sorted({*there, *here}):
-        old, new = (_sampler_setting(node, key, parameters) for node in (there, here))
-        if old != new and Affects.TRAINING in settings.of(f"sampler.{key}").affects:
-            hint = " For other sizes of a flexible sampler give sizes=[...]." if key == "m" else ""
-            raise UserError(
-                f"{KEY}: sampler.{key} must be {old}, as in {run}, got {new}. "
-                f"Leave it out, or train a sampler with it.{hint}"
-            )
+    for key, (old, new) in _differences(here, there).items():
+        hint = " For other sizes of a flexible sampler give sizes=[...]." if key == "m" else ""
+        raise UserError(
+            f"{KEY}: sampler.{key} must be {old}, as in {run}, got {new}. "
+            f"Leave it out, or train a sampler with it.{hint}"
+        )
 
 
-def _sampler_setting(node: dict[str, Any], key: str, parameters: dict[str, Parameter]) -> Any:
-    """Return a setting, by default the constructor's: older records lack newer settings."""
-    if key in node or key not in parameters:
-        return node.get(key)
-    default = parameters[key].default
-    return list(default) if isinstance(default, tuple) else default
+def _differences(here: dict[str, Any], there: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Return the settings of the training in which two samplers differ: old and new value.
+
+    Records lack settings that are newer than they: those have the constructor's default.
+    """
+    defaults = {
+        key: list(one.default) if isinstance(one.default, tuple) else one.default
+        for key, one in signature(str(here["_target_"]), "sampler").items()
+    }
+    pairs = {
+        key: tuple(node.get(key, defaults.get(key)) for node in (there, here))
+        for key in sorted({*there, *here})
+        if Affects.TRAINING in settings.of(f"sampler.{key}").affects
+    }
+    return {key: (old, new) for key, (old, new) in pairs.items() if old != new}

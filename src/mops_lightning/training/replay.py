@@ -148,7 +148,7 @@ def _check_recorded(argument: str, folder: str) -> None:
         override is None
         or override.is_sweep_override()
         or any(part.startswith("_") for part in re.split(r"[.@/]", key))
-        or _names_code(value)
+        or names_code(value)
         or (is_group and not all(NAME.fullmatch(str(one)) for one in choices))
     ):
         raise UserError(
@@ -157,12 +157,12 @@ def _check_recorded(argument: str, folder: str) -> None:
         )
 
 
-def _names_code(value: Any) -> bool:
+def names_code(value: Any) -> bool:
     """Return whether a value holds a special key such as ``_target_``, or an interpolation."""
     if isinstance(value, dict):
-        return any(str(key).startswith("_") or _names_code(one) for key, one in value.items())
+        return any(str(key).startswith("_") or names_code(one) for key, one in value.items())
     if isinstance(value, list):
-        return any(map(_names_code, value))
+        return any(map(names_code, value))
     return "${" in str(value)
 
 
