@@ -14,7 +14,8 @@ from mops_lightning.data.noise import noisy_clouds
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import closing_lines
-from mops_lightning.training import evaluate, pretrain
+from mops_lightning.training import pretrain
+from mops_lightning.training.evaluated_settings import as_trained
 from mops_lightning.training.job import prepare
 from mops_lightning.training.recording import recorded
 from mops_lightning.training.stages import fit_and_test
@@ -40,7 +41,7 @@ def run(
     Raises:
         UserError: a mistake in settings or files.
     """
-    cfg = evaluate.as_trained(cfg, overrides or [])
+    cfg = as_trained(cfg, overrides or [])
     check(cfg)
     leads = not distributed.is_worker_rank(cfg)
     if leads and not claimed:
