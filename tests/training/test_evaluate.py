@@ -92,6 +92,22 @@ def test_evaluate_record_of_other_defaults(trained, tmp_path):
     assert again.metrics != trained[1].metrics
 
 
+def test_evaluate_record_with_settings_of_its_recipe_and_of_no_file(trained, tmp_path):
+    sampler = {**trained[1].config["sampler"], "size_sampling": "uniform", "threshold": 0.0}
+    sampler["feature_channels"] = [64, 64, 64, 128, 128]
+    again = evaluated(changed_record(trained, tmp_path / "run", sampler), tmp_path)
+    assert again.config["sampler"]["size_sampling"] == "uniform"
+    assert again.metrics == trained[1].metrics
+
+
+def test_evaluate_refuses_other_sampler_settings_however_they_are_given(trained, tmp_path):
+    with pytest.raises(UserError, match=r"sampler\.alpha must be 30\.0, as in .*, got 3"):
+        evaluated(trained, tmp_path, "sampler=fmops", "++sampler={alpha:3}")
+    cfg = compose(command_line([f"evaluate={trained[0]}", "sampler.alpha=3"]))
+    with pytest.raises(UserError, match=r"sampler\.alpha must be 30\.0, as in .*, got 3"):
+        run(cfg, tmp_path / "python")
+
+
 def test_evaluate_takes_no_code_from_settings_of_record(trained, tmp_path):
     target = {**trained[1].config["sampler"], "_target_": "pathlib.Path"}
     with pytest.raises(UserError, match=r"sampler\._target_ must be pathlib\.Path, as in .*run"):

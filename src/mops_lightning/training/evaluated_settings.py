@@ -1,5 +1,6 @@
 """The settings of an evaluation and those of the run that it tests."""
 
+import re
 from copy import deepcopy
 from typing import Any
 
@@ -13,8 +14,11 @@ from mops_lightning.errors import UserError
 from mops_lightning.training.replay import KEY, OF_RUN, names_code, place, trained_run
 from mops_lightning.zoo import weights
 
+SHARED = re.compile(r"\$\{\w+\}")
+"""A setting that follows one of the command line, such as ``sampler.m`` follows ``m``."""
 
-def as_trained(cfg: DictConfig, given: list[str]) -> DictConfig:
+
+def as_trained(cfg: DictConfig, given: list[str] | None) -> DictConfig:
     """Return the configuration of an evaluation with its run's values of the sampler's settings.
 
     The defaults may have changed since. Only plain values are taken from a record, as from its
@@ -22,26 +26,28 @@ def as_trained(cfg: DictConfig, given: list[str]) -> DictConfig:
 
     Args:
         cfg: a composed configuration.
-        given: the overrides it was composed from.
+        given: the overrides it was composed from; None if all settings count as given.
 
     Raises:
         UserError: ``cfg.evaluate`` is not a completed run that trained something.
     """
-    if not cfg.evaluate or cfg.learn == "task":
+    whole = any(argument.lstrip("+").startswith("sampler={") for argument in given or [])
+    if given is None or whole or not cfg.evaluate or cfg.learn == "task":
         return cfg
     there = trained_run(cfg.evaluate)["config"]
     if there["names"]["sampler"] != cfg.names.sampler:
         return cfg
     here: Any = OmegaConf.to_container(cfg.sampler, resolve=True)
+    raw: Any = OmegaConf.to_container(cfg.sampler, resolve=False)
     keys = {overrides.key(argument) for argument in given}
     changed = {
         key: old
         for key, (old, _) in _differences(here, there["sampler"]).items()
-        if f"sampler.{key}" not in keys and not OmegaConf.is_interpolation(cfg.sampler, key)
+        if f"sampler.{key}" not in keys and not SHARED.fullmatch(str(raw.get(key)))
     }
     plain = {key: old for key, old in changed.items() if not names_code({key: old})}
     cfg = deepcopy(cfg)
-    with open_dict(cfg):
+    with open_dict(cfg.sampler):
         cfg.sampler.update(plain)
     return cfg
 

@@ -41,7 +41,7 @@ def run(
     Raises:
         UserError: a mistake in settings or files.
     """
-    cfg = as_trained(cfg, overrides or [])
+    cfg = as_trained(cfg, overrides)
     check(cfg)
     leads = not distributed.is_worker_rank(cfg)
     if leads and not claimed:
