@@ -185,3 +185,9 @@ def test_command_line_pretraining_takes_its_settings(run):
     assert "epochs.task=2" in overrides_after(
         f"evaluate={run}", "epochs.task=2", "weights=auto", "trainer=cpu"
     )
+
+
+def test_command_line_run_without_a_name_raises():
+    with pytest.raises(UserError, match=r"^evaluate=: no run is given\. Give a run's folder or a "):
+        command_line(["task=registration", "evaluate="])
+    assert command_line(["evaluate=null"]) == ["evaluate=null"]

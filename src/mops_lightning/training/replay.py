@@ -91,6 +91,10 @@ def _chosen(argument: str) -> str | None:
     if override.is_sweep_override():
         raise UserError(f"{argument}: {KEY} takes one run. Start one evaluation for each.")
     value = override.value()
+    if value == "":
+        raise UserError(
+            f"{argument}: no run is given. Give a run's folder or a model, or leave it out."
+        )
     return None if value is None else str(value)
 
 
