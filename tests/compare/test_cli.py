@@ -4,7 +4,9 @@ import re
 import numpy as np
 import pytest
 
+from mops_lightning.compare import run
 from mops_lightning.compare.cli import main
+from mops_lightning.compare.methods import methods
 from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
 from mops_lightning.samplers.fmops import FMOPSNet
@@ -45,6 +47,31 @@ def test_compare_writes_table_and_page(folder, tmp_path):
     page = (tmp_path / "compare.html").read_text()
     assert "two.pcd, 90 points" in page
     assert "How to read this" in page
+
+
+def test_compare_keeps_an_earlier_comparison(folder, tmp_path):
+    arguments = [folder / "one.ply", "--m", 30, "--methods", "random", "--out", tmp_path]
+    assert call(*arguments)[0] == 0
+    earlier = (tmp_path / "table.csv").read_bytes()
+    status, out, err = call(*arguments, "--seed", 1)
+    assert (status, out) == (2, "")
+    assert re.search(r"--out: .* contains an earlier comparison \(table.md, .*--overwrite", err)
+    assert (tmp_path / "table.csv").read_bytes() == earlier
+    assert call(*arguments, "--seed", 1, "--overwrite")[0] == 0
+    assert (tmp_path / "table.csv").read_bytes() != earlier
+
+
+def test_compare_samples_once_before_it_measures_time(folder, monkeypatch):
+    """Imports and compilation belong to no method; the first one had them."""
+    sizes, sample = [], run._rows
+
+    def noted(path, table, *rest):
+        sizes.append(len(table.points))
+        return sample(path, table, *rest)
+
+    monkeypatch.setattr(run, "_rows", noted)
+    run.compare_file(folder / "one.ply", methods(60, ["random"], None, None, None, 0), 0)
+    assert sizes == [120, 700] * 2
 
 
 def test_compare_page_opens_without_errors(folder, tmp_path, opened):

@@ -67,3 +67,12 @@ def test_lowest_ignores_missing_values_and_draws():
     assert lowest([3.0, None, 1.0]) == 2
     assert lowest([1.0, 1.0]) is None
     assert lowest([None]) is None
+
+
+@pytest.mark.parametrize("far", [1e25, 1e200])
+def test_thin_parts_with_a_stray_point_far_away(far):
+    points = np.concatenate([plane_and_pole(), [[far, 0, 0]]])
+    rows = np.arange(len(points))
+    thin = thin_parts(points, rows, 0.2)
+    assert thin[3000:3200].mean() > 0.9
+    assert not thin[-1]

@@ -166,7 +166,8 @@ def thin_parts(points: Points, rows: Rows, spacing: float) -> NDArray[np.bool_]:
     """
     if not spacing > 0:
         return np.zeros(len(rows), bool)
-    cell = np.floor((points - points.min(0)) / (spacing / 2)).astype(np.int64)
+    # Not as integers: a stray point far away may have a cell that no integer holds.
+    cell = np.floor((points - points.min(0)) / (spacing / 2))
     grid = points[np.unique(cell, axis=0, return_index=True)[1]]
     k = min(NEIGHBOURS, len(grid))
     found: Any = cKDTree(grid).query(points[rows], k=k, distance_upper_bound=2 * spacing)

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 
 from mops_lightning.downsample_files.settings import METHODS, Settings
 
+FILES = ("table.md", "table.csv", "compare.html")
+"""What a comparison writes."""
 TRAINED = "trained"
 FPS = "fps"
 """Always compared: the distance between farthest points is the scale of thin parts."""

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mops_lightning.compare.measures import lowest
-from mops_lightning.compare.methods import TRAINED
+from mops_lightning.compare.methods import FILES, TRAINED
 from mops_lightning.compare.run import FileResult, Result, compare_file
 from mops_lightning.downsample_files.settings import Settings
 from mops_lightning.files import atomic_write
@@ -76,7 +76,7 @@ def write(found: list[tuple[int, FileResult]], folder: Path) -> str:
     text = markdown(grids, remarks)
     clouds = [_clouds(m, result) for m, result in found]
     page = render("compare", grids, clouds, remarks, "How to read this", choice="File")
-    for name, content in (("table.md", text), ("table.csv", _csv(found)), ("compare.html", page)):
+    for name, content in zip(FILES, (text, _csv(found), page), strict=True):
         with atomic_write(folder / name) as temporary:
             temporary.write_text(content, encoding="utf-8")
     return text

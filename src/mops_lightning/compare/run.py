@@ -4,7 +4,7 @@ import os
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from mops_lightning.downsample_files.job import sampled, sampler_of
 from mops_lightning.downsample_files.scene import sample_table
 from mops_lightning.downsample_files.settings import Settings
 from mops_lightning.downsample_files.tiled import ROW
+from mops_lightning.errors import UserError
 from mops_lightning.samplers.base import Sampler
 
 STATM = Path("/proc/self/statm")
@@ -80,13 +81,23 @@ def compare_file(path: Path, methods: dict[str, Settings], seed: int) -> FileRes
     check_size(path, len(table.points), m)
     found = {}
     for name, settings in methods.items():
-        found[name] = _timed(path, table, sampler_of(settings), settings)
+        sampler = sampler_of(settings)
+        _warm_up(path, table, sampler, settings)
+        found[name] = _timed(path, table, sampler, settings)
     reference = Reference.of(table, found[FPS][0], seed)
     results = [
         Result(name, rows, seconds, megabytes, reference.measure(rows))
         for name, (rows, seconds, megabytes) in found.items()
     ]
     return FileResult(path, table, results, int(reference.thin.sum()), reference.spacing)
+
+
+def _warm_up(path: Path, table: Table, sampler: Sampler, settings: Settings) -> None:
+    """Sample a few points, so that imports and compilation are in no method's time."""
+    few = np.random.default_rng(0).permutation(len(table.points))[: 2 * (settings.m or 0)]
+    # A part may be unusable where the whole is not, such as one of equal points.
+    with suppress(UserError):
+        _rows(path, table.take(few), sampler, settings)
 
 
 def _timed(
