@@ -127,13 +127,18 @@ def quiet_on_closed_pipe() -> Iterator[None]:
         finally:
             sys.stdout.flush()
     except BrokenPipeError:
-        closed = [stream for stream in (sys.stdout, sys.stderr) if _is_closed_pipe(stream)]
+        closed = closed_outputs()
         if not closed:
             raise  # a socket or a worker's pipe
         null = os.open(os.devnull, os.O_WRONLY)
         for stream in closed:
             os.dup2(null, stream.fileno())  # Python flushes both again at its exit
         sys.exit(CLOSED_PIPE)
+
+
+def closed_outputs() -> list[TextIO]:
+    """List which of stdout and stderr are pipes without a reader."""
+    return [stream for stream in (sys.stdout, sys.stderr) if _is_closed_pipe(stream)]
 
 
 def _is_closed_pipe(stream: TextIO) -> bool:

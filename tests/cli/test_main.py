@@ -8,7 +8,8 @@ from importlib.metadata import version
 import pytest
 
 from mops_lightning.cli.commands import COMMANDS
-from tests.support.command_line import call, call_anew
+from mops_lightning.records import run_record
+from tests.support.command_line import TINY, call, call_anew, runs, start
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -75,6 +76,21 @@ def test_closed_pipe_ends_quietly(arguments, tmp_path):
     os.close(writer)
     assert done.stderr == b""
     assert done.returncode in (141, 0)  # argparse ignores the error when it prints help
+
+
+def test_run_whose_reader_ends_stops_quietly(tmp_path):
+    """As ``| head -1`` does: the output is closed after the first line."""
+    with start([*TINY, "trainer.max_epochs=50"], tmp_path) as process:
+        assert process.stdout.readline()
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
+    (run,) = runs(tmp_path)
+    record = run_record.read(run)
+    assert (record["status"], record["error"]) == (
+        "interrupted",
+        "BrokenPipeError: [Errno 32] Broken pipe",
+    )
 
 
 def test_help_lists_subcommands_groups_and_keys(tmp_path):

@@ -2,7 +2,7 @@
 
 from mops_lightning.training.run import claim
 from mops_lightning.zoo import publish
-from tests.support.command_line import TINY, call
+from tests.support.command_line import TINY, TINY_ANY_DATA, call
 from tests.support.models import write_run
 
 
@@ -14,6 +14,25 @@ def test_run_with_wrong_setting_leaves_nothing(tmp_path):
     status, _, err = call([*TINY, "sampler=fps", "m=0"], tmp_path)
     assert (status, err.count("\n")) == (2, 1)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_empty_folder_is_refused(tmp_path):
+    for setting in ("out", "cache", "weights", "ckpt_path"):
+        status, _, err = call([*TINY, f"{setting}="], tmp_path)
+        assert (status, err.count("\n")) == (2, 1)
+        assert f"{setting}: no path is given" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_path_with_equals_sign_is_a_path(tmp_path):
+    arguments = [*TINY_ANY_DATA, "sampler=fps", "dataset=meshes", "dataset.root=a=b", "out=c=d"]
+    _, _, err = call(arguments, tmp_path)
+    assert "dataset.root" in err
+    assert "a=b" in err
+    status, out, err = call(["weights=a=b", "out=c=d"], tmp_path)
+    assert (status, out) == (2, "")
+    assert "weights: no file or model 'a=b'" in err
+    assert "out: c=d" in call(["out=c=d", "--cfg", "job"], tmp_path)[1]
 
 
 def test_second_run_in_folder_writes_nothing(tmp_path):

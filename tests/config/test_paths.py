@@ -1,7 +1,8 @@
 import pytest
+from omegaconf import OmegaConf
 
 from mops_lightning.config.compose import compose
-from mops_lightning.config.paths import check_paths
+from mops_lightning.config.paths import INPUTS, OUTPUTS, check_paths
 from mops_lightning.errors import UserError
 
 
@@ -21,6 +22,16 @@ def test_check_paths_impossible_path_names_setting(name, value, said, tmp_path, 
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=f"^{name}: .*{said}"):
         check_paths(compose([f"{name}={value}"]))
+
+
+@pytest.mark.parametrize("name", [*INPUTS, *OUTPUTS])
+def test_check_paths_empty_path_is_not_the_current_folder(name):
+    cfg = OmegaConf.create()
+    OmegaConf.update(cfg, name, "")
+    with pytest.raises(
+        UserError, match=rf"^{name}: no path is given\. Give one, or leave {name} out"
+    ):
+        check_paths(cfg)
 
 
 def test_check_paths_missing_checkpoint_raises(tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
-from tests.support.records import record
+from tests.support.records import CONFIG, record
 
 
 def test_write_then_read_returns_same_record(tmp_path):
@@ -30,6 +30,9 @@ def test_write_nan_becomes_null(tmp_path):
         {"seconds": {"total": -1}},
         {"surprise": 1},
         {"device": 3},
+        {"config": {"names": "mops"}},
+        {"config": {"names": {"task": "classification", "net": "pointnet", "dataset": "shapes"}}},
+        {"config": {"sampler": "mops"}},
     ],
 )
 def test_write_schema_violation_raises_and_writes_nothing(tmp_path, changes):
@@ -50,7 +53,7 @@ def test_read_no_record_raises(tmp_path):
 
 
 def test_run_record_plain_matches_schema(tmp_path):
-    started = RunRecord.begin({"m": 32}, ["m=32"], seed=3)
+    started = RunRecord.begin(CONFIG, ["m=32"], seed=3)
     with started.timed("fit"):
         pass
     run_record.write(tmp_path, started.plain())

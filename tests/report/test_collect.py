@@ -2,6 +2,7 @@ import json
 
 import pytest
 
+from tests.support.records import CONFIG
 from tests.support.reports import put, put_cell, rows, table
 
 
@@ -34,7 +35,8 @@ def test_collect_lists_unreadable_record(tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"config": {"m": 3}}, "config: 'learn' is a required property"),
+        ({"config": {**CONFIG, "m": "x"}}, "not a run record: 'x' is not of type 'integer'"),
+        ({"config": CONFIG}, "config: 'task' is a required property"),
         ({"config": 3}, "not a run record: 3 is not of type 'object'"),
         ({"metrics": {"test/sampled/accuracy": "x"}}, "not a run record"),
         ({"notes": {"metrics": {"accuracy": {"scale": "x"}}}}, "notes.metrics.accuracy.scale"),

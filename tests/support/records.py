@@ -3,12 +3,22 @@
 from mops_lightning.records import run_record
 from mops_lightning.records.environment import environment
 
+NAMES = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": "mops"}
+CONFIG = {
+    "m": 32,
+    "learn": "sampler",
+    "names": NAMES,
+    "dataset": {},
+    "sampler": {},
+    "trainer": {"max_epochs": 3},
+}
 
-def record(**changes):
+
+def record(config=None, **changes):
     return {
         "schema": run_record.SCHEMA,
         "status": "completed",
-        "config": {"m": 32},
+        "config": {**CONFIG, **(config or {})},
         "overrides": ["m=32"],
         "metrics": {"test/generated/accuracy": 0.5},
         "score": 0.5,

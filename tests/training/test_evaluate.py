@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 
 from mops_lightning.config.compose import compose
-from mops_lightning.config.overrides import added
+from mops_lightning.config.overrides import accepted
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.evaluate import same_attributes
 from mops_lightning.training.replay import command_line
 from mops_lightning.training.run import run
-from tests.support.command_line import SMALL_PCRNET, TINY
+from tests.support.command_line import SMALL_PCRNET, TINY, call, runs
 from tests.support.training import small_dataset
 
 
@@ -25,7 +25,7 @@ def trained(tmp_path_factory):
 
 def evaluated(trained, tmp_path, *arguments):
     chosen = command_line([f"evaluate={trained[0]}", "pictures=0", "logger=none", *arguments])
-    chosen = [added(argument) for argument in chosen]
+    chosen = [accepted(argument) for argument in chosen]
     return run(compose(chosen), tmp_path / "new", chosen)
 
 
@@ -98,6 +98,15 @@ def test_evaluate_record_with_settings_of_its_recipe_and_of_no_file(trained, tmp
     again = evaluated(changed_record(trained, tmp_path / "run", sampler), tmp_path)
     assert again.config["sampler"]["size_sampling"] == "uniform"
     assert again.metrics == trained[1].metrics
+
+
+def test_evaluate_wrong_value_in_record_names_the_run_and_leaves_nothing(trained, tmp_path):
+    sampler = {**trained[1].config["sampler"], "alpha": "abc"}
+    folder, _ = changed_record(trained, tmp_path / "run", sampler)
+    status, _, err = call([f"evaluate={folder}"], tmp_path)
+    assert (status, err.count("\n")) == (2, 1)
+    assert f"evaluate: the record of {folder}: sampler.alpha must be a number" in err
+    assert runs(tmp_path) == []
 
 
 def test_evaluate_refuses_other_sampler_settings_however_they_are_given(trained, tmp_path):

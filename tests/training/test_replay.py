@@ -5,7 +5,7 @@ import json
 import pytest
 
 from mops_lightning.config.compose import compose
-from mops_lightning.config.overrides import added
+from mops_lightning.config.overrides import accepted
 from mops_lightning.errors import UserError
 from mops_lightning.training.replay import command_line
 from tests.support.command_line import TINY
@@ -86,7 +86,7 @@ def test_command_line_without_evaluate_is_unchanged():
 
 def test_command_line_adds_settings_of_evaluate(run):
     for given in ("task_nets=[a,b]", "+task_nets=[a,b]"):
-        chosen = [added(one) for one in command_line([given, f"evaluate={run}"])]
+        chosen = [accepted(one) for one in command_line([given, f"evaluate={run}"])]
         assert compose(chosen).task_nets == ["a", "b"]
     assert "task_nets" not in compose(command_line([f"evaluate={run}"]))
 

@@ -6,7 +6,7 @@ from omegaconf import open_dict
 
 from mops_lightning.config.build import build
 from mops_lightning.config.compose import compose
-from mops_lightning.config.overrides import added as with_plus
+from mops_lightning.config.overrides import accepted
 from mops_lightning.errors import UserError
 from mops_lightning.nets.dgcnn import DGCNN
 from mops_lightning.nets.pcrnet import PCRNet
@@ -62,7 +62,7 @@ def folder(tmp_path_factory):
 def evaluating(folder, nets, *arguments):
     given = f"task_nets=[{','.join(map(str, nets))}]"
     fixed = [f"evaluate={folder}/run", "pictures=0", "logger=none", given]
-    return [with_plus(one) for one in command_line([*fixed, *arguments])]
+    return [accepted(one) for one in command_line([*fixed, *arguments])]
 
 
 @pytest.fixture(scope="module")

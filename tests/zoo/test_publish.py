@@ -92,6 +92,12 @@ def test_runs_without_weights_are_refused(tmp_path, fields):
         publish.add(tmp_path / "run", "fmops.mine", tmp_path)
 
 
+def test_run_without_scores_is_refused(tmp_path):
+    write_run(tmp_path / "run", metrics={}, notes={})
+    with pytest.raises(UserError, match="no test score"):
+        publish.add(tmp_path / "run", "fmops.mine", tmp_path)
+
+
 def test_record_that_points_to_a_model_gives_its_weights(run, tmp_path, monkeypatch):
     monkeypatch.setenv(names.VARIABLE, str(tmp_path))
     path = publish.add(run, "fmops.mine", tmp_path, task_net="pointnet.modelnet40")

@@ -81,7 +81,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
             (folder / STARTED).unlink(missing_ok=True)
             score = run(cfg, folder, overrides).score
             return math.nan if score is None else float(score)
-    except Interrupted:
+    except (Interrupted, BrokenPipeError):
         raise
     except Busy:
         log.warning(f"{folder}: skipped, because another process runs this cell")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from mops_lightning.cli.commands import help_lines
 from mops_lightning.cli.flags import flags_first
 from mops_lightning.config.composition import conf_dir
-from mops_lightning.config.overrides import added, key, parse
+from mops_lightning.config.overrides import accepted, key, parse
 from mops_lightning.errors import (
     INTERRUPTED,
     USER_ERROR,
@@ -17,6 +17,7 @@ from mops_lightning.errors import (
     end,
     file_error,
     memory_error,
+    quiet_on_closed_pipe,
 )
 from mops_lightning.records.migrate import answer
 from mops_lightning.zoo import names
@@ -58,7 +59,7 @@ def _run() -> None:
             from mops_lightning.training.replay import command_line
 
             sys.argv[1:] = command_line(sys.argv[1:])
-        sys.argv[1:] = map(added, sys.argv[1:])
+        sys.argv[1:] = map(accepted, sys.argv[1:])
         app = hydra.main(config_path=str(conf_dir()), config_name="config", version_base="1.3")
         app(_job)()
     except (UserError, HydraException, OmegaConfBaseException, YAMLError) as error:
@@ -102,6 +103,18 @@ def _search_models(arguments: list[str]) -> None:
 
 def _job(cfg: "DictConfig") -> float | None:
     """Run one job and return its score, which an optimising sweeper reads."""
+    # Here and not around Hydra, which adds lines of its own to an error.
+    with quiet_on_closed_pipe():
+        return _run_job(cfg)
+
+
+def _run_job(cfg: "DictConfig") -> float | None:
+    """Run one job; the user's mistakes end the program in one line.
+
+    Raises:
+        BrokenPipeError: the reader of the output has ended.
+        KeyboardInterrupt: the user has stopped the job.
+    """
     from pathlib import Path
 
     from hydra.core.hydra_config import HydraConfig
@@ -120,8 +133,9 @@ def _job(cfg: "DictConfig") -> float | None:
             return run_cell(cfg, folder, overrides)
         return run(cfg, folder, overrides, claimed=True).score
     except UserError as error:
-        # Exit here, before Hydra adds lines of its own.
         end(NAME, str(error), USER_ERROR)
+    except BrokenPipeError:
+        raise
     except OSError as error:
         end(NAME, file_error(error), USER_ERROR)
     except (MemoryError, RuntimeError) as error:

@@ -50,10 +50,17 @@ def path(argument: str) -> str:
     return package or name.replace("/", ".")
 
 
-def added(argument: str) -> str:
-    """Return an argument with a ``+`` before a setting that no file contains."""
-    missing = key(argument) in settings.ON_DEMAND and argument[0] not in "+~"
-    return f"+{readable(argument)}" if missing else argument
+def accepted(argument: str) -> str:
+    """Return an argument as Hydra accepts it.
+
+    With a ``+`` before a setting that no file contains, and with quotes around a value that is none
+    to Hydra, such as a path with ``=`` in it.
+    """
+    name = key(argument)
+    if not name:
+        return argument
+    missing = name in settings.ON_DEMAND and argument[0] not in "+~"
+    return f"+{readable(argument)}" if missing else readable(argument)
 
 
 def quote(text: str) -> str:

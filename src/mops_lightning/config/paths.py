@@ -21,7 +21,7 @@ MISSING = {"ckpt_path": "no checkpoint {}. Give a run's folder, a .ckpt file, or
 
 
 def check_paths(cfg: DictConfig) -> None:
-    """Check that inputs exist and that no name is impossible: too long, or a loop of links.
+    """Check that inputs exist and that no name is impossible: empty, too long, a loop of links.
 
     Raises:
         UserError: a setting names such a file or folder.
@@ -30,6 +30,8 @@ def check_paths(cfg: DictConfig) -> None:
         value = OmegaConf.select(cfg, name)
         if not isinstance(value, str) or value in INPUTS.get(name, ()):
             continue
+        if not value:
+            raise UserError(f"{name}: no path is given. Give one, or leave {name} out.")
         try:
             path = Path(value).expanduser()
             path.stat()

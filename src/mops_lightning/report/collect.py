@@ -20,22 +20,10 @@ _WHOLE = {"type": "integer"}
 NEEDED = {
     "properties": {
         "config": {
-            "required": ["m", "learn", "names", "task", "trainer"],
+            "required": ["task"],
             "properties": {
-                "m": _WHOLE,
-                "learn": {"type": "string"},
-                "names": {
-                    "type": "object",
-                    "required": ["task", "net", "dataset", "sampler"],
-                    "additionalProperties": _TEXT,
-                },
                 "task": {"type": "object", "properties": {"net": {"type": ["object", "null"]}}},
-                "trainer": {
-                    "type": "object",
-                    "required": ["max_epochs"],
-                    "properties": {"max_epochs": _WHOLE},
-                },
-                "dataset": {"type": ["object", "null"]},
+                "trainer": {"required": ["max_epochs"], "properties": {"max_epochs": _WHOLE}},
             },
         },
         "git": {"properties": {"commit": _TEXT}},

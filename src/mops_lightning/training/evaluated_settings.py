@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from mops_lightning.config import overrides, settings
 from mops_lightning.config.build import signature
 from mops_lightning.config.declaration import Affects
+from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.training.replay import KEY, OF_RUN, names_code, place, trained_run
 from mops_lightning.zoo import weights
@@ -29,7 +30,8 @@ def as_trained(cfg: DictConfig, given: list[str] | None) -> DictConfig:
         given: the overrides it was composed from; None if all settings count as given.
 
     Raises:
-        UserError: ``cfg.evaluate`` is not a completed run that trained something.
+        UserError: ``cfg.evaluate`` is not a completed run that trained something, or a value in
+            its record or in ``cfg`` is wrong.
     """
     whole = any(argument.lstrip("+").startswith("sampler={") for argument in given or [])
     if given is None or whole or not cfg.evaluate or cfg.learn == "task":
@@ -46,10 +48,17 @@ def as_trained(cfg: DictConfig, given: list[str] | None) -> DictConfig:
         if f"sampler.{key}" not in keys and not SHARED.fullmatch(str(raw.get(key)))
     }
     plain = {key: old for key, old in changed.items() if not names_code({key: old})}
-    cfg = deepcopy(cfg)
-    with open_dict(cfg.sampler):
-        cfg.sampler.update(plain)
-    return cfg
+    if not plain:
+        return cfg
+    check(cfg)  # the user's own mistakes first
+    replaced = deepcopy(cfg)
+    with open_dict(replaced.sampler):
+        replaced.sampler.update(plain)
+    try:
+        check(replaced)
+    except UserError as error:
+        raise UserError(f"{KEY}: the record of {cfg.evaluate}: {error}") from None
+    return replaced
 
 
 def same_settings(cfg: DictConfig, record: dict[str, Any], run: str, task: torch.nn.Module) -> None:

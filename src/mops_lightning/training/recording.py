@@ -8,7 +8,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config import distributed
-from mops_lightning.errors import Interrupted
+from mops_lightning.errors import Interrupted, closed_outputs
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.workers import at_end
@@ -47,7 +47,9 @@ def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[Ru
         record.status, record.error = "interrupted", str(stop) or "interrupted"
         raise
     except BaseException as error:
-        record.status, record.error = "failed", f"{type(error).__name__}: {error}"
+        stopped = isinstance(error, BrokenPipeError) and closed_outputs()
+        record.status = "interrupted" if stopped else "failed"
+        record.error = f"{type(error).__name__}: {error}"
         raise
     finally:
         if writes:

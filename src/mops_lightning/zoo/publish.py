@@ -105,7 +105,9 @@ def figures(record: dict[str, Any]) -> dict[str, Any]:
     named = record["notes"].get("score")
     found = {key: part for key in scores if (part := parse(key))}
     if named not in found:  # records of the first version do not name it
-        named = next(key for key in found if scores[key] == record["score"])
+        named = next((key for key in found if scores[key] == record["score"]), None)
+    if named is None:
+        raise UserError("the record of the run has no test score. Give a run that was tested.")
     main = found[named]
     info = metric_info(main.metric, [record])
     shown = {MetricName(main.m, readout, main.metric) for readout in _readouts(main)}
