@@ -45,10 +45,21 @@ def test_sweeps_and_experiments_of_the_package_are_valid(validator):
         {"sampler": {"tau_min": "low"}},
         {"task": {"net": {"chanels": 3}}},
         {"defaults": [3]},
+        {"models": {"folder": "mine"}},
     ],
 )
 def test_mistakes_are_found(validator, content):
     assert list(validator.iter_errors(content))
+
+
+def test_settings_of_no_file_or_of_one_task_are_allowed(validator):
+    content = {
+        "recipe": {"feature_distillation": 1.0},
+        "sampler": {"min_size": 8},
+        "models": {"path": "mine"},
+        "task_nets": ["outputs/net"],
+    }
+    assert not list(validator.iter_errors(content))
 
 
 def test_own_classes_and_interpolations_are_allowed(validator):

@@ -47,7 +47,7 @@ def test_random_crops_same_seed_same_crops():
 @pytest.mark.parametrize(
     ("points", "crop", "size", "message"),
     [
-        (cloud(40), "nearest", None, "scan.ply has 40 points, fewer than n_points=50"),
+        (cloud(40), "nearest", None, "scan.ply has 40 points, fewer than dataset.n_points=50"),
         (cloud(), "cube", 1.0, r"crop_size=1 is too small for n_points=50: the fullest of 50"),
         (np.ones((60, 3)), "whole", None, "the 50 points of a crop coincide"),
     ],

@@ -230,7 +230,7 @@ def test_scan_pairs_far_from_origin_keep_their_digits(tmp_path):
         ({"scans": "scan_[0-3]*"}, "6 poses, but there are 4 scans.*dataset.scans="),
         ({"motions": "nowhere.txt"}, "motions: no file nowhere.txt"),
         ({"calib": "nowhere.txt"}, "calib: no file nowhere.txt"),
-        ({"n_points": 5000}, "points, fewer than n_points=5000"),
+        ({"n_points": 5000}, "points, fewer than dataset.n_points=5000"),
         ({"crop": "cube", "crop_size": 0.01}, "crop_size=0.01 is too small"),
         ({"gap": 5}, "motions: the 1 pairs of 6 scans cannot be split"),
     ],

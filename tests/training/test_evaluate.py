@@ -11,6 +11,7 @@ from mops_lightning.records import run_record
 from mops_lightning.training.evaluate import same_attributes
 from mops_lightning.training.replay import command_line
 from mops_lightning.training.run import run
+from mops_lightning.zoo import publish
 from tests.support.command_line import SMALL_PCRNET, TINY, call, runs
 from tests.support.training import small_dataset
 
@@ -107,6 +108,19 @@ def test_evaluate_wrong_value_in_record_names_the_run_and_leaves_nothing(trained
     assert (status, err.count("\n")) == (2, 1)
     assert f"evaluate: the record of {folder}: sampler.alpha must be a number" in err
     assert runs(tmp_path) == []
+
+
+def test_evaluate_other_sampler_is_refused_before_a_folder_is_made(trained, tmp_path):
+    status, _, err = call([f"evaluate={trained[0]}", "sampler=mops"], tmp_path)
+    assert (status, err.count("\n")) == (2, 1)
+    assert "was trained with sampler=fmops, got sampler=mops. Leave sampler out" in err
+    assert runs(tmp_path) == []
+
+
+def test_evaluate_model_without_its_task_net_asks_for_one(trained, tmp_path):
+    model = publish.add(trained[0], "fmops.mine", tmp_path)
+    with pytest.raises(UserError, match=r"the model fmops\.mine comes without its task net\. Give"):
+        evaluated((model, trained[1]), tmp_path)
 
 
 def test_evaluate_refuses_other_sampler_settings_however_they_are_given(trained, tmp_path):

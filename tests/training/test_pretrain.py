@@ -28,7 +28,10 @@ def test_task_net_from_file_is_not_published(tmp_path):
     train(tmp_path, "learn=task", *SMALL_PCRNET)
     (published,) = files(tmp_path, "cache/weights/*/weights.pt")
     first = tmp_path / "run0" / "weights.pt"
-    record = train(tmp_path, "learn=task", *SMALL_PCRNET, f"weights={first}", "optimizer.lr=0")
+    # A run's folder means its weights file.
+    record = train(
+        tmp_path, "learn=task", *SMALL_PCRNET, f"weights={first.parent}", "optimizer.lr=0"
+    )
     assert record.notes["weights_loaded"] == published["sha256"]
     own, again = (weights.read(path)["state"] for path in sorted(tmp_path.glob("run*/weights.pt")))
     assert all(torch.equal(own[name], again[name]) for name in own)  # at a rate of 0 nothing moves

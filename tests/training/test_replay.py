@@ -15,10 +15,10 @@ OVERRIDES = [*TINY, "sampler=fmops", "sampler.m_max=32"]
 NAMES = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": "fmops"}
 
 
-def write_run(folder, overrides=OVERRIDES, **names):
+def write_run(folder, overrides=OVERRIDES, learn="sampler", **names):
     """Write the record of a completed run; only the record is read here."""
     folder.mkdir()
-    config = {"learn": "sampler", "names": {**NAMES, **names}}
+    config = {"learn": learn, "names": {**NAMES, **names}}
     content = record(overrides=overrides, config=config, files={"weights": "weights.pt"})
     (folder / "result.json").write_text(json.dumps(content))
     return folder
@@ -177,6 +177,13 @@ def test_command_line_setting_without_effect_raises(run, argument):
     for more in ([], ["weights=auto"]):
         with pytest.raises(UserError, match="has no effect with evaluate"):
             command_line([f"evaluate={run}", argument, *more])
+
+
+def test_command_line_sampler_for_a_task_net_alone_raises(tmp_path):
+    run = write_run(tmp_path / "run", learn="task")
+    for argument in ("sampler=fps", "sampler.m_max=8", "++sampler.alpha=3"):
+        with pytest.raises(UserError, match=r"has no effect .* trained a task net alone\. To test"):
+            command_line([argument, f"evaluate={run}"])
 
 
 def test_command_line_pretraining_takes_its_settings(run):

@@ -57,7 +57,9 @@ def _check_weights(given: str | None) -> None:
     except UserError as error:
         raise UserError(f"weights: {error}") from None
     if not path.exists():
-        raise UserError(f"weights: no file {path}. Give a weights.pt, a model, or weights=auto.")
+        raise UserError(
+            f"weights: no file {path}. Give a weights.pt, a run, a model, or weights=auto."
+        )
 
 
 def make(folder: Path) -> None:

@@ -49,6 +49,7 @@ def schema() -> Schema:
             "description": described,
             **({"default": one.default} if one.default is not None else {}),
         }
+    properties |= _on_demand()
     return {
         "$schema": "http://json-schema.org/draft-07/schema#",
         "title": "mops_lightning configuration",
@@ -57,6 +58,22 @@ def schema() -> Schema:
         "additionalProperties": False,
         "definitions": {"interpolation": {"type": "string", "pattern": r"\$\{"}},
     }
+
+
+def _on_demand() -> Schema:
+    """Return the schema of settings that no file of the package contains."""
+    found: Schema = {}
+    for path, setting in settings.ON_DEMAND.items():
+        top, _, below = path.partition(".")
+        limits = f" ({setting.limits.allowed})" if setting.limits else ""
+        described = {"description": setting.help + limits}
+        if below:
+            node = found.setdefault(top, {"type": "object", "properties": {}})
+            node |= {"additionalProperties": False}
+            node["properties"][below] = described
+        else:
+            found[top] = described
+    return found
 
 
 def choices() -> dict[str, list[str]]:
@@ -86,7 +103,10 @@ def _group(name: str) -> Schema:
     for path in sorted((conf_dir() / name).glob("*.yaml")):
         _add(found, OmegaConf.to_container(OmegaConf.load(path)))
     for folder in sorted(path for path in (conf_dir() / name).iterdir() if path.is_dir()):
-        if not (conf_dir() / name / f"{folder.name}.yaml").is_file():  # task/net, not sampler/mops
+        if folder.with_suffix(".yaml").is_file():  # sampler/mops, whose files change mops.yaml
+            for path in sorted(folder.glob("*.yaml")):
+                _add(found, OmegaConf.to_container(OmegaConf.load(path)))
+        else:
             found[folder.name] = _group(f"{name}/{folder.name}")
     return _node(found, name in OPEN)
 

@@ -95,7 +95,7 @@ class RunSettings:
     weights: str | None = field(
         default="auto",
         metadata=about(
-            "task net: auto (cached, else trained first), a model, a weights file, or null "
+            "task net: auto (cached, else trained first), a model, a run, a weights file, or null "
             "(untrained); with learn=task the file that training starts from",
             nullable=True,
             by_content=True,

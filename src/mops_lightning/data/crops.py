@@ -100,8 +100,8 @@ def check_number(points: Cloud, n_points: int, path: Path) -> None:
     """
     if len(points) < n_points:
         raise BadCloudError(
-            f"{path} has {len(points)} points, fewer than n_points={n_points}. Lower n_points, or "
-            "leave the file out."
+            f"{path} has {len(points)} points, fewer than dataset.n_points={n_points}. Lower "
+            "dataset.n_points, or leave the file out."
         )
 
 

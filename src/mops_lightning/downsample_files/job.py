@@ -79,7 +79,7 @@ def sampler_of(settings: Settings) -> Sampler:
         allowed = f"up to {sampler.m}" if sampler.flexible else f"{sampler.m}"
         raise UserError(
             f"--m: {settings.weights} was trained for {allowed} points, got {m}. "
-            f"Leave --m out, or train with m={m}."
+            f"Give --m {sampler.m}{' or less' * sampler.flexible}, or train with m={m}."
         )
     return sampler
 

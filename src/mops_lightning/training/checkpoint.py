@@ -10,7 +10,7 @@ from mops_lightning.config.comparison import trained_with
 from mops_lightning.errors import UserError
 from mops_lightning.files import set_aside
 from mops_lightning.records import run_record
-from mops_lightning.zoo import weights
+from mops_lightning.zoo import nets, weights
 
 CHECKPOINT = "last.ckpt"
 CHECKPOINT_KEY = "mops_lightning"
@@ -43,10 +43,10 @@ def identity(config: dict[str, Any], fingerprint: str) -> dict[str, str]:
 
 def _given_weights(given: str | None) -> dict[str, str]:
     """Return the hash of the weights file that the user gave, if any."""
-    if given in (None, "auto", "run"):
+    if given is None or given in ("auto", "run"):
         return {}
     try:
-        return {"weights": str(weights.read(given)["sha256"])}
+        return {"weights": str(weights.read(nets.file_of(given))["sha256"])}
     except UserError as error:
         raise UserError(f"weights: {error}") from None
 

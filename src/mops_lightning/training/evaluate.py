@@ -117,6 +117,8 @@ def _load_task(task: torch.nn.Module, folder: Path, record: dict[str, Any]) -> N
         weights.load_into(task, weights.of_run(folder, "task_weights"))
         return
     path = folder / "checkpoints" / CHECKPOINT
+    if folder.is_file():
+        raise UserError(f"the model {folder.stem} comes without its task net. Give weights=FILE.")
     if not path.is_file():
         raise UserError(
             f"{path}, which contains the run's task net, does not exist. Give weights=FILE."

@@ -37,8 +37,7 @@ def as_trained(cfg: DictConfig, given: list[str] | None) -> DictConfig:
     if given is None or whole or not cfg.evaluate or cfg.learn == "task":
         return cfg
     there = trained_run(cfg.evaluate)["config"]
-    if there["names"]["sampler"] != cfg.names.sampler:
-        return cfg
+    _same_group("sampler", cfg.names.sampler, there, cfg.evaluate)
     here: Any = OmegaConf.to_container(cfg.sampler, resolve=True)
     raw: Any = OmegaConf.to_container(cfg.sampler, resolve=False)
     keys = {overrides.key(argument) for argument in given}
@@ -84,12 +83,7 @@ def same_settings(cfg: DictConfig, record: dict[str, Any], run: str, task: torch
     if cfg.learn == "task" and cfg.weights != OF_RUN:
         raise UserError(f"{KEY}: {run} trained a task net; leave weights out.")
     for group in ("task",) if cfg.learn == "task" else ("task", "sampler"):
-        old, new = there["names"][group], here["names"][group]
-        if old != new:
-            raise UserError(
-                f"{KEY}: {run} was trained with {group}={old}, got {group}={new}. "
-                f"Leave {group} out, or give a run with {group}={new}."
-            )
+        _same_group(group, here["names"][group], there, run)
     weightless = not any(True for _ in task.parameters())
     if here["names"]["net"] != there["names"]["net"] and cfg.weights == OF_RUN and not weightless:
         raise UserError(
@@ -98,6 +92,15 @@ def same_settings(cfg: DictConfig, record: dict[str, Any], run: str, task: torch
         )
     if cfg.learn != "task":
         _same_sampler(here["sampler"], there["sampler"], run)
+
+
+def _same_group(group: str, new: str, there: dict[str, Any], run: str) -> None:
+    old = there["names"][group]
+    if old != new:
+        raise UserError(
+            f"{KEY}: {run} was trained with {group}={old}, got {group}={new}. "
+            f"Leave {group} out, or give a run with {group}={new}."
+        )
 
 
 def _same_sampler(here: dict[str, Any], there: dict[str, Any], run: str) -> None:

@@ -53,7 +53,7 @@ def command_line(arguments: list[str]) -> list[str]:
     folder = str(path) if path.exists() else chosen
     record = trained_run(folder)
     chosen_groups = record["config"]["names"]
-    _refuse_without_effect(arguments, folder)
+    _refuse_without_effect(arguments, folder, record["config"]["learn"])
     groups = {key: chosen_groups[key] for key in ("task", "dataset", "sampler")}
     typed = [a for i, a in enumerate(arguments) if i not in places and overrides.key(a)]
     # Choosing the run's own group again changes nothing; the settings below it stay too.
@@ -98,8 +98,8 @@ def _chosen(argument: str) -> str | None:
     return None if value is None else str(value)
 
 
-def _refuse_without_effect(arguments: list[str], folder: str) -> None:
-    """Refuse settings of a training, of which there is none in an evaluation.
+def _refuse_without_effect(arguments: list[str], folder: str, learn: str) -> None:
+    """Refuse settings of a training, and of a sampler where a task net is evaluated alone.
 
     Raises:
         UserError: there is one.
@@ -112,6 +112,11 @@ def _refuse_without_effect(arguments: list[str], folder: str) -> None:
             raise UserError(
                 f"{argument}: has no effect with {KEY}, which trains nothing. Leave it out, or "
                 f"train with the settings of {folder} and without {KEY}."
+            )
+        if learn == "task" and path.partition(".")[0] == "sampler":
+            raise UserError(
+                f"{argument}: has no effect with {KEY}={folder}, which trained a task net alone. "
+                f"To test a sampler with it, evaluate the sampler's run with weights={folder}."
             )
 
 

@@ -8,7 +8,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.nets.warm_start import copy_pointwise_layers, copy_tensors
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.job import Job
-from mops_lightning.zoo import weights
+from mops_lightning.zoo import names, weights
 
 CLOUDS = 64
 """Clouds whose statistics BatchNorm takes where the task net has none."""
@@ -36,7 +36,8 @@ def warm_start(job: Job, record: RunRecord) -> None:
 
 def _from_file(given: str, sampler: nn.Module, record: RunRecord) -> str:
     try:
-        content = weights.read(given)
+        path = names.resolve(given)
+        content = weights.read(weights.of_run(path) if path.is_dir() else path)
     except UserError as error:
         raise UserError(f"recipe.warm_start: {error}") from None
     if content["config"].get("learn") == "task":

@@ -66,7 +66,7 @@ def load_net(path: str | Path, task: str, num_classes: int) -> LoadedNet:
         UserError: the file is missing, damaged, another task's or not a task net's, or its weights
             do not fit the net that it describes.
     """
-    path = _file(names.resolve(path))
+    path = file_of(path)
     content = weights.read(path)
     config = content["config"]
     if config.get("learn") not in ("task", "joint"):
@@ -82,8 +82,17 @@ def load_net(path: str | Path, task: str, num_classes: int) -> LoadedNet:
     return LoadedNet(net.eval(), kind, content)
 
 
-def _file(path: Path) -> Path:
-    """Return the file of the task net of a run's folder; any other path is the file."""
+def file_of(given: str | Path) -> Path:
+    """Return the file of a task net: that of a run's folder; any other path is the file.
+
+    Args:
+        given: what ``names.resolve`` takes, or the folder of a run that trained a task net, alone
+            or with a sampler.
+
+    Raises:
+        UserError: there is no file and no model of this name, or the folder's record is damaged.
+    """
+    path = names.resolve(given)
     if not path.is_dir():
         return path
     joint = weights.of_run(path, "task_weights")

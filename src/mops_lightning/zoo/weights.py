@@ -81,7 +81,7 @@ def read(path: str | Path) -> dict[str, Any]:
     """
     path = names.resolve(path)
     if not path.is_file():
-        raise UserError(f"no file {path}. Give a weights.pt, or weights=auto.")
+        raise UserError(f"no file {path}. Give a weights.pt, the folder of its run, or a model.")
     if path.suffix == model_file.SUFFIX:
         content = model_file.read(path)
         check_state(content["state"], path)
