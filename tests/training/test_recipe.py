@@ -13,6 +13,8 @@ from mops_lightning.data.pairs import Pairs
 from mops_lightning.errors import UserError
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.readout import complete
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.tasks.reconstruction import Reconstruction
@@ -101,6 +103,7 @@ def test_task_points_are_drawn_for_task_net_alone():
         ("task_points", 0),
         ("all_points_from", 1.5),
         ("straight_through", -0.1),
+        ("straight_through_set", "generated"),
         ("ema_span", float("nan")),
         ("distillation", -1.0),
         ("distillation", float("inf")),
@@ -197,6 +200,22 @@ def test_straight_through_has_matched_values_and_gradients_of_generated():
     torch.testing.assert_close(generated.grad, weight)
 
 
+def test_straight_through_completed_set_gives_gradients_to_its_matched_points():
+    points = torch.randn(2, POINTS, 3)
+    rows = torch.tensor([[3, 7, 3, 9], [5, 5, 5, 2]])
+    generated = (gather_points(points, rows) + 1e-3).requires_grad_()
+    found = straight_through(SampleOutput(generated, None, {}), points, completed=True)
+    expected = complete(rows, points)
+    torch.testing.assert_close(found, gather_points(points, expected))
+    weight = torch.randn_like(found)
+    (found * weight).sum().backward()
+    gradients = torch.zeros_like(generated)
+    for cloud, kept in enumerate(([3, 7, 9], [5, 2])):
+        for place, row in enumerate(kept):
+            gradients[cloud, rows[cloud].tolist().index(row)] = weight[cloud, place]
+    torch.testing.assert_close(generated.grad, gradients)
+
+
 @pytest.mark.parametrize("name", ["distillation", "feature_distillation"])
 def test_distillation_is_logged_with_its_weight_and_only_then(name):
     key = f"train/loss/{name}"
@@ -227,6 +246,15 @@ def test_straight_through_changes_the_training_from_its_share_on():
     assert last_step_only
     assert half
     assert not torch.equal(weights[1], weights[2])
+
+
+def test_straight_through_of_completed_sets_is_another_training():
+    sets: list[Any] = ["matched", "completed"]
+    one, other = (
+        trained(Recipe(straight_through=0.0, straight_through_set=name)).state_dict()
+        for name in sets
+    )
+    assert not torch.equal(one["sampler.queries.weight"], other["sampler.queries.weight"])
 
 
 def test_moving_average_ends_with_the_average_of_all_steps():

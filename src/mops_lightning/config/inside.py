@@ -45,6 +45,7 @@ INSIDE: dict[str, dict[str, Any]] = {
     "recipe.distillation": {"limits": number("of at least 0", lambda x: x >= 0)},
     "recipe.feature_distillation": {"limits": number("of at least 0", lambda x: x >= 0)},
     "recipe.straight_through": {"limits": SHARE_OR_NULL},
+    "recipe.straight_through_set": {"limits": one_of("matched", "completed")},
     "recipe.ema_span": {"limits": SHARE_OR_NULL},
     "sampler.threshold": {
         "affects": Affects.SCORES,

@@ -220,7 +220,8 @@ class Experiment(L.LightningModule):
         soft = sampled.soft_projected
         inputs = [sampled.points if soft is None else soft]
         if self.recipe.sees_matched(self._progress):
-            inputs.append(straight_through(sampled, seen))
+            completed = self.recipe.straight_through_set == "completed"
+            inputs.append(straight_through(sampled, seen, completed))
         terms: dict[str, Tensor] = {}
         for points in inputs:
             result = self.task.step(batch, points)

@@ -2,17 +2,20 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import coordinates, gather_points
-from mops_lightning.ops.readout import match
+from mops_lightning.ops.readout import complete, match
 from mops_lightning.types import Batch, PairBatch, SampleOutput
 
 POINTS_PER_SAMPLE = 2
 """A training step sees at least this many times the number of sampled points."""
+
+STRAIGHT_THROUGH_SETS = ("matched", "completed")
 
 
 @dataclass(frozen=True)
@@ -33,10 +36,12 @@ class Recipe:
         feature_distillation: weight of the distance between the frozen task net's max-pooled
             features of the sample and of the points that the step sees.
             Only with ``learn="sampler"`` and a net with ``point_features``.
-        straight_through: share from which on the task net also sees the matched points, whose
+        straight_through: share from which on the task net also sees points of the cloud, whose
             gradients go to the generated ones; None: never.
         ema_span: time constant of an exponential moving average of the weights, as a share; the
             average is validated, tested and saved. None: the last weights are.
+        straight_through_set: the points of ``straight_through``, ``matched`` or ``completed``. The
+            farthest points of a completed set have no gradients.
 
     Raises:
         UserError: an attribute is out of range.
@@ -50,6 +55,7 @@ class Recipe:
     feature_distillation: float = 0.0
     straight_through: float | None = None
     ema_span: float | None = None
+    straight_through_set: Literal["matched", "completed"] = "matched"
 
     def __post_init__(self) -> None:
         """Check the attributes."""
@@ -65,6 +71,12 @@ class Recipe:
             weight = getattr(self, name)
             if not 0 <= weight < math.inf:
                 raise UserError(f"{name} must be at least 0, got {weight}.")
+
+        if self.straight_through_set not in STRAIGHT_THROUGH_SETS:
+            raise UserError(
+                f"straight_through_set must be one of {', '.join(STRAIGHT_THROUGH_SETS)}, got "
+                f"{self.straight_through_set!r}."
+            )
 
     def points_at(self, progress: float, available: int, largest: int) -> int:
         """Return how many points of a cloud a step sees.
@@ -82,7 +94,7 @@ class Recipe:
         return min(available, max(self.train_points, POINTS_PER_SAMPLE * largest))
 
     def sees_matched(self, progress: float) -> bool:
-        """Return whether the task net also sees matched points."""
+        """Return whether the task net also sees points of the cloud."""
         return reached(self.straight_through, progress)
 
 
@@ -109,13 +121,25 @@ def draw_points(batch: Batch | PairBatch, n: int) -> Tensor:
     return gather_points(points, rows)
 
 
-def straight_through(sampled: SampleOutput, points: Tensor) -> Tensor:
-    """Return the matched points of a sample, with the gradients of the generated ones.
+def straight_through(sampled: SampleOutput, points: Tensor, completed: bool = False) -> Tensor:
+    """Return points of the clouds with the gradients of the generated ones.
 
     Args:
         sampled: generated points ``(B, M, 3)``.
         points: ``(B, N, 3)`` the clouds.
+        completed: the completed set in place of the matched one.
+
+    Returns:
+        ``(B, M, 3)``. Of generated points with the same match, the first one has the gradients of
+        a completed set; the farthest points of this set have none.
     """
-    rows = match(coordinates(sampled.points), coordinates(points))
-    matched = gather_points(points, rows)
-    return sampled.points + (matched - sampled.points).detach()
+    generated, places = sampled.points, coordinates(points)
+    rows = match(coordinates(generated), places)
+    if not completed:
+        return generated + (gather_points(points, rows) - generated).detach()
+    filled = complete(rows, places)
+    same = filled[:, :, None] == rows[:, None, :]
+    generated = gather_points(generated, same.byte().argmax(2))
+    chosen = gather_points(points, filled)
+    moving = generated + (chosen - generated).detach()
+    return torch.where(same.any(2, keepdim=True), moving, chosen)
