@@ -39,6 +39,16 @@ def test_mesh_sequence_splits_by_time_with_gap(folder):
     assert train.points.norm(dim=2).amax(1).allclose(torch.ones(13))
 
 
+def test_mesh_sequence_spreads_test_frames_with_gaps(folder):
+    data = mesh_sequence(folder, 3000, test_share=0.25, gap=1, test_frames="spread")
+    train, test = data.train, data.test
+    crane, samba = (sorted(lengths(test.points[test.labels == label])) for label in (0, 1))
+    assert crane == [2, 6, 10]
+    assert samba == [2, 7]
+    assert sorted(lengths(train.points[train.labels == 0])) == [0, 4, 8]
+    assert sorted(lengths(train.points[train.labels == 1])) == [0, 4, 5, 9]
+
+
 def test_by_number_sorts_digits_that_are_no_numbers():
     names = ["f_10", "f_9", "1²", "²"]
     ordered = sorted((PurePath(f"{name}.ply") for name in names), key=by_number)
@@ -60,6 +70,8 @@ def test_mesh_sequence_class_and_cache(folder, tmp_path):
         ({"test_share": 0.0}, r"^test_share must be between 0 and 1, got 0.0"),
         ({"gap": -1}, r"^gap must be at least 0, got -1"),
         ({"gap": 10}, r"^gap must .* got 10: .*crane has 12 frames, of which 2 are test"),
+        ({"test_frames": "lats"}, r"^test_frames: unknown 'lats'.*last"),
+        ({"gap": 5, "test_frames": "spread"}, r"^gap must leave training frames, got 5"),
         ({"n_points": 0}, r"^n_points must be at least 1, got 0"),
         ({"classes": ["samb"]}, r"^classes: unknown class 'samb'.*samba"),
     ],

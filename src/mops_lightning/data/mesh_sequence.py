@@ -3,11 +3,14 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path, PurePath, PurePosixPath
+from typing import Literal
 
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.mesh_io import SUFFIXES
 from mops_lightning.data.mesh_sampling import mesh_root, sample_meshes
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, did_you_mean
+
+TEST_FRAMES = ("last", "spread")
 
 
 def mesh_sequence(
@@ -19,22 +22,27 @@ def mesh_sequence(
     seed: int = 0,
     cache: str | Path | None = None,
     workers: int = 1,
+    test_frames: Literal["last", "spread"] = "last",
 ) -> CloudDataset:
     """Sample the frames of sequences, such as ``SEQUENCE/FRAME.ply``.
 
     Neighbouring frames are almost identical, so that a random split would test on training data.
-    Here, the last frames of every sequence are the test split, and the frames just before them
-    belong to neither split.
+    By default, the last frames of every sequence are the test split, and the frames just before
+    them belong to neither split. ``test_frames="spread"`` tests poses between those of the
+    training, which is easier.
 
     Args:
         root: a folder with one folder per sequence; the sequences are the classes.
         n_points: number of points per frame, uniform by area.
         classes: sequences to keep; None or empty means all.
         test_share: share of test frames in a sequence, between 0 and 1; at least one frame.
-        gap: number of frames between training and test frames that are not used.
+        gap: number of frames between training and test frames that are not used; with ``spread``,
+            on either side of every test frame.
         seed: seed of the sampling.
         cache: folder for sampled clouds; None disables the cache.
         workers: number of processes that read meshes.
+        test_frames: ``last`` takes the last frames of a sequence, ``spread`` frames at equal
+            distances.
 
     Returns:
         Float32 clouds ``(S, n_points, 3)`` in the unit sphere, with the centroid at the origin.
@@ -44,6 +52,9 @@ def mesh_sequence(
     """
     if not 0 < test_share < 1:
         raise UserError(f"test_share must be between 0 and 1, got {test_share}.")
+    if test_frames not in TEST_FRAMES:
+        hint = did_you_mean(test_frames, TEST_FRAMES)
+        raise UserError(f"test_frames: unknown {test_frames!r}.{hint}")
     minima = {
         "n_points": (n_points, 1),
         "gap": (gap, 0),
@@ -55,7 +66,7 @@ def mesh_sequence(
     for sequence in sorted(path for path in folder.iterdir() if path.is_dir()):
         frames = (path for path in sequence.iterdir() if path.suffix.lower() in SUFFIXES)
         paths = sorted(frames, key=by_number)
-        splits = _split_frames(sequence, len(paths), test_share, gap)
+        splits = _split_frames(sequence, len(paths), test_share, gap, test_frames)
         names = [PurePosixPath(path.relative_to(folder).as_posix()) for path in paths]
         rows += [(name, split) for name, split in zip(names, splits, strict=True) if split]
     if not rows:
@@ -65,18 +76,30 @@ def mesh_sequence(
     return sample_meshes(folder, rows, classes, n_points, seed=seed, cache=cache, workers=workers)
 
 
-def _split_frames(sequence: Path, frames: int, test_share: float, gap: int) -> list[str]:
+def _split_frames(
+    sequence: Path, frames: int, test_share: float, gap: int, test_frames: str
+) -> list[str]:
     """Return the split of every frame of a sequence; frames in the gap have an empty one."""
     if not frames:
         return []
     n_test = max(round(frames * test_share), 1)
-    n_train = frames - n_test - gap
-    if n_train < 1:
+    if test_frames == "last":
+        test = list(range(frames - n_test, frames))
+    else:  # the middle frame of each of n_test equal parts
+        test = [(2 * part + 1) * frames // (2 * n_test) for part in range(n_test)]
+    splits = ["train"] * frames
+    for frame in test:
+        begin = max(frame - gap, 0)
+        end = frame + gap + 1
+        splits[begin:end] = [""] * len(splits[begin:end])
+    for frame in test:
+        splits[frame] = "test"
+    if "train" not in splits:
         raise UserError(
             f"gap must leave training frames, got {gap}: {sequence} has {frames} frames, "
             f"of which {n_test} are test frames. Reduce gap or test_share."
         )
-    return ["train"] * n_train + [""] * gap + ["test"] * n_test
+    return splits
 
 
 def by_number(path: PurePath) -> tuple[list[tuple[int, str]], str]:
