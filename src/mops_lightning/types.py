@@ -154,7 +154,11 @@ class PointFeatureNet(Protocol):
 
 @runtime_checkable
 class PooledNet(PointFeatureNet, Protocol):
-    """A net that maps the maxima of ``point_features`` over the points to its result."""
+    """A net that maps the maxima of ``point_features`` over the points to its result.
+
+    A net that does so only with some of its settings has an attribute ``pools_points``, which says
+    whether it does.
+    """
 
     def from_pooled(self, pooled: Tensor) -> Any:
         """Map maxima ``(B, C)`` to what ``forward`` returns."""

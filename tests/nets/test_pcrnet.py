@@ -37,6 +37,15 @@ def test_pcrnet_is_independent_of_order_and_batch(iterations, rng):
     assert module(source[:, :20], target).translation.shape == (4, 3)
 
 
+def test_pcrnet_motion_follows_from_maxima_of_point_features(rng):
+    module = net()
+    source, target = torch.randn(2, 4, 60, 3, generator=rng)
+    pooled = module.point_features(torch.cat([source, target])).amax(1)
+    torch.testing.assert_close(module.from_pooled(pooled), module(source, target))
+    with pytest.raises(UserError, match=r"iterations must be 1 .* got 2"):
+        net(iterations=2).from_pooled(pooled)
+
+
 def test_pcrnet_iterations_compose_motions(rng):
     source, target = torch.randn(2, 4, 60, 3, generator=rng)
     one, three = net(), net(iterations=3)

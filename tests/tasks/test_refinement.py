@@ -5,21 +5,31 @@ from mops_lightning.data.pairs import Pairs
 from mops_lightning.errors import UserError
 from mops_lightning.losses.registration import quaternion_loss
 from mops_lightning.nets.autoencoder import AutoEncoder
+from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.tasks import refinement
+from mops_lightning.tasks.base import Task
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.tasks.reconstruction import Reconstruction
 from mops_lightning.tasks.refinement import Refinement
 from mops_lightning.tasks.registration import Registration
-from mops_lightning.types import Batch
+from mops_lightning.types import Batch, PairBatch
 
 TASKS = {
     "classification": lambda: Classification(PointNetVanilla(5), 5),
     "reconstruction": lambda: Reconstruction(AutoEncoder(50, 16, (8, 8), (16,))),
+    "registration": lambda: Registration(PCRNet(), Pairs(), quaternion_loss),
 }
+
+
+def batch_of(name, points):
+    if name == "registration":
+        nothing = torch.zeros(0)
+        return PairBatch(points, nothing, torch.zeros(len(points) // 2, 4), nothing)
+    return Batch(points, torch.zeros(len(points)).long())
 
 
 def disagreements(task, batch, rows):
@@ -33,7 +43,7 @@ def test_refinement_brings_prediction_nearer(name, rng, monkeypatch):
     task = TASKS[name]().double().eval()
     monkeypatch.setattr(refinement, "BATCH_POINTS", 100)  # two clouds at a time
     with torch.inference_mode():  # as in Lightning's tests
-        batch = Batch(torch.randn(3, 50, 3, generator=rng).double(), torch.zeros(3).long())
+        batch = batch_of(name, torch.randn(6, 50, 3, generator=rng).double())
         before = {m: FPSSampler(m)(batch.points).indices for m in (4, 9)}
         after = Refinement(task, 2)(batch, before)
         for m, rows in after.items():
@@ -45,14 +55,40 @@ def test_refinement_brings_prediction_nearer(name, rng, monkeypatch):
             assert torch.where(was > 0, apart < was, apart == 0).all()
 
 
+def test_refinement_of_pairs_refines_sources_for_whole_targets(rng):
+    """The sources do not depend on the targets' samples; the targets do on the sources'."""
+    torch.manual_seed(0)
+    task = TASKS["registration"]().double().eval()
+    batch = batch_of("registration", torch.randn(6, 50, 3, generator=rng).double())
+    rows = FPSSampler(5)(batch.points).indices
+    refined = Refinement(task, 3)(batch, {5: rows})[5]
+    other = rows.clone()
+    other[3:] = rows[3:].flip(1)
+    other[3:, 0] = torch.tensor([next(i for i in range(50) if i not in row) for row in rows[3:]])
+    again = Refinement(task, 3)(batch, {5: other})[5]
+    assert torch.equal(refined[:3], again[:3])
+    net, (source, target) = task.net, batch.points.chunk(2)
+    chosen = gather_points(source, refined[:3])
+    whole, half = net(source, target), net(chosen, target)
+    apart = task.disagreement(half, whole)
+    before = task.disagreement(net(gather_points(source, rows[:3]), target), whole)
+    assert (apart < before).all()
+
+
 def test_refinement_of_unsuitable_task_or_net_raises():
-    pairs = Registration(PCRNet(), Pairs(), quaternion_loss)
-    with pytest.raises(UserError, match="refine must be 0 for registration, got 2"):
+    pairs = Registration(PCRNet(iterations=2), Pairs(), quaternion_loss)
+    with pytest.raises(UserError, match=r"refine must be 0 with this PCRNet, got 2.*iterations=1"):
         Refinement(pairs, 2)
+    graph = Reconstruction(MFoldingNet(50, encoder="graph"))
+    with pytest.raises(UserError, match=r"refine must be 0 with this MFoldingNet, got 1"):
+        Refinement(graph, 1)
 
     class Mean(torch.nn.Module):
         def forward(self, points):
             return points.mean(1)
 
-    with pytest.raises(UserError, match=r"refine must be 0 with Mean, got 2.*pointnet"):
+    with pytest.raises(UserError, match=r"refine must be 0 for task, got 1"):
+        Refinement(Task(Mean()), 1)
+
+    with pytest.raises(UserError, match=r"refine must be 0 with this Mean, got 2.*pointnet"):
         Refinement(Classification(Mean(), 3), 2)

@@ -188,6 +188,11 @@ class MFoldingNet(nn.Module):
         """
         return self.from_pooled(self.encoder(points), n_points)
 
+    @property
+    def pools_points(self) -> bool:
+        """Whether the codeword follows from ``point_features``: not with the graph encoder."""
+        return not isinstance(self.encoder, GraphEncoder)
+
     def point_features(self, points: Tensor) -> Tensor:
         """Return the features ``(B, N, d)`` whose maxima over points are the codeword.
 

@@ -76,10 +76,13 @@ class PCRNet(nn.Module):
             else:
                 of_source = self._global(moved)
                 of_target = self._global(target) if of_target is None else of_target
-            predicted = self.motion(self.head(torch.cat([of_source, of_target], 1))).to(source)
-            step = Motion(F.normalize(predicted[:, :4], dim=1), predicted[:, 4:])
-            total = step.after(total)
+            total = self._step(of_source, of_target, source).after(total)
         return total
+
+    def _step(self, of_source: Tensor, of_target: Tensor, like: Tensor) -> Motion:
+        """Return the motion of one pass, in the dtype of ``like``, from both global features."""
+        predicted = self.motion(self.head(torch.cat([of_source, of_target], 1))).to(like)
+        return Motion(F.normalize(predicted[:, :4], dim=1), predicted[:, 4:])
 
     def point_features(self, points: Tensor) -> Tensor:
         """Return the features ``(B, N, C)`` of one cloud whose maxima over points the head takes.
@@ -87,6 +90,25 @@ class PCRNet(nn.Module):
         With several iterations, those of the source hold for the first one.
         """
         return self.pool.values(self.features(points))
+
+    @property
+    def pools_points(self) -> bool:
+        """Whether the motion follows from ``point_features``: with one iteration."""
+        return self.iterations == 1
+
+    def from_pooled(self, pooled: Tensor) -> Motion:
+        """Map maxima of ``point_features`` ``(2B, C)``, sources, then targets, to the motion.
+
+        Raises:
+            UserError: there are several iterations, which need the points.
+        """
+        if not self.pools_points:
+            raise UserError(
+                "iterations must be 1 for what needs features of single points, got "
+                f"{self.iterations}."
+            )
+        of_source, of_target = pooled.chunk(2)
+        return self._step(of_source, of_target, pooled)
 
     def _global(self, points: Tensor) -> Tensor:
         return self.pool(self.features(points))

@@ -45,6 +45,9 @@ class Task(nn.Module):
     net_takes: tuple[str, ...] = ("points",)
     """Names of the arguments of the net's ``forward``."""
 
+    clouds_per_prediction: int = 1
+    """Number of clouds that a prediction needs; ``points`` contains all first ones, and so on."""
+
     test_seed: int = 0
     """Seed of the random numbers that ``make_batch`` draws for clouds that are scored."""
 
@@ -84,14 +87,14 @@ class Task(nn.Module):
         """
         raise NotImplementedError
 
-    def predict_pooled(self, batch: Any, pooled: Tensor) -> Tensor:
+    def predict_pooled(self, batch: Any, pooled: Tensor) -> Any:
         """Return what ``predict`` returns, from the pooled features of the points.
 
         Only tasks whose prediction follows from them implement this; the refined readout needs it.
 
         Args:
             batch: from ``make_batch``.
-            pooled: ``(R, C)`` maxima over the net's ``point_features``.
+            pooled: ``(R, C)`` maxima over the net's ``point_features``, in the order of ``points``.
         """
         raise NotImplementedError
 

@@ -1,7 +1,7 @@
 """Registration of sampled clouds (paper section "Registration-oriented Downsampling")."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torch import Generator, Tensor, nn
 from torchmetrics import MetricCollection
@@ -46,6 +46,7 @@ class Registration(Task):
     score = RotationError.name
     net_takes = ("source", "target")
     clouds_are_batches = False
+    clouds_per_prediction = 2
     takes_pairs = True
 
     def __init__(
@@ -72,6 +73,11 @@ class Registration(Task):
     def predict(self, batch: PairBatch, points: Tensor) -> Motion:
         """Return the motions between the centred clouds from ``(2B, M, 3)`` points of both."""
         return self.net(*points.chunk(2))
+
+    def predict_pooled(self, batch: PairBatch, pooled: Tensor) -> Motion:
+        """Return the motions from pooled features ``(2R, C)``: sources, then targets."""
+        net: Any = self.net
+        return net.from_pooled(pooled)
 
     def disagreement(self, found: Motion, reference: Motion) -> Tensor:
         """Return the squared distance of two motions.
