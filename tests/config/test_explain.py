@@ -19,6 +19,7 @@ from tests.support.command_line import TINY, TINY_WITH_PICTURES, call
         (["dataset.features=[red]"], "no such setting here. It belongs to dataset=clouds."),
         (["noise=0.1"], "noise is now called test_noise_std"),
         (["sampler.feature_channels=[8]"], "Write +sampler.feature_channels=..."),
+        (["recipe.straight_through_set=matched"], "Write +recipe.straight_through_set=..."),
         (["learn=smapler"], "Did you mean 'sampler'"),
         (["m=4096"], "dataset.n_points=4096"),
         (["trainer=gpu", *TINY_WITH_PICTURES[1:]], "Try trainer=auto or trainer=cpu"),

@@ -154,6 +154,7 @@ def test_rival_samplers_have_published_settings():
         (["sampler=samplenet", "sampler.k=null"], "sampler.k must be a whole number, got None"),
         (["sampler=snet", "sampler.head_channels=[a]"], "must be a list of whole numbers, got"),
         (["sizes=[8,x]"], "sizes must be auto or a list of whole numbers"),
+        (["learn=task", "refine=1"], "refine must be 0 with learn=task, .*got 1"),
         (["weights=run"], "weights=run means the run named by evaluate"),
         (["learn=smapler"], "Did you mean 'sampler'"),
         (["+sampler.alhpa=3"], "Did you mean 'alpha'"),

@@ -69,9 +69,10 @@ def test_mesh_sequence_class_and_cache(folder, tmp_path):
     [
         ({"test_share": 0.0}, r"^test_share must be between 0 and 1, got 0.0"),
         ({"gap": -1}, r"^gap must be at least 0, got -1"),
-        ({"gap": 10}, r"^gap must .* got 10: .*crane has 12 frames, of which 2 are test"),
+        ({"gap": 10}, r"^gap must .*, got 10: .*crane has 12 frame.*2 of them.* at most 9, or"),
+        ({"test_share": 0.99}, r"crane has 12 frame.*12 of them.* leave this sequence out"),
         ({"test_frames": "lats"}, r"^test_frames: unknown 'lats'.*last"),
-        ({"gap": 5, "test_frames": "spread"}, r"^gap must leave training frames, got 5"),
+        ({"gap": 5, "test_frames": "spread"}, r"^gap must .*, got 5.* at most 2, or"),
         ({"n_points": 0}, r"^n_points must be at least 1, got 0"),
         ({"classes": ["samb"]}, r"^classes: unknown class 'samb'.*samba"),
     ],
@@ -79,6 +80,14 @@ def test_mesh_sequence_class_and_cache(folder, tmp_path):
 def test_mesh_sequence_invalid_argument_raises(folder, arguments, message):
     with pytest.raises(UserError, match=message):
         mesh_sequence(folder, **{"n_points": 50, **arguments})
+
+
+def test_mesh_sequence_left_out_needs_no_training_frames(folder):
+    (folder / "one").mkdir()
+    trimesh.creation.box().export(folder / "one" / "mesh_0.ply")
+    with pytest.raises(UserError, match=r"one has 1 frame.* leave this sequence out"):
+        mesh_sequence(folder, 50)
+    assert mesh_sequence(folder, 50, ["crane"]).class_names == ("crane",)
 
 
 def test_mesh_sequence_empty_folder_raises(tmp_path):

@@ -28,7 +28,7 @@ def plain_refine(features, indices, objective, passes):
             others = [row for row in range(len(features)) if row not in rows]
             options = [[*rows[:place], row, *rows[place + 1 :]] for row in others]
             best = min(options, key=score)
-            if score(best) < (1 - module.MIN_GAIN) * score(rows):
+            if score(best) < score(rows) - max(module.MIN_GAIN * score(rows), module.ROUNDING):
                 rows = best
     return rows
 
@@ -48,6 +48,19 @@ def test_refine_with_full_shortlist_equals_exhaustive_exchange(m, rng, monkeypat
             return objective(pooled, cloud + number)
 
         assert got == plain_refine(alone, indices[number].tolist(), one, 3)
+
+
+def test_refine_exchanges_nothing_for_rounding_errors(rng):
+    features = torch.rand(2, 30, 8, generator=rng)
+    rows = torch.arange(20).expand(2, -1)
+    assert torch.equal(refine(features, rows, lambda p, _: 1e-10 * p.mean(1), 2), rows)
+    assert not torch.equal(refine(features, rows, lambda p, _: p.mean(1), 2), rows)
+
+
+def test_refine_of_all_points_leaves_them(rng):
+    features = torch.rand(2, 30, 8, generator=rng)
+    rows = torch.arange(30).expand(2, -1)
+    assert torch.equal(refine(features, rows, lambda p, _: p.mean(1), 2), rows)
 
 
 def test_refine_lowers_objective_and_keeps_rows_distinct(rng):

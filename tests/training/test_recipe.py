@@ -117,6 +117,11 @@ def test_recipe_value_out_of_range_raises(name, value):
         check(compose([f"++recipe.{name}={value}"]))
 
 
+def test_recipe_set_without_straight_through_raises():
+    with pytest.raises(UserError, match="straight_through_set has no effect without"):
+        Recipe(straight_through_set="completed")
+
+
 def test_recipe_default_is_that_of_the_publication():
     assert Recipe() == Recipe(None, None, None, False, 0.0, 0.0, None, None)
 

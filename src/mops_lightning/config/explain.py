@@ -166,6 +166,8 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     target = OmegaConf.select(cfg, f"{node}._target_")
     if target and name in signature(target, node):
         return f"{key}: {target} accepts it, but no file sets it. Write +{key}=..."
+    if not target and key in settings.INSIDE:
+        return f"{key}: no file sets it. Write +{key}=..."
     choices = _choices_with(node, name)
     if choices:
         return f"{key}: no such setting here. It belongs to {' and '.join(choices)}."

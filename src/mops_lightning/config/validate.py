@@ -55,6 +55,11 @@ def check(cfg: DictConfig) -> None:
             "trainer.max_epochs must be a whole number of at least 1, got "
             f"{cfg.trainer.max_epochs}."
         )
+    if cfg.refine and not declared["refine"].counts(cfg.learn):
+        raise UserError(
+            f"refine must be 0 with learn={cfg.learn}, which samples nothing, got {cfg.refine}. "
+            "Leave it out, or test a sampler."
+        )
     distributed.check(cfg)
     points = cfg.dataset.get("n_points")
     if isinstance(points, int) and 1 <= points < cfg.m:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Literal
 
-from mops_lightning.data.clouds import CloudDataset
+from mops_lightning.data.clouds import CloudDataset, choose_classes
 from mops_lightning.data.mesh_io import SUFFIXES
 from mops_lightning.data.mesh_sampling import mesh_root, sample_meshes
 from mops_lightning.errors import UserError, did_you_mean
@@ -62,44 +62,48 @@ def mesh_sequence(
         "workers": (workers, 1),
     }
     folder = mesh_root(root, minima)
-    rows: list[tuple[PurePosixPath, str]] = []
-    for sequence in sorted(path for path in folder.iterdir() if path.is_dir()):
-        frames = (path for path in sequence.iterdir() if path.suffix.lower() in SUFFIXES)
-        paths = sorted(frames, key=by_number)
-        splits = _split_frames(sequence, len(paths), test_share, gap, test_frames)
-        names = [PurePosixPath(path.relative_to(folder).as_posix()) for path in paths]
-        rows += [(name, split) for name, split in zip(names, splits, strict=True) if split]
-    if not rows:
+    sequences = {path.name: _frames(path) for path in sorted(folder.iterdir()) if path.is_dir()}
+    sequences = {name: frames for name, frames in sequences.items() if frames}
+    if not sequences:
         raise UserError(
             f"root: no mesh in {folder}. Looked for SEQUENCE/* ending in {', '.join(SUFFIXES)}."
         )
+    rows: list[tuple[PurePosixPath, str]] = []
+    for name in choose_classes(classes, list(sequences)):
+        frames = sequences[name]
+        splits = _split_frames(folder / name, len(frames), test_share, gap, test_frames)
+        paths = [PurePosixPath(frame.relative_to(folder).as_posix()) for frame in frames]
+        rows += [(path, split) for path, split in zip(paths, splits, strict=True) if split]
     return sample_meshes(folder, rows, classes, n_points, seed=seed, cache=cache, workers=workers)
+
+
+def _frames(sequence: Path) -> list[Path]:
+    """Return the meshes of a sequence in the order of their numbers."""
+    frames = (path for path in sequence.iterdir() if path.suffix.lower() in SUFFIXES)
+    return sorted(frames, key=by_number)
 
 
 def _split_frames(
     sequence: Path, frames: int, test_share: float, gap: int, test_frames: str
 ) -> list[str]:
     """Return the split of every frame of a sequence; frames in the gap have an empty one."""
-    if not frames:
-        return []
     n_test = max(round(frames * test_share), 1)
     if test_frames == "last":
         test = list(range(frames - n_test, frames))
     else:  # the middle frame of each of n_test equal parts
         test = [(2 * part + 1) * frames // (2 * n_test) for part in range(n_test)]
-    splits = ["train"] * frames
-    for frame in test:
-        begin = max(frame - gap, 0)
-        end = frame + gap + 1
-        splits[begin:end] = [""] * len(splits[begin:end])
-    for frame in test:
-        splits[frame] = "test"
-    if "train" not in splits:
+    # Distance of every frame from the nearest test frame.
+    apart = [min(abs(frame - other) for other in test) for frame in range(frames)]
+    if gap >= max(apart):
+        largest = max(apart) - 1
+        advice = "Reduce test_share, or leave this sequence out (classes)."
+        if largest >= 0:
+            advice = f"Use a gap of at most {largest}, or a smaller test_share."
         raise UserError(
-            f"gap must leave training frames, got {gap}: {sequence} has {frames} frames, "
-            f"of which {n_test} are test frames. Reduce gap or test_share."
+            f"gap must leave training frames, got {gap}: {sequence} has {frames} frame(s), "
+            f"{n_test} of them for the test. {advice}"
         )
-    return splits
+    return ["train" if far > gap else "" if far else "test" for far in apart]
 
 
 def by_number(path: PurePath) -> tuple[list[tuple[int, str]], str]:

@@ -11,6 +11,8 @@ SHORTLIST = 16
 """Candidates for each place of a sample that are scored exactly."""
 MIN_GAIN = 1e-3
 """Smallest relative improvement for which points are exchanged."""
+ROUNDING = 1e-9
+"""Improvements up to here are rounding errors."""
 
 
 @torch.no_grad()
@@ -35,6 +37,8 @@ def refine(
         ``(B, M)`` int64, distinct; no objective is larger than that of ``indices``.
     """
     indices = indices.clone()
+    if indices.shape[1] == features.shape[1]:
+        return indices  # no other points
     active = torch.arange(len(features), device=features.device)
     for _ in range(passes):
         improved = _one_pass(features[active], indices[active], objective, active)
@@ -71,7 +75,7 @@ def _one_pass(
         # An earlier place of this pass may have taken a candidate.
         taken = (candidates[:, :, None] == indices[:, None]).any(2)
         best, which = values.masked_fill(taken, torch.inf).min(1)
-        better = best < value - MIN_GAIN * value.abs()
+        better = best < value - (MIN_GAIN * value.abs()).clamp(min=ROUNDING)
         new = candidates[every, which]
         indices[:, place] = torch.where(better, new, indices[:, place])
         value = torch.where(better, best, value)

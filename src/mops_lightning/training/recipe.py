@@ -77,6 +77,11 @@ class Recipe:
                 f"straight_through_set must be one of {', '.join(STRAIGHT_THROUGH_SETS)}, got "
                 f"{self.straight_through_set!r}."
             )
+        if self.straight_through is None and self.straight_through_set != "matched":
+            raise UserError(
+                "straight_through_set has no effect without straight_through, got "
+                f"{self.straight_through_set}. Set straight_through, such as 0.8, or leave it out."
+            )
 
     def points_at(self, progress: float, available: int, largest: int) -> int:
         """Return how many points of a cloud a step sees.
