@@ -24,6 +24,7 @@ MOPS: dict[str, Any] = {
     **{"alpha": 30.0, "tau_min": 0.1, "annealing": "exponential", "threshold": 0.0},
     **{"rho_channels": (512, 256, 128), "attributes": (), "anchors": None, **FEATURES},
     "anchor_width": 0.5,
+    "overlap": 0.0,
 }
 SNET: dict[str, Any] = {
     **{"alpha": 30.0, "coverage": 1.0, "coverage_per_point": 0.0, **FEATURES},

@@ -3,6 +3,7 @@ import torch
 from torch import nn
 
 from mops_lightning.errors import UserError
+from mops_lightning.losses.overlap import overlap_losses
 from mops_lightning.losses.subset import subset_loss
 from mops_lightning.nets.layers import fit_attribute_scales, linear_norm_relu
 from mops_lightning.samplers.mops import MOPSNet
@@ -106,6 +107,16 @@ def test_mops_points_are_in_bounding_box(rng):
     assert (sampled.amin(1) >= points.amin(1)).all()
 
 
+def test_mops_overlap_adds_weighted_penalty(rng):
+    points = torch.randn(3, 40, 3, generator=rng)
+    plain, net = small().train(), small(overlap=4.0).train()
+    assert set(plain(points).losses) == {"subset"}
+    output = net(points)
+    assert output.losses["subset"] == plain(points).losses["subset"]
+    expected = 4 * overlap_losses(output.matrix, (5,))[5]
+    torch.testing.assert_close(output.losses["overlap"], expected)
+
+
 def test_mops_threshold_drops_small_entries_in_evaluation_only(rng):
     points = torch.randn(2, 20, 3, generator=rng)
     net, dense = small(tau_min=0.02, threshold=0.05), small(tau_min=0.02)
@@ -132,6 +143,8 @@ def test_mops_gradcheck(rng):
         ({"tau_min": 1.5}, "^tau_min must be above 0 and at most 1, got 1.5"),
         ({"feature_channels": ()}, "^feature_channels must be sizes of at least 1 layer,"),
         ({"rho_channels": (8, 0)}, "^rho_channels must be sizes"),
+        ({"overlap": -1.0}, "^overlap must be a number of at least 0, got -1.0"),
+        ({"overlap": float("nan")}, "^overlap must be a number"),
         ({"threshold": 1.0}, "^threshold must be at least 0 and below 1, got 1.0"),
         ({"alpha": -1.0}, "^alpha must be a number of at least 0, got -1.0"),
         ({"alpha": float("inf")}, "^alpha must be a number"),

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.losses.overlap import overlap_losses
 from mops_lightning.losses.subset import subset_losses
 from mops_lightning.nets.layers import PointFeatures, check_channels, linear_norm_relu
 from mops_lightning.ops.points import coordinates
@@ -49,6 +50,8 @@ class MOPSNet(Sampler):
             (see ``anchors``); None, as in the paper, lets them start at random.
         anchor_width: how soft that choice is before training: the width of the columns as a share
             of the spacing of the farthest points. Only with anchors.
+        overlap: weight of the penalty on columns of S that choose the same points
+            (``losses.overlap``); 0, as in the paper, for none.
 
     Raises:
         UserError: an argument is out of range.
@@ -78,12 +81,15 @@ class MOPSNet(Sampler):
         attributes: Sequence[str] = (),
         anchors: Literal["fps"] | None = None,
         anchor_width: float = DEFAULT_WIDTH,
+        overlap: float = 0.0,
     ) -> None:
         super().__init__(m)
         if not 0 < tau_min <= 1:
             raise UserError(f"tau_min must be above 0 and at most 1, got {tau_min}.")
         if not 0 <= alpha < math.inf:
             raise UserError(f"alpha must be a number of at least 0, got {alpha}.")
+        if not 0 <= overlap < math.inf:
+            raise UserError(f"overlap must be a number of at least 0, got {overlap}.")
         if annealing not in ANNEALINGS:
             hint = did_you_mean(annealing, ANNEALINGS)
             raise UserError(f"annealing: unknown {annealing!r}.{hint}")
@@ -103,6 +109,7 @@ class MOPSNet(Sampler):
         if not 0 <= threshold < 1:
             raise UserError(f"threshold must be at least 0 and below 1, got {threshold}.")
         self.alpha = alpha
+        self.overlap = overlap
         self.threshold = threshold
         self.tau_min = tau_min
         self.annealing = annealing
@@ -204,6 +211,13 @@ class MOPSNet(Sampler):
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]
     ) -> dict[int, dict[str, Tensor]]:
-        """Return α times the subset loss at every size (section "Joint Training Loss", Eq. 11)."""
-        losses = subset_losses(coordinates(points), coordinates(output.points), sizes)
-        return {m: {"subset": self.alpha * loss} for m, loss in losses.items()}
+        """Return α times the subset loss at every size (section "Joint Training Loss", Eq. 11).
+
+        With ``overlap``, also the penalty on columns that choose the same points.
+        """
+        subset = subset_losses(coordinates(points), coordinates(output.points), sizes)
+        losses = {m: {"subset": self.alpha * loss} for m, loss in subset.items()}
+        if self.overlap and output.matrix is not None:
+            for m, loss in overlap_losses(output.matrix, sizes).items():
+                losses[m]["overlap"] = self.overlap * loss
+        return losses
