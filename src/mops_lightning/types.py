@@ -157,7 +157,7 @@ class PooledNet(PointFeatureNet, Protocol):
     """A net that maps the maxima of ``point_features`` over the points to its result.
 
     A net that does so only with some of its settings has an attribute ``pools_points``, which says
-    whether it does.
+    whether it does. PCRNet, which needs the maxima of two clouds, has ``from_pooled_pair`` instead.
     """
 
     def from_pooled(self, pooled: Tensor) -> Any:

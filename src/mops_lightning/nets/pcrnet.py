@@ -96,8 +96,8 @@ class PCRNet(nn.Module):
         """Whether the motion follows from ``point_features``: with one iteration."""
         return self.iterations == 1
 
-    def from_pooled(self, pooled: Tensor) -> Motion:
-        """Map maxima of ``point_features`` ``(2B, C)``, sources, then targets, to the motion.
+    def from_pooled_pair(self, of_source: Tensor, of_target: Tensor) -> Motion:
+        """Map maxima of ``point_features`` of sources and targets, ``(B, C)`` each, to the motion.
 
         Raises:
             UserError: there are several iterations, which need the points.
@@ -107,8 +107,7 @@ class PCRNet(nn.Module):
                 "iterations must be 1 for what needs features of single points, got "
                 f"{self.iterations}."
             )
-        of_source, of_target = pooled.chunk(2)
-        return self._step(of_source, of_target, pooled)
+        return self._step(of_source, of_target, of_source)
 
     def _global(self, points: Tensor) -> Tensor:
         return self.pool(self.features(points))

@@ -48,6 +48,9 @@ class Task(nn.Module):
     clouds_per_prediction: int = 1
     """Number of clouds that a prediction needs; ``points`` contains all first ones, and so on."""
 
+    maps_pooled: str = "from_pooled"
+    """Name of the net's method behind ``predict_pooled``."""
+
     test_seed: int = 0
     """Seed of the random numbers that ``make_batch`` draws for clouds that are scored."""
 

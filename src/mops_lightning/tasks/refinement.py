@@ -11,7 +11,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.refine import refine
 from mops_lightning.tasks.base import Task
-from mops_lightning.types import PooledNet
+from mops_lightning.types import PointFeatureNet
 
 BATCH_POINTS = 32768
 """Number of points of one side whose features are in memory together; at least one cloud."""
@@ -41,7 +41,8 @@ class Refinement:
                 f"refine must be 0 for {type(task).__name__.lower()}, got {refine}: its prediction "
                 "does not follow from the features of a sample (predict_pooled)."
             )
-        if not isinstance(task.net, PooledNet) or not getattr(task.net, "pools_points", True):
+        suits = isinstance(task.net, PointFeatureNet) and hasattr(task.net, task.maps_pooled)
+        if not suits or not getattr(task.net, "pools_points", True):
             raise UserError(
                 f"refine must be 0 with this {type(task.net).__name__}, got {refine}: its result "
                 "does not follow from features of single points under a maximum. Such nets are "
@@ -98,7 +99,7 @@ class Refinement:
         self, batch: Any, sides: Sequence[Tensor], samples: Mapping[int, Sequence[Tensor]]
     ) -> dict[int, list[Tensor]]:
         net = self.task.net
-        assert isinstance(net, PooledNet)
+        assert isinstance(net, PointFeatureNet)
         features = [net.point_features(points) for points in sides]
         whole = [each.amax(1) for each in features]
         wanted = self.task.predict_pooled(batch, torch.cat(whole))

@@ -47,6 +47,7 @@ class Registration(Task):
     net_takes = ("source", "target")
     clouds_are_batches = False
     clouds_per_prediction = 2
+    maps_pooled = "from_pooled_pair"
     takes_pairs = True
 
     def __init__(
@@ -77,7 +78,7 @@ class Registration(Task):
     def predict_pooled(self, batch: PairBatch, pooled: Tensor) -> Motion:
         """Return the motions from pooled features ``(2R, C)``: sources, then targets."""
         net: Any = self.net
-        return net.from_pooled(pooled)
+        return net.from_pooled_pair(*pooled.chunk(2))
 
     def disagreement(self, found: Motion, reference: Motion) -> Tensor:
         """Return the squared distance of two motions.
