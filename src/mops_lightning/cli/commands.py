@@ -7,7 +7,7 @@ class Command(NamedTuple):
     """A subcommand.
 
     Attributes:
-        module: has ``main(arguments, prog)`` and ``make_parser(prog)``; imported when it is used.
+        module: has ``main(arguments, prog)``; imported when it is used.
         summary: its line in ``--help``.
     """
 
@@ -29,7 +29,6 @@ COMMANDS = {
         "mops_lightning.cli.models", "trained models: list, show a card, publish a run as one"
     ),
     "export": Command("mops_lightning.cli.export", "write a trained sampler as .onnx or .pt2"),
-    "schema": Command("mops_lightning.cli.schema", "JSON schema of the configuration, for editors"),
 }
 
 

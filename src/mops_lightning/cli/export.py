@@ -2,9 +2,7 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from mops_lightning.cli.models import complete_names
 from mops_lightning.errors import UserError, one_line_endings
 
 DESCRIPTION = """Write a trained sampler as ONNX (.onnx) or as a PyTorch program (.pt2).
@@ -31,8 +29,7 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
         prog=prog, description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    sampler: Any = add("sampler", metavar="SAMPLER", help="a model's name, a run or a weights file")
-    sampler.completer = complete_names
+    add("sampler", metavar="SAMPLER", help="a model's name, a run or a weights file")
     add("target", metavar="OUT", type=Path, help="a file that ends in .onnx or .pt2")
     add("--m", type=int, help="number of points; default: as the sampler was trained for")
     add("--overwrite", action="store_true", help="replace an existing file")

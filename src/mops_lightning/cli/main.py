@@ -3,7 +3,6 @@
 Nothing heavy is imported before the command is known, so that ``--help`` is quick.
 """
 
-import os
 import re
 import sys
 from importlib import import_module
@@ -11,7 +10,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 from mops_lightning.cli.commands import COMMANDS
-from mops_lightning.cli.completion import complete, is_query
 from mops_lightning.errors import USER_ERROR, did_you_mean, end, quiet_on_closed_pipe
 
 WORD = re.compile(r"[^-+~=][^=]*")
@@ -23,8 +21,6 @@ def main() -> None:
     arguments = sys.argv[1:]
     first = arguments[0] if arguments else ""
     with quiet_on_closed_pipe():
-        if is_query(arguments) and complete(os.environ.get("COMP_LINE", "")):
-            return
         if first == "--version":
             print(f"mops_lightning {version('mops-lightning')}")
         elif first in COMMANDS:

@@ -39,8 +39,7 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
         prog=prog, description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    words: Any = add("words", nargs="*", metavar="NAME | add RUN NAME", help="see above")
-    words.completer = complete_names
+    add("words", nargs="*", metavar="NAME | add RUN NAME", help="see above")
     add("--json", action="store_true", help="print the card of NAME as JSON, with the record")
     new = parser.add_argument_group("options of add")
     new.add_argument("--folder", type=Path, help=f"where to; default: first of ${names.VARIABLE}")
@@ -59,11 +58,6 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
         "--record", type=Path, metavar="FOLDER", help="let the record in FOLDER name the model"
     )
     return parser
-
-
-def complete_names(prefix: str, **_: Any) -> list[str]:
-    """Return the names of models that start with a prefix, for the shell."""
-    return [name for name in names.available() if name.startswith(prefix)]
 
 
 def _refuse_unused(chosen: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
