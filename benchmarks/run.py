@@ -12,7 +12,7 @@ import torch
 from cases import ALL
 from measure import ceiling, machine
 
-from mops_lightning.files import atomic_write
+from mops_lightning.filesystem import atomic_write
 
 COLUMNS = {
     "seconds": lambda value: f"{1000 * value:.3g} ms",

@@ -9,7 +9,7 @@ from filelock import FileLock
 
 from mops_lightning.cli.sweep import run_cell
 from mops_lightning.config.compose import compose
-from mops_lightning.files import TEMPORARY
+from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.records import run_record
 from mops_lightning.records.attempts import ASIDE, FAILED
 from tests.support.command_line import TINY, call

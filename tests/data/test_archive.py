@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mops_lightning import files
+from mops_lightning import filesystem
 from mops_lightning.data.archive import unpack
 from mops_lightning.errors import UserError
 
@@ -137,7 +137,7 @@ def test_unpack_member_without_name_raises(tmp_path: Path, write: Write, name: s
 def test_unpack_more_than_limit_raises(
     tmp_path: Path, write: Write, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(files, "MEMORY", 1000)
+    monkeypatch.setattr(filesystem, "MEMORY", 1000)
     write(tmp_path / "a", {"a.txt": bytes(3_000_000), "b.txt": bytes(10)})
     with pytest.raises(UserError, match="unpacks to more than"):
         unpack(tmp_path / "a", tmp_path / "out")

@@ -9,7 +9,7 @@ import torch
 
 from mops_lightning.data.meshes import meshes
 from mops_lightning.errors import UserError
-from mops_lightning.files import TEMPORARY
+from mops_lightning.filesystem import TEMPORARY
 from tests.support.meshes import BALL, write_mesh
 
 

@@ -19,7 +19,7 @@ from mops_lightning.data.procedural.builders import BUILDERS
 from mops_lightning.data.procedural.mesh_parts import join, turned
 from mops_lightning.data.shapes import shapes
 from mops_lightning.errors import UserError
-from mops_lightning.files import TEMPORARY
+from mops_lightning.filesystem import TEMPORARY
 
 SMALL: dict[str, Any] = {
     "n_points": 64,

@@ -3,7 +3,7 @@
 import pytest
 
 from mops_lightning.data.formats.registry import read
-from mops_lightning.files import TEMPORARY
+from mops_lightning.filesystem import TEMPORARY
 from tests.support.downsample import call
 
 

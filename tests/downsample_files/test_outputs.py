@@ -6,7 +6,7 @@ import pytest
 
 from mops_lightning.downsample_files.outputs import check_writable, jobs
 from mops_lightning.errors import UserError
-from mops_lightning.files import TEMPORARY
+from mops_lightning.filesystem import TEMPORARY
 
 
 @pytest.fixture

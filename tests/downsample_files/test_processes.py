@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from mops_lightning import files
+from mops_lightning import filesystem
 from mops_lightning.data.formats import limits
 from mops_lightning.downsample_files.processes import Died, Processes
 
@@ -25,7 +25,7 @@ def job(path, kind):
                 while True:
                     time.sleep(1)
             if kind == "eat":
-                np.ones(files.MEMORY + (1 << 28), np.uint8)
+                np.ones(filesystem.MEMORY + (1 << 28), np.uint8)
     except MemoryError:
         return "too much memory"
     return os.getpid()

@@ -4,7 +4,7 @@ import importlib
 import traceback
 from pathlib import Path
 
-from mops_lightning import files
+from mops_lightning import filesystem
 from mops_lightning.data.formats import limits
 from mops_lightning.errors import UserError
 
@@ -21,7 +21,7 @@ MODULES = {
 
 def outcome(kind, path):
     """Read a file: ``read``, ``refused``, or the traceback of what must not happen."""
-    limits.SECONDS, files.MEMORY = SECONDS, MEMORY
+    limits.SECONDS, filesystem.MEMORY = SECONDS, MEMORY
     importlib.import_module(MODULES.get(kind.split()[0], "mops_lightning.data.formats.registry"))
     try:
         with limits.limited(path):

@@ -2,7 +2,7 @@
 
 import torch
 
-from mops_lightning.files import TEMPORARY
+from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.full_predictions import full_predictions

@@ -7,7 +7,7 @@ from filelock import FileLock
 from mops_lightning.config.build import build
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
-from mops_lightning.files import TEMPORARY
+from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.training.pretrain import cache_folder
 from mops_lightning.training.run import run
 from mops_lightning.zoo import weights

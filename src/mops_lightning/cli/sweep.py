@@ -22,7 +22,7 @@ from mops_lightning.cli.start import begin, make
 from mops_lightning.config import settings
 from mops_lightning.config.declaration import Affects
 from mops_lightning.errors import Interrupted, UserError, file_error, memory_error
-from mops_lightning.files import remove_temporary, set_aside
+from mops_lightning.filesystem import remove_temporary, set_aside
 from mops_lightning.records import run_record
 from mops_lightning.records.attempts import ASIDE, FAILED
 

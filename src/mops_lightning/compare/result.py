@@ -13,7 +13,7 @@ from mops_lightning.compare.measures import lowest
 from mops_lightning.compare.methods import FILES, TRAINED
 from mops_lightning.compare.run import FileResult, Result, compare_file
 from mops_lightning.downsample_files.settings import Settings
-from mops_lightning.files import atomic_write
+from mops_lightning.filesystem import atomic_write
 from mops_lightning.report.page import render
 from mops_lightning.report.text import Grid, markdown
 from mops_lightning.viz.clouds import COLOURS, INPUT_COLOUR

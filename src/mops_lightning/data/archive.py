@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import IO
 
 from mops_lightning.errors import UserError, one_line
-from mops_lightning.files import memory
+from mops_lightning.filesystem import memory
 
 MAX_MEMBERS = 1_000_000
 

@@ -10,7 +10,7 @@ import torch
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, select_classes
 from mops_lightning.errors import UserError, one_line
-from mops_lightning.files import memory
+from mops_lightning.filesystem import memory
 
 NAMES = "shape_names.txt"
 MAX_CLASSES = 10_000

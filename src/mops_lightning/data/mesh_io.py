@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mops_lightning.data import glb_bounds, ply_header
 from mops_lightning.errors import UserError, one_line
-from mops_lightning.files import atomic_write
+from mops_lightning.filesystem import atomic_write
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

@@ -20,7 +20,7 @@ from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
 from mops_lightning.data.mesh_io import VERSION, BrokenMeshError, Result, cloud_or_error
 from mops_lightning.data.split_list import SPLITS
 from mops_lightning.errors import UserError
-from mops_lightning.files import remove_temporary
+from mops_lightning.filesystem import remove_temporary
 
 
 def mesh_root(root: str | Path, minima: dict[str, tuple[int, int]]) -> Path:

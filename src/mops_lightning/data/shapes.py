@@ -21,7 +21,7 @@ from rich.progress import track
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
 from mops_lightning.data.procedural.builders import BUILDERS
 from mops_lightning.errors import UserError
-from mops_lightning.files import atomic_write, remove_temporary
+from mops_lightning.filesystem import atomic_write, remove_temporary
 
 GENERATOR_VERSION = 1
 """Part of the fingerprint; increment it with every change of the shapes."""

@@ -15,7 +15,7 @@ from mops_lightning.errors import (
     one_line,
     quiet_on_closed_pipe,
 )
-from mops_lightning.files import remove_temporary
+from mops_lightning.filesystem import remove_temporary
 from mops_lightning.records.readout_names import GENERATED_READOUTS
 
 DESCRIPTION = """Downsample clouds and meshes from files.

@@ -6,7 +6,7 @@ from tempfile import TemporaryFile
 
 from mops_lightning.data.formats.registry import READABLE, WRITERS
 from mops_lightning.errors import UserError, one_line
-from mops_lightning.files import is_temporary
+from mops_lightning.filesystem import is_temporary
 
 Job = tuple[Path, Path]
 """An input file and its output file."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from mops_lightning.errors import UserError
-from mops_lightning.files import atomic_write
+from mops_lightning.filesystem import atomic_write
 from mops_lightning.records.environment import environment
 from mops_lightning.records.migrate import upgraded_config, upgraded_overrides
 

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from mops_lightning.errors import one_line_endings
-from mops_lightning.files import atomic_write, remove_temporary
+from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.report.build import Report, build
 from mops_lightning.report.text import latex, long_csv, markdown
 

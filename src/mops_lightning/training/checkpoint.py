@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config.comparison import trained_with
 from mops_lightning.errors import UserError
-from mops_lightning.files import set_aside
+from mops_lightning.filesystem import set_aside
 from mops_lightning.records import run_record
 from mops_lightning.zoo import nets, weights
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
-from mops_lightning.files import atomic_write, remove_temporary
+from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.tasks.base import Task
 from mops_lightning.zoo import weights
 

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from mops_lightning.config import distributed
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
-from mops_lightning.files import atomic_write, remove_temporary, set_aside
+from mops_lightning.filesystem import atomic_write, remove_temporary, set_aside
 from mops_lightning.training import checkpoint
 from mops_lightning.training.callbacks import added
 from mops_lightning.training.checkpoint import CHECKPOINT

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from PIL import Image
 
-from mops_lightning.files import atomic_write
+from mops_lightning.filesystem import atomic_write
 
 MAX_PNG_BYTES = 300_000
 MAX_SVG_BYTES = 150_000

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mops_lightning.errors import UserError
-from mops_lightning.files import atomic_write, load_npz
+from mops_lightning.filesystem import atomic_write, load_npz
 
 if TYPE_CHECKING:  # reports, which import this module, do not wait for torch
     from torch import Tensor

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from mops_lightning.errors import UserError
-from mops_lightning.files import atomic_write
+from mops_lightning.filesystem import atomic_write
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.snet import SNet

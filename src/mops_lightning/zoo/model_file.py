@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mops_lightning.errors import UserError
-from mops_lightning.files import atomic_write
+from mops_lightning.filesystem import atomic_write
 from mops_lightning.records import run_record
 from mops_lightning.records.migrate import upgraded_config, upgraded_overrides
 from mops_lightning.zoo.digest import digest

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.files import atomic_write
+from mops_lightning.filesystem import atomic_write
 from mops_lightning.records import run_record
 from mops_lightning.records.migrate import upgraded_config
 from mops_lightning.zoo import bounds, model_file, names

@@ -15,7 +15,7 @@ from mops_lightning.data.formats.table import (
     unique_names,
 )
 from mops_lightning.errors import one_line
-from mops_lightning.files import load_npz
+from mops_lightning.filesystem import load_npz
 
 POINTS = ("points", "xyz", "pos")
 """Names of the array of an .npz file that holds the coordinates."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from mops_lightning.files import memory
+from mops_lightning.filesystem import memory
 
 try:
     import resource

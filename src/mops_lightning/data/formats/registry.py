@@ -13,7 +13,7 @@ from mops_lightning.data.formats.table import Table
 from mops_lightning.data.mesh_io import SUFFIXES as MESHES
 from mops_lightning.data.mesh_io import parse_mesh
 from mops_lightning.errors import one_line
-from mops_lightning.files import atomic_write
+from mops_lightning.filesystem import atomic_write
 
 READERS: dict[str, Callable[[Path], Table | None]] = {
     ".ply": ply.read, ".pcd": pcd.read, ".las": las.read, ".laz": las.read, ".bin": kitti.read,

@@ -4,9 +4,9 @@ import zipfile
 import numpy as np
 import pytest
 
-from mops_lightning import files
+from mops_lightning import filesystem
 from mops_lightning.errors import UserError, file_error
-from mops_lightning.files import (
+from mops_lightning.filesystem import (
     atomic_write,
     is_temporary,
     load_npz,
@@ -75,7 +75,7 @@ def test_set_aside_keeps_every_damaged_file(tmp_path):
 def test_load_npz_small_file_of_large_arrays_is_refused(tmp_path, monkeypatch):
     np.savez_compressed(tmp_path / "a.npz", points=np.zeros((10**6, 3)))
     assert load_npz(tmp_path / "a.npz")["points"].shape == (10**6, 3)
-    monkeypatch.setattr(files, "MEMORY", 1000)
+    monkeypatch.setattr(filesystem, "MEMORY", 1000)
     with pytest.raises(UserError, match=r"a\.npz is broken: .* bytes announced"):
         load_npz(tmp_path / "a.npz")
 
