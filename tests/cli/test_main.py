@@ -87,7 +87,7 @@ def test_run_whose_reader_ends_stops_quietly(tmp_path):
     assert process.returncode == 141
     (run,) = runs(tmp_path)
     record = run_record.read(run)
-    assert (record["status"], record["error"]) == (
+    assert (record.status, record.error) == (
         "interrupted",
         "BrokenPipeError: [Errno 32] Broken pipe",
     )

@@ -41,7 +41,7 @@ def test_run_stopped_mid_epoch_resumes_to_same_weights(unbroken, number, left):
     process.send_signal(number)
     _, err = process.communicate(timeout=60)
     (run,) = (path.parent for path in (folder / out).rglob("result.json"))
-    assert run_record.read(run)["status"] == left
+    assert run_record.read(run).status == left
     if number == signal.SIGINT:
         assert process.returncode == 130
         assert "ckpt_path=" in err
@@ -49,7 +49,7 @@ def test_run_stopped_mid_epoch_resumes_to_same_weights(unbroken, number, left):
     status, _, err = call([*LONGER, f"out={out}", "ckpt_path=last"], folder)
     assert status == 0, err
     (resumed,) = (path.parent for path in (folder / out).rglob("result.json") if path.parent != run)
-    assert run_record.read(resumed)["notes"]["resumed_from"] == str(
+    assert run_record.read(resumed).resumed_from == str(
         (run / "checkpoints" / "last.ckpt").relative_to(folder)
     )
     got = final_state(resumed)

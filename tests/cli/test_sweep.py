@@ -11,7 +11,7 @@ from mops_lightning.cli.sweep import run_cell
 from mops_lightning.config.compose import compose
 from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.records import run_record
-from mops_lightning.records.attempts import ASIDE, FAILED
+from mops_lightning.records.run_record import ASIDE, FAILED
 from tests.support.command_line import TINY, call
 
 
@@ -51,13 +51,13 @@ def test_run_cell_failed_is_repeated(start, tmp_path, caplog):
     file = tmp_path / "net.pt"
     assert math.isnan(start("sampler=fps", f"weights={file}"))
     assert f"no file {file}" in caplog.text
-    assert run_record.read(tmp_path / "cell")["status"] == "failed"
+    assert run_record.read(tmp_path / "cell").status == "failed"
     overrides = [*TINY, "learn=task"]
     run_cell(compose(overrides), tmp_path / "task", overrides)
     (tmp_path / "task" / "weights.pt").rename(file)
     assert math.isfinite(start("sampler=fps", f"weights={file}"))
-    assert run_record.read(tmp_path / "cell")["status"] == "completed"
-    assert run_record.read(tmp_path / "cell" / ASIDE / "1")["status"] == "failed"
+    assert run_record.read(tmp_path / "cell").status == "completed"
+    assert run_record.read(tmp_path / "cell" / ASIDE / "1").status == "failed"
 
 
 def test_run_cell_interrupted_resumes_to_same_result(start, tmp_path):
@@ -66,21 +66,21 @@ def test_run_cell_interrupted_resumes_to_same_result(start, tmp_path):
     whole = run_record.read(tmp_path / "cell")
     # What a killed process leaves: a record that says "running", and its last checkpoint.
     path = tmp_path / "cell" / run_record.FILE
-    path.write_text(json.dumps({**whole, "status": "running", "metrics": {}, "score": None}))
+    path.write_text(json.dumps({**whole.plain(), "status": "running", "score": None}))
     assert start(*longer) == score
     again = run_record.read(tmp_path / "cell")
-    assert again["metrics"] == whole["metrics"]
-    assert again["notes"]["resumed_from"].endswith(f"{ASIDE}/1/checkpoints/last.ckpt")
+    assert again.metrics == whole.metrics
+    assert str(again.resumed_from).endswith(f"{ASIDE}/1/checkpoints/last.ckpt")
     assert start(*longer) == score
     # Cut off again before it has a checkpoint of its own, or a record: the first one still counts.
     (tmp_path / "cell" / "checkpoints" / "last.ckpt").unlink(missing_ok=True)
-    path.write_text(json.dumps({**again, "status": "interrupted", "metrics": {}, "score": None}))
+    path.write_text(json.dumps({**again.plain(), "status": "interrupted", "score": None}))
     assert start(*longer) == score
     for name in (run_record.FILE, "weights.pt"):
         (tmp_path / "cell" / name).unlink()
     (tmp_path / "cell" / "checkpoints" / "last.ckpt").unlink(missing_ok=True)
     assert start(*longer) == score
-    resumed = run_record.read(tmp_path / "cell")["notes"]["resumed_from"]
+    resumed = str(run_record.read(tmp_path / "cell").resumed_from)
     assert resumed.endswith(f"{ASIDE}/1/checkpoints/last.ckpt")
 
 
@@ -93,7 +93,7 @@ def test_run_cell_killed_while_setting_aside_recovers(start, tmp_path, monkeypat
     score = start("sampler=fps", "weights=null")
     cell = tmp_path / "cell"
     record = run_record.read(cell)
-    (cell / run_record.FILE).write_text(json.dumps({**record, "status": "interrupted"}))
+    (cell / run_record.FILE).write_text(json.dumps({**record.plain(), "status": "interrupted"}))
     (cell / "checkpoints").mkdir()
     (cell / "pictures").mkdir()
     moved = {path.name for path in cell.iterdir()} - {".lock"}
@@ -111,7 +111,7 @@ def test_run_cell_killed_while_setting_aside_recovers(start, tmp_path, monkeypat
         with pytest.raises(Killed):
             start("sampler=fps", "weights=null")
     assert start("sampler=fps", "weights=null") == score
-    assert run_record.read(cell)["status"] == "completed"
+    assert run_record.read(cell).status == "completed"
     assert {path.name for path in (cell / ASIDE / "1").iterdir()} == moved
     assert [path.name for path in (cell / ASIDE).iterdir()] == ["1"]
 
@@ -123,7 +123,7 @@ def test_run_cell_damaged_files_are_set_aside(start, tmp_path, capsys, caplog):
     record = run_record.read(cell)
     checkpoint = cell / "checkpoints" / "last.ckpt"
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
-    (cell / run_record.FILE).write_text(json.dumps({**record, "status": "running"}))
+    (cell / run_record.FILE).write_text(json.dumps({**record.plain(), "status": "running"}))
     assert start(*longer) == score
     assert "last.ckpt is damaged" in capsys.readouterr().out
     assert (cell / ASIDE / "1" / "checkpoints" / "last.ckpt.damaged").is_file()

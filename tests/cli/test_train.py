@@ -44,14 +44,14 @@ def test_main_job_prints_scores_and_output_paths(main_job):
 def test_main_job_writes_complete_record(main_job):
     folder, run, *_ = main_job
     record = run_record.read(run)
-    assert record["status"] == "completed"
-    assert record["overrides"] == TINY_WITH_PICTURES
+    assert record.status == "completed"
+    assert record.overrides == TINY_WITH_PICTURES
     for readout in ("random", "voxel", "fps", "generated", "matched", "completed", "full"):
-        assert 0 <= record["metrics"][f"test/{readout}/accuracy"] <= 1
-    assert record["score"] == record["metrics"]["test/generated/accuracy"]
-    assert record["seconds"]["total"] > record["seconds"]["fit"] > 0
-    assert record["device"] == "cpu"
-    assert record["notes"]["test_clouds"] == 3 * len(record["config"]["dataset"]["classes"])
+        assert 0 <= record.metrics[f"test/{readout}/accuracy"] <= 1
+    assert record.score == record.metrics["test/generated/accuracy"]
+    assert record.seconds["total"] > record.seconds["fit"] > 0
+    assert record.device == "cpu"
+    assert record.test_clouds == 3 * len(record.config["dataset"]["classes"])
 
 
 def test_main_job_writes_weights_pictures_and_curves(main_job):
@@ -84,9 +84,9 @@ def test_second_run_uses_cached_task_net(main_job):
     assert status == 0, err
     assert "training it first" not in out
     record = run_record.read(runs(folder)[-1 if "fps" in str(runs(folder)[-1]) else 0])
-    assert record["status"] == "completed"
-    assert "test/sampled/accuracy" in record["metrics"]
-    assert "weights" not in record["files"]
+    assert record.status == "completed"
+    assert "test/sampled/accuracy" in record.metrics
+    assert "weights" not in record.files
 
 
 def test_sweep_with_failed_cell_completes_the_rest(main_job):
@@ -130,8 +130,8 @@ def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
     assert "registration by pcrnet, shapes, rotation error (°), test" in out
     (run,) = runs(tmp_path)
     record = run_record.read(run)
-    assert 0 < record["metrics"]["test/m16/matched/rotation_error_p90_deg"] < 180
-    assert record["score"] == record["metrics"]["test/m8/generated/rotation_error_deg"]
+    assert 0 < record.metrics["test/m16/matched/rotation_error_p90_deg"] < 180
+    assert record.score == record.metrics["test/m8/generated/rotation_error_deg"]
     assert {path.name for path in (run / "pictures").iterdir()} == {
         "clouds.npz",
         "clouds.png",
@@ -172,8 +172,8 @@ def test_failed_run_writes_record_with_error(tmp_path):
     assert "ply_data_test0.h5" in err
     (run,) = runs(tmp_path)
     record = run_record.read(run)
-    assert record["status"] == "failed"
-    assert "ply_data_test0.h5" in record["error"]
+    assert record.status == "failed"
+    assert "ply_data_test0.h5" in str(record.error)
 
 
 def test_real_modelnet40_trains(real_data, tmp_path):
@@ -185,8 +185,8 @@ def test_real_modelnet40_trains(real_data, tmp_path):
     status, out, err = call([*settings, *data, "sampler.alpha=10", "sampler.tau_min=0.2"], tmp_path)
     assert status == 0, err
     (run,) = runs(tmp_path)
-    notes = run_record.read(run)["notes"]
-    assert (notes["train_clouds"], notes["test_clouds"]) == (79 + 64, 20 + 20)
+    record = run_record.read(run)
+    assert (record.train_clouds, record.test_clouds) == (79 + 64, 20 + 20)
 
 
 def test_folder_of_meshes_trains(tmp_path):
@@ -202,7 +202,7 @@ def test_folder_of_meshes_trains(tmp_path):
     status, out, err = call([*settings, "dataset=meshes", "dataset.root=mine"], tmp_path)
     assert status == 0, err
     (run,) = runs(tmp_path)
-    assert run_record.read(run)["notes"]["skipped_meshes"] == 0
+    assert run_record.read(run).dataset_facts["skipped_meshes"] == 0
 
 
 def test_flexible_sampler_is_tested_at_all_sizes_and_evaluated(main_job):
@@ -218,8 +218,8 @@ def test_flexible_sampler_is_tested_at_all_sizes_and_evaluated(main_job):
     again = next(path for path in runs(folder) if path.parent.name == "fmops-m32-evaluated")
     after = run_record.read(again)
     name = "test/m16/completed/accuracy"
-    assert after["metrics"][name] == before["metrics"][name]
-    assert "test/m3/matched/accuracy" in after["metrics"]
+    assert after.metrics[name] == before.metrics[name]
+    assert "test/m3/matched/accuracy" in after.metrics
     status, _, err = call(
         [f"evaluate={run}", "sampler.tau_min=0.5", "hydra.run.dir=refused"], folder
     )

@@ -9,7 +9,6 @@ from mops_lightning.errors import UserError
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ("task_rate=3", "task_rate is now called task_lr_scale"),
         ("sampler=fp", "sampler=fp: no such choice. Did you mean 'fps'"),
         ("nope=3", "nope: no such setting"),
         ("logger=null", "choose one with logger=NAME"),

@@ -107,7 +107,7 @@ def test_two_processes_equal_one_and_rank_zero_writes(tmp_path):
     assert err == ""
     assert out.count("epoch 2/2") == out.count("completed in") == 1
     one, both = (json.loads((tmp_path / run / "result.json").read_text()) for run in ("one", "two"))
-    assert (one["notes"]["processes"], both["notes"]["processes"]) == (1, 2)
+    assert (one["processes"], both["processes"]) == (1, 2)
     assert both["metrics"] == pytest.approx(one["metrics"], rel=1e-4)
     weights = [torch.load(tmp_path / run / "weights.pt")["state"] for run in ("one", "two")]
     for name, value in weights[0].items():

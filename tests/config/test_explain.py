@@ -17,7 +17,6 @@ from tests.support.command_line import TINY, TINY_WITH_PICTURES, call
         (["task/nets=pointnet"], "Did you mean 'task/net'"),
         (["sampler.log=2"], "sampler.log: no such setting"),
         (["dataset.features=[red]"], "no such setting here. It belongs to dataset=clouds."),
-        (["noise=0.1"], "noise is now called test_noise_std"),
         (["sampler.feature_channels=[8]"], "Write +sampler.feature_channels=..."),
         (["recipe.straight_through_set=matched"], "Write +recipe.straight_through_set=..."),
         (["learn=smapler"], "Did you mean 'sampler'"),

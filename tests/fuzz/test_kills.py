@@ -22,7 +22,7 @@ from mops_lightning.config.compose import compose
 from mops_lightning.downsample_files.cli import main as downsample
 from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.records import run_record
-from mops_lightning.records.attempts import ASIDE
+from mops_lightning.records.run_record import ASIDE
 from mops_lightning.training.run import run
 from mops_lightning.zoo import weights
 from tests.support.command_line import TINY
@@ -79,7 +79,7 @@ def results(folder, work):
             content = weights.read(path)
             found[content["config"]["learn"]] = (content["sha256"], content["metrics"])
     records = [run_record.read(path.parent) for path in folder.rglob(run_record.FILE)]
-    assert any(record["status"] == "completed" for record in records)
+    assert any(record.status == "completed" for record in records)
     return found
 
 

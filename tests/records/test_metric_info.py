@@ -3,7 +3,7 @@ from torchmetrics.aggregation import SumMetric
 
 from mops_lightning.metrics.base import collection
 from mops_lightning.metrics.classification import Accuracy
-from mops_lightning.records.metric_info import described, in_summary_order, metric_info
+from mops_lightning.records.metric_info import foreign_metrics, in_summary_order, metric_info
 from tests.support.records import record
 
 
@@ -35,24 +35,20 @@ class Spread(Accuracy):
     summary_order = 2
 
 
-def test_described_metric_is_read_back_from_record():
-    notes = {"metrics": described(collection(Spread(3)).items())}
-    info = metric_info("spread", [record(), record(notes=notes)])
+def test_foreign_metric_is_read_back_from_record():
+    foreign = foreign_metrics(collection(Spread(3), Accuracy(3)).items())
+    assert list(foreign) == ["spread"]
+    info = metric_info("spread", [record(), record(metric_info=foreign)])
     assert info.title == "spread of points (mm)"
     assert info.format(0.5) == "500.00"
     assert info.higher_is_better is False
 
 
-def test_described_plain_torchmetrics_class_gets_defaults():
+def test_plain_torchmetrics_class_gets_defaults():
     """Even under the name of a metric of this package."""
-    notes = {"metrics": described([("accuracy", SumMetric())])}
-    info = metric_info("accuracy", [record(notes=notes)])
+    foreign = foreign_metrics([("accuracy", SumMetric())])
+    info = metric_info("accuracy", [record(metric_info=foreign)])
     assert (info.title, info.format(0.5), info.summary_order) == ("accuracy", "0.5", 10)
-
-
-def test_record_of_later_version_is_read():
-    notes = {"metrics": {"x": {"unit": "m", "colour": "red"}}}
-    assert metric_info("x", [record(notes=notes)]).title == "x (m)"
 
 
 def test_summary_order_sorts_and_drops_hidden():

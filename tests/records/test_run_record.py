@@ -1,5 +1,6 @@
 import json
 import math
+import os
 
 import jsonschema
 import pytest
@@ -7,12 +8,12 @@ import pytest
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
-from tests.support.records import CONFIG, record
+from tests.support.records import CONFIG, evaluated, record
 
 
 def test_write_then_read_returns_same_record(tmp_path):
     run_record.write(tmp_path, record())
-    assert run_record.read(tmp_path)["metrics"] == {"test/generated/accuracy": 0.5}
+    assert run_record.read(tmp_path).metrics == {"test/generated/accuracy": 0.5}
     assert [p.name for p in tmp_path.iterdir()] == ["result.json"]
 
 
@@ -28,7 +29,6 @@ def test_write_nan_becomes_null(tmp_path):
         {"status": "done"},
         {"metrics": {"nested": {"a": 1}}},
         {"seconds": {"total": -1}},
-        {"surprise": 1},
         {"device": 3},
         {"config": {"names": "mops"}},
         {"config": {"names": {"task": "classification", "net": "pointnet", "dataset": "shapes"}}},
@@ -52,13 +52,36 @@ def test_read_no_record_raises(tmp_path):
         run_record.read(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "text",
+    ['{"schema": ' + "1" * 5000 + "}", "[" * 2000 + "]" * 2000, '"\x1b[31m"'],
+    ids=["digits", "levels", "escape"],
+)
+def test_read_hostile_file_ends_in_one_printable_line(tmp_path, text):
+    (tmp_path / "result.json").write_text(text)
+    with pytest.raises(UserError, match="not a run record") as error:
+        run_record.read(tmp_path)
+    assert str(error.value).isprintable()
+
+
+def test_read_named_pipe_does_not_wait(tmp_path):
+    os.mkfifo(tmp_path / "result.json")
+    with pytest.raises(UserError, match="not a regular file"):
+        run_record.read(tmp_path)
+
+
+def test_evaluated_run_is_read_as_written(tmp_path):
+    run_record.write(tmp_path, record(evaluated=evaluated(seed=7)))
+    assert run_record.read(tmp_path).evaluated == evaluated(seed=7)
+
+
 def test_run_record_plain_matches_schema(tmp_path):
     started = RunRecord.begin(CONFIG, ["m=32"], seed=3)
     with started.timed("fit"):
         pass
-    run_record.write(tmp_path, started.plain())
+    run_record.write(tmp_path, started)
     found = run_record.read(tmp_path)
-    assert found == started.plain()
-    assert set(found) == set(run_record.schema()["properties"])
-    assert (found["status"], found["seed"]) == ("running", 3)
-    assert found["seconds"]["fit"] >= 0
+    assert found == started
+    assert set(found.plain()) == set(run_record.schema()["properties"])
+    assert (found.status, found.seed) == ("running", 3)
+    assert found.seconds["fit"] >= 0

@@ -12,8 +12,8 @@ NAMES = {"task": "classification", "net": "pointnet", "dataset": "shapes", "samp
 def printed(metrics, score, infos=None, **config):
     console = Console(width=80, record=True, file=StringIO())
     config = {"m": 32, "learn": "sampler", "names": NAMES, **config}
-    notes = {"score": score, "metrics": infos or {}}
-    closing_lines(Path("run"), record(config=config, metrics=metrics, notes=notes), console)
+    facts = {"score_name": score, "metric_info": infos or {}}
+    closing_lines(Path("run"), record(config=config, metrics=metrics, **facts), console)
     return console.export_text()
 
 

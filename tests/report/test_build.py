@@ -1,3 +1,4 @@
+from tests.support.records import evaluated
 from tests.support.reports import put, put_pairs, rows, table
 
 
@@ -57,8 +58,8 @@ def test_build_registration_shows_degrees_and_icp_last(tmp_path):
 
 
 def test_build_joint_registration_shows_paper_joint_table(tmp_path):
-    notes = {"task_weights_sha256": None, "evaluated": {"learn": "joint", "max_epochs": 9}}
-    put_pairs(tmp_path, "mops", 32, 6.0, notes=notes)
+    joint = {"task_weights_sha256": None, "evaluated": evaluated(learn="joint")}
+    put_pairs(tmp_path, "mops", 32, 6.0, **joint)
     assert ["*the paper's*", "6.74 / 9.18 / 9.65"] in rows(table(tmp_path))
 
 
@@ -66,14 +67,14 @@ def test_recipes_have_rows_of_their_own_with_the_papers_values(tmp_path):
     put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.5})
     (tmp_path / "more").mkdir()
     fast = {"recipe": {"name": "fast", "train_points": 256}}
-    put(tmp_path / "more", "mops", 32, {"test/generated/accuracy": 0.6}, notes=fast)
+    put(tmp_path / "more", "mops", 32, {"test/generated/accuracy": 0.6}, **fast)
     (tmp_path / "third").mkdir()
     put(
         tmp_path / "third",
         "mops",
         32,
         {"test/generated/accuracy": 0.7},
-        notes=fast,
+        **fast,
         of={"anchors": "fps"},
     )
     paper = ["*the paper's*", "84.28 / 79.01 / 79.74"]

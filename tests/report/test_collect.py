@@ -39,8 +39,8 @@ def test_collect_lists_unreadable_record(tmp_path):
         ({"config": CONFIG}, "config: 'task' is a required property"),
         ({"config": 3}, "not a run record: 3 is not of type 'object'"),
         ({"metrics": {"test/sampled/accuracy": "x"}}, "not a run record"),
-        ({"notes": {"metrics": {"accuracy": {"scale": "x"}}}}, "notes.metrics.accuracy.scale"),
-        ({"notes": {"evaluated": {"seed": "x"}}}, "notes.evaluated.seed"),
+        ({"metric_info": {"accuracy": {"scale": "x"}}}, "not a run record"),
+        ({"evaluated": {"seed": "x"}}, "not a run record"),
     ],
     ids=str,
 )

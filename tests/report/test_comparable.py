@@ -4,6 +4,7 @@ import pytest
 
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
+from tests.support.records import evaluated
 from tests.support.reports import (
     put,
     put_cell,
@@ -13,10 +14,10 @@ from tests.support.reports import (
 )
 
 
-@pytest.mark.parametrize("note", ["dataset_fingerprint", "task_weights_sha256"])
-def test_comparable_other_data_or_weights_are_refused(tmp_path, note):
+@pytest.mark.parametrize("name", ["dataset_fingerprint", "task_weights_sha256"])
+def test_comparable_other_data_or_weights_are_refused(tmp_path, name):
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
-    put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.8}, notes={note: "other"})
+    put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.8}, **{name: "other"})
     with pytest.raises(UserError, match="differ in"):
         table(tmp_path)
 
@@ -24,8 +25,8 @@ def test_comparable_other_data_or_weights_are_refused(tmp_path, note):
 def test_comparable_joint_runs_have_own_task_nets(tmp_path):
     for name in ("snet", "mops"):
         metrics = {"test/generated/accuracy": 0.5, "test/fps/accuracy": 0.2}
-        notes = {"task_weights_sha256": name, "evaluated": {"learn": "joint", "max_epochs": 9}}
-        put(tmp_path, name, 32, {**metrics, "test/full/accuracy": 0.9}, notes=notes)
+        joint = {"task_weights_sha256": name, "evaluated": evaluated(learn="joint")}
+        put(tmp_path, name, 32, {**metrics, "test/full/accuracy": 0.9}, **joint)
     text = table(tmp_path)
     assert [row[0] for row in rows(text) if "paper" not in row[0]] == ["sampled by", "snet", "mops"]
     assert "pointnet on all points after joint training with snet, m=32: 90.00" in text
@@ -60,7 +61,7 @@ def test_comparable_data_per_seed_need_every_sampler_per_seed(tmp_path):
             values = {"generated": 1.0 + seed}
             path = put_cell(tmp_path, f"{name}{seed}", name, values, seed=seed)
             content = json.loads(path.read_text())
-            content["notes"] |= {
+            content |= {
                 "dataset_fingerprint": f"d{seed}",
                 "task_weights_sha256": f"w{seed}",
             }

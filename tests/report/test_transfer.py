@@ -21,7 +21,7 @@ def put_transfer(folder, sampler, m, value, nets=NETS, **changes):
         label: {"sha256": sha256, "max_epochs": 20, "dataset": "modelnet40"}
         for label, (sha256, _) in nets.items()
     }
-    put(folder, sampler, m, metrics, notes={"task_nets": notes}, **changes)
+    put(folder, sampler, m, metrics, task_nets=notes, **changes)
 
 
 def second(text):

@@ -29,7 +29,7 @@ def write_run(folder, node=NODE, learn="sampler", **fields):
         "metrics": metrics,
         "score": 0.5,
         "files": {"weights": "weights.pt"},
-        "notes": {"score": "test/m8/generated/accuracy"},
+        "score_name": "test/m8/generated/accuracy",
         **fields,
     }
     folder.mkdir(parents=True)

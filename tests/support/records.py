@@ -1,7 +1,7 @@
 """Made-up run records."""
 
-from mops_lightning.records import run_record
 from mops_lightning.records.environment import environment
+from mops_lightning.records.run_record import Evaluated, RunRecord
 
 NAMES = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": "mops"}
 CONFIG = {
@@ -15,20 +15,23 @@ CONFIG = {
 
 
 def record(config=None, **changes):
-    return {
-        "schema": run_record.SCHEMA,
-        "status": "completed",
-        "config": {**CONFIG, **(config or {})},
-        "overrides": ["m=32"],
-        "metrics": {"test/generated/accuracy": 0.5},
-        "score": 0.5,
-        "seconds": {"total": 1.0},
-        "seed": 0,
-        "started": "2026-01-01T00:00:00+00:00",
-        **environment(),
-        "device": "cpu",
-        "files": {},
-        "error": None,
-        "notes": {},
-        **changes,
-    }
+    return RunRecord(
+        **{
+            "status": "completed",
+            "config": {**CONFIG, **(config or {})},
+            "overrides": ["m=32"],
+            "metrics": {"test/generated/accuracy": 0.5},
+            "score": 0.5,
+            "seconds": {"total": 1.0},
+            "seed": 0,
+            "started": "2026-01-01T00:00:00+00:00",
+            **environment(),
+            "device": "cpu",
+            **changes,
+        }
+    )
+
+
+def evaluated(**changes):
+    values = {"run": "run", "commit": "c", "max_epochs": 9, "learn": "sampler", "seed": 0}
+    return Evaluated(**{**values, "dataset": "shapes", "weights_sha256": "w", **changes})

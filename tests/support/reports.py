@@ -1,7 +1,5 @@
 """Folders of made-up runs, and their tables."""
 
-import json
-
 from mops_lightning.records import run_record
 from mops_lightning.report.build import build
 from mops_lightning.report.text import markdown
@@ -23,10 +21,10 @@ def put(folder, sampler, m, metrics, task="classification", net="pointnet", **ch
         "task": changes.pop("settings", {}),
         "sampler": changes.pop("of", {}),
     }
-    notes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **changes.pop("notes", {})}
+    changes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **changes}
     target = folder / f"{sampler}-{m}-{net}"
     target.mkdir()
-    run_record.write(target, record(config=config, metrics=metrics, notes=notes, **changes))
+    run_record.write(target, record(config=config, metrics=metrics, **changes))
 
 
 def rows(text):
@@ -54,10 +52,10 @@ def put_cell(folder, name, sampler, values, seed=0, **settings):
         **settings,
     }
     metrics = {f"test/{readout}/nre_cd": value for readout, value in values.items()}
-    notes = {"dataset_fingerprint": "d", "score": "test/generated/nre_cd"}
     (folder / name).mkdir(parents=True)
     seconds = {"total": 1.0, "fit": 0.5}
-    content = record(config=config, metrics=metrics, notes=notes, seed=seed, seconds=seconds)
+    score = {"score_name": "test/generated/nre_cd", "dataset_fingerprint": "d"}
+    content = record(config=config, metrics=metrics, seed=seed, seconds=seconds, **score)
     run_record.write(folder / name, content)
     return folder / name / run_record.FILE
 
@@ -83,15 +81,12 @@ DEGREES = "rotation_error_deg"
 
 
 def put_pairs(folder, sampler, m, value, net="pcrnet", rotation=45, **changes):
-    changes["notes"] = {"score": f"test/sampled/{DEGREES}", **changes.get("notes", {})}
+    changes = {"score_name": f"test/sampled/{DEGREES}", **changes}
+    if net == "icp":  # there are no weights to record
+        changes["task_weights_sha256"] = None
     metrics = {f"test/sampled/{DEGREES}": value, f"test/full/{DEGREES}": 7.5}
     pairs = {"pairs": {"rotation": rotation}}
     put(folder, sampler, m, metrics, "registration", net, settings=pairs, **changes)
-    if net == "icp":  # there are no weights to note
-        path = folder / f"{sampler}-{m}-icp" / "result.json"
-        content = json.loads(path.read_text())
-        del content["notes"]["task_weights_sha256"]
-        path.write_text(json.dumps(content))
 
 
 def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):
@@ -106,5 +101,5 @@ def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):
         "task": {"net": {"_target_": net, "n_points": points, **settings}},
         "dataset": {"n_points": points},
     }
-    notes = {"score": next(iter(metrics)), "parameters": {"task": 1_025_000}}
-    return run_record.write(target, record(config=config, metrics=metrics, notes=notes))
+    made = {"score_name": next(iter(metrics)), "parameters": {"task": 1_025_000}}
+    return run_record.write(target, record(config=config, metrics=metrics, **made))

@@ -60,7 +60,7 @@ def test_run_diverged_keeps_last_finite_checkpoint(diverged):
     content = torch.load(path, weights_only=True)
     assert weights.first_nonfinite(content["state_dict"]) is None
     assert content["epoch"] < 2
-    assert run_record.read(folder)["status"] == "failed"
+    assert run_record.read(folder).status == "failed"
     assert not (folder / "weights.pt").exists()
 
 
@@ -77,4 +77,4 @@ def test_run_diverged_in_last_step_fails(tmp_path):
     ]
     with pytest.raises(UserError, match=r"training diverged: .*Try a lower"):
         run(compose(overrides), tmp_path / "run", overrides)
-    assert run_record.read(tmp_path / "run")["status"] == "failed"
+    assert run_record.read(tmp_path / "run").status == "failed"

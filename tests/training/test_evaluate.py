@@ -34,8 +34,8 @@ def test_evaluate_without_changes_repeats_metrics(trained, tmp_path):
     folder, record = trained
     again = evaluated(trained, tmp_path)
     assert again.metrics == record.metrics
-    assert again.notes["evaluated"]["run"] == str(folder)
-    assert again.notes["task_weights_sha256"] == record.notes["task_weights_sha256"]
+    assert again.evaluated.run == str(folder)
+    assert again.task_weights_sha256 == record.task_weights_sha256
     assert "fit" not in again.seconds
     assert again.config["learn"] == "nothing"
     assert not (tmp_path / "new" / "weights.pt").exists()
@@ -49,19 +49,7 @@ def test_evaluate_follows_weights_path_of_record(trained, tmp_path):
     (cached,) = (folder.parent / "cache" / "weights").rglob("weights.pt")
     shutil.copy(cached, tmp_path / "kept" / "net.pt")
     files = {"weights": "../kept/sampler.pt", "task_weights": "../kept/net.pt"}
-    run_record.write(tmp_path / "run", {**record.plain(), "files": files})
-    again = evaluated((tmp_path / "run", record), tmp_path)
-    assert again.metrics == record.metrics
-
-
-def test_evaluate_old_record_accepts_renamed_settings(trained, tmp_path):
-    folder, record = trained
-    shutil.copytree(folder, tmp_path / "run")
-    old_names = {"size_sampling": "sizes_per_step", "num_sizes": "prefixes"}
-    sampler = {old_names.get(k, k): v for k, v in record.config["sampler"].items()}
-    assert "sizes_per_step" in sampler
-    config = {**record.config, "sampler": sampler}
-    run_record.write(tmp_path / "run", {**record.plain(), "config": config})
+    run_record.write(tmp_path / "run", replace(record, files=files))
     again = evaluated((tmp_path / "run", record), tmp_path)
     assert again.metrics == record.metrics
 
@@ -70,7 +58,7 @@ def changed_record(trained, folder, sampler):
     """Copy a run, with other sampler's settings in its record."""
     shutil.copytree(trained[0], folder)
     record = trained[1]
-    run_record.write(folder, {**record.plain(), "config": {**record.config, "sampler": sampler}})
+    run_record.write(folder, replace(record, config={**record.config, "sampler": sampler}))
     return folder, record
 
 
@@ -153,8 +141,8 @@ def test_evaluate_noise_changes_test_clouds_only(trained, tmp_path):
     noisy = evaluated(trained, tmp_path, "test_noise_std=0.5")
     key = "test/m8/generated/subset_distance"
     assert noisy.metrics[key] != record.metrics[key]
-    for note in ("dataset_fingerprint", "task_weights_sha256"):
-        assert noisy.notes[note] == record.notes[note]
+    for name in ("dataset_fingerprint", "task_weights_sha256"):
+        assert getattr(noisy, name) == getattr(record, name)
 
 
 def test_evaluate_threshold_changes_generated_points(trained, tmp_path):
@@ -171,8 +159,8 @@ def test_evaluate_another_task_net(trained, tmp_path):
     overrides = [*TINY, "learn=task", "seed=5", "dataset.seed=0"]
     run(compose(overrides), tmp_path / "task", overrides)
     record = evaluated(trained, tmp_path, f"weights={tmp_path}/task/weights.pt")
-    ours = trained[1].notes["task_weights_sha256"]
-    assert record.notes["task_weights_sha256"] not in (None, ours)
+    ours = trained[1].task_weights_sha256
+    assert record.task_weights_sha256 not in (None, ours)
 
 
 def test_evaluate_joint_run_uses_its_task_net(tmp_path):
@@ -257,7 +245,7 @@ def test_evaluate_task_net_with_its_classes(trained, tmp_path):
     folder, _ = trained
     classes = "dataset.classes=[bed,vase]"
     record = evaluated(trained, tmp_path, classes, "weights=auto", f"cache={folder.parent}/cache")
-    assert record.notes["class_names"] == ["bed", "vase"]
+    assert record.class_names == ["bed", "vase"]
 
 
 def test_evaluate_missing_weights_raises(trained, tmp_path):

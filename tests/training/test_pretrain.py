@@ -32,7 +32,7 @@ def test_task_net_from_file_is_not_published(tmp_path):
     record = train(
         tmp_path, "learn=task", *SMALL_PCRNET, f"weights={first.parent}", "optimizer.lr=0"
     )
-    assert record.notes["weights_loaded"] == published["sha256"]
+    assert record.weights_loaded == published["sha256"]
     own, again = (weights.read(path)["state"] for path in sorted(tmp_path.glob("run*/weights.pt")))
     assert all(torch.equal(own[name], again[name]) for name in own)  # at a rate of 0 nothing moves
     assert len(files(tmp_path, "cache/weights/*/weights.pt")) == 1
@@ -162,7 +162,7 @@ def test_same_task_net_in_two_processes_is_trained_once(tmp_path):
     assert (status, other.returncode) == (0, 0), err + other_err
     assert (here + there).count("training it first") == 1
     records = [json.loads((tmp_path / one / "result.json").read_text()) for one in "ab"]
-    first, second = (record["notes"]["task_weights_sha256"] for record in records)
+    first, second = (record["task_weights_sha256"] for record in records)
     assert first == second
 
 
@@ -174,7 +174,7 @@ def test_resume_with_fewer_epochs_than_done_raises(tmp_path):
         train(tmp_path, *task, "trainer.max_epochs=2", checkpoint)
     same = train(tmp_path, *task, "trainer.max_epochs=3", checkpoint)
     longer = train(tmp_path, *task, "trainer.max_epochs=4", checkpoint)
-    assert [one.notes["lengthened"] for one in (same, longer)] == [False, True]
+    assert [one.lengthened for one in (same, longer)] == [False, True]
 
 
 def test_resumed_pretraining_does_not_warn_about_its_folder(tmp_path, capsys, recwarn):

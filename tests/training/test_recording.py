@@ -8,13 +8,13 @@ from mops_lightning.training.recording import recorded
 
 def test_recorded_running_then_completed(tmp_path):
     with recorded(compose(["seed=4"]), tmp_path, ["seed=4"]) as record:
-        assert run_record.read(tmp_path)["status"] == "running"
+        assert run_record.read(tmp_path).status == "running"
         record.metrics["test/generated/accuracy"] = 0.5
     found = run_record.read(tmp_path)
-    assert (found["status"], found["error"], found["seed"]) == ("completed", None, 4)
-    assert found["overrides"] == ["seed=4"]
-    assert found["metrics"] == {"test/generated/accuracy": 0.5}
-    assert found["seconds"]["total"] >= 0
+    assert (found.status, found.error, found.seed) == ("completed", None, 4)
+    assert found.overrides == ["seed=4"]
+    assert found.metrics == {"test/generated/accuracy": 0.5}
+    assert found.seconds["total"] >= 0
 
 
 @pytest.mark.parametrize(
@@ -29,4 +29,4 @@ def test_recorded_exception_is_written_and_raised(raised, status, error, tmp_pat
     with pytest.raises(type(raised)), recorded(compose(), tmp_path, []):
         raise raised
     found = run_record.read(tmp_path)
-    assert (found["status"], found["error"]) == (status, error)
+    assert (found.status, found.error) == (status, error)

@@ -86,7 +86,7 @@ def test_run_own_net_gives_same_scores(record):
 
 
 def test_other_nets_give_other_scores(record):
-    scores = [under(record, label) for label in record.notes["task_nets"]]
+    scores = [under(record, label) for label in record.task_nets]
     assert len(scores) == 4
     assert len({tuple(one.values()) for one in scores}) == 4
     assert all(one["test/full/accuracy"] > 0.4 for one in scores)
@@ -103,7 +103,7 @@ def test_full_score_is_that_of_net_alone(record, folder):
 
 
 def test_notes_describe_nets(record, folder):
-    notes = record.notes["task_nets"]
+    notes = record.task_nets
     assert set(notes) == {
         "pointnet seed 0",
         "pointnet seed 1",
@@ -127,7 +127,7 @@ def test_scores_of_run_are_unchanged(record, folder):
     plain = run(compose(chosen), folder / "plain", chosen)
     ours = {name: v for name, v in record.metrics.items() if not name.startswith("transfer/")}
     assert plain.metrics == ours
-    assert (plain.score, "task_nets" in plain.notes) == (record.score, False)
+    assert (plain.score, bool(plain.task_nets)) == (record.score, False)
 
 
 @pytest.fixture(scope="module")

@@ -27,8 +27,8 @@ def test_sampler_of_another_size_continues_from_a_run(tmp_path):
     one, two = (weights.read(tmp_path / name / "weights.pt") for name in ("first", "second"))
     rows = two["state"]["queries.weight"]
     torch.testing.assert_close(rows, one["state"]["queries.weight"][:5])
-    notes = json.loads((tmp_path / "second" / "result.json").read_text())["notes"]
-    assert notes["warm_start"]["sha256"] == one["sha256"]
+    record = json.loads((tmp_path / "second" / "result.json").read_text())
+    assert record["warm_start"]["sha256"] == one["sha256"]
     status, _, err = run(tmp_path, "third", "sampler=snet", f"recipe.warm_start={first}")
     assert status != 0
     assert "recipe.warm_start: no tensor of" in err

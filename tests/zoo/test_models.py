@@ -49,7 +49,7 @@ def figures(name):
     m = card["figures"]["m"]
     sizes = [f"sizes=[{m}]"] if m else []
     cfg = compose(command_line([f"evaluate={name}", "dataset.n_points=1024", *sizes]))
-    data = dataset(cfg.names.task, card["record"]["notes"]["class_names"])
+    data = dataset(cfg.names.task, card["record"]["class_names"])
     experiment = make_experiment(cfg, data, {}).eval()
     evaluate.load(cfg, experiment, data)
     task, sampler = experiment.task, experiment.sampler

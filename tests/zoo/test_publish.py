@@ -28,15 +28,15 @@ def test_card_is_written_from_the_record(run, tmp_path):
     figures = {"metric": "accuracy (%)", "m": 8, "points": 64, "values": {"generated": "50.00"}}
     assert card["figures"] == figures
     assert (card["licence"], card["precision"], card["name"]) == ("CC0", "float32", "fmops.mine")
-    assert card["record"]["metrics"] == run_record.read(run)["metrics"]
+    assert card["record"]["metrics"] == run_record.read(run).metrics
 
 
 def test_task_net_is_found_by_hash_or_name(run, tmp_path):
-    for notes in ("weights_loaded", "task_weights_sha256"):
+    for digest in ("weights_loaded", "task_weights_sha256"):
         sha256 = model_file.read_card(names.available()["pointnet.modelnet40"])["sha256"]
-        other = tmp_path / notes
-        write_run(other, notes={"score": "test/m8/generated/accuracy", notes: sha256})
-        card = model_file.read_card(publish.add(other, f"fmops.{notes}", tmp_path))
+        other = tmp_path / digest
+        write_run(other, **{digest: sha256})
+        card = model_file.read_card(publish.add(other, f"fmops.{digest}", tmp_path))
         reference = names.pinned("pointnet.modelnet40", sha256)
         assert card["record"]["files"]["task_weights"] == reference
     card = model_file.read_card(publish.add(run, "fmops.none", tmp_path))
@@ -93,7 +93,7 @@ def test_runs_without_weights_are_refused(tmp_path, fields):
 
 
 def test_run_without_scores_is_refused(tmp_path):
-    write_run(tmp_path / "run", metrics={}, notes={})
+    write_run(tmp_path / "run", metrics={}, score_name="")
     with pytest.raises(UserError, match="no test score"):
         publish.add(tmp_path / "run", "fmops.mine", tmp_path)
 

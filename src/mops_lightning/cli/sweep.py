@@ -24,7 +24,7 @@ from mops_lightning.config.declaration import Affects
 from mops_lightning.errors import Interrupted, UserError, file_error, memory_error
 from mops_lightning.filesystem import remove_temporary, set_aside
 from mops_lightning.records import run_record
-from mops_lightning.records.attempts import ASIDE, FAILED
+from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
 
 BEGUN = ".begun"
 """File in a sweep's folder with the time of its last start."""
@@ -65,9 +65,10 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
             if (folder / ASIDE / MOVING).is_dir():
                 _move_aside(folder)  # an earlier start was killed in the middle of it
             earlier = _earlier(cfg, folder)
-            if earlier and earlier["status"] == "completed":
-                log.info(f"{folder}: already completed, score {earlier['score']:.6g}")
-                return float(earlier["score"])
+            status, score = earlier or ("killed", math.nan)
+            if status == "completed":
+                log.info(f"{folder}: already completed, score {score:.6g}")
+                return score
             if earlier:
                 _move_aside(folder)
             if (folder / ASIDE).is_dir():
@@ -75,12 +76,11 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
                 if checkpoint and cfg.ckpt_path is None:
                     cfg.ckpt_path = str(checkpoint)
                 action = f"resuming from {cfg.ckpt_path}" if cfg.ckpt_path else "starting again"
-                status = earlier["status"] if earlier else "killed"
                 log.info(f"{folder}: the last attempt was {status}; {action}")
             # A process that was killed before it wrote a record left this file.
             (folder / STARTED).unlink(missing_ok=True)
-            score = run(cfg, folder, overrides).score
-            return math.nan if score is None else float(score)
+            new = run(cfg, folder, overrides).score
+            return math.nan if new is None else float(new)
     except (Interrupted, BrokenPipeError):
         raise
     except Busy:
@@ -123,8 +123,8 @@ def _claimed(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def _earlier(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
-    """Return the record in the cell's folder, if any; a damaged one is set aside.
+def _earlier(cfg: DictConfig, folder: Path) -> tuple[str, float] | None:
+    """Return status and score of the record in the cell's folder; a damaged one is set aside.
 
     Raises:
         UserError: it has other settings.
@@ -135,7 +135,7 @@ def _earlier(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
         record = run_record.read(folder)
     except UserError as error:
         log.warning(f"{error} Renamed to {set_aside(folder / run_record.FILE).name}.")
-        return {"status": "damaged"}
+        return "damaged", math.nan
     different = _differences(cfg, record)
     if different:
         # The setting itself, not one that is derived from it.
@@ -146,13 +146,13 @@ def _earlier(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
             f"folder with hydra.sweep.dir=FOLDER; if {key} is swept, add it to hydra.sweep.subdir; "
             "or move the cell's folder away."
         )
-    return record
+    return record.status, math.nan if record.score is None else record.score
 
 
-def _differences(cfg: DictConfig, record: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+def _differences(cfg: DictConfig, record: RunRecord) -> dict[str, tuple[Any, Any]]:
     """Return the dotted settings that differ but must not: the present and the earlier value."""
     mine = run_record.dotted(OmegaConf.to_container(cfg, resolve=True))
-    theirs = run_record.dotted(record["config"])
+    theirs = run_record.dotted(record.config)
     return {
         key: (mine.get(key), theirs.get(key))
         for key in {**mine, **theirs}
@@ -172,7 +172,7 @@ def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
             record = run_record.read(attempt)
         except UserError:
             continue  # its checkpoint may belong to other settings
-        if record["status"] == "failed" or _differences(cfg, record):
+        if record.status == "failed" or _differences(cfg, record):
             return None
         path = attempt / "checkpoints" / CHECKPOINT
         if path.is_file() and not set_aside_if_damaged(path):
@@ -212,7 +212,7 @@ def _state(cell: Path) -> str:
     if (cell / FAILED).exists():
         return "failed"
     try:
-        return str(run_record.read(cell)["status"])
+        return run_record.read(cell).status
     except UserError:
         return "not started"
 

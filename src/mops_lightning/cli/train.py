@@ -1,7 +1,6 @@
 """Training from the command line: one run, or a sweep, composed by Hydra."""
 
 import os
-import re
 import sys
 from typing import TYPE_CHECKING
 
@@ -19,7 +18,6 @@ from mops_lightning.errors import (
     memory_error,
     quiet_on_closed_pipe,
 )
-from mops_lightning.records.migrate import answer
 from mops_lightning.zoo import names
 
 if TYPE_CHECKING:
@@ -52,7 +50,6 @@ def _run() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         sys.argv[1:] = flags_first(sys.argv[1:])
-        _refuse_old_settings(sys.argv[1:])
         refuse_plain_groups(sys.argv[1:])
         _search_models(sys.argv[1:])
         if any(key(argument) == "evaluate" for argument in sys.argv[1:]):
@@ -70,19 +67,6 @@ def _run() -> None:
         if show_traceback or isinstance(error, BrokenPipeError):
             raise
         end(NAME, file_error(error), USER_ERROR)
-
-
-def _refuse_old_settings(arguments: list[str]) -> None:
-    """Refuse settings of earlier versions, also those that ``+`` would add unnoticed.
-
-    Raises:
-        UserError: there is one; it names the new setting.
-    """
-    for argument in arguments:
-        match = re.match(r"[+~]*([^=+~-][^=]*)=|~(.+)$", argument)
-        said = answer(match.group(1) or match.group(2)) if match else None
-        if said:
-            raise UserError(said)
 
 
 def _search_models(arguments: list[str]) -> None:

@@ -16,7 +16,6 @@ from mops_lightning.config.overrides import key as key_of
 from mops_lightning.config.overrides import parse
 from mops_lightning.config.validate import misfit_of
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.records.migrate import answer
 
 FROM_RESOLVER = f"{UserError.__name__} raised while resolving interpolation: "
 """What OmegaConf puts before the error of a resolver."""
@@ -110,10 +109,6 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
     for text in texts:
         if text.startswith(FROM_RESOLVER):
             return text.removeprefix(FROM_RESOLVER).splitlines()[0]
-        if "Interpolation key '" in text:
-            key = text.split("Interpolation key '")[1].split("'")[0]
-            if said := answer(key):
-                return said
         if "Could not override '" in text:
             key = text.split("Could not override '")[1].split("'")[0]
             return _no_such_setting(key, arguments)
@@ -152,8 +147,6 @@ def _names_there(cause: Any, arguments: Sequence[str]) -> str:
 def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     """Name the nearest group or setting, or say how to set an argument that no YAML file sets."""
     groups = _groups()
-    if said := answer(key):
-        return said
     if key in settings.OF_EVALUATE:
         return str(settings.needs_evaluate(key))
     if key in groups:

@@ -10,7 +10,6 @@ from mops_lightning.config import distributed, settings
 from mops_lightning.config.annotations import misfit
 from mops_lightning.config.build import signature
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.records import migrate
 
 OPTIMIZERS = ("optimizer", "pretrain")
 """Nodes whose ``schedule`` is not an argument of the optimizer."""
@@ -31,7 +30,7 @@ def check(cfg: DictConfig) -> None:
     for key in map(str, cfg):
         if key not in declared and key not in on_demand:
             hint = did_you_mean(key, [*declared, *settings.ON_DEMAND])
-            raise UserError(migrate.answer(key) or f"{key}: no such setting.{hint}")
+            raise UserError(f"{key}: no such setting.{hint}")
     for name, setting in declared.items():
         if name not in cfg:
             raise UserError(f"{name} cannot be removed. Choose another value with {name}=...")
@@ -162,8 +161,7 @@ def _check_node(node: Any, where: str) -> None:
                 continue  # built separately
             if not name.startswith("_") and name not in parameters and not takes_any:
                 raise UserError(
-                    migrate.answer(f"{where}.{name}")
-                    or f"{where}: {node['_target_']} takes no setting {name!r}."
+                    f"{where}: {node['_target_']} takes no setting {name!r}."
                     f"{did_you_mean(name, parameters)}"
                 )
             if node[key] == MISSING:

@@ -1,31 +1,37 @@
 """Label, unit and order of the metrics in records."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import cache
 from typing import Any
 
 from mops_lightning.metrics.info import MetricInfo
-
-NOTE = "metrics"
-"""Key of a record's notes under which a run describes its metrics."""
+from mops_lightning.records.run_record import RunRecord
 
 
-def described(metrics: Iterable[tuple[str, object]]) -> dict[str, dict[str, Any]]:
-    """Return what the classes of named metrics declare, as plain data for a record's notes."""
-    return {name: MetricInfo.of(name, metric).as_dict() for name, metric in metrics}
+def foreign_metrics(metrics: Iterable[tuple[str, object]]) -> dict[str, dict[str, Any]]:
+    """Return label, unit and direction of the metrics that this package does not know.
+
+    Args:
+        metrics: names and metrics, such as the items of a collection.
+
+    Returns:
+        Name of the metric → what its class declares, as plain data for a record.
+    """
+    infos = {name: MetricInfo.of(name, metric) for name, metric in metrics}
+    known = _package_metrics()
+    return {name: info.as_dict() for name, info in infos.items() if known.get(name) != info}
 
 
-def metric_info(name: str, records: Iterable[Mapping[str, Any]] = ()) -> MetricInfo:
-    """Return what is known about a metric.
+def metric_info(name: str, records: Iterable[RunRecord] = ()) -> MetricInfo:
+    """Return label, unit and order of a metric.
 
     Args:
         name: the last part of its log key.
-        records: run records; the first that describes the metric is used. Otherwise the class of
-            this package, as for records from before runs described their metrics; a name that is
-            unknown there too has no unit.
+        records: run records; the first that describes the metric is used. Otherwise its class in
+            this package; a name that is unknown there too has no unit.
     """
     for record in records:
-        values = record["notes"].get(NOTE, {}).get(name)
+        values = record.metric_info.get(name)
         if values is not None:
             return MetricInfo.from_dict(name, values)
     return _package_metrics().get(name, MetricInfo(name))

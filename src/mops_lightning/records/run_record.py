@@ -12,26 +12,59 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, printable
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.records.environment import environment
-from mops_lightning.records.migrate import upgraded_config, upgraded_overrides
 
-SCHEMA = "mops_lightning/result/1"
+SCHEMA = "mops_lightning/result/2"
 FILE = "result.json"
+ASIDE = ".attempts"
+"""Folder with the earlier attempts of a sweep's cell."""
+MAX_DEPTH = 50
+"""Deepest nesting of a record that is read."""
+FAILED = ".failed"
+"""File in a cell's folder that says why its last start failed, with or without a record."""
+
+
+@dataclass(kw_only=True)
+class Evaluated:
+    """The run that ``evaluate=RUN`` tests, and how it was trained.
+
+    Attributes:
+        run: its folder, or the name of a model.
+        commit: of the code that trained it.
+        max_epochs: for which it was trained.
+        learn: what it trained.
+        recipe: as in ``RunRecord``.
+        seed: of its training.
+        dataset: name of its data.
+        weights_sha256: of the tested weights.
+    """
+
+    run: str
+    commit: str | None
+    max_epochs: int | None
+    learn: str
+    recipe: dict[str, Any] | None = None
+    seed: int
+    dataset: str
+    weights_sha256: str
 
 
 @dataclass(kw_only=True)
 class RunRecord:
-    """What a run records while its stages fill it in; the fields of ``result.json``.
+    """The fields of ``result.json``, which the stages of a run fill in.
 
     Attributes:
         schema: version of the schema.
         status: ``running``, ``completed``, ``failed`` or ``interrupted``.
         config: the composed configuration, interpolations resolved.
         overrides: what the user changed.
-        metrics: test metrics by name.
-        score: the task's main metric on the first readout.
+        metrics: test metrics by name; None in a file where the value was not finite.
+        score_name: name of the task's main metric on the first readout, among ``metrics``.
+        score: its value.
+        metric_info: label, unit, direction of metrics that are not this package's.
+        validation: metrics of the held-out clouds after the last epoch.
         seconds: wall time by stage.
         seed: of the run.
         started: UTC, ISO 8601.
@@ -42,15 +75,32 @@ class RunRecord:
         device: name of the GPU, or kind of device.
         files: what the run wrote, by kind, relative to its folder.
         error: why the run failed or stopped.
-        notes: further plain facts.
+        dataset_fingerprint: changes with the content of the data.
+        train_clouds: number of training clouds.
+        test_clouds: number of test clouds.
+        class_names: of the data.
+        dataset_facts: what the data set tells, such as the number of skipped meshes.
+        parameters: their numbers by part: ``task``, ``sampler``.
+        processes: that trained together.
+        recipe: how the sampler was trained, with its name; None: the paper's.
+        warm_start: number of copied layers or tensors, and the sha256 of the file they are from.
+        weights_loaded: sha256 of the file that the task net was loaded from.
+        task_weights_sha256: of the task net that was tested, unless the run trained it.
+        task_nets: further task nets by label.
+        resumed_from: the checkpoint that the training continued from.
+        lengthened: whether it continued with another number of epochs than planned.
+        evaluated: the run that was tested; None: this one.
     """
 
     schema: str = SCHEMA
     status: str = "running"
     config: dict[str, Any]
     overrides: list[str]
-    metrics: dict[str, float] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
+    score_name: str = ""
     score: float | None = None
+    metric_info: dict[str, dict[str, Any]] = field(default_factory=dict)
+    validation: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     seed: int
     started: str
@@ -61,7 +111,21 @@ class RunRecord:
     device: str | None = None
     files: dict[str, str] = field(default_factory=dict)
     error: str | None = None
-    notes: dict[str, Any] = field(default_factory=dict)
+    dataset_fingerprint: str | None = None
+    train_clouds: int | None = None
+    test_clouds: int | None = None
+    class_names: list[str] | None = None
+    dataset_facts: dict[str, Any] = field(default_factory=dict)
+    parameters: dict[str, int] = field(default_factory=dict)
+    processes: int | None = None
+    recipe: dict[str, Any] | None = None
+    warm_start: dict[str, Any] | None = None
+    weights_loaded: str | None = None
+    task_weights_sha256: str | None = None
+    task_nets: dict[str, dict[str, Any]] = field(default_factory=dict)
+    resumed_from: str | None = None
+    lengthened: bool = False
+    evaluated: Evaluated | None = None
 
     @classmethod
     def begin(cls, config: dict[str, Any], overrides: list[str], seed: int) -> "RunRecord":
@@ -90,7 +154,22 @@ def schema() -> dict[str, Any]:
     return json.loads(text)
 
 
-def write(folder: Path, record: dict[str, Any]) -> Path:
+def from_plain(plain: Any) -> RunRecord:
+    """Return a record from plain data, such as the content of ``result.json``.
+
+    Raises:
+        jsonschema.ValidationError: it does not fit the schema.
+    """
+    import jsonschema
+
+    jsonschema.validate(plain, schema())
+    record = RunRecord(**plain)
+    if plain["evaluated"] is not None:
+        record.evaluated = Evaluated(**plain["evaluated"])
+    return record
+
+
+def write(folder: Path, record: RunRecord) -> Path:
     """Validate a record and write it as ``result.json``; NaN and infinity become null.
 
     Args:
@@ -102,36 +181,66 @@ def write(folder: Path, record: dict[str, Any]) -> Path:
     """
     import jsonschema
 
-    record = _finite(record)
-    jsonschema.validate(record, schema())
+    plain = _finite(record.plain())
+    jsonschema.validate(plain, schema())
     path = folder / FILE
     with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n")
+        temporary.write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n")
     return path
 
 
-def read(folder: Path) -> dict[str, Any]:
-    """Read and validate the record in ``folder``, as plain data; settings get their present names.
+def read(folder: Path) -> RunRecord:
+    """Read and validate the record in ``folder``.
 
     Raises:
         UserError: the folder has no ``result.json``, or it is not a run record.
     """
-    import jsonschema
-
     path = folder / FILE
+    if path.exists() and not path.is_file():  # reading a named pipe would wait forever
+        raise UserError(f"{path}: not a regular file.")
     try:
-        record = json.loads(path.read_text())
-        jsonschema.validate(record, schema())
-        record["config"] = upgraded_config(record["config"])
+        return from_json(path.read_text(), str(path))
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"{path}: no run record. Give a run's folder.") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}.") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: not a run record: it is no text in UTF-8.") from None
+
+
+def from_json(text: str, place: str) -> RunRecord:
+    """Return the record in a JSON text.
+
+    Args:
+        text: the content of ``result.json``, or a line of ``runs.jsonl``.
+        place: the file, for errors.
+
+    Raises:
+        UserError: it is not a run record.
+    """
+    import jsonschema
+
+    try:
+        plain = json.loads(text)
+        if _depth(plain) > MAX_DEPTH:
+            raise ValueError(f"nested more than {MAX_DEPTH} levels deep")
+        return from_plain(plain)
     except (ValueError, RecursionError, jsonschema.ValidationError) as error:
-        reason = str(error).splitlines()[0][:200]
-        raise UserError(f"{path}: not a run record: {reason}") from None
-    record["overrides"] = upgraded_overrides(record["overrides"])
-    return record
+        reason = printable(str(error).splitlines()[0][:200])
+        raise UserError(f"{place}: not a run record: {reason}") from None
+
+
+def _depth(plain: Any) -> int:
+    """Return how deeply lists and dictionaries are nested."""
+    depth, level = 0, [plain]
+    while level := [
+        below
+        for node in level
+        if isinstance(node, dict | list)
+        for below in (node.values() if isinstance(node, dict) else node)
+    ]:
+        depth += 1
+    return depth
 
 
 def dotted(tree: Any, prefix: str = "") -> dict[str, Any]:

@@ -16,7 +16,7 @@ from mops_lightning.records.readout_names import (
     parse_transfer,
     size_prefix,
 )
-from mops_lightning.records.run_record import FILE
+from mops_lightning.records.run_record import FILE, RunRecord
 
 Rows = dict[str, dict[str, float | None]]
 """Readout → metric, or m=SIZE if several sizes are tested → value."""
@@ -45,7 +45,7 @@ def readout_rows(metrics: dict[str, float | None], score: str | None = None) -> 
     return dict(sorted(rows.items(), key=lambda item: order.get(item[0], -1)))
 
 
-def closing_lines(folder: Path, record: dict[str, Any], console: Console | None = None) -> None:
+def closing_lines(folder: Path, record: RunRecord, console: Console | None = None) -> None:
     """Print the table of test results and the output paths.
 
     Args:
@@ -60,21 +60,21 @@ def closing_lines(folder: Path, record: dict[str, Any], console: Console | None 
     if transferred := transfer_table(record):
         console.print(transferred[0], soft_wrap=True, highlight=False, style="italic")
         console.print(transferred[1])
-    files = ", ".join([FILE, *sorted(record["files"].values())])
-    seconds = record["seconds"]["total"]
+    files = ", ".join([FILE, *sorted(record.files.values())])
+    seconds = record.seconds["total"]
     console.print(
-        f"{record['status']} in {seconds:.0f} s; files in {folder}/: {files}",
+        f"{record.status} in {seconds:.0f} s; files in {folder}/: {files}",
         soft_wrap=True,
         highlight=False,
     )
 
 
-def results_table(record: dict[str, Any]) -> tuple[str, Table]:
+def results_table(record: RunRecord) -> tuple[str, Table]:
     """Return a title and the test results of every readout, by metric or by size."""
-    config = record["config"]
-    names, score = config["names"], parse(record["notes"].get("score", ""))
+    config = record.config
+    names, score = config["names"], parse(record.score_name)
     by_size = score.metric if score and score.m else None
-    rows = readout_rows(record["metrics"], by_size)
+    rows = readout_rows(record.metrics, by_size)
     if by_size:
         info = metric_info(by_size, [record])
         columns = {size: (size, info) for size in next(iter(rows.values()))}
@@ -101,15 +101,15 @@ def results_table(record: dict[str, Any]) -> tuple[str, Table]:
     return f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test", table
 
 
-def transfer_table(record: dict[str, Any]) -> tuple[str, Table] | None:
+def transfer_table(record: RunRecord) -> tuple[str, Table] | None:
     """Return a title and the scores of the same samples under further task nets.
 
     Returns:
         None for a record of a run without ``task_nets``.
     """
-    names, score = record["config"]["names"], parse(record["notes"].get("score", ""))
+    names, score = record.config["names"], parse(record.score_name)
     values: dict[MetricName, dict[str, float | None]] = {}
-    for name, value in record["metrics"].items():
+    for name, value in record.metrics.items():
         found = parse_transfer(name)
         if found and score and found[1].metric == score.metric:
             values.setdefault(found[1], {})[found[0]] = value
@@ -126,10 +126,10 @@ def transfer_table(record: dict[str, Any]) -> tuple[str, Table] | None:
         values, key=lambda one: (one.readout == FULL, one.m or 0, order.get(one.readout, -1))
     ):
         size = f"m={parts.m} " if parts.m else ""
-        own = record["metrics"].get(f"test/{size_prefix(parts.m)}{parts.readout}/{parts.metric}")
+        own = record.metrics.get(f"test/{size_prefix(parts.m)}{parts.readout}/{parts.metric}")
         cells = [own, *(values[parts].get(net) for net in nets)]
         table.add_row(
-            size + _label(parts.readout, sampler_name(record["config"])),
+            size + _label(parts.readout, sampler_name(record.config)),
             *("" if cell is None else info.format(cell) for cell in cells),
         )
     return f"the same samples under other nets, {info.title}", table

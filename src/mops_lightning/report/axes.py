@@ -44,7 +44,7 @@ def axes(found: list[Record], net: str, mixed: bool = False) -> Axes:
     numbers = {key for key in keys if _numeric(found, key)}
     line = len(keys) == 1 and numbers == keys
     plane = all(len(one) == 2 and set(one) <= numbers for one in different.values())
-    sizes = sorted({record["config"]["m"] for record in found})
+    sizes = sorted({record.config["m"] for record in found})
     if (line or plane) and len(sizes) > 1:
         if mixed:
             return Axes()
@@ -75,20 +75,20 @@ def varying(found: list[Record]) -> list[str]:
 
 def considered(record: Record) -> dict[str, Any]:
     """Return the settings that are compared, with dotted keys, and the epochs trained."""
-    config = record["config"]
-    learn = (record["notes"].get("evaluated") or {}).get("learn", config["learn"])
+    config = record.config
+    learn = record.evaluated.learn if record.evaluated else config["learn"]
     settings = {**compared_by(config, learn), **dotted(recipe(record), "recipe")}
     return {**settings, "trainer.max_epochs": epochs(record)}
 
 
 def value(record: Record, key: str) -> Any:
     """Return a dotted setting of a record."""
-    return record["config"]["m"] if key == "m" else considered(record).get(key)
+    return record.config["m"] if key == "m" else considered(record).get(key)
 
 
 def row(record: Record, net: str) -> str:
     """Return the row of a record's own results; it names a net that is not the table's."""
-    names = record["config"]["names"]
+    names = record.config["names"]
     sampler = sampler_row(record)
     return sampler if names["net"] == net else f"{names['net']} on {sampler}"
 

@@ -57,7 +57,7 @@ def build(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Rep
     """
     found = collect(folder)
     without_clouds = _without_bad_clouds(found.done)
-    scored = [record for record in found.done if record["config"]["learn"] != "task"]
+    scored = [record for record in found.done if record.config["learn"] != "task"]
     if not scored:
         grid = nets_grid(found.done, list(metrics), mixed)
         remarks = [*provenance(found.done, ""), *without_result(found), *without_clouds]
@@ -67,7 +67,7 @@ def build(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Rep
     chosen = list(metrics) or [score(scored)]
     tables = [make_cells(scored, metric, names["net"], layout) for metric in chosen]
     grids = [grid for table in tables for grid in _grids(scored, table, names, layout)]
-    same = [r for r in found.done if r["config"]["names"]["task"] == names["task"]]
+    same = [r for r in found.done if r.config["names"]["task"] == names["task"]]
     remarks = [*provenance(same, names["net"]), *without_result(found), *without_clouds]
     return Report(found, scored, names, layout, tables, grids, remarks)
 
@@ -76,12 +76,12 @@ def _without_bad_clouds(found: list[Record]) -> list[str]:
     """Take clouds that cannot be read from the records, and return a line for each."""
     lines = []
     for record in found:
-        path = Path(record["folder"]) / record["files"].get("clouds", "")
+        path = Path(record.folder) / record.files.get("clouds", "")
         try:
             if path.is_file():
                 load_clouds(path)
         except (OSError, UserError) as error:
-            del record["files"]["clouds"]
+            del record.files["clouds"]
             lines.append(f"- {error}")
     return ["", "Saved clouds that are not shown:", "", *lines] if lines else []
 
@@ -108,7 +108,7 @@ def _by_column(found: list[Record], table: Cells, names: dict[str, str], layout:
     published = paper.table(
         names["task"], names["dataset"], table.metric.name, names["learned"] == "joint"
     )
-    samplers = {sampler_row(one): one["config"]["names"]["sampler"] for one in found}
+    samplers = {sampler_row(one): one.config["names"]["sampler"] for one in found}
     rows = []
     for name in table.rows():
         rows.append([name, *(table.text(name, column) for column in columns)])
@@ -161,7 +161,7 @@ def _full_row(found: list[Record], table: Cells, layout: Axes) -> list[str]:
     """Return the task net's values on full clouds, by the setting of the columns."""
     texts = {}
     for record in found:
-        figure = record["metrics"].get(f"test/{FULL}/{table.metric.name}")
+        figure = record.metrics.get(f"test/{FULL}/{table.metric.name}")
         if figure is not None:
             texts[value(record, layout.column)] = table.metric.format(figure)
     return ["all points", *(texts.get(column, "") for column in table.columns()[::-1])]
@@ -177,15 +177,15 @@ def _full_lines(found: list[Record], names: dict[str, str], metric: MetricInfo) 
         metric = metric_info(metric.full_cloud_metric, found)
         label = f"{metric.title} "
     lines: dict[str, None] = {}  # a dictionary as a set in order
-    for record in sorted(found, key=lambda one: (sampler_row(one), -one["config"]["m"])):
-        figure = record["metrics"].get(f"test/{FULL}/{metric.name}")
+    for record in sorted(found, key=lambda one: (sampler_row(one), -one.config["m"])):
+        figure = record.metrics.get(f"test/{FULL}/{metric.name}")
         if figure is None:
             continue
-        net = record["config"]["names"]["net"]
+        net = record.config["names"]["net"]
         after = ""
         if trained_with(record) == "joint":
-            several = any(parts.m for parts in map(parse, record["metrics"]) if parts)
-            size = "" if several else f", m={record['config']['m']}"
+            several = any(parts.m for parts in map(parse, record.metrics) if parts)
+            size = "" if several else f", m={record.config['m']}"
             after = f" after joint training with {sampler_row(record)}{size}"
         compared = published if net == names["net"] else ""
         lines[f"{net} on all points{after}: {label}{metric.format(figure)}{compared}."] = None

@@ -85,7 +85,7 @@ def make_cells(found: list[Record], metric: str, net: str, axes: Axes) -> Cells:
     for record in found:
         _add(table, record, net, axes)
     if not table.values:
-        known = {parts.metric for r in found for parts in map(parse, r["metrics"]) if parts}
+        known = {parts.metric for r in found for parts in map(parse, r.metrics) if parts}
         raise UserError(f"--metric: no run has {metric!r}.{did_you_mean(metric, known)}")
     return table
 
@@ -93,13 +93,13 @@ def make_cells(found: list[Record], metric: str, net: str, axes: Axes) -> Cells:
 def _add(table: Cells, record: Record, net: str, axes: Axes) -> None:
     own_row = row(record, net)
     prefix = own_row.removesuffix(sampler_row(record))  # such as "icp on "
-    for name, figure in record["metrics"].items():
+    for name, figure in record.metrics.items():
         parts = parse(name)
         if parts is None or parts.metric != table.metric.name or parts.readout == FULL:
             continue
         if figure is None:
             continue
-        if axes != Axes() and parts.m not in (None, record["config"]["m"]):
+        if axes != Axes() and parts.m not in (None, record.config["m"]):
             continue  # tables by another setting show the run's own size only
         column: Column = value(record, axes.column)
         if axes.planes:
@@ -120,7 +120,7 @@ def _add(table: Cells, record: Record, net: str, axes: Axes) -> None:
             if seed(record) in values:
                 raise UserError(
                     f"Two runs of {own} have {axes.column}={column} and seed={seed(record)}; "
-                    f"the second is {record['folder']}. Give a folder with one of each."
+                    f"the second is {record.folder}. Give a folder with one of each."
                 )
         else:
             place, readout = (prefix + parts.readout, column), INDEX_READOUT

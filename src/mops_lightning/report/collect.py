@@ -6,59 +6,35 @@ from typing import Any
 
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-from mops_lightning.records.attempts import ASIDE, FAILED
 from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import parse
+from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
 from mops_lightning.records.summary import sampler_name
 
-Record = dict[str, Any]
-"""A run record, with its path under ``folder``."""
+
+@dataclass(kw_only=True)
+class Record(RunRecord):
+    """A run record with the path of its folder."""
+
+    folder: str
 
 
-_TEXT = {"type": ["string", "null"]}
-_WHOLE = {"type": "integer"}
 NEEDED = {
     "properties": {
         "config": {
             "required": ["task"],
             "properties": {
                 "task": {"type": "object", "properties": {"net": {"type": ["object", "null"]}}},
-                "trainer": {"required": ["max_epochs"], "properties": {"max_epochs": _WHOLE}},
+                "trainer": {
+                    "required": ["max_epochs"],
+                    "properties": {"max_epochs": {"type": "integer"}},
+                },
             },
         },
-        "git": {"properties": {"commit": _TEXT}},
-        "notes": {
-            "properties": {
-                "score": {"type": "string"},
-                "metrics": {
-                    "type": "object",
-                    "additionalProperties": {
-                        "type": "object",
-                        "properties": {
-                            "label": {"type": "string"},
-                            "unit": {"type": "string"},
-                            "scale": {"type": "number"},
-                            "summary_order": {"type": ["integer", "null"]},
-                            "full_cloud_metric": _TEXT,
-                        },
-                    },
-                },
-                "parameters": {"type": "object", "additionalProperties": _WHOLE},
-                "evaluated": {
-                    "type": ["object", "null"],
-                    "properties": {
-                        "learn": {"type": "string"},
-                        "seed": _WHOLE,
-                        "max_epochs": {"type": ["integer", "null"]},
-                    },
-                },
-                "dataset_fingerprint": _TEXT,
-                "task_weights_sha256": _TEXT,
-            },
-        },
+        "git": {"properties": {"commit": {"type": ["string", "null"]}}},
     },
 }
-"""What tables read of a completed record, beyond the schema of all records."""
+"""The parts of a completed record that tables need, beyond the schema of all records."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +71,12 @@ def collect(folder: Path) -> Found:
     for run in runs:
         try:
             record = run_record.read(run)
-            if record["status"] == "completed":
+            if record.status == "completed":
                 _check(record, run)
-                done.append({**record, "folder": str(run)})
+                done.append(Record(**vars(record), folder=str(run)))
                 continue
-            why = f": {record['error']}" if record["error"] else ""
-            undone[str(run)] = record["status"] + why
+            why = f": {record.error}" if record.error else ""
+            undone[str(run)] = record.status + why
         except UserError as error:
             undone[str(run)] = _failure(run) or str(error)
     if not done:
@@ -109,7 +85,7 @@ def collect(folder: Path) -> Found:
     return Found(done, undone, len(runs))
 
 
-def _check(record: Record, run: Path) -> None:
+def _check(record: RunRecord, run: Path) -> None:
     """Reject a record without what tables need, which one table with others would fail at.
 
     Raises:
@@ -118,7 +94,7 @@ def _check(record: Record, run: Path) -> None:
     import jsonschema
 
     try:
-        jsonschema.validate(record, NEEDED)
+        jsonschema.validate(record.plain(), NEEDED)
     except jsonschema.ValidationError as error:
         place = ".".join(map(str, error.absolute_path)) or "record"
         raise UserError(f"{run / run_record.FILE}: {place}: {error.message[:200]}") from None
@@ -134,14 +110,13 @@ def _failure(run: Path) -> str:
 
 def trained_with(record: Record) -> str:
     """Return whether the task net was trained with the sampler, also in an evaluated run."""
-    learn = (record["notes"].get("evaluated") or {}).get("learn", record["config"]["learn"])
+    learn = record.evaluated.learn if record.evaluated else record.config["learn"]
     return "joint" if learn == "joint" else "sampler alone"
 
 
 def recipe(record: Record) -> dict[str, Any]:
     """Return the recipe that a record's sampler was trained by, with its name; {}: the paper's."""
-    notes = record["notes"]
-    return notes.get("recipe") or (notes.get("evaluated") or {}).get("recipe") or {}
+    return record.recipe or (record.evaluated and record.evaluated.recipe) or {}
 
 
 def sampler_row(record: Record) -> str:
@@ -149,22 +124,20 @@ def sampler_row(record: Record) -> str:
 
     That is ``anchored`` for a MOPS-Net with anchors, and its recipe unless it is the paper's.
     """
-    parts = [sampler_name(record["config"]), recipe(record).get("name")]
+    parts = [sampler_name(record.config), recipe(record).get("name")]
     return " ".join(filter(None, parts))
 
 
 def epochs(record: Record) -> int | None:
     """Return the epochs that a run, or the run that it evaluates, was trained; None: untrained."""
-    earlier = record["notes"].get("evaluated") or {}
-    if "fit" in record["seconds"]:
-        return record["config"]["trainer"]["max_epochs"]
-    return earlier.get("max_epochs")
+    if "fit" in record.seconds:
+        return record.config["trainer"]["max_epochs"]
+    return record.evaluated.max_epochs if record.evaluated else None
 
 
 def seed(record: Record) -> int:
     """Return the seed of a run, or of the run that it evaluates."""
-    earlier: Record = record["notes"].get("evaluated") or {}
-    return earlier["seed"] if "seed" in earlier else record["seed"]
+    return record.evaluated.seed if record.evaluated else record.seed
 
 
 def score(found: list[Record]) -> str:
@@ -173,8 +146,8 @@ def score(found: list[Record]) -> str:
     Early records do not name it; it is the first metric of the closing table.
     """
     for record in found:
-        if parts := parse(record["notes"].get("score", "")):
+        if parts := parse(record.score_name):
             return parts.metric
-    names = {parts.metric for record in found for parts in map(parse, record["metrics"]) if parts}
+    names = {parts.metric for record in found for parts in map(parse, record.metrics) if parts}
     infos = in_summary_order(metric_info(name, found) for name in names)
     return infos[0].name if infos else ""

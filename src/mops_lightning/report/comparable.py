@@ -21,17 +21,17 @@ def shared_names(found: list[Record], mixed: bool = False) -> dict[str, str]:
     """
     trained = [record for record in found if not _weightless(record)] or found
     shared = {
-        "task": {record["config"]["names"]["task"] for record in found},
-        "net": {record["config"]["names"]["net"] for record in trained},
-        "dataset": {record["config"]["names"]["dataset"] for record in found},
-        "pairs (task.pairs)": {_plain(record["config"]["task"].get("pairs")) for record in found},
+        "task": {record.config["names"]["task"] for record in found},
+        "net": {record.config["names"]["net"] for record in trained},
+        "dataset": {record.config["names"]["dataset"] for record in found},
+        "pairs (task.pairs)": {_plain(record.config["task"].get("pairs")) for record in found},
         "what was trained (learn)": {trained_with(record) for record in trained},
     }
-    for net in sorted({record["config"]["names"]["net"] for record in found}):
-        same = [r["config"]["task"] for r in found if r["config"]["names"]["net"] == net]
+    for net in sorted({record.config["names"]["net"] for record in found}):
+        same = [r.config["task"] for r in found if r.config["names"]["net"] == net]
         shared[f"settings of {net} (task.net)"] = {_plain(task.get("net")) for task in same}
     if any(trained_with(record) == "joint" for record in trained):
-        losses = {_plain(record["config"]["task"].get("loss")) for record in trained}
+        losses = {_plain(record.config["task"].get("loss")) for record in trained}
         shared["loss (task.loss)"] = losses
     for what, values in shared.items():
         require_one(what, values - {None})
@@ -41,7 +41,7 @@ def shared_names(found: list[Record], mixed: bool = False) -> dict[str, str]:
     same_for_every_seed("task weights (sha256)", "task_weights_sha256", separate)
     require_one_commit(found, mixed)
     names = {what: next(iter(shared[what]), "") or "" for what in ("task", "net", "dataset")}
-    sizes = "/".join(str(m) for m in sorted({record["config"]["m"] for record in found}))
+    sizes = "/".join(str(m) for m in sorted({record.config["m"] for record in found}))
     return {**names, "learned": next(iter(shared["what was trained (learn)"]), ""), "m": sizes}
 
 
@@ -66,11 +66,11 @@ def require_one_commit(found: list[Record], mixed: bool) -> None:
 
 def commit(record: Record) -> str:
     """Return the short commit of the code that made a record."""
-    return (record["git"]["commit"] or "unknown")[:10]
+    return (record.git["commit"] or "unknown")[:10]
 
 
-def same_for_every_seed(what: str, note: str, found: list[Record]) -> None:
-    """Check that runs of one seed have the same data or nets, as a note of the records says.
+def same_for_every_seed(what: str, name: str, found: list[Record]) -> None:
+    """Check that runs of one seed have the same data or nets, as a field of the records says.
 
     Seeds may differ in it, as with procedural data and nets that are trained first; then every
     sampler must have been run with every seed.
@@ -81,9 +81,9 @@ def same_for_every_seed(what: str, note: str, found: list[Record]) -> None:
     by_seed: dict[int, set[str]] = {}
     seeds: dict[str, set[int]] = {}
     for record in found:
-        if known := record["notes"].get(note):  # absent where a checkpoint gave the net
+        if known := getattr(record, name):  # absent where a checkpoint gave the net
             by_seed.setdefault(seed(record), set()).add(known)
-            seeds.setdefault(record["config"]["names"]["sampler"], set()).add(seed(record))
+            seeds.setdefault(record.config["names"]["sampler"], set()).add(seed(record))
     distinct = sorted({one for values in by_seed.values() for one in values})
     differ = any(len(values) > 1 for values in by_seed.values())
     uneven = len(distinct) > 1 and len({frozenset(values) for values in seeds.values()}) > 1
@@ -97,9 +97,9 @@ def same_for_every_seed(what: str, note: str, found: list[Record]) -> None:
 
 
 def _weightless(record: Record) -> bool:
-    """Return whether the task net has no weights: none were noted, and none were trained."""
-    trains = record["config"]["learn"] in ("task", "joint")
-    return not trains and "task_weights_sha256" not in record["notes"]
+    """Return whether the task net has no weights: none are recorded, and none were trained."""
+    trains = record.config["learn"] in ("task", "joint")
+    return not trains and record.task_weights_sha256 is None
 
 
 def _plain(node: Any) -> str | None:

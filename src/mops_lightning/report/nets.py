@@ -34,7 +34,7 @@ def nets_grid(found: list[Record], metrics: Sequence[str] = (), mixed: bool = Fa
             metric.
     """
     _require_comparable(found, mixed)
-    names = found[0]["config"]["names"]
+    names = found[0].config["names"]
     nets = [_net(record) for record in found]
     keys = sorted({key for net in nets for key in net} - set(HIDDEN))
     keys = [key for key in keys if len({str(net[key]) for net in nets if key in net}) > 1]
@@ -50,7 +50,7 @@ def nets_grid(found: list[Record], metrics: Sequence[str] = (), mixed: bool = Fa
 
 def _require_comparable(found: list[Record], mixed: bool) -> None:
     for what in ("task", "dataset"):
-        require_one(what, {record["config"]["names"][what] for record in found})
+        require_one(what, {record.config["names"][what] for record in found})
     require_one_commit(found, mixed)
     for points in {_points(record) for record in found}:
         same = [record for record in found if _points(record) == points]
@@ -67,13 +67,13 @@ def _by_net(found: list[Record], keys: list[str]) -> dict[tuple[Any, ...], dict[
     """Return sort key of a net → seed → record."""
     groups: dict[tuple[Any, ...], dict[int, Record]] = {}
     for record in found:
-        net, names = _net(record), record["config"]["names"]
+        net, names = _net(record), record.config["names"]
         label = [(net.get(key) is not None, net.get(key) or 0) for key in keys]
         place = (_points(record) or 0, *label, names["net"])
         if seed(record) in groups.setdefault(place, {}):
             raise UserError(
                 f"Two runs of {names['task']} have the same net and seed; the second is "
-                f"{record['folder']}. Give a folder with one of each."
+                f"{record.folder}. Give a folder with one of each."
             )
         groups[place][seed(record)] = record
     return groups
@@ -82,28 +82,28 @@ def _by_net(found: list[Record], keys: list[str]) -> dict[tuple[Any, ...], dict[
 def _row(records: list[Record], keys: list[str], metrics: list[MetricInfo]) -> list[str]:
     """Return the cells of one net, over all its seeds."""
     first = records[0]
-    label = [first["config"]["names"]["net"], *map(_net(first).get, keys), _points(first)]
+    label = [first.config["names"]["net"], *map(_net(first).get, keys), _points(first)]
     texts = ["" if value is None else str(value) for value in label]
     for metric in metrics:
-        values = [record["metrics"].get(f"test/{FULL}/{metric.name}") for record in records]
+        values = [record.metrics.get(f"test/{FULL}/{metric.name}") for record in records]
         present = [value for value in values if value is not None]
         count = f" (n={len(present)})" if len(present) > 1 else ""
         texts.append(over_seeds(metric, present) + count if present else "")
-    size = first["notes"].get("parameters", {}).get("task")
+    size = first.parameters.get("task")
     return [*texts, "" if size is None else f"{4e-6 * size:.1f}", _paper(first)]
 
 
 def _net(record: Record) -> dict[str, Any]:
-    return record["config"]["task"].get("net") or {}
+    return record.config["task"].get("net") or {}
 
 
 def _points(record: Record) -> int | None:
-    return record["config"].get("dataset", {}).get("n_points")
+    return record.config.get("dataset", {}).get("n_points")
 
 
 def _metrics(found: list[Record], requested: Sequence[str]) -> list[MetricInfo]:
     """Return the metrics of full clouds: those requested, or those of the closing table."""
-    names = {name for record in found for name in record["metrics"]}
+    names = {name for record in found for name in record.metrics}
     known = {name.rsplit("/", 1)[1] for name in names if name.startswith(f"test/{FULL}/")}
     for name in requested:
         if name not in known:
@@ -115,7 +115,7 @@ def _metrics(found: list[Record], requested: Sequence[str]) -> list[MetricInfo]:
 
 
 def _paper(record: Record) -> str:
-    names, points = record["config"]["names"], _points(record)
+    names, points = record.config["names"], _points(record)
     values = None
     if names["task"] == "reconstruction":
         values = paper.net(names["net"], _net(record).get("pieces"), points)

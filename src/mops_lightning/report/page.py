@@ -118,13 +118,13 @@ def _clouds(report: Report, folder: Path) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
     colours = {INPUT: INPUT_COLOUR, **COLOURS}
     for record in report.found.done:
-        path = Path(record["folder"]) / record["files"].get("clouds", "")
+        path = Path(record.folder) / record.files.get("clouds", "")
         if not path.is_file() or len(found) == MAX_RUNS:
             continue
         titles, arrays = load_clouds(path)
         found.append(
             {
-                "name": str(Path(record["folder"]).relative_to(folder)),
+                "name": str(Path(record.folder).relative_to(folder)),
                 "titles": titles,
                 "points": {name: a.astype(float).round(3).tolist() for name, a in arrays.items()},
                 "colours": {name: f"rgb{colours.get(name, COLOURS['sampled'])}" for name in arrays},

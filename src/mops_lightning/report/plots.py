@@ -40,7 +40,7 @@ def clouds_by_column(report: Report) -> Figure | None:
     """Draw the first saved cloud of every sampler at every value of a setting, such as noise."""
     found: dict[str, dict[Any, Path]] = {}
     for record in report.scored:
-        path = Path(record["folder"]) / record["files"].get("clouds", "")
+        path = Path(record.folder) / record.files.get("clouds", "")
         if path.is_file():
             name = row(record, report.names["net"])
             found.setdefault(name, {}).setdefault(value(record, report.axes.column), path)

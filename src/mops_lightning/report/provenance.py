@@ -22,7 +22,7 @@ def provenance(found: Iterable[Record], net: str) -> list[str]:
     made: dict[str, dict[str, list[str]]] = {}
     for record in found:
         ways = made.setdefault(_kind(record, net), {})
-        ways.setdefault(_way(record), []).append(Path(record["folder"]).name)
+        ways.setdefault(_way(record), []).append(Path(record.folder).name)
     lines = []
     for kind, ways in made.items():
         for way, folders in ways.items():
@@ -43,11 +43,11 @@ def without_result(found: Found) -> list[str]:
 
 
 def _kind(record: Record, net: str) -> str:
-    names = record["config"]["names"]
-    kind = names["net"] if record["config"]["learn"] == "task" else sampler_row(record)
+    names = record.config["names"]
+    kind = names["net"] if record.config["learn"] == "task" else sampler_row(record)
     if names["net"] not in (net, kind):
         kind += f" under {names['net']}"
-    joint = trained_with(record) == "joint" and "fit" in record["seconds"]
+    joint = trained_with(record) == "joint" and "fit" in record.seconds
     return f"{kind}, jointly trained" if joint else kind
 
 
@@ -55,11 +55,11 @@ def _way(record: Record) -> str:
     length = "nothing to train"
     if epochs(record) is not None:
         length = f"{epochs(record)} {'epoch' if epochs(record) == 1 else 'epochs'}"
-    if "fit" not in record["seconds"] and epochs(record) is not None:
+    if "fit" not in record.seconds and epochs(record) is not None:
         length = f"evaluated after {length}"
-    threads = "thread" if record["threads"] == 1 else "threads"
-    changes = " with changes" if record["git"]["dirty"] else ""
+    threads = "thread" if record.threads == 1 else "threads"
+    changes = " with changes" if record.git["dirty"] else ""
     return (
-        f"{length}, seed {seed(record)}, {record['device']}, {record['threads']} {threads}, "
+        f"{length}, seed {seed(record)}, {record.device}, {record.threads} {threads}, "
         f"commit {commit(record)}{changes}"
     )

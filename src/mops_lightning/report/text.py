@@ -100,28 +100,28 @@ def long_csv(found: list[Record], net: str, keys: list[str]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     fixed = ["folder", "sampler", "learn", "seed", "epochs", "m", "readout", "metric", "value"]
-    has_nets = any(parse_transfer(name) for record in found for name in record["metrics"])
+    has_nets = any(parse_transfer(name) for record in found for name in record.metrics)
     writer.writerow([*fixed, *keys, *(["net"] if has_nets else []), "commit", "device"])
     for record in found:
-        for name, figure in record["metrics"].items():
-            other, parts = parse_transfer(name) or (record["config"]["names"]["net"], parse(name))
+        for name, figure in record.metrics.items():
+            other, parts = parse_transfer(name) or (record.config["names"]["net"], parse(name))
             if parts is None or figure is None:
                 continue
             writer.writerow(
                 [
-                    record["folder"],
+                    record.folder,
                     row(record, net),
                     trained_with(record),
                     seed(record),
                     epochs(record) or 0,
-                    parts.m or record["config"].get("m"),
+                    parts.m or record.config.get("m"),
                     parts.readout,
                     parts.metric,
                     repr(figure),
                     *(value(record, key) for key in keys),
                     *([other] if has_nets else []),
-                    record["git"]["commit"],
-                    record["device"],
+                    record.git["commit"],
+                    record.device,
                 ]
             )
     return out.getvalue()

@@ -1,6 +1,7 @@
 """A table of the same samples under several task nets: size × sampler × net."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from mops_lightning.metrics.info import MetricInfo
@@ -11,9 +12,6 @@ from mops_lightning.report.cells import Cells, Column, make_cells, over_seeds
 from mops_lightning.report.collect import Record
 from mops_lightning.report.comparable import require_one
 from mops_lightning.report.text import Grid
-
-NOTE = "task_nets"
-"""Key of a record's notes about its further nets, by their labels."""
 
 
 def transfer_grid(
@@ -39,7 +37,7 @@ def transfer_grid(
     nets = {
         label: records
         for label, records in nets.items()
-        if any(name.endswith(f"/{metric.name}") for one in records for name in one["metrics"])
+        if any(name.endswith(f"/{metric.name}") for one in records for name in one.metrics)
     }
     if axes.planes or not nets:
         return None
@@ -75,18 +73,18 @@ def _labels(found: list[Record]) -> list[str]:
 
 
 def _notes(record: Record) -> dict[str, Any]:
-    return record["notes"].get(NOTE) or {}
+    return record.task_nets
 
 
 def _under(record: Record, label: str) -> Record:
     """Return a record whose test metrics are those under one of the further nets."""
     metrics = {}
-    for name, figure in record["metrics"].items():
+    for name, figure in record.metrics.items():
         found = parse_transfer(name)
         if found and found[0] == label:
             parts = found[1]
             metrics[f"test/{size_prefix(parts.m)}{parts.readout}/{parts.metric}"] = figure
-    return {**record, "metrics": metrics}
+    return replace(record, metrics=metrics)
 
 
 def _text(table: Cells, row: str, column: Column) -> str:
@@ -95,7 +93,7 @@ def _text(table: Cells, row: str, column: Column) -> str:
 
 def _full(records: list[Record], metric: MetricInfo) -> str:
     """Return the value on full clouds; over the distinct ones where data depend on the seed."""
-    values = [one["metrics"].get(f"test/{FULL}/{metric.name}") for one in records]
+    values = [one.metrics.get(f"test/{FULL}/{metric.name}") for one in records]
     distinct = sorted({value for value in values if value is not None})
     return over_seeds(metric, distinct) if distinct else ""
 

@@ -136,7 +136,7 @@ def _run_had(folder: Path, cfg: DictConfig) -> bool:
     """Return whether the record in a folder has the settings that affect training here."""
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     try:
-        there = run_record.read(folder)["config"]
+        there = run_record.read(folder).config
         return trained_with({**there, "trainer": plain["trainer"]}) == trained_with(plain)
     except (UserError, KeyError):
         return False

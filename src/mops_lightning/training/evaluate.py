@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
+from mops_lightning.records.run_record import Evaluated, RunRecord
 from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.evaluated_settings import same_settings
 from mops_lightning.training.experiment import Experiment
@@ -23,11 +24,11 @@ from mops_lightning.zoo import weights
 from mops_lightning.zoo.closed_list import attributes_in
 
 
-def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict[str, Any]:
+def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> Evaluated:
     """Load the nets of the run that ``cfg.evaluate`` names into an experiment.
 
     Returns:
-        Notes for the record: the run and how it was trained.
+        The run and how it was trained, for the record.
 
     Raises:
         UserError: settings, classes or files do not match the run.
@@ -35,11 +36,10 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
     record, folder = trained_run(cfg.evaluate), place(cfg.evaluate)
     run = cfg.evaluate.removesuffix(f"/{run_record.FILE}")
     same_settings(cfg, record, run, experiment.task)
-    notes = record["notes"]
-    own_data = notes.get("dataset_fingerprint") == dataset.fingerprint
+    own_data = record.dataset_fingerprint == dataset.fingerprint
     if experiment.task.requires_same_classes and cfg.weights == OF_RUN and not own_data:
-        same_classes(notes.get("class_names"), dataset, f"{KEY}: {run}")
-    same_attributes(record["config"], dataset, f"{KEY}: {run}")
+        same_classes(record.class_names, dataset, f"{KEY}: {run}")
+    same_attributes(record.config, dataset, f"{KEY}: {run}")
     learned = experiment.task if cfg.learn == "task" else experiment.sampler
     what = "task net" if cfg.learn == "task" else "sampler"
     assert learned is not None  # learn=nothing builds a sampler
@@ -53,16 +53,16 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> dict
             _load_task(experiment.task, folder, record)
         except UserError as error:
             raise UserError(f"{KEY}: {error}{_other_net(cfg, record)}") from None
-    return {
-        "run": run,
-        "commit": record["git"]["commit"],
-        "max_epochs": record["config"]["trainer"]["max_epochs"],
-        "learn": record["config"]["learn"],
-        "recipe": notes.get("recipe"),
-        "seed": record["seed"],
-        "dataset": record["config"]["names"]["dataset"],
-        f"{'task' if cfg.learn == 'task' else 'sampler'}_weights_sha256": content["sha256"],
-    }
+    return Evaluated(
+        run=run,
+        commit=record.git["commit"],
+        max_epochs=record.config["trainer"]["max_epochs"],
+        learn=record.config["learn"],
+        recipe=record.recipe,
+        seed=record.seed,
+        dataset=record.config["names"]["dataset"],
+        weights_sha256=content["sha256"],
+    )
 
 
 def same_classes(names: list[str] | None, dataset: CloudDataset, what: str) -> None:
@@ -111,9 +111,9 @@ def same_attributes(config: dict[str, Any], dataset: CloudDataset, what: str) ->
         )
 
 
-def _load_task(task: torch.nn.Module, folder: Path, record: dict[str, Any]) -> None:
+def _load_task(task: torch.nn.Module, folder: Path, record: RunRecord) -> None:
     """Load the task net from a jointly trained run's weights, or from the run's checkpoint."""
-    if "task_weights" in record["files"]:
+    if "task_weights" in record.files:
         weights.load_into(task, weights.of_run(folder, "task_weights"))
         return
     path = folder / "checkpoints" / CHECKPOINT
@@ -127,15 +127,15 @@ def _load_task(task: torch.nn.Module, folder: Path, record: dict[str, Any]) -> N
     own = {
         key.removeprefix("task."): value for key, value in state.items() if key.startswith("task.")
     }
-    if weights.digest(own) != record["notes"].get("task_weights_sha256"):
+    if weights.digest(own) != record.task_weights_sha256:
         raise UserError(f"{path} does not belong to the run in its folder. Give weights=FILE.")
     weights.fit_state(task, own, path)
 
 
-def _other_net(cfg: DictConfig, record: dict[str, Any]) -> str:
+def _other_net(cfg: DictConfig, record: RunRecord) -> str:
     """Return the settings of the task net in which an evaluation differs from its run."""
     here: Any = OmegaConf.to_container(cfg.task.net, resolve=True)
-    there = record["config"]["task"].get("net") or {}
+    there = record.config["task"].get("net") or {}
     changed = [
         f"task.net.{key} is {here.get(key)} here and was {there.get(key)}"
         for key in {**there, **here}

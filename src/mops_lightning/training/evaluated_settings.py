@@ -12,6 +12,7 @@ from mops_lightning.config.build import signature
 from mops_lightning.config.declaration import Affects
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.replay import KEY, OF_RUN, names_code, place, trained_run
 from mops_lightning.zoo import weights
 
@@ -36,7 +37,7 @@ def as_trained(cfg: DictConfig, given: list[str] | None) -> DictConfig:
     whole = any(argument.lstrip("+").startswith("sampler={") for argument in given or [])
     if given is None or whole or not cfg.evaluate or cfg.learn == "task":
         return cfg
-    there = trained_run(cfg.evaluate)["config"]
+    there = trained_run(cfg.evaluate).config
     _same_group("sampler", cfg.names.sampler, there, cfg.evaluate)
     here: Any = OmegaConf.to_container(cfg.sampler, resolve=True)
     raw: Any = OmegaConf.to_container(cfg.sampler, resolve=False)
@@ -60,7 +61,7 @@ def as_trained(cfg: DictConfig, given: list[str] | None) -> DictConfig:
     return replaced
 
 
-def same_settings(cfg: DictConfig, record: dict[str, Any], run: str, task: torch.nn.Module) -> None:
+def same_settings(cfg: DictConfig, record: RunRecord, run: str, task: torch.nn.Module) -> None:
     """Reject settings with which a run's nets cannot be tested.
 
     Args:
@@ -72,7 +73,7 @@ def same_settings(cfg: DictConfig, record: dict[str, Any], run: str, task: torch
     Raises:
         UserError: a setting differs from the run's.
     """
-    there = record["config"]
+    there = record.config
     here: Any = OmegaConf.to_container(cfg, resolve=True)
     if (cfg.learn == "task") != (there["learn"] == "task"):
         raise UserError(

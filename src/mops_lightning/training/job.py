@@ -62,18 +62,15 @@ def prepare(cfg: DictConfig, folder: Path, dataset: CloudDataset, record: RunRec
     """
     identity = checkpoint.identity(record.config, dataset.fingerprint)
     resumed = checkpoint.find(cfg, identity)
-    record.notes |= {
-        "dataset_fingerprint": dataset.fingerprint,
-        "train_clouds": len(dataset.train.labels),
-        "test_clouds": len(dataset.test.labels),
-        "class_names": list(dataset.class_names),
-        "resumed_from": None if resumed is None else str(resumed),
-        "lengthened": resumed is not None and checkpoint.lengthened(cfg, resumed),
-        **dataset.notes,
-    }
+    record.dataset_fingerprint = dataset.fingerprint
+    record.train_clouds, record.test_clouds = len(dataset.train.labels), len(dataset.test.labels)
+    record.class_names = list(dataset.class_names)
+    record.dataset_facts = dataset.notes
+    record.resumed_from = None if resumed is None else str(resumed)
+    record.lengthened = resumed is not None and checkpoint.lengthened(cfg, resumed)
     experiment = make_experiment(cfg, dataset, identity)
     if task_nets.KEY in cfg:
-        record.notes[task_nets.KEY] = task_nets.add_task_nets(experiment, cfg, dataset)
+        record.task_nets = task_nets.add_task_nets(experiment, cfg, dataset)
     trainer = make_trainer(cfg, folder, dataset, experiment)
     job = Job(cfg, folder, dataset, experiment, trainer, resumed)
     distributed.check_shares(

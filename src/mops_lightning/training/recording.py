@@ -34,10 +34,10 @@ def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[Ru
 
     def ended(text: str) -> None:
         record.status, record.error = "interrupted", text
-        run_record.write(folder, record.plain())
+        run_record.write(folder, record)
 
     if writes:
-        run_record.write(folder, record.plain())
+        run_record.write(folder, record)
         at_end.append(ended)
     try:
         with record.timed("total"):
@@ -54,4 +54,4 @@ def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[Ru
     finally:
         if writes:
             at_end.remove(ended)
-            run_record.write(folder, record.plain())
+            run_record.write(folder, record)

@@ -12,6 +12,7 @@ from typing import Any
 from mops_lightning.config import overrides, settings
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.zoo import model_file, names
 
@@ -52,17 +53,15 @@ def command_line(arguments: list[str]) -> list[str]:
     path = Path(chosen).expanduser()
     folder = str(path) if path.exists() else chosen
     record = trained_run(folder)
-    chosen_groups = record["config"]["names"]
-    _refuse_without_effect(arguments, folder, record["config"]["learn"])
+    chosen_groups = record.config["names"]
+    _refuse_without_effect(arguments, folder, record.config["learn"])
     groups = {key: chosen_groups[key] for key in ("task", "dataset", "sampler")}
     typed = [a for i, a in enumerate(arguments) if i not in places and overrides.key(a)]
     # Choosing the run's own group again changes nothing; the settings below it stay too.
     typed_keys = [
         overrides.key(a) for a in typed if a not in [f"{k}={v}" for k, v in groups.items()]
     ]
-    earlier = [
-        overrides.repeatable(a) for a in record["overrides"] if overrides.key(a) not in groups
-    ]
+    earlier = [overrides.repeatable(a) for a in record.overrides if overrides.key(a) not in groups]
     earlier = [f"{group}={name}" for group, name in groups.items()] + earlier
     kept = [
         a
@@ -73,7 +72,7 @@ def command_line(arguments: list[str]) -> list[str]:
     for argument in kept:
         _check_recorded(argument, folder)
     _data_are_here(kept, folder)
-    learn = "task" if record["config"]["learn"] == "task" else "nothing"
+    learn = "task" if record.config["learn"] == "task" else "nothing"
     own = [*kept, f"learn={learn}", f"weights={OF_RUN}", f"{KEY}={overrides.quote(folder)}"]
     # All in one place: argparse accepts flags before or after all overrides, not between them.
     before = [a for i, a in enumerate(arguments[: places[0]]) if i not in places]
@@ -194,7 +193,7 @@ def place(run: str) -> Path:
     return path
 
 
-def trained_run(run: str) -> dict[str, Any]:
+def trained_run(run: str) -> RunRecord:
     """Return the record of a completed run that trained something, or of a model.
 
     Raises:
@@ -203,17 +202,17 @@ def trained_run(run: str) -> dict[str, Any]:
     folder = place(run)
     try:
         if folder.is_file():
-            return dict(model_file.read_card(folder)["record"])
+            return run_record.from_plain(model_file.read_card(folder)["record"])
         record = run_record.read(folder)
     except UserError as error:
         raise UserError(f"{KEY}: {error}") from None
-    if record["status"] != "completed":
+    if record.status != "completed":
         hint = "Give a completed run."
         if (folder / "checkpoints" / CHECKPOINT).is_file():
             hint = f"Finish it with its own command and ckpt_path={folder}."
         state = {"failed": "failed", "running": "is still running or was killed"}
-        raise UserError(f"{KEY}: {folder} {state.get(record['status'], 'was interrupted')}. {hint}")
-    if "weights" not in record["files"]:
+        raise UserError(f"{KEY}: {folder} {state.get(record.status, 'was interrupted')}. {hint}")
+    if "weights" not in record.files:
         raise UserError(
             f"{KEY}: {folder} trained nothing, or its weights were not kept; "
             "run its own command with other settings."

@@ -57,7 +57,7 @@ def run(
         fit_and_test(job, record, task_weights)
         pretrain.publish(job)
     if leads:
-        closing_lines(folder, record.plain())
+        closing_lines(folder, record)
     return record
 
 

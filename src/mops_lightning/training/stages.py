@@ -13,7 +13,7 @@ from torch import nn
 
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import Interrupted, UserError
-from mops_lightning.records.metric_info import described
+from mops_lightning.records.metric_info import foreign_metrics
 from mops_lightning.records.readout_names import parse
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training import evaluate
@@ -52,11 +52,11 @@ def fit_and_test(job: Job, record: RunRecord, task_weights: Path | None) -> None
     _load_weights(job, record, task_weights)
     if job.trains:
         if job.experiment.recipe != Recipe():
-            record.notes["recipe"] = _recipe_notes(job)
+            record.recipe = _recipe(job)
         warm_start(job, record)
         with record.timed("fit"):
             _fit(job)
-        record.notes["validation"] = {
+        record.validation = {
             name: float(value)
             for name, value in job.trainer.callback_metrics.items()
             if name.startswith("val/")
@@ -64,14 +64,14 @@ def fit_and_test(job: Job, record: RunRecord, task_weights: Path | None) -> None
     if job.cfg.learn in ("sampler", "nothing") and job.has_task_weights:
         # A resumed run has its task net from the checkpoint, not from a weights file.
         digest = weights.digest(job.experiment.task.state_dict())
-        record.notes["task_weights_sha256"] = digest
+        record.task_weights_sha256 = digest
     with record.timed("test"):
         record.metrics = _test(job, record.config)
     if job.trainer.is_global_zero:
         _save(job, record)
 
 
-def _recipe_notes(job: Job) -> dict[str, Any]:
+def _recipe(job: Job) -> dict[str, Any]:
     recipe = job.experiment.recipe
     if job.experiment.sampler is None:
         return {"task_points": recipe.task_points}
@@ -87,11 +87,11 @@ def _load_weights(job: Job, record: RunRecord, task_weights: Path | None) -> Non
             weights.fit_state(task, content["state"], task_weights)
         except UserError as error:
             raise UserError(f"weights: {error}") from None
-        record.notes["weights_loaded"] = content["sha256"]
+        record.weights_loaded = content["sha256"]
         if task.requires_same_classes and content.get("classes"):
             evaluate.same_classes(content["classes"], job.dataset, f"weights: {task_weights}")
     if job.cfg.evaluate:
-        record.notes["evaluated"] = evaluate.load(job.cfg, job.experiment, job.dataset)
+        record.evaluated = evaluate.load(job.cfg, job.experiment, job.dataset)
 
 
 def _fit(job: Job) -> None:
@@ -218,15 +218,13 @@ def _save(job: Job, record: RunRecord) -> None:
             record.files[kind] = name
     record.score = record.metrics[experiment.score_name]
     parts: dict[str, nn.Module | None] = {"task": task, "sampler": sampler}
-    record.notes |= {
-        "score": experiment.score_name,
-        "metrics": described(task.metrics().items()),
-        "processes": job.trainer.world_size,
-        "parameters": {
-            name: sum(parameter.numel() for parameter in module.parameters())
-            for name, module in parts.items()
-            if module is not None
-        },
+    record.score_name = experiment.score_name
+    record.metric_info = foreign_metrics(task.metrics().items())
+    record.processes = job.trainer.world_size
+    record.parameters = {
+        name: sum(parameter.numel() for parameter in module.parameters())
+        for name, module in parts.items()
+        if module is not None
     }
     _check_scores(job, record.metrics)
     if not job.trains:

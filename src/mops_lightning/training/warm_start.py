@@ -28,7 +28,7 @@ def warm_start(job: Job, record: RunRecord) -> None:
     else:
         typical = job.dataset.train.points[:CLOUDS]
         copied = copy_pointwise_layers(experiment.task.net, experiment.sampler, typical)
-        record.notes["warm_start"] = {"layers": copied}
+        record.warm_start = {"layers": copied}
         said = f"the first {copied} layers are copies of {job.cfg.names.net}'s"
     if job.trainer.is_global_zero:
         print(f"Warm start: {said}.")
@@ -51,7 +51,7 @@ def _from_file(given: str, sampler: nn.Module, record: RunRecord) -> str:
             f"recipe.warm_start: no tensor of {given} fits this sampler. Give the weights file of "
             "a sampler of the same kind."
         )
-    record.notes["warm_start"] = {"sha256": content["sha256"], "tensors": len(copied)}
+    record.warm_start = {"sha256": content["sha256"], "tensors": len(copied)}
     return described(copied, list(sampler.state_dict()), given)
 
 

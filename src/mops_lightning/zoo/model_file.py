@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.records import run_record
-from mops_lightning.records.migrate import upgraded_config, upgraded_overrides
 from mops_lightning.zoo.digest import digest
 
 if TYPE_CHECKING:
@@ -80,7 +79,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def read_card(path: Path) -> dict[str, Any]:
-    """Read the card of a model file; settings in its record get their present names.
+    """Read the card of a model file.
 
     Raises:
         UserError: the file is missing, damaged or not a model file.
@@ -102,9 +101,6 @@ def read_card(path: Path) -> dict[str, Any]:
         ) from None
     except (SafetensorError, OSError, ValueError, RecursionError):
         raise _damaged(path) from None
-    record = card["record"]
-    record["config"] = upgraded_config(record["config"])
-    record["overrides"] = upgraded_overrides(record["overrides"])
     return card
 
 

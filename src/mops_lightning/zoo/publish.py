@@ -1,6 +1,5 @@
 """From a run to a model: the card is written from the run's record."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import ROWS, MetricName, parse
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.zoo import model_file, names, weights
 from mops_lightning.zoo.packing import pack
 
@@ -60,13 +60,13 @@ def add(
     if path.exists() and not overwrite:
         raise UserError(f"{path} exists. Give another NAME, or --overwrite.")
     record = run_record.read(run)
-    if record["status"] != "completed" or "weights" not in record["files"]:
+    if record.status != "completed" or "weights" not in record.files:
         raise UserError(f"{run}: not a completed run that kept its weights. Give another RUN.")
     content = weights.read(weights.of_run(run))
     state = _stored(content["state"], precision)
     files = {"weights": name}
-    if record["config"]["learn"] == "sampler":
-        used = _task_net(task_net, record["notes"])
+    if record.config["learn"] == "sampler":
+        used = _task_net(task_net, record)
         files |= {"task_weights": used} if used else {}
     card = {
         "name": name,
@@ -76,7 +76,7 @@ def add(
         "notes": notes,
         "classes": _classes(content.get("classes", []), record),
         "figures": figures(run_record.read(tested) if tested else record),
-        "record": {**record, "files": files},
+        "record": {**record.plain(), "files": files},
     }
     model_file.write(path, card, state)
     return path
@@ -90,31 +90,28 @@ def point_to(run: Path, model: Path) -> None:
         model: the file of the model.
     """
     card = model_file.read_card(model)
-    run_record.read(run)  # reports its mistakes
-    record = json.loads((run / run_record.FILE).read_text())
-    record["files"]["weights"] = names.pinned(card["name"], card["sha256"])
+    record = run_record.read(run)
+    record.files["weights"] = names.pinned(card["name"], card["sha256"])
     task_net = card["record"]["files"].get("task_weights")
     if task_net:
-        record["files"]["task_weights"] = task_net
+        record.files["task_weights"] = task_net
     run_record.write(run, record)
 
 
-def figures(record: dict[str, Any]) -> dict[str, Any]:
+def figures(record: RunRecord) -> dict[str, Any]:
     """Return a record's score by readout, at the run's own size, for a card."""
-    scores = {key: value for key, value in record["metrics"].items() if value is not None}
-    named = record["notes"].get("score")
+    scores = {key: value for key, value in record.metrics.items() if value is not None}
+    named = record.score_name
     found = {key: part for key in scores if (part := parse(key))}
-    if named not in found:  # records of the first version do not name it
-        named = next((key for key in found if scores[key] == record["score"]), None)
-    if named is None:
+    if named not in found:
         raise UserError("the record of the run has no test score. Give a run that was tested.")
     main = found[named]
     info = metric_info(main.metric, [record])
     shown = {MetricName(main.m, readout, main.metric) for readout in _readouts(main)}
     return {
         "metric": info.title,
-        "m": None if main.readout == ROWS[-1] else main.m or record["config"]["m"],
-        "points": record["config"]["dataset"].get("n_points"),
+        "m": None if main.readout == ROWS[-1] else main.m or record.config["m"],
+        "points": record.config["dataset"].get("n_points"),
         "values": {
             part.readout: info.format(scores[key]) for key, part in found.items() if part in shown
         },
@@ -125,7 +122,7 @@ def _readouts(main: MetricName) -> tuple[str, ...]:
     return ROWS[-1:] if main.readout == ROWS[-1] else ROWS[:-1]
 
 
-def _task_net(given: str | None, notes: dict[str, Any]) -> str | None:
+def _task_net(given: str | None, record: RunRecord) -> str | None:
     """Return a reference to the model of a sampler's task net, or None if it is no model."""
     if given is not None:
         path = names.find(given)
@@ -137,7 +134,7 @@ def _task_net(given: str | None, notes: dict[str, Any]) -> str | None:
         if card["record"]["config"]["learn"] != "task":
             raise UserError(f"--task-net: {given} is a sampler. Give the model of a task net.")
         return names.pinned(given, card["sha256"])
-    used = {notes.get("weights_loaded"), notes.get("task_weights_sha256")}
+    used = {record.weights_loaded, record.task_weights_sha256}
     for name, path in names.available().items():
         try:
             sha256 = model_file.read_card(path)["sha256"]
@@ -148,12 +145,12 @@ def _task_net(given: str | None, notes: dict[str, Any]) -> str | None:
     return None
 
 
-def _classes(own: list[str], record: dict[str, Any]) -> list[str]:
+def _classes(own: list[str], record: RunRecord) -> list[str]:
     """Return the classes of a classifier's outputs, as its file or its record says."""
-    config = record["config"]
+    config = record.config
     if own or config["learn"] != "task" or config["names"]["task"] != "classification":
         return list(own)
-    return list(record["notes"].get("class_names") or [])
+    return list(record.class_names or [])
 
 
 def _stored(state: dict[str, Tensor], precision: str) -> dict[str, Tensor]:

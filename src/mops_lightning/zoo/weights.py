@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.records import run_record
-from mops_lightning.records.migrate import upgraded_config
 from mops_lightning.zoo import bounds, model_file, names
 from mops_lightning.zoo.digest import digest
 
@@ -72,8 +71,7 @@ def read(path: str | Path) -> dict[str, Any]:
         path: a weights file, or what ``names.resolve`` takes.
 
     Returns:
-        The content as saved: ``config``, ``metrics``, ``classes``, ``sha256`` and ``state``;
-        settings in ``config`` get their present names.
+        The content as saved: ``config``, ``metrics``, ``classes``, ``sha256`` and ``state``.
 
     Raises:
         UserError: the file is missing.
@@ -98,10 +96,6 @@ def read(path: str | Path) -> dict[str, Any]:
         raise Damaged(f"{path} is damaged (sha256 differs). Delete it and run again.")
     if not _is_plain(content["config"], dict) or not _is_plain(content["classes"], list):
         raise Damaged(f"{path} is damaged (config or classes). Delete it and run again.")
-    try:
-        content["config"] = upgraded_config(content["config"])
-    except UserError as error:
-        raise Damaged(f"{path} is damaged: {error}") from None
     return content
 
 
@@ -182,7 +176,7 @@ def of_run(run: Path, kind: str = "weights") -> Path:
         files, run = model_file.read_card(run)["record"]["files"], run.parent
     else:
         has_record = (run / run_record.FILE).is_file()
-        files = run_record.read(run)["files"] if has_record else {}
+        files = run_record.read(run).files if has_record else {}
     named = files.get(kind, f"{kind}.pt")
     path = run / named
     return path if path.exists() else names.find(named) or path
