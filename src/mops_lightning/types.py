@@ -13,32 +13,6 @@ if TYPE_CHECKING:
     from mops_lightning.ops.sampling_matrix import SamplingMatrix
 
 
-class TruePairs(NamedTuple):
-    """The other clouds of pairs with known motions; the first clouds are the sources.
-
-    A true motion maps a point p of a source to R·p + t in its target. Source and target are each
-    centred at their own centroid and divided by one scale, so that the motion stays rigid.
-
-    Attributes:
-        target: ``(B, N, 3)``.
-        quaternion: ``(B, 4)`` rotation from source to target, scalar first.
-        translation: ``(B, 3)`` translation between the centred and scaled clouds.
-        origin: ``(B, 3)`` the point, in the source's coordinates, where translation errors are
-            measured: where the predicted and the true motion move it.
-        scale: ``(B,)`` the length of 1 in the data's own unit.
-    """
-
-    target: Tensor
-    quaternion: Tensor
-    translation: Tensor
-    origin: Tensor
-    scale: Tensor
-
-    def take(self, rows: Tensor) -> "TruePairs":
-        """Return the pairs of the given rows, or of a mask."""
-        return TruePairs(*(one[rows] for one in self))
-
-
 class Batch(NamedTuple):
     """One batch of clouds.
 
@@ -46,13 +20,11 @@ class Batch(NamedTuple):
         points: ``(B, N, 3)``, or ``(B, N, 3 + C)`` with attributes.
         labels: ``(B,)`` int64 class numbers.
         rows: ``(B,)`` int64 rows of the clouds in their split, or None.
-        pairs: the targets of these clouds, for data that are pairs with known motions; or None.
     """
 
     points: Tensor
     labels: Tensor
     rows: Tensor | None = None
-    pairs: TruePairs | None = None
 
     @property
     def num_clouds(self) -> int:
@@ -69,16 +41,12 @@ class PairBatch(NamedTuple):
         centroids: ``(2B, 3)`` the subtracted centroids.
         quaternion: ``(B, 4)`` rotation of the true motion from source to target, scalar first.
         translation: ``(B, 3)`` its translation. Both refer to the clouds before centring.
-        origin: ``(B, 3)`` see ``TruePairs``; None: the origin of the coordinates.
-        scale: ``(B,)`` see ``TruePairs``; None: 1.
     """
 
     points: Tensor
     centroids: Tensor
     quaternion: Tensor
     translation: Tensor
-    origin: Tensor | None = None
-    scale: Tensor | None = None
 
     @property
     def num_clouds(self) -> int:

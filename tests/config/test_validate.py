@@ -27,7 +27,6 @@ EXTRA = {
     "dataset=clouds": ["dataset.root=somewhere"],
     "experiment=own_scans": ["dataset.root=somewhere"],
     "dataset=mesh_sequence": ["dataset.root=somewhere"],
-    "dataset=scan_pairs": ["dataset.root=somewhere", "dataset.motions=somewhere"],
     "task/loss=quaternion": ["task=registration"],
     "task/loss=frobenius_chamfer": ["task=registration"],
 }

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from mops_lightning.data.clouds import Clouds, choose_classes, select_classes
+from mops_lightning.data.clouds import Clouds, choose_classes, noisy, select_classes
 from mops_lightning.errors import UserError
 
 KNOWN = ("chair", "lamp", "table")
@@ -32,3 +32,25 @@ def test_select_classes_renumbers_labels():
     selected = select_classes(clouds, KNOWN, ("chair", "table"))
     assert selected.labels.tolist() == [1, 0, 1, 0]
     assert selected.points[:, 0, 0].tolist() == [0, 1, 3, 4]
+
+
+def split_of(points):
+    return Clouds(points, torch.zeros(len(points), dtype=torch.int64))
+
+
+def test_noisy_has_standard_deviation(rng):
+    points = torch.randn(20, 2000, 3, generator=rng)
+    added = noisy(split_of(points), 0.05).points - points
+    assert added.std((0, 1)).tolist() == pytest.approx([0.05] * 3, rel=0.02)
+    assert added.mean((0, 1)).abs().max() < 0.001
+    assert added.abs().max() > 0.2  # not clipped at four standard deviations
+
+
+def test_noisy_depends_on_position_and_scales(rng):
+    points = torch.randn(5, 30, 3, generator=rng)
+    small, large = (noisy(split_of(points), noise).points - points for noise in (0.01, 0.1))
+    first = noisy(split_of(points[:3]), 0.1).points - points[:3]
+    torch.testing.assert_close(large[:3], first)
+    torch.testing.assert_close(10 * small, large, atol=1e-5, rtol=1e-4)
+    assert not torch.equal(small[0], small[1])
+    assert torch.equal(noisy(split_of(points), 0.0).points, points)

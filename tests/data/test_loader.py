@@ -8,7 +8,6 @@ from mops_lightning.data.clouds import Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.seeding import generator
-from mops_lightning.types import TruePairs
 
 
 def clouds(number=10, points=7):
@@ -101,21 +100,6 @@ def test_augmentation_default_is_identity(rng):
 def test_augmentation_negative_jitter_raises():
     with pytest.raises(UserError, match=r"jitter .* at least 0, got -1.0"):
         Augmentation(jitter=-1.0)
-
-
-def test_loader_pairs_belong_to_their_rows():
-    plain = clouds()
-    numbers = torch.arange(10.0)
-    pairs = TruePairs(plain.points + 1, numbers, numbers, numbers, numbers)
-    data = plain._replace(pairs=pairs)
-    loader = CloudLoader(data, 4, shuffle=True, seed=5)
-    for batch in loader:
-        assert batch.pairs.scale.tolist() == batch.labels.tolist()
-        assert torch.equal(batch.pairs.target, batch.points + 1)
-    assert loader.batch_of(torch.tensor([7, 2])).pairs.scale.tolist() == [7, 2]
-    CloudLoader(data, 4, augment=Augmentation())
-    with pytest.raises(UserError, match="augment: changes one cloud of a pair"):
-        CloudLoader(data, 4, augment=Augmentation(jitter=0.01))
 
 
 @pytest.mark.parametrize("shuffle", [False, True])

@@ -6,8 +6,7 @@ from mops_lightning.data.pairs import Pairs, pair_batch
 from mops_lightning.errors import UserError
 from mops_lightning.ops.rigid import Motion
 from mops_lightning.seeding import generator
-from mops_lightning.types import Batch, TruePairs
-from tests.support.rigid import motion
+from mops_lightning.types import Batch
 from tests.support.training import small_dataset
 
 
@@ -115,40 +114,6 @@ def test_pairs_change_by_epoch_in_training_only():
     other = CloudLoader(data, 7, make_batch=make)
     assert torch.equal(torch.cat([batch.quaternion for batch in other]), first)
     assert torch.equal(scored.batch_of(torch.tensor([3, 9])).quaternion, first[[3, 9]])
-
-
-def given(points, true):
-    """Pairs whose targets are the points under a true motion."""
-    rest = torch.arange(6.0)
-    origin = rest[:, None].expand(6, 3)
-    return TruePairs(true.apply(points), true.quaternion, true.translation, origin, rest)
-
-
-def test_pairs_given_keep_their_motion(rng):
-    points, true = clouds(rng), motion(3, 6)
-    batch = Pairs(0.0, 0.0)(points, generators(6), given(points, true))
-    source, target = restored(batch)
-    torch.testing.assert_close(source, points)
-    torch.testing.assert_close(target, true.apply(points), atol=1e-5, rtol=0)
-    torch.testing.assert_close(batch.quaternion, true.quaternion)
-    torch.testing.assert_close(batch.translation, true.translation)
-    assert batch.origin is not None
-    assert batch.scale is not None
-    assert batch.scale.tolist() == batch.origin[:, 0].tolist() == list(range(6))
-
-
-@pytest.mark.parametrize("overlap", [0.5, 1.0])
-def test_pairs_given_random_motion_follows(overlap, rng):
-    points, true = clouds(rng, points=100), motion(3, 6)
-    pairs = Pairs(rotation=30, overlap=overlap, resample=80)
-    batch = pairs(points, generators(6), given(points, true))
-    source, target = restored(batch)
-    assert not torch.allclose(batch.quaternion, true.quaternion, atol=1e-2)
-    assert source.shape == target.shape == (6, pairs.points_of(100), 3)
-    for i in range(6):  # cut at opposite ends of one direction
-        mine, theirs = rows_of(source[i], points[i]), rows_of(target[i], moved(batch, points)[i])
-        middle = [points[i, sorted(one)].mean(0) for one in (mine - theirs, theirs - mine)]
-        assert (middle[0] - middle[1]).norm() > (1 if overlap < 1 else 0)
 
 
 @pytest.mark.parametrize(

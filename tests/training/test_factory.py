@@ -11,7 +11,6 @@ from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.training.factory import make_experiment
 from mops_lightning.training.recipe import Recipe
-from mops_lightning.types import TruePairs
 from tests.support.training import small_dataset
 
 BASELINE = "+baselines.submodular._target_=mops_lightning.samplers.submodular.SubmodularSampler"
@@ -49,15 +48,6 @@ def test_factory_counts_the_points_that_pairs_draw():
     make_experiment(compose([*overrides, "sampler.start=15"]), small_dataset(), {})
     with pytest.raises(UserError, match=r"^sampler.start must be less than .* N=16, got 16"):
         make_experiment(compose([*overrides, "sampler.start=16"]), small_dataset(), {})
-
-
-def test_factory_task_without_use_for_pairs_raises():
-    data = small_dataset()
-    one = torch.ones(len(data.train.labels))
-    pairs = TruePairs(data.train.points, *(one for _ in range(4)))
-    data = replace(data, train=data.train._replace(pairs=pairs))
-    with pytest.raises(UserError, match="task=classification does not use the pairs"):
-        make_experiment(compose(["m=8"]), data, {})
 
 
 @pytest.mark.parametrize("learn", ["task", "sampler"])

@@ -1,4 +1,4 @@
-"""Datasets in memory: a training and a test split of clouds."""
+"""Data sets in memory: a training and a test split of clouds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -8,7 +8,10 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.types import TruePairs
+from mops_lightning.seeding import generator
+
+NOISE = 13
+"""Random stream of the noise on test clouds."""
 
 
 class Clouds(NamedTuple):
@@ -19,13 +22,11 @@ class Clouds(NamedTuple):
         labels: ``(S,)`` int64, positions in ``CloudDataset.class_names``.
         sources: ``(S,)`` int64, the same number for clouds that must be in the same split, such as
             the crops of a file; None: no two must.
-        pairs: S targets, if ``points`` are the sources of pairs with known motions; else None.
     """
 
     points: Tensor
     labels: Tensor
     sources: Tensor | None = None
-    pairs: TruePairs | None = None
 
     def take(self, rows: Tensor) -> "Clouds":
         """Return the clouds of the given rows, or of a mask, with all that belongs to them."""
@@ -33,7 +34,6 @@ class Clouds(NamedTuple):
             self.points[rows],
             self.labels[rows],
             None if self.sources is None else self.sources[rows],
-            None if self.pairs is None else self.pairs.take(rows),
         )
 
 
@@ -96,3 +96,22 @@ def select_classes(clouds: Clouds, known: Sequence[str], chosen: Sequence[str]) 
     labels = table[clouds.labels]
     keep = labels >= 0
     return clouds.take(keep)._replace(labels=labels[keep])
+
+
+def noisy(clouds: Clouds, noise: float) -> Clouds:
+    """Add Gaussian noise to every coordinate, without clipping (paper, "Robustness Analysis").
+
+    The noise of a cloud depends on its position in the split only, so that every method is tested
+    on the same noisy clouds. Other standard deviations scale the same noise.
+
+    Args:
+        clouds: a split.
+        noise: standard deviation in units of the coordinates; 0.1 is 10 % in the paper.
+    """
+    points = clouds.points
+    if not noise:
+        return clouds
+    drawn = [
+        torch.randn(points.shape[1:], generator=generator(NOISE, s)) for s in range(len(points))
+    ]
+    return clouds._replace(points=points + noise * torch.stack(drawn))

@@ -84,9 +84,6 @@ class CloudLoader:
         seed: seed of the order, the augmentation and ``make_batch``.
         part: rank of this process and number of processes, which share every batch. With
             ``shuffle``, all shares have the same size; otherwise none is empty.
-
-    Raises:
-        UserError: ``augment`` would change one cloud of a pair only.
     """
 
     def __init__(
@@ -100,11 +97,6 @@ class CloudLoader:
         seed: int = 0,
         part: tuple[int, int] = (0, 1),
     ) -> None:
-        if clouds.pairs is not None and augment is not None and augment.active:
-            raise UserError(
-                "augment: changes one cloud of a pair of scans, so that its true motion is wrong. "
-                "Leave augment out, or try task.pairs.rotation and task.pairs.jitter."
-            )
         self.clouds = clouds
         self.batch_size = batch_size
         self.shuffle = shuffle
@@ -172,10 +164,7 @@ class CloudLoader:
         return self._made(self.clouds.points[rows], rows, 0)
 
     def _made(self, points: Tensor, rows: Tensor, epoch: int) -> Any:
-        pairs = self.clouds.pairs
-        batch = Batch(
-            points, self.clouds.labels[rows], rows, None if pairs is None else pairs.take(rows)
-        )
+        batch = Batch(points, self.clouds.labels[rows], rows)
         if self.make_batch is None:
             return batch
         stream = (DRAWN, self.seed, epoch) if self.shuffle else (FIXED, self.seed)

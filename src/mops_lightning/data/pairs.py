@@ -1,4 +1,4 @@
-"""Pairs for registration: a cloud and a copy under a random motion, or two scans."""
+"""Pairs for registration: a cloud and a copy under a random motion."""
 
 import math
 from collections.abc import Sequence
@@ -9,8 +9,8 @@ from torch import Generator, Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import gather_points
-from mops_lightning.ops.rigid import Motion, quaternion_to_matrix, random_motion
-from mops_lightning.types import PairBatch, TruePairs
+from mops_lightning.ops.rigid import Motion, random_motion
+from mops_lightning.types import PairBatch
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,7 @@ class Pairs:
 
     The target is the source under a random motion, with uniform angles about the fixed axes x, y
     and z and a uniform translation (paper section "Registration-oriented Downsampling"). The
-    default ranges are those of PCRNet's authors. For data that are pairs already, the random motion
-    follows the true one, and everything else is done to both clouds of a pair.
+    default ranges are those of PCRNet's authors.
 
     Attributes:
         rotation: largest angle about each axis, in degrees, from 0 to 180.
@@ -74,15 +73,12 @@ class Pairs:
         drawn = self.resample or n_points
         return max(round(drawn * (1 + self.overlap) / 2), 1)
 
-    def __call__(
-        self, points: Tensor, generators: Sequence[Generator], given: TruePairs | None = None
-    ) -> PairBatch:
+    def __call__(self, points: Tensor, generators: Sequence[Generator]) -> PairBatch:
         """Convert every cloud to a pair.
 
         Args:
             points: ``(B, N, 3)``.
             generators: B generators; each determines the pair of its cloud.
-            given: the targets of these clouds, or None: copies of the clouds.
 
         Returns:
             B pairs.
@@ -92,24 +88,18 @@ class Pairs:
         """
         kept = self.points_of(points.shape[1])
         motion = random_motion(self.rotation, self.translation, generators)
-        source, target = points, points if given is None else given.target
+        source = target = points
         if self.resample is not None:
             source, target = (self._drawn(one, generators) for one in (source, target))
         if kept < source.shape[1]:
             direction = torch.stack([torch.randn(3, 1, generator=g) for g in generators])
             source = _cut(source, direction, kept)
-            if given is not None:
-                direction = quaternion_to_matrix(given.quaternion) @ direction
             target = _cut(target, -direction, kept)
         target = motion.apply(target)
         if self.jitter:
             source = source + self._noise(source, generators)
             target = target + self._noise(target, generators)
-        if given is None:
-            return pair_batch(source, target, motion)
-        motion = motion.after(Motion(given.quaternion, given.translation))
-        made = pair_batch(source, target, motion)
-        return made._replace(origin=given.origin, scale=given.scale)
+        return pair_batch(source, target, motion)
 
     def _drawn(self, points: Tensor, generators: Sequence[Generator]) -> Tensor:
         rows = [torch.randperm(points.shape[1], generator=g)[: self.resample] for g in generators]

@@ -39,9 +39,6 @@ class Task(nn.Module):
     takes_attributes: bool = False
     """Whether the points may have attributes, as channels after the coordinates."""
 
-    takes_pairs: bool = False
-    """Whether the task uses the pairs of data that are pairs with known motions."""
-
     net_takes: tuple[str, ...] = ("points",)
     """Names of the arguments of the net's ``forward``."""
 

@@ -48,7 +48,6 @@ class Registration(Task):
     clouds_are_batches = False
     clouds_per_prediction = 2
     maps_pooled = "from_pooled_pair"
-    takes_pairs = True
 
     def __init__(
         self, net: nn.Module, pairs: Pairs | None = None, loss: Loss | None = None
@@ -64,8 +63,8 @@ class Registration(Task):
         self.loss = loss
 
     def make_batch(self, batch: Batch, generators: Callable[[], list[Generator]]) -> PairBatch:
-        """Make a pair of every cloud, or of every given pair; see ``Pairs``."""
-        return self.pairs(batch.points, generators(), batch.pairs)
+        """Make a pair of every cloud; see ``Pairs``."""
+        return self.pairs(batch.points, generators())
 
     def points_of(self, n_points: int) -> int:
         """Return the number of points per cloud of a pair."""
@@ -99,8 +98,7 @@ class Registration(Task):
             points: ``(2B, M, 3)`` sampled from ``batch.points``: sources, then targets.
 
         Returns:
-            The loss terms, the predicted motions and the true ones. For pairs of scans, their
-            translations are the places to which they move ``batch.origin``, in the data's own unit.
+            The loss terms, the predicted motions and the true ones.
         """
         found = self.predict(batch, points)
         true = Motion(batch.quaternion, batch.translation)
@@ -110,9 +108,6 @@ class Registration(Task):
         losses = self.loss(found, true._replace(translation=shift), *points.chunk(2))
         turned = found._replace(translation=from_target).apply(-from_source[:, None])[:, 0]
         predicted = Motion(found.quaternion, found.translation + turned)
-        if batch.origin is not None and batch.scale is not None:
-            predicted = _in_own_unit(predicted, batch.origin, batch.scale)
-            true = _in_own_unit(true, batch.origin, batch.scale)
         return TaskOutput(losses, predicted, true, found)
 
     def metrics(self, training: bool = False) -> MetricCollection:
@@ -155,8 +150,3 @@ class Registration(Task):
         true = Motion(batch.quaternion, batch.translation)
         before = RotationError.of(identity_motion(source), true).tolist()
         return {"pairs": pair_grid(source, target, before, columns, titles)}
-
-
-def _in_own_unit(motion: Motion, origin: Tensor, scale: Tensor) -> Motion:
-    """Return motions with the places ``(B, 3)`` to which they move ``origin`` as translations."""
-    return motion._replace(translation=scale[:, None] * motion.apply(origin[:, None])[:, 0])

@@ -32,12 +32,6 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     Raises:
         UserError: a setting that its part or the data do not allow.
     """
-    takes_pairs = getattr(get_object(cfg.task._target_), "takes_pairs", False)
-    if dataset.train.pairs is not None and not takes_pairs:
-        raise UserError(
-            f"task={cfg.names.task} does not use the pairs of dataset={cfg.names.dataset}. Add "
-            "task=registration, or read the scans with dataset=clouds."
-        )
     attributes = dataset.attributes
     task = _make_task(cfg, len(dataset.class_names), attributes)
     # A seed of its own: the sampler's initial weights must not depend on the task net's size.

@@ -9,8 +9,7 @@ from omegaconf import DictConfig
 from mops_lightning.config import distributed
 from mops_lightning.config.build import build
 from mops_lightning.config.validate import check
-from mops_lightning.data.clouds import CloudDataset
-from mops_lightning.data.noise import noisy_clouds
+from mops_lightning.data.clouds import CloudDataset, noisy
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import closing_lines
@@ -94,7 +93,7 @@ def _load_data(cfg: DictConfig) -> CloudDataset:
     points = dataset.train.points.shape[1]
     if cfg.m > points:
         raise UserError(f"m must be at most the {points} points of a cloud, got m={cfg.m}.")
-    test = noisy_clouds(dataset.test, cfg.test_noise_std)
+    test = noisy(dataset.test, cfg.test_noise_std)
     if not torch.isfinite(test.points).all():
         raise UserError(
             f"test_noise_std={cfg.test_noise_std} makes coordinates infinite. Lower it."
