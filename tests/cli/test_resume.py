@@ -1,5 +1,6 @@
 """Runs that are stopped and resumed by the same command."""
 
+import os
 import signal
 import time
 
@@ -7,6 +8,7 @@ import pytest
 import torch
 
 from mops_lightning.records import run_record
+from mops_lightning.training.experiment import Experiment
 from tests.support.command_line import TINY, call, runs
 from tests.support.forked import start_fork
 
@@ -46,7 +48,9 @@ def test_run_stopped_mid_epoch_resumes_to_same_weights(unbroken, number, left):
         assert process.returncode == 130
         assert "ckpt_path=" in err
         assert "Traceback" not in err
-    status, _, err = call([*LONGER, f"out={out}", "ckpt_path=last"], folder)
+    # A folder of its own: both runs may start in the same second.
+    again = [*LONGER, f"out={out}", "ckpt_path=last", f"hydra.run.dir={out}/resumed"]
+    status, _, err = call(again, folder)
     assert status == 0, err
     (resumed,) = (path.parent for path in (folder / out).rglob("result.json") if path.parent != run)
     assert run_record.read(resumed).resumed_from == str(
@@ -56,6 +60,37 @@ def test_run_stopped_mid_epoch_resumes_to_same_weights(unbroken, number, left):
     assert got.keys() == want.keys()
     different = [name for name in want if not torch.equal(got[name], want[name])]
     assert different == []
+
+
+SHORT = [*TINY, "trainer.max_epochs=3", "weights=null", "baselines={}"]
+"""Epochs of two steps; the default recipe, with a moving average of the weights."""
+
+
+@pytest.mark.parametrize("stops", [[1, 3], ["test"]], ids=["two ends of epochs", "test"])
+def test_stopped_run_resumed_by_same_command_tests_same_weights(tmp_path, monkeypatch, stops):
+    status, _, err = call([*SHORT, "out=unbroken"], tmp_path)
+    assert status == 0, err
+
+    def stop_at(place):
+        if place in stops:
+            stops.remove(place)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(
+        Experiment, "on_before_zero_grad", lambda self, _: stop_at(self.global_step)
+    )
+    monkeypatch.setattr(Experiment, "on_test_start", lambda _: stop_at("test"))
+    for number, expected in enumerate([130] * len(stops) + [0]):
+        arguments = [*SHORT, "out=stopped", f"hydra.run.dir=stopped/{number}"]
+        status, _, err = call([*arguments, *(["ckpt_path=last"] if number else [])], tmp_path)
+        assert status == expected, err
+    want, *_, got = (
+        run_record.read(path.parent)
+        for out in ("unbroken", "stopped")
+        for path in sorted((tmp_path / out).rglob("result.json"))
+    )
+    assert got["status"] == "completed"
+    assert got["metrics"] == want["metrics"]
 
 
 def test_checkpoint_of_other_settings_is_rejected(unbroken):

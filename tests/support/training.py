@@ -12,14 +12,13 @@ from mops_lightning.data.clouds import CloudDataset, Clouds
 def quiet_trainer(epochs: int, **extra: Any) -> L.Trainer:
     """A CPU trainer that writes and prints nothing."""
     return L.Trainer(
+        **{"enable_checkpointing": False, **extra},
         max_epochs=epochs,
         accelerator="cpu",
         logger=False,
-        enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
         num_sanity_val_steps=0,
-        **extra,
     )
 
 

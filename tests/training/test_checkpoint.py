@@ -1,64 +1,178 @@
-"""A run that is stopped between any two steps goes on to the weights of an unbroken one."""
+"""A run that is stopped and resumed, also several times, gets the weights of an unbroken one."""
+
+import os
+import signal
+from functools import cache, partial
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
 import torch
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from torch import nn
 
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import Interrupted
-from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.classification import Classification
-from mops_lightning.training.callbacks import StopBetweenSteps
+from mops_lightning.training.averaging import MovingAverage
+from mops_lightning.training.callbacks import StopBetweenSteps, last_checkpoint
 from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.learn import Learn
+from mops_lightning.training.recipe import Recipe
 from mops_lightning.training.schedules import one_cycle
 from tests.support.training import quiet_trainer, small_dataset
 
-EPOCHS = 3
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:Checkpoint directory .* not empty", "ignore:.*callbacks used to create the checkpoint"
+)
+
+EPOCHS = 4
+CLOUDS = 12
 
 
-class StopAt(StopBetweenSteps):
-    """Gets its signal in a given step, as if the user had pressed Ctrl-C there."""
+class Setting(NamedTuple):
+    """What is trained; the recipe is ``fast`` or ``paper``."""
 
-    def __init__(self, checkpoint, epoch, step):
-        super().__init__(checkpoint)
-        self.at = (epoch, step)
+    learn: Learn
+    fast: bool = False
+    steps: int = 3
+    accumulated: int = 1
+
+
+SETTINGS = [
+    Setting("sampler", fast=True, steps=1),
+    Setting("joint", accumulated=2),
+    Setting("task", steps=1),
+    Setting("sampler", fast=True),
+    Setting("joint", steps=1),
+    Setting("sampler"),
+    Setting("task"),
+    Setting("sampler", steps=1),
+]
+
+
+class SmallNet(nn.Module):
+    """A classifier with dropout and BatchNorm, whose state must be restored, too."""
+
+    def __init__(self):
+        super().__init__()
+        self.features = nn.Linear(3, 16)
+        self.head = nn.Sequential(nn.BatchNorm1d(16), nn.ReLU(), nn.Dropout(), nn.Linear(16, 3))
+
+    def forward(self, points):
+        return self.head(self.features(points).amax(1))
+
+
+class Killed(BaseException):
+    """Ends an attempt where SIGKILL would end its process."""
+
+
+class StopAt(Callback):
+    """Sends Ctrl-C, or kills the run, when a hook has come after some training steps."""
+
+    def __init__(self, stop, steps):
+        (self.kind, self.place), self.left = stop, steps
+
+    def _reach(self, place):
+        if place == self.place and self.left <= 0:
+            self.place = ""
+            if self.kind == "kill":
+                raise Killed
+            os.kill(os.getpid(), signal.SIGINT)
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
-        if (trainer.current_epoch, batch_idx) == self.at:
-            self.received = 2
+        self.left -= 1
+        self._reach("last step" if batch_idx + 1 == trainer.num_training_batches else "step")
+
+    def on_validation_start(self, trainer, pl_module):
+        self._reach("validation")
+
+    def on_train_epoch_end(self, trainer, pl_module):
+        self._reach("epoch end")
+
+    def on_test_start(self, trainer, pl_module):
+        self._reach("test")
 
 
-def fit(callbacks, checkpoint=None):
-    """Train jointly, so that dropout and BatchNorm of both nets take part."""
+PLACES = ("step", "last step", "validation", "epoch end")
+STOPS = [*product(("ctrl-c", "kill"), PLACES), ("kill", "test")]
+
+
+def attempt(setting: Setting, path: Path, *callbacks: Callback) -> Any:
+    """Train and test from ``path`` where it exists: the final weights, None if it was stopped."""
+    learn, fast, steps, accumulated = setting
     torch.manual_seed(0)
+    sampler = MOPSNet(4, feature_channels=(4, 4), rho_channels=(8, 4))
+    recipe = Recipe(ema_span=0.3, train_points=16, all_points_from=0.5, distillation=1.0)
     module = Experiment(
-        Classification(PointNetVanilla(3), 3),
-        MOPSNet(8, feature_channels=(8, 8), rho_channels=(16, 8)),
-        learn="joint",
-        make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
+        Classification(SmallNet(), 3),
+        None if learn == "task" else sampler,
+        learn,
+        make_optimizer=partial(torch.optim.Adam, lr=1e-2),
         make_schedule=one_cycle,
+        recipe=recipe if fast else None,
     )
-    data = small_dataset()
+    average = [MovingAverage(0.3)] if fast else []
+    callbacks = (*average, *callbacks, last_checkpoint(path), StopBetweenSteps(path))
+    trainer = quiet_trainer(
+        EPOCHS,
+        callbacks=list(callbacks),
+        enable_checkpointing=True,
+        accumulate_grad_batches=accumulated,
+    )
+    data = small_dataset(train=CLOUDS, test=3, points=24)
     augment = Augmentation(rotate_up=True, jitter=0.01)
-    trainer = quiet_trainer(EPOCHS, callbacks=callbacks)
-    trainer.fit(
-        module,
-        CloudLoader(data.train, 6, shuffle=True, augment=augment, drop_last=True),
-        CloudLoader(data.test, 6),
-        ckpt_path=checkpoint,
-    )
+    test = CloudLoader(data.test, 3)
+    train = CloudLoader(data.train, CLOUDS // steps, shuffle=True, augment=augment, drop_last=True)
+    try:
+        trainer.fit(module, train, test, ckpt_path=path if path.is_file() else None)
+        trainer.test(module, test, verbose=False)
+    except (Interrupted, Killed):
+        return None
     return module.state_dict()
 
 
 @pytest.fixture(scope="module")
-def unbroken():
-    return fit([])
+def unbroken(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("unbroken")
+    return cache(lambda setting: attempt(setting, folder / str(setting) / "last.ckpt"))
 
 
-@pytest.mark.parametrize(("epoch", "step"), [(0, 0), (0, 3), (1, 0), (1, 1), (1, 3), (2, 2)])
-def test_stopped_run_resumes_to_same_weights(unbroken, tmp_path, epoch, step):
+def assert_same(state, want):
+    assert [name for name in want if not torch.equal(want[name], state[name])] == []
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "number"),
+    [(*pair, number) for number, pair in enumerate(product(STOPS, repeat=2))],
+    ids=lambda value: "-".join(value) if isinstance(value, tuple) else str(value),
+)
+def test_run_stopped_three_times_resumes_to_same_weights(unbroken, tmp_path, first, second, number):
+    setting, path = SETTINGS[number % len(SETTINGS)], tmp_path / "last.ckpt"
+    third = STOPS[number % len(STOPS)]
+    for steps, stop in zip((2, 1, 1), (first, second, third), strict=True):
+        state = attempt(setting, path, StopAt(stop, steps))
+        if state is not None:  # the stop's place was not reached
+            break
+    else:
+        state = attempt(setting, path)
+    assert_same(state, unbroken(setting))
+
+
+@pytest.mark.parametrize("setting", SETTINGS, ids=str)
+def test_completed_run_resumes_to_same_weights(unbroken, tmp_path, setting):
     path = tmp_path / "last.ckpt"
-    with pytest.raises(Interrupted, match="ckpt_path"):
-        fit([StopAt(path, epoch, step)])
-    resumed = fit([], path)
-    assert [name for name in unbroken if not torch.equal(unbroken[name], resumed[name])] == []
+    attempt(setting, path)
+    assert_same(attempt(setting, path), unbroken(setting))
+
+
+def test_checkpoint_written_in_last_step_of_epoch_resumes_to_same_weights(unbroken, tmp_path):
+    setting, path = Setting("joint"), tmp_path / "last.ckpt"
+    saves = ModelCheckpoint(
+        dirpath=tmp_path, filename="last", every_n_train_steps=3, enable_version_counter=False
+    )
+    attempt(setting, path, saves, StopAt(("kill", "validation"), 3))
+    assert attempt(setting, path, StopAt(("ctrl-c", "step"), 2)) is None
+    assert_same(attempt(setting, path), unbroken(setting))

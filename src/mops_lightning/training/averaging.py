@@ -32,3 +32,7 @@ class MovingAverage(WeightAveraging):
                 torch._foreach_copy_(averaged, current)
 
         self._average_model.multi_avg_fn = update
+
+    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Apply the average, also if a resumed run has no step left and training never starts."""
+        self.on_train_end(trainer, pl_module)

@@ -7,11 +7,7 @@ from types import FrameType
 from typing import Any
 
 import lightning as L
-from lightning.pytorch.callbacks import (
-    Callback,
-    ModelCheckpoint,
-    RichProgressBar,
-)
+from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, RichProgressBar
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config.build import accepted, build
@@ -21,11 +17,14 @@ STANDARD = ("learning_rate", "checkpoint", "progress", "pictures")
 """Names in ``conf/callbacks/default.yaml``. None of them changes what is learned."""
 
 
-class StopBetweenSteps(Callback):
+class StopBetweenSteps(Checkpoint):
     """On the first Ctrl-C or SIGTERM, finish the step, write a checkpoint and stop.
 
     A signal may arrive inside an optimizer step. The state is consistent between steps only, and
-    only then does resuming give the result of an uninterrupted run. A second signal stops at once.
+    only then does resuming give the result of an uninterrupted run. After the last step of an
+    epoch, the epoch's validation is finished first. A second signal stops at once.
+
+    As a ``Checkpoint``, it is called after the callbacks that act at the end of an epoch.
 
     Args:
         checkpoint: path to write to.
@@ -50,8 +49,17 @@ class StopBetweenSteps(Callback):
         if self.leads:
             print("Stopping after this step (once more: at once) ...", file=sys.stderr, flush=True)
 
-    def on_train_batch_end(self, trainer: L.Trainer, *args: Any) -> None:
-        """Stop if a signal came, all processes of a run after the same step."""
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Stop if a signal came, all processes of a run after the same optimizer step."""
+        batches = batch_idx + 1
+        stepped = batches % trainer.accumulate_grad_batches == 0
+        if stepped and batches < trainer.num_training_batches:
+            self._stop_if_asked(trainer, save=True)
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Stop if a signal came in the last step of the epoch or in its validation."""
         self._stop_if_asked(trainer, save=True)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:

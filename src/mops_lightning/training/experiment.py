@@ -148,9 +148,14 @@ class Experiment(L.LightningModule):
         """Set the loader to where a resumed run continues, which may be inside an epoch.
 
         Lightning 2.6 restores a loader's state only in some cases, and does not call
-        ``on_train_epoch_start`` for an epoch that had begun.
+        ``on_train_epoch_start`` for an epoch that had begun. From a checkpoint written after the
+        last step of an epoch and before its end, it counts this epoch as completed and does not
+        begin the next one: every later checkpoint would be one epoch behind.
         """
         self.started = True
+        epochs: Any = self.trainer.fit_loop.epoch_progress.current
+        if epochs.processed == epochs.ready:
+            self.trainer.fit_loop.reset_restart_stage()
         loader: Any = self.trainer.train_dataloader
         if hasattr(loader, "load_state_dict"):
             begun = self.trainer.fit_loop.epoch_loop.batch_progress.current.ready
