@@ -58,7 +58,7 @@ def test_main_job_writes_weights_pictures_and_curves(main_job):
     folder, run, *_ = main_job
     content = weights.read(run / "weights.pt")
     assert content["state"]["queries.weight"].shape[0] == 8
-    for name in ("clouds.png", "matrix.png"):
+    for name in ("clouds.png", "comparison.png", "matrix.png"):
         assert (run / "pictures" / name).read_bytes().startswith(b"\x89PNG")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -134,6 +134,7 @@ def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
     assert record.score == record.metrics["test/m8/generated/rotation_error_deg"]
     assert {path.name for path in (run / "pictures").iterdir()} == {
         "clouds.npz",
+        "comparison.png",
         "clouds.png",
         "matrix.png",
         "pairs.png",

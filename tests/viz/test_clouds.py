@@ -3,7 +3,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from mops_lightning.viz.clouds import COLOURS, cloud_grid, matrix_figure
+from mops_lightning.viz.clouds import COLOURS, cloud_grid, comparison, matrix_figure
 from mops_lightning.viz.figures import save_figure
 
 
@@ -54,3 +54,17 @@ def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, rng):
         )
     # Without the hiding cloud the frame is tighter, hence markers cover more pixels.
     assert pixel_counts[0] > 0.2 * pixel_counts[1]
+
+
+def test_comparison_draws_every_sample_and_whole_cloud(tmp_path, rng):
+    points = torch.rand(300, 3, generator=rng)
+    captions = {"fps": "fps: 78.75 %", "generated": "MOPSNet: 96.25 %", "full": "all points"}
+    figure = comparison(points, {"fps": points[:20], "generated": points[:20]}, captions)
+    assert [axes.get_title() for axes in figure.axes] == list(captions.values())
+    image = pixels(figure, tmp_path)
+    width = image.shape[1] // 3
+    drawn = []
+    for column, colour in enumerate((COLOURS["sampled"], COLOURS["generated"])):
+        part = image[:, column * width : (column + 1) * width].reshape(-1, 3)
+        drawn.append((np.abs(part - np.array(colour) / 255).max(1) < 0.02).sum())
+    assert min(drawn) > 200

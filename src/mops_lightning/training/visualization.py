@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor
 
+from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.ops.points import coordinates
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.samplers.base import sample_with_attributes
@@ -22,6 +23,7 @@ from mops_lightning.viz.clouds import (
     COLOURS,
     INPUT_COLOUR,
     cloud_grid,
+    comparison,
     matrix_figure,
 )
 from mops_lightning.viz.figures import save_figure
@@ -68,7 +70,8 @@ class CloudVisualization(Callback):
         training = module.training
         module.eval()
         batch = move_data_to_device(self.batch, module.device)
-        figures, samples = self._figures(module, batch, with_baselines=folder is not None)
+        scores = trainer.callback_metrics if folder is not None else None
+        figures, samples = self._figures(module, batch, scores)
         module.train(training)
         task: Any = module.task
         titles = task.cloud_titles(self.titles)
@@ -89,12 +92,18 @@ class CloudVisualization(Callback):
 
     @torch.no_grad()
     def _figures(
-        self, module: Any, batch: Any, with_baselines: bool
+        self, module: Any, batch: Any, scores: Mapping[str, Tensor] | None
     ) -> tuple[dict[str, Figure], dict[str, Tensor]]:
-        """Return the figures by name, and the coordinates of the sampler's readouts."""
+        """Return the figures by name, and the coordinates of the sampler's readouts.
+
+        Args:
+            module: the experiment.
+            batch: the clouds.
+            scores: test metrics by name; None before the test.
+        """
         points, sampler, m = batch.points, module.sampler, module.m
         # Baselines do not change in training, so they are drawn once, at the end.
-        baselines = module.baselines.items() if with_baselines else ()
+        baselines = () if scores is None else module.baselines.items()
         methods = {
             name: sample_with_attributes(baseline, points, (m,))[m].points
             for name, baseline in baselines
@@ -105,6 +114,9 @@ class CloudVisualization(Callback):
         samples = readouts(points, {m: output}, sampler)[m]
         figures = module.task.figures(batch, {**methods, **samples}, self.titles)
         titles = module.task.cloud_titles(self.titles)
+        if scores is not None:
+            main = {**methods, module.main_readout: samples[module.main_readout]}
+            figures["comparison"] = self._comparison(module, points, main, scores)
         samples = {name: coordinates(chosen) for name, chosen in samples.items()}
         figures["clouds"] = cloud_grid(coordinates(points), samples, titles)
         matrix = output.matrix
@@ -112,6 +124,26 @@ class CloudVisualization(Callback):
             first = matrix.first_cloud()
             figures["matrix"] = matrix_figure(first.dense()[0], first.gram()[0], titles[0])
         return figures, samples
+
+    def _comparison(
+        self,
+        module: Any,
+        points: Tensor,
+        samples: Mapping[str, Tensor],
+        scores: Mapping[str, Tensor],
+    ) -> Figure:
+        """Draw one cloud with the sample of each method, under the method's test score."""
+        shown = (len(self.titles) - 1) // 2
+        info = MetricInfo.of(module.task.score, module.task.metrics()[module.task.score])
+        labels = {module.main_readout: type(module.sampler).__name__, FULL: "all points"}
+        captions = {}
+        for name in (*samples, FULL):
+            prefix = "" if name == FULL else module.prefixes[module.m]
+            score = scores.get(f"test/{prefix}{name}/{info.name}")
+            value = "" if score is None else f": {info.format(float(score))} {info.unit}"
+            captions[name] = labels.get(name, name) + value
+        drawn = {name: coordinates(chosen)[shown] for name, chosen in samples.items()}
+        return comparison(coordinates(points)[shown], drawn, captions)
 
 
 def _add_meshes(

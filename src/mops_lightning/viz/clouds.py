@@ -47,6 +47,24 @@ def cloud_grid(points: Tensor, readouts: Mapping[str, Tensor], titles: Sequence[
     return figure
 
 
+def comparison(
+    points: Tensor, samples: Mapping[str, Tensor], captions: Mapping[str, str]
+) -> Figure:
+    """Draw one cloud with the sample of each method side by side, and the whole cloud last.
+
+    Args:
+        points: ``(N, 3)`` input, y up.
+        samples: ``(M, 3)`` by the name of a readout or baseline, which gives the colour.
+        captions: by the same names, then one for the whole cloud.
+    """
+    figure = new_figure(2.4 * len(captions), 2.9)
+    cloud = upright(points)
+    for column, (name, caption) in enumerate(captions.items()):
+        axes = cloud_axes(figure, 1, len(captions), 0, column, caption)
+        draw_cloud(axes, cloud, upright(samples[name]) if name in samples else None, name)
+    return figure
+
+
 def draw_cloud(
     axes: Axes3D, cloud: np.ndarray, samples: np.ndarray | None, readout: str, size: float = 22
 ) -> None:
