@@ -89,8 +89,8 @@ def test_stopped_run_resumed_by_same_command_tests_same_weights(tmp_path, monkey
         for out in ("unbroken", "stopped")
         for path in sorted((tmp_path / out).rglob("result.json"))
     )
-    assert got["status"] == "completed"
-    assert got["metrics"] == want["metrics"]
+    assert got.status == "completed"
+    assert got.metrics == want.metrics
 
 
 def test_checkpoint_of_other_settings_is_rejected(unbroken):

@@ -106,7 +106,6 @@ def rewrite(path, **changes):
         {"state": {"a": torch.ones(2).to(torch.float8_e4m3fn)}},
         {"config": [1]},
         {"config": {"sampler": torch.ones(1)}},
-        {"config": {"optimizer": 3, "baselines": [1]}},
         {"classes": 5},
         {"sha256": "absent"},
     ],
