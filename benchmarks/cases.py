@@ -13,14 +13,13 @@ from twins import PlainMOPS, plain_farthest_point_sample
 
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.ops import compiled as numba_forms
 from mops_lightning.ops.attention import attend
+from mops_lightning.ops.elimination import eliminate
 from mops_lightning.ops.fps import farthest_point_sample
-from mops_lightning.ops.nearest import nearest, nearest_distances
+from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.poisson import eliminate
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.samplenet import SampleNet
 from mops_lightning.samplers.snet import SNet
@@ -195,26 +194,17 @@ def step(net: nn.Module, points: Tensor) -> None:
     (made if isinstance(made, Tensor) else made.points).square().sum().backward()
 
 
-def plain(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function without numba."""
-    kernels, numba_forms.kernels = numba_forms.kernels, lambda: None
-    try:
-        return function(*arguments)
-    finally:
-        numba_forms.kernels = kernels
-
-
 FARTHEST = [(1024, 32), (1024, 512), (10_000, 1024), (40_960, 4096), (100_000, 1024)]
 FARTHEST += [(1_000_000, 1000)]
 
 
 def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
-    """Farthest point sampling with and without numba, and other libraries."""
+    """Farthest point sampling, and other libraries."""
     rows: list[Row] = []
     for number, m in FARTHEST:
         points = cloud(number)
         own = partial(farthest_point_sample, points, m)
-        calls: Calls = {"fps": own, "fps, without numba": partial(plain, own)}
+        calls: Calls = {"fps": own}
         if number * m <= 2**25:
             calls["fps, plain twin"] = partial(plain_farthest_point_sample, points[0], m)
         others = libraries.farthest(points[0], m)
@@ -223,7 +213,6 @@ def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
             name: len(wanted & {tuple(point) for point in call().astype("f4").tolist()})
             for name, call in others.items()
         }
-        _equal_rows(own(), plain(own))
         setup = (
             f"from cases import *\npoints = cloud({number})\nfarthest_point_sample(cloud(64), 2)"
         )
@@ -236,44 +225,33 @@ def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
 
 
 def completed(peak: dict[str, float], rounds: int) -> list[Row]:
-    """Matched and completed sets of 40,960 points, with and without numba."""
+    """Matched and completed sets of 40,960 points."""
     points = cloud(40960)
     generated = 0.97 * cloud(4096)
     matched = match(generated, points)
-    both: Calls = {
+    calls: Calls = {
         "matched": partial(match, generated, points),
         "completed from matched": partial(complete, matched, points),
         "fps": partial(farthest_point_sample, points, 4096),
     }
-    calls: Calls = {}
-    for name, call in both.items():
-        _equal_rows(call(), plain(call))
-        calls |= {name: call, f"{name}, without numba": partial(plain, call)}
     return _rows("readout", calls, {"N": 40960, "m": 4096}, rounds, peak)
 
 
 def poisson(peak: dict[str, float], rounds: int) -> list[Row]:
-    """Poisson-disk sampling by elimination, with numba and, up to 10,000 points, without."""
+    """Poisson-disk sampling by elimination."""
     rows: list[Row] = []
     for number, m in ((1024, 128), (10_000, 1000), (100_000, 1000), (100_000, 10_000)):
-        own = partial(eliminate, cloud(number), m)
-        calls: Calls = {"poisson": own}
-        if number <= 10_000:
-            _equal_rows(own(), plain(own))
-            calls["poisson, without numba"] = partial(plain, own)
+        calls: Calls = {"poisson": partial(eliminate, cloud(number), m)}
         rows += _rows("sampler", calls, {"N": number, "m": m}, rounds, peak)
     return rows
 
 
 def neighbours(peak: dict[str, float], rounds: int) -> list[Row]:
-    """Nearest points: exhaustive search, a KD-tree where it is faster, and other libraries."""
+    """Nearest points, and other libraries."""
     rows: list[Row] = []
     for number, m in ((1024, 1024), (10_000, 1024), (40_960, 4096), (40_960, 40_960)):
         points, queries = cloud(number), cloud(m + 1)[:, :m]
-        calls: Calls = {
-            "nearest": partial(nearest, queries, points),
-            "nearest_distances": partial(nearest_distances, queries, points),
-        }
+        calls: Calls = {"nearest": partial(nearest, queries, points)}
         others = libraries.nearest(queries[0], points[0])
         own = nearest(queries, points)[1][0].numpy()
         shared = {name: int((call() == own).sum()) for name, call in others.items()}
@@ -293,12 +271,6 @@ def growth(peak: dict[str, float], rounds: int) -> list[Row]:
         names = {"sampler": "mops, in chunks", "N": number, "m": m}
         rows.append({**names, "seconds": seconds, "rounds": 1, "peak_bytes": memory})
     return rows
-
-
-def _equal_rows(fast: Tensor, slow: Tensor) -> None:
-    """Check that both forms chose the same rows before they are timed."""
-    if not torch.equal(fast, slow):
-        raise ValueError("the compiled form does not return the rows of the plain form")
 
 
 def _equal(fast: Tensor, plain: Tensor) -> None:

@@ -1,9 +1,16 @@
 import pytest
 
-from mops_lightning.ops import extreme
+from mops_lightning.ops import argextreme, compiled
 
 
-@pytest.fixture(params=[0, extreme.PLAIN_MAX_VALUES], ids=["blocked", "plain"])
+@pytest.fixture(params=[0, argextreme.PLAIN_MAX_VALUES], ids=["blocked", "plain"])
 def argextreme_path(request, monkeypatch):
     """Small inputs through both code paths of ``blocked_argextreme``."""
-    monkeypatch.setattr(extreme, "PLAIN_MAX_VALUES", request.param)
+    monkeypatch.setattr(argextreme, "PLAIN_MAX_VALUES", request.param)
+
+
+@pytest.fixture(params=["compiled", "torch"])
+def farthest_form(request, monkeypatch):
+    """Farthest points by the compiled loops, and by torch, as on a GPU."""
+    if request.param == "torch":
+        monkeypatch.setattr(compiled, "farthest", lambda *_: None)

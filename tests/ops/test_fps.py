@@ -6,7 +6,7 @@ from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample
 from tests.support.plain import plain_farthest
 
 
-@pytest.mark.usefixtures("argextreme_path")
+@pytest.mark.usefixtures("farthest_form")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (20, 20), (32, 7), (75, 30)])
 def test_fps_equals_double_loop(n, m, dtype, rng):
@@ -31,7 +31,7 @@ def test_fps_start_is_given_drawn_or_zero(rng):
     assert not torch.equal(drawn(1)[:, 0], drawn(2)[:, 0])
 
 
-@pytest.mark.usefixtures("argextreme_path")
+@pytest.mark.usefixtures("farthest_form")
 def test_fps_of_coincident_points_is_distinct():
     points = torch.zeros(2, 40, 3)
     points[1, 10:20] = 1.0
@@ -51,7 +51,7 @@ def test_fps_single_cloud_raises():
         farthest_point_sample(torch.zeros(5, 3), 2)
 
 
-@pytest.mark.usefixtures("argextreme_path")
+@pytest.mark.usefixtures("farthest_form")
 def test_fill_equals_double_loop(rng):
     points = torch.randn(3, 45, 3, generator=rng)
     given = torch.tensor([1, 6, 12])

@@ -1,12 +1,11 @@
 import pytest
 import torch
 from scipy.spatial import cKDTree
-from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops import compiled
 from mops_lightning.ops import nearest as search
-from mops_lightning.ops.nearest import k_nearest, nearest, nearest_distances
+from mops_lightning.ops.nearest import k_nearest, nearest
 from mops_lightning.ops.points import gather_points
 from tests.support.plain import plain_nearest
 
@@ -105,12 +104,11 @@ def test_nearest_half_precision_compares_in_float32(rng):
     assert torch.equal(indices, nearest(queries.float(), points.float())[1])
 
 
-@pytest.mark.usefixtures("trees")
 @pytest.mark.parametrize(
     ("queries", "points"), [((1, 4, 3), (2, 5, 3)), ((1, 4, 2), (1, 5, 3)), ((1, 4, 3), (1, 0, 3))]
 )
 def test_nearest_shape_mismatch_raises(queries, points):
-    for search_ in (nearest, nearest_distances, lambda q, p: k_nearest(q, p, 1)):
+    for search_ in (nearest, lambda q, p: k_nearest(q, p, 1)):
         with pytest.raises(UserError, match="points"):
             search_(torch.zeros(queries), torch.zeros(points))
 
@@ -129,66 +127,3 @@ def test_k_nearest_equals_sorted_distances(k, rng):
 def test_k_nearest_out_of_range_raises(k):
     with pytest.raises(UserError, match=rf"k must be from 1 .*N=5, got {k}"):
         k_nearest(torch.zeros(1, 2, 3), torch.zeros(1, 5, 3), k)
-
-
-@pytest.fixture
-def trees(monkeypatch):
-    """Allow KD-trees for small clouds; return a list of the sizes of the trees built."""
-    built = []
-
-    def tree(points):
-        built.append(len(points))
-        return KDTree(points)
-
-    KDTree = search.cKDTree
-    monkeypatch.setattr(search, "cKDTree", tree)
-    monkeypatch.setattr(search, "KD_TREE_MIN_PAIRS", 1)
-    return built
-
-
-def sphere(n, rng, dtype=torch.float32):
-    return F.normalize(torch.randn(2, n, 3, generator=rng, dtype=dtype), dim=2)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("m", "n"), [(600, 800), (30, 900), (900, 700)])
-def test_nearest_distances_with_tree_equals_exhaustive_search(m, n, dtype, rng, trees):
-    points = sphere(n, rng, dtype).requires_grad_()
-    noise = 0.02 * torch.randn(2, m, 3, generator=rng, dtype=dtype)
-    queries = (sphere(m, rng, dtype) + noise).requires_grad_()
-    weight = torch.rand(2, m, generator=rng, dtype=dtype)
-    found = nearest_distances(queries, points)
-    assert trees == [n, n]
-    plain = nearest(queries, points)[0]
-    torch.testing.assert_close(found, plain, rtol=1e-6, atol=0)
-    for got, wanted in zip(
-        torch.autograd.grad((found * weight).sum(), (queries, points)),
-        torch.autograd.grad((plain * weight).sum(), (queries, points)),
-        strict=True,
-    ):
-        torch.testing.assert_close(got, wanted, rtol=1e-5, atol=1e-7)
-
-
-@pytest.mark.parametrize(
-    "queries",
-    [torch.zeros(2, 500, 3), torch.full((2, 500, 3), torch.nan), torch.full((2, 500, 3), 1e30)],
-)
-def test_nearest_distances_equidistant_queries_build_no_tree(queries, rng, trees):
-    points = sphere(800, rng)
-    queries = torch.cat([points[:, :1], queries], 1)  # the first one says nothing of the others
-    found = nearest_distances(queries, points)
-    assert trees == []
-    torch.testing.assert_close(found, nearest(queries, points)[0], equal_nan=True)
-
-
-def test_nearest_distances_of_coincident_points_are_zero(rng, trees):
-    points = sphere(800, rng)
-    points[:, 400:] = points[:, :400]
-    assert not nearest_distances(points, points).any()
-    assert trees == [800, 800]
-
-
-def test_nearest_distances_small_clouds_build_no_tree(rng, monkeypatch):
-    monkeypatch.setattr(search, "cKDTree", None)
-    points = sphere(300, rng)
-    assert torch.equal(nearest_distances(points, points), nearest(points, points)[0])

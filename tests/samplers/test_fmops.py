@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.losses.subset import subset_loss
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
+from tests.support.losses import subset_loss
 
 
 def small(m_max=16, **settings):

@@ -3,10 +3,10 @@ import torch
 from torch import nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.losses.overlap import overlap_losses
-from mops_lightning.losses.subset import subset_loss
+from mops_lightning.losses.subset import overlap_losses
 from mops_lightning.nets.layers import fit_attribute_scales, linear_norm_relu
 from mops_lightning.samplers.mops import MOPSNet
+from tests.support.losses import subset_loss
 
 
 def small(m=5, **settings):

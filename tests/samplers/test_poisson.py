@@ -1,71 +1,14 @@
-import pytest
 import torch
 
-from mops_lightning.ops import compiled
-from mops_lightning.samplers import poisson
 from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.poisson import PoissonSampler, eliminate, spacing_bound
+from mops_lightning.samplers.poisson import PoissonSampler
 from mops_lightning.samplers.random import RandomSampler
-
-
-def plain_eliminate(cloud, m, reach):
-    """Sample elimination that sums all weights again before every removal."""
-    kept = list(range(len(cloud)))
-    while len(kept) > m:
-        sums = []
-        for i in kept:
-            distances = [float((cloud[i] - cloud[j]).norm()) for j in kept if j != i]
-            sums.append(sum(max(0.0, 1 - d / reach) ** 8 for d in distances))
-        kept.pop(max(range(len(kept)), key=lambda place: sums[place]))
-    return kept
-
-
-@pytest.mark.parametrize("m", [2, 9, 23, 24])  # the last two points are equally crowded
-def test_eliminate_equals_plain_form(m, rng):
-    points = torch.randn(3, 24, 3, generator=rng, dtype=torch.float64)
-    reach = spacing_bound(points, m)
-    expected = [
-        plain_eliminate(cloud, m, float(bound)) for cloud, bound in zip(points, reach, strict=True)
-    ]
-    assert eliminate(points, m).tolist() == expected
-
-
-def test_eliminate_to_one_point_has_reach_of_bounding_box(rng):
-    points = torch.randn(1, 24, 3, generator=rng, dtype=torch.float64)
-    reach = float((points[0].amax(0) - points[0].amin(0)).norm())
-    assert eliminate(points, 1).tolist() == [plain_eliminate(points[0], 1, reach)]
-
-
-def test_eliminate_in_blocks_equals_whole(rng, monkeypatch):
-    monkeypatch.setattr(compiled, "kernels", lambda: None)
-    points = torch.randn(2, 24, 3, generator=rng)
-    whole = eliminate(points, 9)
-    monkeypatch.setattr(poisson, "BLOCK", 24 * 5)
-    assert torch.equal(eliminate(points, 9), whole)
-
-
-def test_eliminate_of_many_copies_does_not_overflow():
-    points = torch.zeros(1, 8200, 3)
-    points[0, 0] = 1.0
-    kept = eliminate(points, 8199)
-    assert kept[0, 0] == 0  # the only point that is not crowded
 
 
 def test_poisson_of_points_with_gradients_equals_points_without(rng):
     points = torch.randn(1, 30, 3, generator=rng, dtype=torch.float64)
     found = PoissonSampler(5)(points.clone().requires_grad_())
     assert torch.equal(found.indices, PoissonSampler(5)(points).indices)
-
-
-@pytest.mark.parametrize("m", [2, 5, 12])
-def test_spacing_bound_is_upper_bound(m, rng):
-    points = torch.randn(20, 30, 3, generator=rng, dtype=torch.float64)
-    bound = spacing_bound(points, m)
-    for _ in range(30):
-        rows = torch.randperm(30, generator=rng)[:m]
-        spacing = torch.cdist(points[:, rows], points[:, rows])
-        spacing.diagonal(dim1=1, dim2=2).fill_(torch.inf)
-        assert (spacing.amin((1, 2)) <= bound[:, 0]).all()
 
 
 def spacing(points):

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.losses.subset import simplification_loss
 from mops_lightning.ops.nearest import k_nearest, nearest
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet, soft_projection
+from tests.support.losses import simplification_loss
 
 
 def plain_projection(queries, points, k, sigma):

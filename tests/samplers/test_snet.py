@@ -3,8 +3,8 @@ import torch
 from torch import nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.losses.subset import simplification_loss
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
+from tests.support.losses import simplification_loss
 
 
 def layers(net):

@@ -9,7 +9,6 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from mops_lightning.data.loader import CloudLoader
-from mops_lightning.losses.subset import simplification_loss, subset_loss
 from mops_lightning.metrics.base import collection
 from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.samplers.fmops import FMOPSNet
@@ -18,6 +17,7 @@ from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.schedules import exponential
+from tests.support.losses import simplification_loss, subset_loss
 from tests.support.recording import (
     Fingerprint,
     MeanFingerprint,

@@ -1,8 +1,7 @@
-"""Losses between generated points and the input cloud: subset and simplification loss.
+"""Losses of generated points: subset and simplification loss, and overlap of the columns of S.
 
-Nested samplers are trained at several sizes: the first m points are the sample of size m.
-``subset_losses`` and ``simplification_losses`` compute the losses of all sizes at little more than
-the cost of the largest.
+Nested samplers are trained at several sizes: the first m points are the sample of size m. Every
+function computes the losses of all sizes at little more than the cost of the largest.
 """
 
 from collections.abc import Sequence
@@ -10,11 +9,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mops_lightning.ops.nearest import nearest_distances
+from mops_lightning.ops.nearest import nearest
+from mops_lightning.ops.sampling_matrix import SamplingMatrix
 
 
-def subset_loss(points: Tensor, samples: Tensor) -> Tensor:
-    """Return the subset loss: the mean squared distance of samples to their nearest input point.
+def subset_losses(points: Tensor, samples: Tensor, sizes: Sequence[int]) -> dict[int, Tensor]:
+    """Return the mean squared distance of the first m samples to their nearest input points.
 
     L_subset(P, Q) = 1/m Σ_j min_i ‖q_j − p_i‖² (paper section "Joint Training Loss", Eq. 10),
     averaged over the clouds.
@@ -22,48 +22,13 @@ def subset_loss(points: Tensor, samples: Tensor) -> Tensor:
     Args:
         points: ``(B, N, 3)`` clouds P.
         samples: ``(B, M, 3)`` generated points Q.
-
-    Returns:
-        A scalar in squared units of the coordinates; 0 if every sample is an input point.
-    """
-    return subset_losses(points, samples, (samples.shape[1],))[samples.shape[1]]
-
-
-def subset_losses(points: Tensor, samples: Tensor, sizes: Sequence[int]) -> dict[int, Tensor]:
-    """Return ``subset_loss`` of the first m samples for several sizes m.
-
-    Args:
-        points: ``(B, N, 3)`` clouds P.
-        samples: ``(B, M, 3)`` generated points Q.
         sizes: sizes m, each from 1 to M.
 
     Returns:
-        Scalars by size.
+        Scalars by size, in squared units of the coordinates; 0 if every sample is an input point.
     """
-    distances = nearest_distances(samples, points)
+    distances = nearest(samples, points)[0]
     return {m: distances[:, :m].mean() for m in sizes}
-
-
-def simplification_loss(
-    points: Tensor, samples: Tensor, coverage: float = 1.0, coverage_per_point: float = 0.0
-) -> Tensor:
-    """Return the simplification loss of S-Net and SampleNet.
-
-    L_simplify(Q, P) = mean_q d²(q, P) + max_q d²(q, P) + (γ + δ·M)·mean_p d²(p, Q), where d² is the
-    squared distance to the nearest point of the other set, averaged over the clouds (Dovrat et al.,
-    CVPR 2019, section "Loss"; Lang et al., CVPR 2020).
-
-    Args:
-        points: ``(B, N, 3)`` clouds P.
-        samples: ``(B, M, 3)`` generated points Q.
-        coverage: γ.
-        coverage_per_point: δ.
-
-    Returns:
-        A scalar in squared units of the coordinates.
-    """
-    size = samples.shape[1]
-    return simplification_losses(points, samples, (size,), coverage, coverage_per_point)[size]
 
 
 def simplification_losses(
@@ -73,7 +38,11 @@ def simplification_losses(
     coverage: float = 1.0,
     coverage_per_point: float = 0.0,
 ) -> dict[int, Tensor]:
-    """Return ``simplification_loss`` of the first m samples for several sizes m.
+    """Return the simplification loss of S-Net and SampleNet for the first m samples.
+
+    L_simplify(Q, P) = mean_q d²(q, P) + max_q d²(q, P) + (γ + δ·m)·mean_p d²(p, Q), where d² is the
+    squared distance to the nearest point of the other set, averaged over the clouds (Dovrat et al.,
+    CVPR 2019, section "Loss"; Lang et al., CVPR 2020).
 
     Args:
         points: ``(B, N, 3)`` clouds P.
@@ -83,16 +52,36 @@ def simplification_losses(
         coverage_per_point: δ.
 
     Returns:
-        Scalars by size.
+        Scalars by size, in squared units of the coordinates.
     """
-    to_cloud = nearest_distances(samples, points)
+    to_cloud = nearest(samples, points)[0]
     losses, begin, from_cloud = {}, 0, None
     for m in sorted(set(sizes)):
         # The nearest of the first m is the nearest of the previous size or of the added points.
-        added = nearest_distances(points, samples[:, begin:m])
+        added = nearest(points, samples[:, begin:m])[0]
         from_cloud = added if from_cloud is None else torch.minimum(from_cloud, added)
         begin = m
         sample_terms = to_cloud[:, :m].mean(1) + to_cloud[:, :m].amax(1)
         weight = coverage + coverage_per_point * m
         losses[m] = (sample_terms + weight * from_cloud.mean(1)).mean()
     return losses
+
+
+def overlap_losses(matrix: SamplingMatrix, sizes: Sequence[int]) -> dict[int, Tensor]:
+    """Return how far SᵀS of the first m columns is from a diagonal matrix.
+
+    L_overlap(S) = 1/m Σ_{i≠j} (SᵀS)_ij², averaged over the clouds. The columns of an ideal sampling
+    matrix are orthogonal (paper section "Problem Formulation", Eq. 2); two columns that choose the
+    same point give two generated points with the same match.
+
+    Args:
+        matrix: S of every cloud, with at least max(sizes) columns. Its N·M entries are computed.
+        sizes: sizes m, each from 1 to M.
+
+    Returns:
+        Scalars by size, without unit; 0 where no point has weight in two columns.
+    """
+    columns = matrix.leftmost(max(sizes)).dense().mT
+    squares = (columns @ columns.mT).square()
+    squares = squares - squares.diagonal(dim1=1, dim2=2).diag_embed()
+    return {m: squares[:, :m, :m].sum((1, 2)).mean() / m for m in sizes}

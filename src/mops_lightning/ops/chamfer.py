@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from mops_lightning.ops.nearest import nearest_distances
+from mops_lightning.ops.nearest import nearest
 
 
 def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
@@ -27,4 +27,4 @@ def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
         >>> chamfer_distance(torch.zeros(1, 4, 3), torch.ones(1, 2, 3))
         tensor([6.])
     """
-    return nearest_distances(points, others).mean(1) + nearest_distances(others, points).mean(1)
+    return nearest(points, others)[0].mean(1) + nearest(others, points)[0].mean(1)

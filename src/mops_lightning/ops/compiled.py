@@ -1,14 +1,12 @@
-"""Farthest and nearest points on a CPU by compiled loops, where numba is installed.
+"""Farthest and nearest points on a CPU, by the compiled loops in ``ops.kernels``.
 
-The rows are the same as those of the plain forms, bit for bit; only the time differs. All functions
-return None where the plain form must be used: on other devices, without numba, and for points that
-are not finite.
+The first call of ``farthest`` compiles for 5 s, the first call of ``nearest`` for 1 to 4 s, once
+per dtype; later processes read the compiled form from a file. Both functions return None where the
+torch form must be used: on other devices, and for points that are not finite.
 """
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -16,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.ops.fps_cpu import sum_of_squares_
+from mops_lightning.ops import kernels
 from mops_lightning.ops.points import distance_dtype
 
 FARTHEST_LEAF, NEAREST_LEAF = 1024, 256
@@ -29,70 +27,25 @@ THREADS_MIN_WORK = 2**22
 Array = NDArray[Any]
 
 
-def kernels() -> ModuleType | None:
-    """Return the compiled functions, or None where the plain forms must be used.
-
-    Importing numba takes 0.2 s. The first call of ``farthest`` compiles it for 5 s, that of
-    ``nearest`` for 1 to 4 s, once per dtype; later processes read the compiled form from a file.
-    """
-    return _kernels()
-
-
-@cache
-def _kernels() -> ModuleType | None:
-    try:
-        from mops_lightning.ops import kernels
-    except ImportError:
-        return None
-    return kernels if _fused() is not None else None
-
-
-@cache
-def _fused() -> bool | None:
-    """Return whether torch sums squares by fused multiply-add; None if by something else."""
-    # This depends on the processor. The product of two float32 is exact in float64.
-    planes = torch.linspace(-1, 1, 3 * 512).sin().view(3, 512)
-    total = sum_of_squares_(planes.clone()).numpy()
-    x, y, z = planes.numpy()
-    if np.array_equal(total, (x * x + y * y) + z * z):
-        return False
-    wide = np.square(planes.numpy(), dtype=np.float64)
-    first = (wide[1] + (x * x)).astype(np.float32)
-    return True if np.array_equal(total, (wide[2] + first).astype(np.float32)) else None
-
-
-def farthest(
-    points: Tensor, steps: int, start: int | Tensor = 0, distances: Tensor | None = None
-) -> Tensor | None:
+def farthest(points: Tensor, steps: int, distances: Tensor) -> Tensor | None:
     """Repeatedly choose the point with the largest distance and update the distances.
 
     Args:
         points: ``(B, N, C)``.
         steps: number of points to choose, at most the number of points that are not chosen.
-        start: row of the first point, one for all clouds or ``(B,)``.
-        distances: ``(B, N)`` initial squared distances instead of a first point; -1 marks chosen
-            points.
+        distances: ``(B, N)`` initial squared distances; -1 marks chosen points.
 
     Returns:
         ``(B, steps)`` int64, the lowest row in case of ties.
     """
-    module = kernels()
-    if module is None or points.device.type != "cpu" or points.numel() == 0:
+    if points.device.type != "cpu" or points.numel() == 0:
         return None
     planes = _planes(points)
-    if distances is None:
-        initial = np.full((len(points), points.shape[1]), np.finfo(planes.dtype).max, planes.dtype)
-        if isinstance(start, int):
-            initial[:, start] = np.inf
-        else:
-            initial[np.arange(len(initial)), start.numpy()] = np.inf
-    else:
-        initial = np.ascontiguousarray(distances.numpy())
-    bits = initial.view(_integer(planes))
-    fixed = (steps, points.shape[2], FARTHEST_LEAF, _fused())
+    bits = np.ascontiguousarray(distances.numpy()).view(_integer(planes))
+    fixed = (steps, points.shape[2], FARTHEST_LEAF)
     work = steps * points.shape[1] * len(points)
     return _rows(
-        lambda cloud: module.farthest(*cloud, *fixed), zip(planes, bits, strict=True), work
+        lambda cloud: kernels.farthest(*cloud, *fixed), zip(planes, bits, strict=True), work
     )
 
 
@@ -106,16 +59,15 @@ def nearest(queries: Tensor, points: Tensor) -> Tensor | None:
     Returns:
         ``(B, M)`` int64, the lowest row in case of ties.
     """
-    module = kernels()
-    if module is None or points.device.type != "cpu" or not (points.numel() and queries.numel()):
+    if points.device.type != "cpu" or not (points.numel() and queries.numel()):
         return None
     planes = _planes(points)
     flat = queries.detach().to(distance_dtype(points)).contiguous().flatten(1).numpy()
     scratch = np.empty((len(points), points.shape[1]), _integer(planes))
-    fixed = (points.shape[2], NEAREST_LEAF, _fused())
+    fixed = (points.shape[2], NEAREST_LEAF)
     clouds = zip(planes, flat, scratch, strict=True)
     work = NEAREST_LEAF * (points.shape[1] + queries.shape[1]) * len(points)
-    return _rows(lambda cloud: module.nearest(*cloud, *fixed), clouds, work)
+    return _rows(lambda cloud: kernels.nearest(*cloud, *fixed), clouds, work)
 
 
 def _planes(points: Tensor) -> Array:

@@ -2,24 +2,11 @@
 
 import torch
 from torch import Generator, Tensor
-from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops import compiled
-from mops_lightning.ops.extreme import blocked_argextreme
-from mops_lightning.ops.fps_cpu import (
-    farthest_by_distance_table,
-    farthest_by_groups,
-    sum_of_squares_,
-)
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.points import distance_dtype, gather_points, to_planes
-
-GROUPS_MIN_POINTS, GROUPS_MIN_STEPS = 65536, 256
-"""Minimum number of points and of steps for ``farthest_by_groups`` on a CPU."""
-
-TABLE_MAX_CLOUDS, TABLE_MAX_POINTS = 4, 1024
-"""Maximum number of clouds and of points for ``farthest_by_distance_table`` on a CPU."""
 
 
 def farthest_point_sample(
@@ -63,9 +50,6 @@ def farthest_point_sample(
     outside = (start < 0) | (start >= n)
     if outside if isinstance(outside, bool) else bool(outside.any()):
         raise UserError(f"start must be between 0 and N-1={n - 1}, got {start}.")
-    fast = compiled.farthest(points, m, start)
-    if fast is not None:
-        return fast
     first = torch.as_tensor(start, device=points.device).expand(clouds)
     dtype = distance_dtype(points)
     distances = points.new_full((clouds, n), torch.finfo(dtype).max, dtype=dtype)
@@ -94,9 +78,7 @@ def farthest_point_fill(points: Tensor, indices: Tensor, given: Tensor) -> Tenso
     distinct = chosen[:, : int(given.max())]
     distances, _ = nearest(points.detach(), gather_points(points.detach(), distinct))
     distances = distances.to(distance_dtype(points)).scatter_(1, chosen, -1.0)
-    added = compiled.farthest(points, missing, distances=distances)
-    if added is None:
-        added = _farthest(points, distances, missing)
+    added = _farthest(points, distances, missing)
     # Clouds that lack fewer points write the surplus beyond column M, which is then cut off.
     filled = torch.cat([chosen, added], 1)
     return filled.scatter_(1, given[:, None] + slot[:missing], added)[:, :wanted]
@@ -113,23 +95,25 @@ def _farthest(points: Tensor, distances: Tensor, steps: int) -> Tensor:
         steps: number of points to choose.
 
     Returns:
-        ``(B, steps)`` int64.
+        ``(B, steps)`` int64, the lowest row in case of ties.
     """
-    _, n, channels = points.shape
-    small = len(points) <= TABLE_MAX_CLOUDS and n <= TABLE_MAX_POINTS and 8 * steps >= n
-    large = n >= GROUPS_MIN_POINTS and steps >= GROUPS_MIN_STEPS and channels <= 4
-    if points.device.type == "cpu" and (small or large) and bool(points.isfinite().all()):
-        choose = farthest_by_distance_table if small else farthest_by_groups
-        clouds = zip(points, distances, strict=True)
-        return torch.stack([choose(*cloud, steps) for cloud in clouds])
-    planes = to_planes(points.to(distances.dtype), padding=0.0)
-    distances = F.pad(distances, (0, planes.shape[2] - n), value=-1.0)
-    differences = torch.empty_like(planes)
+    rows = compiled.farthest(points, steps, distances)
+    return farthest_in_steps(points, distances, steps) if rows is None else rows
+
+
+def farthest_in_steps(points: Tensor, distances: Tensor, steps: int) -> Tensor:
+    """Choose farthest points in torch, for GPUs; arguments as for ``compiled.farthest``."""
+    planes = to_planes(points.to(distances.dtype))
+    distances, differences = distances.clone(), torch.empty_like(planes)
     chosen = []
     for _ in range(steps):
-        index = blocked_argextreme(distances, largest=True)
+        index = distances.argmax(1, keepdim=True)
         chosen.append(index)
         distances.scatter_(1, index, -1.0)
-        torch.sub(planes, planes.gather(2, index.expand(channels, -1, -1)), out=differences)
-        torch.minimum(distances, sum_of_squares_(differences), out=distances)
+        torch.sub(planes, planes.gather(2, index.expand(len(planes), -1, -1)), out=differences)
+        total, *others = differences
+        total.mul_(total)
+        for other in others:
+            total.addcmul_(other, other)
+        torch.minimum(distances, total, out=distances)
     return torch.cat(chosen, 1)

@@ -1,5 +1,8 @@
 """Farthest and nearest points in loops that numba compiles; ``ops.compiled`` calls them.
 
+Squares are summed by fused multiply-add, which rounds once, as torch does on processors with
+AVX2: the rows are those of the torch forms, bit for bit.
+
 Points are sorted into a tree of boxes, and far boxes are skipped, as in QuickFPS (Han et al., IEEE
 TCAD 2023). The distance to a box is never above the distance to a point in it, because both are
 computed by the same operations in the same order, each of which is monotonic.
@@ -36,7 +39,7 @@ FANOUT, PROBES = 8, 8
 
 
 @intrinsic
-def _fused(typing, a, b, c):
+def _multiply_add(typing, a, b, c):
     """Return a·b + c, rounded once."""
 
     def generate(context, builder, signature, arguments):
@@ -55,7 +58,7 @@ def _all_finite(values):
 
 
 @jit
-def _write_distances(planes, size, start, stop, point, fused, out):
+def _write_distances(planes, size, start, stop, point, out):
     """Write the squared distances from a point to the rows from start to stop."""
     for axis in range(len(point)):
         line, at = planes[axis * size + start : axis * size + stop], point[axis]
@@ -66,11 +69,11 @@ def _write_distances(planes, size, start, stop, point, fused, out):
         else:
             for i in range(len(line)):
                 d = line[i] - at
-                out[i] = _fused(d, d, out[i]) if fused else d * d + out[i]
+                out[i] = _multiply_add(d, d, out[i])
 
 
 @jit
-def _distance_to_box(boxes, node, point, fused):
+def _distance_to_box(boxes, node, point):
     """Return the squared distance from a point to the box of a node."""
     channels = len(point)
     first = 2 * channels * node
@@ -78,7 +81,7 @@ def _distance_to_box(boxes, node, point, fused):
     for axis in range(channels):
         d = max(boxes[first + axis] - point[axis], point[axis] - boxes[first + channels + axis])
         d = max(d, zero)
-        total = _fused(d, d, total) if fused else d * d + total
+        total = _multiply_add(d, d, total)
     return total
 
 
@@ -220,7 +223,7 @@ def _place(bits, wanted):
 
 
 @cached
-def farthest(planes, distances, steps, channels, leaf, fused):
+def farthest(planes, distances, steps, channels, leaf):
     """Repeatedly choose the point with the largest distance and update the distances.
 
     Args:
@@ -230,7 +233,6 @@ def farthest(planes, distances, steps, channels, leaf, fused):
         steps: number of points to choose, at most the number of points that are not chosen.
         channels: C.
         leaf: maximum number of points of a leaf.
-        fused: whether distances are computed by fused multiply-add.
 
     Returns:
         ``(steps,)`` rows, the lowest row in case of ties; none if a coordinate is not finite.
@@ -269,13 +271,13 @@ def farthest(planes, distances, steps, channels, leaf, fused):
                 stack[depth] = ~node
                 depth += 1
                 for k in range(nodes[4 * node + 2], nodes[4 * node + 2] + nodes[4 * node + 3]):
-                    near = _distance_to_box(boxes, k, point, fused) < left[peaks[k]]
+                    near = _distance_to_box(boxes, k, point) < left[peaks[k]]
                     if near or nodes[4 * k] <= place < nodes[4 * k + 1]:
                         stack[depth] = k
                         depth += 1
             else:
                 start, stop = nodes[4 * node], nodes[4 * node + 1]
-                _write_distances(planes, size, start, stop, point, fused, new)
+                _write_distances(planes, size, start, stop, point, new)
                 peaks[node] = start + _lower(bits[start:stop], new_bits)
     return chosen
 
@@ -293,7 +295,7 @@ def _choose_child(nodes, peaks, left, rows, node):
 
 
 @cached
-def nearest(planes, queries, scratch, channels, leaf, fused):
+def nearest(planes, queries, scratch, channels, leaf):
     """Find the nearest point for every query.
 
     Args:
@@ -302,7 +304,6 @@ def nearest(planes, queries, scratch, channels, leaf, fused):
         scratch: ``(N,)`` integers of the same width, overwritten.
         channels: C.
         leaf: maximum number of points of a leaf.
-        fused: whether distances are computed by fused multiply-add.
 
     Returns:
         ``(M,)`` rows, the lowest row in case of ties; none if a coordinate is not finite.
@@ -328,7 +329,7 @@ def nearest(planes, queries, scratch, channels, leaf, fused):
             if nodes[4 * node + 3]:
                 bottom = depth
                 for k in range(nodes[4 * node + 2], nodes[4 * node + 2] + nodes[4 * node + 3]):
-                    bound = _distance_to_box(boxes, k, point, fused)
+                    bound = _distance_to_box(boxes, k, point)
                     if bound <= best:  # the nearest child is visited first
                         place = depth
                         while place > bottom and bounds[place - 1] < bound:
@@ -338,7 +339,7 @@ def nearest(planes, queries, scratch, channels, leaf, fused):
                         depth += 1
             else:
                 start, stop = nodes[4 * node], nodes[4 * node + 1]
-                _write_distances(planes, size, start, stop, point, fused, distances)
+                _write_distances(planes, size, start, stop, point, distances)
                 low = scratch[0]
                 for i in range(stop - start):
                     low = min(low, scratch[i])

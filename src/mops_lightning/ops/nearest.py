@@ -1,4 +1,4 @@
-"""Nearest neighbours by exhaustive search or with a KD-tree.
+"""Nearest neighbours by exhaustive search, or by compiled loops over a tree on a CPU.
 
 Distances are computed from differences of coordinates. The form |a|² + |b|² − 2⟨a, b⟩ would be a
 single matrix product, but its cancellation error gives wrong neighbours for points that are 1e-3
@@ -8,12 +8,11 @@ apart in the unit sphere.
 import math
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops import compiled
-from mops_lightning.ops.extreme import blocked_argextreme
+from mops_lightning.ops.argextreme import blocked_argextreme
 from mops_lightning.ops.points import distance_dtype, gather_points, to_planes
 
 BLOCK = {"cpu": 2**19, "other": 2**24}
@@ -22,17 +21,9 @@ BLOCK = {"cpu": 2**19, "other": 2**24}
 COMPILED_MIN_PAIRS, COMPILED_MAX_CHANNELS = 2**16, 4
 """Minimum number of pairs per cloud, and maximum number of channels, for compiled code."""
 
-KD_TREE_MIN_PAIRS = 2**24
-"""Minimum number of query-point pairs for using a KD-tree."""
-
-PROBES = 64
-"""Number of queries that are tested to decide whether a KD-tree is faster."""
-
 
 def nearest(queries: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the nearest point for every query by exhaustive search.
-
-    The search runs in blocks, so that memory stays bounded.
+    """Find the nearest point for every query, with bounded memory.
 
     Args:
         queries: ``(B, M, C)``.
@@ -82,47 +73,6 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
     return (queries[:, :, None] - neighbours).square().sum(3), indices
 
 
-def nearest_distances(queries: Tensor, points: Tensor) -> Tensor:
-    """Return the squared distance from every query to its nearest point.
-
-    Equal to ``nearest`` up to rounding; ties are broken arbitrarily, which affects gradients only.
-    On a CPU, large clouds use a KD-tree where it is faster. It is slower if many points are almost
-    equally far from a query, for example with queries at the centre of a cloud, where an untrained
-    sampler generates its points.
-
-    Args:
-        queries: ``(B, M, C)``.
-        points: ``(B, N, C)``, N ≥ 1.
-
-    Returns:
-        ``(B, M)``; gradients flow to both arguments.
-
-    Raises:
-        UserError: the shapes do not match, or N is 0.
-    """
-    pairs = queries.shape[1] * points.shape[1]
-    fits = queries.shape[::2] == points.shape[::2] and queries.device.type == "cpu"
-    if not fits or pairs < KD_TREE_MIN_PAIRS or not _tree_helps(queries.detach(), points.detach()):
-        return nearest(queries, points)[0]
-    clouds = zip(queries.detach().double(), points.detach().double(), strict=True)
-    workers = torch.get_num_threads()
-    rows = [
-        cKDTree(cloud.numpy()).query(query.numpy(), workers=workers)[1] for query, cloud in clouds
-    ]
-    found = gather_points(points, torch.stack([torch.from_numpy(row) for row in rows]))
-    return (queries - found).square().sum(2)
-
-
-def _tree_helps(queries: Tensor, points: Tensor) -> bool:
-    """Return whether few points are about as near to a query as the nearest one."""
-    if not bool(queries.isfinite().all() and points.isfinite().all()):
-        return False
-    step = max(queries.shape[1] // PROBES, 1)
-    distances = torch.cdist(queries[:, ::step].float(), points.float())
-    near = distances <= 1.1 * distances.amin(2, keepdim=True)
-    return bool(near.float().mean() < 0.02)
-
-
 def _check_shapes(queries: Tensor, points: Tensor) -> None:
     if queries.ndim != 3 or points.ndim != 3 or queries.shape[::2] != points.shape[::2]:
         raise UserError(
@@ -134,12 +84,17 @@ def _check_shapes(queries: Tensor, points: Tensor) -> None:
 
 
 def _search(queries: Tensor, points: Tensor, k: int) -> Tensor:
-    """Return the ``(B, M, k)`` nearest rows; planes of coordinates keep every step vectorised."""
+    """Return the ``(B, M, k)`` nearest rows."""
     large = queries.shape[1] * points.shape[1] >= COMPILED_MIN_PAIRS
     if k == 1 and large and points.shape[2] <= COMPILED_MAX_CHANNELS:
-        found = compiled.nearest(queries, points)
-        if found is not None:
-            return found[..., None]
+        rows = compiled.nearest(queries, points)
+        if rows is not None:
+            return rows[..., None]
+    return search_in_blocks(queries, points, k)
+
+
+def search_in_blocks(queries: Tensor, points: Tensor, k: int) -> Tensor:
+    """Find the k nearest rows ``(B, M, k)`` in torch; planes keep every step vectorised."""
     dtype = distance_dtype(points)
     rows = to_planes(queries.to(dtype))[..., None]  # (C, B, M, 1)
     columns = to_planes(points.to(dtype), padding=torch.inf)[:, :, None]  # (C, B, 1, N)

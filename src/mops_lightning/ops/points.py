@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from mops_lightning.ops.extreme import GROUP
+from mops_lightning.ops.argextreme import GROUP
 
 
 def gather_points(points: Tensor, indices: Tensor) -> Tensor:

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.losses.overlap import overlap_losses
-from mops_lightning.losses.subset import subset_losses
+from mops_lightning.losses.subset import overlap_losses, subset_losses
 from mops_lightning.nets.layers import PointFeatures, check_channels, linear_norm_relu
 from mops_lightning.ops.points import coordinates
 from mops_lightning.ops.precision import pointwise_autocast, pointwise_autocast_dtype
@@ -51,7 +50,7 @@ class MOPSNet(Sampler):
         anchor_width: how soft that choice is before training: the width of the columns as a share
             of the spacing of the farthest points. Only with anchors.
         overlap: weight of the penalty on columns of S that choose the same points
-            (``losses.overlap``); 0, as in the paper, for none.
+            (``losses.subset``); 0, as in the paper, for none.
 
     Raises:
         UserError: an argument is out of range.

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from mops_lightning.ops.extreme import GROUP, blocked_argextreme
+from mops_lightning.ops.argextreme import GROUP, blocked_argextreme
 
 
 @pytest.mark.usefixtures("argextreme_path")
