@@ -27,9 +27,10 @@ test: setup
 fuzz: setup
 	MOPS_FUZZ=$(EXAMPLES) $(BIN)/python -m pytest tests/fuzz -s
 
-# Takes hours: MODULES="samplers/mops ops/readout" takes some modules, SAMPLE=20 a part of each.
+# Takes hours without MODULES="samplers/mops ops/readout".
 mutants: setup
-	OMP_NUM_THREADS=1 nice $(BIN)/python -m tests.mutation $(MODULES) $(if $(SAMPLE),--sample $(SAMPLE))
+	OMP_NUM_THREADS=1 nice $(BIN)/mutmut run $(foreach module,$(MODULES),'mops_lightning.$(subst /,.,$(module)).*')
+	$(BIN)/mutmut results
 
 # The documentation as pages in build/site. Fails on any broken link.
 site: setup
@@ -43,4 +44,4 @@ check: setup site
 	$(BIN)/hadolint docker/*.Dockerfile
 
 clean:
-	rm -rf .venv build dist
+	rm -rf .venv build dist mutants
