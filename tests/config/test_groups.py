@@ -1,6 +1,6 @@
 """The groups of conf/: what one run's configuration shows, and what depends on several groups."""
 
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 from mops_lightning.config.compose import compose
 from mops_lightning.config.composition import conf_dir
 from mops_lightning.config.validate import check
+from mops_lightning.types import Learn
 from tests.support.command_line import TINY, TINY_ANY_DATA, call, runs
 
 TASKS = ("classification", "registration", "reconstruction")
@@ -134,7 +135,7 @@ def test_fmops_under_shipped_pcrnet_starts_from_shipped_sampler():
     assert compose(["sampler=fmops"]).sampler.m_max == 512
 
 
-LEARN = ("task", "sampler", "joint", "nothing")
+LEARN = get_args(Learn)
 
 
 def test_user_files_need_no_specialised_file(tmp_path):

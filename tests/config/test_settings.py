@@ -16,7 +16,7 @@ from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.report.build import build
 from mops_lightning.training.checkpoint import identity
-from mops_lightning.training.pretrain import cache_folder, task_config
+from mops_lightning.training.pretrain import cache_folder
 from mops_lightning.training.replay import command_line
 from tests.support.command_line import TINY, call
 from tests.support.reports import put_cell
@@ -123,13 +123,6 @@ def test_of_a_path_gives_the_nearest_declaration(path, affects, repeated, compar
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["+task_nets=[a]"], "give evaluate=RUN"),
-        (["task_nets=[a]"], "task_nets tests.*give evaluate=RUN"),
-        (["+task_nets=[a]", "evaluate=x", "learn=task"], "the run of a sampler"),
-        (["+task_nets=a", "evaluate=x", "learn=nothing"], "must be a list of weights files.*'a'"),
-        (["+task_nets=[1]", "evaluate=x", "learn=nothing"], "must be a list of weights files"),
-        (["+task_nets=[]", "evaluate=x", "learn=nothing"], "must be a list of weights files"),
-        (["+task_net=[a]"], "Did you mean 'task_nets'"),
         (["+models.paht=a"], r"models\.paht: no such setting\. Did you mean 'models\.path'"),
         (["+models.path=5"], r"models\.path must be a text, got 5"),
         (["+models=5"], "models must be settings"),
@@ -138,16 +131,6 @@ def test_of_a_path_gives_the_nearest_declaration(path, affects, repeated, compar
 def test_setting_on_demand_is_validated(overrides, words):
     with pytest.raises(UserError, match=words):
         check(compose(overrides))
-
-
-def test_setting_of_evaluate_alone_affects_scores_only():
-    plain = compose(["evaluate=x", "learn=nothing"])
-    with_nets = compose(["evaluate=x", "learn=nothing", "+task_nets=[a]"])
-    check(with_nets)
-    assert identity_of(plain) == identity_of(with_nets)
-    assert cache_folder(plain, DATA) == cache_folder(with_nets, DATA)
-    assert "task_nets" not in task_config(with_nets)
-    assert settings.of("task_nets").affects is Affects.SCORES
 
 
 def test_defaults_of_the_schema_are_the_composed_values():

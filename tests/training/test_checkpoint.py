@@ -19,9 +19,9 @@ from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.averaging import MovingAverage
 from mops_lightning.training.callbacks import StopBetweenSteps, last_checkpoint
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.learn import Learn
 from mops_lightning.training.recipe import Recipe
 from mops_lightning.training.schedules import one_cycle
+from mops_lightning.types import Learn
 from tests.support.training import quiet_trainer, small_dataset
 
 pytestmark = pytest.mark.filterwarnings(

@@ -12,7 +12,6 @@ from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.scores import TransferScores
 from tests.support.training import changed, quiet_trainer, small_dataset, state
 
 
@@ -153,17 +152,6 @@ def test_test_refine_adds_readout():
     run.test(module, CloudLoader(data.test, 4), verbose=False)
     assert "test/refined/accuracy" in run.callback_metrics
     assert module.score_name == "test/generated/accuracy"
-
-
-def test_test_transfer_scores_all_readouts_without_loggers():
-    module, run = experiment(task_net=SpreadNet()), quiet_trainer(1)
-    keys = ("generated", "matched", "completed", "random", "fps", "full")
-    module.transfer = TransferScores({"other": Classification(SpreadNet(), 3)}, keys)
-    run.test(module, CloudLoader(small_dataset().test, 4), verbose=False)
-    for key in keys:  # the same net once more
-        score = run.callback_metrics[f"transfer/other/{key}/accuracy"]
-        assert score == run.callback_metrics[f"test/{key}/accuracy"]
-    assert not any(name.startswith("transfer/") for name in run.logged_metrics)
 
 
 def test_fit_same_seed_gives_same_weights():

@@ -5,7 +5,6 @@ import json
 import pytest
 
 from mops_lightning.config.compose import compose
-from mops_lightning.config.overrides import accepted
 from mops_lightning.errors import UserError
 from mops_lightning.training.replay import command_line
 from tests.support.command_line import TINY
@@ -82,18 +81,6 @@ def test_command_line_missing_data_raises(tmp_path):
 def test_command_line_without_evaluate_is_unchanged():
     assert command_line(["m=8", "evaluate=null"]) == ["m=8", "evaluate=null"]
     assert command_line(["--help"]) == ["--help"]
-
-
-def test_command_line_adds_settings_of_evaluate(run):
-    for given in ("task_nets=[a,b]", "+task_nets=[a,b]"):
-        chosen = [accepted(one) for one in command_line([given, f"evaluate={run}"])]
-        assert compose(chosen).task_nets == ["a", "b"]
-    assert "task_nets" not in compose(command_line([f"evaluate={run}"]))
-
-
-def test_command_line_does_not_repeat_task_nets(tmp_path):
-    folder = write_run(tmp_path / "run", [*OVERRIDES, "+task_nets=[a]"])
-    assert not any("task_nets" in argument for argument in command_line([f"evaluate={folder}"]))
 
 
 ATTACKS = {

@@ -1,13 +1,10 @@
 import pytest
 import torch
-from torch import nn
 
 from mops_lightning.metrics.base import collection
 from mops_lightning.metrics.classification import Accuracy
-from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.tasks.classification import Classification
-from mops_lightning.training.scores import Scores, TransferScores
-from mops_lightning.types import Batch, SampleOutput, TaskOutput
+from mops_lightning.training.scores import Scores
+from mops_lightning.types import SampleOutput, TaskOutput
 
 
 def scores(prefixes=()):
@@ -60,29 +57,3 @@ def test_scores_sets_not_nested_measure_each_size(rng):
     found = scores(("m8/", "m4/")).update_sets(points, outputs, False, {8: "m8/", 4: "m4/"})
     assert float(found["m4/generated/subset_distance"].compute()) == 0
     assert float(found["m8/generated/subset_distance"].compute()) > 1
-
-
-def test_transfer_nets_are_frozen():
-    made = TransferScores({"net": Classification(PointNetVanilla(3), 3)}, ("generated",))
-    for change in (lambda: None, made.train, nn.Sequential(made).train):
-        change()
-        assert not any(module.training for module in made.modules())
-        assert not any(parameter.requires_grad for parameter in made.parameters())
-
-
-def test_transfer_scores_each_readout(rng):
-    task = Classification(PointNetVanilla(3), 3)
-    made = TransferScores({"net": task}, ("generated", "full"))
-    points = torch.randn(2, 20, 3, generator=rng)
-    right = task.net(points).argmax(1)
-    batch = Batch(points, right)
-    found = made.update(batch, {"generated": points.flip(0), "full": points})
-    assert set(found) == {
-        "transfer/net/generated/accuracy",
-        "transfer/net/full/accuracy",
-        "transfer/net/generated/mean_class_accuracy",
-        "transfer/net/full/mean_class_accuracy",
-    }
-    assert found["transfer/net/full/accuracy"].compute() == 1
-    flipped = (task.net(points.flip(0)).argmax(1) == right).float().mean()
-    assert found["transfer/net/generated/accuracy"].compute() == flipped

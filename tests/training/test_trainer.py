@@ -1,9 +1,14 @@
+import sys
+import tempfile
+
+import pytest
+import torch
+
 from mops_lightning.config.compose import compose
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.tasks.classification import Classification
-from mops_lightning.training.checkpoint_io import AtomicCheckpointIO
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.trainer import make_trainer
+from mops_lightning.training.trainer import AtomicCheckpointIO, keep_freed_memory, make_trainer
 from tests.support.command_line import TINY
 from tests.support.training import small_dataset
 
@@ -12,3 +17,35 @@ def test_make_trainer_writes_checkpoints_atomically(tmp_path):
     experiment = Experiment(Classification(PointNetVanilla(3), 3), learn="task")
     trainer = make_trainer(compose(TINY), tmp_path, small_dataset(), experiment)
     assert isinstance(trainer.strategy.checkpoint_io, AtomicCheckpointIO)
+
+
+class Unwritable:
+    """Fails in the middle of writing, as a full disk does."""
+
+    def __reduce__(self):
+        raise OSError("no space left on device")
+
+
+def test_save_checkpoint_error_keeps_previous(tmp_path):
+    path = tmp_path / "checkpoints" / "last.ckpt"
+    AtomicCheckpointIO().save_checkpoint({"epoch": 1}, path)
+    with pytest.raises(OSError, match="no space left"):
+        AtomicCheckpointIO().save_checkpoint({"big": torch.zeros(9999), "bad": Unwritable()}, path)
+    assert torch.load(path) == {"epoch": 1}
+    assert [one.name for one in path.parent.iterdir()] == ["last.ckpt"]
+
+
+def test_save_checkpoint_does_not_use_tmpdir(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    AtomicCheckpointIO().save_checkpoint({"epoch": 2}, tmp_path / "last.ckpt")
+    assert torch.load(tmp_path / "last.ckpt") == {"epoch": 2}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="mallopt is a function of Linux's C libraries")
+def test_keep_freed_memory_on_linux_is_accepted():
+    assert keep_freed_memory()
+
+
+def test_keep_freed_memory_elsewhere_does_nothing(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert not keep_freed_memory()

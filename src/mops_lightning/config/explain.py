@@ -147,8 +147,6 @@ def _names_there(cause: Any, arguments: Sequence[str]) -> str:
 def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     """Name the nearest group or setting, or say how to set an argument that no YAML file sets."""
     groups = _groups()
-    if key in settings.OF_EVALUATE:
-        return str(settings.needs_evaluate(key))
     if key in groups:
         return f"{key}: its files are chosen by other groups. --cfg job shows what they set."
     if "/" in key or "@" in key:

@@ -8,7 +8,7 @@ group is one line of ``inside.INSIDE``.
 import textwrap
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
@@ -27,9 +27,8 @@ from mops_lightning.config.declaration import (
 )
 from mops_lightning.config.inside import INSIDE
 from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.types import Learn
 
-LEARN = ("task", "sampler", "joint", "nothing")
-"""What a run may train."""
 WITH_SAMPLER = ("sampler", "joint", "nothing")
 NAME = "run_settings"
 """What the schema is called in the defaults list of ``conf/config.yaml``."""
@@ -41,11 +40,6 @@ SIZES = Limits(
         x == "auto"
         or (isinstance(x, list) and bool(x) and all(type(m) is int and m >= 1 for m in x))
     ),
-)
-
-FILES = Limits(
-    "a list of weights files or run folders, such as [FILE,RUN]",
-    lambda x: isinstance(x, list) and bool(x) and all(type(one) is str for one in x),
 )
 
 
@@ -79,7 +73,7 @@ class RunSettings:
         metadata=about(
             "what is trained: sampler (task net frozen), task (alone, full clouds), joint, nothing",
             Affects.TRAINING,
-            limits=one_of(*LEARN),
+            limits=one_of(*get_args(Learn)),
             repeat=False,
             compare=False,
         ),
@@ -243,13 +237,6 @@ SCHEMA: type = RunSettings
 """The declaration in use."""
 
 ON_DEMAND: dict[str, Setting] = {
-    "task_nets": Setting(
-        "with evaluate=RUN, further task nets that score the same samples: [FILE,RUN,...]",
-        Affects.SCORES,
-        limits=FILES,
-        repeat=False,
-        compare=False,
-    ),
     "models.path": Setting(
         "folders with models of your own, searched before those of MOPS_MODELS",
         Affects.NOTHING,
@@ -257,9 +244,6 @@ ON_DEMAND: dict[str, Setting] = {
     ),
 }
 """Settings that a configuration contains only where the command line gives them."""
-
-OF_EVALUATE = ("task_nets",)
-"""Those of ``ON_DEMAND`` that count only with ``evaluate=RUN``."""
 
 
 def declared() -> dict[str, Setting]:
@@ -296,13 +280,6 @@ def refusal(path: str, value: Any) -> UserError:
     allowed = limits.allowed if limits else describe(get_type_hints(SCHEMA).get(path, Any))
     near = did_you_mean(str(value), limits.choices) if limits and limits.choices else ""
     return UserError(f"{path} must be {allowed}, got {value!r}.{near.partition(' Allowed:')[0]}")
-
-
-def needs_evaluate(name: str) -> UserError:
-    """Return the error about a setting that counts only where a sampler's run is evaluated."""
-    return UserError(
-        f"{name} tests the sampler of a trained run: give evaluate=RUN, the run of a sampler, too."
-    )
 
 
 def help_lines() -> str:

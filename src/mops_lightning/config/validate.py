@@ -139,9 +139,6 @@ def _check_evaluation(config: dict[str, Any]) -> None:
             f"evaluate: trains nothing, got learn={learn}. Leave learn out, or train "
             "without evaluate."
         )
-    for name in settings.OF_EVALUATE:
-        if name in config and not (evaluate and learn == "nothing"):
-            raise settings.needs_evaluate(name)
     if not evaluate and config["weights"] == "run":
         raise UserError("weights=run means the run named by evaluate=RUN, which is not given.")
     if learn == "nothing" and config["ckpt_path"] is not None:

@@ -6,7 +6,7 @@ Per batch: loader, ``sampler.sample_sizes``, ``readouts``, ``task.step``, losses
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import lightning as L
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
 from mops_lightning.records.readout_names import FULL, REFINED, SOFT_PROJECTED, size_prefix
 from mops_lightning.samplers.base import Sampler, sample_with_attributes
@@ -24,11 +24,10 @@ from mops_lightning.tasks.refinement import Refinement
 from mops_lightning.training.checkpoint import CHECKPOINT_KEY
 from mops_lightning.training.distillation import Distillation, Targets
 from mops_lightning.training.divergence import check_checkpoint, check_loss
-from mops_lightning.training.learn import Learn, check_learn
 from mops_lightning.training.readouts import readout_names, readouts
 from mops_lightning.training.recipe import Recipe, draw_points, straight_through
-from mops_lightning.training.scores import Scores, TransferScores
-from mops_lightning.types import Batch, SampleOutput
+from mops_lightning.training.scores import Scores
+from mops_lightning.types import Batch, Learn, SampleOutput
 
 
 class Experiment(L.LightningModule):
@@ -51,7 +50,7 @@ class Experiment(L.LightningModule):
         m: the size that is validated and gives the run's score; None: the sampler's.
 
     Raises:
-        UserError: see ``check_learn`` and ``Refinement``.
+        UserError: ``learn`` is unknown, or task and sampler do not allow it; see ``Refinement``.
     """
 
     def __init__(
@@ -71,7 +70,7 @@ class Experiment(L.LightningModule):
         refine: int = 0,
     ) -> None:
         super().__init__()
-        check_learn(learn, task, sampler)
+        _check_learn(learn, task, sampler)
         self.task: Task = task
         self.sampler = None if learn == "task" else sampler
         self.baselines = nn.ModuleDict({} if learn == "task" else dict(baselines or {}))
@@ -83,7 +82,6 @@ class Experiment(L.LightningModule):
         self.task_lr_scale = task_lr_scale
         self.recipe = recipe or Recipe()
         self.distillation = Distillation(task, self.recipe) if learn == "sampler" else None
-        self.transfer: TransferScores | None = None  # set for tests with further task nets
         self.total_steps = 1
         self.started = False  # whether a checkpoint, if any, was restored
         for module in self._frozen():
@@ -277,20 +275,6 @@ class Experiment(L.LightningModule):
             if self.sampler is not None:  # without one, the full clouds are scored already
                 self._score("test/", "", batch, {FULL: batch.points}, reference)
             self._score_sets("test/", self.prefixes, batch.points, outputs)
-            self._score_transfer(batch, samples)
-
-    def _score_transfer(self, batch: Batch, samples: Mapping[int, Mapping[str, Tensor]]) -> None:
-        """Update the metrics of all readouts under further task nets; loggers get none of them."""
-        if self.transfer is None:
-            return
-        keyed = {
-            f"{prefix}{readout}": points
-            for m, prefix in self.prefixes.items()
-            for readout, points in samples[m].items()
-        }
-        updated = self.transfer.update(batch, {**keyed, FULL: batch.points})
-        for name, metric in updated.items():
-            self.log(name, metric, batch_size=len(batch.points), logger=False)
 
     def _score(
         self, stage: str, prefix: str, batch: Batch, samples: Mapping[str, Tensor], reference: Any
@@ -321,3 +305,25 @@ class Experiment(L.LightningModule):
         updated = self.scores.update_sets(points, outputs, self.sampler.nested, prefixes)
         for name, metric in updated.items():
             self.log(f"{stage}{name}", metric, batch_size=len(points))
+
+
+def _check_learn(learn: Learn, task: Task, sampler: Sampler | None) -> None:
+    """Reject what cannot be trained.
+
+    Raises:
+        UserError: ``learn`` is unknown, the sampler that it needs is missing, or the task net lets
+            no gradient through.
+    """
+    allowed = get_args(Learn)
+    if learn not in allowed:
+        raise UserError(f"learn: unknown value {learn!r}.{did_you_mean(learn, allowed)}")
+    if sampler is None and learn != "task":
+        raise UserError(f"learn={learn} needs a sampler; only learn=task works without one.")
+    learned = sampler is not None and sampler.learned
+    learns = learn in ("task", "joint") or (learn == "sampler" and learned)
+    if learns and not getattr(task.net, "differentiable", True):
+        raise UserError(
+            f"learn={learn}: {type(task.net).__name__} has no weights and lets no gradient "
+            "through. Train under another task/net and test with evaluate=RUN, or choose a "
+            "sampler that needs no training, such as sampler=fps."
+        )

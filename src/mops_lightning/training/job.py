@@ -10,7 +10,7 @@ from mops_lightning.config import distributed
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
-from mops_lightning.training import checkpoint, task_nets
+from mops_lightning.training import checkpoint
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.factory import make_experiment
 from mops_lightning.training.loaders import held_out_mask
@@ -69,8 +69,6 @@ def prepare(cfg: DictConfig, folder: Path, dataset: CloudDataset, record: RunRec
     record.resumed_from = None if resumed is None else str(resumed)
     record.lengthened = resumed is not None and checkpoint.lengthened(cfg, resumed)
     experiment = make_experiment(cfg, dataset, identity)
-    if task_nets.KEY in cfg:
-        record.task_nets = task_nets.add_task_nets(experiment, cfg, dataset)
     trainer = make_trainer(cfg, folder, dataset, experiment)
     job = Job(cfg, folder, dataset, experiment, trainer, resumed)
     distributed.check_shares(

@@ -86,7 +86,6 @@ def task_config(cfg: DictConfig) -> DictConfig:
         own.trainer.devices, own.trainer.num_nodes, own.trainer.strategy = 1, 1, "auto"
         own.ckpt_path = None
         own.evaluate = None
-        own.pop("task_nets", None)
     return own
 
 

@@ -11,7 +11,6 @@ from mops_lightning.config import distributed
 from mops_lightning.errors import Interrupted, closed_outputs
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
-from mops_lightning.training.workers import at_end
 
 
 @contextmanager
@@ -32,13 +31,8 @@ def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[Ru
     record = RunRecord.begin(config, overrides, cfg.seed)
     writes = not distributed.is_worker_rank(cfg)
 
-    def ended(text: str) -> None:
-        record.status, record.error = "interrupted", text
-        run_record.write(folder, record)
-
     if writes:
         run_record.write(folder, record)
-        at_end.append(ended)
     try:
         with record.timed("total"):
             yield record
@@ -53,5 +47,4 @@ def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[Ru
         raise
     finally:
         if writes:
-            at_end.remove(ended)
             run_record.write(folder, record)

@@ -1,15 +1,12 @@
 """The metrics of an experiment's validation and test."""
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
 
 from torch import Tensor, nn
 from torchmetrics import MeanMetric, Metric, MetricCollection
 
 from mops_lightning.metrics.sampled_set import SET_METRICS
 from mops_lightning.ops.points import coordinates
-from mops_lightning.records.readout_names import TRANSFER
-from mops_lightning.tasks.base import Task
 from mops_lightning.types import SampleOutput, TaskOutput
 
 
@@ -88,51 +85,4 @@ class Scores(nn.Module):
                     assert isinstance(mean, cls)
                     mean.update(values)
                     updated[key] = mean
-        return updated
-
-
-class TransferScores(nn.Module):
-    """The scores of the same samples under task nets that had no part in the training.
-
-    The nets are frozen and stay in evaluation mode.
-
-    Args:
-        tasks: by the label of their net.
-        keys: of the readouts, behind the prefixes of their sizes.
-    """
-
-    def __init__(self, tasks: Mapping[str, Task], keys: Iterable[str]) -> None:
-        super().__init__()
-        keys = list(keys)
-        self.tasks = nn.ModuleDict(tasks)
-        self.scores = nn.ModuleDict(
-            {label: Scores(task.metrics, keys, ()) for label, task in tasks.items()}
-        )
-        self.requires_grad_(False)
-        self.eval()
-
-    def train(self, mode: bool = True) -> "TransferScores":
-        """Stay in evaluation mode."""
-        return super().train(False)
-
-    def update(self, batch: Any, samples: Mapping[str, Tensor]) -> dict[str, Metric]:
-        """Score the samples of a batch under every net.
-
-        Args:
-            batch: as for ``Task.scored``.
-            samples: points ``(B, m, 3)`` by readout, behind the prefix of their size.
-
-        Returns:
-            The metrics under the names they are logged by, such as
-            ``transfer/dgcnn seed 0/m32/generated/accuracy``.
-        """
-        updated: dict[str, Metric] = {}
-        for label, task in self.tasks.items():
-            scores = self.scores[label]
-            assert isinstance(task, Task)
-            assert isinstance(scores, Scores)
-            reference = task.reference(batch)
-            for key, points in samples.items():
-                changed = scores.update_readout(key, task.scored(batch, points, reference))
-                updated |= {f"{TRANSFER}/{label}/{name}": one for name, one in changed.items()}
         return updated

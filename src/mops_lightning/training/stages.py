@@ -25,7 +25,6 @@ from mops_lightning.training.loaders import augmentation, score_loader, split
 from mops_lightning.training.recipe import Recipe
 from mops_lightning.training.trainer import log_hparams
 from mops_lightning.training.warm_start import warm_start
-from mops_lightning.training.workers import dead_workers_reported
 from mops_lightning.viz.snapshots import CLOUDS
 from mops_lightning.zoo import weights
 
@@ -129,7 +128,7 @@ def _fit(job: Job) -> None:
     every = min(trainer.log_every_n_steps, len(loader))  # type: ignore[attr-defined]
     trainer.log_every_n_steps = every  # type: ignore[attr-defined]
     try:
-        with _interruptible(), _monitoring(), dead_workers_reported(trainer):
+        with _interruptible(), _monitoring():
             trainer.fit(job.experiment, loader, validation, ckpt_path=job.resumed)
         if name := weights.first_nonfinite(job.experiment.state_dict()):
             raise Diverged(f"training diverged: {name} is not finite.")
@@ -156,7 +155,7 @@ def _test(job: Job, config: dict[str, Any]) -> dict[str, float]:
         config: the settings as plain data, for the logger.
     """
     experiment, trainer = job.experiment, job.trainer
-    with _interruptible(), dead_workers_reported(trainer):
+    with _interruptible():
         loader = score_loader(job.dataset.test, job.cfg.batch_size, experiment.task, job.part)
         trainer.test(experiment, loader, verbose=False)
     metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
