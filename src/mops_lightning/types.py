@@ -1,8 +1,7 @@
 """Types that data, samplers, tasks and metrics exchange, and the letters of their shapes.
 
 ``B`` clouds in a batch, ``N`` input points, ``M`` sampled points, ``C`` channels, ``S`` shapes in
-a split. Points are float32 ``(B, N, 3)`` in the unit sphere, without unit. Where clouds have C
-attributes, such as intensities, these follow as further channels, ``(B, N, 3 + C)``.
+a split. Points are float32 ``(B, N, 3)`` in the unit sphere, without unit.
 """
 
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, runtime_checkable
@@ -21,7 +20,7 @@ class Batch(NamedTuple):
     """One batch of clouds.
 
     Attributes:
-        points: ``(B, N, 3)``, or ``(B, N, 3 + C)`` with attributes.
+        points: ``(B, N, 3)``.
         labels: ``(B,)`` int64 class numbers.
         rows: ``(B,)`` int64 rows of the clouds in their split, or None.
     """
@@ -62,7 +61,7 @@ class SampleOutput(NamedTuple):
     """The output of every sampler; a NamedTuple, which device transfer and collation support.
 
     Attributes:
-        points: ``(B, M, 3)`` the sampled points, or ``(B, M, 3 + C)`` with attributes.
+        points: ``(B, M, 3)`` the sampled points.
         indices: ``(B, M)`` int64 rows of the input, or None when the points are generated.
         losses: the sampler's own weighted loss terms, to add to the task loss.
         matrix: the sampling matrix S that generated the points, or None.

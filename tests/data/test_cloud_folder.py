@@ -101,36 +101,3 @@ def test_cloud_folder_invalid_argument_raises(tmp_path, settings, message):
 def test_cloud_folder_without_cloud_raises(tmp_path):
     with pytest.raises(UserError, match=r"root: no cloud in .*\.ply"):
         cloud_folder(tmp_path)
-
-
-@pytest.mark.parametrize("crop", ["nearest", "whole", "cube"])
-def test_cloud_folder_features_follow_their_points(crop, tmp_path):
-    for seed in range(3):
-        points = np.random.default_rng(seed).normal(size=(300, 3))
-        columns = {"height": 5 + points[:, 2], "row": np.arange(300)}
-        WRITERS[".ply"](tmp_path / f"{seed}.ply", Table(points, columns))
-    settings = {
-        "n_points": 32,
-        "crops": 2,
-        "crop": crop,
-        "crop_size": 4 if crop == "cube" else None,
-    }
-    data = cloud_folder(tmp_path, **settings, features=["row", "height"])
-    plain = cloud_folder(tmp_path, **settings)
-    assert data.attributes == ("row", "height")
-    assert plain.attributes == ()
-    assert data.fingerprint != plain.fingerprint
-    for mine, without in ((data.train, plain.train), (data.test, plain.test)):
-        assert torch.equal(mine.points[..., :3], without.points)
-        z, height = mine.points[..., 2], mine.points[..., 4]
-        scale = height.std(1) / z.std(1)  # as in the file: the coordinates were divided by it
-        centred = height - height.mean(1, keepdim=True)
-        torch.testing.assert_close(centred, scale[:, None] * z, atol=1e-4, rtol=1e-3)
-        assert mine.points[..., 3].frac().eq(0).all()
-
-
-def test_cloud_folder_missing_feature_names_file(folder):
-    with pytest.raises(UserError, match=r"box\.stl.*'intensity'.*nx, ny, nz.*skip_broken=true"):
-        cloud_folder(folder, n_points=64, features=["intensity"])
-    with pytest.raises(UserError, match=r"features must be a list, such as \[intensity\]"):
-        cloud_folder(folder, n_points=64, features="intensity")

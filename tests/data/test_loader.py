@@ -162,11 +162,3 @@ def test_loader_task_draws_by_cloud_and_in_training_by_epoch(shuffle):
     assert drawn(loader(seed=6)) != epochs[0]
     if not shuffle:
         assert loader().batch_of(torch.tensor([7, 2])) == [(row, epochs[0][row]) for row in (7, 2)]
-
-
-def test_augmentation_leaves_attributes(rng):
-    points = torch.randn(4, 9, 5, generator=rng)
-    augment = Augmentation(rotate_up=True, jitter=0.1)
-    changed = augment(points, generator(1))
-    assert torch.equal(changed[..., 3:], points[..., 3:])
-    assert torch.equal(changed[..., :3], augment(points[..., :3], generator(1)))

@@ -1,16 +1,11 @@
 """Files by tiles, as the command does it."""
 
-import re
-
 import numpy as np
 import pytest
 
 from mops_lightning import load
-from mops_lightning.config.compose import compose
 from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
-from mops_lightning.training.run import run
-from tests.support.command_line import TINY_ANY_DATA
 from tests.support.downsample import call
 
 
@@ -85,59 +80,10 @@ def test_scene_invalid_options_end_in_one_line(options, said, scan, tmp_path):
     assert len(err.splitlines()) == 1
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A folder of scans with colours of 16 bits, and the run that trained a sampler on it."""
-    folder = tmp_path_factory.mktemp("trained")
-    (folder / "scans").mkdir()
-    for seed in range(3):
-        points = np.random.default_rng(seed).normal(size=(400, 3)) * [9, 5, 1] + [1000, 0, 0]
-        red = ((points[:, 1] > 0) * 60_000).astype("u2")
-        WRITERS[".ply"](folder / "scans" / f"{seed}.ply", Table(points, {"red": red}))
-    overrides = [
-        *("task=reconstruction", "dataset=clouds", f"dataset.root={folder}/scans", *TINY_ANY_DATA),
-        *("dataset.features=[red]", "dataset.crops=4", "sampler=fmops", "sampler.m_max=32"),
-        *("sizes=[8]", "trainer.max_epochs=6", "task.emd_weight=0", "optimizer.lr=0.02"),
-        *(f"cache={folder}/cache", "val_fraction=0"),
-    ]
-    run(compose(overrides), folder / "run", overrides)
-    return folder
-
-
-def test_scene_sampler_with_attributes_takes_those_of_the_file(trained, tmp_path):
-    source, options = trained / "scans" / "0.ply", ["--weights", trained / "run", "--m", 50]
-    whole = read(source, 9, 0)
-    inverse = Table(whole.points, {"red": 60_000 - whole.columns["red"]})
-    WRITERS[".ply"](tmp_path / "inverse.ply", inverse)
-    found = []
-    for name in (source, tmp_path / "inverse.ply"):
-        arguments = [name, tmp_path / "out.npz", *options, "--tile", 64, "--overwrite"]
-        status, out, err = call(*arguments, "--keep-attributes")
-        assert (status, err) == (0, "")
-        assert "50 of 400 points" in out
-        found.append(read(tmp_path / "out.npz", 9, 0))
-    assert {tuple(one) for one in found[0].points} <= {tuple(one) for one in whole.points}
-    assert not np.array_equal(found[0].points, found[1].points)
-    np.testing.assert_array_equal(found[0].columns["red"] > 0, found[0].points[:, 1] > 0)
-
-
-def test_scene_loaded_sampler_equals_command(trained, tmp_path):
-    source = trained / "scans" / "1.ply"
-    assert call(source, tmp_path / "out.npy", "--weights", trained / "run", "--m", 20)[0] == 0
-    sampler = load(trained / "run")
-    assert sampler.attributes == ("red",)
-    table = read(source, 9, 0)
-    points = np.column_stack([table.points, table.columns["red"]])
-    chosen, rows = sampler.downsample(points, 20)
+def test_scene_loaded_sampler_equals_command(scan, tmp_path):
+    name = "fmops.modelnet40-m512"
+    assert call(scan, tmp_path / "out.npy", "--weights", name, "--m", 20)[0] == 0
+    points = read(scan, 9, 0).finite().points
+    chosen, rows = load(name).downsample(points, 20)
     np.testing.assert_array_equal(chosen, points[rows])
-    assert {tuple(p) for p in chosen[:, :3]} == {tuple(p) for p in np.load(tmp_path / "out.npy")}
-
-
-def test_scene_attribute_missing_or_in_chunks_raises(trained, scan, tmp_path):
-    options = ["--weights", trained / "run", "--m", 50, "--tile", 64]
-    status, _, err = call(scan, tmp_path / "out.ply", *options)
-    assert status == 2
-    assert re.search(r"scan\.ply has no attribute 'red'.*it has label", err)
-    status, _, err = call(trained / "scans/0.ply", tmp_path / "out.ply", *options, "--chunk", 90)
-    assert status == 2
-    assert re.search(r"--chunk: .* takes attributes \(red\)", err)
+    assert {tuple(p) for p in chosen} == {tuple(p) for p in np.load(tmp_path / "out.npy")}

@@ -107,8 +107,3 @@ def test_unknown_encoder_raises():
     settings: dict[str, Any] = {"encoder": "grpah"}
     with pytest.raises(UserError, match=r"encoder: unknown 'grpah'.* 'graph'"):
         MFoldingNet(64, **settings)
-
-
-def test_graph_encoder_with_attributes_raises():
-    with pytest.raises(UserError, match=r"encoder must be mlp with attributes \(red\)"):
-        MFoldingNet(64, encoder="graph", attributes=["red"])

@@ -142,15 +142,6 @@ def test_anchors_in_half_precision_keep_distances(dtype, rng):
     torch.testing.assert_close(found.float(), want, atol=0.05, rtol=0)
 
 
-def test_anchors_with_attributes_are_those_of_coordinates(rng):
-    points = torch.randn(2, 40, 5, generator=rng)
-    net = small(attributes=["intensity", "red"]).eval()
-    output = net(points)
-    assert output.matrix is not None
-    torch.testing.assert_close(output.points, output.matrix.dense().mT @ points)
-    torch.testing.assert_close(output.points[..., :3], small().eval()(points[..., :3]).points)
-
-
 def test_anchors_warm_start_keeps_their_start():
     plain = MOPSNet(6, feature_channels=(8, 6), rho_channels=(12, 10))
     net = small()

@@ -61,12 +61,3 @@ def test_gumbel_training_starts_at_temperature_1(sampler):
 def test_gumbel_invalid_argument_raises(arguments, message):
     with pytest.raises(UserError, match=message):
         GumbelSampler(4, **arguments)
-
-
-def test_sample_with_attributes_chooses_rows(rng):
-    torch.manual_seed(0)
-    sampler = GumbelSampler(4, feature_channels=(8, 6), key_channels=(8,), attributes=["red"])
-    points = torch.randn(2, 30, 4, generator=rng)
-    assert sampler(points).points.shape == (2, 4, 4)
-    chosen = sampler.eval()(points).points
-    assert (chosen[:, :, None] == points[:, None]).all(3).any(2).all()

@@ -4,7 +4,7 @@ from torch import nn
 
 from mops_lightning.errors import UserError
 from mops_lightning.losses.subset import overlap_losses
-from mops_lightning.nets.layers import fit_attribute_scales, linear_norm_relu
+from mops_lightning.nets.layers import linear_norm_relu
 from mops_lightning.samplers.mops import MOPSNet
 from tests.support.losses import subset_loss
 
@@ -154,36 +154,3 @@ def test_mops_gradcheck(rng):
 def test_mops_invalid_argument_raises(arguments, message):
     with pytest.raises(UserError, match=message):
         small(**arguments)
-
-
-@pytest.mark.parametrize("training", [True, False])
-def test_sample_with_attributes_is_s_times_all_channels(training, rng):
-    points = torch.randn(2, 40, 5, generator=rng)
-    sampler = small(attributes=["intensity", "red"]).train(training)
-    fit_attribute_scales(sampler, points)
-    output = sampler(points)
-    assert output.matrix is not None
-    torch.testing.assert_close(output.points, output.matrix.dense().mT @ points)
-    brighter = points.clone()
-    brighter[:, ::2, 3] += 1
-    assert not torch.allclose(sampler(brighter).points[..., :3], output.points[..., :3])
-    if training:
-        coordinates = output.points[..., :3]
-        expected = sampler.alpha * subset_loss(points[..., :3], coordinates)
-        torch.testing.assert_close(output.losses["subset"], expected)
-
-
-def test_downsample_with_attributes_keeps_rows_and_unit(rng):
-    points = torch.randn(60, 5, generator=rng, dtype=torch.float64) * 3 + 50
-    sampler = small(attributes=["intensity", "red"]).eval()
-    fit_attribute_scales(sampler, points)
-    chosen, rows = sampler.downsample(points)
-    assert torch.equal(chosen, points[rows])
-    generated, _ = sampler.downsample(points, readout="generated")
-    assert generated.dtype == torch.float64
-    low, high = points.min(0).values, points.max(0).values
-    assert ((generated > low) & (generated < high)).all()
-    with pytest.raises(UserError, match=r"\(N, 5\) .* x, y, z, intensity, red, got \(60, 3\)"):
-        sampler.downsample(points[:, :3])
-    with pytest.raises(UserError, match=r"\(B, N, 5\): x, y, z, intensity, red, got \(1, 60, 3\)"):
-        sampler(points[None, :, :3].float())

@@ -2,7 +2,6 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.layers import fit_attribute_scales
 from mops_lightning.ops.readout import match
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
@@ -65,14 +64,3 @@ def test_stream_sample_invalid_input_raises(make, chunks, message):
 def test_stream_sample_of_more_than_largest_size_raises():
     with pytest.raises(UserError, match="m must be between 1 and 4, got 5"):
         stream_sample(FMOPSNet(4).eval(), lambda: [torch.zeros(9, 3)], 5)
-
-
-def test_stream_sample_with_attributes_equals_whole_cloud(rng):
-    torch.manual_seed(1)
-    sampler = FMOPSNet(24, attributes=["intensity"]).eval()
-    points = torch.randn(1, 500, 4, generator=rng)
-    fit_attribute_scales(sampler, 3 * points)
-    with torch.no_grad():
-        whole = sampler(points, 9).points[0]
-    streamed = stream_sample(sampler, lambda: points[0].split(64), 9)
-    torch.testing.assert_close(streamed, whole, rtol=0, atol=1e-5)

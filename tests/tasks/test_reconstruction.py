@@ -3,10 +3,8 @@ import torch
 
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
-from mops_lightning.nets.atlasnet import AtlasNet
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
-from mops_lightning.nets.layers import fit_attribute_scales
 from mops_lightning.ops.chamfer import chamfer_distance
 from mops_lightning.ops.emd import earth_movers_distance
 from mops_lightning.samplers.fps import FPSSampler
@@ -157,21 +155,3 @@ def test_figures_show_samples_and_reconstructions(rng):
     result = module.scored(given, chosen)
     ratio = (result.predictions.chamfer / result.targets.chamfer)[1]
     assert axes[7].texts[0].get_text() == f"NRE {ratio:.2f}"
-
-
-@pytest.mark.parametrize("make", [AutoEncoder, MFoldingNet, AtlasNet])
-def test_reconstruction_sees_attributes_and_rebuilds_coordinates(make, rng):
-    torch.manual_seed(0)
-    module = Reconstruction(make(48, codeword=8, attributes=["red", "green"]))
-    points = torch.randn(4, 48, 5, generator=rng)
-    fit_attribute_scales(module, points)
-    given = Batch(points, torch.zeros(4))
-    built = module.predict(given, points)
-    assert built.shape == (4, 48, 3)
-    module.eval()
-    built = module.predict(given, points[:, :12])
-    result = module.scored(given, points[:, :12])
-    torch.testing.assert_close(result.predictions.chamfer, chamfer_distance(built, points[..., :3]))
-    other = points[:, :12].clone()
-    other[..., 4] += 1
-    assert not torch.allclose(module.predict(given, other), built)

@@ -8,12 +8,10 @@ from mops_lightning.config.compose import compose
 from mops_lightning.config.overrides import accepted
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-from mops_lightning.training.evaluate import same_attributes
 from mops_lightning.training.replay import command_line
 from mops_lightning.training.run import run
 from mops_lightning.zoo import publish
 from tests.support.command_line import SMALL_PCRNET, TINY, call, runs
-from tests.support.training import small_dataset
 
 
 @pytest.fixture(scope="module")
@@ -264,13 +262,3 @@ def test_command_line_other_net_drops_its_settings(tmp_path):
         cfg = compose(chosen)
         record = run(cfg, tmp_path / other[0].replace("/", "-"), chosen)
         assert record.status == "completed"
-
-
-@pytest.mark.parametrize("features", [None, ["green"], ["green", "red"]])
-def test_same_attributes_other_ones_raise(features):
-    data = replace(small_dataset(), attributes=("red", "green"))
-    same_attributes({"dataset": {"features": ["red", "green"]}}, data, "RUN")
-    same_attributes({"dataset": "damaged"}, small_dataset(), "RUN")
-    listed = ",".join(features or [])
-    with pytest.raises(UserError, match=rf"RUN .*features=\[{listed}\], got \[red,green\]"):
-        same_attributes({"dataset": {"features": features}}, data, "RUN")

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -6,7 +5,6 @@ import torch
 
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
-from mops_lightning.nets.layers import AttributeScale
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.training.factory import make_experiment
@@ -67,37 +65,3 @@ def test_factory_sampler_sees_weights_loaded_later(rng):
     torch.manual_seed(9)
     made.task.net.load_state_dict(PointNetVanilla(3).state_dict())
     assert not torch.equal(made.sampler(points).indices, before)
-
-
-def with_attributes():
-    data = small_dataset()
-    points = torch.cat([data.train.points, 9 + data.train.points[..., :1]], 2)
-    train, test = data.train._replace(points=points), data.test._replace(points=points[:10])
-    return replace(data, train=train, test=test, attributes=("red",))
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        ([], "task=classification takes coordinates only"),
-        (["task=registration"], "task=registration takes coordinates only"),
-        (["task=reconstruction", "sampler=snet"], "SNet takes coordinates only"),
-        (["task=reconstruction", "sampler=critical"], "CriticalSampler takes coordinates only"),
-        (["task=reconstruction", BASELINE], "SubmodularSampler takes coordinates only"),
-        (["task=reconstruction", "task/net=pcrnet"], "task/net=pcrnet takes coordinates only"),
-    ],
-)
-def test_factory_attributes_where_they_are_no_use_raises(overrides, message):
-    with pytest.raises(UserError, match=rf"dataset\.features=\[red\]: .*{message}"):
-        make_experiment(compose([*overrides, "m=8"]), with_attributes(), {})
-
-
-@pytest.mark.parametrize("sampler", ["mops", "fps"])
-def test_factory_attributes_are_standardised_as_in_the_training_data(sampler):
-    cfg = compose(["task=reconstruction", f"sampler={sampler}", "m=8", "dataset.n_points=48"])
-    data = with_attributes()
-    made: Any = make_experiment(cfg, data, {})
-    scales = [module for module in made.modules() if isinstance(module, AttributeScale)]
-    assert len(scales) == (1 if sampler == "fps" else 2)
-    for scale in scales:
-        assert scale.mean.item() == pytest.approx(data.train.points[..., 3].mean().item())

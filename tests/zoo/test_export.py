@@ -77,8 +77,3 @@ def test_mistakes_are_one_line(tmp_path, sampler, name, m, words):
     with pytest.raises(UserError, match=words):
         export(sampler.eval(), tmp_path / name, m)
     assert not list(tmp_path.iterdir())
-
-
-def test_export_sampler_with_attributes_raises():
-    with pytest.raises(UserError, match=r"takes attributes \(red\)"):
-        plain_net(MOPSNet(8, attributes=["red"], **SMALL).eval())

@@ -3,7 +3,6 @@
 import sys
 import zlib
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -16,18 +15,17 @@ from rich.progress import track
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
 from mops_lightning.data.crops import Crop, check_crop, random_crops
 from mops_lightning.data.file_splits import Box, class_of, split_by_folder, split_by_share
-from mops_lightning.data.formats.attributes import attribute_values
 from mops_lightning.data.formats.registry import READABLE, read
 from mops_lightning.data.hdf5 import choose_and_fingerprint
 from mops_lightning.data.mesh_sampling import mesh_root
 from mops_lightning.data.split_list import SPLITS, read_split_list
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import coordinates, normalize_unit_sphere, with_coordinates
+from mops_lightning.ops.points import normalize_unit_sphere
 from mops_lightning.seeding import derive_seed
 
 
 class Source(NamedTuple):
-    """What is kept of a file: its path, its bounding box and its crops ``(K, n_points, 3 + C)``."""
+    """What is kept of a file: its path, its bounding box and its crops ``(K, n_points, 3)``."""
 
     name: PurePosixPath
     box: Box
@@ -46,7 +44,6 @@ def cloud_folder(
     surface: int | None = None,
     skip_broken: bool = False,
     seed: int = 0,
-    features: Sequence[str] | None = None,
 ) -> CloudDataset:
     """Draw crops of the clouds in a folder and its subfolders, one cloud per file.
 
@@ -69,11 +66,9 @@ def cloud_folder(
         surface: points to sample from a mesh's surface first; None: 10,000 or 8 ``n_points``.
         skip_broken: whether to skip files without a usable cloud instead of raising an error.
         seed: seed of the split and the crops.
-        features: names of C attributes of the files that points have as further channels, see
-            ``formats.attributes``; None or empty: coordinates alone.
 
     Returns:
-        Float32 clouds ``(S, n_points, 3 + C)`` in the unit sphere, with the centroid at the origin.
+        Float32 clouds ``(S, n_points, 3)`` in the unit sphere, with the centroid at the origin.
         ``notes`` has the number of files per split, of skipped files and of tiles left out.
 
     Raises:
@@ -82,9 +77,6 @@ def cloud_folder(
     minima = {"n_points": (n_points, 2), "crops": (crops, 1), "seed": (seed, 0)}
     folder = mesh_root(root, minima)
     _check(test_share, crop, crop_size, surface)
-    if isinstance(features, str):
-        raise UserError(f"features must be a list, such as [{features}], got {features!r}.")
-    attributes = tuple(features or ())
     listed = None
     if split_file:
         listed = dict(read_split_list(folder, Path(split_file).expanduser(), READABLE, False))
@@ -98,9 +90,7 @@ def cloud_folder(
         rng = np.random.default_rng(derive_seed(seed, zlib.crc32(str(name).encode())))
         try:
             table = read(folder / name, surface or max(10_000, 8 * n_points), seed).finite()
-            values = attribute_values(table, attributes, folder / name)
-            points = np.concatenate([table.points, values], 1)
-            drawn = random_crops(points, n_points, crops, crop, crop_size, rng, folder / name)
+            drawn = random_crops(table.points, n_points, crops, crop, crop_size, rng, folder / name)
         except UserError as error:
             if not skip_broken:
                 raise UserError(
@@ -117,8 +107,7 @@ def cloud_folder(
     else:
         kept = [source.name for source in sources]
         splits = split_by_share(kept, [source.box for source in sources], test_share, seed)
-    found = _dataset(folder, sources, splits, chosen, len(names) - len(sources))
-    return replace(found, attributes=attributes)
+    return _dataset(folder, sources, splits, chosen, len(names) - len(sources))
 
 
 def _check(test_share: float, crop: str, crop_size: float | None, surface: int | None) -> None:
@@ -175,7 +164,7 @@ def _dataset(
         each = len(sources[0].crops)
         labels = torch.tensor([classes.index(class_of(sources[i].name)) for i in rows])
         clouds[split] = Clouds(
-            with_coordinates(crops, normalize_unit_sphere(coordinates(crops))),
+            normalize_unit_sphere(crops),
             labels.repeat_interleave(each),
             torch.tensor(rows).repeat_interleave(each),
         )

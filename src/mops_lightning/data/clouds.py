@@ -18,7 +18,7 @@ class Clouds(NamedTuple):
     """One split.
 
     Attributes:
-        points: ``(S, N, 3)`` float32, or ``(S, N, 3 + C)`` with attributes.
+        points: ``(S, N, 3)`` float32.
         labels: ``(S,)`` int64, positions in ``CloudDataset.class_names``.
         sources: ``(S,)`` int64, the same number for clouds that must be in the same split, such as
             the crops of a file; None: no two must.
@@ -48,7 +48,6 @@ class CloudDataset:
         fingerprint: sha256 of everything that determines the content; part of the cache key of task
             nets.
         notes: facts for the run record, such as the number of skipped meshes.
-        attributes: names of the C attributes behind the coordinates, in the files' own unit.
     """
 
     class_names: tuple[str, ...]
@@ -56,7 +55,6 @@ class CloudDataset:
     test: Clouds
     fingerprint: str
     notes: dict[str, Any] = field(default_factory=dict)
-    attributes: tuple[str, ...] = ()
 
 
 def choose_classes(classes: Sequence[str] | None, known: Sequence[str]) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ def random_crops(
     """Draw crops of a cloud, each with its centroid at the origin.
 
     Args:
-        points: ``(N, 3)``, finite, in the file's own unit, or ``(N, 3 + C)`` with attributes.
+        points: ``(N, 3)``, finite, in the file's own unit.
         n_points: number of points per crop.
         number: of crops.
         crop: ``nearest`` takes the points nearest to a point drawn at random, ``cube`` random
@@ -40,7 +40,7 @@ def random_crops(
         path: for errors.
 
     Returns:
-        ``(number, n_points, 3 + C)``, in the file's own unit.
+        ``(number, n_points, 3)``, in the file's own unit.
 
     Raises:
         BadCloudError: the cloud has fewer than ``n_points`` points, or no cube with as many.
@@ -51,7 +51,7 @@ def random_crops(
         "cube": lambda: _cube(points, n_points, crop_size or 0.0, rng),
         "whole": lambda: points[rng.choice(len(points), n_points, replace=False)],
     }[crop]
-    crops = np.empty((number, n_points, points.shape[1]), np.float32)
+    crops = np.empty((number, n_points, 3), np.float32)
     for place in range(number):
         crops[place] = _usable(draw, n_points, crop_size if crop == "cube" else None, path)
     return crops
@@ -62,10 +62,9 @@ def _usable(draw: Callable[[], Cloud], n_points: int, side: float | None, path: 
     largest = 0
     for _ in range(DRAWS):
         drawn = draw()
-        places = drawn[:, :3]
-        if len(drawn) == n_points and (places != places[0]).any():
+        if len(drawn) == n_points and (drawn != drawn[0]).any():
             # Before float32, which has too few digits for coordinates of a map.
-            return np.concatenate([places - places.mean(0), drawn[:, 3:]], 1)
+            return drawn - drawn.mean(0)
         largest = max(largest, len(drawn))
     if side is not None and largest < n_points:
         raise BadCloudError(
@@ -109,7 +108,7 @@ def nearest(points: Cloud, centre: Cloud, n_points: int) -> Cloud:
     """Return the ``n_points`` rows of points nearest to a place, in their order.
 
     Args:
-        points: ``(N, 3)``, or ``(N, 3 + C)`` with attributes.
+        points: ``(N, 3)``.
         centre: ``(3,)`` or longer; the coordinates count.
         n_points: how many.
     """

@@ -9,14 +9,13 @@ from torch import Generator, Tensor
 
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import coordinates, with_coordinates
 from mops_lightning.seeding import generator
 from mops_lightning.types import Batch
 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Random changes of the coordinates of training clouds; attributes stay as they are.
+    """Random changes of the coordinates of training clouds.
 
     Attributes:
         rotate_up: rotate every cloud by a random angle about the up axis (y).
@@ -45,9 +44,8 @@ class Augmentation:
         """Whether clouds are changed at all."""
         return self.rotate_up or self.jitter > 0
 
-    def __call__(self, clouds: Tensor, rng: Generator) -> Tensor:
-        """Return the augmented ``(B, N, 3)`` or ``(B, N, 3 + C)`` points."""
-        points = coordinates(clouds)
+    def __call__(self, points: Tensor, rng: Generator) -> Tensor:
+        """Return the augmented ``(B, N, 3)`` points."""
         if self.rotate_up:
             angle = torch.rand(len(points), generator=rng) * (2 * torch.pi)
             cos, sin, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
@@ -56,7 +54,7 @@ class Augmentation:
         if self.jitter:
             noise = torch.randn(points.shape, generator=rng).mul_(self.jitter)
             points = points + noise.clamp_(-self.jitter_clip, self.jitter_clip)
-        return with_coordinates(clouds, points)
+        return points
 
 
 FIXED, DRAWN = 11, 12

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mops_lightning.data.formats.attributes import attribute_values
 from mops_lightning.data.formats.errors import check_size
 from mops_lightning.data.formats.registry import read, write
 from mops_lightning.data.formats.table import Table
@@ -17,7 +16,6 @@ from mops_lightning.downsample_files.seams import Seams
 from mops_lightning.downsample_files.settings import Settings
 from mops_lightning.downsample_files.unit_sphere import largest_distance, sum_of, unit_sphere
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import coordinates
 from mops_lightning.ops.readout import complete
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.mops import MOPSNet
@@ -69,11 +67,6 @@ def sampler_of(settings: Settings) -> Sampler:
             f"--weights: tiles need a sampler of every size, such as FMOPS-Net; "
             f"{settings.weights} is a {type(sampler).__name__} for {sampler.m} points."
         )
-    if settings.chunk and sampler.attributes:
-        raise UserError(
-            f"--chunk: {settings.weights} takes attributes ({', '.join(sampler.attributes)}), "
-            "which are not read in chunks. Leave --chunk out."
-        )
     m = None if settings.tiled else settings.m  # a tile keeps a part of them
     if m is not None and (m > sampler.m or (m != sampler.m and not sampler.flexible)):
         allowed = f"up to {sampler.m}" if sampler.flexible else f"{sampler.m}"
@@ -114,13 +107,10 @@ def sampled(source: Path, table: Table, sampler: Sampler, m: int, settings: Sett
     centre = sum_of(table.points) / len(table.points)
     sphere = unit_sphere(centre, largest_distance(table.points, centre), source)
     points = sphere.normalise(table.points)
-    if sampler.attributes:
-        values = torch.from_numpy(attribute_values(table, sampler.attributes, source))
-        points = torch.cat([points, values.float()], 1)
     with torch.no_grad():
         rows, generated = _chosen(points, sampler, m, settings)
     if rows is None:
-        return Table(sphere.restore(coordinates(generated)), {}, table.header)
+        return Table(sphere.restore(generated), {}, table.header)
     kept = table.take(rows.numpy())
     return kept if settings.keep_attributes else kept.without_attributes()
 
@@ -129,7 +119,6 @@ def _chosen(
     points: Tensor, sampler: Sampler, m: int, settings: Settings
 ) -> tuple[Tensor | None, Tensor]:
     """Return the rows ``(m,)`` of the points to keep, or None, and the generated points."""
-    places = coordinates(points)
     if isinstance(sampler, MOPSNet) and sampler.streams:
         generated = stream_sample(sampler, lambda: list(points.split(CHUNK)), m)
     else:
@@ -139,7 +128,7 @@ def _chosen(
             return output.indices[0], generated
     if settings.readout == "generated":
         return None, generated
-    rows = stream_match(coordinates(generated), lambda: list(places.split(CHUNK)))
+    rows = stream_match(generated, lambda: list(points.split(CHUNK)))
     if settings.readout == "completed":
-        rows = complete(rows[None], places[None])[0]
+        rows = complete(rows[None], points[None])[0]
     return rows, generated

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.data.formats.attributes import attribute_values
 from mops_lightning.data.formats.errors import check_size
 from mops_lightning.data.formats.registry import open_cloud_file, read
 from mops_lightning.data.formats.table import Table
@@ -63,8 +62,7 @@ def sample_table(
 ) -> tuple[Chosen, Seams]:
     """Sample a cloud in memory by tiles; see ``sample_scene``."""
     tiling = _tiling(source, settings, len(table.points), table.points.min(0, initial=np.inf))
-    values = attribute_values(table, sampler.attributes, source)
-    cloud, parts = in_memory(table.points, source, values)
+    cloud, parts = in_memory(table.points, source)
     return by_tiles(cloud, parts, tiling, sampler, engine, _rounds(sampler))
 
 

@@ -28,7 +28,6 @@ from mops_lightning.downsample_files.seams import (
     to_drop,
 )
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import coordinates
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.samplers.base import Sampler
 
@@ -41,36 +40,26 @@ ROUNDS = 3
 ROW = "row"
 """The column of a point's row in the user's file."""
 
-VALUES = "values"
-"""The column, ``(N, C)``, of the attributes that the sampler takes, if there are any."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class InMemory(CloudFile):
     """A cloud in memory, in the form that an engine takes."""
 
     points: NDArray[np.float64]
-    values: NDArray[np.float64]
 
     def _parse(self, rows: range) -> Table:
-        part = slice(rows.start, rows.stop)
-        columns = {ROW: np.arange(rows.start, rows.stop), VALUES: self.values[part]}
-        return Table(self.points[part], columns)
+        columns = {ROW: np.arange(rows.start, rows.stop)}
+        return Table(self.points[rows.start : rows.stop], columns)
 
 
-def in_memory(
-    points: NDArray[np.float64], path: Path, values: NDArray[np.float64] | None = None
-) -> tuple[CloudFile, list[range]]:
+def in_memory(points: NDArray[np.float64], path: Path) -> tuple[CloudFile, list[range]]:
     """Return a cloud in the form that ``by_tiles`` takes.
 
     Args:
         points: ``(N, 3)``.
         path: the file, for errors.
-        values: ``(N, C)`` the attributes that the sampler takes; None: none.
     """
-    if values is None:
-        values = np.empty((len(points), 0))
-    cloud = InMemory(path=path, number=len(points), points=points, values=values)
+    cloud = InMemory(path=path, number=len(points), points=points)
     return cloud, cloud.row_ranges(len(points))
 
 
@@ -85,8 +74,7 @@ def by_tiles(
     """Sample every tile of a cloud.
 
     Args:
-        cloud: its column ``ROW`` has the rows of the user's file, and ``VALUES`` the attributes of
-            a sampler that takes some.
+        cloud: its column ``ROW`` has the rows of the user's file.
         parts: ranges that are cut into tiles on their own, in order and without gaps.
         tiling: how they are cut.
         sampler: a flexible sampler.
@@ -145,9 +133,6 @@ def _sample(cloud: CloudFile, rows: range, tiling: Tiling, sampler: Sampler) -> 
         for first in range(0, len(members), step):
             batch = members[first : first + step]
             points = _normalised(np.stack([table.points[tiles[i]] for i in batch]), cloud.path)
-            if sampler.attributes:
-                values = np.stack([table.columns[VALUES][tiles[i]] for i in batch])
-                points = torch.cat([points, torch.from_numpy(values).float()], 2)
             rows_of = _rows(sampler, points, m).numpy()
             for i, chosen in zip(batch, rows_of, strict=True):
                 found[i] = tiles[i][chosen]
@@ -172,14 +157,13 @@ def _normalised(points: NDArray[np.float64], path: Path) -> Tensor:
 
 @torch.no_grad()
 def _rows(sampler: Sampler, points: Tensor, m: int) -> Tensor:
-    """Return m different rows ``(B, m)`` of every tile ``(B, n, 3 + C)``."""
+    """Return m different rows ``(B, m)`` of every tile ``(B, n, 3)``."""
     if m == points.shape[1]:
         return torch.arange(m).expand(len(points), m)
     output = sampler(points, m)
     if output.indices is not None:
         return output.indices
-    places = coordinates(points)
-    return complete(match(coordinates(output.points), places), places)
+    return complete(match(output.points, points), points)
 
 
 def _refill(

@@ -46,7 +46,6 @@ class AtlasNet(nn.Module):
         pieces: M, the number of patches.
         codeword: size d of the codeword.
         patch_channels: sizes of the layers of every patch.
-        attributes: as for ``AutoEncoder``.
 
     Raises:
         UserError: an argument is out of range.
@@ -58,7 +57,6 @@ class AtlasNet(nn.Module):
         pieces: int = 4,
         codeword: int = 128,
         patch_channels: Sequence[int] = (1024, 512, 512),
-        attributes: Sequence[str] = (),
     ) -> None:
         super().__init__()
         if pieces < 1:
@@ -67,8 +65,7 @@ class AtlasNet(nn.Module):
             raise UserError(f"n_points must be at least pieces={pieces}, got {n_points}.")
         check_channels("patch_channels", patch_channels)
         self.n_points = n_points
-        self.attributes = tuple(attributes)
-        self.encoder = PointEncoder(codeword, attributes=len(attributes))
+        self.encoder = PointEncoder(codeword)
         self.patches = nn.ModuleList(Patch(codeword, patch_channels) for _ in range(pieces))
 
     def forward(self, points: Tensor, n_points: int | None = None) -> Tensor:

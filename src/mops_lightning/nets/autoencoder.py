@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from mops_lightning.errors import UserError
 from mops_lightning.nets.layers import (
     PointMLP,
-    attribute_scale,
     check_channels,
     linear_norm_relu,
 )
@@ -24,7 +23,6 @@ class PointEncoder(nn.Module):
     Args:
         codeword: size d of the codeword, the last layer.
         channels: sizes of the layers before it.
-        attributes: number of attributes of every point.
 
     Raises:
         UserError: a layer has no channels.
@@ -34,24 +32,22 @@ class PointEncoder(nn.Module):
         self,
         codeword: int = 128,
         channels: Sequence[int] = (64, 128, 128, 256),
-        attributes: int = 0,
     ) -> None:
         super().__init__()
         if codeword < 1:
             raise UserError(f"codeword must be at least 1, got {codeword}.")
         check_channels("channels", channels)
         self.codeword = codeword
-        self.scale = attribute_scale(attributes)
-        self.features = PointMLP([3 + attributes, *channels])
+        self.features = PointMLP([3, *channels])
         self.pool = PointMaxPool(channels[-1], codeword)
 
     def forward(self, points: Tensor) -> Tensor:
         """Map ``(B, N, 3)`` points to ``(B, d)`` codewords, any N."""
-        return self.pool(self.features(self.scale(points)))
+        return self.pool(self.features(points))
 
     def point_features(self, points: Tensor) -> Tensor:
         """Return the features ``(B, N, d)`` whose maxima over points are the codeword."""
-        return self.pool.values(self.features(self.scale(points)))
+        return self.pool.values(self.features(points))
 
 
 class AutoEncoder(nn.Module):
@@ -62,8 +58,6 @@ class AutoEncoder(nn.Module):
         codeword: size d of the codeword.
         encoder_channels: sizes of the encoder's layers before the codeword.
         decoder_channels: sizes of the decoder's hidden layers, with ReLU and without BatchNorm.
-        attributes: names of C attributes that the points have as further channels, in the files'
-            own unit. The encoder takes them; coordinates alone are rebuilt.
 
     Raises:
         UserError: an argument is out of range.
@@ -75,7 +69,6 @@ class AutoEncoder(nn.Module):
         codeword: int = 128,
         encoder_channels: Sequence[int] = (64, 128, 128, 256),
         decoder_channels: Sequence[int] = (256, 256),
-        attributes: Sequence[str] = (),
     ) -> None:
         super().__init__()
         if n_points < 1:
@@ -83,8 +76,7 @@ class AutoEncoder(nn.Module):
         check_channels("encoder_channels", encoder_channels)
         check_channels("decoder_channels", decoder_channels)
         self.n_points = n_points
-        self.attributes = tuple(attributes)
-        self.encoder = PointEncoder(codeword, encoder_channels, len(attributes))
+        self.encoder = PointEncoder(codeword, encoder_channels)
         self.decoder = nn.Sequential(
             *linear_norm_relu([codeword, *decoder_channels], norm=False),
             nn.Linear(decoder_channels[-1], 3 * n_points),

@@ -146,7 +146,6 @@ class MFoldingNet(nn.Module):
         codeword: size d of the codeword, a multiple of M.
         encoder: ``mlp``, the encoder of all nets in the paper, or ``graph``, FoldingNet's own.
         fold_channels: sizes of the hidden layers of each of the two foldings.
-        attributes: as for ``AutoEncoder``; not with the encoder ``graph``.
 
     Raises:
         UserError: an argument is out of range.
@@ -159,24 +158,18 @@ class MFoldingNet(nn.Module):
         codeword: int = 128,
         encoder: Literal["mlp", "graph"] = "mlp",
         fold_channels: Sequence[int] = (2048, 144),
-        attributes: Sequence[str] = (),
     ) -> None:
         super().__init__()
         if n_points < pieces:
             raise UserError(f"n_points must be at least pieces={pieces}, got {n_points}.")
         self.n_points = n_points
-        self.attributes = tuple(attributes)
         self.encoder: GraphEncoder | PointEncoder
         if encoder not in ENCODERS:
             raise UserError(f"encoder: unknown {encoder!r}.{did_you_mean(encoder, ENCODERS)}")
         if encoder == "graph":
-            if attributes:
-                raise UserError(
-                    f"encoder must be mlp with attributes ({', '.join(attributes)}), got graph."
-                )
             self.encoder = GraphEncoder(codeword)
         else:
-            self.encoder = PointEncoder(codeword, attributes=len(attributes))
+            self.encoder = PointEncoder(codeword)
         self.decoder = FoldingDecoder(codeword, pieces, fold_channels)
 
     def forward(self, points: Tensor, n_points: int | None = None) -> Tensor:

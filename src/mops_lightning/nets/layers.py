@@ -7,14 +7,10 @@ Layers process ``(B·N, C)`` rows: on a CPU, BatchNorm over rows is 1.6 times fa
 from collections.abc import Sequence
 from itertools import pairwise
 
-import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops.precision import pointwise_autocast, pointwise_autocast_dtype
-
-LIMIT = 5.0
-"""Largest absolute value of a standardised attribute; single points can be far off the rest."""
 
 
 def check_channels(name: str, channels: Sequence[int], min_layers: int = 1) -> None:
@@ -83,69 +79,18 @@ class PointMLP(nn.Module):
         return rows.unflatten(0, features.shape[:2])
 
 
-class AttributeScale(nn.Module):
-    """Standardises the attributes of points: (value − mean) / standard deviation, within ±5.
-
-    Mean and standard deviation are those of the training data. They are saved with the weights, so
-    that a net takes attributes as files have them.
-
-    Args:
-        number: of attributes.
-    """
-
-    mean: Tensor
-    std: Tensor
-
-    def __init__(self, number: int) -> None:
-        super().__init__()
-        self.register_buffer("mean", torch.zeros(number))
-        self.register_buffer("std", torch.ones(number))
-
-    def fit(self, points: Tensor) -> None:
-        """Take mean and standard deviation from ``(B, N, 3 + number)`` points."""
-        values = points[..., 3:].flatten(0, -2).double()
-        std, mean = torch.std_mean(values, 0, correction=0)
-        self.mean.copy_(mean)
-        self.std.copy_(torch.where(std > 0, std, 1.0))
-
-    def forward(self, points: Tensor) -> Tensor:
-        """Map ``(..., 3 + number)`` points to points whose attributes are standardised."""
-        scaled = ((points[..., 3:] - self.mean) / self.std).clamp(-LIMIT, LIMIT)
-        return torch.cat([points[..., :3], scaled], -1)
-
-
-def attribute_scale(number: int) -> nn.Module:
-    """Return the first module of a net that takes ``number`` attributes; without, it does nothing.
-
-    Args:
-        number: of attributes.
-    """
-    return AttributeScale(number) if number else nn.Identity()
-
-
-def fit_attribute_scales(net: nn.Module, points: Tensor) -> None:
-    """Let a net standardise attributes by the statistics of ``(B, N, 3 + C)`` points."""
-    for module in net.modules():
-        if isinstance(module, AttributeScale):
-            module.fit(points)
-
-
 class PointFeatures(nn.Module):
     """Local and global features of a cloud (paper section "Feature Extraction").
 
     Args:
         channels: sizes of the pointwise layers after the coordinates.
-        attributes: number of attributes of every point.
     """
 
-    def __init__(
-        self, channels: Sequence[int] = (64, 64, 64, 128, 128), attributes: int = 0
-    ) -> None:
+    def __init__(self, channels: Sequence[int] = (64, 64, 64, 128, 128)) -> None:
         super().__init__()
-        self.scale = attribute_scale(attributes)
-        self.mlp = PointMLP([3 + attributes, *channels])
+        self.mlp = PointMLP([3, *channels])
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Map ``(B, N, 3)`` points to local features ``(B, N, C)`` and their maxima ``(B, C)``."""
-        local = self.mlp(self.scale(points))
+        local = self.mlp(points)
         return local, local.amax(1)

@@ -20,33 +20,6 @@ def gather_points(points: Tensor, indices: Tensor) -> Tensor:
     return points.gather(1, indices[..., None].expand(-1, -1, points.shape[2]))
 
 
-def coordinates(points: Tensor) -> Tensor:
-    """Return the coordinates of points that may have attributes.
-
-    Args:
-        points: ``(..., 3 + C)``, the coordinates first.
-
-    Returns:
-        ``(..., 3)``; the argument itself where C is 0.
-    """
-    return points if points.shape[-1] == 3 else points[..., :3].contiguous()
-
-
-def with_coordinates(points: Tensor, moved: Tensor) -> Tensor:
-    """Replace the coordinates of points and keep their attributes.
-
-    Args:
-        points: ``(..., 3 + C)``.
-        moved: ``(..., 3)``.
-
-    Returns:
-        ``(..., 3 + C)``; ``moved`` itself where C is 0.
-    """
-    if points.shape[-1] == 3:
-        return moved
-    return torch.cat([moved, points[..., 3:].to(moved)], -1)
-
-
 def normalize_unit_sphere(points: Tensor) -> Tensor:
     """Centre every cloud at the origin and scale its largest norm to 1.
 

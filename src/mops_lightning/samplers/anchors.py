@@ -15,7 +15,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from mops_lightning.ops.points import coordinates, distance_dtype, gather_points
+from mops_lightning.ops.points import distance_dtype, gather_points
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.fps import FARTHEST, farthest_rows
 
@@ -57,7 +57,7 @@ class FPSAnchors(nn.Module):
         """Return the first m columns of the sampling matrices.
 
         Args:
-            points: ``(B, N, 3)``, or with attributes.
+            points: ``(B, N, 3)``.
             keys: ``(B, N, C)``, the output of the hidden layers of ρ.
             m: number of columns.
             tau: temperature.
@@ -66,7 +66,7 @@ class FPSAnchors(nn.Module):
             Matrices with queries ``(B, m, C + 4)``, in float32 at least.
         """
         dtype = distance_dtype(points)
-        places, keys = coordinates(points).to(dtype), keys.to(dtype)
+        places, keys = points.to(dtype), keys.to(dtype)
         # Distances are more precise around the mean.
         centred = places - places.mean(1, keepdim=True)
         count = min(SPACING_POINTS, places.shape[1])

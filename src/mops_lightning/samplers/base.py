@@ -8,10 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.ops.points import coordinates, gather_points
 from mops_lightning.ops.precision import restrict_autocast_to_pointwise
 from mops_lightning.ops.readout import complete, match
-from mops_lightning.samplers.ragged import described_shape, select_points
+from mops_lightning.samplers.ragged import select_points
 from mops_lightning.types import SampleOutput
 
 READOUTS = ("generated", "matched", "completed")
@@ -54,11 +53,6 @@ class Sampler(nn.Module):
     size_reduction: Literal["mean", "sum"] = "mean"
     """How the losses at several ``training_sizes`` are reduced to one."""
 
-    attributes: tuple[str, ...] = ()
-    """Names of the C attributes that points have as further channels, in the files' own unit:
-    points are ``(B, N, 3 + C)``, the input as well as the output. Distances are those of the
-    coordinates."""
-
     def __init__(self, m: int) -> None:
         super().__init__()
         if not isinstance(m, int) or m < 1:
@@ -94,7 +88,6 @@ class Sampler(nn.Module):
 
         Args:
             points: ``(N, 3)``, ``(B, N, 3)``, or ``(P, 3)`` with ``batch``; a tensor or an array.
-                3 + C columns for a sampler with C ``attributes``, as files have them.
             m: number of points to return of each cloud; None means ``self.m``.
             readout: of generated points: ``generated``, ``matched`` (the nearest input points,
                 perhaps repeated) or ``completed`` (m different input points).
@@ -134,16 +127,15 @@ class Sampler(nn.Module):
             generated = output.points.to(clouds.device)
             if readout == "generated":
                 return None, generated
-            places = coordinates(clouds)
-            rows = match(coordinates(generated), places)
-            return complete(rows, places) if readout == "completed" else rows, generated
+            rows = match(generated, clouds)
+            return complete(rows, clouds) if readout == "completed" else rows, generated
 
-        return select_points(select, points, m, lengths, batch, self.attributes)
+        return select_points(select, points, m, lengths, batch)
 
     def _checked(self, points: Tensor, m: int) -> SampleOutput:
         """Check the points and sample them, without losses."""
         finite = not (self.training and points.is_cuda)
-        check_points(points, at_least=m, finite=finite, attributes=self.attributes)
+        check_points(points, at_least=m, finite=finite)
         dtype = next((p.dtype for p in self.parameters()), points.dtype)
         if not torch.is_autocast_enabled(points.device.type):
             check_dtype(points, dtype)
@@ -227,32 +219,7 @@ class Sampler(nn.Module):
         """
 
 
-def sample_with_attributes(
-    sampler: Sampler, points: Tensor, sizes: Sequence[int]
-) -> dict[int, SampleOutput]:
-    """Sample points with attributes by any sampler that takes them or selects input points.
-
-    Args:
-        sampler: without ``attributes`` it is given the coordinates, and the attributes of the
-            points that it selects follow.
-        points: ``(B, N, 3 + C)``.
-        sizes: as for ``Sampler.sample_sizes``.
-
-    Returns:
-        As ``Sampler.sample_sizes``, with ``(B, m, 3 + C)`` points.
-    """
-    if points.shape[-1] == 3 or sampler.attributes:
-        return sampler.sample_sizes(points, sizes)
-    found = {}
-    for m, output in sampler.sample_sizes(coordinates(points), sizes).items():
-        assert output.indices is not None  # generated points have no attributes
-        found[m] = output._replace(points=gather_points(points, output.indices))
-    return found
-
-
-def check_points(
-    points: Tensor, at_least: int = 1, finite: bool = True, attributes: Sequence[str] = ()
-) -> None:
+def check_points(points: Tensor, at_least: int = 1, finite: bool = True) -> None:
     """Check that an argument is a batch of clouds with enough points.
 
     Args:
@@ -260,7 +227,6 @@ def check_points(
         at_least: smallest N allowed.
         finite: whether to check for NaN and infinity. On a GPU this check waits for the device;
             training there relies on the check in data loading.
-        attributes: names of the channels after the coordinates.
 
     Raises:
         UserError: the argument is invalid.
@@ -268,9 +234,8 @@ def check_points(
     if not isinstance(points, Tensor):
         raise UserError(f"points must be a torch.Tensor, got {type(points).__name__}.")
     shape = tuple(points.shape)
-    if points.ndim != 3 or points.shape[-1] != 3 + len(attributes):
-        wanted = described_shape("(B, N, 3)", attributes)
-        raise UserError(f"points must have shape {wanted}, got {shape}.")
+    if points.ndim != 3 or points.shape[-1] != 3:
+        raise UserError(f"points must have shape (B, N, 3), got {shape}.")
     if not points.is_floating_point():
         raise UserError(f"points must be floating point, got {points.dtype}.")
     if points.shape[0] == 0 or points.shape[1] == 0:

@@ -36,7 +36,6 @@ class FusedMOPSNet(NamedTuple):
         global_weight: the weights of this layer for the global feature.
         rest: the other hidden layers of ρ.
         queries: ``(M, C)``, the last layer of ρ divided by the temperature.
-        scale: standardises the attributes of points; None without attributes.
     """
 
     features: tuple[Layer, ...]
@@ -44,7 +43,6 @@ class FusedMOPSNet(NamedTuple):
     global_weight: Tensor
     rest: tuple[Layer, ...]
     queries: Tensor
-    scale: nn.Module | None = None
 
     @torch.no_grad()
     def local_features(self, points: Tensor) -> Tensor:
@@ -52,8 +50,7 @@ class FusedMOPSNet(NamedTuple):
         result = points.new_empty(len(points), len(self.features[-1].bias))
         size = _block(points)
         for rows, out in zip(points.split(size), result.split(size), strict=True):
-            seen = rows if self.scale is None else self.scale(rows)
-            out.copy_(_through(self.features, seen))
+            out.copy_(_through(self.features, rows))
         return result
 
     @torch.no_grad()

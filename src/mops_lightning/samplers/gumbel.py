@@ -31,7 +31,6 @@ class GumbelSampler(Sampler):
         tau_min: temperature at the end of training; training starts at 1.
         feature_channels: sizes of the pointwise layers.
         key_channels: sizes of the layers of the MLP.
-        attributes: names of C attributes, see ``Sampler.attributes``.
 
     Raises:
         UserError: an argument is out of range.
@@ -51,7 +50,6 @@ class GumbelSampler(Sampler):
         tau_min: float = 0.1,
         feature_channels: Sequence[int] = (64, 64, 64, 128, 128),
         key_channels: Sequence[int] = (256, 128),
-        attributes: Sequence[str] = (),
     ) -> None:
         super().__init__(m)
         if not 0 < tau_min <= 1:
@@ -60,8 +58,7 @@ class GumbelSampler(Sampler):
         check_channels("key_channels", key_channels)
         self.tau_min = tau_min
         self.training_tau = 1.0
-        self.attributes = tuple(attributes)
-        self.features = PointFeatures(feature_channels, len(attributes))
+        self.features = PointFeatures(feature_channels)
         self.keys = PointMLP([2 * feature_channels[-1], *key_channels])
         self.queries = nn.Linear(key_channels[-1], m, bias=False)
 

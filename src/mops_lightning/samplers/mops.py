@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.losses.subset import overlap_losses, subset_losses
 from mops_lightning.nets.layers import PointFeatures, check_channels, linear_norm_relu
-from mops_lightning.ops.points import coordinates
 from mops_lightning.ops.precision import pointwise_autocast, pointwise_autocast_dtype
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.anchors import FPSAnchors
@@ -43,8 +42,6 @@ class MOPSNet(Sampler):
         threshold: in evaluation, entries of S below it count as zero, as ``SamplingMatrix.sparse``
             drops them (paper section "Efficient Regression of the Sampled Set", with 0.01); 0 keeps
             all. Sampling in chunks keeps all.
-        attributes: names of C attributes, see ``Sampler.attributes``. The features are those of all
-            3 + C channels, and SᵀP has them all.
         anchors: ``fps`` lets the columns of S start as a soft choice of the cloud's farthest points
             (see ``anchors``); None, as in the paper, lets them start at random.
         anchor_width: how soft that choice is before training: the width of the columns as a share
@@ -77,7 +74,6 @@ class MOPSNet(Sampler):
         feature_channels: Sequence[int] = (64, 64, 64, 128, 128),
         rho_channels: Sequence[int] = (512, 256, 128),
         threshold: float = 0.0,
-        attributes: Sequence[str] = (),
         anchors: Literal["fps"] | None = None,
         anchor_width: float = DEFAULT_WIDTH,
         overlap: float = 0.0,
@@ -114,8 +110,7 @@ class MOPSNet(Sampler):
         self.annealing = annealing
         self.training_tau = 1.0
         local = feature_channels[-1]
-        self.attributes = tuple(attributes)
-        self.features = PointFeatures(feature_channels, len(attributes))
+        self.features = PointFeatures(feature_channels)
         # The first layer of ρ acts on [local, global]. The product with the global feature is the
         # same for all points of a cloud, so it is computed once per cloud.
         self.rho_local = nn.Linear(local, rho_channels[0], bias=False)
@@ -183,8 +178,7 @@ class MOPSNet(Sampler):
         assert isinstance(norm, nn.BatchNorm1d)
         queries = self.queries.weight.detach() / self.tau_min
         layers = self.features.mlp.layers
-        net = fuse(layers, self.rho_local, self.rho_global, norm, self.rho, queries)
-        return net._replace(scale=self.features.scale) if self.attributes else net
+        return fuse(layers, self.rho_local, self.rho_global, norm, self.rho, queries)
 
     def _fused_keys(self, points: Tensor) -> Tensor:
         """Return the keys without gradients, from the fused network."""
@@ -214,7 +208,7 @@ class MOPSNet(Sampler):
 
         With ``overlap``, also the penalty on columns that choose the same points.
         """
-        subset = subset_losses(coordinates(points), coordinates(output.points), sizes)
+        subset = subset_losses(points, output.points, sizes)
         losses = {m: {"subset": self.alpha * loss} for m, loss in subset.items()}
         if self.overlap and output.matrix is not None:
             for m, loss in overlap_losses(output.matrix, sizes).items():

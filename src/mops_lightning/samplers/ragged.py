@@ -1,6 +1,6 @@
 """Clouds as people have them: arrays or tensors, one or many, of one or several sizes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import gather_points, with_coordinates
+from mops_lightning.ops.points import gather_points
 
 Select = Callable[[Tensor, int], tuple[Tensor | None, Tensor]]
 """``select(points, m)`` maps ``(B, N, 3)`` float32 in the unit sphere to rows ``(B, m)``, or None
@@ -33,7 +33,6 @@ def select_points(
     m: int,
     lengths: Any = None,
     batch: Any = None,
-    attributes: Sequence[str] = (),
 ) -> tuple[Any, Any]:
     """Move clouds into the unit sphere, select points, and map them back.
 
@@ -43,7 +42,6 @@ def select_points(
         m: number of points to return of each cloud.
         lengths: ``(B,)`` numbers of points of the clouds in ``(B, N, 3)``, the rest being padding.
         batch: ``(P,)`` the cloud of every point, ascending from 0.
-        attributes: names of further columns of the points, which are left as they are.
 
     Returns:
         See ``Sampler.downsample``.
@@ -56,17 +54,17 @@ def select_points(
     if lengths is not None and batch is not None:
         raise UserError("lengths and batch exclude each other. Give lengths for (B, N, 3) points.")
     if batch is not None:
-        _check_shape(tensor, 2, "(P, 3) with batch", attributes)
+        _check_shape(tensor, 2, "(P, 3) with batch")
         found = _flat(select, tensor, m, _tensor("batch", batch))
     elif lengths is not None:
-        _check_shape(tensor, 3, "(B, N, 3) with lengths", attributes)
+        _check_shape(tensor, 3, "(B, N, 3) with lengths")
         found = _padded(select, tensor, m, _tensor("lengths", lengths))
     elif tensor.ndim == 2:
-        _check_shape(tensor, 2, "(N, 3) or (B, N, 3)", attributes)
+        _check_shape(tensor, 2, "(N, 3) or (B, N, 3)")
         one = _selected(select, tensor[None], m)
         found = one[0][0], None if one[1] is None else one[1][0]
     else:
-        _check_shape(tensor, 3, "(N, 3) or (B, N, 3)", attributes)
+        _check_shape(tensor, 3, "(N, 3) or (B, N, 3)")
         found = _selected(select, tensor, m)
     if not as_array:
         return found
@@ -97,17 +95,9 @@ def _floating(points: Tensor) -> Tensor:
     return points
 
 
-def _check_shape(points: Tensor, ndim: int, wanted: str, attributes: Sequence[str]) -> None:
-    if points.ndim != ndim or points.shape[-1] != 3 + len(attributes):
-        wanted = described_shape(wanted, attributes)
+def _check_shape(points: Tensor, ndim: int, wanted: str) -> None:
+    if points.ndim != ndim or points.shape[-1] != 3:
         raise UserError(f"points must have shape {wanted}, got {tuple(points.shape)}.")
-
-
-def described_shape(wanted: str, attributes: Sequence[str]) -> str:
-    """Return the text of a shape of points, such as (B, N, 3), with the attributes' columns."""
-    if not attributes:
-        return wanted
-    return f"{wanted.replace('3', str(3 + len(attributes)))}: x, y, z, {', '.join(attributes)}"
 
 
 def _padded(
@@ -180,12 +170,11 @@ def _selected(select: Select, points: Tensor, m: int) -> tuple[Tensor, Tensor | 
         raise UserError(
             f"points must have at least one cloud and one point, got shape {tuple(points.shape)}."
         )
-    exact = points[..., :3].double()
+    exact = points.double()
     centre = exact.mean(1, keepdim=True)
     radius = torch.linalg.vector_norm(exact - centre, dim=2, keepdim=True).amax(1, keepdim=True)
     radius = torch.where(radius > 0, radius, 1.0)
-    rows, generated = select(with_coordinates(points, ((exact - centre) / radius).float()), m)
+    rows, generated = select(((exact - centre) / radius).float(), m)
     if rows is not None:
         return gather_points(points, rows), rows
-    restored = (generated[..., :3].double() * radius + centre).to(points.dtype)
-    return with_coordinates(generated, restored), None
+    return (generated.double() * radius + centre).to(points.dtype), None

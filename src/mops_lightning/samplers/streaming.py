@@ -103,7 +103,7 @@ def stream_match(generated: Tensor, chunks: Chunks) -> Tensor:
 def _checked(chunks: Chunks, m: int, sampler: MOPSNet) -> Iterable[Tensor]:
     number = 0
     for chunk in chunks():
-        check_points(chunk[None], attributes=sampler.attributes)
+        check_points(chunk[None])
         check_dtype(chunk, sampler.queries.weight.dtype)
         number += len(chunk)
         yield chunk

@@ -36,9 +36,6 @@ class Task(nn.Module):
     clouds_are_batches: bool = True
     """Whether ``make_batch`` leaves clouds as they are, so that their predictions can be kept."""
 
-    takes_attributes: bool = False
-    """Whether the points may have attributes, as channels after the coordinates."""
-
     net_takes: tuple[str, ...] = ("points",)
     """Names of the arguments of the net's ``forward``."""
 

@@ -24,7 +24,6 @@ from mops_lightning.metrics.reconstruction import (
 )
 from mops_lightning.ops.chamfer import chamfer_distance
 from mops_lightning.ops.emd import earth_movers_distance
-from mops_lightning.ops.points import coordinates
 from mops_lightning.tasks.base import Task
 from mops_lightning.types import Batch, TaskOutput
 
@@ -41,7 +40,7 @@ class Reconstruction(Task):
     The loss is the chamfer distance plus ``emd_weight`` times the earth mover's distance. In
     training the latter is computed by blocks (see ``ops.emd``), because exact matching would take
     most of the time. In scores it is exact up to ``exact_up_to`` points, and by larger blocks
-    above. The net may see attributes of the points; coordinates alone are rebuilt.
+    above.
 
     Args:
         net: maps ``(B, M, 3)`` points and a number n to ``(B, n, 3)``.
@@ -59,7 +58,6 @@ class Reconstruction(Task):
     score = NormalizedChamfer.name
     full_score = NormalizedChamfer.full_cloud_metric
     net_takes = ("points", "n_points")
-    takes_attributes = True
 
     def __init__(
         self,
@@ -102,7 +100,7 @@ class Reconstruction(Task):
         Returns:
             The loss terms, and the distances of the reconstructions without a reference.
         """
-        built, clouds = self.predict(batch, points), coordinates(batch.points)
+        built, clouds = self.predict(batch, points), batch.points
         chamfer = chamfer_distance(built, clouds)
         losses = {"chamfer": chamfer.mean()}
         emd = torch.zeros_like(chamfer)
@@ -135,7 +133,7 @@ class Reconstruction(Task):
         return TaskOutput(losses, found, reference)
 
     def _distances(self, batch: Batch, points: Tensor) -> Distances:
-        clouds = coordinates(batch.points)
+        clouds = batch.points
         built = self.predict(batch, points)
         exact = clouds.shape[1] <= self.exact_up_to
         emd = self._emd(built, clouds, None if exact else SCORED_BLOCK, SCORED_ROUNDS)
@@ -156,16 +154,16 @@ class Reconstruction(Task):
         """
         from mops_lightning.viz.reconstruction import ReconstructionResult, reconstruction_grid
 
-        clouds, n = coordinates(batch.points), batch.points.shape[1]
-        full = self.net(batch.points, n)
+        clouds, n = batch.points, batch.points.shape[1]
+        full = self.net(clouds, n)
         reference = chamfer_distance(full, clouds)
         columns = {}
         for name, chosen in samples.items():
-            if chosen.shape == batch.points.shape:
+            if chosen.shape == clouds.shape:
                 continue  # all points have a column of their own
             built = self.net(chosen, n)
             ratios = (chamfer_distance(built, clouds) / reference).tolist()
-            columns[name] = ReconstructionResult(coordinates(chosen), built, ratios)
+            columns[name] = ReconstructionResult(chosen, built, ratios)
         return {"reconstructions": reconstruction_grid(clouds, full, columns, titles)}
 
     def metrics(self, training: bool = False) -> MetricCollection:

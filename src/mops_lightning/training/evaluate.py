@@ -21,7 +21,6 @@ from mops_lightning.training.evaluated_settings import same_settings
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.replay import KEY, OF_RUN, place, trained_run
 from mops_lightning.zoo import weights
-from mops_lightning.zoo.closed_list import attributes_in
 
 
 def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> Evaluated:
@@ -39,7 +38,6 @@ def load(cfg: DictConfig, experiment: Experiment, dataset: CloudDataset) -> Eval
     own_data = record.dataset_fingerprint == dataset.fingerprint
     if experiment.task.requires_same_classes and cfg.weights == OF_RUN and not own_data:
         same_classes(record.class_names, dataset, f"{KEY}: {run}")
-    same_attributes(record.config, dataset, f"{KEY}: {run}")
     learned = experiment.task if cfg.learn == "task" else experiment.sampler
     what = "task net" if cfg.learn == "task" else "sampler"
     assert learned is not None  # learn=nothing builds a sampler
@@ -89,25 +87,6 @@ def same_classes(names: list[str] | None, dataset: CloudDataset, what: str) -> N
             f"the data: {', '.join(missing[:3])} ... instead of {', '.join(here[:3])} .... "
             "Give a task net of these classes with weights=auto, or data of its classes with "
             "dataset.classes."
-        )
-
-
-def same_attributes(config: dict[str, Any], dataset: CloudDataset, what: str) -> None:
-    """Reject a net that takes other attributes than the data have.
-
-    Args:
-        config: of the run that trained the net.
-        dataset: the data.
-        what: the file or folder of the net.
-
-    Raises:
-        UserError: names or their order differ.
-    """
-    there, here = attributes_in(config), list(dataset.attributes)
-    if there != here:
-        raise UserError(
-            f"{what} was trained with dataset.features=[{','.join(there)}], got "
-            f"[{','.join(here)}]. Give the same ones, or other weights."
         )
 
 

@@ -17,7 +17,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
 from mops_lightning.records.readout_names import FULL, REFINED, SOFT_PROJECTED, size_prefix
-from mops_lightning.samplers.base import Sampler, sample_with_attributes
+from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
 from mops_lightning.tasks.refinement import Refinement
@@ -181,7 +181,7 @@ class Experiment(L.LightningModule):
         """Sample at all sizes; without a sampler, the task net is given all points."""
         if self.sampler is None:
             return {m: SampleOutput(points, None, {}) for m in sizes}
-        return sample_with_attributes(self.sampler, points, sizes)
+        return self.sampler.sample_sizes(points, sizes)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the task loss plus the sampler's losses, over all sizes of this step.
@@ -266,7 +266,7 @@ class Experiment(L.LightningModule):
             samples = readouts(batch.points, outputs, self.sampler, refine)
             for name, baseline in self.baselines.items():
                 assert isinstance(baseline, Sampler)
-                found = sample_with_attributes(baseline, batch.points, self.sizes)
+                found = baseline.sample_sizes(batch.points, self.sizes)
                 for m, output in found.items():
                     samples[m].setdefault(name, output.points)
             reference = self.task.reference(batch)

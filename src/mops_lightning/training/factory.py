@@ -4,16 +4,12 @@ from typing import Any
 
 import lightning as L
 import torch
-from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from mops_lightning.config.build import accepted, build, settings_named
 from mops_lightning.data.clouds import CloudDataset
-from mops_lightning.errors import UserError
-from mops_lightning.nets.layers import fit_attribute_scales
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.task_net import TaskNetSampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
 from mops_lightning.training.experiment import Experiment
@@ -32,13 +28,12 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     Raises:
         UserError: a setting that its part or the data do not allow.
     """
-    attributes = dataset.attributes
-    task = _make_task(cfg, len(dataset.class_names), attributes)
+    task = _make_task(cfg, len(dataset.class_names))
     # A seed of its own: the sampler's initial weights must not depend on the task net's size.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
     # For samplers that select points by the task net's features.
     net = {"net": task.net}
-    own = accepted(cfg.sampler, {**net, "attributes": attributes})
+    own = accepted(cfg.sampler, net)
     sampler = build(cfg.sampler, "sampler", **own) if cfg.learn != "task" else None
     points = task.points_of(dataset.test.points.shape[1])
     sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, points, training=cfg.learn != "nothing")
@@ -48,11 +43,6 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     elif sampler is not None and sampler.flexible:
         sampler = build(cfg.sampler, "sampler", m=max(sizes), **own)
     _check_cloud_size(cfg, sampler, baselines, points)
-    if attributes:
-        for one in (sampler, *baselines.values()):
-            _check_attributes(one, attributes)
-        for module in (task, *([sampler] if sampler is not None else [])):
-            fit_attribute_scales(module, dataset.train.points)
     make_optimizer, make_schedule = optimizer_makers(cfg.optimizer)
     if cfg.learn != "nothing":
         _try_optimizer(make_optimizer, make_schedule)
@@ -82,34 +72,9 @@ def _recipe(cfg: DictConfig, sampler: Sampler | None) -> Recipe:
     return Recipe(**settings) if sampler.learned else Recipe()
 
 
-def _check_attributes(sampler: Sampler | None, attributes: tuple[str, ...]) -> None:
-    """Refuse a sampler whose points would have no attributes.
-
-    Raises:
-        UserError: it generates points from coordinates alone, or uses the task net.
-    """
-    if sampler is None or sampler.attributes:
-        return
-    if sampler.generates or isinstance(sampler, TaskNetSampler):
-        others = "sampler=fmops, mops, gumbel or fps, or leave dataset.features out"
-        raise _no_attributes(attributes, type(sampler).__name__, others)
-
-
-def _no_attributes(attributes: tuple[str, ...], taken_by: str, others: str) -> UserError:
-    given = f"dataset.features=[{','.join(attributes)}]"
-    return UserError(f"{given}: {taken_by} takes coordinates only. Choose {others}.")
-
-
-def _make_task(cfg: DictConfig, num_classes: int, attributes: tuple[str, ...]) -> Task:
+def _make_task(cfg: DictConfig, num_classes: int) -> Task:
     L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
-    if attributes and not getattr(get_object(cfg.task._target_), "takes_attributes", False):
-        others = "task=reconstruction, or leave dataset.features out"
-        raise _no_attributes(attributes, f"task={cfg.names.task}", others)
-    offered = accepted(cfg.task.net, {"num_classes": num_classes, "attributes": attributes})
-    if attributes and "attributes" not in offered:
-        others = "task/net=autoencoder, mfoldingnet or atlasnet"
-        raise _no_attributes(attributes, f"task/net={cfg.names.net}", others)
-    net = build(cfg.task.net, "task.net", **offered)
+    net = build(cfg.task.net, "task.net", **accepted(cfg.task.net, {"num_classes": num_classes}))
     return task_with(cfg, net, num_classes)
 
 

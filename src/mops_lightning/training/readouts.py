@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 
 from torch import Tensor
 
-from mops_lightning.ops.points import coordinates, gather_points
+from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.records.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT, REFINED
 from mops_lightning.samplers.base import Sampler
@@ -27,8 +27,7 @@ def readouts(
     """Return every readout at every size.
 
     Args:
-        points: ``(B, N, 3)`` the clouds, or ``(B, N, 3 + C)`` with attributes, which the points of
-            all readouts then have as well.
+        points: ``(B, N, 3)`` the clouds.
         outputs: what ``sampler.sample_sizes`` returned for them, by size.
         sampler: says whether it generates points and whether its sizes are nested; None for
             outputs that are the clouds themselves.
@@ -45,16 +44,12 @@ def readouts(
     generates = sampler is not None and sampler.generates
     # Points are matched one by one, so matching the largest nested set matches all smaller ones.
     nested = generates and sampler is not None and sampler.nested
-    places = coordinates(points)
-    largest = match(coordinates(outputs[max(outputs)].points), places) if nested else None
+    largest = match(outputs[max(outputs)].points, points) if nested else None
     for m, output in outputs.items():
         sets = [output.points]
         if generates:
-            if largest is None:
-                matched = match(coordinates(output.points), places)
-            else:
-                matched = largest[:, :m]
-            rows[m] = complete(matched, places)
+            matched = match(output.points, points) if largest is None else largest[:, :m]
+            rows[m] = complete(matched, points)
             sets += [gather_points(points, matched), gather_points(points, rows[m])]
         elif output.indices is not None:
             rows[m] = output.indices

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import coordinates, gather_points
+from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.types import Batch, PairBatch, SampleOutput
 
@@ -138,11 +138,11 @@ def straight_through(sampled: SampleOutput, points: Tensor, completed: bool = Fa
         ``(B, M, 3)``. Of generated points with the same match, the first one has the gradients of
         a completed set; the farthest points of this set have none.
     """
-    generated, places = sampled.points, coordinates(points)
-    rows = match(coordinates(generated), places)
+    generated = sampled.points
+    rows = match(generated, points)
     if not completed:
         return generated + (gather_points(points, rows) - generated).detach()
-    filled = complete(rows, places)
+    filled = complete(rows, points)
     same = filled[:, :, None] == rows[:, None, :]
     generated = gather_points(generated, same.byte().argmax(2))
     chosen = gather_points(points, filled)

@@ -6,7 +6,6 @@ from torch import Tensor, nn
 from torchmetrics import MeanMetric, Metric, MetricCollection
 
 from mops_lightning.metrics.sampled_set import SET_METRICS
-from mops_lightning.ops.points import coordinates
 from mops_lightning.types import SampleOutput, TaskOutput
 
 
@@ -73,13 +72,11 @@ class Scores(nn.Module):
         """
         # The largest nested set contains all smaller ones, so it is measured once for all.
         groups = {max(outputs): tuple(outputs)} if nested else {m: (m,) for m in outputs}
-        places = coordinates(points)
         updated: dict[str, Metric] = {}
         for largest, sizes in groups.items():
             output = outputs[largest]
-            output = output._replace(points=coordinates(output.points))
             for name, cls in SET_METRICS.items():
-                for m, values in (cls.measure(places, output, sizes) or {}).items():
+                for m, values in (cls.measure(points, output, sizes) or {}).items():
                     key = f"{prefixes[m]}{name}"
                     mean = self.sets[key]
                     assert isinstance(mean, cls)

@@ -82,7 +82,6 @@ def _load_weights(job: Job, record: RunRecord, task_weights: Path | None) -> Non
     if task_weights is not None:
         try:
             content = weights.read(task_weights)
-            evaluate.same_attributes(content["config"], job.dataset, str(task_weights))
             weights.fit_state(task, content["state"], task_weights)
         except UserError as error:
             raise UserError(f"weights: {error}") from None

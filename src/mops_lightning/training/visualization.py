@@ -15,9 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from mops_lightning.metrics.info import MetricInfo
-from mops_lightning.ops.points import coordinates
 from mops_lightning.records.readout_names import FULL
-from mops_lightning.samplers.base import sample_with_attributes
 from mops_lightning.training.readouts import readouts
 from mops_lightning.viz.clouds import (
     COLOURS,
@@ -75,9 +73,8 @@ class CloudVisualization(Callback):
         module.train(training)
         task: Any = module.task
         titles = task.cloud_titles(self.titles)
-        places = coordinates(batch.points)
         if folder is not None and samples:
-            save_clouds(folder / CLOUDS, places, samples, titles)
+            save_clouds(folder / CLOUDS, batch.points, samples, titles)
         for name, figure in figures.items():
             path = folder and save_figure(figure, folder / f"{name}.png")
             if board is None:
@@ -88,7 +85,7 @@ class CloudVisualization(Callback):
                 pixels = np.asarray(Image.open(path).convert("RGB"))
                 board.experiment.add_image(name, pixels, trainer.global_step, dataformats="HWC")
         if board is not None:
-            _add_meshes(board, places, samples, titles, trainer.global_step)
+            _add_meshes(board, batch.points, samples, titles, trainer.global_step)
 
     @torch.no_grad()
     def _figures(
@@ -104,21 +101,17 @@ class CloudVisualization(Callback):
         points, sampler, m = batch.points, module.sampler, module.m
         # Baselines do not change in training, so they are drawn once, at the end.
         baselines = () if scores is None else module.baselines.items()
-        methods = {
-            name: sample_with_attributes(baseline, points, (m,))[m].points
-            for name, baseline in baselines
-        }
+        methods = {name: baseline(points, m).points for name, baseline in baselines}
         if sampler is None:
             return module.task.figures(batch, {**methods, FULL: points}, self.titles), {}
-        output = sample_with_attributes(sampler, points, (m,))[m]
+        output = sampler(points, m)
         samples = readouts(points, {m: output}, sampler)[m]
         figures = module.task.figures(batch, {**methods, **samples}, self.titles)
         titles = module.task.cloud_titles(self.titles)
         if scores is not None:
             main = {**methods, module.main_readout: samples[module.main_readout]}
             figures["comparison"] = self._comparison(module, points, main, scores)
-        samples = {name: coordinates(chosen) for name, chosen in samples.items()}
-        figures["clouds"] = cloud_grid(coordinates(points), samples, titles)
+        figures["clouds"] = cloud_grid(points, samples, titles)
         matrix = output.matrix
         if matrix is not None and points.shape[1] * matrix.m <= DENSE_PIXELS:
             first = matrix.first_cloud()
@@ -142,8 +135,8 @@ class CloudVisualization(Callback):
             score = scores.get(f"test/{prefix}{name}/{info.name}")
             value = "" if score is None else f": {info.format(float(score))} {info.unit}"
             captions[name] = labels.get(name, name) + value
-        drawn = {name: coordinates(chosen)[shown] for name, chosen in samples.items()}
-        return comparison(coordinates(points)[shown], drawn, captions)
+        drawn = {name: chosen[shown] for name, chosen in samples.items()}
+        return comparison(points[shown], drawn, captions)
 
 
 def _add_meshes(

@@ -117,25 +117,6 @@ def at_most(number: int) -> Iterator[None]:
         hook.remove()
 
 
-def with_attributes(node: Any, config: dict[str, Any]) -> Any:
-    """Return the description of a module, with the attributes of the data it was trained on.
-
-    Args:
-        node: as for ``ClosedList.build``.
-        config: the run's configuration.
-    """
-    names = attributes_in(config)
-    return {**node, "attributes": names} if names and isinstance(node, dict) else node
-
-
-def attributes_in(config: dict[str, Any]) -> list[str]:
-    """Return the attributes of a run's data, ``dataset.features``; none for damaged settings."""
-    dataset = config.get("dataset")
-    names = dataset.get("features") if isinstance(dataset, dict) else None
-    plain = isinstance(names, list) and all(isinstance(name, str) for name in names)
-    return list(names) if plain and names else []
-
-
 def _is_plain(value: Any) -> bool:
     if isinstance(value, list):
         return all(item is not None and _is_plain(item) for item in value)

@@ -89,16 +89,10 @@ def plain_net(sampler: Sampler, m: int | None = None) -> nn.Module:
         m: number of points; None means ``sampler.m``.
 
     Raises:
-        UserError: the sampler has no weights, selects input points, takes attributes, or does not
-            return m points.
+        UserError: the sampler has no weights, selects input points, or does not return m points.
     """
     m = sampler.m if m is None else m
     sampler.check_m(m)
-    if sampler.attributes:
-        raise UserError(
-            f"the sampler takes attributes ({', '.join(sampler.attributes)}) and cannot be "
-            "exported. Export one that was trained without dataset.features."
-        )
     if isinstance(sampler, MOPSNet) and not sampler.streams:
         raise UserError(
             f"{type(sampler).__name__} with anchors=fps cannot be exported, as its farthest points "

@@ -16,7 +16,7 @@ from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.zoo import names, weights
-from mops_lightning.zoo.closed_list import ClosedList, with_attributes
+from mops_lightning.zoo.closed_list import ClosedList
 
 SAMPLERS: tuple[type[Sampler], ...] = (
     MOPSNet,
@@ -58,8 +58,7 @@ def load(path: str | Path) -> Sampler:
     Returns:
         The sampler in eval mode on the CPU. It maps points ``(B, N, 3)`` to a ``SampleOutput`` with
         points ``(B, M, 3)``, M being the number of points that it was trained for, or any smaller
-        one for a flexible sampler. If it was trained with ``dataset.features``, its ``attributes``
-        are these, and points are ``(B, N, 3 + C)``.
+        one for a flexible sampler.
 
     Raises:
         UserError: the file is missing, damaged, not a sampler's, or does not match the sampler.
@@ -81,6 +80,5 @@ def load(path: str | Path) -> Sampler:
     config = content["config"]
     if config.get("learn") == "task":
         raise UserError(f"{path} holds a task net, not a sampler. {HINT}")
-    node = with_attributes(config.get("sampler"), config)
-    sampler: Sampler = LISTED.build(node, content["state"], path, HINT)
+    sampler: Sampler = LISTED.build(config.get("sampler"), content["state"], path, HINT)
     return sampler.eval()

@@ -14,7 +14,7 @@ from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import PointNetTransform, PointNetVanilla
 from mops_lightning.zoo import names, weights
-from mops_lightning.zoo.closed_list import ClosedList, with_attributes
+from mops_lightning.zoo.closed_list import ClosedList
 
 NETS: dict[str, type[nn.Module]] = {
     "pointnet": PointNetVanilla,
@@ -76,7 +76,7 @@ def load_net(path: str | Path, task: str, num_classes: int) -> LoadedNet:
         raise UserError(f"{path} holds a net for {trained_for}, not for {task}. Give a net for it.")
     # The file is a task's, whose only part with weights is the net.
     state = {name.removeprefix("net."): value for name, value in content["state"].items()}
-    described = with_attributes(below(config, "task").get("net"), config)
+    described = below(config, "task").get("net")
     net = LISTED.build(described, state, path, HINT, num_classes=num_classes)
     kind = next(name for name, cls in NETS.items() if type(net) is cls)
     return LoadedNet(net.eval(), kind, content)
