@@ -91,11 +91,12 @@ def end(name: str, message: str, status: int) -> NoReturn:
 
 
 @contextmanager
-def one_line_endings(prog: str) -> Iterator[None]:
+def one_line_endings(prog: str, interrupted: str = "interrupted.") -> Iterator[None]:
     """End a subcommand in one line for mistakes, files that cannot be used, and Ctrl-C.
 
     Args:
         prog: what the user typed to start the subcommand.
+        interrupted: the line for Ctrl-C.
 
     Raises:
         SystemExit: instead of these errors, and see ``quiet_on_closed_pipe``.
@@ -111,7 +112,7 @@ def one_line_endings(prog: str) -> Iterator[None]:
         except OSError as error:
             end(name, file_error(error), USER_ERROR)
         except KeyboardInterrupt:
-            end(name, "interrupted.", INTERRUPTED)
+            end(name, interrupted, INTERRUPTED)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from mops_lightning.downsample_files.processes import Died, Processes
+from mops_lightning.files.processes import Died, Processes
 from mops_lightning.zoo.weights import digest
 from tests.support import mutations
 from tests.support.fuzz_readers import try_file

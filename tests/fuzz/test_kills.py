@@ -19,7 +19,7 @@ import pytest
 
 from mops_lightning.cli.sweep import run_cell
 from mops_lightning.config.compose import compose
-from mops_lightning.downsample_files.cli import main as downsample
+from mops_lightning.files.downsample_cli import main as downsample
 from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE

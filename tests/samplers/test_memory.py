@@ -50,10 +50,13 @@ print(status("VmHWM") - before)
 IN_CHUNKS = """
 import numpy as np
 
-from mops_lightning.downsample_files.large import by_chunks
+from mops_lightning.files.chunks import sample_by_chunks
+from mops_lightning.files.engine import LocalEngine
+from mops_lightning.files.options import Options
 from mops_lightning.samplers.mops import MOPSNet
 
 sampler = MOPSNet(16, feature_channels=(8, 8), rho_channels=(8, 8)).eval()
+options = Options(16, "weights", readout="matched", chunk=20_000)
 sizes, peaks = (200_000, 4_000_000), []
 for number in sizes:
     path = Path(sys.argv[1]) / f"{number}.npy"
@@ -65,7 +68,7 @@ for number in sizes:
 for number in sizes:
     path = Path(sys.argv[1]) / f"{number}.npy"
     reset_peak()
-    by_chunks(path, sampler, 16, 20_000, "matched", False)
+    sample_by_chunks(path, sampler, 16, options, LocalEngine())
     peaks.append(status("VmHWM"))
 print(peaks[1] - peaks[0])
 """

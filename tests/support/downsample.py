@@ -1,6 +1,6 @@
 """The command that downsamples files, in this process."""
 
-from mops_lightning.downsample_files.cli import main
+from mops_lightning.files.downsample_cli import main
 from tests.support.captured import captured
 
 

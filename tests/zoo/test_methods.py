@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from mops_lightning import downsample, load
-from mops_lightning.downsample_files.settings import METHODS
 from mops_lightning.errors import UserError
+from mops_lightning.files.options import METHODS
 from mops_lightning.zoo import methods, publish
 from tests.support.models import write_run
 

@@ -20,10 +20,10 @@ COMMANDS = {
         "mops_lightning.report.cli", "tables, plots and a page from the records of runs"
     ),
     "downsample": Command(
-        "mops_lightning.downsample_files.cli", "downsample clouds and meshes from files"
+        "mops_lightning.files.downsample_cli", "downsample clouds and meshes from files"
     ),
     "compare": Command(
-        "mops_lightning.compare.cli", "what methods of downsampling are worth on your own files"
+        "mops_lightning.files.compare_cli", "compare downsampling methods on your own files"
     ),
     "models": Command(
         "mops_lightning.cli.models", "trained models: list, show a card, publish a run as one"

@@ -1,4 +1,4 @@
-"""Which file is written for each input file."""
+"""Input files, and the output file of each."""
 
 from collections import Counter
 from pathlib import Path
@@ -8,38 +8,35 @@ from mops_lightning.data.formats.registry import READABLE, WRITERS
 from mops_lightning.errors import UserError, one_line
 from mops_lightning.filesystem import is_temporary
 
-Job = tuple[Path, Path]
+FilePair = tuple[Path, Path]
 """An input file and its output file."""
 
 
-def jobs(source: Path, target: Path, file_format: str | None, keep_attributes: bool) -> list[Job]:
+def file_pairs(source: Path, target: Path, keep_attributes: bool) -> list[FilePair]:
     """Return the input files and their output files.
+
+    An output file in a folder has the format of its input, or .ply where that cannot be written.
 
     Args:
         source: a file or a folder.
         target: a file or a folder; a folder if ``source`` is one.
-        file_format: suffix of output files in a folder; None: as the input, or .ply for formats
-            that cannot be written.
         keep_attributes: the output format must hold attributes.
 
     Raises:
         UserError: an input is missing, or an output is ambiguous or cannot be written.
     """
     try:
-        return _jobs(source, target, file_format, keep_attributes)
+        return _file_pairs(source, target, keep_attributes)
     except OSError as error:  # a name that is too long, a folder that may not be read
         raise UserError(f"IN or OUT cannot be used: {one_line(error)}.") from None
     except RuntimeError:  # of pathlib
         raise UserError(f"IN or OUT: {source} or {target} is a loop of symbolic links.") from None
 
 
-def _jobs(source: Path, target: Path, file_format: str | None, keep_attributes: bool) -> list[Job]:
-    wanted = f".{file_format.lstrip('.').lower()}" if file_format else None
-    if wanted and wanted not in WRITERS:
-        raise UserError(f"--format must be one of {', '.join(WRITERS)}, got {file_format}.")
+def _file_pairs(source: Path, target: Path, keep_attributes: bool) -> list[FilePair]:
     if not source.exists():
         raise UserError(f"{source}: no such file or folder.")
-    if keep_attributes and ".obj" in (wanted, target.suffix.lower()):
+    if keep_attributes and target.suffix.lower() == ".obj":
         raise UserError("--keep-attributes: .obj holds coordinates only. Use .ply, .pcd or .npz.")
     if target.resolve() == source.resolve():
         raise UserError(f"OUT must differ from IN, got {source} for both.")
@@ -49,7 +46,7 @@ def _jobs(source: Path, target: Path, file_format: str | None, keep_attributes: 
     def suffix(path: Path) -> str:
         own = path.suffix.lower()
         loses_attributes = own == ".obj" and keep_attributes
-        return wanted or (own if own in WRITERS and not loses_attributes else ".ply")
+        return own if own in WRITERS and not loses_attributes else ".ply"
 
     if source.is_dir():
         goals = {path: path.relative_to(source) for path in _inputs(source, target)}
@@ -90,13 +87,11 @@ def _inputs(source: Path, target: Path) -> list[Path]:
     return files
 
 
-def _distinct(found: list[Job]) -> list[Job]:
+def _distinct(found: list[FilePair]) -> list[FilePair]:
     """Reject two input files with the same output file."""
     targets = Counter(path for _, path in found)
     twice = next((path for path, number in targets.items() if number > 1), None)
     if twice:
         both = " and ".join(str(source) for source, target in found if target == twice)
-        raise UserError(
-            f"{both} have the same output {twice}. Rename one, or give another --format."
-        )
+        raise UserError(f"{both} have the same output {twice}. Rename one.")
     return found

@@ -11,93 +11,94 @@ from collections import Counter
 from collections.abc import Generator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rich.progress import track
 
 from mops_lightning.data.formats import limits
-from mops_lightning.downsample_files.outputs import check_writable
-from mops_lightning.downsample_files.processes import Died, processes
-from mops_lightning.downsample_files.settings import Settings
 from mops_lightning.errors import UserError, one_line, printable
+from mops_lightning.files.engine import Engine
+from mops_lightning.files.options import Options
+from mops_lightning.files.paths import FilePair, check_writable
+from mops_lightning.files.processes import Died, processes
+
+if TYPE_CHECKING:
+    from mops_lightning.files.downsample import Outcome
 
 
 def attempt(
-    source: Path, target: Path, settings: Settings, workers: int | None, engine: Any = None
-) -> Any:
-    """Downsample one file and return the result of ``job.run``, or the error.
+    source: Path,
+    target: Path,
+    options: Options,
+    workers: int | None = None,
+    engine: Engine | None = None,
+) -> "Outcome | UserError":
+    """Downsample one file and return the numbers of its points, or the error.
 
     Args:
         source: the file.
         target: the file to write.
-        settings: what to do.
+        options: how.
         workers: number of processes that share the cores; None: leave torch's threads alone.
-        engine: processes the chunks of a file, see ``large.Engine``; None: this process.
+        engine: processes the chunks of a file; None: this process.
     """
-    from mops_lightning.downsample_files.job import run
-    from mops_lightning.downsample_files.large import in_turn
+    from mops_lightning.files.downsample import downsample_file
 
     if workers:
         import torch
 
         torch.set_num_threads(max((os.cpu_count() or 1) // workers, 1))
     try:
-        return run(source, target, settings, engine or in_turn)
+        return downsample_file(source, target, options, engine)
     except UserError as error:
         return error
     except Exception as error:
         return UserError(f"{source}: {one_line(error)}.")
 
 
-def process_file(source: Path, target: Path, settings: Settings, engine: Any) -> None:
-    """Downsample one file and print what was written.
+def process_file(source: Path, target: Path, options: Options, engine: Engine | None) -> None:
+    """Downsample one file and print the numbers of its points.
 
     Raises:
         UserError: it failed.
     """
-
-    def with_progress(title: str, function: Any, cloud: Any, row_ranges: Any, *common: Any) -> Any:
-        results = engine(title, function, cloud, row_ranges, *common)
-        total, hidden = len(row_ranges), not sys.stdout.isatty()
-        return track(results, title, total=total, disable=hidden, transient=True)
-
     start = time.perf_counter()
-    result = attempt(source, target, settings, None, with_progress)
+    result = attempt(source, target, options, engine=engine)
     if isinstance(result, UserError):
         raise result
-    written, number, dropped, seams = result
-    more = f" ({dropped:,} more without finite coordinates left out)" if dropped else ""
-    seconds = time.perf_counter() - start
-    close = ""
-    if seams is not None:
-        close = f", {seams.after:,} of {seams.before:,} close pairs at seams left"
-    print(printable(f"{target}: {written:,} of {number:,} points{more}{close}, {seconds:.1f} s"))
+    more = f" ({result.dropped:,} more without finite coordinates left out)"
+    print(
+        printable(
+            f"{target}: {result.written:,} of {result.number:,} points"
+            f"{more if result.dropped else ''}, {time.perf_counter() - start:.1f} s"
+        )
+    )
 
 
 def process_folder(
-    jobs: list[tuple[Path, Path]],
-    settings: Settings,
+    pairs: list[FilePair],
+    options: Options,
     target: Path,
     workers: int,
     overwrite: bool,
-    engine: Any,
+    engine: Engine | None,
 ) -> int:
     """Downsample files, print errors and a closing line, and return how many files failed.
 
     Args:
-        jobs: input and output files.
-        settings: what to do.
+        pairs: input and output files.
+        options: how.
         target: the folder of the output files, for the closing line.
         workers: number of processes that share the files.
         overwrite: replace existing output files; otherwise they are skipped.
-        engine: see ``large.Engine``.
+        engine: processes the chunks of one file after the other; None: processes share the files.
     """
     done: Counter[str] = Counter()
-    todo = [job for job in jobs if overwrite or not job[1].exists()]
+    todo = [pair for pair in pairs if overwrite or not pair[1].exists()]
     failures, dropped = {}, 0
     if todo:
         check_writable(target)
-    results = _results(todo, settings, workers, engine)
+    results = _results(todo, options, workers, engine)
     with closing(results):  # ends the processes when the user interrupts
         for (source, _), result in track(
             results, "downsampling", total=len(todo), disable=not sys.stdout.isatty()
@@ -106,35 +107,33 @@ def process_folder(
             if isinstance(result, UserError):
                 failures[source] = result
             else:
-                dropped += result[2]
-    if len(jobs) > len(todo):
-        done["skipped"] = len(jobs) - len(todo)
+                dropped += result.dropped
+    if len(pairs) > len(todo):
+        done["skipped"] = len(pairs) - len(todo)
     for source, error in sorted(failures.items()):
         name = "" if str(source) in str(error) else f"{source}: "
         print(printable(f"failed: {name}{error}"), file=sys.stderr)
     counts = ", ".join(f"{number} {state}" for state, number in done.items())
     left = f"; {dropped:,} points without finite coordinates left out" if dropped else ""
-    print(printable(f"{len(jobs)} files: {counts}{left}; in {target}"))
+    print(printable(f"{len(pairs)} files: {counts}{left}; in {target}"))
     return len(failures)
 
 
 def _results(
-    jobs: list[tuple[Path, Path]], settings: Settings, workers: int, engine: Any
-) -> Generator[Any, None, None]:
-    """Yield pairs of job and result, in the order of completion.
+    pairs: list[FilePair], options: Options, workers: int, engine: Engine | None
+) -> Generator["tuple[FilePair, Outcome | UserError]", None, None]:
+    """Yield pairs of files and results, in the order of completion.
 
     Several files are read in other processes, so that one bad file cannot stop the rest; with
     ``--cluster`` the cluster's processes read them.
     """
-    from mops_lightning.downsample_files.large import in_turn
-
-    if engine is not in_turn or len(jobs) < 2:
-        yield from ((job, attempt(*job, settings, None, engine)) for job in jobs)
+    if engine is not None or len(pairs) < 2:
+        yield from ((pair, attempt(*pair, options, engine=engine)) for pair in pairs)
         return
     shared = workers if workers > 1 else None
-    calls = ((*job, settings, shared) for job in jobs)
-    for place, result in processes(min(workers, len(jobs))).run(attempt, calls):
-        yield jobs[place], _death(jobs[place][0], result) if isinstance(result, Died) else result
+    calls = ((*pair, options, shared) for pair in pairs)
+    for place, result in processes(min(workers, len(pairs))).run(attempt, calls):
+        yield pairs[place], _death(pairs[place][0], result) if isinstance(result, Died) else result
 
 
 def _death(source: Path, died: Died) -> UserError:

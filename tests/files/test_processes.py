@@ -9,7 +9,7 @@ import pytest
 
 from mops_lightning import filesystem
 from mops_lightning.data.formats import limits
-from mops_lightning.downsample_files.processes import Died, Processes
+from mops_lightning.files.processes import Died, Processes
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="the system has no timer")
 

@@ -11,12 +11,11 @@ import torch
 
 from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
-from mops_lightning.downsample_files.cluster import cluster, engine_of, environment_kept
-from mops_lightning.downsample_files.large import by_chunks, in_turn
-from mops_lightning.downsample_files.scene import sample_scene
-from mops_lightning.downsample_files.settings import Settings
 from mops_lightning.errors import UserError
-from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.files.chunks import sample_by_chunks
+from mops_lightning.files.dask_engine import DaskEngine, dask_engine, environment_kept
+from mops_lightning.files.engine import LocalEngine
+from mops_lightning.files.options import Options
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.zoo import weights
 from tests.support.downsample import call
@@ -47,6 +46,11 @@ def scan(tmp_path_factory):
     return folder / "scan.ply", sampler
 
 
+def options(readout, size=300):
+    keep_attributes = readout == "matched"
+    return Options(24, "weights", None, readout, keep_attributes, chunk=size)
+
+
 def same(one: Table, other: Table) -> None:
     np.testing.assert_array_equal(one.points, other.points)
     assert list(one.columns) == list(other.columns)
@@ -56,38 +60,36 @@ def same(one: Table, other: Table) -> None:
 
 @pytest.mark.parametrize("readout", ["generated", "matched"])
 def test_workers_equal_one_process(readout, client, scan):
-    here, number, *_ = by_chunks(scan[0], scan[1], 24, 300, readout, True)
-    there, same_number, left_out, _ = by_chunks(
-        scan[0], scan[1], 24, 300, readout, True, engine_of(client)
-    )
-    assert (number, same_number, left_out) == (2780, 2780, 220)
+    local, number, _ = sample_by_chunks(scan[0], scan[1], 24, options(readout), LocalEngine())
+    shared, *numbers = sample_by_chunks(scan[0], scan[1], 24, options(readout), DaskEngine(client))
+    assert (number, *numbers) == (2780, 2780, 220)
     # Threads differ between the two, and with them the order of sums.
-    np.testing.assert_allclose(there.points, here.points, atol=1e-5 * np.ptp(here.points))
+    np.testing.assert_allclose(shared.points, local.points, atol=1e-5 * np.ptp(local.points))
 
 
-def test_workers_sample_tiles_like_one_process(client, scan, tmp_path):
-    settings = Settings(500, method="fps", keep_attributes=True, chunk=700, tile=128)
-    sampler = FPSSampler(500)
-    here = sample_scene(scan[0], tmp_path / "out.ply", sampler, settings, in_turn)
-    there = sample_scene(scan[0], tmp_path / "out.ply", sampler, settings, engine_of(client))
-    assert len(here.table.points) == 500
-    assert here[1:] == there[1:]
-    same(here.table, there.table)
+class Watched:
+    """An engine that calls a function after every result."""
+
+    def __init__(self, engine, watch):
+        self.engine, self.watch = engine, watch
+
+    def map(self, title, function, row_ranges):
+        for done, result in enumerate(self.engine.map(title, function, row_ranges)):
+            self.watch(title, done)
+            yield result
 
 
 def test_killed_worker_leaves_result_unchanged(client, scan):
-    engine, killed = engine_of(client), []
-    whole, *_ = by_chunks(scan[0], scan[1], 24, 300, "matched", True, engine)
+    engine, killed = DaskEngine(client), []
+    whole, *_ = sample_by_chunks(scan[0], scan[1], 24, options("matched"), engine)
 
-    def killing(title, function, cloud, row_ranges, *common):
-        for done, result in enumerate(engine(title, function, cloud, row_ranges, *common)):
-            if title in ("sampling", "matching") and done == 3:
-                pids = client.run(os.getpid)
-                os.kill(next(iter(pids.values())), signal.SIGKILL)
-                killed.append(title)
-            yield result
+    def kill(title, done):
+        if title in ("sampling", "matching") and done == 3:
+            pids = client.run(os.getpid)
+            os.kill(next(iter(pids.values())), signal.SIGKILL)
+            killed.append(title)
 
-    again, *_ = by_chunks(scan[0], scan[1], 24, 300, "matched", True, killing)
+    again, *_ = sample_by_chunks(scan[0], scan[1], 24, options("matched"), Watched(engine, kill))
     assert killed == ["sampling", "matching"]
     same(again, whole)
 
@@ -126,7 +128,7 @@ def test_broken_file_is_named(client, scan, tmp_path):
 
 
 def test_missing_scheduler_is_reported(scan, tmp_path, monkeypatch):
-    monkeypatch.setattr("mops_lightning.downsample_files.cluster.PATIENCE", 1)
+    monkeypatch.setattr("mops_lightning.files.dask_engine.PATIENCE", 1)
     settings = ["--weights", scan[0].parent, "--readout", "generated", "--chunk", 500]
     for address in ("tcp://127.0.0.1:9", "nonsense://"):
         status, _, err = call(scan[0], tmp_path / "a.ply", *settings, "--cluster", address)
@@ -135,12 +137,12 @@ def test_missing_scheduler_is_reported(scan, tmp_path, monkeypatch):
 
 
 def test_scheduler_without_workers_is_reported(monkeypatch):
-    monkeypatch.setattr("mops_lightning.downsample_files.cluster.PATIENCE", 1)
+    monkeypatch.setattr("mops_lightning.files.dask_engine.PATIENCE", 1)
     with (
         environment_kept(),
         distributed.LocalCluster(n_workers=0, dashboard_address=":0") as empty,
         pytest.raises(UserError, match="has no workers"),
-        cluster(empty.scheduler_address, 1),
+        dask_engine(empty.scheduler_address, 1, progress=False),
     ):
         raise AssertionError("there is nobody to work")
 
@@ -176,13 +178,11 @@ def test_lost_scheduler_is_reported(scan):
         ) as one,
         distributed.Client(one) as client,
     ):
-        engine = engine_of(client)
 
-        def closing(*arguments):
-            for result in engine(*arguments):
-                if one.status.name == "running":
-                    one.close()
-                yield result
+        def close(title, done):
+            if one.status.name == "running":
+                one.close()
 
+        engine = Watched(DaskEngine(client), close)
         with pytest.raises(UserError, match="lost the connection"):
-            by_chunks(scan[0], scan[1], 24, 10, "generated", False, closing)
+            sample_by_chunks(scan[0], scan[1], 24, options("generated", 10), engine)

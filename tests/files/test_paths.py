@@ -1,11 +1,11 @@
-"""Which file is written for each input file."""
+"""The output file of each input file."""
 
 from pathlib import Path
 
 import pytest
 
-from mops_lightning.downsample_files.outputs import check_writable, jobs
 from mops_lightning.errors import UserError
+from mops_lightning.files.paths import check_writable, file_pairs
 from mops_lightning.filesystem import TEMPORARY
 
 
@@ -20,39 +20,37 @@ def inputs(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("source", "target", "file_format", "expected"),
+    ("source", "target", "expected"),
     [
-        ("b.npy", "small.ply", None, ["small.ply"]),
-        ("b.npy", "in", None, ["in/b.npy"]),
-        ("in", "out", None, ["out/a.npy", "out/c.ply", "out/deep/b.ply"]),
-        ("in", "out", "LAS", ["out/a.las", "out/c.las", "out/deep/b.las"]),
-        ("in", "in/deep", None, ["in/deep/a.npy", "in/deep/c.ply"]),
+        ("b.npy", "small.ply", ["small.ply"]),
+        ("b.npy", "in", ["in/b.npy"]),
+        ("in", "out", ["out/a.npy", "out/c.ply", "out/deep/b.ply"]),
+        ("in", "in/deep", ["in/deep/a.npy", "in/deep/c.ply"]),
     ],
 )
-def test_outputs_follow_inputs(source, target, file_format, expected, inputs):
-    found = jobs(Path(source), Path(target), file_format, False)
+def test_outputs_follow_inputs(source, target, expected, inputs):
+    found = file_pairs(Path(source), Path(target), False)
     assert [str(path) for _, path in found] == expected
 
 
 @pytest.mark.parametrize(
-    ("source", "target", "file_format", "message"),
+    ("source", "target", "message"),
     [
-        ("b.npy", "b.npy", None, "OUT must differ from IN"),
-        ("b.npy", "b.npy/below.ply", None, "b.npy is a file, not a folder"),
-        ("b.npy", "out.stl", None, "OUT must end in"),
-        ("b.npy", "out.obj", None, ".obj holds coordinates only"),
-        ("b.npy", "out", "stl", "--format must be one of .* got stl"),
-        ("nowhere", "out", None, "nowhere: no such file or folder"),
-        ("in", "b.npy", None, "OUT must be a folder"),
-        ("empty", "out", None, "empty contains no file"),
-        ("in", "out", "ply", "a.npy and in/a.ply have the same output out/a.ply"),
+        ("b.npy", "b.npy", "OUT must differ from IN"),
+        ("b.npy", "b.npy/below.ply", "b.npy is a file, not a folder"),
+        ("b.npy", "out.stl", "OUT must end in"),
+        ("b.npy", "out.obj", ".obj holds coordinates only"),
+        ("nowhere", "out", "nowhere: no such file or folder"),
+        ("in", "b.npy", "OUT must be a folder"),
+        ("empty", "out", "empty contains no file"),
+        ("in", "out", "in/c.ply and in/c.stl have the same output out/c.ply"),
     ],
 )
-def test_impossible_output_is_rejected(source, target, file_format, message, inputs):
+def test_impossible_output_is_rejected(source, target, message, inputs):
     Path("empty").mkdir()
-    Path("in/a.ply").touch()
+    Path("in/c.ply").touch()
     with pytest.raises(UserError, match=message):
-        jobs(Path(source), Path(target), file_format, True)
+        file_pairs(Path(source), Path(target), True)
 
 
 @pytest.mark.parametrize(
@@ -63,14 +61,14 @@ def test_impossible_output_is_rejected(source, target, file_format, message, inp
 def test_outputs_loop_or_long_name_raises(source, target, inputs):
     Path("loop").symlink_to("loop")
     with pytest.raises(UserError, match=r"IN or OUT|no such file|cannot be"):
-        jobs(Path(source), Path(target), None, False)
+        file_pairs(Path(source), Path(target), False)
 
 
 def test_outputs_links_and_temporary_files_are_no_inputs(inputs):
     Path("in/loop.npy").symlink_to("loop.npy")
     Path("in/circle").symlink_to("../in")
     Path(f"in/{TEMPORARY}a-x.npy").touch()
-    found = jobs(Path("in"), Path("out"), None, False)
+    found = file_pairs(Path("in"), Path("out"), False)
     assert [str(path) for path, _ in found] == ["in/a.npy", "in/c.stl", "in/deep/b.ply"]
 
 

@@ -4,11 +4,9 @@ import re
 import numpy as np
 import pytest
 
-from mops_lightning.compare import run
-from mops_lightning.compare.cli import main
-from mops_lightning.compare.methods import methods
 from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
+from mops_lightning.files.compare_cli import main
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
 from tests.support.captured import captured
@@ -36,14 +34,13 @@ def test_compare_writes_table_and_page(folder, tmp_path):
     assert (status, err) == (0, "")
     assert "one.ply: 60 of 700 points" in out
     assert "two.pcd: 90 of 700 points" in out
-    assert "The trained sampler is " in out
     with (tmp_path / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 2 * 5
     assert {row["method"] for row in rows} == {"random", "voxel", "fps", "poisson", "trained"}
-    assert {row["measure"] for row in rows} >= {"chamfer", "hausdorff", "density", "intensity"}
-    largest = {row["method"]: float(row["value"]) for row in rows if row["measure"] == "hausdorff"}
+    largest = {row["method"]: float(row["hausdorff"]) for row in rows}
     assert largest["fps"] < largest["random"]
-    assert (tmp_path / "table.md").read_text() in out
+    assert all(float(row[name]) > 0 for row in rows for name in ("chamfer", "density", "seconds"))
     page = (tmp_path / "compare.html").read_text()
     assert "two.pcd, 90 points" in page
     assert "How to read this" in page
@@ -55,30 +52,27 @@ def test_compare_keeps_an_earlier_comparison(folder, tmp_path):
     earlier = (tmp_path / "table.csv").read_bytes()
     status, out, err = call(*arguments, "--seed", 1)
     assert (status, out) == (2, "")
-    assert re.search(r"--out: .* contains an earlier comparison \(table.md, .*--overwrite", err)
+    assert re.search(r"--out: .* contains an earlier comparison \(.*table.csv\).*--overwrite", err)
     assert (tmp_path / "table.csv").read_bytes() == earlier
     assert call(*arguments, "--seed", 1, "--overwrite")[0] == 0
     assert (tmp_path / "table.csv").read_bytes() != earlier
 
 
-def test_compare_samples_once_before_it_measures_time(folder, monkeypatch):
-    """Imports and compilation belong to no method; the first one had them."""
-    sizes, sample = [], run._rows
-
-    def noted(path, table, *rest):
-        sizes.append(len(table.points))
-        return sample(path, table, *rest)
-
-    monkeypatch.setattr(run, "_rows", noted)
-    run.compare_file(folder / "one.ply", methods(60, ["random"], None, None, None, 0), 0)
-    assert sizes == [120, 700] * 2
+@pytest.mark.parametrize("more", [[], ["--overwrite"]])
+def test_compare_refuses_a_folder_of_other_files(more, folder, tmp_path):
+    (tmp_path / "table.csv").write_text("mine")
+    (tmp_path / "notes.txt").write_text("mine")
+    status, out, err = call(folder / "one.ply", "--m", 30, "--out", tmp_path, *more)
+    assert (status, out) == (2, "")
+    assert "contains notes.txt, which is not part of a comparison" in err
+    assert (tmp_path / "table.csv").read_text() == "mine"
 
 
 def test_compare_page_opens_without_errors(folder, tmp_path, opened):
     call(folder / "one.ply", "--m", 30, "--methods", "random", "--out", tmp_path)
     page, errors, requests = opened((tmp_path / "compare.html").as_uri())
     page.wait_for_selector("#view .legend", timeout=60_000)
-    assert page.locator("#view .legendtext").all_text_contents() == ["input", "fps", "random"]
+    assert page.locator("#view .legendtext").all_text_contents() == ["input", "random"]
     assert (errors, len(requests)) == ([], 1)
 
 

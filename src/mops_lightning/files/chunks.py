@@ -6,7 +6,7 @@ Results are merged in the order of the file, so they do not depend on the distri
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,23 +19,21 @@ from mops_lightning.data.formats.cloud_file import CloudFile
 from mops_lightning.data.formats.errors import check_size
 from mops_lightning.data.formats.registry import open_cloud_file
 from mops_lightning.data.formats.table import Table
-from mops_lightning.downsample_files.seams import Seams
-from mops_lightning.downsample_files.unit_sphere import (
+from mops_lightning.errors import UserError
+from mops_lightning.files.engine import Engine
+from mops_lightning.files.options import Options
+from mops_lightning.files.unit_sphere import (
     UnitSphere,
     largest_distance,
     sum_of,
     unit_sphere,
 )
-from mops_lightning.errors import UserError
 from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.nearest import nearest
+from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fused import FusedMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.streaming import global_part, sum_part
-
-Engine = Callable[..., Iterable[Any]]
-"""``engine(title, function, cloud, row_ranges, *common)`` yields ``function(cloud, rows, *common)``
-for every range of rows, in order."""
 
 
 class Nearest(NamedTuple):
@@ -55,17 +53,6 @@ class Nearest(NamedTuple):
         return Nearest(np.minimum(self.distance, other.distance), Table(points, columns))
 
 
-def in_turn(
-    title: str,
-    function: Callable[..., Any],
-    cloud: CloudFile,
-    row_ranges: list[range],
-    *common: Any,
-) -> Iterable[Any]:
-    """Process one range after the other in this process; see ``Engine``."""
-    return (function(cloud, rows, *common) for rows in row_ranges)
-
-
 class Kept(NamedTuple):
     """What is kept of a file.
 
@@ -73,23 +60,15 @@ class Kept(NamedTuple):
         table: the sampled points.
         number: how many points with finite coordinates the file has.
         dropped: how many it has without.
-        seams: close pairs at the seams of tiles.
     """
 
     table: Table
     number: int
     dropped: int
-    seams: Seams | None = None
 
 
-def by_chunks(
-    source: Path,
-    sampler: Any,
-    m: int,
-    size: int,
-    readout: str,
-    keep_attributes: bool,
-    engine: Engine = in_turn,
+def sample_by_chunks(
+    source: Path, sampler: Sampler, m: int, options: Options, engine: Engine
 ) -> Kept:
     """Sample a file by a trained MOPS-Net without reading it as a whole.
 
@@ -97,23 +76,22 @@ def by_chunks(
         source: of a format in ``registry.CHUNKED``.
         sampler: trained.
         m: number of points to keep.
-        size: number of rows in a range; with m it bounds the memory.
-        readout: generated or matched.
-        keep_attributes: keep the columns of matched points.
-        engine: processes the ranges.
+        options: ``chunk``, with m, bounds the memory.
+        engine: processes the chunks.
 
     Raises:
         UserError: the file is broken or too small, or the sampler cannot work in chunks.
     """
+    assert options.chunk is not None
     if not isinstance(sampler, MOPSNet):
         raise UserError(f"--chunk works with MOPS-Net and FMOPS-Net, not {type(sampler).__name__}.")
     sampler.check_m(m)
     net = sampler.fused()
     whole = open_cloud_file(source)
-    cloud, row_ranges = replace(whole, header=None), whole.row_ranges(size)
+    cloud, row_ranges = replace(whole, header=None), whole.row_ranges(options.chunk)
 
     def over(title: str, function: Callable[..., Any], *common: Any) -> Iterable[Any]:
-        results = engine(title, function, cloud, row_ranges, *common)
+        results = engine.map(title, partial(function, cloud, *common), row_ranges)
         return (result for result in results if result is not None)
 
     number, summed = 0, np.zeros(3)
@@ -127,11 +105,11 @@ def by_chunks(
     sums: Partial = reduce(Partial.merge, over("sampling", _sum, sphere, net, global_, m))
     generated = sums.result()
     dropped = whole.number - number
-    if readout == "generated":
+    if options.readout == "generated":
         return Kept(Table(sphere.restore(generated)), number, dropped)
     found: Nearest = reduce(Nearest.merge, over("matching", _nearest, sphere, generated))
     kept = replace(found.table, header=whole.header)
-    return Kept(kept if keep_attributes else kept.without_attributes(), number, dropped)
+    return Kept(kept if options.keep_attributes else kept.without_attributes(), number, dropped)
 
 
 def _count_and_sum(cloud: CloudFile, rows: range) -> tuple[int, NDArray[np.float64]]:
@@ -139,24 +117,24 @@ def _count_and_sum(cloud: CloudFile, rows: range) -> tuple[int, NDArray[np.float
     return len(table.points), sum_of(table.points)
 
 
-def _largest_distance(cloud: CloudFile, rows: range, centre: NDArray[np.float64]) -> float:
+def _largest_distance(cloud: CloudFile, centre: NDArray[np.float64], rows: range) -> float:
     return largest_distance(cloud.read(rows).points, centre)
 
 
-def _global(cloud: CloudFile, rows: range, sphere: UnitSphere, net: FusedMOPSNet) -> Tensor | None:
+def _global(cloud: CloudFile, sphere: UnitSphere, net: FusedMOPSNet, rows: range) -> Tensor | None:
     points = sphere.normalise(cloud.read(rows).points)
     return global_part(net, points) if len(points) else None
 
 
 def _sum(
-    cloud: CloudFile, rows: range, sphere: UnitSphere, net: FusedMOPSNet, global_: Tensor, m: int
+    cloud: CloudFile, sphere: UnitSphere, net: FusedMOPSNet, global_: Tensor, m: int, rows: range
 ) -> Partial | None:
     points = sphere.normalise(cloud.read(rows).points)
     return sum_part(net, points, global_, m) if len(points) else None
 
 
 def _nearest(
-    cloud: CloudFile, rows: range, sphere: UnitSphere, generated: Tensor
+    cloud: CloudFile, sphere: UnitSphere, generated: Tensor, rows: range
 ) -> Nearest | None:
     table = cloud.read(rows)
     if not len(table.points):

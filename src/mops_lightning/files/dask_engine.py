@@ -11,12 +11,10 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
-from mops_lightning.data.formats.cloud_file import CloudFile
-from mops_lightning.downsample_files.large import Engine
 from mops_lightning.errors import UserError
+from mops_lightning.files.engine import with_progress
 
 LOCAL = "local"
 PATIENCE = 20
@@ -27,12 +25,13 @@ AHEAD = 4
 
 
 @contextmanager
-def cluster(address: str, workers: int) -> Iterator[Engine]:
+def dask_engine(address: str, workers: int, progress: bool) -> Iterator["DaskEngine"]:
     """Yield an engine that distributes its work by Dask.
 
     Args:
         address: of a running scheduler, or ``local`` for processes on this machine.
         workers: number of local processes.
+        progress: show the progress on a terminal.
 
     Raises:
         UserError: Dask is not installed, or no scheduler with workers answers at the address.
@@ -46,7 +45,7 @@ def cluster(address: str, workers: int) -> Iterator[Engine]:
     with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}):
         if address != LOCAL:
             with _client(distributed, address) as client:
-                yield engine_of(client)
+                yield DaskEngine(client, progress)
             return
         with environment_kept():
             with _no_interrupts():
@@ -58,7 +57,7 @@ def cluster(address: str, workers: int) -> Iterator[Engine]:
                     silence_logs=logging.CRITICAL,
                 )
             with processes, distributed.Client(processes) as client:
-                yield engine_of(client)
+                yield DaskEngine(client, progress)
 
 
 @contextmanager
@@ -113,48 +112,64 @@ def _client(distributed: Any, address: str) -> Iterator[Any]:
         yield client
 
 
-def engine_of(client: Any) -> Engine:
-    """Return an engine that submits to a client; see ``large.Engine``."""
-    from distributed import CancelledError, KilledWorker
-    from distributed.comm import CommClosedError
+class DaskEngine:
+    """Submits ranges to a Dask client; a range is repeated when its worker dies.
 
-    def engine(
-        title: str,
-        function: Callable[..., Any],
-        cloud: CloudFile,
-        row_ranges: list[range],
-        *common: Any,
+    Args:
+        client: a ``distributed.Client``.
+        progress: show the progress on a terminal.
+    """
+
+    def __init__(self, client: Any, progress: bool = False) -> None:
+        self.client = client
+        self.progress = progress
+
+    def map(
+        self, title: str, function: Callable[[range], Any], row_ranges: list[range]
     ) -> Iterator[Any]:
-        # Workers may have a different working directory.
-        cloud = replace(cloud, path=cloud.path.absolute())
-        futures: deque[Any] = deque()
-        rest = iter(row_ranges)
+        """See ``Engine.map``.
+
+        Raises:
+            UserError: workers die repeatedly, or the scheduler is lost.
+        """
+        from distributed import CancelledError, KilledWorker
+        from distributed.comm import CommClosedError
+
         try:
-            # Tasks, not scattered data: Dask repeats them when the worker that holds them dies.
-            shared = [client.submit(_same, value, pure=False) for value in common]
-            ahead = AHEAD * max(sum(client.nthreads().values()), 1)
-            while True:
-                while len(futures) < ahead and (rows := next(rest, None)) is not None:
-                    futures.append(client.submit(function, cloud, rows, *shared, pure=False))
-                if not futures:
-                    return
-                yield futures.popleft().result()
+            results = self._results(function, row_ranges)
+            total = len(row_ranges)
+            yield from with_progress(results, title, total) if self.progress else results
         except KilledWorker:
             raise UserError(
-                f"--cluster: workers died repeatedly at {cloud.path} ({title}), perhaps for lack "
-                "of memory. Try a smaller --chunk."
+                f"--cluster: workers died repeatedly ({title}), perhaps for lack of memory. Try a "
+                "smaller --chunk."
             ) from None
         except Exception as error:  # Dask raises several kinds when the connection is lost
             lost = isinstance(error, CancelledError | CommClosedError)
-            if not lost and client.status == "running":
+            if not lost and self.client.status == "running":
                 raise
             raise UserError(
                 f"--cluster: lost the connection to the scheduler ({type(error).__name__}). "
                 "Restart it and run the same command again."
             ) from None
 
-    return engine
+    def _results(self, function: Callable[[range], Any], row_ranges: list[range]) -> Iterator[Any]:
+        # A task, not scattered data: Dask repeats it when the worker that holds it dies.
+        shared = self.client.submit(_same, function, pure=False)
+        ahead = AHEAD * max(sum(self.client.nthreads().values()), 1)
+        futures: deque[Any] = deque()
+        rest = iter(row_ranges)
+        while True:
+            while len(futures) < ahead and (rows := next(rest, None)) is not None:
+                futures.append(self.client.submit(_call, shared, rows, pure=False))
+            if not futures:
+                return
+            yield futures.popleft().result()
 
 
 def _same(value: Any) -> Any:
     return value
+
+
+def _call(function: Callable[[range], Any], rows: range) -> Any:
+    return function(rows)

@@ -2,7 +2,7 @@
 
 import os
 
-from mops_lightning.downsample_files import batch
+from mops_lightning.files import batch
 from tests.support.downsample import call
 
 
@@ -11,23 +11,23 @@ def test_folder_second_run_does_only_missing_files(folder, tmp_path):
     bad = folder / "in" / "bad.xyz"
     bad.write_text("not a cloud\n")
     try:
-        settings = ["--weights", folder / "weights.pt", "--m", 8, "--format", "ply"]
+        settings = ["--weights", folder / "weights.pt", "--m", 8]
         status, out, err = call(folder / "in", target, *settings, "--workers", 2)
         assert status == 1
         assert "3 files: " in out
         assert "2 done" in out
         assert "1 failed" in out
         assert err.startswith(f"failed: {bad}")
-        first = {path.name: path.read_bytes() for path in target.rglob("*.ply")}
-        assert set(first) == {"a.ply", "b.ply"}
-        assert (target / "deep" / "b.ply").is_file()
+        first = {path.name: path.read_bytes() for path in target.rglob("*.*")}
+        assert set(first) == {"a.ply", "b.npz"}
+        assert (target / "deep" / "b.npz").is_file()
         (target / "a.ply").unlink()
     finally:
         bad.unlink()
     status, out, err = call(folder / "in", target, *settings)
     assert (status, err) == (0, "")
     assert "2 files: 1 done, 1 skipped" in out
-    again = {path.name: path.read_bytes() for path in target.rglob("*.ply")}
+    again = {path.name: path.read_bytes() for path in target.rglob("*.*")}
     assert again == first, "one process gives what two gave"
 
 

@@ -1,1 +1,0 @@
-"""Comparing methods of downsampling on a user's own files."""

@@ -1,1 +1,0 @@
-"""Downsampling clouds and meshes from files into files."""

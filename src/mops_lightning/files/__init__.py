@@ -1,0 +1,1 @@
+"""From files to files: downsampling them, and comparing methods of downsampling on them."""

@@ -1,0 +1,168 @@
+"""Downsampling one file: read, normalise as in training, sample, map back, write."""
+
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mops_lightning.data.formats.errors import check_size
+from mops_lightning.data.formats.registry import read, write
+from mops_lightning.data.formats.table import Table
+from mops_lightning.errors import UserError
+from mops_lightning.files.chunks import Kept, sample_by_chunks
+from mops_lightning.files.engine import Engine, LocalEngine
+from mops_lightning.files.options import Options
+from mops_lightning.files.tiles import sample_by_tiles
+from mops_lightning.files.unit_sphere import largest_distance, sum_of, unit_sphere
+from mops_lightning.ops.readout import complete
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.streaming import stream_match, stream_sample
+from mops_lightning.zoo.load import load
+from mops_lightning.zoo.methods import untrained
+
+PART = 65536
+"""Number of points that a learned sampler processes at a time; it bounds the memory of features."""
+
+SURFACE = 10_000
+"""Least number of points that are sampled from a mesh."""
+
+
+class Outcome(NamedTuple):
+    """Numbers of points of a downsampled file.
+
+    Attributes:
+        written: number of points that were written.
+        number: how many points with finite coordinates the cloud has.
+        dropped: how many it has without.
+    """
+
+    written: int
+    number: int
+    dropped: int
+
+
+@cache
+def load_sampler(options: Options) -> Sampler:
+    """Load or build the sampler that the options name.
+
+    Raises:
+        UserError: the weights are not a sampler's, or were trained for another number of points.
+    """
+    torch.manual_seed(options.seed)
+    if options.method:
+        assert options.m is not None
+        return untrained(options.method, options.m, options.seed)
+    assert options.weights is not None
+    try:
+        sampler = load(options.weights)
+    except UserError as error:
+        raise UserError(f"--weights: {error}") from None
+    if options.tile is not None:
+        if not sampler.flexible:
+            raise UserError(
+                f"--weights: tiles need a sampler of every size, such as FMOPS-Net; "
+                f"{options.weights} is a {type(sampler).__name__} for {sampler.m} points."
+            )
+        return sampler  # a tile keeps a part of the m points
+    m = sampler.m if options.m is None else options.m
+    if m > sampler.m or (m != sampler.m and not sampler.flexible):
+        allowed = f"up to {sampler.m}" if sampler.flexible else f"{sampler.m}"
+        raise UserError(
+            f"--m: {options.weights} was trained for {allowed} points, got {m}. "
+            f"Give --m {sampler.m}{' or less' * sampler.flexible}, or train with m={m}."
+        )
+    return sampler
+
+
+def downsample_file(
+    source: Path, target: Path, options: Options, engine: Engine | None = None
+) -> Outcome:
+    """Downsample one file into another.
+
+    Args:
+        source: the file.
+        target: the file to write.
+        options: how.
+        engine: processes the chunks of a file; None: this process.
+
+    Raises:
+        UserError: the file holds no cloud, or one of too few points.
+    """
+    sampler = load_sampler(options)
+    m = options.m or sampler.m
+    if options.chunk is None:
+        kept = _sample_whole(source, sampler, m, options)
+    else:
+        kept = sample_by_chunks(source, sampler, m, options, engine or LocalEngine())
+    write(target, kept.table)
+    return Outcome(len(kept.table.points), kept.number, kept.dropped)
+
+
+def _sample_whole(source: Path, sampler: Sampler, m: int, options: Options) -> Kept:
+    """Sample a file that is read as a whole."""
+    table = read(source, options.surface or max(SURFACE, 8 * m), options.seed)
+    finite = table.finite()
+    number = len(finite.points)
+    check_size(source, number, m)
+    rows, points = sample_cloud(finite.points, sampler, m, options, source)
+    if rows is None:
+        kept = Table(points, {}, table.header)
+    else:
+        kept = finite.take(rows)
+        kept = kept if options.keep_attributes else kept.without_attributes()
+    return Kept(kept, number, len(table.points) - number)
+
+
+def sample_cloud(
+    points: NDArray[np.float64], sampler: Sampler, m: int, options: Options, source: Path
+) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
+    """Sample a cloud in the file's own unit.
+
+    Args:
+        points: ``(N, 3)`` finite, N ≥ m.
+        sampler: from ``load_sampler``.
+        m: number of points to keep.
+        options: how.
+        source: the file, for errors.
+
+    Returns:
+        The rows ``(m,)`` of the kept points, or None for generated points; the points ``(m, 3)``.
+
+    Raises:
+        UserError: the coordinates are too large, or tiles keep more points than the sampler can.
+    """
+    if options.tile is not None:
+        rows = sample_by_tiles(points, options.tile, m, sampler, source)
+        return rows, points[rows]
+    centre = sum_of(points) / len(points)
+    sphere = unit_sphere(centre, largest_distance(points, centre), source)
+    chosen, generated = _sample_in_sphere(sphere.normalise(points), sampler, m, options.readout)
+    if chosen is None:
+        return None, sphere.restore(generated)
+    rows = chosen.numpy()
+    return rows, points[rows]
+
+
+@torch.no_grad()
+def _sample_in_sphere(
+    points: Tensor, sampler: Sampler, m: int, readout: str
+) -> tuple[Tensor | None, Tensor]:
+    """Return the rows ``(m,)`` of the points to keep, or None, and the generated points."""
+    if isinstance(sampler, MOPSNet) and sampler.streams:
+        generated = stream_sample(sampler, lambda: list(points.split(PART)), m)
+    else:
+        output = sampler(points[None], m)
+        generated = output.points[0]
+        if not sampler.generates:
+            return output.indices[0], generated
+    if readout == "generated":
+        return None, generated
+    rows = stream_match(generated, lambda: list(points.split(PART)))
+    if readout == "completed":
+        rows = complete(rows[None], points[None])[0]
+    return rows, generated

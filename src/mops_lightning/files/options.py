@@ -1,0 +1,79 @@
+"""Options of ``downsample``, checked."""
+
+from dataclasses import dataclass
+
+from mops_lightning.errors import UserError
+from mops_lightning.records.readout_names import GENERATED_READOUTS
+
+METHODS = ("fps", "random", "voxel", "poisson")
+"""Untrained samplers."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How every file is downsampled.
+
+    Attributes:
+        m: number of points to keep; None: as many as the weights were trained for.
+        weights: of a trained sampler: a model, a weights file, or the folder of its run.
+        method: one of ``METHODS``, instead of weights.
+        readout: of a trained sampler: generated, matched or completed.
+        keep_attributes: keep colours, normals and the like of the kept points.
+        surface: number of points to sample from a mesh's surface first.
+        seed: of random choices.
+        chunk: number of points to read at a time; None: the whole file.
+        tile: most points of a tile; None: no tiles.
+
+    Raises:
+        UserError: a value is out of range, or options exclude each other.
+    """
+
+    m: int | None
+    weights: str | None = None
+    method: str | None = None
+    readout: str = "completed"
+    keep_attributes: bool = False
+    surface: int | None = None
+    seed: int = 0
+    chunk: int | None = None
+    tile: int | None = None
+
+    def __post_init__(self) -> None:
+        """Reject values out of range and options that exclude each other."""
+        if self.weights is None and self.method is None:
+            raise UserError(
+                f"give --method {'|'.join(METHODS)}, or --weights MODEL of a trained sampler."
+            )
+        if self.weights is not None and self.method is not None:
+            raise UserError(f"give --weights or --method {self.method}, not both.")
+        if (self.m is not None and self.m < 1) or (self.m is None and self.method):
+            raise UserError(f"--m must be a whole number of at least 1, got {self.m}.")
+        if self.surface is not None and self.surface < 1:
+            raise UserError(f"--surface must be at least 1, got {self.surface}.")
+        if self.readout not in GENERATED_READOUTS:
+            raise UserError(
+                f"--readout must be one of {', '.join(GENERATED_READOUTS)}, got {self.readout}."
+            )
+        if self.keep_attributes and self.weights and self.readout == "generated":
+            raise UserError(
+                "--keep-attributes: generated points are new and have no attributes. Use "
+                "--readout completed or matched."
+            )
+        self._check_parts()
+
+    def _check_parts(self) -> None:
+        """Reject tiles and chunks out of range, or with options that they exclude."""
+        if self.tile is not None and self.tile < 2:
+            raise UserError(f"--tile must be at least 2, got {self.tile}.")
+        if self.tile is not None and self.m is None:
+            raise UserError("--tile needs --m, the number of points to keep of all tiles together.")
+        if self.tile is not None and self.readout != "completed":
+            raise UserError(f"--tile keeps different input points: no --readout {self.readout}.")
+        if self.chunk is not None and self.chunk < 1:
+            raise UserError(f"--chunk must be at least 1, got {self.chunk}.")
+        whole = self.method or self.tile is not None or self.readout == "completed"
+        if self.chunk is not None and whole:
+            raise UserError(
+                "--chunk needs --weights of MOPS-Net and --readout generated or matched, without "
+                "--tile: everything else needs the whole cloud in memory."
+            )

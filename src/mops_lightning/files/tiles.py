@@ -1,0 +1,164 @@
+"""Downsampling large scenes by tiles: cut, sample every tile as in training, thin the seams."""
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from mops_lightning.data.formats.errors import BadCloudError
+from mops_lightning.errors import UserError
+from mops_lightning.ops.readout import complete, match
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.random import RandomSampler
+
+Points = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+BATCH = 32768
+"""Points of the tiles that are sampled together."""
+
+EXTRA = 1.25
+"""How many times the points to keep are sampled; the final thinning removes the rest."""
+
+NEIGHBOURS = 8
+"""Nearest sampled points that the thinning compares a point with."""
+
+
+def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler, path: Path) -> Rows:
+    """Sample every tile of a cloud, then thin the points where tiles meet.
+
+    Points of neighbouring tiles may be nearly equal. Therefore a quarter more points are sampled,
+    and one of the nearest two is removed until m remain. Random points are near to each other
+    everywhere, not at the seams only, and are not thinned.
+
+    Args:
+        points: ``(N, 3)``, N ≥ m.
+        size: most points of a tile.
+        m: number of points to keep of all tiles together.
+        sampler: a flexible sampler.
+        path: the file, for errors.
+
+    Returns:
+        ``(m,)`` different rows, ascending.
+
+    Raises:
+        UserError: the tiles keep more points than the sampler can return.
+    """
+    tiles = balanced_tiles(points, size)
+    sizes = [len(tile) for tile in tiles]
+    thinned = len(tiles) > 1 and not isinstance(sampler, RandomSampler)
+    sampled = min(int(EXTRA * m), len(points)) if thinned else m
+    numbers = np.minimum(shares(sampled, sizes), sampler.m).tolist()
+    if sum(numbers) < m:
+        raise UserError(
+            f"--m: {len(tiles)} tiles of up to {max(sizes)} points would keep {m} points, but the "
+            f"sampler was trained for up to {sampler.m} points of each. Use smaller tiles, or keep "
+            "fewer points."
+        )
+    same: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for place, pair in enumerate(zip(sizes, numbers, strict=True)):
+        same[pair].append(place)
+    found: list[Rows] = [np.empty(0, np.int64)] * len(tiles)
+    for (n, number), places in same.items():
+        step = max(BATCH // n, 1)
+        for first in range(0, len(places) if number else 0, step):
+            batch = places[first : first + step]
+            stacked = np.stack([points[tiles[place]] for place in batch])
+            rows = sample_tiles(sampler, _normalised(stacked, path), number).numpy()
+            for place, chosen in zip(batch, rows, strict=True):
+                found[place] = tiles[place][chosen]
+    kept = np.concatenate(found)
+    return np.sort(kept[thin(points[kept], m)])
+
+
+def balanced_tiles(points: Points, size: int) -> list[Rows]:
+    """Cut a cloud by a balanced kd-tree, across the longest side of every part.
+
+    Args:
+        points: ``(n, 3)``, n ≥ 1.
+        size: most points of a tile.
+
+    Returns:
+        The rows of every tile, ascending. The numbers of rows differ by one at most.
+    """
+    tiles: list[Rows] = []
+    planes = np.ascontiguousarray(points.T)  # extremes are found ten times as fast along memory
+    parts = [(np.arange(len(points)), -(-len(points) // size))]
+    while parts:
+        rows, number = parts.pop()
+        if number == 1:
+            tiles.append(np.sort(rows))
+            continue
+        inside = planes.take(rows, 1)
+        axis = int((inside.max(1) - inside.min(1)).argmax())
+        first = number // 2
+        at = len(rows) * first // number
+        order = inside[axis].argpartition(at)
+        parts += [(rows[order[at:]], number - first), (rows[order[:at]], first)]
+    return tiles
+
+
+def shares(m: int, sizes: list[int]) -> Rows:
+    """Share m points among tiles in proportion to their sizes.
+
+    Returns:
+        A number for every tile, at most its size; their sum is m.
+    """
+    ends = np.cumsum([0, *sizes], dtype=np.int64)
+    return np.diff(m * ends // ends[-1])
+
+
+def _normalised(tiles: Points, path: Path) -> Tensor:
+    """Return tiles ``(B, n, 3)`` in the unit sphere, as in training."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        centred = tiles - tiles.mean(1, keepdims=True)
+        radius = np.linalg.norm(centred, axis=2).max(1)[:, None, None]
+    if not np.isfinite(radius).all():
+        raise BadCloudError(f"{path}: its coordinates are too large for float64 distances.")
+    return torch.from_numpy((centred / np.where(radius > 0, radius, 1.0)).astype(np.float32))
+
+
+@torch.no_grad()
+def sample_tiles(sampler: Sampler, tiles: Tensor, m: int) -> Tensor:
+    """Return m different rows ``(B, m)`` of every tile ``(B, n, 3)``."""
+    if m == tiles.shape[1]:
+        return torch.arange(m).expand(len(tiles), m)
+    output = sampler(tiles, m)
+    if output.indices is not None:
+        return output.indices
+    return complete(match(output.points, tiles), tiles)
+
+
+def thin(points: Points, m: int) -> Rows:
+    """Remove one of the nearest two points until m remain.
+
+    Args:
+        points: ``(k, 3)``, k ≥ m.
+        m: number of points to keep.
+
+    Returns:
+        ``(m,)`` rows, ascending.
+    """
+    excess = len(points) - m
+    if not excess:
+        return np.arange(m)
+    found: Any = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)))
+    distance, other = found
+    rows, column = (other != np.arange(len(points))[:, None]).nonzero()
+    nearest_first = distance[rows, column].argsort(kind="stable")
+    pairs = np.stack([rows, other[rows, column]], 1)[nearest_first]
+    remains = np.ones(len(points), bool)
+    for one, neighbour in pairs.tolist():
+        if not excess:
+            break
+        if remains[one] and remains[neighbour]:
+            remains[max(one, neighbour)] = False
+            excess -= 1
+    kept = np.flatnonzero(remains)
+    # Too many remain only where many points are equal.
+    return np.sort(kept[distance[kept, 1].argsort(kind="stable")[excess:]])
