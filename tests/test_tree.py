@@ -34,6 +34,14 @@ def test_tracked_files_stay_below_25_mb(tracked):
     assert sum(path.stat().st_size for path in tracked) < TREE
 
 
+def test_results_have_at_most_150_files_and_short_pages(tracked):
+    files = [path for path in tracked if path.is_relative_to(ROOT / "results")]
+    assert len(files) <= 150
+    pages = {path: len(path.read_text().splitlines()) for path in files if path.suffix == ".md"}
+    readmes = {path: lines for path, lines in pages.items() if path.name == "README.md"}
+    assert {path: lines for path, lines in readmes.items() if lines > 65} == {}
+
+
 def test_pictures_stay_below_300_kb(tracked):
     sizes = {path: path.stat().st_size for path in tracked if path.suffix in PICTURES}
     assert {path: size for path, size in sizes.items() if size >= PICTURE} == {}
@@ -48,7 +56,8 @@ def test_weights_are_models_of_the_package(tracked):
 
 
 def test_records_and_models_name_models_that_exist(tracked):
-    records = [json.loads(path.read_text()) for path in tracked if path.name == "result.json"]
+    tables = [path for path in tracked if path.name == "runs.jsonl"]
+    records = [json.loads(line) for path in tables for line in path.read_text().splitlines()]
     records += [model_file.read_card(path)["record"] for path in tracked if path.suffix in WEIGHTS]
     named = {record["files"][k] for record in records for k in record["files"] if k in KINDS}
     found = {names.find(name) for name in named}

@@ -75,7 +75,7 @@ def test_pip_install_uses_the_constraints(name):
         ".venv/bin/python",
         "data/modelnet40_ply_hdf5_2048/ply_data_train0.h5",
         "outputs/classification/result.json",
-        "results/main_job/result.json",
+        "results/main_job/runs.jsonl",
         "src/mops_lightning/__pycache__/cli.cpython-312.pyc",
         "src/mops_lightning/samplers/__pycache__/base.cpython-312.pyc",
     ],

@@ -1,9 +1,14 @@
 import json
+import os
 
 import pytest
 
+from mops_lightning.records import run_record
+from mops_lightning.report.collect import collect
 from tests.support.records import CONFIG
 from tests.support.reports import put, put_cell, rows, table
+
+WITHOUT_TASK = {key: value for key, value in CONFIG.items() if key != "task"}
 
 
 def test_collect_counts_but_hides_unfinished_runs(tmp_path):
@@ -36,7 +41,7 @@ def test_collect_lists_unreadable_record(tmp_path):
     ("change", "said"),
     [
         ({"config": {**CONFIG, "m": "x"}}, "not a run record: 'x' is not of type 'integer'"),
-        ({"config": CONFIG}, "config: 'task' is a required property"),
+        ({"config": WITHOUT_TASK}, "not a run record: 'task' is a required property"),
         ({"config": 3}, "not a run record: 3 is not of type 'object'"),
         ({"metrics": {"test/sampled/accuracy": "x"}}, "not a run record"),
         ({"metric_info": {"accuracy": {"scale": "x"}}}, "not a run record"),
@@ -53,6 +58,30 @@ def test_collect_lists_record_without_what_tables_need(tmp_path, change, said):
     assert "1 of 2 runs is not completed" in text
     assert said in text
     assert "fps" in text
+
+
+def test_collect_reads_records_of_many_runs_from_one_file(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    put(tmp_path, "random", 32, {"test/sampled/accuracy": 0.2})
+    before = table(tmp_path)
+    run_record.write_many(tmp_path / "runs.jsonl", collect(tmp_path).done)
+    for path in tmp_path.rglob("result.json"):
+        path.unlink()
+    assert table(tmp_path) == before
+    with (tmp_path / "runs.jsonl").open("a") as file:
+        file.write("broken\n")
+    text = table(tmp_path)
+    assert "1 of 3 runs is not completed" in text
+    assert "line 3: not a run record" in text
+    assert rows(text) == rows(before)
+
+
+def test_collect_named_pipe_is_skipped(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    (tmp_path / "pipe").mkdir()
+    for name in ("result.json", "runs.jsonl"):
+        os.mkfifo(tmp_path / "pipe" / name)
+    assert "result.json: not a regular file" in table(tmp_path)
 
 
 def test_collect_lists_bytes_that_are_no_text(tmp_path):

@@ -8,6 +8,7 @@ CONFIG = {
     "m": 32,
     "learn": "sampler",
     "names": NAMES,
+    "task": {},
     "dataset": {},
     "sampler": {},
     "trainer": {"max_epochs": 3},

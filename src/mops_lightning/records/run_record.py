@@ -2,8 +2,9 @@
 
 import json
 import math
+import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -18,6 +19,8 @@ from mops_lightning.records.environment import environment
 
 SCHEMA = "mops_lightning/result/2"
 FILE = "result.json"
+MANY = "runs.jsonl"
+"""File with the records of several runs, one a line."""
 ASIDE = ".attempts"
 """Folder with the earlier attempts of a sweep's cell."""
 MAX_DEPTH = 50
@@ -90,6 +93,7 @@ class RunRecord:
         resumed_from: the checkpoint that the training continued from.
         lengthened: whether it continued with another number of epochs than planned.
         evaluated: the run that was tested; None: this one.
+        folder: of the run, relative to the file that holds the record.
     """
 
     schema: str = SCHEMA
@@ -126,6 +130,7 @@ class RunRecord:
     resumed_from: str | None = None
     lengthened: bool = False
     evaluated: Evaluated | None = None
+    folder: str = "."
 
     @classmethod
     def begin(cls, config: dict[str, Any], overrides: list[str], seed: int) -> "RunRecord":
@@ -187,6 +192,15 @@ def write(folder: Path, record: RunRecord) -> Path:
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n")
     return path
+
+
+def write_many(path: Path, records: Iterable[RunRecord]) -> None:
+    """Write records to one file, one a line; their folders become relative to its own."""
+    with atomic_write(path) as temporary, temporary.open("w") as file:
+        for record in records:
+            plain = _finite(record.plain())
+            plain["folder"] = Path(os.path.relpath(record.folder, path.parent)).as_posix()
+            file.write(json.dumps(plain, allow_nan=False) + "\n")
 
 
 def read(folder: Path) -> RunRecord:

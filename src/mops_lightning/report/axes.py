@@ -5,8 +5,8 @@ from typing import Any
 
 from mops_lightning.config.comparison import compared_by
 from mops_lightning.errors import UserError
-from mops_lightning.records.run_record import dotted
-from mops_lightning.report.collect import Record, epochs, recipe, sampler_row
+from mops_lightning.records.run_record import RunRecord, dotted
+from mops_lightning.report.collect import epochs, recipe, sampler_row
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Axes:
     planes: dict[str, tuple[str, str]] | None = None
 
 
-def axes(found: list[Record], net: str, mixed: bool = False) -> Axes:
+def axes(found: list[RunRecord], net: str, mixed: bool = False) -> Axes:
     """Choose the layout of a table of these records.
 
     If runs of one sampler differ in size and seed only, columns are sizes. If they differ in one
@@ -66,14 +66,14 @@ def axes(found: list[Record], net: str, mixed: bool = False) -> Axes:
     )
 
 
-def varying(found: list[Record]) -> list[str]:
+def varying(found: list[RunRecord]) -> list[str]:
     """Return the dotted settings in which records of one sampler differ."""
     flat = [considered(record) for record in found]
     keys = sorted({key for one in flat for key in one})
     return [key for key in keys if len({_text(one.get(key)) for one in flat}) > 1]
 
 
-def considered(record: Record) -> dict[str, Any]:
+def considered(record: RunRecord) -> dict[str, Any]:
     """Return the settings that are compared, with dotted keys, and the epochs trained."""
     config = record.config
     learn = record.evaluated.learn if record.evaluated else config["learn"]
@@ -81,19 +81,19 @@ def considered(record: Record) -> dict[str, Any]:
     return {**settings, "trainer.max_epochs": epochs(record)}
 
 
-def value(record: Record, key: str) -> Any:
+def value(record: RunRecord, key: str) -> Any:
     """Return a dotted setting of a record."""
     return record.config["m"] if key == "m" else considered(record).get(key)
 
 
-def row(record: Record, net: str) -> str:
+def row(record: RunRecord, net: str) -> str:
     """Return the row of a record's own results; it names a net that is not the table's."""
     names = record.config["names"]
     sampler = sampler_row(record)
     return sampler if names["net"] == net else f"{names['net']} on {sampler}"
 
 
-def _numeric(found: list[Record], key: str) -> bool:
+def _numeric(found: list[RunRecord], key: str) -> bool:
     values = [considered(record).get(key) for record in found if key in considered(record)]
     return all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
 

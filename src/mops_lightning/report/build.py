@@ -8,10 +8,11 @@ from mops_lightning.errors import UserError
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import FULL, parse
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report import paper
 from mops_lightning.report.axes import Axes, axes, value
 from mops_lightning.report.cells import Cells, make_cells, sort_key
-from mops_lightning.report.collect import Found, Record, collect, sampler_row, score, trained_with
+from mops_lightning.report.collect import Found, collect, sampler_row, score, trained_with
 from mops_lightning.report.comparable import shared_names
 from mops_lightning.report.nets import nets_grid
 from mops_lightning.report.provenance import provenance, without_result
@@ -36,7 +37,7 @@ class Report:
     """
 
     found: Found
-    scored: list[Record]
+    scored: list[RunRecord]
     names: dict[str, str]
     axes: Axes
     tables: list[Cells]
@@ -72,7 +73,7 @@ def build(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Rep
     return Report(found, scored, names, layout, tables, grids, remarks)
 
 
-def _without_bad_clouds(found: list[Record]) -> list[str]:
+def _without_bad_clouds(found: list[RunRecord]) -> list[str]:
     """Take clouds that cannot be read from the records, and return a line for each."""
     lines = []
     for record in found:
@@ -86,7 +87,7 @@ def _without_bad_clouds(found: list[Record]) -> list[str]:
     return ["", "Saved clouds that are not shown:", "", *lines] if lines else []
 
 
-def _grids(found: list[Record], table: Cells, names: dict[str, str], layout: Axes) -> list[Grid]:
+def _grids(found: list[RunRecord], table: Cells, names: dict[str, str], layout: Axes) -> list[Grid]:
     """Return the texts of one metric's table, with the values of full clouds."""
     if layout.planes:
         compared = equal_ratios(table, layout.planes)
@@ -101,7 +102,7 @@ def _grids(found: list[Record], table: Cells, names: dict[str, str], layout: Axe
     return [*grids, *([transferred] if transferred else [])]
 
 
-def _by_column(found: list[Record], table: Cells, names: dict[str, str], layout: Axes) -> Grid:
+def _by_column(found: list[RunRecord], table: Cells, names: dict[str, str], layout: Axes) -> Grid:
     columns = table.columns()
     if layout.column != "m":
         columns = columns[::-1]
@@ -157,7 +158,7 @@ def _spread(table: Cells, name: str) -> str:
     return f"Spread over the plane of {name}: {', '.join(parts)}."
 
 
-def _full_row(found: list[Record], table: Cells, layout: Axes) -> list[str]:
+def _full_row(found: list[RunRecord], table: Cells, layout: Axes) -> list[str]:
     """Return the task net's values on full clouds, by the setting of the columns."""
     texts = {}
     for record in found:
@@ -167,7 +168,7 @@ def _full_row(found: list[Record], table: Cells, layout: Axes) -> list[str]:
     return ["all points", *(texts.get(column, "") for column in table.columns()[::-1])]
 
 
-def _full_lines(found: list[Record], names: dict[str, str], metric: MetricInfo) -> list[str]:
+def _full_lines(found: list[RunRecord], names: dict[str, str], metric: MetricInfo) -> list[str]:
     """Return a line for each task net with its value on full clouds."""
     joint = names["learned"] == "joint"
     theirs = paper.table(names["task"], names["dataset"], metric.name, joint)

@@ -14,8 +14,9 @@ from mops_lightning.records.readout_names import (
     REFINED,
     parse,
 )
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report.axes import Axes, row, value
-from mops_lightning.report.collect import Record, sampler_row, seed, trained_with
+from mops_lightning.report.collect import sampler_row, seed, trained_with
 
 Column = Any
 """A size, a value of another setting, or a pair of values in a heat map."""
@@ -69,7 +70,7 @@ class Cells:
         return {name: found[name] for name in (*GENERATED_READOUTS, *found) if name in found}
 
 
-def make_cells(found: list[Record], metric: str, net: str, axes: Axes) -> Cells:
+def make_cells(found: list[RunRecord], metric: str, net: str, axes: Axes) -> Cells:
     """Sort the records' values into a table.
 
     Args:
@@ -90,7 +91,7 @@ def make_cells(found: list[Record], metric: str, net: str, axes: Axes) -> Cells:
     return table
 
 
-def _add(table: Cells, record: Record, net: str, axes: Axes) -> None:
+def _add(table: Cells, record: RunRecord, net: str, axes: Axes) -> None:
     own_row = row(record, net)
     prefix = own_row.removesuffix(sampler_row(record))  # such as "icp on "
     for name, figure in record.metrics.items():

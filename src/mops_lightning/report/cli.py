@@ -3,8 +3,9 @@
 import argparse
 from pathlib import Path
 
-from mops_lightning.errors import one_line_endings
+from mops_lightning.errors import one_line_endings, printable
 from mops_lightning.filesystem import atomic_write, remove_temporary
+from mops_lightning.records import run_record
 from mops_lightning.report.build import Report, build
 from mops_lightning.report.text import latex, long_csv, markdown
 
@@ -12,11 +13,11 @@ PAGE = "report.html"
 
 DESCRIPTION = """Write tables, plots and an HTML page of all run records below a folder.
 
-Reads result.json files only. As in the paper's tables, columns are sizes, and a cell has the values
-of generated / matched / completed sets, or one value for samplers that choose input points. If the
-runs differ in one other setting, such as noise, columns are its values; if in two, as in an
-ablation, each sampler gets a heat map. Several seeds give means and standard deviations. The
-paper's values are shown next to ours. A folder of task nets only gives a table of nets."""
+Reads result.json and runs.jsonl files only. As in the paper's tables, columns are sizes, and a cell
+has the values of generated / matched / completed sets, or one value for samplers that choose input
+points. If the runs differ in one other setting, such as noise, columns are its values; if in two,
+as in an ablation, each sampler gets a heat map. Several seeds give means and standard deviations.
+The paper's values are shown next to ours. A folder of task nets only gives a table of nets."""
 
 
 def main(arguments: list[str] | None = None, prog: str = "python -m mops_lightning.report") -> None:
@@ -30,7 +31,9 @@ def main(arguments: list[str] | None = None, prog: str = "python -m mops_lightni
         chosen = make_parser(prog).parse_args(arguments)
         report = build(chosen.folder, chosen.metric, chosen.mixed)
         written = write(report, chosen.folder)
-        print(markdown(report.grids, report.remarks))
+        if chosen.records:
+            run_record.write_many(chosen.records, report.found.done)
+        print(printable(markdown(report.grids, report.remarks)))
         print(f"files in {chosen.folder}/: {', '.join(written)}")
 
 
@@ -49,6 +52,9 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
         "--mixed",
         action="store_true",
         help="allow runs of different commits or settings in one table",
+    )
+    parser.add_argument(
+        "--records", type=Path, metavar="FILE", help="also write all records to one file (.jsonl)"
     )
     return parser
 

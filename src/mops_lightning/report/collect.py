@@ -1,6 +1,6 @@
 """Read the records of all runs below a folder."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,31 +12,6 @@ from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
 from mops_lightning.records.summary import sampler_name
 
 
-@dataclass(kw_only=True)
-class Record(RunRecord):
-    """A run record with the path of its folder."""
-
-    folder: str
-
-
-NEEDED = {
-    "properties": {
-        "config": {
-            "required": ["task"],
-            "properties": {
-                "task": {"type": "object", "properties": {"net": {"type": ["object", "null"]}}},
-                "trainer": {
-                    "required": ["max_epochs"],
-                    "properties": {"max_epochs": {"type": "integer"}},
-                },
-            },
-        },
-        "git": {"properties": {"commit": {"type": ["string", "null"]}}},
-    },
-}
-"""The parts of a completed record that tables need, beyond the schema of all records."""
-
-
 @dataclass(frozen=True)
 class Found:
     """The runs below a folder.
@@ -44,12 +19,10 @@ class Found:
     Attributes:
         done: records of completed runs, sorted by folder.
         undone: folder → why it has no result.
-        count: number of runs, completed or not.
     """
 
-    done: list[Record]
+    done: list[RunRecord]
     undone: dict[str, str]
-    count: int
 
 
 def collect(folder: Path) -> Found:
@@ -60,44 +33,49 @@ def collect(folder: Path) -> Found:
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: folder not found. Give the folder of a run or a sweep.")
-    done: list[Record] = []
+    done: list[RunRecord] = []
     undone: dict[str, str] = {}
-    paths = [*folder.rglob(run_record.FILE), *folder.rglob(FAILED)]
-    runs = sorted({path.parent for path in paths if ASIDE not in path.parts})
-    if not runs:
+    for place, record in _records(folder):
+        if isinstance(record, RunRecord) and record.status == "completed":
+            done.append(replace(record, folder=str(place)))
+        elif isinstance(record, RunRecord):
+            undone[str(place)] = record.status + (f": {record.error}" if record.error else "")
+        else:
+            undone[str(place)] = record
+    if not done and not undone:
         raise UserError(
-            f"{folder}: no {run_record.FILE} found. Give the folder of a run or a sweep."
+            f"{folder}: no {run_record.FILE} or {run_record.MANY} found. Give the folder of a run "
+            "or a sweep."
         )
-    for run in runs:
-        try:
-            record = run_record.read(run)
-            if record.status == "completed":
-                _check(record, run)
-                done.append(Record(**vars(record), folder=str(run)))
-                continue
-            why = f": {record.error}" if record.error else ""
-            undone[str(run)] = record.status + why
-        except UserError as error:
-            undone[str(run)] = _failure(run) or str(error)
     if not done:
         listed = "; ".join(f"{run} ({why})" for run, why in list(undone.items())[:3])
-        raise UserError(f"{folder}: none of its {len(runs)} runs is completed: {listed}.")
-    return Found(done, undone, len(runs))
+        raise UserError(f"{folder}: none of its {len(undone)} runs is completed: {listed}.")
+    return Found(done, undone)
 
 
-def _check(record: RunRecord, run: Path) -> None:
-    """Reject a record without what tables need, which one table with others would fail at.
+def _records(folder: Path) -> list[tuple[Path, RunRecord | str]]:
+    """Return the folder of every run, sorted, with its record or the reason why it has none."""
+    found: dict[Path, RunRecord | str] = {}
+    for path in folder.rglob(run_record.MANY):
+        for number, line in enumerate(_lines(path), 1):
+            place = f"{path}, line {number}"
+            try:
+                record = run_record.from_json(line, place)
+                found[path.parent / record.folder] = record
+            except UserError as error:
+                found[Path(place)] = str(error)
+    paths = [*folder.rglob(run_record.FILE), *folder.rglob(FAILED)]
+    for run in {path.parent for path in paths if ASIDE not in path.parts}:
+        try:
+            found[run] = run_record.read(run)
+        except UserError as error:
+            found[run] = _failure(run) or str(error)
+    return sorted(found.items(), key=lambda item: item[0])
 
-    Raises:
-        UserError: something is missing or of another type.
-    """
-    import jsonschema
 
-    try:
-        jsonschema.validate(record.plain(), NEEDED)
-    except jsonschema.ValidationError as error:
-        place = ".".join(map(str, error.absolute_path)) or "record"
-        raise UserError(f"{run / run_record.FILE}: {place}: {error.message[:200]}") from None
+def _lines(path: Path) -> list[str]:
+    """Return the lines of a regular file; other files and bytes that are no text give none."""
+    return path.read_text(errors="replace").splitlines() if path.is_file() else []
 
 
 def _failure(run: Path) -> str:
@@ -108,18 +86,18 @@ def _failure(run: Path) -> str:
         return ""
 
 
-def trained_with(record: Record) -> str:
+def trained_with(record: RunRecord) -> str:
     """Return whether the task net was trained with the sampler, also in an evaluated run."""
     learn = record.evaluated.learn if record.evaluated else record.config["learn"]
     return "joint" if learn == "joint" else "sampler alone"
 
 
-def recipe(record: Record) -> dict[str, Any]:
+def recipe(record: RunRecord) -> dict[str, Any]:
     """Return the recipe that a record's sampler was trained by, with its name; {}: the paper's."""
     return record.recipe or (record.evaluated and record.evaluated.recipe) or {}
 
 
-def sampler_row(record: Record) -> str:
+def sampler_row(record: RunRecord) -> str:
     """Return the name of a record's sampler, with what makes it a row of its own.
 
     That is ``anchored`` for a MOPS-Net with anchors, and its recipe unless it is the paper's.
@@ -128,19 +106,19 @@ def sampler_row(record: Record) -> str:
     return " ".join(filter(None, parts))
 
 
-def epochs(record: Record) -> int | None:
+def epochs(record: RunRecord) -> int | None:
     """Return the epochs that a run, or the run that it evaluates, was trained; None: untrained."""
     if "fit" in record.seconds:
         return record.config["trainer"]["max_epochs"]
     return record.evaluated.max_epochs if record.evaluated else None
 
 
-def seed(record: Record) -> int:
+def seed(record: RunRecord) -> int:
     """Return the seed of a run, or of the run that it evaluates."""
     return record.evaluated.seed if record.evaluated else record.seed
 
 
-def score(found: list[Record]) -> str:
+def score(found: list[RunRecord]) -> str:
     """Return the name of the records' main metric.
 
     Early records do not name it; it is the first metric of the closing table.

@@ -4,10 +4,11 @@ import json
 from typing import Any
 
 from mops_lightning.errors import UserError
-from mops_lightning.report.collect import Record, seed, trained_with
+from mops_lightning.records.run_record import RunRecord
+from mops_lightning.report.collect import seed, trained_with
 
 
-def shared_names(found: list[Record], mixed: bool = False) -> dict[str, str]:
+def shared_names(found: list[RunRecord], mixed: bool = False) -> dict[str, str]:
     """Return what all records must share: names of task, net and dataset, ``learned``, ``m``.
 
     A net without weights, such as ICP, may be in one table with the trained net.
@@ -54,7 +55,7 @@ def require_one(what: str, values: set[Any]) -> None:
         )
 
 
-def require_one_commit(found: list[Record], mixed: bool) -> None:
+def require_one_commit(found: list[RunRecord], mixed: bool) -> None:
     """Raise a UserError if runs of different commits are not allowed."""
     commits = sorted({commit(record) for record in found})
     if len(commits) > 1 and not mixed:
@@ -64,12 +65,12 @@ def require_one_commit(found: list[Record], mixed: bool) -> None:
         )
 
 
-def commit(record: Record) -> str:
+def commit(record: RunRecord) -> str:
     """Return the short commit of the code that made a record."""
     return (record.git["commit"] or "unknown")[:10]
 
 
-def same_for_every_seed(what: str, name: str, found: list[Record]) -> None:
+def same_for_every_seed(what: str, name: str, found: list[RunRecord]) -> None:
     """Check that runs of one seed have the same data or nets, as a field of the records says.
 
     Seeds may differ in it, as with procedural data and nets that are trained first; then every
@@ -96,7 +97,7 @@ def same_for_every_seed(what: str, name: str, found: list[Record]) -> None:
         )
 
 
-def _weightless(record: Record) -> bool:
+def _weightless(record: RunRecord) -> bool:
     """Return whether the task net has no weights: none are recorded, and none were trained."""
     trains = record.config["learn"] in ("task", "joint")
     return not trains and record.task_weights_sha256 is None

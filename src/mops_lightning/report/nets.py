@@ -7,10 +7,11 @@ from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report import paper
 from mops_lightning.report.axes import varying
 from mops_lightning.report.cells import over_seeds
-from mops_lightning.report.collect import Record, score, seed
+from mops_lightning.report.collect import score, seed
 from mops_lightning.report.comparable import require_one, require_one_commit, same_for_every_seed
 from mops_lightning.report.text import PAPER, Grid
 
@@ -18,7 +19,7 @@ HIDDEN = ("_target_", "n_points")
 """Settings of a net that get no column; the number of points has its own."""
 
 
-def nets_grid(found: list[Record], metrics: Sequence[str] = (), mixed: bool = False) -> Grid:
+def nets_grid(found: list[RunRecord], metrics: Sequence[str] = (), mixed: bool = False) -> Grid:
     """Return a table with a row for each net, sorted by number of points and settings.
 
     Sizes are of float32 parameters, in MB of a million bytes. Values of several seeds are means ±
@@ -48,7 +49,7 @@ def nets_grid(found: list[Record], metrics: Sequence[str] = (), mixed: bool = Fa
     return Grid(title, head, rows)
 
 
-def _require_comparable(found: list[Record], mixed: bool) -> None:
+def _require_comparable(found: list[RunRecord], mixed: bool) -> None:
     for what in ("task", "dataset"):
         require_one(what, {record.config["names"][what] for record in found})
     require_one_commit(found, mixed)
@@ -63,9 +64,9 @@ def _require_comparable(found: list[Record], mixed: bool) -> None:
         )
 
 
-def _by_net(found: list[Record], keys: list[str]) -> dict[tuple[Any, ...], dict[int, Record]]:
+def _by_net(found: list[RunRecord], keys: list[str]) -> dict[tuple[Any, ...], dict[int, RunRecord]]:
     """Return sort key of a net → seed → record."""
-    groups: dict[tuple[Any, ...], dict[int, Record]] = {}
+    groups: dict[tuple[Any, ...], dict[int, RunRecord]] = {}
     for record in found:
         net, names = _net(record), record.config["names"]
         label = [(net.get(key) is not None, net.get(key) or 0) for key in keys]
@@ -79,7 +80,7 @@ def _by_net(found: list[Record], keys: list[str]) -> dict[tuple[Any, ...], dict[
     return groups
 
 
-def _row(records: list[Record], keys: list[str], metrics: list[MetricInfo]) -> list[str]:
+def _row(records: list[RunRecord], keys: list[str], metrics: list[MetricInfo]) -> list[str]:
     """Return the cells of one net, over all its seeds."""
     first = records[0]
     label = [first.config["names"]["net"], *map(_net(first).get, keys), _points(first)]
@@ -93,15 +94,15 @@ def _row(records: list[Record], keys: list[str], metrics: list[MetricInfo]) -> l
     return [*texts, "" if size is None else f"{4e-6 * size:.1f}", _paper(first)]
 
 
-def _net(record: Record) -> dict[str, Any]:
+def _net(record: RunRecord) -> dict[str, Any]:
     return record.config["task"].get("net") or {}
 
 
-def _points(record: Record) -> int | None:
+def _points(record: RunRecord) -> int | None:
     return record.config.get("dataset", {}).get("n_points")
 
 
-def _metrics(found: list[Record], requested: Sequence[str]) -> list[MetricInfo]:
+def _metrics(found: list[RunRecord], requested: Sequence[str]) -> list[MetricInfo]:
     """Return the metrics of full clouds: those requested, or those of the closing table."""
     names = {name for record in found for name in record.metrics}
     known = {name.rsplit("/", 1)[1] for name in names if name.startswith(f"test/{FULL}/")}
@@ -114,7 +115,7 @@ def _metrics(found: list[Record], requested: Sequence[str]) -> list[MetricInfo]:
     return [info for info in infos if info.full_cloud_metric is None]  # the rest is 1 here
 
 
-def _paper(record: Record) -> str:
+def _paper(record: RunRecord) -> str:
     names, points = record.config["names"], _points(record)
     values = None
     if names["task"] == "reconstruction":

@@ -3,14 +3,15 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from mops_lightning.report.collect import Found, Record, epochs, sampler_row, seed, trained_with
+from mops_lightning.records.run_record import RunRecord
+from mops_lightning.report.collect import Found, epochs, sampler_row, seed, trained_with
 from mops_lightning.report.comparable import commit
 
 MAX_NAMED = 8
 """Most runs listed by name that were made in the same way."""
 
 
-def provenance(found: Iterable[Record], net: str) -> list[str]:
+def provenance(found: Iterable[RunRecord], net: str) -> list[str]:
     """Return a line for each way in which runs were made: epochs, seed, device, commit.
 
     If runs of one kind were made in several ways, the lines name their folders.
@@ -39,10 +40,15 @@ def without_result(found: Found) -> list[str]:
         return []
     lines = [f"- {folder}: {why}" for folder, why in found.undone.items()]
     verb = "is" if len(lines) == 1 else "are"
-    return ["", f"{len(lines)} of {found.count} runs {verb} not completed:", "", *lines]
+    return [
+        "",
+        f"{len(lines)} of {len(found.done) + len(found.undone)} runs {verb} not completed:",
+        "",
+        *lines,
+    ]
 
 
-def _kind(record: Record, net: str) -> str:
+def _kind(record: RunRecord, net: str) -> str:
     names = record.config["names"]
     kind = names["net"] if record.config["learn"] == "task" else sampler_row(record)
     if names["net"] not in (net, kind):
@@ -51,7 +57,7 @@ def _kind(record: Record, net: str) -> str:
     return f"{kind}, jointly trained" if joint else kind
 
 
-def _way(record: Record) -> str:
+def _way(record: RunRecord) -> str:
     length = "nothing to train"
     if epochs(record) is not None:
         length = f"{epochs(record)} {'epoch' if epochs(record) == 1 else 'epochs'}"

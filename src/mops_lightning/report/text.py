@@ -5,8 +5,9 @@ import io
 from dataclasses import dataclass, field
 
 from mops_lightning.records.readout_names import parse, parse_transfer
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report.axes import row, value
-from mops_lightning.report.collect import Record, epochs, seed, trained_with
+from mops_lightning.report.collect import epochs, seed, trained_with
 
 PAPER = "*the paper's*"
 """Label of a row with the paper's values for the sampler in the row above."""
@@ -87,7 +88,7 @@ def _tex(text: str) -> str:
     return "".join(TEX.get(letter, letter) for letter in " ".join(text.splitlines()))
 
 
-def long_csv(found: list[Record], net: str, keys: list[str]) -> str:
+def long_csv(found: list[RunRecord], net: str, keys: list[str]) -> str:
     """Return one line for every test value of every record.
 
     The column ``net`` is there if some values are those of further task nets (``task_nets``).

@@ -7,15 +7,15 @@ from typing import Any
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import FULL, parse_transfer, size_prefix
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report.axes import Axes
 from mops_lightning.report.cells import Cells, Column, make_cells, over_seeds
-from mops_lightning.report.collect import Record
 from mops_lightning.report.comparable import require_one
 from mops_lightning.report.text import Grid
 
 
 def transfer_grid(
-    found: list[Record], own: Cells, names: Mapping[str, str], axes: Axes
+    found: list[RunRecord], own: Cells, names: Mapping[str, str], axes: Axes
 ) -> Grid | None:
     """Return the scores of the same samples under the nets of ``task_nets``.
 
@@ -63,7 +63,7 @@ def transfer_grid(
     )
 
 
-def _labels(found: list[Record]) -> list[str]:
+def _labels(found: list[RunRecord]) -> list[str]:
     """Return the labels of all nets, sorted, each of which must mean one net."""
     labels = sorted({label for record in found for label in _notes(record)})
     for label in labels:
@@ -72,11 +72,11 @@ def _labels(found: list[Record]) -> list[str]:
     return labels
 
 
-def _notes(record: Record) -> dict[str, Any]:
+def _notes(record: RunRecord) -> dict[str, Any]:
     return record.task_nets
 
 
-def _under(record: Record, label: str) -> Record:
+def _under(record: RunRecord, label: str) -> RunRecord:
     """Return a record whose test metrics are those under one of the further nets."""
     metrics = {}
     for name, figure in record.metrics.items():
@@ -91,14 +91,14 @@ def _text(table: Cells, row: str, column: Column) -> str:
     return table.text(row, column) if row in table.values else ""
 
 
-def _full(records: list[Record], metric: MetricInfo) -> str:
+def _full(records: list[RunRecord], metric: MetricInfo) -> str:
     """Return the value on full clouds; over the distinct ones where data depend on the seed."""
     values = [one.metrics.get(f"test/{FULL}/{metric.name}") for one in records]
     distinct = sorted({value for value in values if value is not None})
     return over_seeds(metric, distinct) if distinct else ""
 
 
-def _fact(found: list[Record], label: str) -> str:
+def _fact(found: list[RunRecord], label: str) -> str:
     """Return a line about a net: how long it was trained, on what, and which weights it has."""
     note = next(_notes(record)[label] for record in found if label in _notes(record))
     return (
