@@ -33,7 +33,7 @@ def test_arrays_under_another_key(cloud):
 
 
 def test_generated_points_have_no_attributes(cloud):
-    transform = Downsample(32, readout="generated")
+    transform = Downsample(32, "fmops.modelnet40-m512", readout="generated")
     assert transform({"pos": cloud["pos"]})["pos"].shape == (32, 3)
     with pytest.raises(UserError, match=r"'row' belongs to input points.*completed"):
         transform(cloud)

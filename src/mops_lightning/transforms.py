@@ -53,7 +53,7 @@ class Downsample(BaseTransform):
     def __init__(
         self,
         m: int,
-        method: str | Path = "fmops.modelnet40-m512",
+        method: str | Path = "fps",
         readout: str = "completed",
         points: str = "pos",
         attributes: Sequence[str] | None = None,

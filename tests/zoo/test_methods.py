@@ -29,8 +29,15 @@ def test_seed_and_start_are_used():
     assert torch.equal(first, downsample(CLOUD, 5, "random")[1])
 
 
-def test_default_is_a_model_and_equals_its_sampler():
-    points, indices = downsample(CLOUD.numpy(), 20)
+def test_default_is_farthest_point_sampling():
+    points, indices = downsample(CLOUD, 20)
+    expected = downsample(CLOUD, 20, method="fps")
+    assert torch.equal(points, expected[0])
+    assert torch.equal(indices, expected[1])
+
+
+def test_model_equals_its_sampler():
+    points, indices = downsample(CLOUD.numpy(), 20, "fmops.modelnet40-m512")
     expected = load("fmops.modelnet40-m512").downsample(CLOUD, 20)
     assert np.array_equal(indices, expected[1].numpy())
     assert np.array_equal(points, expected[0].numpy())

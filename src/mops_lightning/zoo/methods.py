@@ -28,7 +28,7 @@ UNTRAINED: dict[str, Callable[..., Sampler]] = {
 def downsample(
     points: Any,
     m: int,
-    method: str | Path = "fmops.modelnet40-m512",
+    method: str | Path = "fps",
     readout: str = "completed",
     lengths: Any = None,
     batch: Any = None,
@@ -44,7 +44,7 @@ def downsample(
             floating point, in any unit.
         m: number of points to return of each cloud.
         method: ``random``, ``voxel``, ``fps`` or ``poisson``, or what ``load`` takes, such as the
-            name of a model.
+            name of a model. A model suits the task net and the shapes that it was trained for.
         readout: of a model: ``generated``, ``matched`` or ``completed``; see
             ``Sampler.downsample``.
         lengths: ``(B,)`` numbers of points, where clouds of several sizes are padded to
@@ -64,7 +64,7 @@ def downsample(
     Example:
         >>> import torch
         >>> from mops_lightning import downsample
-        >>> points, indices = downsample(torch.rand(64, 3), 8, method="fps")
+        >>> points, indices = downsample(torch.rand(64, 3), 8)
         >>> points.shape, indices.shape
         (torch.Size([8, 3]), torch.Size([8]))
     """
