@@ -24,24 +24,19 @@ def batch(rng, number=4, points=48):
     return Batch(torch.randn(number, points, 3, generator=rng), torch.zeros(number))
 
 
-def test_step_loss_is_chamfer_plus_weighted_emd(rng):
+def test_step_loss_is_chamfer_plus_emd(rng):
     given = batch(rng)
-    for weight in (0.0, 1.0, 2.5):
-        module = task(emd_weight=weight, emd_block=48).eval()
-        losses = module.step(given, given.points).losses
-        built = module.net(given.points)
-        torch.testing.assert_close(losses["chamfer"], chamfer_distance(built, given.points).mean())
-        assert set(losses) == {"chamfer", *(["emd"] if weight else [])}
-        if weight:
-            emd = earth_movers_distance(built, given.points).mean()
-            torch.testing.assert_close(losses["emd"], weight * emd)
+    module = task(emd_block=48).eval()
+    losses = module.step(given, given.points).losses
+    built = module.net(given.points)
+    assert set(losses) == {"chamfer", "emd"}
+    torch.testing.assert_close(losses["chamfer"], chamfer_distance(built, given.points).mean())
+    torch.testing.assert_close(losses["emd"], earth_movers_distance(built, given.points).mean())
 
 
-@pytest.mark.parametrize("weight", [0.0, 1.0])
-def test_training_metrics_are_those_that_are_computed(weight):
-    names = {"chamfer", "emd"} if weight else {"chamfer"}
-    assert set(task(emd_weight=weight).metrics(training=True)) == names
-    assert {"chamfer", "emd", "nre_emd"} < set(task(emd_weight=weight).metrics())
+def test_training_metrics_need_no_reference():
+    assert set(task().metrics(training=True)) == {"chamfer", "emd"}
+    assert {"chamfer", "emd", "nre_emd"} < set(task().metrics())
 
 
 def values_of(module, result):
@@ -131,11 +126,6 @@ def test_scored_other_cloud_size_needs_flexible_net(rng):
     assert module.scored(given, given.points).predictions.emd.shape == (4,)
     with pytest.raises(UserError, match=r"48.*60"):
         task().scored(given, given.points)
-
-
-def test_emd_weight_negative_raises():
-    with pytest.raises(UserError, match=r"emd_weight.*at least 0.*-1"):
-        task(emd_weight=-1)
 
 
 def test_figures_show_samples_and_reconstructions(rng):

@@ -255,7 +255,7 @@ def test_evaluate_missing_weights_raises(trained, tmp_path):
 
 def test_command_line_other_net_drops_its_settings(tmp_path):
     overrides = [*TINY, *SMALL_PCRNET, "task.net.iterations=2", f"cache={tmp_path}/cache"]
-    overrides += ["sampler=mops", "task/loss=frobenius_chamfer", "task.loss.chamfer_weight=0.5"]
+    overrides += ["sampler=mops", "task/loss=frobenius_chamfer"]
     run(compose(overrides), tmp_path / "run", overrides)
     for other in (["task/net=icp"], ["task/loss=quaternion"]):
         chosen = command_line([f"evaluate={tmp_path}/run", "pictures=0", "logger=none", *other])

@@ -29,7 +29,6 @@ INSIDE: dict[str, dict[str, Any]] = {
     "dataset.mirrors": {"repeat": False},
     "dataset.archive_hash": {"repeat": False},
     "dataset.workers": _NOTHING,
-    "task.emd_workers": _NOTHING,
     "task.pairs.test_seed": {"affects": Affects.SCORES},
     "sampler.m": {"compare": False},
     "sampler.m_max": {"compare": False, "limits": whole(1)},

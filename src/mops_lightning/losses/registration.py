@@ -1,11 +1,8 @@
 """Losses between rigid motions, and the registration losses, as weighted terms by name."""
 
-import math
-
 import torch
 from torch import Tensor
 
-from mops_lightning.errors import UserError
 from mops_lightning.ops.chamfer import chamfer_distance
 from mops_lightning.ops.rigid import Motion, quaternion_to_matrix
 
@@ -46,7 +43,6 @@ def quaternion_loss(
     true: Motion,
     source: Tensor,
     target: Tensor,
-    translation_weight: float = 1.0,
 ) -> dict[str, Tensor]:
     """Return the paper's quaternion loss and a translation loss.
 
@@ -57,20 +53,15 @@ def quaternion_loss(
         true: the true motion between centred clouds.
         source: ``(B, M, 3)`` points of the centred source; unused.
         target: ``(B, M, 3)`` points of the centred target; unused.
-        translation_weight: weight of the L2 distance between translations. The paper does not
-            mention this term, but without it the predicted translation would not be trained.
 
     Returns:
-        The terms ``quaternion`` and ``translation``, scalars.
-
-    Raises:
-        UserError: the weight is out of range.
+        The terms ``quaternion`` and ``translation``, scalars. The paper does not mention the L2
+        distance between translations, but without it they would not be trained.
     """
-    _check_weight("translation_weight", translation_weight)
     shift = torch.linalg.vector_norm(predicted.translation - true.translation, dim=1).mean()
     return {
         "quaternion": quaternion_distance(predicted.quaternion, true.quaternion),
-        "translation": translation_weight * shift,
+        "translation": shift,
     }
 
 
@@ -79,7 +70,6 @@ def frobenius_chamfer_loss(
     true: Motion,
     source: Tensor,
     target: Tensor,
-    chamfer_weight: float = 1.0,
 ) -> dict[str, Tensor]:
     """Return SampleNet's registration loss: ‖R̂Rᵀ − I‖²_F and a chamfer distance.
 
@@ -91,22 +81,12 @@ def frobenius_chamfer_loss(
         true: the true motion between centred clouds.
         source: ``(B, M, 3)`` points of the centred source.
         target: ``(B, M, 3)`` points of the centred target.
-        chamfer_weight: weight of the chamfer distance between moved source and target.
 
     Returns:
         The terms ``frobenius`` and ``chamfer``, scalars.
-
-    Raises:
-        UserError: the weight is out of range.
     """
-    _check_weight("chamfer_weight", chamfer_weight)
     chamfer = chamfer_distance(predicted.apply(source), target).mean()
     return {
         "frobenius": frobenius_distance(predicted.quaternion, true.quaternion),
-        "chamfer": chamfer_weight * chamfer,
+        "chamfer": chamfer,
     }
-
-
-def _check_weight(name: str, value: float) -> None:
-    if not 0 <= value < math.inf:
-        raise UserError(f"{name} must be a number of at least 0, got {value}.")

@@ -26,7 +26,7 @@ def earth_movers_distance(
     others: Tensor,
     block: int | None = None,
     rounds: int = 4,
-    workers: int | None = 1,
+    workers: int = 1,
 ) -> Tensor:
     """Return the earth mover's distance between clouds with the same number of points.
 
@@ -38,9 +38,8 @@ def earth_movers_distance(
         block: None solves the assignment exactly, in O(N³) time at worst; a number approximates it
             in blocks of at most this many points, see ``assignment.approximate_assignment``.
         rounds: number of improvement rounds of the approximation.
-        workers: worker processes that share the clouds of a batch; None means one per thread of
-            torch. The result does not depend on it. A script that uses more than one needs an
-            ``if __name__ == "__main__":`` guard.
+        workers: worker processes that share the clouds of a batch. The result does not depend on
+            it. A script that uses more than one needs an ``if __name__ == "__main__":`` guard.
 
     Returns:
         ``(B,)`` in units of the coordinates; the approximation is an upper bound. Gradients flow
@@ -65,7 +64,7 @@ def assignment(
     others: Tensor,
     block: int | None = None,
     rounds: int = 4,
-    workers: int | None = 1,
+    workers: int = 1,
 ) -> Tensor:
     """Return the assignment whose mean distance is the earth mover's distance.
 
@@ -91,13 +90,13 @@ def assignment(
         raise UserError(f"block must be at least 2 points, got {block}.")
     if rounds < 0:
         raise UserError(f"rounds must be at least 0, got {rounds}.")
-    if workers is not None and workers < 1:
-        raise UserError(f"workers must be at least 1, or None for one per thread, got {workers}.")
+    if workers < 1:
+        raise UserError(f"workers must be at least 1, got {workers}.")
     p, q = _solvable(points), _solvable(others)
     solve = (
         partial(approximate_assignment, block=block, rounds=rounds) if block else solve_assignment
     )
-    workers = min(workers or torch.get_num_threads(), len(p))
+    workers = min(workers, len(p))
     if workers < 2 or points[..., 0].numel() < WORKERS_MIN_POINTS:
         rows: list[Rows] = list(map(solve, p, q))
     else:
@@ -107,8 +106,8 @@ def assignment(
             pool.cache_clear()
             raise UserError(
                 "workers: a process that solved assignments died. Either memory ran out, "
-                "or the calling script has no 'if __name__ == \"__main__\":' guard. Try workers=1 "
-                "(task.emd_workers=1 on the command line)."
+                "or the calling script has no 'if __name__ == \"__main__\":' guard. Use one thread "
+                "(OMP_NUM_THREADS=1), or workers=1."
             ) from error
     return torch.from_numpy(np.stack(rows)).to(points.device)
 

@@ -3,7 +3,6 @@
 Paper section "Reconstruction-oriented Downsampling".
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,6 @@ import torch
 from torch import Tensor, nn
 from torchmetrics import MetricCollection
 
-from mops_lightning.errors import UserError
 from mops_lightning.metrics.base import TableMetric, collection
 from mops_lightning.metrics.reconstruction import (
     Distances,
@@ -37,22 +35,16 @@ SCORED_BLOCK, SCORED_ROUNDS = 128, 8
 class Reconstruction(Task):
     """Reconstructs clouds from their sampled points with an auto-encoder.
 
-    The loss is the chamfer distance plus ``emd_weight`` times the earth mover's distance. In
-    training the latter is computed by blocks (see ``ops.emd``), because exact matching would take
+    The loss is the chamfer distance plus the earth mover's distance. In training the latter is
+    computed by blocks (see ``ops.emd``), because exact matching would take
     most of the time. In scores it is exact up to ``exact_up_to`` points, and by larger blocks
     above.
 
     Args:
         net: maps ``(B, M, 3)`` points and a number n to ``(B, n, 3)``.
-        emd_weight: weight of the earth mover's distance in the loss; 0 leaves it out.
         emd_block: points per block, in training.
         emd_rounds: rounds of blocks, in training.
         exact_up_to: largest number of points for the exact distance in scores.
-        emd_workers: processes that compute assignments; None: as many as torch has threads. Does
-            not affect results.
-
-    Raises:
-        UserError: ``emd_weight`` is negative or not finite.
     """
 
     score = NormalizedChamfer.name
@@ -62,20 +54,14 @@ class Reconstruction(Task):
     def __init__(
         self,
         net: nn.Module,
-        emd_weight: float = 1.0,
         emd_block: int = 64,
         emd_rounds: int = 2,
         exact_up_to: int = 2048,
-        emd_workers: int | None = 1,
     ) -> None:
         super().__init__(net)
-        if not 0 <= emd_weight < math.inf:
-            raise UserError(f"emd_weight must be at least 0 and finite, got {emd_weight}.")
-        self.emd_weight = emd_weight
         self.emd_block = emd_block
         self.emd_rounds = emd_rounds
         self.exact_up_to = exact_up_to
-        self.emd_workers = emd_workers
 
     def predict(self, batch: Batch, points: Tensor) -> Tensor:
         """Return reconstructions ``(B, N, 3)`` of the clouds from ``(B, M, 3)`` points."""
@@ -102,11 +88,8 @@ class Reconstruction(Task):
         """
         built, clouds = self.predict(batch, points), batch.points
         chamfer = chamfer_distance(built, clouds)
-        losses = {"chamfer": chamfer.mean()}
-        emd = torch.zeros_like(chamfer)
-        if self.emd_weight:
-            emd = self._emd(built, clouds, self.emd_block, self.emd_rounds)
-            losses["emd"] = self.emd_weight * emd.mean()
+        emd = _emd(built, clouds, self.emd_block, self.emd_rounds)
+        losses = {"chamfer": chamfer.mean(), "emd": emd.mean()}
         return TaskOutput(losses, Distances(chamfer, emd), None, built)
 
     def reference(self, batch: Batch) -> Distances:
@@ -127,7 +110,7 @@ class Reconstruction(Task):
             The loss terms, the distances of the reconstructions and the reference.
         """
         found = self._distances(batch, points)
-        losses = {"chamfer": found.chamfer.mean(), "emd": self.emd_weight * found.emd.mean()}
+        losses = {"chamfer": found.chamfer.mean(), "emd": found.emd.mean()}
         if reference is None:
             reference = self.reference(batch)
         return TaskOutput(losses, found, reference)
@@ -136,11 +119,8 @@ class Reconstruction(Task):
         clouds = batch.points
         built = self.predict(batch, points)
         exact = clouds.shape[1] <= self.exact_up_to
-        emd = self._emd(built, clouds, None if exact else SCORED_BLOCK, SCORED_ROUNDS)
+        emd = _emd(built, clouds, None if exact else SCORED_BLOCK, SCORED_ROUNDS)
         return Distances(chamfer_distance(built, clouds), emd)
-
-    def _emd(self, built: Tensor, points: Tensor, block: int | None, rounds: int) -> Tensor:
-        return earth_movers_distance(built, points, block, rounds, self.emd_workers)
 
     def figures(
         self, batch: Batch, samples: Mapping[str, Tensor], titles: Sequence[str]
@@ -167,13 +147,8 @@ class Reconstruction(Task):
         return {"reconstructions": reconstruction_grid(clouds, full, columns, titles)}
 
     def metrics(self, training: bool = False) -> MetricCollection:
-        """Return mean distances and, except in training, which has no reference, NRE.
-
-        Training computes the earth mover's distance only where it is in the loss.
-        """
-        metrics: list[TableMetric] = [MeanChamfer()]
-        if self.emd_weight or not training:
-            metrics += [MeanEMD()]
+        """Return mean distances and, except in training, which has no reference, NRE."""
+        metrics: list[TableMetric] = [MeanChamfer(), MeanEMD()]
         if not training:
             metrics += [
                 NormalizedChamfer(),
@@ -182,3 +157,8 @@ class Reconstruction(Task):
                 NormalizedEMDOfMeans(),
             ]
         return collection(*metrics)
+
+
+def _emd(built: Tensor, points: Tensor, block: int | None, rounds: int) -> Tensor:
+    """Return earth mover's distances ``(B,)``, computed by one process per thread of torch."""
+    return earth_movers_distance(built, points, block, rounds, torch.get_num_threads())
