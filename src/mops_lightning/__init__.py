@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mops_lightning.ops.readout import complete, match
     from mops_lightning.ops.sampling_matrix import SamplingMatrix
     from mops_lightning.samplers.base import Sampler
-    from mops_lightning.samplers.critical import CriticalSampler
+    from mops_lightning.samplers.critical_points import CriticalSampler
     from mops_lightning.samplers.fmops import FMOPSNet
     from mops_lightning.samplers.fps import FPSSampler
     from mops_lightning.samplers.gumbel import GumbelSampler
@@ -65,7 +65,7 @@ _MODULES = {
     "ops.readout": ("complete", "match"),
     "ops.sampling_matrix": ("SamplingMatrix",),
     "samplers.base": ("Sampler",),
-    "samplers.critical": ("CriticalSampler",),
+    "samplers.critical_points": ("CriticalSampler",),
     "samplers.fmops": ("FMOPSNet",),
     "samplers.fps": ("FPSSampler",),
     "samplers.gumbel": ("GumbelSampler",),

@@ -121,15 +121,3 @@ class PointFeatureNet(Protocol):
 
     def point_features(self, points: Tensor) -> Tensor:
         """Map ``(B, N, 3)`` points to non-negative features ``(B, N, C)``."""
-
-
-@runtime_checkable
-class PooledNet(PointFeatureNet, Protocol):
-    """A net that maps the maxima of ``point_features`` over the points to its result.
-
-    A net that does so only with some of its settings has an attribute ``pools_points``, which says
-    whether it does. PCRNet, which needs the maxima of two clouds, has ``from_pooled_pair`` instead.
-    """
-
-    def from_pooled(self, pooled: Tensor) -> Any:
-        """Map maxima ``(B, C)`` to what ``forward`` returns."""

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.critical import CriticalSampler
+from mops_lightning.samplers.critical_points import CriticalSampler
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.gumbel import GumbelSampler
@@ -33,9 +33,9 @@ SNET: dict[str, Any] = {
 DEFAULTS: dict[type[Sampler], dict[str, Any]] = {
     RandomSampler: {"seed": 0},
     FPSSampler: {"seed": 0, "start": None},
-    VoxelSampler: {"pick": "nearest"},
+    VoxelSampler: {},
     PoissonSampler: {"seed": 0},
-    SubmodularSampler: {"net": None, "weighting": "none", "seed": 0},
+    SubmodularSampler: {"net": None, "seed": 0},
     CriticalSampler: {"net": None, "seed": 0},
     GumbelSampler: {"tau_min": 0.1, "key_channels": (256, 128), **FEATURES},
     MOPSNet: MOPS,

@@ -9,7 +9,7 @@ import torch
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.critical import CriticalSampler
+from mops_lightning.samplers.critical_points import CriticalSampler
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.gumbel import GumbelSampler
@@ -37,10 +37,8 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "random": lambda m, **kw: RandomSampler(m, **kw),
     "fps": lambda m, **kw: FPSSampler(m, **kw),
     "voxel": lambda m: VoxelSampler(m),
-    "voxel-centroid": lambda m: VoxelSampler(m, pick="centroid"),
     "poisson": lambda m, **kw: PoissonSampler(m, **kw),
     "submodular": lambda m, **kw: SubmodularSampler(m, PointNetVanilla(3), **kw),
-    "submodular-gradient": lambda m: SubmodularSampler(m, PointNetVanilla(3), "gradient"),
     "critical": lambda m, **kw: CriticalSampler(m, PointNetVanilla(3), **kw),
     "gumbel": lambda m: GumbelSampler(m, feature_channels=(8, 6), key_channels=(12, 10)),
     "mops": lambda m: MOPSNet(m, **MOPS_LAYERS),

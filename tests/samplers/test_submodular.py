@@ -2,8 +2,6 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.autoencoder import AutoEncoder
-from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.submodular import SubmodularSampler
 
@@ -34,21 +32,6 @@ def test_submodular_reaches_result_of_all_points(net, rng):
     torch.testing.assert_close(net(output.points), net(points))
 
 
-def test_submodular_gradient_weights_decide(net, rng):
-    points = torch.randn(2, 40, 3, generator=rng)
-    with torch.inference_mode():  # as in Lightning's tests
-        chosen = SubmodularSampler(6, net, weighting="gradient")(points).indices
-    for features, rows in zip(net.point_features(points).detach(), chosen, strict=True):
-        pooled = features.amax(0, keepdim=True).requires_grad_()
-        log_p = net.from_pooled(pooled).log_softmax(1).max()
-        weights = torch.autograd.grad(log_p, pooled)[0][0].abs()
-        covered = torch.zeros_like(weights)
-        for row in rows:
-            gains = (features - covered).relu() @ weights
-            torch.testing.assert_close(gains[row], gains.max())
-            covered = torch.maximum(covered, features[row])
-
-
 def test_submodular_leaves_net_as_it_is(net, rng):
     net.train()
     net.pool.eval()
@@ -71,15 +54,12 @@ def test_submodular_large_batch_equals_small_ones(net, rng, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("net", "weighting", "words"),
+    ("net", "words"),
     [
-        (None, "none", "net must be the task net.*SubmodularSampler"),
-        (torch.nn.Linear(3, 3), "none", "net must have features of single points.*got Linear"),
-        (PCRNet(), "gradient", "weighting must be none"),
-        (AutoEncoder(40), "gradient", "weighting must be none"),
-        (PointNetVanilla(3), "grad", "weighting: unknown 'grad'.*gradient"),
+        (None, "net must be the task net.*SubmodularSampler"),
+        (torch.nn.Linear(3, 3), "net must have features of single points.*got Linear"),
     ],
 )
-def test_submodular_unsuitable_net_or_weighting_raises(net, weighting, words):
+def test_submodular_unsuitable_net_raises(net, words):
     with pytest.raises(UserError, match=words):
-        SubmodularSampler(4, net, weighting)(torch.zeros(1, 9, 3))
+        SubmodularSampler(4, net)

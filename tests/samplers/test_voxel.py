@@ -3,7 +3,6 @@ from collections import defaultdict
 import pytest
 import torch
 
-from mops_lightning.errors import UserError
 from mops_lightning.samplers.voxel import BISECTIONS, COARSEST, FINEST, VoxelSampler, group_voxels
 
 
@@ -35,13 +34,10 @@ def plain_choice(cloud, m):
 def test_voxel_equals_plain_search(m, rng):
     points = torch.randn(3, 100, 3, dtype=torch.float64, generator=rng)
     picked = VoxelSampler(m)(points)
-    means = VoxelSampler(m, pick="centroid")(points)
-    assert means.indices is None
     for b in range(3):
         members = plain_choice(points[b].tolist(), m)
         for slot, voxel in enumerate(members):
             mean = points[b][voxel].mean(0)
-            torch.testing.assert_close(means.points[b, slot], mean)
             index = int(picked.indices[b, slot])
             distances = (points[b][voxel] - mean).norm(dim=1)
             assert index in voxel
@@ -50,9 +46,7 @@ def test_voxel_equals_plain_search(m, rng):
 
 def test_voxel_single_voxel_holds_all_points(rng):
     points = torch.randn(2, 40, 3, generator=rng)
-    centroid = VoxelSampler(1, pick="centroid")(points).points
-    torch.testing.assert_close(centroid, points.mean(1, keepdim=True))
-    nearest = (points - centroid).norm(dim=2).argmin(1)
+    nearest = (points - points.mean(1, keepdim=True)).norm(dim=2).argmin(1)
     assert VoxelSampler(1)(points).indices.squeeze(1).tolist() == nearest.tolist()
 
 
@@ -65,24 +59,11 @@ def test_group_voxels_outlier_leaves_enough_voxels(rng):
     assert voxels.population.sum() == 60
 
 
-@pytest.mark.parametrize("pick", ["nearest", "centroid"])
-def test_voxel_fills_up_coincident_points(pick):
+def test_voxel_fills_up_coincident_points():
     places = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1.0, 0]])
     points = places.repeat_interleave(torch.tensor([5, 4, 3]), 0)[None]
-    output = VoxelSampler(7, pick=pick)(points)
+    output = VoxelSampler(7)(points)
     assert output.points[0, :3].tolist() == places.tolist()  # in order of decreasing population
     rows = {tuple(p) for p in output.points[0].tolist()}
     assert rows == {tuple(p) for p in places.tolist()}
-    if pick == "nearest":
-        assert len(set(output.indices[0].tolist())) == 7
-
-
-def test_voxel_centroid_has_gradients_of_all_points(rng):
-    points = torch.randn(1, 30, 3, dtype=torch.float64, generator=rng, requires_grad=True)
-    VoxelSampler(1, pick="centroid")(points).points.sum().backward()
-    torch.testing.assert_close(points.grad, torch.full_like(points, 1 / 30))
-
-
-def test_voxel_unknown_pick_raises():
-    with pytest.raises(UserError, match=r"^pick: unknown .* Did you mean 'centroid'"):
-        VoxelSampler(4, pick="centriod")  # type: ignore[arg-type]
+    assert len(set(output.indices[0].tolist())) == 7

@@ -9,7 +9,6 @@ from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.random import RandomSampler
-from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.experiment import Experiment
 from tests.support.training import changed, quiet_trainer, small_dataset, state
@@ -133,16 +132,6 @@ def test_test_index_sampler_has_one_readout():
     assert run.callback_metrics["test/matched/unique_points"] == 8
     assert "test/generated/accuracy" not in run.callback_metrics
     assert "test/sampled/accuracy" in run.callback_metrics
-
-
-def test_test_generating_unlearned_sampler_has_three_readouts():
-    data = small_dataset()
-    run = quiet_trainer(2)
-    module = experiment(sampler=VoxelSampler(8, "centroid"))
-    run.test(module, CloudLoader(data.test, 4), verbose=False)
-    for readout in ("generated", "matched", "completed"):
-        assert f"test/{readout}/accuracy" in run.callback_metrics
-    assert run.callback_metrics["test/generated/subset_distance"] > 0
 
 
 def test_test_refine_adds_readout():

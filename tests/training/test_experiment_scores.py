@@ -8,7 +8,7 @@ import torch
 
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.samplers.critical import CriticalSampler
+from mops_lightning.samplers.critical_points import CriticalSampler
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.gumbel import GumbelSampler
@@ -33,7 +33,6 @@ SAMPLERS = {
     "samplenet": lambda: SampleNet(8, k=3, **SNET),
     "snet-progressive": lambda: ProgressiveSNet(8, **SNET),
     "samplenet-progressive": lambda: ProgressiveSampleNet(8, k=3, **SNET),
-    "voxel-centroid": lambda: VoxelSampler(8, pick="centroid"),
     "voxel": lambda: VoxelSampler(8),
     "fps": lambda: FPSSampler(8),
     "random": lambda: RandomSampler(8),

@@ -8,7 +8,6 @@ from mops_lightning.ops.readout import complete, match
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.training.readouts import readout_names, readouts
 
 SMALL: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
@@ -19,7 +18,6 @@ SMALL: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
     [
         (MOPSNet(8, **SMALL), (8,)),
         (FMOPSNet(16, **SMALL), (4, 16, 9)),
-        (VoxelSampler(8, "centroid"), (3, 8)),
     ],
 )
 @torch.no_grad()

@@ -10,7 +10,7 @@ import torch
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.samplers.mops import MOPSNet
 
-DISTRIBUTIONS = ("nested", "uniform", "log_uniform")
+DISTRIBUTIONS = ("nested", "uniform")
 
 
 class FMOPSNet(MOPSNet):
@@ -24,9 +24,8 @@ class FMOPSNet(MOPSNet):
     Args:
         m_max: largest number of points.
         size_sampling: how a training step chooses its sizes. ``uniform`` draws one m from min_size
-            to m_max, as in the paper; ``log_uniform`` draws one m with a uniform logarithm, which
-            favours small sizes; ``nested`` splits the range of logarithms into ``num_sizes`` equal
-            parts and draws one m from each. The sizes of a step share one forward pass of the
+            to m_max, as in the paper; ``nested`` splits the range of logarithms into ``num_sizes``
+            equal parts and draws one m from each. The sizes of a step share one forward pass of the
             sampler, and their losses are averaged.
         num_sizes: number of sizes with ``nested``.
         min_size: smallest training size, or m_max if that is smaller. Smaller samples can be taken,
@@ -51,7 +50,7 @@ class FMOPSNet(MOPSNet):
     def __init__(
         self,
         m_max: int = 512,
-        size_sampling: Literal["nested", "uniform", "log_uniform"] = "nested",
+        size_sampling: Literal["nested", "uniform"] = "nested",
         num_sizes: int = 4,
         min_size: int = 1,
         **settings: Any,
@@ -73,7 +72,7 @@ class FMOPSNet(MOPSNet):
         smallest = min(self.min_size, self.m)
         if self.size_sampling == "uniform":
             return (int(torch.randint(smallest, self.m + 1, ())),)
-        parts = self.num_sizes if self.size_sampling == "nested" else 1
+        parts = self.num_sizes
         exponents = (torch.arange(parts) + torch.rand(parts)).double() / parts
         # floor(a·((m_max + 1)/a)^u) ranges from a to m_max, with probabilities ∝ log(1 + 1/m).
         sizes = smallest * ((self.m + 1) / smallest) ** exponents

@@ -1,12 +1,11 @@
 """Voxel sampling with exactly m points, a baseline in the paper's tables."""
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.ops.fps import farthest_point_fill
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
@@ -24,51 +23,36 @@ class Voxels(NamedTuple):
 
     Attributes:
         population: ``(B, N)`` int64 number of points in the voxel; 0 for an empty slot.
-        means: ``(B, N, 3)`` mean of these points.
-        nearest: ``(B, N)`` int64 row of the input point nearest to the mean.
+        nearest: ``(B, N)`` int64 row of the input point nearest to the mean of these points.
     """
 
     population: Tensor
-    means: Tensor
     nearest: Tensor
 
 
 class VoxelSampler(Sampler):
-    """Divide space into cubic voxels and return one point for each of m occupied voxels.
+    """Divide space into cubic voxels and return one input point for each of m occupied voxels.
 
-    The grid starts at the lowest corner of the cloud's bounding box. Bisection finds the largest
-    voxel size of each cloud with at least m occupied voxels; where the number of voxels is not
-    monotonic in the size, it finds one of several such sizes. The m voxels with the most points are
-    kept and returned in this order; ties are broken in (x, y, z) order. If there are fewer than m
-    voxels at the smallest size, 2⁻²⁰ of the cloud's longest side, because points coincide, farthest
-    point sampling adds input points. Flexible, but not nested.
+    The point of a voxel is the one nearest to the mean of its points. The grid starts at the lowest
+    corner of the cloud's bounding box. Bisection finds the largest voxel size of each cloud with at
+    least m occupied voxels; where the number of voxels is not monotonic in the size, it finds one
+    of several such sizes. The m voxels with the most points are kept and returned in this order;
+    ties are broken in (x, y, z) order. If there are fewer than m voxels at the smallest size, 2⁻²⁰
+    of the cloud's longest side, because points coincide, farthest point sampling adds input points.
+    Flexible, but not nested.
 
     Args:
         m: largest number of points to return.
-        pick: ``nearest`` returns the input point nearest to the mean of a voxel's points, with its
-            index; ``centroid`` returns the mean itself.
-
-    Raises:
-        UserError: ``pick`` is unknown.
 
     Examples:
         >>> import torch
         >>> from mops_lightning import VoxelSampler
         >>> points = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [1, 1, 1]]])
-        >>> VoxelSampler(m=2, pick="centroid")(points).points  # (B, N, 3) to (B, m, 3)
-        tensor([[[0.0500, 0.0000, 0.0000],
-                 [1.0000, 1.0000, 1.0000]]])
+        >>> VoxelSampler(m=2)(points).indices  # (B, N, 3) to (B, m)
+        tensor([[0, 2]])
     """
 
     flexible = True
-
-    def __init__(self, m: int, pick: Literal["nearest", "centroid"] = "nearest") -> None:
-        super().__init__(m)
-        if pick not in ("nearest", "centroid"):
-            hint = did_you_mean(pick, ("nearest", "centroid"))
-            raise UserError(f"pick: unknown {pick!r}.{hint}")
-        self.pick = pick
-        self.generates = pick == "centroid"
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return one point for each of m voxels of ``(B, N, 3)`` points."""
@@ -79,14 +63,11 @@ class VoxelSampler(Sampler):
         occupied = voxels.population.gather(1, fullest) > 0
         chosen = voxels.nearest.gather(1, fullest)
         chosen = farthest_point_fill(ordered, chosen, occupied.sum(1))
-        if self.pick == "centroid":
-            means = gather_points(voxels.means, fullest)
-            filled = gather_points(ordered, chosen)
-            return SampleOutput(torch.where(occupied[..., None], means, filled), None, {})
         indices = order.gather(1, chosen)
         return SampleOutput(gather_points(points, indices), indices, {})
 
 
+@torch.no_grad()
 def group_voxels(points: Tensor, m: int) -> Voxels:
     """Group points into voxels of the largest size with at least m occupied voxels.
 
@@ -94,11 +75,8 @@ def group_voxels(points: Tensor, m: int) -> Voxels:
         points: ``(B, N, 3)``; the first of several points nearest to a mean is chosen.
         m: smallest number of occupied voxels, 1 ≤ m ≤ N; there are fewer only if the smallest size
             gives fewer.
-
-    Returns:
-        The voxels; gradients flow from the means to the points.
     """
-    key, perm = _voxel_keys(points.detach(), m).sort(dim=1, stable=True)
+    key, perm = _voxel_keys(points, m).sort(dim=1, stable=True)
     begins = torch.ones_like(key)
     begins[:, 1:] = key[:, 1:] != key[:, :-1]
     slot = begins.cumsum(1) - 1
@@ -108,17 +86,14 @@ def group_voxels(points: Tensor, m: int) -> Voxels:
     members = gather_points(points, perm).double()
     means = torch.zeros_like(members).scatter_add(1, slot3, members)
     means = means / population.clamp_min(1)[..., None]
-    with torch.no_grad():
-        distance = (members - means.gather(1, slot3)).square().sum(2)
-        smallest = torch.full_like(distance, torch.inf).scatter_reduce_(1, slot, distance, "amin")
-        near = distance <= smallest.gather(1, slot) * (1 + 1e-6)
-        rank = torch.where(near, perm, points.shape[1] - 1)
-        nearest = torch.full_like(slot, points.shape[1] - 1)
-        nearest.scatter_reduce_(1, slot, rank, "amin")
-    return Voxels(population, means.to(points.dtype), nearest)
+    distance = (members - means.gather(1, slot3)).square().sum(2)
+    smallest = torch.full_like(distance, torch.inf).scatter_reduce_(1, slot, distance, "amin")
+    near = distance <= smallest.gather(1, slot) * (1 + 1e-6)
+    rank = torch.where(near, perm, points.shape[1] - 1)
+    nearest = torch.full_like(slot, points.shape[1] - 1)
+    return Voxels(population, nearest.scatter_reduce_(1, slot, rank, "amin"))
 
 
-@torch.no_grad()
 def _voxel_keys(points: Tensor, m: int) -> Tensor:
     """Return the ``(B, N)`` int64 voxel keys at the largest size, ascending in (x, y, z)."""
     points = points.to(torch.promote_types(points.dtype, torch.float32)).permute(2, 0, 1)

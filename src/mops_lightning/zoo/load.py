@@ -4,7 +4,7 @@ from pathlib import Path
 
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.critical import CriticalSampler
+from mops_lightning.samplers.critical_points import CriticalSampler
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.gumbel import GumbelSampler

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.samplers.critical import CriticalSampler
+from mops_lightning.samplers.critical_points import CriticalSampler
 from mops_lightning.samplers.ordering import seeded_order
 from tests.support.plain import plain_farthest
 
