@@ -203,7 +203,7 @@ def test_folder_of_meshes_trains(tmp_path):
     status, out, err = call([*settings, "dataset=meshes", "dataset.root=mine"], tmp_path)
     assert status == 0, err
     (run,) = runs(tmp_path)
-    assert run_record.read(run).dataset_facts["skipped_meshes"] == 0
+    assert run_record.read(run).dataset_facts["train_files"] == 18
 
 
 def test_flexible_sampler_is_tested_at_all_sizes_and_evaluated(main_job):

@@ -16,7 +16,7 @@ from tests.support.command_line import TINY, TINY_WITH_PICTURES, call
         (["sampler/mops=registration"], "chosen by other groups"),
         (["task/nets=pointnet"], "Did you mean 'task/net'"),
         (["sampler.log=2"], "sampler.log: no such setting"),
-        (["dataset.crops=8"], "no such setting here. It belongs to dataset=clouds."),
+        (["dataset.download=true"], "no such setting here. It belongs to dataset=modelnet40."),
         (["sampler.feature_channels=[8]"], "Write +sampler.feature_channels=..."),
         (["recipe.straight_through_set=matched"], "Write +recipe.straight_through_set=..."),
         (["learn=smapler"], "Did you mean 'sampler'"),

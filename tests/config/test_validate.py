@@ -175,7 +175,6 @@ def test_rival_samplers_have_published_settings():
         (["trainer=ddp", "+trainer.sync_batchnorm=true"], "trainer.sync_batchnorm must be false"),
         (["sampler.alpha=abc"], r"sampler\.alpha must be a number, got 'abc'"),
         (["optimizer.lr=abc"], r"optimizer\.lr must be a number, got 'abc'"),
-        (["dataset=meshes", "dataset.root=x", "dataset.skip_broken=maybe"], "true or false"),
         (["~pretrain"], "pretrain cannot be removed"),
         (["dataset.n_points=abc"], r"dataset\.n_points must be a whole number"),
         (["trainer.max_epochs=0"], "trainer.max_epochs must be a whole number"),

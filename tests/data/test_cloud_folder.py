@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -71,33 +73,143 @@ def test_cloud_folder_split_file(folder):
     assert (len(data.train.points), len(data.test.points)) == (2, 2)
 
 
-def test_cloud_folder_broken_file_named_or_skipped(folder):
+def test_cloud_folder_broken_file_is_named(folder):
     (folder / "notes.txt").write_text("scanned on Monday\n")
-    write(folder / "small.ply", number=10)
-    with pytest.raises(UserError, match=r"notes\.txt.*skip_broken=true"):
+    with pytest.raises(UserError, match=r"notes\.txt"):
         cloud_folder(folder, n_points=64)
-    data = cloud_folder(folder, n_points=64, crops=1, skip_broken=True)
-    assert data.notes["skipped_files"] == 2
-    assert data.notes["train_files"] + data.notes["test_files"] == 9
+    (folder / "notes.txt").unlink()
+    write(folder / "small.ply", number=10)
+    with pytest.raises(UserError, match=r"small\.ply has 10 points.*or remove the file"):
+        cloud_folder(folder, n_points=64)
+
+
+def test_cloud_folder_tiles_that_touch_a_test_tile_are_left_out(tmp_path, capsys):
+    for i in range(10):
+        points = np.random.default_rng(i).random((300, 3)) + np.array([i, 0, 0])
+        WRITERS[".npy"](tmp_path / f"tile_{i}.npy", Table(points))
+    data = cloud_folder(tmp_path, n_points=64, crops=1)
+    assert data.notes["test_files"] == 2
+    assert data.notes["left_out_files"] == 8 - data.notes["train_files"] > 0
+    assert "left out because they touch a test file" in capsys.readouterr().err
+    objects = cloud_folder(tmp_path, n_points=64, crops=1, crop="whole")
+    assert objects.notes == {"train_files": 8, "test_files": 2, "left_out_files": 0}
+
+
+def test_cloud_folder_class_in_one_split_is_reported(mesh_layout, capsys):
+    (mesh_layout / "ball" / "test" / "ball_3.OFF").unlink()
+    data = cloud_folder(mesh_layout, n_points=20, crop="surface", crops=1)
+    assert data.notes["classes_without_test_files"] == ["ball"]
+    assert "no test file of ball: never scored" in capsys.readouterr().err
+
+
+def test_cloud_folder_surface_reads_modelnet_layout(mesh_layout, capsys):
+    data = cloud_folder(mesh_layout, n_points=200, crop="surface", crops=1)
+    assert data.class_names == ("ball", "box")
+    assert data.train.labels.tolist() == [0, 1, 1]
+    assert data.test.labels.tolist() == [0, 1]
+    assert data.notes == {"train_files": 3, "test_files": 2, "left_out_files": 0}
+    for clouds in (data.train, data.test):
+        assert clouds.points.shape == (len(clouds.labels), 200, 3)
+        assert (clouds.points.dtype, clouds.labels.dtype) == (torch.float32, torch.int64)
+        torch.testing.assert_close(clouds.points.mean(1), torch.zeros(len(clouds.labels), 3))
+        farthest = clouds.points.norm(dim=2).amax(1)
+        torch.testing.assert_close(farthest, torch.ones(len(clouds.labels)))
+    assert capsys.readouterr() == ("", "")  # no progress bar without a terminal
+
+
+def test_cloud_folder_surface_of_a_cloud_raises(folder):
+    with pytest.raises(UserError, match=r"scan_0\.ply.*has no faces"):
+        cloud_folder(folder, n_points=64, crop="surface", crops=1, split_file=_listed(folder))
+
+
+def _listed(folder):
+    (folder / "list.csv").write_text("scan_0.ply,train\nbox.stl,test\n")
+    return "list.csv"
+
+
+def test_cloud_folder_splits_every_class_by_share(tmp_path):
+    """ShapeNetCore's layout: SYNSET/*.ply, objects that overlap each other."""
+    for synset, number in (("02691156", 20), ("03001627", 5)):
+        for i in range(number):
+            write(tmp_path / synset / f"{i:032x}.ply", seed=i, number=60)
+    settings: dict[str, Any] = {"n_points": 50, "crop": "whole", "crops": 1, "test_share": 0.15}
+    data = cloud_folder(tmp_path, **settings)
+    assert data.class_names == ("02691156", "03001627")
+    assert data.train.points.shape == (17 + 4, 50, 3)
+    assert data.test.labels.tolist() == [0] * 3 + [1]
+    assert data.train.sources is None
+    again, other = (cloud_folder(tmp_path, **settings, seed=seed) for seed in (0, 1))
+    assert again.fingerprint == data.fingerprint != other.fingerprint
+    assert torch.equal(again.test.points, data.test.points)
+
+
+@pytest.fixture
+def sequences(tmp_path):
+    """Two sequences of boxes that grow with time; frame numbers are not padded."""
+    for name, frames in (("crane", 12), ("samba", 10)):
+        (tmp_path / name).mkdir()
+        for frame in range(frames):
+            box = trimesh.creation.box((1, 1, 1 + frame))
+            box.export(tmp_path / name / f"mesh_{frame}.ply")
+        (tmp_path / name / "notes.txt").write_text("no mesh")
+    return tmp_path
+
+
+def frame_numbers(clouds, label):
+    """Return the frames of a sequence from the proportions of the boxes."""
+    points = clouds.points[clouds.labels == label]
+    size = points.amax(1) - points.amin(1)
+    return sorted((size[:, 2] / size[:, 0] - 1).round().int().tolist())
+
+
+@pytest.mark.parametrize(
+    ("settings", "test", "train"),
+    [
+        (("last", 2), ([9, 10, 11], [8, 9]), (list(range(7)), list(range(6)))),
+        (("spread", 1), ([2, 6, 10], [2, 7]), ([0, 4, 8], [0, 4, 5, 9])),
+    ],
+)
+def test_cloud_folder_splits_sequences_by_time(sequences, settings, test, train):
+    frames, gap = settings
+    data = cloud_folder(
+        sequences, 3000, test_frames=frames, test_share=0.25, gap=gap, crop="surface", crops=1
+    )
+    assert data.class_names == ("crane", "samba")
+    for label in (0, 1):
+        assert frame_numbers(data.test, label) == test[label]
+        assert frame_numbers(data.train, label) == train[label]
+
+
+def test_cloud_folder_real_sequences(real_data):
+    root = real_data / "vlasic2008"
+    if not root.is_dir():
+        pytest.skip(f"{root} is not there")
+    data = cloud_folder(root, 64, test_frames="last", gap=2, crop="surface", crops=1)
+    assert data.class_names == ("crane", "samba")
+    assert len(data.test.labels) == 24
+    assert len(data.train.labels) == 2 * (59 - 12 - 2)
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"crop": "cubes"}, "crop: unknown 'cubes'.*'cube'"),
-        ({"crop": "cube"}, "crop_size.*crop=cube"),
-        ({"crop_size": 2.0}, "crop_size.*crop=nearest"),
-        ({"crop": "cube", "crop_size": -1.0}, "crop_size must be above 0"),
-        ({"test_share": 1.0}, "test_share"),
-        ({"surface": 0}, "surface"),
+        ({"crop": "near"}, "crop: unknown 'near'.*'nearest'"),
+        ({"crop": "surface"}, "crops must be 1 with crop=surface, got 32"),
+        ({"test_share": 1.0}, "test_share must be between 0 and 1, got 1.0"),
         ({"crops": 0}, "crops must be at least 1"),
+        ({"n_points": 0}, "n_points must be at least 2, got 0"),
+        ({"gap": -1}, "gap must be at least 0, got -1"),
+        ({"seed": -1}, "seed must be at least 0, got -1"),
+        ({"classes": ["clod"]}, "classes: unknown class 'clod'.*cloud"),
     ],
 )
-def test_cloud_folder_invalid_argument_raises(tmp_path, settings, message):
-    with pytest.raises(UserError, match=message):
-        cloud_folder(tmp_path, **settings)
+def test_cloud_folder_invalid_argument_raises(folder, settings, message):
+    with pytest.raises(UserError, match=f"^{message}"):
+        cloud_folder(folder, **{"n_points": 64, **settings})
 
 
 def test_cloud_folder_without_cloud_raises(tmp_path):
-    with pytest.raises(UserError, match=r"root: no cloud in .*\.ply"):
+    with pytest.raises(UserError, match=r"^root: no file in .*\.ply"):
         cloud_folder(tmp_path)
+    with pytest.raises(UserError, match=r"^root: .*none is not a folder"):
+        cloud_folder(tmp_path / "none")

@@ -14,9 +14,9 @@ def cloud(number=2000, side=10.0):
     return np.random.default_rng(0).uniform(0, side, (number, 3)) + FAR
 
 
-def draw(points, crop="nearest", size=None, n_points=50, number=6, seed=1):
+def draw(points, crop="nearest", n_points=50, number=6, seed=1):
     rng = np.random.default_rng(seed)
-    return random_crops(points, n_points, number, crop, size, rng, PATH)
+    return random_crops(points, n_points, number, crop, rng, PATH)
 
 
 def test_random_crops_nearest_is_a_ball_around_a_point():
@@ -30,9 +30,8 @@ def test_random_crops_nearest_is_a_ball_around_a_point():
     assert np.allclose(crops[0], near - near.mean(0), atol=1e-5)
 
 
-def test_random_crops_cube_and_whole():
+def test_random_crops_whole():
     points = cloud()
-    assert np.ptp(draw(points, "cube", 4.0), axis=1).max() <= 4
     whole = draw(points, "whole", n_points=1000, number=2)
     assert np.ptp(whole, axis=1).min() > 9
     assert not np.array_equal(whole[0], whole[1])
@@ -45,13 +44,12 @@ def test_random_crops_same_seed_same_crops():
 
 
 @pytest.mark.parametrize(
-    ("points", "crop", "size", "message"),
+    ("points", "crop", "message"),
     [
-        (cloud(40), "nearest", None, "scan.ply has 40 points, fewer than dataset.n_points=50"),
-        (cloud(), "cube", 1.0, r"crop_size=1 is too small for n_points=50: the fullest of 50"),
-        (np.ones((60, 3)), "whole", None, "the 50 points of a crop coincide"),
+        (cloud(40), "nearest", "scan.ply has 40 points, fewer than dataset.n_points=50"),
+        (np.ones((60, 3)), "whole", "the 50 points of a crop coincide"),
     ],
 )
-def test_random_crops_unusable_cloud_raises(points, crop, size, message):
+def test_random_crops_unusable_cloud_raises(points, crop, message):
     with pytest.raises(BadCloudError, match=message):
-        draw(points, crop, size)
+        draw(points, crop)

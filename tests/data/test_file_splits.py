@@ -1,13 +1,16 @@
-from pathlib import PurePosixPath
+from pathlib import PurePath, PurePosixPath
 
 import numpy as np
 import pytest
 
 from mops_lightning.data.file_splits import (
+    by_number,
     class_of,
     neighbouring_tiles,
+    read_split_list,
     split_by_folder,
     split_by_share,
+    split_by_time,
 )
 from mops_lightning.errors import UserError
 
@@ -74,3 +77,88 @@ def test_split_by_share_no_training_file_left_raises():
         split_by_share(paths("a.las", "b.las"), STREET[:2], 0.5, 0)
     with pytest.raises(UserError, match="no test file is left of 1"):
         split_by_share(paths("a.las"), STREET[:1], 0.5, 0)
+
+
+@pytest.fixture
+def flat(tmp_path):
+    for name in ("box/1.off", "box/2.off", "ball/old, round/3.off", "ball/4.off", "5.off"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    return tmp_path
+
+
+def test_read_split_list_gives_split_of_paths(flat):
+    lines = [
+        "path,split",
+        "# a comment",
+        "",
+        "box/1.off,train",
+        '"ball/old, round/3.off", train',
+        " box/2.off , test ",
+        "5.off,test",
+    ]
+    (flat / "split.csv").write_text("\ufeff" + "\n".join(lines), encoding="utf-8")
+    expected = {
+        PurePosixPath("box/1.off"): "train",
+        PurePosixPath("ball/old, round/3.off"): "train",
+        PurePosixPath("box/2.off"): "test",
+        PurePosixPath("5.off"): "test",
+    }
+    for path in (PurePath("split.csv"), flat / "split.csv"):
+        assert read_split_list(flat, flat / path, (".off",)) == expected
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("box/2.off", "line 2: must read 'path,train' or 'path,test'"),
+        ("box/2.off,val", "line 2: must read"),
+        ("/box/2.off,train", "line 2: the path must be relative to"),
+        ("box/../box/2.off,train", "line 2: the path must be relative to"),
+        ("box/2.txt,train", "line 2: box/2.txt must end in"),
+        ("box/1.off,test", "line 2: box/1.off is listed twice"),
+        ("box/9.off,test", "line 2: .*9.off does not exist"),
+    ],
+)
+def test_read_split_list_invalid_line_raises(flat, line, message):
+    (flat / "split.txt").write_text(f"box/1.off,train\n{line}\n")
+    with pytest.raises(UserError, match=rf"^split_file: .*split\.txt, {message}"):
+        read_split_list(flat, flat / "split.txt", (".off",))
+
+
+def test_read_split_list_without_content_raises(flat):
+    with pytest.raises(UserError, match=r"^split_file: cannot read .*none\.txt"):
+        read_split_list(flat, flat / "none.txt", (".off",))
+    (flat / "split.txt").write_text("# nothing\n")
+    with pytest.raises(UserError, match="lists no file"):
+        read_split_list(flat, flat / "split.txt", (".off",))
+
+
+def test_by_number_sorts_digits_that_are_no_numbers():
+    names = ["f_10", "f_9", "1²", "²"]
+    ordered = sorted((PurePath(f"{name}.ply") for name in names), key=by_number)
+    assert [path.stem for path in ordered] == ["1²", "f_9", "f_10", "²"]
+
+
+FRAMES = paths(*(f"crane/{i}.ply" for i in range(12)), *(f"samba/{i}.ply" for i in range(10)))
+
+
+def test_split_by_time_leaves_out_gap():
+    splits = split_by_time(FRAMES, 0.25, 2, "last")
+    assert splits[:12] == ["train"] * 7 + [""] * 2 + ["test"] * 3
+    assert splits[12:] == ["train"] * 6 + [""] * 2 + ["test"] * 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ((0.0, 2, "last"), r"^test_share must be between 0 and 1, got 0.0"),
+        ((0.2, 10, "last"), r"^gap must .*, got 10: crane has 12 frame.*2 of them.* at most 9, or"),
+        ((0.99, 2, "last"), r"crane has 12 frame.*12 of them.* leave this sequence out"),
+        ((0.2, 2, "lats"), r"^test_frames: unknown 'lats'.*last"),
+        ((0.2, 5, "spread"), r"^gap must .*, got 5.* at most 2, or"),
+    ],
+)
+def test_split_by_time_invalid_argument_raises(settings, message):
+    with pytest.raises(UserError, match=message):
+        split_by_time(FRAMES, *settings)

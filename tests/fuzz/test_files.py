@@ -24,7 +24,7 @@ from tests.support.fuzz_seeds import changed_content, json_bytes, seeds
 
 FILES = int(os.environ.get("MOPS_FUZZ", "12"))
 KINDS = (
-    "bin", "checkpoint", "glb", "hdf5", "las", "laz", "listing", "names", "npy", "npz", "obj",
+    "bin", "checkpoint", "glb", "hdf5", "las", "laz", "names", "npy", "npz", "obj",
     "obj cloud", "off", "pcd", "pcd ascii", "pcd compressed", "pictured clouds", "ply",
     "ply ascii", "ply mesh", "record", "record content", "stl", "tar", "tar xz", "weights",
     "weights content", "xyz", "zip",

@@ -11,7 +11,7 @@ from mops_lightning.errors import UserError
 SECONDS, MEMORY = 60.0, 1 << 30
 MODULES = {
     "hdf5": "mops_lightning.data.hdf5", "names": "mops_lightning.data.hdf5",
-    "listing": "mops_lightning.data.shapenet", "zip": "mops_lightning.data.archive",
+    "zip": "mops_lightning.data.archive",
     "tar": "mops_lightning.data.archive", "weights": "mops_lightning.zoo.load",
     "checkpoint": "mops_lightning.training.checkpoint",
     "record": "mops_lightning.records.run_record", "pictured": "mops_lightning.viz.snapshots",
@@ -61,22 +61,6 @@ def read_names(path):
     read_names(path)
 
 
-def read_listing(path):
-    from mops_lightning.data.shapenet import shapenet_part
-
-    root = path.with_suffix("")
-    (root / "train_test_split").mkdir(parents=True, exist_ok=True)
-    (root / "02691156").mkdir(exist_ok=True)
-    (root / "synsetoffset2category.txt").write_text("Airplane 02691156\n")
-    for name in "ab":
-        (root / "02691156" / f"{name}.txt").write_text("1 2 3 0\n4 5 6 0\n")
-    for split in ("train", "val", "test"):
-        (root / "train_test_split" / f"shuffled_{split}_file_list.json").write_bytes(
-            path.read_bytes()
-        )
-    shapenet_part(root, 2)
-
-
 def read_archive(path):
     import shutil
 
@@ -117,7 +101,7 @@ def read_pictured(path):
 
 
 READERS = {
-    "hdf5": read_hdf5, "names": read_names, "listing": read_listing, "zip": read_archive,
+    "hdf5": read_hdf5, "names": read_names, "zip": read_archive,
     "tar": read_archive, "weights": read_weights, "checkpoint": read_checkpoint,
     "record": read_record, "pictured": read_pictured,
 }  # fmt: skip

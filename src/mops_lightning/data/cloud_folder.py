@@ -1,35 +1,52 @@
-"""Datasets of a user's own clouds: a folder of files of any format that ``downsample`` reads."""
+"""Data sets of files: scans, clouds of single objects, meshes and sequences of meshes."""
 
+import hashlib
 import sys
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
+from torch import Tensor
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
 from mops_lightning.data.crops import Crop, check_crop, random_crops
-from mops_lightning.data.file_splits import Box, class_of, split_by_folder, split_by_share
+from mops_lightning.data.file_splits import (
+    SPLITS,
+    Box,
+    class_of,
+    read_split_list,
+    split_by_folder,
+    split_by_share,
+    split_by_time,
+)
+from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
 from mops_lightning.data.formats.registry import READABLE, read
 from mops_lightning.data.hdf5 import choose_and_fingerprint
-from mops_lightning.data.mesh_sampling import mesh_root
-from mops_lightning.data.split_list import SPLITS, read_split_list
+from mops_lightning.data.surfaces import VERSION, sample_surface
 from mops_lightning.errors import UserError
+from mops_lightning.filesystem import remove_temporary
 from mops_lightning.ops.points import normalize_unit_sphere
 from mops_lightning.seeding import derive_seed
 
 
 class Source(NamedTuple):
-    """What is kept of a file: its path, its bounding box and its crops ``(K, n_points, 3)``."""
+    """A file that was read.
 
-    name: PurePosixPath
-    box: Box
-    crops: NDArray[np.float32]
+    Attributes:
+        clouds: ``(K, n_points, 3)`` in the unit sphere.
+        box: the bounding box in the file's own unit; None where it does not matter.
+        digest: sha256 of a mesh's file; empty for other files.
+    """
+
+    clouds: Tensor
+    box: Box | None = None
+    digest: str = ""
 
 
 def cloud_folder(
@@ -37,136 +54,208 @@ def cloud_folder(
     n_points: int = 1024,
     classes: Sequence[str] | None = None,
     split_file: str | Path | None = None,
+    test_frames: Literal["last", "spread"] | None = None,
     test_share: float = 0.2,
+    gap: int = 0,
     crop: Crop = "nearest",
-    crop_size: float | None = None,
     crops: int = 32,
-    surface: int | None = None,
-    skip_broken: bool = False,
     seed: int = 0,
+    cache: str | Path | None = None,
 ) -> CloudDataset:
-    """Draw crops of the clouds in a folder and its subfolders, one cloud per file.
+    """Read the clouds or meshes in a folder and its subfolders, one per file.
 
-    A file is in one split only. The split comes from ``split_file``; else from folders named
-    ``train`` and ``test``; else a random share of the files is the test split. Of files that are
-    neighbouring tiles of one scene, the training tiles that touch a test tile are left out.
+    A file is in one split only. The split comes from ``split_file``; else from ``test_frames``;
+    else from folders named ``train`` and ``test``; else a random share of the files of every class
+    is the test split. With ``crop=nearest``, training files that touch a test file of the same
+    scene are left out then.
+
+    A list has one line per file, with a path relative to ``root``; other files are ignored. The
+    first line is optional. Empty lines and lines that start with ``#`` are ignored::
+
+        path,split
+        chair/chair_0001.off,train
+        chair/old/seat.obj,test
 
     Args:
         root: the folder. The first folder of a path is the class, if there is one.
-        n_points: number of points per crop.
+        n_points: number of points per cloud.
         classes: names to keep; None or empty means all.
-        split_file: lines ``PATH,train`` and ``PATH,test``, as for ``meshes``; files that are not
-            listed are ignored.
+        split_file: path of a list, relative to the working directory or to ``root``.
+        test_frames: for sequences, whose frames are in the order of their numbers: ``last`` tests
+            the last frames of every class, ``spread`` frames at equal distances.
         test_share: share of test files in a class, between 0 and 1.
+        gap: number of frames between training and test frames that are not used, because
+            neighbouring frames are almost identical.
         crop: ``nearest`` takes the points nearest to a drawn point, as the tiles of ``downsample
-            --tile``; ``cube`` random points of a cube of side ``crop_size``, as ``--tile-size``;
-            ``whole`` random points of the cloud.
-        crop_size: side of the cube, in the files' own unit.
-        crops: number of crops per file.
-        surface: points to sample from a mesh's surface first; None: 10,000 or 8 ``n_points``.
-        skip_broken: whether to skip files without a usable cloud instead of raising an error.
-        seed: seed of the split and the crops.
+            --tile``; ``whole`` random points of the cloud; ``surface`` random points on the
+            surface of a mesh, uniform by area.
+        crops: number of clouds per file; 1 for ``surface``.
+        seed: seed of the split and the points.
+        cache: folder for sampled surfaces, found by file content, ``n_points`` and ``seed``; None
+            disables the cache.
 
     Returns:
-        Float32 clouds ``(S, n_points, 3)`` in the unit sphere, with the centroid at the origin.
-        ``notes`` has the number of files per split, of skipped files and of tiles left out.
+        Float32 clouds ``(S, n_points, 3)`` in the unit sphere, with the centroid at the origin, and
+        classes in alphabetical order. ``notes`` has the number of files per split and of files left
+        out. The fingerprint depends on the content of the files and the arguments, not on ``root``.
 
     Raises:
         UserError: an argument or a file is invalid, or a split is empty.
     """
-    minima = {"n_points": (n_points, 2), "crops": (crops, 1), "seed": (seed, 0)}
-    folder = mesh_root(root, minima)
-    _check(test_share, crop, crop_size, surface)
+    minima = {"n_points": (n_points, 2), "crops": (crops, 1), "seed": (seed, 0), "gap": (gap, 0)}
+    for argument, (value, minimum) in minima.items():
+        if value < minimum:
+            raise UserError(f"{argument} must be at least {minimum}, got {value}.")
+    check_crop(crop, crops)
+    folder = Path(root).expanduser()
+    if not folder.is_dir():
+        raise UserError(f"root: {folder} is not a folder.")
+    suffixes = MESHES if crop == "surface" else READABLE
     listed = None
     if split_file:
-        listed = dict(read_split_list(folder, Path(split_file).expanduser(), READABLE, False))
-    names = sorted(listed) if listed else cloud_files(folder)
+        listed = read_split_list(folder, Path(split_file).expanduser(), suffixes)
+    names = sorted(listed) if listed else files(folder, suffixes)
     chosen = choose_classes(classes, sorted(set(map(class_of, names))))
     names = [name for name in names if class_of(name) in chosen]
-    by_folder = split_by_folder(names) if listed is None else None
-    sources: list[Source] = []
-    console = Console(stderr=True)
-    for name in track(names, "Reading clouds", console=console, disable=not console.is_terminal):
-        rng = np.random.default_rng(derive_seed(seed, zlib.crc32(str(name).encode())))
-        try:
-            table = read(folder / name, surface or max(10_000, 8 * n_points), seed).finite()
-            drawn = random_crops(table.points, n_points, crops, crop, crop_size, rng, folder / name)
-        except UserError as error:
-            if not skip_broken:
-                raise UserError(
-                    f"{error} To leave out files without a usable cloud: dataset.skip_broken=true."
-                ) from error
-            continue
-        box = np.stack([table.points.min(0), table.points.max(0)])
-        sources.append(Source(name, box, drawn))
     if listed is not None:
-        splits = [listed[source.name] for source in sources]
-    elif by_folder is not None:
-        split_of = dict(zip(names, by_folder, strict=True))
-        splits = [split_of[source.name] for source in sources]
+        splits: list[str] | None = [listed[name] for name in names]
+    elif test_frames is not None:
+        splits = split_by_time(names, test_share, gap, test_frames)
     else:
-        kept = [source.name for source in sources]
-        splits = split_by_share(kept, [source.box for source in sources], test_share, seed)
-    return _dataset(folder, sources, splits, chosen, len(names) - len(sources))
+        splits = split_by_folder(names)
+    if splits is not None:
+        names, splits = _used(names, splits)
+    if crop == "surface":
+        sources = _surfaces(folder, names, n_points, seed, cache)
+    else:
+        sources = _crops(folder, names, n_points, crop, crops, seed)
+    left_out = 0
+    if splits is None:
+        boxes = [source.box for source in sources if source.box is not None]
+        splits = split_by_share(names, boxes if crop == "nearest" else None, test_share, seed)
+        left_out = splits.count("")
+    clouds = _splits(folder, names, sources, splits, chosen)
+    notes = _notes(folder, names, splits, chosen, left_out)
+    if crop != "surface":
+        found = choose_and_fingerprint("clouds", clouds, chosen, None, folder)
+        return CloudDataset(chosen, found.train, found.test, found.fingerprint, notes)
+    digest = hashlib.sha256(repr(("meshes", VERSION, n_points, seed, chosen)).encode())
+    for path, split, source in zip(names, splits, sources, strict=True):
+        digest.update(repr((split, str(path), source.digest)).encode())
+    return CloudDataset(chosen, clouds["train"], clouds["test"], digest.hexdigest(), notes)
 
 
-def _check(test_share: float, crop: str, crop_size: float | None, surface: int | None) -> None:
-    if not 0 < test_share < 1:
-        raise UserError(f"test_share must be between 0 and 1, got {test_share}.")
-    check_crop(crop, crop_size)
-    if surface is not None and surface < 1:
-        raise UserError(f"surface must be at least 1, got {surface}.")
-
-
-def cloud_files(folder: Path, pattern: str = "*") -> list[PurePosixPath]:
-    """Return the relative paths of the clouds and meshes in a folder and its subfolders, sorted.
+def files(folder: Path, suffixes: Sequence[str]) -> list[PurePosixPath]:
+    """Return the relative paths of the files in a folder and its subfolders, sorted.
 
     Args:
         folder: the folder.
-        pattern: of the ends of the paths, as in ``velodyne/*.bin``.
+        suffixes: what the paths may end in.
 
     Raises:
         UserError: there is none.
     """
     names = sorted(
         PurePosixPath(path.relative_to(folder).as_posix())
-        for path in folder.rglob(pattern)
-        if path.suffix.lower() in READABLE and path.is_file()
+        for path in folder.rglob("*")
+        if path.suffix.lower() in suffixes and path.is_file()
     )
     names = [name for name in names if not any(part.startswith(".") for part in name.parts)]
     if not names:
         raise UserError(
-            f"root: no cloud in {folder} or its subfolders. Looked for {pattern} ending in "
-            f"{', '.join(READABLE)}."
+            f"root: no file in {folder} or its subfolders ends in {', '.join(suffixes)}."
         )
     return names
 
 
-def _dataset(
-    folder: Path, sources: list[Source], splits: list[str], classes: tuple[str, ...], skipped: int
-) -> CloudDataset:
-    """Collect the crops of both splits; files with an empty split are left out."""
-    counts = {split: splits.count(split) for split in SPLITS}
-    notes: dict[str, Any] = {f"{split}_files": number for split, number in counts.items()}
-    notes |= {"skipped_files": skipped, "left_out_tiles": splits.count("")}
-    if skipped or splits.count(""):
-        print(
-            f"{folder}: {skipped} files without a usable cloud skipped, {splits.count('')} training"
-            " tiles left out because they touch a test tile.",
-            file=sys.stderr,
-        )
+def _used(
+    names: list[PurePosixPath], splits: list[str]
+) -> tuple[list[PurePosixPath], list[str] | None]:
+    """Leave out the files that are in neither split."""
+    kept = [i for i, split in enumerate(splits) if split]
+    return [names[i] for i in kept], [splits[i] for i in kept]
+
+
+def _with_progress(names: list[PurePosixPath]) -> Iterable[PurePosixPath]:
+    console = Console(stderr=True)
+    return track(names, "Reading files", console=console, disable=not console.is_terminal)
+
+
+def _crops(
+    folder: Path, names: list[PurePosixPath], n_points: int, crop: Crop, number: int, seed: int
+) -> list[Source]:
+    """Draw crops of clouds."""
+    sources = []
+    for name in _with_progress(names):
+        rng = np.random.default_rng(derive_seed(seed, zlib.crc32(str(name).encode())))
+        points = read(folder / name, max(10_000, 8 * n_points), seed).finite().points
+        drawn = torch.from_numpy(random_crops(points, n_points, number, crop, rng, folder / name))
+        box: NDArray[np.float64] = np.stack([points.min(0), points.max(0)])
+        sources.append(Source(normalize_unit_sphere(drawn), box))
+    return sources
+
+
+def _surfaces(
+    folder: Path, names: list[PurePosixPath], n_points: int, seed: int, cache: str | Path | None
+) -> list[Source]:
+    """Sample the surfaces of meshes."""
+    kept = Path(cache).expanduser() if cache else None
+    if kept is not None:
+        remove_temporary(kept, below=False)
+    sources = []
+    for name in _with_progress(names):
+        digest, points = sample_surface(folder / name, n_points, seed, kept)
+        sources.append(Source(points[None], digest=digest))
+    return sources
+
+
+def _splits(
+    folder: Path,
+    names: list[PurePosixPath],
+    sources: list[Source],
+    splits: list[str],
+    classes: tuple[str, ...],
+) -> dict[str, Clouds]:
+    """Return the clouds of both splits."""
     clouds: dict[str, Clouds] = {}
     for split in SPLITS:
-        rows = [i for i, one in enumerate(splits) if one == split]
+        rows = [i for i, of_file in enumerate(splits) if of_file == split]
         if not rows:
-            raise UserError(f"root: {folder} has no {split} file ({skipped} files skipped).")
-        crops = torch.from_numpy(np.concatenate([sources[i].crops for i in rows]))
-        each = len(sources[0].crops)
-        labels = torch.tensor([classes.index(class_of(sources[i].name)) for i in rows])
+            raise UserError(f"root: {folder} has no {split} file of {', '.join(classes)}.")
+        each = len(sources[0].clouds)
+        labels = torch.tensor([classes.index(class_of(names[i])) for i in rows])
         clouds[split] = Clouds(
-            normalize_unit_sphere(crops),
+            torch.cat([sources[i].clouds for i in rows]),
             labels.repeat_interleave(each),
-            torch.tensor(rows).repeat_interleave(each),
+            torch.tensor(rows).repeat_interleave(each) if each > 1 else None,
         )
-    found = choose_and_fingerprint("clouds", clouds, classes, None, folder)
-    return CloudDataset(found.class_names, found.train, found.test, found.fingerprint, notes)
+    return clouds
+
+
+def _notes(
+    folder: Path,
+    names: list[PurePosixPath],
+    splits: list[str],
+    classes: tuple[str, ...],
+    left_out: int,
+) -> dict[str, Any]:
+    """Return facts for the run record; print what a user may not expect."""
+    notes: dict[str, Any] = {f"{split}_files": splits.count(split) for split in SPLITS}
+    notes["left_out_files"] = left_out
+    if left_out:
+        print(
+            f"{folder}: {left_out} training files left out because they touch a test file.",
+            file=sys.stderr,
+        )
+    for split, consequence in zip(SPLITS, ("never learned", "never scored"), strict=True):
+        found = {
+            class_of(name) for name, of_file in zip(names, splits, strict=True) if of_file == split
+        }
+        missing = [name for name in classes if name not in found]
+        if missing:
+            notes[f"classes_without_{split}_files"] = missing
+            print(
+                f"{folder}: no {split} file of {', '.join(missing)}: {consequence}.",
+                file=sys.stderr,
+            )
+    return notes

@@ -1,15 +1,19 @@
-"""Splits of a folder of files: by its folders, or by a share that keeps neighbours together."""
+"""Splits of a folder of files: by a list, by time, by folders, or by a share of the files."""
 
+import csv
+import re
 from collections import deque
 from collections.abc import Sequence
-from pathlib import PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.data.split_list import SPLITS
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.seeding import derive_seed
+
+SPLITS = ("train", "test")
+TEST_FRAMES = ("last", "spread")
 
 Box = NDArray[np.float64]
 """Lowest and highest coordinates of a cloud, ``(2, 3)``."""
@@ -19,6 +23,122 @@ GAP = 0.02
 
 OVERLAP = 0.25
 """Boxes that share more of the smaller one's volume are scans of one place, not tiles."""
+
+
+def read_split_list(
+    root: Path, split_file: Path, suffixes: tuple[str, ...]
+) -> dict[PurePosixPath, str]:
+    """Read and check a list of files: a path relative to ``root`` and a split per line.
+
+    Args:
+        root: the folder of the files.
+        split_file: relative to the working directory or to ``root``.
+        suffixes: what the paths may end in.
+
+    Returns:
+        The split of every path.
+
+    Raises:
+        UserError: the list cannot be read, or a line is wrong.
+    """
+    path = split_file if split_file.is_file() else root / split_file
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"split_file: cannot read {split_file}: {error}.") from error
+    rows: dict[PurePosixPath, str] = {}
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        fields = [field.strip() for field in next(csv.reader([line]))]
+        if fields == ["path", "split"] and not rows:
+            continue
+        where = f"split_file: {path}, line {number}:"
+        if len(fields) != 2 or fields[1] not in SPLITS:
+            raise UserError(f"{where} must read 'path,train' or 'path,test', got {line!r}.")
+        name = PurePosixPath(fields[0])
+        if name.is_absolute() or ".." in name.parts or not name.parts:
+            raise UserError(f"{where} the path must be relative to {root}, got {fields[0]!r}.")
+        if name.suffix.lower() not in suffixes:
+            raise UserError(f"{where} {name} must end in {', '.join(suffixes)}.")
+        if name in rows:
+            raise UserError(f"{where} {name} is listed twice.")
+        if not (root / name).is_file():
+            raise UserError(f"{where} {root / name} does not exist.")
+        rows[name] = fields[1]
+    if not rows:
+        raise UserError(f"split_file: {path} lists no file.")
+    return rows
+
+
+def split_by_time(
+    names: Sequence[PurePosixPath], test_share: float, gap: int, test_frames: str
+) -> list[str]:
+    """Split every sequence of frames, which are in the order of their numbers.
+
+    Args:
+        names: of the files; the sequences are their first folders.
+        test_share: share of test frames in a sequence, between 0 and 1; at least one frame.
+        gap: number of frames between training and test frames that are not used.
+        test_frames: ``last`` or ``spread``, frames at equal distances.
+
+    Returns:
+        A split per file: ``train``, ``test``, or an empty one for files in the gap.
+
+    Raises:
+        UserError: an argument is invalid, or a sequence has no training frame.
+    """
+    check_test_share(test_share)
+    if test_frames not in TEST_FRAMES:
+        hint = did_you_mean(test_frames, TEST_FRAMES)
+        raise UserError(f"test_frames: unknown {test_frames!r}.{hint}")
+    splits = [""] * len(names)
+    for sequence in sorted({class_of(name) for name in names}):
+        members = [i for i, name in enumerate(names) if class_of(name) == sequence]
+        members.sort(key=lambda i: (names[i].parent.parts, by_number(names[i])))
+        of_sequence = _split_frames(sequence, len(members), test_share, gap, test_frames)
+        for i, split in zip(members, of_sequence, strict=True):
+            splits[i] = split
+    return splits
+
+
+def check_test_share(test_share: float) -> None:
+    """Check the share of test files.
+
+    Raises:
+        UserError: it is not between 0 and 1.
+    """
+    if not 0 < test_share < 1:
+        raise UserError(f"test_share must be between 0 and 1, got {test_share}.")
+
+
+def _split_frames(
+    sequence: str, frames: int, test_share: float, gap: int, test_frames: str
+) -> list[str]:
+    """Return the split of every frame of a sequence; frames in the gap have an empty one."""
+    n_test = max(round(frames * test_share), 1)
+    if test_frames == "last":
+        test = list(range(frames - n_test, frames))
+    else:  # the middle frame of each of n_test equal parts
+        test = [(2 * part + 1) * frames // (2 * n_test) for part in range(n_test)]
+    # Distance of every frame from the nearest test frame.
+    apart = [min(abs(frame - other) for other in test) for frame in range(frames)]
+    if gap >= max(apart):
+        largest = max(apart) - 1
+        advice = "Reduce test_share, or leave this sequence out (classes)."
+        if largest >= 0:
+            advice = f"Use a gap of at most {largest}, or a smaller test_share."
+        raise UserError(
+            f"gap must leave training frames, got {gap}: {sequence} has {frames} frame(s), "
+            f"{n_test} of them for the test. {advice}"
+        )
+    return ["train" if far > gap else "" if far else "test" for far in apart]
+
+
+def by_number(path: PurePath) -> tuple[list[tuple[int, str]], str]:
+    """Return a sort key that puts frame_9 before frame_10."""
+    parts = re.split(r"(\d+)", path.stem)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], path.name
 
 
 def split_by_folder(names: Sequence[PurePosixPath]) -> list[str] | None:
@@ -46,7 +166,7 @@ def class_of(name: PurePosixPath) -> str:
 
 
 def split_by_share(
-    names: Sequence[PurePosixPath], boxes: Sequence[Box], test_share: float, seed: int
+    names: Sequence[PurePosixPath], boxes: Sequence[Box] | None, test_share: float, seed: int
 ) -> list[str]:
     """Draw a share of the files of every class as the test split.
 
@@ -55,7 +175,7 @@ def split_by_share(
 
     Args:
         names: of the files; the classes are their first folders.
-        boxes: of the files.
+        boxes: of the files; None: no file is a tile.
         test_share: share of test files in a class, between 0 and 1; at least one file of two.
         seed: of the draw.
 
@@ -63,13 +183,14 @@ def split_by_share(
         A split per file: ``train``, ``test``, or an empty one for files that are left out.
 
     Raises:
-        UserError: no file is left for one of the splits.
+        UserError: ``test_share`` is invalid, or no file is left for one of the splits.
     """
-    touching = neighbouring_tiles(boxes)
+    check_test_share(test_share)
+    touching = [[] for _ in names] if boxes is None else neighbouring_tiles(boxes)
     classes = [class_of(name) for name in names]
     splits = ["train"] * len(names)
-    for label, one in enumerate(sorted(set(classes))):
-        members = [i for i, name in enumerate(classes) if name == one]
+    for label, of_class in enumerate(sorted(set(classes))):
+        members = [i for i, name in enumerate(classes) if name == of_class]
         order = _grown(members, touching, np.random.default_rng(derive_seed(seed, label)))
         number = max(round(len(members) * test_share), 1) if len(members) > 1 else 0
         for i in order[:number]:

@@ -20,6 +20,7 @@ from rich.progress import track
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
 from mops_lightning.data.procedural.builders import BUILDERS
+from mops_lightning.data.surfaces import unit_sphere
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write, remove_temporary
 
@@ -154,10 +155,7 @@ def _cloud(name: str, n_points: int, seed: int, split: int, i: int) -> NDArray[n
     cos, sin = np.cos(angle), np.sin(angle)
     number = int(spread.generate_state(1, np.uint64)[0])
     cloud = np.asarray(trimesh.sample.sample_surface(mesh, n_points, seed=number)[0])
-    cloud = cloud @ ((cos, 0, -sin), (0, 1, 0), (sin, 0, cos))
-    cloud -= cloud.mean(0)
-    # A single point is its own centroid and has norm 0.
-    return (cloud / max(np.linalg.norm(cloud, axis=1).max(), 1e-12)).astype(np.float32)
+    return unit_sphere(cloud @ ((cos, 0, -sin), (0, 1, 0), (sin, 0, cos)))
 
 
 def _cache_path(cache: str | Path, fingerprint: str) -> Path:

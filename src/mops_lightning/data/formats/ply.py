@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.data import ply_header
+from mops_lightning.data.formats import ply_header
 from mops_lightning.data.formats.cloud_file import BinaryCloudFile
 from mops_lightning.data.formats.errors import BadCloudError
 from mops_lightning.data.formats.table import (

@@ -9,9 +9,9 @@ from mops_lightning.data.formats import arrays, kitti, las, obj, pcd, ply, text
 from mops_lightning.data.formats.cloud_file import CloudFile
 from mops_lightning.data.formats.errors import BadCloudError, naming_file
 from mops_lightning.data.formats.limits import limited
+from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
+from mops_lightning.data.formats.mesh import parse_mesh
 from mops_lightning.data.formats.table import Table
-from mops_lightning.data.mesh_io import SUFFIXES as MESHES
-from mops_lightning.data.mesh_io import parse_mesh
 from mops_lightning.errors import one_line
 from mops_lightning.filesystem import atomic_write
 

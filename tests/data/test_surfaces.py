@@ -1,44 +1,31 @@
-"""Sampling lists of meshes, called through ``meshes``."""
+"""Sampling the surfaces of meshes, called through ``cloud_folder``."""
 
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from mops_lightning.data.meshes import meshes
+from mops_lightning.data.cloud_folder import cloud_folder
+from mops_lightning.data.surfaces import sample_surface
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
 from tests.support.meshes import BALL, write_mesh
 
-
-def test_sampling_class_in_one_split_is_reported(
-    mesh_layout: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (mesh_layout / "ball" / "test" / "ball_3.OFF").unlink()
-    dataset = meshes(mesh_layout, n_points=20)
-    assert dataset.notes["classes_without_test_meshes"] == ["ball"]
-    assert "no test mesh of ball: never scored" in capsys.readouterr().err
+meshes = partial(cloud_folder, crop="surface", crops=1)
 
 
-def test_sampling_broken_mesh_raises_or_is_skipped(mesh_layout: Path) -> None:
-    whole = meshes(mesh_layout, n_points=20)
-    (mesh_layout / "ball" / "train" / "a.off").write_bytes(b"OFF\n")
-    (mesh_layout / "box" / "test" / "b.stl").write_bytes(b"")
-    with pytest.raises(UserError, match=r"a\.off is broken.*dataset\.skip_broken=true"):
-        meshes(mesh_layout, n_points=20)
-    dataset = meshes(mesh_layout, n_points=20, skip_broken=True)
-    assert dataset.notes == {"skipped_meshes": 2}
-    assert torch.equal(dataset.train.points, whole.train.points)
-    assert torch.equal(dataset.test.labels, whole.test.labels)
-
-
-def test_sampling_split_without_mesh_raises(mesh_layout: Path) -> None:
-    for path in mesh_layout.glob("*/test/*"):
-        path.write_bytes(b"")
-    with pytest.raises(UserError, match=r"no test mesh of ball, box .*2 broken meshes"):
-        meshes(mesh_layout, n_points=20, skip_broken=True)
+def test_sample_surface_is_uniform_by_area(tmp_path: Path) -> None:
+    # A big and a small triangle in the plane z = 5: 90 % and 10 % of the area.
+    text = "OFF\n6 2 0\n0 0 5\n3 0 5\n0 3 5\n9 0 5\n10 0 5\n9 1 5\n3 0 1 2\n3 3 4 5\n"
+    (tmp_path / "two.off").write_text(text)
+    points = sample_surface(tmp_path / "two.off", 10_000, seed=0)[1].numpy()
+    assert np.ptp(points[:, 2]) == 0
+    small = points[:, 0] > points[:, 0].min() + 0.6 * np.ptp(points[:, 0])
+    assert abs(small.mean() - 0.1) < 0.012  # four standard deviations
+    assert len(np.unique(points, axis=0)) == 10_000
 
 
 def test_sampling_cloud_depends_on_content_and_seed(mesh_layout: Path, tmp_path: Path) -> None:
@@ -111,14 +98,4 @@ def test_sampling_damaged_cache_is_replaced(
 def test_sampling_unwritable_cache_raises(mesh_layout: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=r"^cache: cannot write"):
-        meshes(mesh_layout, n_points=20, cache=tmp_path / "file", skip_broken=True)
-
-
-def test_sampling_workers_give_same_result(mesh_layout: Path) -> None:
-    (mesh_layout / "ball" / "train" / "a.off").write_bytes(b"OFF\n")
-    one = meshes(mesh_layout, n_points=20, skip_broken=True)
-    two = meshes(mesh_layout, n_points=20, skip_broken=True, workers=2)
-    assert torch.equal(one.train.points, two.train.points)
-    assert torch.equal(one.test.points, two.test.points)
-    assert one.fingerprint == two.fingerprint
-    assert one.notes == two.notes == {"skipped_meshes": 1}
+        meshes(mesh_layout, n_points=20, cache=tmp_path / "file")

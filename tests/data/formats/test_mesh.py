@@ -1,4 +1,6 @@
+import json
 import os
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -6,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mops_lightning.data.mesh_io import MAX_MATERIALS, BrokenMeshError, cloud_from_file, parse_mesh
+from mops_lightning.data.formats.mesh import MAX_MATERIALS, BrokenMeshError, parse_mesh
 
 BOX = trimesh.creation.box((1.0, 2.0, 3.0))
 BALL = trimesh.creation.icosphere(subdivisions=1)
@@ -16,17 +18,6 @@ SQUARE = "OFF\n4 2 0\n0 0 5\n3 0 5\n3 3 5\n0 3 5\n3 0 1 2\n3 0 2 3\n"
 def write(path: Path, mesh: Any, **options: Any) -> Path:
     mesh.export(path, **options)
     return path
-
-
-def test_cloud_is_uniform_by_area(tmp_path: Path) -> None:
-    # A big and a small triangle in the plane z = 5: 90 % and 10 % of the area.
-    text = "OFF\n6 2 0\n0 0 5\n3 0 5\n0 3 5\n9 0 5\n10 0 5\n9 1 5\n3 0 1 2\n3 3 4 5\n"
-    (tmp_path / "two.off").write_text(text)
-    _, points = cloud_from_file(tmp_path / "two.off", 10_000, seed=0)
-    assert np.ptp(points[:, 2]) == 0
-    small = points[:, 0] > points[:, 0].min() + 0.6 * np.ptp(points[:, 0])
-    assert abs(small.mean() - 0.1) < 0.012  # four standard deviations
-    assert len(np.unique(points, axis=0)) == 10_000
 
 
 @pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl", "glb", "ascii.ply", "ascii.stl"])
@@ -135,27 +126,22 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_cloud_of_broken_mesh_raises(tmp_path: Path, name: str) -> None:
+def test_parse_broken_mesh_raises(name: str) -> None:
     data, message = BROKEN[name]
-    (tmp_path / name).write_bytes(data)
     with pytest.raises(BrokenMeshError, match=rf"{name}.*({message})"):
-        cloud_from_file(tmp_path / name, 8, seed=0)
+        parse_mesh(data, Path(name))
 
 
 @pytest.mark.skipif("MOPS_DATA" not in os.environ, reason="MOPS_DATA names no folder of real data")
-def test_cloud_of_real_obj() -> None:
+def test_parse_real_obj() -> None:
     path = Path(os.environ["MOPS_DATA"]) / "scans" / "stanford-bunny.obj"
     mesh = parse_mesh(path.read_bytes(), path)
     assert len(mesh.faces) > 10_000
-    _, points = cloud_from_file(path, 1000, seed=0)
-    assert np.linalg.norm(points, axis=1).max() == pytest.approx(1)
 
 
-def test_obj_vertices_of_two_coordinates_are_broken(tmp_path):
-    path = tmp_path / "a.obj"
-    path.write_text("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n")
+def test_obj_vertices_of_two_coordinates_are_broken():
     with pytest.raises(BrokenMeshError, match=r"a\.obj is broken"):
-        cloud_from_file(path, 9, 0)
+        parse_mesh(b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", Path("a.obj"))
 
 
 def test_obj_of_many_materials_is_read(tmp_path):
@@ -163,3 +149,66 @@ def test_obj_of_many_materials_is_read(tmp_path):
     faces = "".join(f"usemtl m{number}\nf 1 2 3\n" for number in range(MAX_MATERIALS + 1))
     path.write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\n{faces}")
     assert len(parse_mesh(path.read_bytes(), path).faces) == MAX_MATERIALS + 1
+
+
+def crafted(path, change):
+    """Write a box whose JSON part was changed."""
+    data = trimesh.Scene(trimesh.creation.box()).export(file_type="glb")
+    length = struct.unpack_from("<I", data, 12)[0]
+    tree = json.loads(data[20 : 20 + length])
+    change(tree)
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + length :]
+    head = b"glTF" + struct.pack("<III", 2, 20 + len(text) + len(rest), len(text)) + b"JSON"
+    path.write_bytes(head + text + rest)
+    return path
+
+
+def announce_zeros(tree):
+    for accessor in tree["accessors"]:
+        accessor.pop("bufferView")
+        accessor["count"] = 10**9
+
+
+def repeat_mesh(tree):
+    node = next(node for node in tree["nodes"] if "mesh" in node)
+    tree["nodes"] += [{"name": str(number), "mesh": node["mesh"]} for number in range(40_000)]
+    tree["meshes"][0]["primitives"] *= 100
+
+
+def share_child(tree):
+    tree["nodes"].append({"children": [1]})
+    tree["nodes"].append({"children": [1]})
+
+
+def circle(tree):
+    tree["nodes"] = [{"children": [1], "mesh": 0}, {"children": [0], "mesh": 0}]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (announce_zeros, "values announced"),
+        (repeat_mesh, "values announced"),
+        (share_child, "two parents"),
+        (circle, "circle"),
+    ],
+)
+def test_glb_crafted_is_broken(change, said, tmp_path):
+    path = crafted(tmp_path / "a.glb", change)
+    with pytest.raises(BrokenMeshError, match=said):
+        parse_mesh(path.read_bytes(), path)
+
+
+def test_glb_texture_of_another_file_is_not_opened(tmp_path):
+    path = crafted(tmp_path / "a.glb", lambda tree: tree.update(images=[{"uri": "/etc/passwd"}]))
+    assert len(parse_mesh(path.read_bytes(), path).faces) == 12
+
+
+def test_glb_buffer_of_another_file_is_broken(tmp_path):
+    (tmp_path / "b.bin").write_bytes(bytes(9))
+    other = {"uri": "b.bin", "byteLength": 9}
+    path = crafted(tmp_path / "a.glb", lambda tree: tree["buffers"].append(other))
+    with pytest.raises(BrokenMeshError, match=r"a\.glb is broken"):
+        parse_mesh(path.read_bytes(), path)

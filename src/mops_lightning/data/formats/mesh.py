@@ -1,24 +1,20 @@
-"""Clouds from mesh files; the module imports neither torch nor trimesh: workers start fast."""
+"""Mesh files: OFF, OBJ, PLY, STL and GLB, parsed by trimesh."""
 
-import hashlib
+import json
 import re
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mops_lightning.data import glb_bounds, ply_header
+from mops_lightning.data.formats import ply_header
 from mops_lightning.errors import UserError, one_line
-from mops_lightning.filesystem import atomic_write
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
 SUFFIXES = (".off", ".obj", ".ply", ".stl", ".glb")
-VERSION = 1
-"""Part of the cache key; increment it when the same file gives another cloud."""
 
 FLAT = 1e-12
 """Smallest ratio of area to squared extent; below, a mesh is a line or a point."""
@@ -27,65 +23,12 @@ FLAT = 1e-12
 MAX_MATERIALS = 1000
 """In an OBJ file with more, materials are ignored: trimesh's time grows with their square."""
 
+VALUES_PER_BYTE = 100
+"""Most values that a GLB scene may have per byte of its file, by repeating meshes."""
+
 
 class BrokenMeshError(UserError):
-    """A mesh file without a readable surface; ``skip_broken`` skips these errors only."""
-
-
-Result = tuple[str, NDArray[np.float32]] | BrokenMeshError
-
-
-def cloud_or_error(path: Path, n_points: int, seed: int, cache: Path | None) -> Result:
-    """Do the same as ``cloud_from_file``, but return the error of a broken mesh."""
-    try:
-        return cloud_from_file(path, n_points, seed, cache)
-    except BrokenMeshError as error:
-        return error
-
-
-def cloud_from_file(
-    path: Path, n_points: int, seed: int, cache: Path | None = None
-) -> tuple[str, NDArray[np.float32]]:
-    """Sample the surface of a mesh file and normalise the cloud to the unit sphere.
-
-    The random numbers depend on ``seed`` and the content of the file only, so that a mesh gives the
-    same cloud in any folder and order.
-
-    Args:
-        path: a file with one of ``SUFFIXES``.
-        n_points: number of points, uniform by area.
-        seed: a non-negative number.
-        cache: folder for sampled clouds, found by file content and arguments, or None.
-
-    Returns:
-        sha256 of the file's bytes, and the cloud ``(n_points, 3)``: centroid at the origin, the
-        farthest point at distance 1.
-
-    Raises:
-        BrokenMeshError: the file cannot be read, or has no surface.
-        UserError: the cache cannot be written.
-    """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise BrokenMeshError(f"{path} cannot be read: {error}.") from error
-    digest = hashlib.sha256(data).hexdigest()
-    key = repr((VERSION, digest, path.suffix.lower(), n_points, seed))
-    cached = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.npy" if cache else None
-    if cached is not None and (points := _load_cached(cached, n_points)) is not None:
-        return digest, points
-    from trimesh.sample import sample_surface
-
-    mesh = parse_mesh(data, path)
-    random = np.random.default_rng([seed, int(digest[:16], 16)])
-    points = unit_sphere(sample_surface(mesh, n_points, seed=random)[0])
-    if cached is not None:
-        try:
-            with atomic_write(cached) as temporary:
-                np.save(temporary, points)
-        except OSError as error:
-            raise UserError(f"cache: cannot write {cached}: {error}.") from error
-    return digest, points
+    """A mesh file without a readable surface."""
 
 
 def parse_mesh(data: bytes, path: Path) -> "Trimesh":
@@ -136,13 +79,6 @@ def parse_mesh(data: bytes, path: Path) -> "Trimesh":
     return mesh
 
 
-def unit_sphere(points: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Centre ``(N, 3)`` points at the origin and scale the largest norm to 1."""
-    points = points - points.mean(axis=0)
-    radius = np.linalg.norm(points, axis=1).max()
-    return (points / radius if radius > 0 else points).astype(np.float32)
-
-
 def _load(data: bytes, kind: str) -> "Trimesh":
     """Parse a file with trimesh and join the parts of a scene."""
     import trimesh
@@ -162,7 +98,7 @@ def _load(data: bytes, kind: str) -> "Trimesh":
     if kind == ".ply":
         data = ply_header.plain(data)
     if kind == ".glb":
-        glb_bounds.check(data)
+        _check_glb(data)
     # Materials do not affect the surface, and their files may be missing.
     extra: dict[str, Any] = {"skip_materials": True} if kind != ".off" else {}
     scene: Any = trimesh.load(
@@ -217,10 +153,38 @@ def _announced_faces(data: bytes, kind: str) -> int:
     return int(counts[1]) if counts else 0
 
 
-def _load_cached(path: Path, n_points: int) -> NDArray[np.float32] | None:
-    """Load a cached cloud; return None if it is missing or damaged."""
-    try:
-        points: NDArray[np.float32] = np.load(path)
-    except (OSError, ValueError, EOFError):
-        return None
-    return points if points.shape == (n_points, 3) and points.dtype == np.float32 else None
+def _check_glb(data: bytes) -> None:
+    """Reject a scene that would take much more memory than its file.
+
+    Args:
+        data: content of the file.
+
+    Raises:
+        ValueError: a count is too large, or the parts of the scene are no tree.
+    """
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    limit = VALUES_PER_BYTE * len(data)
+    counts = [accessor["count"] for accessor in tree.get("accessors", [])]
+    if sum(counts) > limit:
+        raise ValueError(f"{sum(counts)} values announced in {len(data)} bytes")
+    sizes = [_glb_values(mesh, counts) for mesh in tree.get("meshes", [])]
+    nodes: list[dict[str, Any]] = tree.get("nodes", [])
+    total = sum(sizes) + sum(sizes[node["mesh"]] for node in nodes if "mesh" in node)
+    if total > limit:
+        raise ValueError(f"{total} values announced in {len(data)} bytes")
+    children = [child for node in nodes for child in node.get("children", [])]
+    if len(set(children)) < len(children):
+        raise ValueError("a part of the scene has two parents")
+    roots = set(range(len(nodes))) - set(children)
+    if nodes and not roots:
+        raise ValueError("the parts of the scene form a circle")
+
+
+def _glb_values(mesh: dict[str, Any], counts: list[int]) -> int:
+    """Return the number of values of a mesh's accessors."""
+    used = [
+        place
+        for part in mesh["primitives"]
+        for place in (*part["attributes"].values(), part.get("indices"))
+    ]
+    return sum(counts[place] for place in used if place is not None)
