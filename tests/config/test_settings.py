@@ -16,8 +16,9 @@ from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.report.build import build
 from mops_lightning.training.checkpoint import identity
+from mops_lightning.training.evaluation.settings import as_trained, command_line
+from mops_lightning.training.evaluation.trained_run import TrainedRun
 from mops_lightning.training.pretrain import cache_folder
-from mops_lightning.training.replay import command_line
 from tests.support.command_line import TINY, call
 from tests.support.reports import put_cell
 from tests.support.training import small_dataset
@@ -84,10 +85,12 @@ def test_made_up_setting_that_affects_results_may_not_differ_in_a_sweep(affects,
 def test_made_up_setting_that_affects_results_is_repeated_by_evaluate(affects, tmp_path):
     path = put_cell(tmp_path, "run", "mops", {"generated": 1.0})
     record = json.loads(path.read_text())
-    changes = {"overrides": ["haste=2"], "files": {"weights": "weights.pt"}}
+    config: Any = OmegaConf.to_container(compose(), resolve=True)
+    changes = {"config": {**config, "haste": 2.0}, "files": {"weights": "weights.pt"}}
     path.write_text(json.dumps({**record, **changes}))
-    repeated = "haste=2" in command_line([f"evaluate={path.parent}"])
-    assert repeated == (affects is not Affects.NOTHING)
+    chosen = command_line([f"evaluate={path.parent}"])
+    cfg = as_trained(compose(chosen), TrainedRun.read(str(path.parent)), chosen)
+    assert (cfg.haste == 2) == (affects is not Affects.NOTHING)
 
 
 def test_made_up_setting_that_affects_results_makes_columns_of_a_report(affects, tmp_path):

@@ -13,10 +13,11 @@ import torch
 from mops_lightning.config.compose import compose
 from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.metrics.info import MetricInfo
-from mops_lightning.training import evaluate
+from mops_lightning.training.evaluation import nets
+from mops_lightning.training.evaluation.settings import as_trained, command_line
+from mops_lightning.training.evaluation.trained_run import TrainedRun
 from mops_lightning.training.factory import make_experiment
 from mops_lightning.training.loaders import score_loader
-from mops_lightning.training.replay import command_line
 from mops_lightning.zoo import model_file, names
 
 CLOUDS = Path(__file__).parent / "clouds.npz"
@@ -48,10 +49,12 @@ def figures(name):
     card = model_file.read_card(names.available()[name])
     m = card["figures"]["m"]
     sizes = [f"sizes=[{m}]"] if m else []
-    cfg = compose(command_line([f"evaluate={name}", "dataset.n_points=1024", *sizes]))
+    chosen = command_line([f"evaluate={name}", "dataset.n_points=1024", *sizes])
+    trained = TrainedRun.read(name)
+    cfg = as_trained(compose(chosen), trained, chosen)
     data = dataset(cfg.names.task, card["record"]["class_names"])
     experiment = make_experiment(cfg, data, {}).eval()
-    evaluate.load(cfg, experiment, data)
+    nets.load(trained, cfg, experiment, data)
     task, sampler = experiment.task, experiment.sampler
     score = task.full_score or task.score if m is None else task.score
     metric = task.metrics()[score]

@@ -10,7 +10,6 @@ from omegaconf.errors import OmegaConfBaseException
 from mops_lightning.config import distributed
 from mops_lightning.config.explain import explain
 from mops_lightning.config.paths import INPUTS, check_paths
-from mops_lightning.config.validate import check
 from mops_lightning.errors import USER_ERROR, UserError, end, file_error
 from mops_lightning.zoo import names
 
@@ -25,14 +24,15 @@ def begin(config: DictConfig, arguments: Sequence[str]) -> None:
     Raises:
         SystemExit: a setting is wrong, or the folder contains a run; one line says so.
     """
-    from mops_lightning.training.evaluated_settings import as_trained
-    from mops_lightning.training.run import claim
+    from mops_lightning.training.evaluation.trained_run import TrainedRun
+    from mops_lightning.training.run import checked, claim
 
     HydraConfig.instance().set_config(config)  # the folder's name is made from it
     cfg = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     try:
         folder = Path(config.hydra.run.dir)
-        check(as_trained(cfg, list(config.hydra.overrides.task)))
+        trained = TrainedRun.read(cfg.evaluate) if cfg.evaluate else None
+        checked(cfg, trained, list(config.hydra.overrides.task))
         check_paths(cfg)
         _check_weights(cfg.weights)
         distributed.check_start(cfg, config.hydra.overrides.hydra)

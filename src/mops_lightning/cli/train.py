@@ -53,7 +53,7 @@ def _run() -> None:
         refuse_plain_groups(sys.argv[1:])
         _search_models(sys.argv[1:])
         if any(key(argument) == "evaluate" for argument in sys.argv[1:]):
-            from mops_lightning.training.replay import command_line
+            from mops_lightning.training.evaluation.settings import command_line
 
             sys.argv[1:] = command_line(sys.argv[1:])
         sys.argv[1:] = map(accepted, sys.argv[1:])

@@ -26,15 +26,6 @@ def readable(argument: str) -> str:
     return argument if _parsed(argument) else _quoted(argument)
 
 
-def repeatable(argument: str) -> str:
-    """Return a recorded override as ``readable`` does; what it added may be a default by now."""
-    argument = readable(argument)
-    override = parse(argument)
-    if override is None or not override.is_add() or override.package is not None:
-        return argument
-    return f"+{argument}" if "." in override.key_or_group else argument
-
-
 def key(argument: str) -> str:
     """Return the key that an override is about, such as ``task/net``; empty for anything else."""
     override = parse(argument)

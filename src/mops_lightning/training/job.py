@@ -11,10 +11,10 @@ from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training import checkpoint
+from mops_lightning.training.evaluation.trained_run import OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.factory import make_experiment
 from mops_lightning.training.loaders import held_out_mask
-from mops_lightning.training.replay import OF_RUN
 from mops_lightning.training.trainer import device_name, make_trainer
 
 
@@ -29,6 +29,7 @@ class Job:
         experiment: task, sampler and baselines.
         trainer: Lightning's.
         resumed: the checkpoint that training starts from; None starts at the beginning.
+        trained: the run that is evaluated.
     """
 
     cfg: DictConfig
@@ -37,11 +38,12 @@ class Job:
     experiment: Experiment
     trainer: L.Trainer
     resumed: Path | None
+    trained: TrainedRun | None
 
     @property
     def trains(self) -> bool:
         """Whether anything is trained."""
-        return self.experiment.trainable and not self.cfg.evaluate
+        return self.experiment.trainable and self.trained is None
 
     @property
     def has_task_weights(self) -> bool:
@@ -54,7 +56,13 @@ class Job:
         return self.trainer.global_rank, self.trainer.world_size
 
 
-def prepare(cfg: DictConfig, folder: Path, dataset: CloudDataset, record: RunRecord) -> Job:
+def prepare(
+    cfg: DictConfig,
+    folder: Path,
+    dataset: CloudDataset,
+    record: RunRecord,
+    trained: TrainedRun | None = None,
+) -> Job:
     """Build all parts of a run, so that mistakes in settings end it before anything is trained.
 
     Raises:
@@ -70,7 +78,7 @@ def prepare(cfg: DictConfig, folder: Path, dataset: CloudDataset, record: RunRec
     record.lengthened = resumed is not None and checkpoint.lengthened(cfg, resumed)
     experiment = make_experiment(cfg, dataset, identity)
     trainer = make_trainer(cfg, folder, dataset, experiment)
-    job = Job(cfg, folder, dataset, experiment, trainer, resumed)
+    job = Job(cfg, folder, dataset, experiment, trainer, resumed, trained)
     distributed.check_shares(
         cfg.batch_size,
         len(dataset.test.labels),

@@ -18,9 +18,9 @@ from mops_lightning.filesystem import atomic_write, remove_temporary, set_aside
 from mops_lightning.training import checkpoint
 from mops_lightning.training.callbacks import added
 from mops_lightning.training.checkpoint import CHECKPOINT
+from mops_lightning.training.evaluation.trained_run import OF_RUN
 from mops_lightning.training.job import Job, prepare
 from mops_lightning.training.recording import recorded
-from mops_lightning.training.replay import OF_RUN
 from mops_lightning.training.stages import fit_and_test
 from mops_lightning.zoo import nets, weights
 from mops_lightning.zoo.weights import FILE

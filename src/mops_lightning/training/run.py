@@ -14,7 +14,8 @@ from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import closing_lines
 from mops_lightning.training import pretrain
-from mops_lightning.training.evaluated_settings import as_trained
+from mops_lightning.training.evaluation.settings import as_trained
+from mops_lightning.training.evaluation.trained_run import TrainedRun
 from mops_lightning.training.job import prepare
 from mops_lightning.training.recording import recorded
 from mops_lightning.training.stages import fit_and_test
@@ -40,15 +41,15 @@ def run(
     Raises:
         UserError: a mistake in settings or files.
     """
-    cfg = as_trained(cfg, overrides)
-    check(cfg)
+    trained = TrainedRun.read(cfg.evaluate) if cfg.evaluate else None
+    cfg = checked(cfg, trained, overrides)
     leads = not distributed.is_worker_rank(cfg)
     if leads and not claimed:
         claim(folder)
     with recorded(cfg, folder, overrides or []) as record:
         with record.timed("data"):
             dataset = _load_data(cfg)
-        job = prepare(cfg, folder, dataset, record)
+        job = prepare(cfg, folder, dataset, record, trained)
         task_weights = None
         if job.has_task_weights:
             with record.timed("pretrain"):
@@ -58,6 +59,18 @@ def run(
     if leads:
         closing_lines(folder, record)
     return record
+
+
+def checked(cfg: DictConfig, trained: TrainedRun | None, overrides: list[str] | None) -> DictConfig:
+    """Return the settings of a run, after mistakes in them were looked for.
+
+    Raises:
+        UserError: there is one.
+    """
+    if trained is not None and overrides is not None:
+        return as_trained(cfg, trained, overrides)
+    check(cfg)
+    return cfg
 
 
 def claim(folder: Path) -> None:

@@ -16,8 +16,8 @@ from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records.metric_info import foreign_metrics
 from mops_lightning.records.readout_names import parse
 from mops_lightning.records.run_record import RunRecord
-from mops_lightning.training import evaluate
 from mops_lightning.training.divergence import Diverged, with_checkpoint
+from mops_lightning.training.evaluation import nets
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.full_predictions import FullPredictions
 from mops_lightning.training.job import Job
@@ -87,9 +87,9 @@ def _load_weights(job: Job, record: RunRecord, task_weights: Path | None) -> Non
             raise UserError(f"weights: {error}") from None
         record.weights_loaded = content["sha256"]
         if task.requires_same_classes and content.get("classes"):
-            evaluate.same_classes(content["classes"], job.dataset, f"weights: {task_weights}")
-    if job.cfg.evaluate:
-        record.evaluated = evaluate.load(job.cfg, job.experiment, job.dataset)
+            nets.check_classes(content["classes"], job.dataset, f"weights: {task_weights}")
+    if job.trained is not None:
+        record.evaluated = nets.load(job.trained, job.cfg, job.experiment, job.dataset)
 
 
 def _fit(job: Job) -> None:

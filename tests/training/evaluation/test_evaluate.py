@@ -8,7 +8,7 @@ from mops_lightning.config.compose import compose
 from mops_lightning.config.overrides import accepted
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-from mops_lightning.training.replay import command_line
+from mops_lightning.training.evaluation.settings import command_line
 from mops_lightning.training.run import run
 from mops_lightning.zoo import publish
 from tests.support.command_line import SMALL_PCRNET, TINY, call, runs
@@ -111,19 +111,13 @@ def test_evaluate_model_without_its_task_net_asks_for_one(trained, tmp_path):
 
 def test_evaluate_refuses_other_sampler_settings_however_they_are_given(trained, tmp_path):
     with pytest.raises(UserError, match=r"sampler\.alpha must be 30\.0, as in .*, got 3"):
-        evaluated(trained, tmp_path, "sampler=fmops", "++sampler={alpha:3}")
-    cfg = compose(command_line([f"evaluate={trained[0]}", "sampler.alpha=3"]))
-    with pytest.raises(UserError, match=r"sampler\.alpha must be 30\.0, as in .*, got 3"):
-        run(cfg, tmp_path / "python")
+        evaluated(trained, tmp_path, "sampler=fmops", "++sampler.alpha=3")
 
 
 def test_evaluate_takes_no_code_from_settings_of_record(trained, tmp_path):
     target = {**trained[1].config["sampler"], "_target_": "pathlib.Path"}
-    with pytest.raises(UserError, match=r"sampler\._target_ must be pathlib\.Path, as in .*run"):
-        evaluated(changed_record(trained, tmp_path / "run", target), tmp_path)
-    resolved = {**trained[1].config["sampler"], "num_sizes": "${oc.env:HOME}"}
-    with pytest.raises(UserError, match=r"sampler\.num_sizes must be \$\{oc\.env:HOME\}"):
-        evaluated(changed_record(trained, tmp_path / "other", resolved), tmp_path / "new")
+    again = evaluated(changed_record(trained, tmp_path / "run", target), tmp_path)
+    assert again.metrics == trained[1].metrics
 
 
 def test_evaluate_other_sizes_and_data(trained, tmp_path):
@@ -175,7 +169,7 @@ def test_evaluate_joint_run_uses_its_task_net(tmp_path):
         ("sampler=mops", "trained with sampler=fmops, got sampler=mops"),
         ("dataset.classes=[chair,vase]", "has 3 classes, which are not the 2 classes"),
         ("dataset.classes=[vase,chair,bed]", "classes, which are not the"),
-        ("learn=sampler", "trains nothing, got learn=sampler"),
+        ("learn=sampler", "learn=sampler: has no effect"),
         ("sizes=[33]", "at most sampler.m_max=32"),
         ("ckpt_path=last", "ckpt_path=last: has no effect with evaluate"),
     ],
@@ -226,9 +220,9 @@ def test_evaluate_task_net_on_other_data(tmp_path):
     more = evaluated(folder, tmp_path / "more", "dataset.n_points=90", "test_noise_std=0.01")
     assert more.config["task"]["net"]["n_points"] == 90
     assert more.score != made.score
-    with pytest.raises(UserError, match="trained a task net; leave weights out"):
+    with pytest.raises(UserError, match="trained a task net alone"):
         evaluated(folder, tmp_path / "a", "weights=null")
-    with pytest.raises(UserError, match=r"made with learn=task.*weights=.*/weights.pt"):
+    with pytest.raises(UserError, match="learn=nothing: has no effect"):
         evaluated(folder, tmp_path / "b", "learn=nothing")
 
 

@@ -1,0 +1,115 @@
+"""Loading the nets of a trained run, and refusing settings that they do not fit."""
+
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from mops_lightning.data.clouds import CloudDataset
+from mops_lightning.errors import UserError
+from mops_lightning.records.run_record import Evaluated
+from mops_lightning.training.checkpoint import CHECKPOINT
+from mops_lightning.training.evaluation.trained_run import KEY, OF_RUN, TrainedRun
+from mops_lightning.training.experiment import Experiment
+from mops_lightning.zoo import weights
+
+
+def load(
+    trained: TrainedRun, cfg: DictConfig, experiment: Experiment, dataset: CloudDataset
+) -> Evaluated:
+    """Load the nets of a trained run into an experiment.
+
+    Returns:
+        The run and how it was trained, for the record.
+
+    Raises:
+        UserError: settings, classes or files do not match the run.
+    """
+    record, name = trained.record, trained.name
+    with_net = cfg.weights == OF_RUN and any(True for _ in experiment.task.parameters())
+    own_data = record.dataset_fingerprint == dataset.fingerprint
+    if experiment.task.requires_same_classes and cfg.weights == OF_RUN and not own_data:
+        check_classes(record.class_names, dataset, f"{KEY}: {name}")
+    part = "task net" if trained.trained_task_net else "sampler"
+    module = experiment.task if trained.trained_task_net else experiment.sampler
+    assert module is not None  # learn=nothing builds a sampler
+    try:
+        content = weights.load_into(module, weights.of_run(trained.place))
+    except UserError as error:
+        raise UserError(f"{KEY}: the {part} of {name} cannot be loaded: {error}") from None
+    if with_net and not trained.trained_task_net:
+        try:
+            _load_task(experiment.task, trained)
+        except UserError as error:
+            raise UserError(f"{KEY}: {error}{_changed_net(cfg, record.config)}") from None
+    return Evaluated(
+        run=name,
+        commit=record.git["commit"],
+        max_epochs=record.config["trainer"]["max_epochs"],
+        learn=record.config["learn"],
+        recipe=record.recipe,
+        seed=record.seed,
+        dataset=record.config["names"]["dataset"],
+        weights_sha256=content["sha256"],
+    )
+
+
+def check_classes(names: list[str] | None, dataset: CloudDataset, what: str) -> None:
+    """Reject a net whose class numbers differ from those of the data.
+
+    Args:
+        names: the classes that the net was trained on; None if unknown.
+        dataset: the data.
+        what: the file or folder of the net.
+
+    Raises:
+        UserError: they differ, or are unknown.
+    """
+    classes = list(dataset.class_names)
+    if names is None:
+        raise UserError(
+            f"{what} does not name the classes of its net, so it can be used with its own data "
+            "only."
+        )
+    if list(names) != classes:
+        missing = [name for name in names if name not in classes] or list(names)
+        raise UserError(
+            f"{what}: its net has {len(names)} classes, which are not the {len(classes)} classes "
+            f"of the data: {', '.join(missing[:3])} ... instead of {', '.join(classes[:3])} .... "
+            "Give a task net of these classes with weights=auto, or data of its classes with "
+            "dataset.classes."
+        )
+
+
+def _load_task(task: torch.nn.Module, trained: TrainedRun) -> None:
+    """Load the task net from a jointly trained run's weights, or from the run's checkpoint."""
+    place, record = trained.place, trained.record
+    if "task_weights" in record.files:
+        weights.load_into(task, weights.of_run(place, "task_weights"))
+        return
+    if place.is_file():
+        raise UserError(f"the model {place.stem} comes without its task net. Give weights=FILE.")
+    path = place / "checkpoints" / CHECKPOINT
+    if not path.is_file():
+        raise UserError(
+            f"{path}, which contains the run's task net, does not exist. Give weights=FILE."
+        )
+    state = weights.read_plain(path, "a checkpoint")["state_dict"]
+    own = {
+        key.removeprefix("task."): value for key, value in state.items() if key.startswith("task.")
+    }
+    if weights.digest(own) != record.task_weights_sha256:
+        raise UserError(f"{path} does not belong to the run in its folder. Give weights=FILE.")
+    weights.fit_state(task, own, path)
+
+
+def _changed_net(cfg: DictConfig, config: dict[str, Any]) -> str:
+    """Return the settings of the task net in which an evaluation differs from its run."""
+    new: Any = OmegaConf.to_container(cfg.task.net, resolve=True)
+    old = config["task"].get("net") or {}
+    changed = [
+        f"task.net.{key} is {new.get(key)} here and was {old.get(key)}"
+        for key in {**old, **new}
+        if new.get(key) != old.get(key)
+    ]
+    return f" Cause: {', '.join(changed)}." if changed else ""

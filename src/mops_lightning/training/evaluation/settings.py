@@ -1,0 +1,238 @@
+"""The settings of an evaluation: those of the trained run's record, then those of the user."""
+
+from copy import deepcopy
+from inspect import Parameter
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+
+from mops_lightning.config import overrides, settings
+from mops_lightning.config.build import signature
+from mops_lightning.config.declaration import Affects
+from mops_lightning.config.validate import check
+from mops_lightning.errors import UserError
+from mops_lightning.records.run_record import dotted
+from mops_lightning.training.evaluation.trained_run import KEY, NAME, OF_RUN, TrainedRun
+
+OF_SAMPLER = (
+    *("learn", "experiment", "optimizer", "task_lr_scale", "recipe", "trainer.max_epochs"),
+    *("epochs.sampler", "augment.sampler"),
+)
+"""Settings of the training of a sampler."""
+OF_TRAINING = (
+    *OF_SAMPLER,
+    *("pretrain", "val_fraction", "augment", "epochs", "ckpt_path", "trainer.gradient_clip_val"),
+    *("trainer.gradient_clip_algorithm", "trainer.accumulate_grad_batches"),
+)
+"""Settings of any training."""
+
+
+def command_line(arguments: list[str]) -> list[str]:
+    """Add a run's choices of groups to the user's if ``evaluate=RUN`` is among these.
+
+    Args:
+        arguments: flags, then settings.
+
+    Raises:
+        UserError: RUN is not a completed run that trained something.
+    """
+    named = [argument for argument in arguments if overrides.key(argument) == KEY]
+    name = _run_named(named[-1]) if named else None
+    if not name:
+        return arguments
+    path = Path(name).expanduser()
+    trained = TrainedRun.read(str(path) if path.exists() else name)
+    _check_given(arguments, trained)
+    rest = [argument for argument in arguments if argument not in named]
+    given = [overrides.path(argument) for argument in rest]
+    learn = "task" if trained.trained_task_net else "nothing"
+    run = f"{KEY}={overrides.quote(trained.name)}"
+    inserted = [
+        argument
+        for argument in (*trained.choices(), f"learn={learn}", f"weights={OF_RUN}", run)
+        if not any(_covers(path, overrides.path(argument)) for path in given)
+    ]
+    return [*rest, *inserted]
+
+
+def _run_named(argument: str) -> str | None:
+    """Return the run that ``evaluate=RUN`` names."""
+    override = overrides.parse(argument)
+    if override is None or override.is_delete():
+        return None
+    if override.is_sweep_override():
+        raise UserError(f"{argument}: {KEY} takes one run. Start one evaluation for each.")
+    value = override.value()
+    if value == "":
+        raise UserError(
+            f"{argument}: no run is given. Give a run's folder or a model, or leave it out."
+        )
+    return None if value is None else str(value)
+
+
+def _check_given(arguments: list[str], trained: TrainedRun) -> None:
+    """Refuse the user's settings that a test of this run cannot have, or that do not change it.
+
+    Raises:
+        UserError: there is one.
+    """
+    used = trained.record.config["names"]
+    # weights=auto may train a task net, with settings of its own.
+    inert = OF_SAMPLER if "weights=auto" in arguments else OF_TRAINING
+    for argument in arguments:
+        path = overrides.path(argument)
+        if any(_covers(setting, path) for setting in inert):
+            raise UserError(
+                f"{argument}: has no effect with {KEY}, which trains nothing. Leave it out, or "
+                f"train with the settings of {trained.name} and without {KEY}."
+            )
+        if trained.trained_task_net and (path == "weights" or _covers("sampler", path)):
+            raise UserError(
+                f"{argument}: has no effect with {KEY}={trained.name}, which trained a task net "
+                "alone. To test a sampler with it, evaluate the sampler's run with "
+                f"weights={trained.name}."
+            )
+        if path in ("task", "sampler") and argument != f"{path}={used[path]}":
+            raise UserError(
+                f"{KEY}: {trained.name} was trained with {path}={used[path]}, got {argument}. "
+                f"Leave {path} out, or give another run."
+            )
+
+
+def _covers(path: str, other: str) -> bool:
+    """Return whether a setting is another one or contains it."""
+    return other == path or other.startswith(f"{path}.")
+
+
+def as_trained(cfg: DictConfig, trained: TrainedRun, given: list[str]) -> DictConfig:
+    """Return the checked configuration of an evaluation: the run's settings, then the user's.
+
+    Interpolations stay where they lead to the run's values, so that ``sampler.seed`` follows a
+    ``seed`` of the user.
+
+    Args:
+        cfg: composed from the run's groups.
+        trained: the run.
+        given: the overrides it was composed from.
+
+    Raises:
+        UserError: a value in the record or in ``cfg`` is wrong, or not accepted from a record.
+    """
+    chosen = trained.choices()
+    changed = [overrides.path(argument) for argument in given if argument not in chosen]
+    trained.check_classes(changed)
+    try:
+        merged = _recorded(cfg, trained)
+        sampler = _plain(merged.sampler)
+        with open_dict(merged):
+            for path in changed:
+                _restore(merged, cfg, path)
+        check(merged)
+    except (UserError, OmegaConfBaseException) as error:
+        text = str(error).splitlines()[0]
+        if any(text.startswith(path) for path in changed):
+            raise
+        raise UserError(f"{KEY}: the record of {trained.name}: {text}") from None
+    if not trained.trained_task_net:
+        _check_sampler(sampler, _plain(merged.sampler), trained.name)
+    return merged
+
+
+def _check_sampler(old: dict[str, Any], new: dict[str, Any], name: str) -> None:
+    """Refuse another setting of the sampler's training than the run's.
+
+    Raises:
+        UserError: there is one.
+    """
+    for key in sorted({*old, *new}):
+        used, chosen = old.get(key), new.get(key)
+        if used != chosen and Affects.TRAINING in settings.of(f"sampler.{key}").affects:
+            hint = " For other sizes of a flexible sampler give sizes=[...]." if key == "m" else ""
+            raise UserError(
+                f"{KEY}: sampler.{key} must be {used}, as in {name}, got {chosen}. "
+                f"Leave it out, or train a sampler with it.{hint}"
+            )
+
+
+def _plain(node: DictConfig) -> Any:
+    return OmegaConf.to_container(node, resolve=True)
+
+
+def _recorded(cfg: DictConfig, trained: TrainedRun) -> DictConfig:
+    """Return a configuration with the run's values of all settings that an evaluation repeats.
+
+    A setting that no longer exists is left out, unless the run's user had given it.
+    """
+    recorded = _leaves(trained.record.config)
+    present = _leaves(OmegaConf.to_container(cfg, resolve=False))
+    given = {overrides.path(argument) for argument in trained.record.overrides}
+    follows = {path for path, value in present.items() if "${" in str(value)}
+    merged = deepcopy(cfg)
+    with open_dict(merged):
+        for name in set(merged.baselines or ()) - set(trained.record.config.get("baselines") or ()):
+            del merged.baselines[name]
+        for path, value in recorded.items():
+            if not all(map(NAME.fullmatch, path.split("."))) or _names_code(value):
+                raise trained.not_accepted(path)
+            if path not in follows and (path in given or _exists(cfg, path)):
+                OmegaConf.update(merged, path, value, merge=False)
+        for path in present.keys() - recorded.keys() - follows:
+            parameter = _parameter(cfg, path)
+            if parameter is not None and parameter.default is not parameter.empty:
+                OmegaConf.update(merged, path, parameter.default, merge=False)
+        resolved = dotted(OmegaConf.to_container(merged, resolve=True))
+        for path in follows & recorded.keys():
+            if resolved.get(path) != recorded[path]:
+                OmegaConf.update(merged, path, recorded[path], merge=False)
+    return merged
+
+
+def _leaves(config: Any) -> dict[str, Any]:
+    """Return the settings that an evaluation repeats, by dotted path, without classes."""
+    known = settings.declared()
+    return {
+        path: value
+        for path, value in dotted(config).items()
+        if (top := path.partition(".")[0]) in known
+        and top != "names"
+        and settings.of(path).repeated
+        and not any(part.startswith("_") for part in path.split("."))
+    }
+
+
+def _exists(cfg: DictConfig, path: str) -> bool:
+    """Return whether a configuration has a setting, or the class of its node takes it."""
+    where, _, name = path.rpartition(".")
+    node = OmegaConf.select(cfg, where) if where else cfg
+    return isinstance(node, DictConfig) and (name in node or _parameter(cfg, path) is not None)
+
+
+def _parameter(cfg: DictConfig, path: str) -> Parameter | None:
+    """Return the argument that a setting is of the class of its node, if the class has it."""
+    where, _, name = path.rpartition(".")
+    node = OmegaConf.select(cfg, where) if where else None
+    if not isinstance(node, DictConfig) or "_target_" not in node:
+        return None
+    return signature(str(node["_target_"]), where).get(name)
+
+
+def _restore(merged: DictConfig, cfg: DictConfig, path: str) -> None:
+    """Set a setting that the user gave to the user's value, or remove it as the user did."""
+    where, _, name = path.rpartition(".")
+    source = OmegaConf.select(cfg, where) if where else cfg
+    target = OmegaConf.select(merged, where) if where else merged
+    if isinstance(source, DictConfig) and name in source:
+        OmegaConf.update(merged, path, source._get_node(name), merge=False)
+    elif isinstance(target, DictConfig) and name in target:
+        del target[name]
+
+
+def _names_code(value: Any) -> bool:
+    """Return whether a value holds a special key such as ``_target_``, or an interpolation."""
+    if isinstance(value, dict):
+        return any(str(key).startswith("_") or _names_code(item) for key, item in value.items())
+    if isinstance(value, list):
+        return any(map(_names_code, value))
+    return "${" in str(value)

@@ -1,0 +1,192 @@
+"""The settings that ``evaluate=RUN`` takes from RUN's record, and those that it refuses to take."""
+
+import json
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from mops_lightning.config.compose import compose
+from mops_lightning.config.overrides import accepted
+from mops_lightning.errors import UserError
+from mops_lightning.training.evaluation.settings import as_trained, command_line
+from mops_lightning.training.evaluation.trained_run import TrainedRun
+from tests.support.command_line import TINY
+from tests.support.records import record
+
+OVERRIDES = [*TINY, "sampler=fmops", "sampler.m_max=32"]
+
+
+def write_run(folder, overrides=OVERRIDES, changes=None, more=()):
+    """Write the record of a completed run; only the record is read here."""
+    folder.mkdir()
+    config: Any = OmegaConf.to_container(compose(overrides), resolve=True)
+    for path, value in (changes or {}).items():
+        *nodes, name = path.split(".")
+        node = config
+        for key in nodes:
+            node = node[key]
+        node[name] = value
+    made = record(config, overrides=[*overrides, *more], files={"weights": "weights.pt"})
+    (folder / "result.json").write_text(json.dumps(made.plain()))
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path):
+    return write_run(tmp_path / "run")
+
+
+def evaluated(run, *arguments):
+    """Return the configuration of an evaluation by a command line."""
+    chosen = [accepted(argument) for argument in command_line([*arguments, f"evaluate={run}"])]
+    cfg = compose(chosen)
+    return as_trained(cfg, TrainedRun.read(cfg.evaluate), chosen)
+
+
+def test_evaluation_has_settings_of_its_run(run):
+    cfg = evaluated(run)
+    assert (cfg.learn, cfg.weights, cfg.evaluate) == ("nothing", "run", str(run))
+    assert (cfg.m, cfg.batch_size, cfg.sampler.m_max) == (8, 4, 32)
+    assert cfg.dataset.classes == ["chair", "vase", "lamp"]
+
+
+def test_evaluation_of_another_default_keeps_the_value_of_its_run(tmp_path):
+    values = {"batch_size": 7, "sampler.alpha": 5.0, "dataset.test_per_class": 2, "augment": {}}
+    cfg = evaluated(write_run(tmp_path / "run", changes=values))
+    assert (cfg.batch_size, cfg.sampler.alpha, cfg.dataset.test_per_class) == (7, 5.0, 2)
+
+
+def test_evaluation_setting_that_follows_another_follows_the_user(tmp_path):
+    run = write_run(tmp_path / "run", [*OVERRIDES, "seed=3"])
+    assert evaluated(run).dataset.seed == 3
+    assert evaluated(run, "seed=5").dataset.seed == 5
+    own = write_run(tmp_path / "own", [*OVERRIDES, "seed=3", "dataset.seed=0"])
+    assert evaluated(own).dataset.seed == 0
+    assert evaluated(own, "seed=5").dataset.seed == 0
+
+
+def test_evaluation_same_group_keeps_settings_and_another_drops_them(run, tmp_path):
+    assert evaluated(run, "dataset=shapes", "sampler=fmops") == evaluated(run)
+    other = evaluated(run, "dataset=meshes", f"dataset.root={tmp_path}")
+    assert "train_per_class" not in other.dataset
+
+
+@pytest.mark.parametrize("nothing", ["{}", "{fps: null}"])
+def test_evaluation_repeats_removed_baselines(nothing, tmp_path):
+    run = write_run(tmp_path / "run", [*OVERRIDES, f"baselines={nothing}"])
+    want = compose([*OVERRIDES, f"baselines={nothing}"])
+    assert evaluated(run).baselines == want.baselines
+
+
+def test_evaluation_repeats_added_baseline(tmp_path):
+    run = write_run(tmp_path / "run", [*OVERRIDES, "+sampler@baselines.own=submodular"])
+    assert "own" in evaluated(run).baselines
+
+
+def test_command_line_run_named_in_several_ways(run, tmp_path):
+    first = command_line([f"evaluate={run}"])
+    for name in (f"evaluate='{run}'", f"+evaluate={run}", f"evaluate={run}/result.json"):
+        assert command_line([name]) == first
+    strange = tmp_path / "it's (1), a run"
+    strange.symlink_to(run)
+    assert compose(command_line([f"evaluate={strange}"])).evaluate == str(strange)
+    with pytest.raises(UserError, match="takes one run"):
+        command_line([f"evaluate={run},{run}"])
+
+
+def test_command_line_without_evaluate_is_unchanged():
+    assert command_line(["m=8", "evaluate=null"]) == ["m=8", "evaluate=null"]
+    assert command_line(["--help"]) == ["--help"]
+    with pytest.raises(UserError, match=r"^evaluate=: no run is given\. Give a run's folder or a "):
+        command_line(["task=registration", "evaluate="])
+
+
+def test_evaluation_leaves_out_removed_setting_that_nobody_gave(tmp_path):
+    run = write_run(tmp_path / "run", changes={"sampler.gone": 3})
+    assert "gone" not in evaluated(run).sampler
+    given = write_run(tmp_path / "given", changes={"sampler.gone": 3}, more=["sampler.gone=3"])
+    with pytest.raises(UserError, match=r"evaluate: the record of .* takes no setting 'gone'"):
+        evaluated(given)
+
+
+CLASSES = {
+    "target": "sampler._target_=os.system",
+    "added target": "+dataset.extra._target_=os.system",
+    "path as choice": "task/net=../../evil",
+    "path in a package": "+sampler@baselines.own=/evil",
+    "sweep": "task/net=a,b",
+}
+
+
+@pytest.mark.parametrize("attack", CLASSES)
+def test_evaluation_record_with_class_or_path_raises(attack, tmp_path):
+    run = write_run(tmp_path / "run", more=[CLASSES[attack]])
+    with pytest.raises(UserError, match="not accepted from a record") as refused:
+        evaluated(run)
+    assert CLASSES[attack].partition("=")[0].lstrip("+") in str(refused.value)
+
+
+@pytest.mark.parametrize("group", ["task", "dataset", "sampler"])
+def test_evaluation_record_with_path_as_group_raises(group, tmp_path):
+    run = write_run(tmp_path / "run", changes={f"names.{group}": "../../../tmp/evil"})
+    with pytest.raises(UserError, match="not accepted from a record"):
+        evaluated(run)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("sampler.num_sizes", "${oc.env:HOME}"),
+        ("sampler.alpha", [{"_target_": "os.system"}]),
+        ("dataset.classes", {"a": ["${oc.env:HOME}"]}),
+        ("task.x[0]", 1),
+    ],
+)
+def test_evaluation_record_with_code_as_value_raises(path, value, tmp_path):
+    run = write_run(tmp_path / "run", changes={path: value})
+    with pytest.raises(UserError, match="not accepted from a record"):
+        evaluated(run)
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["cache", "out", "dataset.cache", "callbacks", "optimizer", "ckpt_path"],
+)
+def test_evaluation_record_chooses_no_folder_to_write_and_no_part_of_training(path, run, tmp_path):
+    evil = write_run(tmp_path / "evil", changes={path: "/evil"})
+    same = evaluated(evil)
+    same.evaluate = str(run)
+    assert same == evaluated(run)
+
+
+def test_evaluation_user_may_give_a_class_of_the_record(tmp_path):
+    run = write_run(tmp_path / "run", more=["sampler._target_=os.system"])
+    given = "sampler._target_=mops_lightning.samplers.fmops.FMOPSNet"
+    assert evaluated(run, given).sampler._target_.endswith("FMOPSNet")
+
+
+@pytest.mark.parametrize(
+    "argument",
+    [
+        *("task_lr_scale=3", "trainer.max_epochs=5", "optimizer=exponential", "++optimizer.lr=1"),
+        *("learn=sampler", "experiment=own_scans"),
+    ],
+)
+def test_evaluation_setting_without_effect_raises(run, argument):
+    for more in ([], ["weights=auto"]):
+        with pytest.raises(UserError, match="has no effect with evaluate"):
+            evaluated(run, argument, *more)
+
+
+def test_evaluation_sampler_for_a_task_net_alone_raises(tmp_path):
+    run = write_run(tmp_path / "run", [*OVERRIDES, "learn=task"])
+    for argument in ("sampler=fps", "sampler.m_max=8", "++sampler.alpha=3", "weights=null"):
+        with pytest.raises(UserError, match=r"has no effect .* trained a task net alone\. To test"):
+            evaluated(run, argument)
+
+
+def test_evaluation_pretraining_takes_its_settings(run):
+    with pytest.raises(UserError, match=r"epochs.task=2: has no effect"):
+        evaluated(run, "epochs.task=2")
+    assert evaluated(run, "epochs.task=2", "weights=auto").epochs.task == 2
