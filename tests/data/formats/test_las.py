@@ -44,3 +44,37 @@ def test_laz_damaged_is_broken(size, tmp_path):
     path.write_bytes(content)
     with pytest.raises(UserError, match=r"a\.laz is broken"):
         open_cloud_file(path).read(range(size))
+
+
+def test_las_arrays_and_extended_records_are_kept(tmp_path):
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.add_extra_dim(laspy.ExtraBytesParams(name="Colors", type="3u1"))
+    header.add_extra_dim(laspy.ExtraBytesParams(name="Height", type="f4"))
+    header.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("LASF_Projection", 2112, "", b"WKT")])
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = np.random.default_rng(0).uniform(0, 9, (3, 30))
+    cloud["Colors"], cloud["Height"] = np.arange(90).reshape(30, 3), np.arange(30)
+    cloud.write(tmp_path / "a.las")
+    for table in (
+        read(tmp_path / "a.las", 9, 0),
+        open_cloud_file(tmp_path / "a.las").read(range(30)),
+    ):
+        assert table.columns["Colors_1"].tolist() == list(range(1, 90, 3))
+    table = read(tmp_path / "a.las", 9, 0)
+    WRITERS[".laz"](tmp_path / "b.laz", table.take(np.array([3, 5])))
+    again = laspy.read(tmp_path / "b.laz")
+    assert [list(again[f"Colors_{place}"]) for place in range(3)] == [[9, 15], [10, 16], [11, 17]]
+    assert list(again["Height"]) == [3, 5]
+    assert "Colors" not in again.point_format.dimension_names
+    assert [record.string for record in again.evlrs] == ["WKT"]
+
+
+def test_copc_is_written_without_its_index(tmp_path):
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.vlrs.append(laspy.copc.CopcInfoVlr())
+    header.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("copc", 1000, "", b"pages")])
+    points = np.random.default_rng(0).uniform(0, 9, (30, 3))
+    WRITERS[".las"](tmp_path / "a.las", Table(points, header=header))
+    again = laspy.read(tmp_path / "a.las")
+    assert len(again.points) == 30
+    assert not [*again.header.vlrs, *again.evlrs]

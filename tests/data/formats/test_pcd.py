@@ -90,3 +90,12 @@ def test_lzf_repeats_and_stops_at_its_size():
     assert decompress(b"\0a\xe0\x02\0\x01bc\x40\x01", 1 + 11 + 2 + 4) == b"a" * 12 + b"bcbcbc"
     with pytest.raises(ValueError, match="expected 12"):
         decompress(b"\0a" + b"\xe0\xff\0" * 100_000, 12)
+
+
+def test_pcd_fields_of_several_numbers_are_kept(tmp_path):
+    head = "FIELDS x y z fpfh\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 2\nWIDTH 3\nPOINTS 3\n"
+    lines = "".join(f"{row} 0 0 {row}.5 {row}.25\n" for row in range(3))
+    (tmp_path / "a.pcd").write_text(f"{head}DATA ascii\n{lines}")
+    table = read(tmp_path / "a.pcd", 9, 0)
+    assert list(table.columns) == ["fpfh_0", "fpfh_1"]
+    assert table.columns["fpfh_1"].tolist() == [0.25, 1.25, 2.25]

@@ -1,5 +1,6 @@
 """LAS and LAZ files, read and written by laspy, an extra."""
 
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,11 @@ import numpy as np
 from mops_lightning.data.formats import las_header
 from mops_lightning.data.formats.cloud_file import CloudFile
 from mops_lightning.data.formats.errors import BadCloudError, ends_early
-from mops_lightning.data.formats.table import Column, Table, unique_names
+from mops_lightning.data.formats.table import Column, Table, split_array, unique_names
 from mops_lightning.errors import UserError
+
+COPC = "copc"
+"""The user of the records that index the points of a COPC file."""
 
 
 def read(path: Path) -> Table:
@@ -21,7 +25,7 @@ def read(path: Path) -> Table:
     """
     laspy = _laspy(path)
     las_header.check(path)
-    with laspy.open(path, read_evlrs=False) as file:
+    with laspy.open(path) as file:
         declared = file.header.point_count
         table = _table(file.read_points(declared), file.header)
     if len(table.points) < declared:
@@ -45,7 +49,7 @@ def locate(path: Path) -> LasFile:
     """Open a file to read ranges of its rows."""
     laspy = _laspy(path)
     las_header.check(path)
-    with laspy.open(path, read_evlrs=False) as file:
+    with laspy.open(path) as file:
         return LasFile(path=path, number=file.header.point_count, header=file.header)
 
 
@@ -62,11 +66,13 @@ def _check_bounds(path: Path, table: Table, header: Any) -> None:
 
 
 def _table(cloud: Any, header: Any) -> Table:
-    """Make a table of laspy's points, with all dimensions of one number each."""
+    """Make a table of laspy's points; an array of k numbers per point becomes k columns."""
     points = np.stack([np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"], 1)
     names = [name for name in cloud.point_format.dimension_names if name not in "XYZ"]
-    columns = {name: np.asarray(cloud[name]) for name in names}
-    return Table(points, {n: c for n, c in columns.items() if c.ndim == 1}, header)
+    columns: dict[str, Column] = {}
+    for name in names:
+        columns |= split_array(name, np.asarray(cloud[name]))
+    return Table(points, columns, header)
 
 
 def write(path: Path, table: Table) -> None:
@@ -87,7 +93,11 @@ def write(path: Path, table: Table) -> None:
 
 
 def _header(laspy: Any, table: Table) -> Any:
-    """Return a header with the format, scales and offsets of the file that was read."""
+    """Return a header like that of the file that was read.
+
+    Without the index of COPC files, which does not fit other points, and without arrays of numbers,
+    which the table has as columns.
+    """
     if table.header is None:
         header = laspy.LasHeader(point_format=3, version="1.2")
         extent = float(np.ptp(table.points, axis=0).max())
@@ -95,8 +105,15 @@ def _header(laspy: Any, table: Table) -> Any:
         header.scales = np.full(3, max(extent, 1e-9) / 2**30)
         return header
     source = table.header
-    header = laspy.LasHeader(point_format=source.point_format, version=str(source.version))
-    header.offsets, header.scales, header.vlrs = source.offsets, source.scales, source.vlrs
+    header = laspy.LasHeader(
+        point_format=deepcopy(source.point_format), version=str(source.version)
+    )
+    header.offsets, header.scales = source.offsets, source.scales
+    header.vlrs = [record for record in source.vlrs if record.user_id != COPC]
+    extended = [record for record in source.evlrs or () if record.user_id != COPC]
+    header.evlrs = laspy.vlrs.vlrlist.VLRList(extended)
+    arrays = [d.name for d in source.point_format.extra_dimensions if d.num_elements > 1]
+    header.remove_extra_dims(arrays)
     return header
 
 

@@ -43,6 +43,11 @@ def check(path: Path) -> None:
             first, evlrs, number = struct.unpack_from("<QIQ", head, 235)
             end = first + evlrs * EVLR if evlrs else 0
             _within(path, f"{evlrs} extended variable length records", end, size)
+            for _ in range(evlrs):
+                file.seek(first)
+                (record_length,) = struct.unpack_from("<Q", file.read(EVLR).ljust(EVLR, b"\0"), 20)
+                first += EVLR + record_length
+                _within(path, "an extended variable length record", first, size)
         if not length:
             raise BadCloudError(f"{path} is broken: its points have no bytes.")
         if not form & 0xC0:

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from mops_lightning.data.formats.errors import BadCloudError
 from mops_lightning.data.formats.lzf import decompress
 from mops_lightning.data.formats.table import (
+    Column,
     Table,
     compact_coordinates,
     from_array,
+    split_array,
     unique_names,
 )
 
@@ -20,7 +22,7 @@ HEADER = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEW
 
 
 def read(path: Path) -> Table:
-    """Read a PCD file; fields with a COUNT above 1 are left out.
+    """Read a PCD file; a field with a COUNT of k becomes k columns.
 
     Raises:
         BadCloudError: the file is broken.
@@ -40,15 +42,14 @@ def read(path: Path) -> Table:
         array = _body(data[start:], header["DATA"][0], layout, number)
     except (KeyError, ValueError, IndexError) as error:
         raise BadCloudError(f"{path} is broken: {type(error).__name__}: {error}.") from None
-    single = [
-        field
-        for field, (_, _, count) in zip(layout.names or (), fields, strict=True)
-        if count == (1,) and not field.startswith("_")
-    ]
-    flat = np.empty(number, [(name, layout[name].base) for name in single])
-    for name in single:
-        flat[name] = array[name][:, 0]
-    return from_array(flat, single, path)
+    columns: dict[str, Column] = {}
+    for name in layout.names or ():
+        values = array[name][:, 0] if layout[name].shape == (1,) else array[name]
+        columns |= {} if name.startswith("_") else split_array(name, values)
+    flat = np.empty(number, [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        flat[name] = column
+    return from_array(flat, list(columns), path)
 
 
 def write(path: Path, table: Table) -> None:

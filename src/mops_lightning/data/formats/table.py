@@ -103,6 +103,13 @@ def column_names(array: NDArray[Any], path: Path) -> list[str]:
     return ["x", "y", "z", *(f"column_{place}" for place in range(3, shape[1]))]
 
 
+def split_array(name: str, values: NDArray[Any]) -> dict[str, Column]:
+    """Return values ``(N,)`` as one column, or ``(N, k)`` as ``NAME_0`` to ``NAME_k-1``."""
+    if values.ndim == 1:
+        return {name: values}
+    return {f"{name}_{place}": values[:, place] for place in range(values.shape[1])}
+
+
 def unique_names(table: Table) -> dict[str, Column]:
     """Return the columns under names that a file's header can hold: unique and without spaces."""
     named: dict[str, Column] = {}
