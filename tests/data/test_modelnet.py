@@ -1,6 +1,8 @@
+import hashlib
 import os
 import shutil
 import threading
+import zipfile
 from collections.abc import Callable, Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -12,6 +14,8 @@ import numpy as np
 import pytest
 import torch
 
+from mops_lightning import filesystem
+from mops_lightning.data import modelnet
 from mops_lightning.data.modelnet import FOLDER, modelnet40
 from mops_lightning.errors import UserError
 
@@ -238,19 +242,31 @@ def shelf(tmp_path: Path) -> Iterator[tuple[str, list[str], Path]]:
             thread.join()
 
 
+@pytest.fixture
+def mirror(
+    layout: Path, shelf: tuple[str, list[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """The archive on the second of two mirrors, with the expected hash."""
+    address, _, folder = shelf
+    archive = Path(shutil.make_archive(str(folder / "set"), "zip", layout.parent, FOLDER))
+    monkeypatch.setattr(modelnet, "MIRRORS", (f"{address}/gone.zip", f"{address}/set.zip"))
+    monkeypatch.setattr(modelnet, "ARCHIVE_HASH", md5(archive))
+    return archive
+
+
+def md5(path: Path) -> str:
+    return f"md5:{hashlib.md5(path.read_bytes()).hexdigest()}"
+
+
 @pytest.mark.parametrize("name", ["data", f"data/{FOLDER}"])
 def test_modelnet_downloads_once(
-    layout: Path, shelf: tuple[str, list[str], Path], tmp_path: Path, name: str
+    layout: Path, mirror: Path, shelf: tuple[str, list[str], Path], tmp_path: Path, name: str
 ) -> None:
-    address, asked, folder = shelf
-    shutil.make_archive(str(folder / "set"), "zip", layout.parent, FOLDER)
     root = tmp_path / "new" / name
-    mirrors = [f"{address}/gone.zip", f"{address}/set.zip"]
     found: list[str] = []
 
     def load() -> None:
-        dataset = modelnet40(root, n_points=4, download=True, mirrors=mirrors)
-        found.append(dataset.fingerprint)
+        found.append(modelnet40(root, n_points=4, download=True).fingerprint)
 
     threads = [threading.Thread(target=load) for _ in range(3)]  # as a sweep would start them
     for thread in threads:
@@ -259,35 +275,73 @@ def test_modelnet_downloads_once(
         thread.join()
     load()
     assert found == [modelnet40(layout, n_points=4).fingerprint] * 4
-    assert asked == ["/gone.zip", "/set.zip"]
+    assert shelf[1] == ["/gone.zip", "/set.zip"]
     assert not list((tmp_path / "new").rglob("*.zip*"))
 
 
 def test_modelnet_existing_files_are_not_downloaded(
-    layout: Path, shelf: tuple[str, list[str], Path]
+    layout: Path, mirror: Path, shelf: tuple[str, list[str], Path]
 ) -> None:
-    address, asked, _ = shelf
-    modelnet40(layout, n_points=4, download=True, mirrors=[f"{address}/set.zip"])
-    assert asked == []
-
-
-def test_modelnet_other_archive_raises(shelf: tuple[str, list[str], Path], tmp_path: Path) -> None:
-    address, _, folder = shelf
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "readme.txt").write_text("something else")
-    shutil.make_archive(str(folder / "set"), "zip", tmp_path / "other")
-    with pytest.raises(UserError, match=r"^mirrors: .* is not ModelNet40"):
-        modelnet40(tmp_path / "new", download=True, mirrors=[f"{address}/set.zip"])
+    modelnet40(layout, n_points=4, download=True)
+    assert shelf[1] == []
 
 
 def test_modelnet_wrong_hash_raises(
-    layout: Path, shelf: tuple[str, list[str], Path], tmp_path: Path
+    mirror: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    address, _, folder = shelf
-    shutil.make_archive(str(folder / "set"), "zip", layout.parent, FOLDER)
-    mirrors = [f"{address}/set.zip"]
-    with pytest.raises(UserError, match=r"hash.*expected 0000"):
-        modelnet40(tmp_path / "new", download=True, mirrors=mirrors, archive_hash="0" * 64)
+    monkeypatch.setattr(modelnet, "ARCHIVE_HASH", "md5:" + "0" * 32)
+    with pytest.raises(UserError, match=r"gone\.zip: .*404.*set\.zip: .*hash.*save the file as"):
+        modelnet40(tmp_path / "new", download=True)
+    assert not list((tmp_path / "new").rglob("*.zip"))
+
+
+def replaced(mirror: Path, monkeypatch: pytest.MonkeyPatch, content: dict[str, bytes]) -> None:
+    """Replace the archive by another one, which is expected."""
+    with zipfile.ZipFile(mirror, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name, data in content.items():
+            packed.writestr(name, data)
+    monkeypatch.setattr(modelnet, "ARCHIVE_HASH", md5(mirror))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"readme.txt": b"something else"}, "is not ModelNet40"),
+        ({"shape_names.txt": bytes(10**6)}, r"unpacks to 1,000,000 bytes, far more"),
+        ({"../outside/shape_names.txt": b"chair"}, "is not ModelNet40"),
+    ],
+)
+def test_modelnet_other_archive_raises(
+    mirror: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    content: dict[str, bytes],
+    message: str,
+) -> None:
+    replaced(mirror, monkeypatch, content)
+    monkeypatch.setattr(filesystem, "MEMORY", 10**5)
+    with pytest.raises(UserError, match=message):
+        modelnet40(tmp_path / "new", download=True)
+    assert not (tmp_path / "new" / FOLDER).exists()
+    assert not (tmp_path / "new" / "outside").exists()
+
+
+def test_modelnet_damaged_archive_raises(
+    mirror: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = bytearray(mirror.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    mirror.write_bytes(content)
+    monkeypatch.setattr(modelnet, "ARCHIVE_HASH", md5(mirror))
+    with pytest.raises(UserError, match=rf"{FOLDER}\.zip is damaged"):
+        modelnet40(tmp_path / "new", download=True)
+    assert not (tmp_path / "new" / FOLDER).exists()
+
+
+def test_modelnet_unwritable_root_raises(mirror: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=r"Cannot download ModelNet40 into"):
+        modelnet40(tmp_path / "file" / "data", download=True)
 
 
 @pytest.mark.skipif("MOPS_DATA" not in os.environ, reason="MOPS_DATA names no folder of real data")

@@ -11,8 +11,7 @@ from mops_lightning.errors import UserError
 SECONDS, MEMORY = 60.0, 1 << 30
 MODULES = {
     "hdf5": "mops_lightning.data.hdf5", "names": "mops_lightning.data.hdf5",
-    "zip": "mops_lightning.data.archive",
-    "tar": "mops_lightning.data.archive", "weights": "mops_lightning.zoo.load",
+    "weights": "mops_lightning.zoo.load",
     "checkpoint": "mops_lightning.training.checkpoint",
     "record": "mops_lightning.records.run_record", "pictured": "mops_lightning.viz.snapshots",
 }  # fmt: skip
@@ -61,20 +60,6 @@ def read_names(path):
     read_names(path)
 
 
-def read_archive(path):
-    import shutil
-
-    from mops_lightning.data.archive import unpack
-
-    folder = path.parent / "unpacked" / "into"
-    try:
-        unpack(path, folder)
-        outside = [p for p in path.parent.iterdir() if p.name not in (path.name, "unpacked")]
-        assert not outside, f"written outside: {outside}"
-    finally:
-        shutil.rmtree(folder.parent, ignore_errors=True)
-
-
 def read_weights(path):
     from mops_lightning.zoo.load import load
 
@@ -101,8 +86,8 @@ def read_pictured(path):
 
 
 READERS = {
-    "hdf5": read_hdf5, "names": read_names, "zip": read_archive,
-    "tar": read_archive, "weights": read_weights, "checkpoint": read_checkpoint,
+    "hdf5": read_hdf5, "names": read_names,
+    "weights": read_weights, "checkpoint": read_checkpoint,
     "record": read_record, "pictured": read_pictured,
 }  # fmt: skip
 

@@ -2,8 +2,6 @@
 
 import io
 import json
-import tarfile
-import zipfile
 from typing import Any
 
 import h5py
@@ -53,9 +51,6 @@ def seeds(folder):
     packed = {"compression": "gzip", "chunks": (2, 20, 3)}
     made["hdf5"] = (".h5", [_hdf5(folder / "a.h5", options) for options in ({}, packed)])
     made["names"] = (".txt", [b"chair\ntable\nlamp\n"])
-    made["zip"] = (".zip", [_zip()])
-    made["tar"] = (".tar.gz", [_tar("w:gz")])
-    made["tar xz"] = (".tar.xz", [_tar("w:xz"), _tar("w")])
     made["weights"] = (".pt", [_weights(folder / "a.pt")])
     made["checkpoint"] = (".ckpt", [_saved(lambda file: torch.save(CHECKPOINT, file))])
     run_record.write(folder, record(files={"weights": "weights.pt"}))
@@ -129,27 +124,6 @@ def _hdf5(path, options):
         )
         file["label"] = (np.arange(6) % 3).astype("u1")[:, None]
     return path.read_bytes()
-
-
-def _zip():
-    def save(file):
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
-            packed.writestr("set/", b"")
-            packed.writestr("set/a.txt", b"chair\n" * 50)
-            packed.writestr("set/deep/b.txt", bytes(range(256)))
-
-    return _saved(save)
-
-
-def _tar(mode):
-    def save(file):
-        with tarfile.open(fileobj=file, mode=mode) as packed:
-            for name in ("set/a.txt", "set/deep/b.txt"):
-                info = tarfile.TarInfo(name)
-                info.size = 300
-                packed.addfile(info, io.BytesIO(bytes(range(250)) + bytes(50)))
-
-    return _saved(save)
 
 
 def _weights(path):

@@ -2,22 +2,31 @@
 
 import hashlib
 import re
+import sys
+import tempfile
+import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
+import pooch
 import torch
+from filelock import FileLock
 
-from mops_lightning.data.archive import unpack
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, select_classes
-from mops_lightning.data.download import fetch, one_at_a_time
 from mops_lightning.data.hdf5 import read_clouds, read_names
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, one_line
+from mops_lightning.filesystem import memory
 
 FOLDER = "modelnet40_ply_hdf5_2048"
 MIRRORS = (
     f"https://huggingface.co/datasets/Msun/modelnet40/resolve/main/{FOLDER}.zip",
     f"https://shapenet.cs.stanford.edu/media/{FOLDER}.zip",
 )
+ARCHIVE_HASH = "md5:c9ab8e6dfb16f67afdab25e155c79e59"
+TIMEOUT = 60.0
+"""Seconds without a byte after which a mirror is given up."""
+
 LOOKED_FOR = "shape_names.txt, train_files.txt, test_files.txt and ply_data_{train,test}*.h5"
 
 
@@ -26,8 +35,6 @@ def modelnet40(
     n_points: int = 1024,
     classes: Sequence[str] | None = None,
     download: bool = False,
-    mirrors: Sequence[str] | None = None,
-    archive_hash: str | None = None,
 ) -> CloudDataset:
     """Read ModelNet40, the dataset of the paper's classification and registration experiments.
 
@@ -40,9 +47,6 @@ def modelnet40(
         n_points: number of points per shape, at most the number that is stored.
         classes: names from ``shape_names.txt`` to keep; None or empty means all 40.
         download: whether to download the archive into ``root`` if the files are missing.
-        mirrors: addresses of the archive, tried in turn; None means ``MIRRORS``.
-        archive_hash: hexadecimal sha256 of the archive, or another hash as ``md5:...``; None
-            accepts any archive.
 
     Returns:
         Float32 clouds ``(S, n_points, 3)`` and int64 labels ``(S,)``. The fingerprint depends on
@@ -57,7 +61,7 @@ def modelnet40(
     root = Path(root).expanduser()
     folder = _find(root)
     if folder is None and download:
-        folder = _download(root, mirrors or MIRRORS, archive_hash)
+        folder = _download(root)
     if folder is None:
         raise UserError(
             f"root: no ModelNet40 in {root}. Looked there and in {root / FOLDER} for {LOOKED_FOR}. "
@@ -91,22 +95,54 @@ def _find(root: Path) -> Path | None:
     return None
 
 
-def _download(root: Path, mirrors: Sequence[str], archive_hash: str | None) -> Path:
+def _download(root: Path) -> Path:
+    """Download and unpack the archive; of several processes, one does it and the others wait."""
     folder = root if root.name == FOLDER else root / FOLDER
-    archive = folder.parent / f"{FOLDER}.zip"
-    with one_at_a_time(folder.parent / f".{FOLDER}.lock"):
-        if _find(folder) is None:
-            brought = archive.exists()
-            fetch(mirrors, archive, archive_hash)
-            unpack(archive, folder)
-            if not brought:
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder.parent / f".{FOLDER}.lock"):
+            if _find(folder) is None:
+                archive = _fetch(folder.parent)
+                _unpack(archive, folder)
                 archive.unlink()
-    if _find(folder) is None:
-        raise UserError(
-            f"mirrors: the archive unpacked into {folder} is not ModelNet40; it lacks "
-            f"{LOOKED_FOR}. Remove the folder and use other mirrors."
-        )
+    except OSError as error:
+        raise UserError(f"Cannot download ModelNet40 into {folder.parent}: {error}.") from error
     return folder
+
+
+def _fetch(folder: Path) -> Path:
+    """Download the archive from the first mirror that has it; a file with its hash is kept."""
+    pooch.get_logger().setLevel("WARNING")
+    downloader = pooch.HTTPDownloader(progressbar=sys.stderr.isatty(), timeout=TIMEOUT)
+    answers = []
+    for url in MIRRORS:
+        try:
+            name = pooch.retrieve(url, ARCHIVE_HASH, f"{FOLDER}.zip", folder, downloader=downloader)
+        except (OSError, ValueError) as error:  # an answer of the network, or another hash
+            answers.append(f"{url}: {one_line(error)}")
+        else:
+            return Path(name)
+    raise UserError(
+        f"No mirror served ModelNet40 ({'; '.join(answers)}). Check the network and try again, or "
+        f"save the file as {folder / f'{FOLDER}.zip'} yourself."
+    )
+
+
+def _unpack(archive: Path, folder: Path) -> None:
+    """Unpack the archive's top folder as ``folder``, completely or not at all."""
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as name:
+        try:
+            with zipfile.ZipFile(archive) as packed:
+                size = sum(member.file_size for member in packed.infolist())
+                if size > memory(archive):
+                    raise UserError(f"{archive} unpacks to {size:,} bytes, far more than its own.")
+                packed.extractall(name)
+        except (zipfile.BadZipFile, zlib.error) as error:
+            raise UserError(f"{archive} is damaged ({one_line(error)}). Remove it.") from error
+        unpacked = _find(Path(name))
+        if unpacked is None:
+            raise UserError(f"{archive} is not ModelNet40; it lacks {LOOKED_FOR}. Remove it.")
+        unpacked.replace(folder)
 
 
 def _lines(path: Path) -> list[str]:
