@@ -57,6 +57,22 @@ def test_edge_conv_equals_published_form_without_norm(rng):
     torch.testing.assert_close(layer(points), expected, atol=1e-5, rtol=1e-4)
 
 
+def test_dgcnn_neighbours_are_found_in_the_space_of_features(rng):
+    """Every edge convolution has a graph of its own."""
+    torch.manual_seed(0)
+    net = DGCNN(5, k=4, edge_channels=(8, 8)).eval()
+    points = torch.randn(2, 30, 3, generator=rng)
+    features, outputs = points, []
+    for layer in net.edges:
+        near = torch.cdist(features, features).topk(4, largest=False).indices
+        others = features[torch.arange(2)[:, None, None], near]
+        edges = layer.own(features)[:, :, None] + layer.edge(others - features[:, :, None])
+        features = layer.norm(edges.amax(2).flatten(0, 1)).relu().unflatten(0, (2, 30))
+        outputs.append(features)
+    expected = net.head(net.pool(torch.cat(outputs, 2)))
+    torch.testing.assert_close(net(points), expected, atol=1e-5, rtol=1e-4)
+
+
 def test_max_of_rows_equals_maximum_of_gathered_rows(rng):
     features = torch.randn(2, 20, 6, generator=rng, requires_grad=True)
     rows = torch.randint(20, (2, 9, 4), generator=rng)

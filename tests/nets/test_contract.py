@@ -5,7 +5,6 @@ from typing import Any
 import pytest
 import torch
 
-from mops_lightning.errors import UserError
 from mops_lightning.nets.atlasnet import AtlasNet
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
@@ -15,7 +14,6 @@ NETS = {
     "autoencoder": lambda n: AutoEncoder(n, 16, (8, 8), (16,)),
     "foldingnet": lambda n: MFoldingNet(n, 1, 16, fold_channels=(32, 8)),
     "mfoldingnet": lambda n: MFoldingNet(n, 4, 16, fold_channels=(32, 8)),
-    "graph": lambda n: MFoldingNet(n, 4, 16, "graph", fold_channels=(32, 8)),
     "atlasnet": lambda n: AtlasNet(n, 3, 16, (32, 8)),
 }
 
@@ -47,7 +45,7 @@ def test_mixed_precision_is_close_with_finite_gradients(name, rng):
     check_close_in_mixed_precision(NETS[name](50).eval(), torch.randn(3, 40, 3, generator=rng))
 
 
-@pytest.mark.parametrize("name", ["foldingnet", "mfoldingnet", "graph", "atlasnet"])
+@pytest.mark.parametrize("name", ["foldingnet", "mfoldingnet", "atlasnet"])
 @pytest.mark.parametrize("n", [4, 7, 50, 101, 300])
 def test_number_of_points_is_variable(name, n, rng):
     torch.manual_seed(0)
@@ -63,10 +61,6 @@ def test_result_follows_from_maxima_of_point_features(name, rng):
     torch.manual_seed(0)
     net: Any = NETS[name](50).eval()
     points = torch.randn(2, 40, 3, generator=rng)
-    if name == "graph":
-        with pytest.raises(UserError, match=r"encoder must be mlp .* got graph"):
-            net.point_features(points)
-        return
     features = net.point_features(points)
     assert features.min() >= 0
     torch.testing.assert_close(net.from_pooled(features.amax(1)), net(points))

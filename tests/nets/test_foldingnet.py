@@ -1,17 +1,9 @@
-from typing import Any
-
 import pytest
 import torch
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.foldingnet import (
-    REACH,
-    FoldingDecoder,
-    GraphEncoder,
-    MFoldingNet,
-    square_grid,
-)
+from mops_lightning.nets.foldingnet import REACH, FoldingDecoder, MFoldingNet, square_grid
 
 
 def test_square_grid_is_regular_and_nearly_square():
@@ -79,14 +71,6 @@ def test_mfoldingnet_has_published_size(codeword, published, tolerance):
         assert megabytes == pytest.approx(size, abs=tolerance)
 
 
-def test_graph_encoder_accepts_fewer_points_than_neighbours(rng):
-    torch.manual_seed(0)
-    net = GraphEncoder(16, k=4).eval()
-    points = torch.randn(2, 30, 3, generator=rng)
-    assert net(points).shape == (2, 16)
-    assert net(points[:, :2]).shape == (2, 16)  # fewer points than k
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -94,16 +78,9 @@ def test_graph_encoder_accepts_fewer_points_than_neighbours(rng):
         (lambda: MFoldingNet(n_points=2), r"^n_points must be at least pieces=4, got 2"),
         (lambda: MFoldingNet(fold_channels=[]), r"^fold_channels must be .*got \[\]"),
         (lambda: MFoldingNet()(torch.randn(2, 9, 3), 3), r"^n_points must .* pieces=4, got 3"),
-        (lambda: GraphEncoder(0), "^codeword must be at least 1, got 0"),
-        (lambda: GraphEncoder(8, 0), "^k must be at least 1, got 0"),
+        (lambda: MFoldingNet(codeword=0), "^codeword must be at least 1, got 0"),
     ],
 )
 def test_foldingnet_invalid_argument_raises(make, message):
     with pytest.raises(UserError, match=message):
         make()
-
-
-def test_unknown_encoder_raises():
-    settings: dict[str, Any] = {"encoder": "grpah"}
-    with pytest.raises(UserError, match=r"encoder: unknown 'grpah'.* 'graph'"):
-        MFoldingNet(64, **settings)

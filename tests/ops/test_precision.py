@@ -97,7 +97,7 @@ def test_max_pool_half_precision_gradients(n, norm, rng):
 
 @pytest.mark.parametrize(
     "make",
-    [PCRNet, lambda: MFoldingNet(64, 4, 64), lambda: MFoldingNet(64, 1, 64, "graph")],
+    [PCRNet, lambda: MFoldingNet(64, 4, 64), lambda: MFoldingNet(64, 1, 64)],
     ids=["pcrnet", "mfoldingnet", "foldingnet"],
 )
 def test_nets_under_plain_autocast_are_close(make, rng):

@@ -57,7 +57,7 @@ def test_nets_grid_reconstruction_shows_paper(tmp_path):
         for pieces in (16, 1, 8):
             net = "mfoldingnet" if pieces > 1 else "foldingnet"
             given = ("reconstruction", net, points)
-            put_net(tmp_path, f"m{pieces}", distances, *given, pieces=pieces, encoder="mlp")
+            put_net(tmp_path, f"m{pieces}", distances, *given, pieces=pieces)
     put_net(tmp_path, "mlp", distances, "reconstruction", "autoencoder")
     found = rows(table(tmp_path))
     assert found[0] == ["net", "pieces", "points", "chamfer", "emd", "MB", "*the paper's*"]

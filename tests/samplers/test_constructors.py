@@ -21,7 +21,7 @@ from mops_lightning.samplers.voxel import VoxelSampler
 
 FEATURES: dict[str, Any] = {"feature_channels": (64, 64, 64, 128, 128)}
 MOPS: dict[str, Any] = {
-    **{"alpha": 30.0, "tau_min": 0.1, "annealing": "exponential", "threshold": 0.0},
+    **{"alpha": 30.0, "tau_min": 0.1, "threshold": 0.0},
     **{"rho_channels": (512, 256, 128), "anchors": None, **FEATURES},
     "anchor_width": 0.5,
     "overlap": 0.0,
@@ -37,7 +37,7 @@ DEFAULTS: dict[type[Sampler], dict[str, Any]] = {
     PoissonSampler: {"seed": 0},
     SubmodularSampler: {"net": None, "seed": 0},
     CriticalSampler: {"net": None, "seed": 0},
-    GumbelSampler: {"tau_min": 0.1, "key_channels": (256, 128), **FEATURES},
+    GumbelSampler: {"tau_min": 0.1, **FEATURES},
     MOPSNet: MOPS,
     FMOPSNet: {"m_max": 512, "size_sampling": "nested", "num_sizes": 4, "min_size": 1},
     SNet: SNET,

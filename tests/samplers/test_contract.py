@@ -40,7 +40,7 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "poisson": lambda m, **kw: PoissonSampler(m, **kw),
     "submodular": lambda m, **kw: SubmodularSampler(m, PointNetVanilla(3), **kw),
     "critical": lambda m, **kw: CriticalSampler(m, PointNetVanilla(3), **kw),
-    "gumbel": lambda m: GumbelSampler(m, feature_channels=(8, 6), key_channels=(12, 10)),
+    "gumbel": lambda m: GumbelSampler(m, feature_channels=(8, 6)),
     "mops": lambda m: MOPSNet(m, **MOPS_LAYERS),
     "fmops": lambda m: FMOPSNet(m, **MOPS_LAYERS),
     "mops-anchors": lambda m: moved(MOPSNet(m, anchors="fps", **MOPS_LAYERS)),

@@ -8,7 +8,7 @@ from mops_lightning.samplers.gumbel import GumbelSampler
 @pytest.fixture
 def sampler():
     torch.manual_seed(0)
-    return GumbelSampler(4, feature_channels=(8, 6), key_channels=(12, 10))
+    return GumbelSampler(4, feature_channels=(8, 6))
 
 
 def test_gumbel_evaluation_chooses_largest_score(sampler, rng):
@@ -55,7 +55,6 @@ def test_gumbel_training_starts_at_temperature_1(sampler):
         ({"tau_min": 0}, "^tau_min must be above 0 and at most 1, got 0"),
         ({"tau_min": 1.5}, "^tau_min must be above 0 and at most 1, got 1.5"),
         ({"feature_channels": ()}, "^feature_channels must be sizes"),
-        ({"key_channels": (0,)}, "^key_channels must be"),
     ],
 )
 def test_gumbel_invalid_argument_raises(arguments, message):

@@ -79,12 +79,6 @@ def test_tau_exponential_annealing():
     assert taus == pytest.approx([1.0, 0.1**0.5, 0.1])
 
 
-def test_tau_linear_annealing():
-    net = small(tau_min=0.2, annealing="linear").train()
-    net.anneal(0.25)
-    assert net.tau == pytest.approx(0.8)
-
-
 def test_tau_in_evaluation_is_tau_min():
     net = small(tau_min=0.1).train()
     net.anneal(0.0)
@@ -148,7 +142,6 @@ def test_mops_gradcheck(rng):
         ({"threshold": 1.0}, "^threshold must be at least 0 and below 1, got 1.0"),
         ({"alpha": -1.0}, "^alpha must be a number of at least 0, got -1.0"),
         ({"alpha": float("inf")}, "^alpha must be a number"),
-        ({"annealing": "exponentail"}, "^annealing: unknown 'exponentail'.*exponential"),
     ],
 )
 def test_mops_invalid_argument_raises(arguments, message):

@@ -5,10 +5,11 @@ from mops_lightning.data.pairs import Pairs
 from mops_lightning.errors import UserError
 from mops_lightning.losses.registration import quaternion_loss
 from mops_lightning.nets.autoencoder import AutoEncoder
-from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.refine import refine
+from mops_lightning.ops.rigid import Motion
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.tasks import refinement
 from mops_lightning.tasks.base import Task
@@ -75,13 +76,31 @@ def test_refinement_of_pairs_refines_sources_for_whole_targets(rng):
     assert (apart < before).all()
 
 
+def test_refinement_of_pairs_refines_targets_for_refined_sources(rng):
+    torch.manual_seed(0)
+    task = TASKS["registration"]().double().eval()
+    batch = batch_of("registration", torch.randn(6, 50, 3, generator=rng).double())
+    rows = FPSSampler(5)(batch.points).indices
+    refined = Refinement(task, 3)(batch, {5: rows})[5]
+    source, target = (task.net.point_features(points) for points in batch.points.chunk(2))
+    whole = task.predict(batch, batch.points)
+
+    def refined_for(pooled):
+        def apart(candidates, cloud):
+            found = task.predict_pooled(batch, torch.cat([pooled[cloud], candidates]))
+            return task.disagreement(found, Motion(*(part[cloud] for part in whole)))
+
+        return refine(target, rows[3:], apart, 3)
+
+    with torch.no_grad():
+        assert torch.equal(refined[3:], refined_for(gather_points(source, refined[:3]).amax(1)))
+        assert not torch.equal(refined[3:], refined_for(source.amax(1)))
+
+
 def test_refinement_of_unsuitable_task_or_net_raises():
     pairs = Registration(PCRNet(iterations=2), Pairs(), quaternion_loss)
     with pytest.raises(UserError, match=r"refine must be 0 with this PCRNet, got 2.*iterations=1"):
         Refinement(pairs, 2)
-    graph = Reconstruction(MFoldingNet(50, encoder="graph"))
-    with pytest.raises(UserError, match=r"refine must be 0 with this MFoldingNet, got 1"):
-        Refinement(graph, 1)
 
     class Mean(torch.nn.Module):
         def forward(self, points):

@@ -58,6 +58,14 @@ def test_step_exact_net_recovers_motions(rng):
         assert sum(result.losses.values()) < 1e-3
 
 
+def test_disagreement_of_shifted_motions_is_squared_shift():
+    true = motion(1)
+    shift = torch.tensor([1.0, -2.0, 0.5])
+    moved = true._replace(translation=true.translation + shift)
+    apart = task().disagreement(moved, true)
+    torch.testing.assert_close(apart, torch.full_like(apart, 5.25))
+
+
 def test_step_loss_takes_sampled_points(rng):
     source, target = torch.randn(2, 5, 40, 3, generator=rng)
     batch = pair_batch(source, target, motion(1))

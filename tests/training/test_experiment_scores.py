@@ -39,7 +39,7 @@ SAMPLERS = {
     "poisson": lambda: PoissonSampler(8),
     "submodular": lambda: SubmodularSampler(8, PointNetVanilla(3)),
     "critical": lambda: CriticalSampler(8, PointNetVanilla(3)),
-    "gumbel": lambda: GumbelSampler(8, feature_channels=(8, 6), key_channels=(12, 10)),
+    "gumbel": lambda: GumbelSampler(8, feature_channels=(8, 6)),
 }
 BASELINES = {"fps": FPSSampler, "random": RandomSampler, "voxel": VoxelSampler}
 

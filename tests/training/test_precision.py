@@ -25,7 +25,6 @@ def test_train_mixed_precision_is_close(task, tmp_path):
             "pictures=0",
             "logger=none",
         ]
-        common += ["task.net.encoder=graph"] if net == "foldingnet" else []
         common += ["learn=joint", "weights=null", f"cache={tmp_path}/cache"]
         found = {}
         for precision in ("32-true", "bf16-mixed"):

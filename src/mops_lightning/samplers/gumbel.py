@@ -11,6 +11,9 @@ from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.types import SampleOutput
 
+KEY_CHANNELS = (256, 128)
+"""Sizes of the layers of the MLP on the local and the global feature."""
+
 
 class GumbelSampler(Sampler):
     """Gumbel subset sampling: every sampled point is a learned random choice of an input point.
@@ -30,7 +33,6 @@ class GumbelSampler(Sampler):
         m: number of points to choose.
         tau_min: temperature at the end of training; training starts at 1.
         feature_channels: sizes of the pointwise layers.
-        key_channels: sizes of the layers of the MLP.
 
     Raises:
         UserError: an argument is out of range.
@@ -49,18 +51,16 @@ class GumbelSampler(Sampler):
         m: int,
         tau_min: float = 0.1,
         feature_channels: Sequence[int] = (64, 64, 64, 128, 128),
-        key_channels: Sequence[int] = (256, 128),
     ) -> None:
         super().__init__(m)
         if not 0 < tau_min <= 1:
             raise UserError(f"tau_min must be above 0 and at most 1, got {tau_min}.")
         check_channels("feature_channels", feature_channels)
-        check_channels("key_channels", key_channels)
         self.tau_min = tau_min
         self.training_tau = 1.0
         self.features = PointFeatures(feature_channels)
-        self.keys = PointMLP([2 * feature_channels[-1], *key_channels])
-        self.queries = nn.Linear(key_channels[-1], m, bias=False)
+        self.keys = PointMLP([2 * feature_channels[-1], *KEY_CHANNELS])
+        self.queries = nn.Linear(KEY_CHANNELS[-1], m, bias=False)
 
     @property
     def tau(self) -> float:

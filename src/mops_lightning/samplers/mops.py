@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.errors import UserError
 from mops_lightning.losses.subset import overlap_losses, subset_losses
 from mops_lightning.nets.layers import PointFeatures, check_channels, linear_norm_relu
 from mops_lightning.ops.precision import pointwise_autocast, pointwise_autocast_dtype
@@ -16,8 +16,6 @@ from mops_lightning.samplers.anchors import FPSAnchors
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fused import FusedMOPSNet, fuse
 from mops_lightning.types import SampleOutput
-
-ANNEALINGS = ("exponential", "linear")
 
 DEFAULT_WIDTH = 0.5
 MAX_WIDTH = 100
@@ -35,7 +33,6 @@ class MOPSNet(Sampler):
         m: number of points to generate.
         alpha: weight α of the subset loss (Eq. 11).
         tau_min: temperature at the end of training and in evaluation; training starts at 1.
-        annealing: how tau decreases with the training progress, ``exponential`` or ``linear``.
         feature_channels: sizes of the pointwise layers; the last is that of the local and the
             global feature.
         rho_channels: sizes of the hidden layers of ρ.
@@ -70,7 +67,6 @@ class MOPSNet(Sampler):
         m: int,
         alpha: float = 30.0,
         tau_min: float = 0.1,
-        annealing: Literal["exponential", "linear"] = "exponential",
         feature_channels: Sequence[int] = (64, 64, 64, 128, 128),
         rho_channels: Sequence[int] = (512, 256, 128),
         threshold: float = 0.0,
@@ -85,9 +81,6 @@ class MOPSNet(Sampler):
             raise UserError(f"alpha must be a number of at least 0, got {alpha}.")
         if not 0 <= overlap < math.inf:
             raise UserError(f"overlap must be a number of at least 0, got {overlap}.")
-        if annealing not in ANNEALINGS:
-            hint = did_you_mean(annealing, ANNEALINGS)
-            raise UserError(f"annealing: unknown {annealing!r}.{hint}")
         check_channels("feature_channels", feature_channels)
         check_channels("rho_channels", rho_channels)
         if anchors not in (None, "fps"):
@@ -107,7 +100,6 @@ class MOPSNet(Sampler):
         self.overlap = overlap
         self.threshold = threshold
         self.tau_min = tau_min
-        self.annealing = annealing
         self.training_tau = 1.0
         local = feature_channels[-1]
         self.features = PointFeatures(feature_channels)
@@ -135,12 +127,8 @@ class MOPSNet(Sampler):
         return not isinstance(self.queries, FPSAnchors)
 
     def anneal(self, progress: float) -> None:
-        """Set the training temperature for a progress from 0 (tau = 1) to 1 (tau = tau_min)."""
-        progress = min(max(progress, 0.0), 1.0)
-        if self.annealing == "exponential":
-            self.training_tau = self.tau_min**progress
-        else:
-            self.training_tau = 1 + (self.tau_min - 1) * progress
+        """Set tau, exponentially from 1 to ``tau_min`` for a progress from 0 to 1."""
+        self.training_tau = self.tau_min ** min(max(progress, 0.0), 1.0)
 
     def sampling_matrix(self, points: Tensor, m: int | None = None) -> SamplingMatrix:
         """Return the sampling matrices S of ``(B, N, 3)`` points, with the first m columns."""

@@ -47,7 +47,7 @@ class Refinement:
                 f"refine must be 0 with this {type(task.net).__name__}, got {refine}: its result "
                 "does not follow from features of single points under a maximum. Such nets are "
                 "pointnet for classification, pcrnet with iterations=1 for registration, and "
-                "autoencoder, atlasnet or mfoldingnet with encoder=mlp for reconstruction."
+                "autoencoder, atlasnet or mfoldingnet for reconstruction."
             )
         self.task = task
         self.passes = refine
