@@ -1,5 +1,7 @@
 """What every classifier guarantees. A new net adds one line to NETS."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -60,7 +62,7 @@ def test_edge_conv_equals_published_form_without_norm(rng):
 def test_dgcnn_neighbours_are_found_in_the_space_of_features(rng):
     """Every edge convolution has a graph of its own."""
     torch.manual_seed(0)
-    net = DGCNN(5, k=4, edge_channels=(8, 8)).eval()
+    net: Any = DGCNN(5, k=4, edge_channels=(8, 8)).eval()
     points = torch.randn(2, 30, 3, generator=rng)
     features, outputs = points, []
     for layer in net.edges:

@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 import torch
 
@@ -78,7 +80,7 @@ def test_refinement_of_pairs_refines_sources_for_whole_targets(rng):
 
 def test_refinement_of_pairs_refines_targets_for_refined_sources(rng):
     torch.manual_seed(0)
-    task = TASKS["registration"]().double().eval()
+    task: Any = TASKS["registration"]().double().eval()
     batch = batch_of("registration", torch.randn(6, 50, 3, generator=rng).double())
     rows = FPSSampler(5)(batch.points).indices
     refined = Refinement(task, 3)(batch, {5: rows})[5]
@@ -87,7 +89,7 @@ def test_refinement_of_pairs_refines_targets_for_refined_sources(rng):
 
     def refined_for(pooled):
         def apart(candidates, cloud):
-            found = task.predict_pooled(batch, torch.cat([pooled[cloud], candidates]))
+            found = refinement.predict_pooled(task, batch, torch.cat([pooled[cloud], candidates]))
             return task.disagreement(found, Motion(*(part[cloud] for part in whole)))
 
         return refine(target, rows[3:], apart, 3)

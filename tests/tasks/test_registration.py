@@ -19,6 +19,7 @@ from mops_lightning.samplers.samplenet import SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.tasks.registration import Registration
 from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.visualization import cloud_titles
 from tests.support.rigid import motion
 from tests.support.training import changed, quiet_trainer, small_dataset, state
 
@@ -240,4 +241,4 @@ def test_figures_show_every_readout_and_its_error(rng):
     assert axes[5].texts[0].get_text() == f"rotation error {error:.1f}°"
     angle = RotationError.of(result.targets, identity_motion(batch.points[:2]))[1]
     assert axes[3].texts[0].get_text() == f"tall, {angle:.1f}° apart"
-    assert module.cloud_titles(["long"]) == ["long_source", "long_target"]
+    assert cloud_titles(module, ["long"]) == ["long_source", "long_target"]

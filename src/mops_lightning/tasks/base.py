@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from inspect import signature
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from torch import Generator, Tensor, nn
 from torchmetrics import MetricCollection
@@ -14,8 +14,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+K = TypeVar("K")
+
+
 class Task(nn.Module):
     """Base of all tasks: owns the task net, its losses and its metrics.
+
+    A task implements ``step`` and ``metrics``, and, for distillation and the refined readout,
+    ``predict`` and ``disagreement``. ``make_batch``, ``scores`` and ``figures`` have defaults.
 
     Args:
         net: the task net; its call signature is task-specific, see ``net_takes``.
@@ -42,8 +48,9 @@ class Task(nn.Module):
     clouds_per_prediction: int = 1
     """Number of clouds that a prediction needs; ``points`` contains all first ones, and so on."""
 
-    maps_pooled: str = "from_pooled"
-    """Name of the net's method behind ``predict_pooled``."""
+    maps_pooled: str | None = None
+    """Name of the net's method that maps pooled features to the prediction, for tasks whose
+    prediction follows from them, as the refined readout needs it."""
 
     test_seed: int = 0
     """Seed of the random numbers that ``make_batch`` draws for clouds that are scored."""
@@ -71,27 +78,12 @@ class Task(nn.Module):
         """
         return batch
 
-    def points_of(self, n_points: int) -> int:
-        """Return the number of points per cloud of ``make_batch``, for ``n_points`` in the data."""
-        return n_points
-
     def predict(self, batch: Any, points: Tensor) -> Any:
         """Return the net's output for sampled points, as ``disagreement`` compares it.
 
         Args:
             batch: from ``make_batch``.
             points: as for ``step``.
-        """
-        raise NotImplementedError
-
-    def predict_pooled(self, batch: Any, pooled: Tensor) -> Any:
-        """Return what ``predict`` returns, from the pooled features of the points.
-
-        Only tasks whose prediction follows from them implement this; the refined readout needs it.
-
-        Args:
-            batch: from ``make_batch``.
-            pooled: ``(R, C)`` maxima over the net's ``point_features``, in the order of ``points``.
         """
         raise NotImplementedError
 
@@ -116,34 +108,25 @@ class Task(nn.Module):
         """
         raise NotImplementedError
 
-    def reference(self, batch: Any) -> Any:
-        """Return what all scores of a batch are compared with; None by default."""
-        return None
-
-    def scored(self, batch: Any, points: Tensor, reference: Any = None) -> TaskOutput:
-        """Run the net on sampled points, for scores; the same as ``step`` by default.
+    def scores(self, batch: Any, samples: Mapping[K, Tensor]) -> dict[K, TaskOutput]:
+        """Run the net on several samples of one batch, for scores; by default ``step`` on each.
 
         Args:
             batch: from ``make_batch``.
-            points: as for ``step``.
-            reference: from ``reference(batch)``, which is the same for all readouts of a batch.
+            samples: points by name, each as for ``step``.
 
         Returns:
-            Loss terms, predictions and targets.
+            Loss terms, predictions and targets by name.
         """
-        return self.step(batch, points)
+        return {name: self.step(batch, points) for name, points in samples.items()}
 
     def metrics(self, training: bool = False) -> MetricCollection:
-        """Return new metrics of the predictions and targets of ``scored``.
+        """Return new metrics of the predictions and targets of ``scores``.
 
         Args:
             training: of those of ``step`` instead.
         """
         raise NotImplementedError
-
-    def cloud_titles(self, titles: Sequence[str]) -> list[str]:
-        """Return one title per cloud of ``batch.points``, from one per cloud of the dataset."""
-        return list(titles)
 
     def figures(
         self, batch: Any, samples: Mapping[str, Tensor], titles: Sequence[str]

@@ -1,7 +1,5 @@
 """Classification of sampled clouds (paper section "Classification-oriented Downsampling")."""
 
-from typing import Any
-
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torchmetrics import MetricCollection
@@ -26,6 +24,7 @@ class Classification(Task):
 
     score = Accuracy.name
     requires_same_classes = True
+    maps_pooled = "from_pooled"
 
     def __init__(self, net: nn.Module, num_classes: int) -> None:
         super().__init__(net)
@@ -39,11 +38,6 @@ class Classification(Task):
     def predict(self, batch: Batch, points: Tensor) -> Tensor:
         """Return the logits ``(B, num_classes)`` of ``(B, M, 3)`` points."""
         return self.net(points)
-
-    def predict_pooled(self, batch: Batch, pooled: Tensor) -> Tensor:
-        """Return the logits ``(R, num_classes)`` of pooled features ``(R, C)``."""
-        net: Any = self.net
-        return net.from_pooled(pooled)
 
     def disagreement(self, found: Tensor, reference: Tensor) -> Tensor:
         """Return the Kullback-Leibler divergence KL(reference ‖ found) of the classes."""

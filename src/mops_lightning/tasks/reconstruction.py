@@ -4,7 +4,7 @@ Paper section "Reconstruction-oriented Downsampling".
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +22,7 @@ from mops_lightning.metrics.reconstruction import (
 )
 from mops_lightning.ops.chamfer import chamfer_distance
 from mops_lightning.ops.emd import earth_movers_distance
-from mops_lightning.tasks.base import Task
+from mops_lightning.tasks.base import K, Task
 from mops_lightning.types import Batch, TaskOutput
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ class Reconstruction(Task):
     score = NormalizedChamfer.name
     full_score = NormalizedChamfer.full_cloud_metric
     net_takes = ("points", "n_points")
+    maps_pooled = "from_pooled"
 
     def __init__(
         self,
@@ -66,11 +67,6 @@ class Reconstruction(Task):
     def predict(self, batch: Batch, points: Tensor) -> Tensor:
         """Return reconstructions ``(B, N, 3)`` of the clouds from ``(B, M, 3)`` points."""
         return self.net(points, batch.points.shape[1])
-
-    def predict_pooled(self, batch: Batch, pooled: Tensor) -> Tensor:
-        """Return reconstructions ``(R, N, 3)`` from codewords ``(R, C)``."""
-        net: Any = self.net
-        return net.from_pooled(pooled, batch.points.shape[1])
 
     def disagreement(self, found: Tensor, reference: Tensor) -> Tensor:
         """Return the chamfer distance of two reconstructions."""
@@ -92,28 +88,14 @@ class Reconstruction(Task):
         losses = {"chamfer": chamfer.mean(), "emd": emd.mean()}
         return TaskOutput(losses, Distances(chamfer, emd), None, built)
 
-    def reference(self, batch: Batch) -> Distances:
-        """Return the distances of the reconstructions from all points, for normalized errors."""
-        return self._distances(batch, batch.points)
-
-    def scored(
-        self, batch: Batch, points: Tensor, reference: Distances | None = None
-    ) -> TaskOutput:
-        """Reconstruct one batch for scores.
-
-        Args:
-            batch: the clouds ``(B, N, 3)``.
-            points: ``(B, M, 3)`` sampled from the clouds.
-            reference: from ``reference(batch)``; None computes it.
-
-        Returns:
-            The loss terms, the distances of the reconstructions and the reference.
-        """
-        found = self._distances(batch, points)
-        losses = {"chamfer": found.chamfer.mean(), "emd": found.emd.mean()}
-        if reference is None:
-            reference = self.reference(batch)
-        return TaskOutput(losses, found, reference)
+    def scores(self, batch: Batch, samples: Mapping[K, Tensor]) -> dict[K, TaskOutput]:
+        """Return the distances of reconstructions from samples and, as targets, from all points."""
+        full = self._distances(batch, batch.points)
+        found = {name: self._distances(batch, points) for name, points in samples.items()}
+        return {
+            name: TaskOutput({"chamfer": one.chamfer.mean(), "emd": one.emd.mean()}, one, full)
+            for name, one in found.items()
+        }
 
     def _distances(self, batch: Batch, points: Tensor) -> Distances:
         clouds = batch.points

@@ -36,10 +36,10 @@ class Refinement:
     def __init__(self, task: Task, refine: int) -> None:
         if isinstance(refine, bool) or not isinstance(refine, int) or refine < 1:
             raise UserError(f"refine must be a whole number of at least 1, got {refine!r}.")
-        if type(task).predict_pooled is Task.predict_pooled:
+        if task.maps_pooled is None:
             raise UserError(
                 f"refine must be 0 for {type(task).__name__.lower()}, got {refine}: its prediction "
-                "does not follow from the features of a sample (predict_pooled)."
+                "does not follow from the features of a sample (maps_pooled)."
             )
         suits = isinstance(task.net, PointFeatureNet) and hasattr(task.net, task.maps_pooled)
         if not suits or not getattr(task.net, "pools_points", True):
@@ -102,7 +102,7 @@ class Refinement:
         assert isinstance(net, PointFeatureNet)
         features = [net.point_features(points) for points in sides]
         whole = [each.amax(1) for each in features]
-        wanted = self.task.predict_pooled(batch, torch.cat(whole))
+        wanted = predict_pooled(self.task, batch, torch.cat(whole))
         result: dict[int, list[Tensor]] = {}
         for m, rows in samples.items():
             # One side after the other; what is not refined yet is the whole cloud.
@@ -125,8 +125,22 @@ class Refinement:
     ) -> Tensor:
         """Return the disagreement when one side has other pooled features ``(R, C)``."""
         both = [candidates if i == side else each[cloud] for i, each in enumerate(pooled)]
-        found = self.task.predict_pooled(batch, torch.cat(both))
+        found = predict_pooled(self.task, batch, torch.cat(both))
         return self.task.disagreement(found, _take(wanted, cloud))
+
+
+def predict_pooled(task: Task, batch: Any, pooled: Tensor) -> Any:
+    """Return the prediction of a task from maxima over the net's ``point_features``.
+
+    Args:
+        task: with ``maps_pooled``.
+        batch: from ``make_batch``.
+        pooled: ``(R, C)``, in the order of the points.
+    """
+    sizes = (batch.points.shape[1],) if "n_points" in task.net_takes else ()
+    return getattr(task.net, str(task.maps_pooled))(
+        *pooled.chunk(task.clouds_per_prediction), *sizes
+    )
 
 
 def _take(prediction: Any, rows: Tensor) -> Any:

@@ -1,7 +1,7 @@
 """Registration of sampled clouds (paper section "Registration-oriented Downsampling")."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from torch import Generator, Tensor, nn
 from torchmetrics import MetricCollection
@@ -66,18 +66,9 @@ class Registration(Task):
         """Make a pair of every cloud; see ``Pairs``."""
         return self.pairs(batch.points, generators())
 
-    def points_of(self, n_points: int) -> int:
-        """Return the number of points per cloud of a pair."""
-        return self.pairs.points_of(n_points)
-
     def predict(self, batch: PairBatch, points: Tensor) -> Motion:
         """Return the motions between the centred clouds from ``(2B, M, 3)`` points of both."""
         return self.net(*points.chunk(2))
-
-    def predict_pooled(self, batch: PairBatch, pooled: Tensor) -> Motion:
-        """Return the motions from pooled features ``(2R, C)``: sources, then targets."""
-        net: Any = self.net
-        return net.from_pooled_pair(*pooled.chunk(2))
 
     def disagreement(self, found: Motion, reference: Motion) -> Tensor:
         """Return the squared distance of two motions.
@@ -120,10 +111,6 @@ class Registration(Task):
             RotationRecall10(),
             TranslationError(),
         )
-
-    def cloud_titles(self, titles: Sequence[str]) -> list[str]:
-        """Return titles of all sources, then of all targets."""
-        return [f"{title}_{side}" for side in ("source", "target") for title in titles]
 
     def figures(
         self, batch: PairBatch, samples: Mapping[str, Tensor], titles: Sequence[str]

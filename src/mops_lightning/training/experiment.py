@@ -255,7 +255,7 @@ class Experiment(L.LightningModule):
         with full_precision(self.device.type):
             outputs = self._sample(batch.points, (self.m,))
             samples = readouts(batch.points, outputs, self.sampler)[self.m]
-            self._score("val/", "", batch, samples, self.task.reference(batch))
+            self._score("val/", batch, {"": samples})
             self._score_sets("val/", {self.m: ""}, batch.points, outputs)
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
@@ -269,20 +269,27 @@ class Experiment(L.LightningModule):
                 found = baseline.sample_sizes(batch.points, self.sizes)
                 for m, output in found.items():
                     samples[m].setdefault(name, output.points)
-            reference = self.task.reference(batch)
-            for m, prefix in self.prefixes.items():
-                self._score("test/", prefix, batch, samples[m], reference)
-            if self.sampler is not None:  # without one, the full clouds are scored already
-                self._score("test/", "", batch, {FULL: batch.points}, reference)
+            sets = {prefix: samples[m] for m, prefix in self.prefixes.items()}
+            # The same for all sizes; without a sampler, the full clouds are in it already.
+            sets[""] = {**sets.get("", {}), FULL: batch.points}
+            self._score("test/", batch, sets)
             self._score_sets("test/", self.prefixes, batch.points, outputs)
 
-    def _score(
-        self, stage: str, prefix: str, batch: Batch, samples: Mapping[str, Tensor], reference: Any
-    ) -> None:
-        """Update and log the task's metrics of readouts, and the loss of the main one."""
+    def _score(self, stage: str, batch: Batch, sets: Mapping[str, Mapping[str, Tensor]]) -> None:
+        """Update and log the task's metrics of readouts, and the loss of the main one.
+
+        Args:
+            stage: prefix of all log keys.
+            batch: the clouds.
+            sets: points by readout, by prefix of a size.
+        """
         clouds = len(batch.points)
-        for readout, points in samples.items():
-            result = self.task.scored(batch, points, reference)
+        samples = {
+            (prefix, readout): points
+            for prefix, found in sets.items()
+            for readout, points in found.items()
+        }
+        for (prefix, readout), result in self.task.scores(batch, samples).items():
             for name, metric in self.scores.update_readout(f"{prefix}{readout}", result).items():
                 self.log(f"{stage}{name}", metric, batch_size=clouds)
             if readout != self.main_readout:

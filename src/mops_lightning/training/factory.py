@@ -15,6 +15,7 @@ from mops_lightning.tasks.base import Task
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe import Recipe
 from mops_lightning.training.sizes import sizes_to_test
+from mops_lightning.types import Batch
 
 
 def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, str]) -> Experiment:
@@ -35,7 +36,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     net = {"net": task.net}
     own = accepted(cfg.sampler, net)
     sampler = build(cfg.sampler, "sampler", **own) if cfg.learn != "task" else None
-    points = task.points_of(dataset.test.points.shape[1])
+    points = points_per_cloud(task, dataset)
     sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, points, training=cfg.learn != "nothing")
     baselines: dict[str, Sampler] = {}
     if sampler is not None and sampler.learned:
@@ -61,6 +62,17 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         refine=cfg.refine,
         recipe=_recipe(cfg, sampler),
     )
+
+
+def points_per_cloud(task: Task, dataset: CloudDataset) -> int:
+    """Return the number of points that a sampler gets of every cloud.
+
+    Raises:
+        UserError: the data have too few points for the task.
+    """
+    clouds = Batch(dataset.test.points[:1], dataset.test.labels[:1])
+    batch = task.make_batch(clouds, lambda: [torch.Generator()])
+    return batch.points.shape[1]
 
 
 def _recipe(cfg: DictConfig, sampler: Sampler | None) -> Recipe:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.readout_names import FULL
+from mops_lightning.tasks.base import Task
 from mops_lightning.training.readouts import readouts
 from mops_lightning.viz.clouds import (
     COLOURS,
@@ -72,7 +73,7 @@ class CloudVisualization(Callback):
         figures, samples = self._figures(module, batch, scores)
         module.train(training)
         task: Any = module.task
-        titles = task.cloud_titles(self.titles)
+        titles = cloud_titles(task, self.titles)
         if folder is not None and samples:
             save_clouds(folder / CLOUDS, batch.points, samples, titles)
         for name, figure in figures.items():
@@ -107,7 +108,7 @@ class CloudVisualization(Callback):
         output = sampler(points, m)
         samples = readouts(points, {m: output}, sampler)[m]
         figures = module.task.figures(batch, {**methods, **samples}, self.titles)
-        titles = module.task.cloud_titles(self.titles)
+        titles = cloud_titles(module.task, self.titles)
         if scores is not None:
             main = {**methods, module.main_readout: samples[module.main_readout]}
             figures["comparison"] = self._comparison(module, points, main, scores)
@@ -137,6 +138,13 @@ class CloudVisualization(Callback):
             captions[name] = labels.get(name, name) + value
         drawn = {name: chosen[shown] for name, chosen in samples.items()}
         return comparison(points[shown], drawn, captions)
+
+
+def cloud_titles(task: Task, titles: Sequence[str]) -> list[str]:
+    """Return one title per cloud of a batch, from one per cloud of the data."""
+    if task.clouds_per_prediction == 1:
+        return list(titles)
+    return [f"{title}_{side}" for side in ("source", "target") for title in titles]
 
 
 def _add_meshes(
