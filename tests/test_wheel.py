@@ -91,7 +91,7 @@ def test_wheel_has_console_script_and_licence(wheel: Path) -> None:
 
 def test_installed_copy_is_imported(installed: Path, tmp_path: Path) -> None:
     code = (
-        "import mops_lightning, mops_lightning.config.composition as c;"
+        "import mops_lightning, mops_lightning.config.hydra_conf as c;"
         "print(mops_lightning.__file__); print(c.conf_dir())"
     )
     lines = python("-c", code, cwd=tmp_path, path=installed).split("\n")

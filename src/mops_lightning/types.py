@@ -4,16 +4,12 @@
 a split. Points are float32 ``(B, N, 3)`` in the unit sphere, without unit.
 """
 
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
 if TYPE_CHECKING:
     from mops_lightning.ops.sampling_matrix import SamplingMatrix
-
-
-Learn = Literal["task", "sampler", "joint", "nothing"]
-"""The parts that a run trains; ``joint``: task net and sampler."""
 
 
 class Batch(NamedTuple):

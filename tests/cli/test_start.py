@@ -1,9 +1,7 @@
 """What a refused run leaves."""
 
 from mops_lightning.training.run import claim
-from mops_lightning.zoo import publish
 from tests.support.command_line import TINY, TINY_ANY_DATA, call
-from tests.support.models import write_run
 
 
 def listing(folder):
@@ -59,16 +57,3 @@ def test_weights_of_a_model_pass_every_check(tmp_path):
     _, _, err = call([*TINY, "sampler=fps", "weights=pointnet.modelnet", place], tmp_path)
     assert "weights: no file or model" in err
     assert "'pointnet.modelnet40'" in err
-
-
-def test_models_path_finds_own_models(tmp_path):
-    write_run(tmp_path / "run")
-    publish.add(tmp_path / "run", "fmops.mine", tmp_path / "own")
-    arguments = ["evaluate=fmops.mine", "models.path=own", "--cfg", "job"]
-    status, out, err = call(arguments, tmp_path)
-    assert (status, err) == (0, "")
-    assert "fmops.FMOPSNet" in out
-    assert "models:\n  path: own" in out
-    assert "no file or model" in call(arguments[:1], tmp_path)[2]
-    assert "no folder none" in call(["models.path=none"], tmp_path)[2]
-    assert "models.path=FOLDER" in call(["models.path=null"], tmp_path)[2]

@@ -1,24 +1,58 @@
 """The groups of conf/: what one run's configuration shows, and what depends on several groups."""
 
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml  # type: ignore[import-untyped]
 from omegaconf import OmegaConf
 
+from mops_lightning.config.build import signature
 from mops_lightning.config.compose import compose
-from mops_lightning.config.composition import conf_dir
+from mops_lightning.config.hydra_conf import conf_dir
+from mops_lightning.config.settings import declared
 from mops_lightning.config.validate import check
-from mops_lightning.types import Learn
+from mops_lightning.records.run_record import dotted
 from tests.support.command_line import TINY, TINY_ANY_DATA, call, runs
 
 TASKS = ("classification", "registration", "reconstruction")
 
 
-def test_default_run_is_described_in_90_lines(tmp_path):
+def test_default_run_is_described_in_120_lines(tmp_path):
     status, out, err = call(["--cfg", "job"], tmp_path)
     assert (status, err) == (0, "")
-    assert len(out.splitlines()) <= 90
+    assert len(out.splitlines()) <= 120
+
+
+def test_cfg_job_shows_every_argument(tmp_path):
+    _, out, _ = call(["--cfg", "job", "sampler=fmops", "task=reconstruction"], tmp_path)
+    shown = yaml.safe_load(out)
+    for node, given in (
+        (shown["sampler"], {"attributes"}),
+        (shown["task"], {"net"}),
+        (shown["task"]["net"], {"attributes"}),
+        (shown["recipe"], set()),
+        (shown["dataset"], set()),
+    ):
+        named = set(signature(node["_target_"], "")) - given
+        assert named == {key for key in node if key != "_target_"} - {"net"}
+    assert set(shown) == set(declared())
+
+
+def test_help_shows_every_key_and_choice(tmp_path):
+    _, out, _ = call(["--help"], tmp_path)
+    for name, setting in declared().items():
+        text = " ".join(out.split())
+        assert setting.group or f"{name} {setting.help}" in text
+    for group in ("sampler", "task/net", "dataset", "recipe", "experiment"):
+        names = sorted(path.stem for path in conf_dir().joinpath(group).glob("*.yaml"))
+        assert f"\n{group}: {', '.join(names)}\n" in out
+
+
+def test_no_default_is_computed_from_other_choices():
+    for path in conf_dir().rglob("*.yaml"):
+        text = path.read_text()
+        assert not any(word in text for word in ("choose:", "model_for:", "oc.select")), path
 
 
 def test_only_experiments_set_keys_of_other_groups():
@@ -61,12 +95,12 @@ def test_mops_alpha_and_tau_depend_on_task(task, alpha, tau_min):
     ("task", "learn", "rate"),
     [
         ("classification", "sampler", 1e-2),
-        ("classification", "joint", 1e-3),
+        ("classification", "joint", 1e-2),
         ("registration", "sampler", 1e-3),
         ("reconstruction", "sampler", 5e-4),
     ],
 )
-def test_snet_rate_depends_on_task_and_learn(task, learn, rate):
+def test_snet_rate_depends_on_task(task, learn, rate):
     cfg = compose([f"task={task}", f"learn={learn}", "sampler=snet"])
     assert (cfg.optimizer.lr, cfg.pretrain.lr) == (rate, 1e-3)
 
@@ -93,49 +127,55 @@ def test_epochs_depend_on_dataset_and_task(overrides, epochs):
     assert lengths == {"task": epochs[0], "sampler": epochs[1], "joint": epochs[1], "nothing": 0}
 
 
+@pytest.mark.parametrize("sampler", ["mops", "fmops", "samplenet", "fps"])
+def test_spelling_of_weights_changes_nothing_else(sampler):
+    chosen = ["task=registration", f"sampler={sampler}"]
+    spellings = ["auto", "pcrnet.modelnet40", "models/pcrnet.modelnet40.safetensors", "null"]
+    found: list[Any] = [compose([*chosen, f"weights={name}"]) for name in spellings]
+    for cfg in found:
+        cfg.weights = "the same"
+    assert all(cfg == found[0] for cfg in found)
+    started: list[Any] = [
+        compose([*chosen, f"recipe.warm_start={name}"])
+        for name in ("true", "fmops.pairs-m64", "models/fmops.pairs-m64.safetensors")
+    ]
+    for cfg in started:
+        cfg.recipe.warm_start = True
+    assert all(cfg == started[0] for cfg in started)
+
+
+@pytest.mark.parametrize("learn", ["sampler", "joint", "task"])
 @pytest.mark.parametrize(
-    ("overrides", "expected"),
-    [
-        ([], "pcrnet.modelnet40"),
-        (["learn=joint"], "pcrnet.modelnet40"),
-        (["learn=task"], "auto"),
-        (["task/net=icp"], "auto"),
-        (["task.net.iterations=2"], "auto"),
-        (["+task.net.feature_channels=[8,16]"], "auto"),
-        (["task.pairs.rotation=90"], "auto"),
-        (["task.pairs.jitter=0.01"], "auto"),
-        (["dataset=modelnet40"], "auto"),
-        (["weights=auto"], "auto"),
-        (["weights=null"], None),
-    ],
+    "change", ["task.pairs.resample=256", "task/net=pcrnet", "weights=pcrnet.modelnet40", "m=8"]
 )
-def test_registration_of_shapes_is_under_shipped_net(overrides, expected):
-    assert compose(["task=registration", *overrides]).weights == expected
+def test_changed_setting_changes_no_other(learn, change):
+    chosen = ["task=registration", "sampler=fmops", f"learn={learn}"]
+    before, after = (
+        dotted(OmegaConf.to_container(compose(given), resolve=True))
+        for given in (chosen, [*chosen, change])
+    )
+    different = {name for name in {**before, **after} if before.get(name) != after.get(name)}
+    assert different <= {change.partition("=")[0]}
 
 
-def test_fmops_under_shipped_pcrnet_starts_from_shipped_sampler():
-    chosen = ["task=registration", "sampler=fmops"]
-    cfg = compose(chosen)
-    assert (cfg.recipe.warm_start, cfg.sampler.m_max) == ("fmops.pairs-m64", 64)
-    assert (cfg.sampler.anchors, cfg.recipe.train_points) == ("fps", 512)
-    assert (cfg.epochs.sampler, cfg.optimizer.lr) == (3, 5e-5)
-    plain = compose([*chosen, "sampler.anchors=null"])
-    assert (plain.recipe.warm_start, plain.recipe.train_points) == (True, 128)
-    assert (plain.epochs.sampler, plain.optimizer.lr) == (15, 1e-3)
-    random = compose([*chosen, "recipe.warm_start=true"])
-    assert (random.epochs.sampler, random.optimizer.lr) == (15, 1e-3)
-    started = "recipe.warm_start=fmops.pairs-m64"
-    for change in (["learn=joint"], ["learn=task"], ["weights=auto", started]):
-        other = compose([*chosen, *change])
-        assert other.epochs.sampler == 15
-        assert other.optimizer.lr == other.pretrain.lr == 1e-3
-    assert "anchors" not in compose([*chosen, "recipe=paper"]).sampler
-    assert compose([*chosen, "weights=auto"]).recipe.warm_start is True
-    assert compose([*chosen, "recipe=paper"]).recipe.warm_start is False
+def test_fmops_for_registration_has_anchors_and_points_for_them():
+    cfg = compose(["task=registration", "sampler=fmops"])
+    assert (cfg.sampler.anchors, cfg.sampler.m_max, cfg.recipe.train_points) == ("fps", 64, 512)
+    assert (cfg.weights, cfg.recipe.warm_start, cfg.optimizer.lr) == ("auto", True, 1e-3)
+    plain = compose(["task=registration", "sampler=fmops", "recipe=paper"])
+    assert (plain.sampler.anchors, plain.sampler.m_max) == (None, 64)
     assert compose(["sampler=fmops"]).sampler.m_max == 512
 
 
-LEARN = get_args(Learn)
+def test_registration_quick_is_the_default_with_its_own_values():
+    own = ["weights=pcrnet.modelnet40", "recipe.warm_start=fmops.pairs-m64", "epochs.sampler=3"]
+    own += ["optimizer.lr=5e-5"]
+    assert compose(["experiment=registration_quick"]) == compose(
+        ["task=registration", "sampler=fmops", *own]
+    )
+
+
+LEARN = ("task", "sampler", "joint", "nothing")
 
 
 def test_user_files_need_no_specialised_file(tmp_path):
@@ -166,7 +206,7 @@ def test_devices_inherit_the_default_trainer():
     expected: dict[str, dict[str, Any]] = {
         "cpu": {"accelerator": "cpu"},
         "gpu": {"accelerator": "gpu"},
-        "ddp": {"devices": "auto", "num_nodes": 1, "strategy": "ddp"},
+        "ddp": {"devices": "auto", "strategy": "ddp"},
     }
     for name, changes in expected.items():
         assert compose([f"trainer={name}"]).trainer == {**default, **changes}

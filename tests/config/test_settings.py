@@ -1,7 +1,7 @@
 """The declaration of settings, and a made-up setting that everything finds there."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -10,8 +10,7 @@ from omegaconf import OmegaConf
 from mops_lightning.cli.sweep import run_cell
 from mops_lightning.config import settings
 from mops_lightning.config.compose import compose
-from mops_lightning.config.declaration import Affects, about, number
-from mops_lightning.config.settings import RunSettings
+from mops_lightning.config.settings import Affects, RunSettings, number, setting
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.report.build import build
@@ -38,9 +37,7 @@ def affects(request, monkeypatch):
 
     @dataclass
     class WithHaste(RunSettings):
-        haste: float = field(
-            default=1.0, metadata=about("how much haste there is", request.param, limits=limits)
-        )
+        haste: float = setting(1.0, "how much haste there is", request.param, limits=limits)
 
     monkeypatch.setattr(settings, "SCHEMA", WithHaste)
     settings.register()
@@ -120,19 +117,6 @@ def test_made_up_setting_that_affects_results_makes_columns_of_a_report(affects,
 def test_of_a_path_gives_the_nearest_declaration(path, affects, repeated, compared):
     found = settings.of(path)
     assert (found.affects, found.repeated, found.compared) == (affects, repeated, compared)
-
-
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (["+models.paht=a"], r"models\.paht: no such setting\. Did you mean 'models\.path'"),
-        (["+models.path=5"], r"models\.path must be a text, got 5"),
-        (["+models=5"], "models must be settings"),
-    ],
-)
-def test_setting_on_demand_is_validated(overrides, words):
-    with pytest.raises(UserError, match=words):
-        check(compose(overrides))
 
 
 def test_defaults_of_the_schema_are_the_composed_values():

@@ -8,8 +8,9 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from mops_lightning.config.composition import conf_dir
+from mops_lightning.config.hydra_conf import conf_dir
 from mops_lightning.config.validate import check
+from mops_lightning.records.run_record import dotted
 
 ROOT = Path(__file__).parents[2] / "sweeps"
 SWEEPS = sorted(
@@ -48,3 +49,22 @@ def test_sweep_cells_are_valid_and_named_by_swept_settings(name):
 def test_sweeps_all_have_quick_form():
     full = {name for name in SWEEPS if "/" not in name}
     assert {f"quick/{name}" for name in full - {"noise"}} == set(SWEEPS) - full
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_sweep_neighbours_differ_in_what_is_swept(name):
+    params: Any = OmegaConf.to_container(composed(name).hydra.sweeper.params)
+    swept = {key: values.split(",") for key, values in params.items() if "," in str(values)}
+    for key, (first, second, *_) in swept.items():
+        one, other = (settings_of(composed(name, [f"{key}={value}"])) for value in (first, second))
+        different = {path for path in {**one, **other} if one.get(path) != other.get(path)}
+        # A sampler may have an optimizer of its own.
+        allowed = ("sampler.", "optimizer.", "names.sampler") if key == "sampler" else (key,)
+        followers = {f"sampler.{key}"} if key in ("m", "seed") else set()
+        followers |= {f"dataset.{key}"} if key == "seed" else set()
+        assert not {path for path in different - followers if not path.startswith(allowed)}
+
+
+def settings_of(cfg):
+    plain = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+    return dotted(OmegaConf.to_container(plain, resolve=True))

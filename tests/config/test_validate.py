@@ -4,7 +4,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config.build import signature
 from mops_lightning.config.compose import compose
-from mops_lightning.config.composition import conf_dir
+from mops_lightning.config.hydra_conf import conf_dir
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 
@@ -17,7 +17,8 @@ def choices():
     for path in sorted(conf_dir().rglob("*.yaml")):
         group = path.parent.relative_to(conf_dir()).as_posix()
         specialised = group in SPECIALISED or path.parent.with_suffix(".yaml").is_file()
-        if group != "." and not group.startswith("hydra") and not specialised:
+        is_choice = group != "." and not group.startswith("hydra") and path.stem != "own"
+        if is_choice and not specialised:
             yield f"{group}={path.stem}"
 
 
@@ -30,7 +31,7 @@ EXTRA = {
     "task/loss=quaternion": ["task=registration"],
     "task/loss=frobenius_chamfer": ["task=registration"],
 }
-CALLER = {
+CALLER: dict[str, set[str]] = {
     # Arguments that code gives, not YAML: see training.factory and training.trainer.
     "PointNetVanilla": {"num_classes"},
     "PointNetTransform": {"num_classes"},
@@ -40,9 +41,12 @@ CALLER = {
     "quaternion_loss": {"predicted", "true", "source", "target"},
     "frobenius_chamfer_loss": {"predicted", "true", "source", "target"},
     "Adam": {"params"},
-    "RandomSampler": {"m"},
+    "RandomSampler": {"m", "seed"},
     "VoxelSampler": {"m"},
-    "FPSSampler": {"m"},
+    "FPSSampler": {"m", "seed"},
+    "SubmodularSampler": {"net"},
+    "CriticalSampler": {"net"},
+    "Reconstruction": {"net"},
     "one_cycle": {"optimizer", "total_steps"},
     "exponential": {"optimizer", "total_steps"},
     "step_decay": {"optimizer", "total_steps"},
@@ -52,6 +56,10 @@ CALLER = {
     "progress": {"score"},
     "CloudVisualization": {"batch", "titles", "folder"},
 }
+
+
+FROM_DATA = {"attributes"}
+"""Arguments of samplers and nets that the data give."""
 
 
 def nodes(cfg):
@@ -73,13 +81,15 @@ def test_compose_every_choice_fits_its_constructor(override):
         parameters = signature(node["_target_"], override)
         given = {key for key in node if not str(key).startswith("_")} - {"schedule"}
         assert given <= set(parameters), node["_target_"]
-        needed = {
-            name
+        named = {
+            name: p
             for name, p in parameters.items()
-            if p.default is p.empty and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
+            if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
         }
-        missing = needed - given - CALLER.get(target.__name__, set())
-        assert not missing, f"{node['_target_']} would lack {missing}"
+        if not node["_target_"].startswith("mops_lightning."):
+            named = {name: p for name, p in named.items() if p.default is p.empty}
+        missing = set(named) - given - CALLER.get(target.__name__, set()) - FROM_DATA
+        assert not missing, f"{node['_target_']}: no file shows {missing}"
 
 
 def test_default_settings_are_those_of_readme():
@@ -120,7 +130,7 @@ def test_rival_samplers_have_published_settings():
     assert (cfg.trainer.max_epochs, cfg.val_fraction) == (500, 0)
     cfg = compose(["sampler=snet"])
     assert (cfg.optimizer.lr, cfg.pretrain.lr) == (0.01, 0.001)
-    assert compose(["sampler=snet", "learn=joint"]).optimizer.lr == 0.001
+    assert compose(["sampler=snet", "learn=joint"]).optimizer.lr == 0.01
     assert compose(["sampler=snet", "optimizer=exponential"]).optimizer.lr == 5e-4
     assert compose(["sampler=fmops"]).optimizer.lr == 0.001
     cfg = compose(["sampler=snet_progressive"])
@@ -135,20 +145,12 @@ def test_rival_samplers_have_published_settings():
         (["task_lr_scale=inf"], "task_lr_scale must be .*got inf"),
         (["optimizer.lr=1e400"], "optimizer.lr must be finite, got inf"),
         (["+optimizer.betas=[nan,1]"], "optimizer.betas must be finite, got nan"),
-        (["trainer.gradient_clip_val=nan"], "trainer.gradient_clip_val must be .*got nan"),
-        (["trainer.gradient_clip_val=-1"], "trainer.gradient_clip_val must be .*got -1"),
-        (["trainer.log_every_n_steps=0"], "trainer.log_every_n_steps must be .*at least 1, got 0"),
         (["seed=18446744073709551616"], r"seed must be below 2\*\*63, got one of 65 bits"),
         (["m=0"], "m must be a whole number of at least 1, got 0"),
         (["m=2.5"], "m must be a whole number"),
-        (["m=2000"], r"m must be at most dataset.n_points=1024, got m=2000"),
         (
             ["sampler=fmops", "sampler.num_sizes=1.5"],
             "sampler.num_sizes must be a whole number, got 1.5",
-        ),
-        (
-            ["sampler=fmops", "sampler.m_max=0"],
-            "sampler.m_max must be a whole number of at least 1",
         ),
         (["sampler=samplenet", "sampler.k=null"], "sampler.k must be a whole number, got None"),
         (["sampler=snet", "sampler.head_channels=[a]"], "must be a list of whole numbers, got"),
@@ -170,7 +172,6 @@ def test_rival_samplers_have_published_settings():
         (["trainer.devices=0"], "trainer.devices must be a number of devices"),
         (["trainer.devices=[]"], "trainer.devices must be a number of devices"),
         (["trainer=cpu", "trainer.devices=-1"], "trainer.devices=-1 means all GPUs"),
-        (["trainer=ddp", "trainer.num_nodes=0"], "trainer.num_nodes must be a number of hosts"),
         (["trainer=ddp", "trainer.strategy=fsdp"], "trainer.strategy: several devices work with"),
         (["trainer=ddp", "+trainer.sync_batchnorm=true"], "trainer.sync_batchnorm must be false"),
         (["sampler.alpha=abc"], r"sampler\.alpha must be a number, got 'abc'"),
@@ -186,6 +187,7 @@ def test_rival_samplers_have_published_settings():
         (["test_noise_std=inf"], "test_noise_std must be a number of at least 0"),
         (["trainer.precision=bf16"], "precision must be one of .*Did you mean 'bf16-mixed'"),
         (["dataset=meshes"], "dataset.root must be set"),
+        (["sampler=own"], "sampler._target_ must be set: give sampler._target_=MODULE.CLASS"),
         (["sampler._target_=mops_lightning.samplers.mops.MOPSNett"], "cannot import"),
     ],
 )

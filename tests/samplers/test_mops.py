@@ -70,7 +70,7 @@ def test_mops_has_published_layers():
     assert sizes == [*features, (512, 128), (512, 128), (256, 512), (128, 256), (32, 128)]
 
 
-def test_tau_exponential_annealing():
+def test_tau_decreases_exponentially():
     net = small(tau_min=0.1).train()
     taus = []
     for progress in (0.0, 0.5, 1.0):

@@ -36,8 +36,8 @@ TINY = [
 
 SMALL_PCRNET = [
     "task=registration",
-    "+task.net.feature_channels=[16,32]",
-    "+task.net.head_channels=[32]",
+    "task.net.feature_channels=[16,32]",
+    "task.net.head_channels=[32]",
 ]
 """Registration by a net that is written to disk in no time."""
 

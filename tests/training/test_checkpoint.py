@@ -12,6 +12,7 @@ import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from torch import nn
 
+from mops_lightning.config.settings import Learn
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import Interrupted
 from mops_lightning.samplers.mops import MOPSNet
@@ -21,7 +22,6 @@ from mops_lightning.training.callbacks import StopBetweenSteps, last_checkpoint
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe import Recipe
 from mops_lightning.training.schedules import one_cycle
-from mops_lightning.types import Learn
 from tests.support.training import quiet_trainer, small_dataset
 
 pytestmark = pytest.mark.filterwarnings(

@@ -11,7 +11,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.training.run import run
 from tests.support.command_line import TINY
 
-CURVES = ["sampler=mops", "weights=null", "val_fraction=0.2", "trainer.log_every_n_steps=1"]
+CURVES = ["sampler=mops", "weights=null", "val_fraction=0.2"]
 
 
 def logged(tmp_path, *arguments):

@@ -4,10 +4,9 @@ from typing import Any
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
+from mops_lightning.config.build import build
 from mops_lightning.config.compose import compose
-from mops_lightning.config.validate import check
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.data.pairs import Pairs
 from mops_lightning.errors import UserError
@@ -63,10 +62,8 @@ def logged(recipe: Recipe) -> dict[str, float]:
 
 
 def test_recipe_paper_and_fast_are_valid_and_differ():
-    paper: Any = OmegaConf.to_container(compose(["recipe=paper"]).recipe)
-    fast: Any = OmegaConf.to_container(compose().recipe)
-    assert Recipe(**paper) == Recipe()
-    assert Recipe(**fast) != Recipe()
+    assert build(compose(["recipe=paper"]).recipe, "recipe") == Recipe()
+    assert build(compose().recipe, "recipe") != Recipe()
 
 
 class NetSeenBy(PointNetVanilla):
@@ -114,7 +111,7 @@ def test_recipe_value_out_of_range_raises(name, value):
     with pytest.raises(UserError, match=rf"{name} must be .* got"):
         Recipe(**{name: value})
     with pytest.raises(UserError, match=rf"recipe.{name} must be .* got"):
-        check(compose([f"++recipe.{name}={value}"]))
+        build(compose([f"recipe.{name}={value}"]).recipe, "recipe")
 
 
 def test_recipe_set_without_straight_through_raises():

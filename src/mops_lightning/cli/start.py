@@ -1,17 +1,40 @@
-"""What is checked before Hydra writes anything into the folder of a single run."""
+"""Checks before Hydra writes anything into the folder of a single run."""
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mops_lightning.config import distributed
 from mops_lightning.config.explain import explain
-from mops_lightning.config.paths import INPUTS, check_paths
 from mops_lightning.errors import USER_ERROR, UserError, end, file_error
 from mops_lightning.zoo import names
+
+INPUTS = {
+    "weights": ("auto", "run"),
+    "ckpt_path": ("last",),
+    "evaluate": (),
+    "dataset.root": (),
+    "dataset.motions": (),
+    "dataset.calib": (),
+}
+"""Settings that name what must exist, with values that are no paths."""
+OUTPUTS = ("out", "cache", "dataset.cache")
+MISSING = {"ckpt_path": "no checkpoint {}. Give a run's folder, a .ckpt file, or last."}
+"""Errors of inputs that nothing else checks before a run begins."""
+
+
+class RunStart(Callback):
+    """Checks a single run before Hydra writes into its folder."""
+
+    def on_run_start(self, config: DictConfig, **extra: Any) -> None:
+        """Check the settings and claim the folder."""
+        begin(config, sys.argv[1:])
 
 
 def begin(config: DictConfig, arguments: Sequence[str]) -> None:
@@ -42,6 +65,34 @@ def begin(config: DictConfig, arguments: Sequence[str]) -> None:
         end("mops_lightning", explain(error, arguments), USER_ERROR)
     except OSError as error:
         end("mops_lightning", file_error(error), USER_ERROR)
+
+
+def check_paths(cfg: DictConfig) -> None:
+    """Check that inputs exist and that no name is impossible: empty, too long, a loop of links.
+
+    Raises:
+        UserError: a setting names such a file or folder.
+    """
+    for name in (*INPUTS, *OUTPUTS):
+        value = OmegaConf.select(cfg, name)
+        if not isinstance(value, str) or value in INPUTS.get(name, ()):
+            continue
+        if not value:
+            raise UserError(f"{name}: no path is given. Give one, or leave {name} out.")
+        try:
+            path = Path(value).expanduser()
+            path.stat()
+        except FileNotFoundError:
+            if name in MISSING:
+                raise UserError(f"{name}: {MISSING[name].format(path)}") from None
+        except (OSError, RuntimeError, ValueError) as error:
+            # Python: no such user, a null byte.
+            reason = error.strerror if isinstance(error, OSError) else str(error)
+            raise UserError(f"{name}: {_short(value)}: {reason}.") from None
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 100 else f"{text[:60]} ... ({len(text)} characters)"
 
 
 def _check_weights(given: str | None) -> None:

@@ -7,7 +7,6 @@ again with the same command at any time.
 import logging
 import math
 import os
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -18,9 +17,9 @@ from filelock import FileLock, Timeout
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from mops_lightning.cli.start import begin, make
+from mops_lightning.cli.start import make
 from mops_lightning.config import settings
-from mops_lightning.config.declaration import Affects
+from mops_lightning.config.settings import Affects
 from mops_lightning.errors import Interrupted, UserError, file_error, memory_error
 from mops_lightning.filesystem import remove_temporary, set_aside
 from mops_lightning.records import run_record
@@ -219,10 +218,6 @@ def _state(cell: Path) -> str:
 
 class SweepSummary(Callback):
     """Prints the states of a sweep's cells at its end; the exit status is 1 if any failed."""
-
-    def on_run_start(self, config: DictConfig, **extra: Any) -> None:
-        """Check the settings and claim the folder of a single run before Hydra writes into it."""
-        begin(config, sys.argv[1:])
 
     def on_multirun_start(self, config: DictConfig, **extra: Any) -> None:
         """Mark the start, on the clock of the folder's file system."""

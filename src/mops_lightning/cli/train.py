@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from mops_lightning.cli.commands import help_lines
 from mops_lightning.cli.flags import flags_first
-from mops_lightning.config.composition import conf_dir
-from mops_lightning.config.overrides import accepted, key, parse
+from mops_lightning.config.hydra_conf import conf_dir
+from mops_lightning.config.overrides import key, readable, with_own_classes
 from mops_lightning.errors import (
     INTERRUPTED,
     USER_ERROR,
@@ -18,7 +18,6 @@ from mops_lightning.errors import (
     memory_error,
     quiet_on_closed_pipe,
 )
-from mops_lightning.zoo import names
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -51,12 +50,11 @@ def _run() -> None:
     try:
         sys.argv[1:] = flags_first(sys.argv[1:])
         refuse_plain_groups(sys.argv[1:])
-        _search_models(sys.argv[1:])
         if any(key(argument) == "evaluate" for argument in sys.argv[1:]):
             from mops_lightning.training.evaluation.settings import command_line
 
             sys.argv[1:] = command_line(sys.argv[1:])
-        sys.argv[1:] = map(accepted, sys.argv[1:])
+        sys.argv[1:] = with_own_classes([readable(argument) for argument in sys.argv[1:]])
         app = hydra.main(config_path=str(conf_dir()), config_name="config", version_base="1.3")
         app(_job)()
     except (UserError, HydraException, OmegaConfBaseException, YAMLError) as error:
@@ -67,22 +65,6 @@ def _run() -> None:
         if show_traceback or isinstance(error, BrokenPipeError):
             raise
         end(NAME, file_error(error), USER_ERROR)
-
-
-def _search_models(arguments: list[str]) -> None:
-    """Search the folders of ``models.path`` for models, before any setting names one.
-
-    Raises:
-        UserError: there is no such folder, or the value is none.
-    """
-    for argument in arguments:
-        override = parse(argument) if key(argument) == "models.path" else None
-        if override is None or override.is_delete():
-            continue
-        value = None if override.is_sweep_override() else override.value()
-        if not isinstance(value, str):
-            raise UserError(f"{argument}: give folders as in $MOPS_MODELS: models.path=FOLDER.")
-        names.search_first(value)
 
 
 def _job(cfg: "DictConfig") -> float | None:

@@ -4,8 +4,9 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
-from mops_lightning.config.composition import composed
 from mops_lightning.config.explain import explain, refuse_plain_groups
+from mops_lightning.config.hydra_conf import composed
+from mops_lightning.config.overrides import with_own_classes
 from mops_lightning.errors import UserError
 
 
@@ -20,7 +21,7 @@ def compose(overrides: list[str] | None = None) -> DictConfig:
     """
     from hydra.errors import HydraException
 
-    given = overrides or []
+    given = with_own_classes(overrides or [])
     refuse_plain_groups(given)
     try:
         return composed(given)

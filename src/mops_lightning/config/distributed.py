@@ -19,10 +19,10 @@ STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true")
 
 
 def is_distributed(cfg: DictConfig) -> bool:
-    """Return whether the settings request more than one device or host."""
+    """Return whether the settings request more than one device."""
     devices = cfg.trainer.get("devices")
     one = len(devices) == 1 if OmegaConf.is_list(devices) else devices == 1
-    return not (one and cfg.trainer.get("num_nodes", 1) == 1)
+    return not one
 
 
 def is_worker_rank(cfg: DictConfig) -> bool:
@@ -60,7 +60,7 @@ def started_together(cfg: DictConfig) -> bool:
 
 
 def check(cfg: DictConfig) -> None:
-    """Check the number of devices and hosts, and the strategy.
+    """Check the number of devices and the strategy.
 
     Raises:
         UserError: a value out of range, or a strategy that this program does not support.
@@ -77,9 +77,6 @@ def check(cfg: DictConfig) -> None:
         )
     if devices == -1 and cfg.trainer.get("accelerator") == "cpu":
         raise UserError("trainer.devices=-1 means all GPUs; on the CPU give a number of processes.")
-    nodes = cfg.trainer.get("num_nodes", 1)
-    if type(nodes) is not int or nodes < 1:
-        raise UserError(f"trainer.num_nodes must be a number of hosts, got {nodes!r}.")
     if cfg.trainer.get("sync_batchnorm"):
         raise UserError(
             "trainer.sync_batchnorm must be false: the nets pool and normalise in one step, each "
@@ -101,8 +98,8 @@ def check_multirun(cfg: DictConfig) -> None:
     """
     if is_distributed(cfg):
         raise UserError(
-            f"trainer.devices={cfg.trainer.get('devices')}, trainer.num_nodes="
-            f"{cfg.trainer.get('num_nodes', 1)}: a sweep (-m) gives each run one device. Use "
+            f"trainer.devices={cfg.trainer.get('devices')}: a sweep (-m) gives each run one "
+            "device. Use "
             "trainer.devices=1 hydra/launcher=joblib (or submitit_slurm) for parallel runs, or "
             "start each large run separately, without -m."
         )

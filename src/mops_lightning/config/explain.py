@@ -11,14 +11,11 @@ from yaml import MarkedYAMLError  # type: ignore[import-untyped]
 from mops_lightning.config import settings
 from mops_lightning.config.annotations import misfit
 from mops_lightning.config.build import signature
-from mops_lightning.config.composition import composed, conf_dir
+from mops_lightning.config.hydra_conf import composed, conf_dir
 from mops_lightning.config.overrides import key as key_of
 from mops_lightning.config.overrides import parse
 from mops_lightning.config.validate import misfit_of
 from mops_lightning.errors import UserError, did_you_mean
-
-FROM_RESOLVER = f"{UserError.__name__} raised while resolving interpolation: "
-"""What OmegaConf puts before the error of a resolver."""
 
 OTHERWISE = {
     "logger": " (logger=none for none)",
@@ -107,8 +104,6 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
     if isinstance(error, UserError):
         return texts[0]
     for text in texts:
-        if text.startswith(FROM_RESOLVER):
-            return text.removeprefix(FROM_RESOLVER).splitlines()[0]
         if "Could not override '" in text:
             key = text.split("Could not override '")[1].split("'")[0]
             return _no_such_setting(key, arguments)
@@ -157,8 +152,6 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     target = OmegaConf.select(cfg, f"{node}._target_")
     if target and name in signature(target, node):
         return f"{key}: {target} accepts it, but no file sets it. Write +{key}=..."
-    if not target and key in settings.INSIDE:
-        return f"{key}: no file sets it. Write +{key}=..."
     choices = _choices_with(node, name)
     if choices:
         return f"{key}: no such setting here. It belongs to {' and '.join(choices)}."
@@ -182,7 +175,7 @@ def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
 
 def _known_keys(cfg: DictConfig) -> list[str]:
     """List every key of a configuration, dotted."""
-    keys = [*settings.declared(), *settings.ON_DEMAND]
+    keys = list(settings.declared())
 
     def walk(node: DictConfig, prefix: str) -> None:
         for key in node:

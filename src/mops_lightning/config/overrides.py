@@ -3,7 +3,8 @@
 from functools import cache
 from typing import TYPE_CHECKING
 
-from mops_lightning.config import settings
+OWN = {"sampler": "sampler", "task": "task", "task.net": "task/net", "dataset": "dataset"}
+"""Settings that describe an object of a class that may be the user's, and their groups."""
 
 if TYPE_CHECKING:
     from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -23,7 +24,7 @@ def parse(argument: str) -> "Override | None":
 
 def readable(argument: str) -> str:
     """Return an override in a form that Hydra reads, with its value quoted if need be."""
-    return argument if _parsed(argument) else _quoted(argument)
+    return _quoted(argument) if key(argument) and not _parsed(argument) else argument
 
 
 def key(argument: str) -> str:
@@ -41,17 +42,21 @@ def path(argument: str) -> str:
     return package or name.replace("/", ".")
 
 
-def accepted(argument: str) -> str:
-    """Return an argument as Hydra accepts it.
+def with_own_classes(arguments: list[str]) -> list[str]:
+    """Choose ``GROUP=own`` where a class from outside is named, and accept any setting of it.
 
-    With a ``+`` before a setting that no file contains, and with quotes around a value that is none
-    to Hydra, such as a path with ``=`` in it.
+    Args:
+        arguments: such as ``["sampler._target_=my_package.MySampler", "sampler.x=3"]``. With a
+            choice of the group, such as ``sampler=mops``, the settings of its file are kept.
     """
-    name = key(argument)
-    if not name:
-        return argument
-    missing = name in settings.ON_DEMAND and argument[0] not in "+~"
-    return f"+{readable(argument)}" if missing else readable(argument)
+    keys = [key(argument) for argument in arguments]
+    places = [place for place in OWN if f"{place}._target_" in keys]
+    chosen = [f"{OWN[place]}=own" for place in places if OWN[place] not in keys]
+    below = tuple(f"{place}." for place in places)
+    return [
+        f"++{argument.lstrip('+')}" if name.startswith(below) and argument[0] != "~" else argument
+        for argument, name in zip(arguments, keys, strict=True)
+    ] + chosen
 
 
 def quote(text: str) -> str:

@@ -1,39 +1,86 @@
 """The declaration of every setting of a run: its type, help, limits and what it affects.
 
-Help, validation, resuming, the cache of pretrained task nets, sweeps, ``evaluate`` and ``report``
-read it. A new setting is one field of ``RunSettings``; one inside a group that differs from its
-group is one line of ``inside.INSIDE``.
+Help, validation, resuming, the cache of task nets, sweeps, ``evaluate`` and ``report`` read it. A
+new run-level setting is one field of ``RunSettings``. A setting of a group is an argument of the
+class behind the group, which checks it; it has a line in ``INSIDE`` where it affects something else
+than its group.
 """
 
 import textwrap
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from enum import Flag, auto
 from functools import cache
-from typing import Any, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_type_hints
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from mops_lightning.config.annotations import describe
-from mops_lightning.config.declaration import (
-    Affects,
-    Limits,
-    Setting,
-    about,
-    group,
-    number,
-    one_of,
-    table,
-    whole,
-)
-from mops_lightning.config.inside import INSIDE
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.types import Learn
 
+Learn = Literal["task", "sampler", "joint", "nothing"]
+LEARN = get_args(Learn)
+"""What a run may train."""
 WITH_SAMPLER = ("sampler", "joint", "nothing")
 NAME = "run_settings"
-"""What the schema is called in the defaults list of ``conf/config.yaml``."""
+"""Name of the schema in the defaults list of ``conf/config.yaml``."""
+PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
+"""Allowed values of ``trainer.precision``; Lightning has more."""
 
 
+class Affects(Flag):
+    """What a setting changes.
+
+    ``TRAINING`` is what is learned: such a setting belongs to the identity of a resumed run and to
+    the key of a cached task net. ``SCORES`` is what is measured on the test clouds. Settings that
+    affect ``NOTHING`` may differ between two starts of a sweep.
+    """
+
+    NOTHING = 0
+    TRAINING = auto()
+    SCORES = auto()
+    RESULTS = TRAINING | SCORES
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The values that a setting takes.
+
+    Attributes:
+        allowed: in words, behind "must be".
+        fits: whether a value is one of them.
+        choices: all of them, if they have names.
+    """
+
+    allowed: str
+    fits: Callable[[Any], bool]
+    choices: tuple[str, ...] = ()
+
+
+def whole(minimum: int) -> Limits:
+    """Allow whole numbers of at least ``minimum``."""
+    return Limits(
+        f"a whole number of at least {minimum}", lambda x: type(x) is int and x >= minimum
+    )
+
+
+def number(allowed: str, fits: Callable[[float], bool]) -> Limits:
+    """Allow finite numbers in a range."""
+    return Limits(
+        f"a number {allowed}",
+        lambda x: isinstance(x, int | float) and abs(x) < float("inf") and fits(x),
+    )
+
+
+def one_of(*choices: str, others: tuple[Any, ...] = ()) -> Limits:
+    """Allow named choices, and ``others`` that are other spellings of them."""
+    return Limits(
+        f"one of {', '.join(choices)}", lambda x: x in choices or x in others, choices=choices
+    )
+
+
+NOT_NEGATIVE = number("of at least 0", lambda x: x >= 0)
 SIZES = Limits(
     "auto or a list of whole numbers of at least 1",
     lambda x: (
@@ -43,207 +90,231 @@ SIZES = Limits(
 )
 
 
+@dataclass(frozen=True)
+class Setting:
+    """One setting.
+
+    Attributes:
+        help: its text in ``--help``.
+        affects: what it changes.
+        limits: the values it takes; None: all of its type.
+        learn: the values of ``learn`` with which it counts; None: with all.
+        group: whether it is a group of choices, which ``--help`` lists elsewhere.
+        nullable: whether it may be removed or null.
+        per_learn: whether it has one entry for learn=task and one for training a sampler.
+        by_content: whether a run is identified by the content of the files that it names.
+        repeat: whether ``evaluate=RUN`` takes it from RUN; None: if it affects anything.
+        compare: whether ``report`` refuses runs in one table that differ in it; None: if it
+            affects anything.
+    """
+
+    help: str = ""
+    affects: Affects = Affects.RESULTS
+    limits: Limits | None = None
+    learn: tuple[str, ...] | None = None
+    group: bool = False
+    nullable: bool = False
+    per_learn: bool = False
+    by_content: bool = False
+    repeat: bool | None = None
+    compare: bool | None = None
+
+    def counts(self, learn: str) -> bool:
+        """Return whether it makes a difference with this value of ``learn``."""
+        return self.learn is None or learn in self.learn
+
+    @property
+    def repeated(self) -> bool:
+        """Whether ``evaluate=RUN`` takes it from RUN."""
+        return bool(self.affects) if self.repeat is None else self.repeat
+
+    @property
+    def compared(self) -> bool:
+        """Whether ``report`` compares it."""
+        return bool(self.affects) if self.compare is None else self.compare
+
+
+def setting(default: Any, text: str, affects: Affects = Affects.RESULTS, **more: Any) -> Any:
+    """Return a field of ``RunSettings``; see ``Setting``."""
+    return field(default=default, metadata={"setting": Setting(text, affects, **more)})
+
+
+def group(affects: Affects = Affects.RESULTS, **more: Any) -> Any:
+    """Return a field for a group of choices."""
+    return setting(None, "", affects, group=True, **more)
+
+
 @dataclass
 class RunSettings:
     """The top level of the configuration."""
 
     # Sizes and seeds make the rows and columns of a report, so that it does not compare them.
-    m: int = field(
-        default=32,
-        metadata=about(
-            "points that the sampler returns; for a net of many sizes, the size that is shown",
-            Affects.SCORES,
-            limits=whole(1),
-            compare=False,
-        ),
+    m: int = setting(
+        32,
+        "number of sampled points; for multi-size samplers, the size reported as the score",
+        Affects.SCORES,
+        limits=whole(1),
+        compare=False,
     )
-    sizes: Any = field(
-        default="auto",
-        metadata=about(
-            "sizes tested in addition to m: auto (the usual sizes for a net of many sizes) or "
-            "[8,100,...]",
-            Affects.SCORES,
-            limits=SIZES,
-            compare=False,
-        ),
+    sizes: Any = setting(
+        "auto",
+        "sizes tested in addition to m: auto (the usual sizes, for multi-size samplers) or "
+        "[8,100,...]",
+        Affects.SCORES,
+        limits=SIZES,
+        compare=False,
     )
     # What a run learned, its weights, data and task net are compared by the record's notes.
-    learn: str = field(
-        default="sampler",
-        metadata=about(
-            "what is trained: sampler (task net frozen), task (alone, full clouds), joint, nothing",
-            Affects.TRAINING,
-            limits=one_of(*get_args(Learn)),
-            repeat=False,
-            compare=False,
-        ),
+    learn: str = setting(
+        "sampler",
+        "what is trained: sampler (task net frozen), task (alone, full clouds), joint, nothing",
+        Affects.TRAINING,
+        limits=one_of(*LEARN),
+        repeat=False,
+        compare=False,
     )
-    seed: int = field(
-        default=0,
-        metadata=about(
-            "seed of weights, order, augmentation and procedural data",
-            limits=whole(0),
-            compare=False,
-        ),
+    seed: int = setting(
+        0,
+        "seed of weights, order, augmentation and procedural data",
+        limits=whole(0),
+        compare=False,
     )
-    weights: str | None = field(
-        default="auto",
-        metadata=about(
-            "task net: auto (cached, else trained first), a model, a run, a weights file, or null "
-            "(untrained); with learn=task the file that training starts from",
-            nullable=True,
-            by_content=True,
-            repeat=False,
-            compare=False,
-        ),
+    weights: str | None = setting(
+        "auto",
+        "task net: auto (cached, else trained first), a model, a run, a weights file, or null "
+        "(untrained); with learn=task the file that training starts from",
+        nullable=True,
+        by_content=True,
+        repeat=False,
+        compare=False,
     )
-    ckpt_path: str | None = field(
-        default=None,
-        metadata=about(
-            "resume training: last (newest run of these settings), a run folder or a .ckpt file",
-            Affects.NOTHING,
-            nullable=True,
-        ),
+    ckpt_path: str | None = setting(
+        None,
+        "resume training: last (newest run of these settings), a run folder or a .ckpt file",
+        Affects.NOTHING,
+        nullable=True,
     )
-    evaluate: str | None = field(
-        default=None,
-        metadata=about(
-            "test this run or model again, with other sizes=, dataset= or weights=; trains nothing",
-            nullable=True,
-            repeat=False,
-            compare=False,
-        ),
+    evaluate: str | None = setting(
+        None,
+        "test this run or model again, with other sizes=, dataset= or weights=; trains nothing",
+        nullable=True,
+        repeat=False,
+        compare=False,
     )
-    task_lr_scale: float = field(
-        default=1.0,
-        metadata=about(
-            "with learn=joint, the task net's learning rate as a share of the sampler's",
-            Affects.TRAINING,
-            limits=number("above 0", lambda x: x > 0),
-            learn=("joint",),
-        ),
+    task_lr_scale: float = setting(
+        1.0,
+        "with learn=joint, the task net's learning rate as a share of the sampler's",
+        Affects.TRAINING,
+        limits=number("above 0", lambda x: x > 0),
+        learn=("joint",),
     )
-    batch_size: int = field(
-        default=32,
-        metadata=about(
-            "clouds per batch",
-            limits=whole(2),  # BatchNorm cannot learn from one cloud
-        ),
+    batch_size: int = setting(
+        32,
+        "clouds per batch",
+        limits=whole(2),  # BatchNorm cannot learn from one cloud
     )
-    val_fraction: float = field(
-        default=0.05,
-        metadata=about(
-            "share of the training clouds held out for the curves under val/; never trained on",
-            Affects.TRAINING,
-            limits=number("of at least 0 and below 1", lambda x: 0 <= x < 1),
-        ),
+    val_fraction: float = setting(
+        0.05,
+        "share of the training clouds held out for the curves under val/; never trained on",
+        Affects.TRAINING,
+        limits=number("of at least 0 and below 1", lambda x: 0 <= x < 1),
     )
-    test_noise_std: float = field(
-        default=0.0,
-        metadata=about(
-            "standard deviation of Gaussian noise on all coordinates of test clouds (0.1 is 10 %)",
-            Affects.SCORES,
-            limits=number("of at least 0", lambda x: x >= 0),
-        ),
+    test_noise_std: float = setting(
+        0.0,
+        "standard deviation of Gaussian noise on all coordinates of test clouds (0.1 is 10 %)",
+        Affects.SCORES,
+        limits=NOT_NEGATIVE,
     )
-    refine: int = field(
-        default=0,
-        metadata=about(
-            "passes of exchanges that improve the tested points by asking the task net (readout "
-            "refined; slow); 0 leaves it out",
-            Affects.SCORES,
-            limits=whole(0),
-            learn=WITH_SAMPLER,
-            compare=False,  # its results have rows of their own
-        ),
+    refine: int = setting(
+        0,
+        "passes of local search with the task net (readout refined; slow); 0: off",
+        Affects.SCORES,
+        limits=whole(0),
+        learn=WITH_SAMPLER,
+        compare=False,  # its results have rows of their own
     )
-    pictures: int = field(
-        default=4,
-        metadata=about(
-            "number of test clouds in the pictures; 0 for none", Affects.NOTHING, limits=whole(0)
-        ),
+    pictures: int = setting(
+        4, "number of test clouds in the pictures; 0 for none", Affects.NOTHING, limits=whole(0)
     )
-    out: str = field(
-        default="outputs",
-        metadata=about(
-            "folder for runs; every run makes a folder of its own below it",
-            Affects.NOTHING,
-        ),
+    out: str = setting(
+        "outputs",
+        "folder for runs; every run makes a folder of its own below it",
+        Affects.NOTHING,
     )
-    cache: str = field(
-        default="${oc.env:MOPS_CACHE,'~/.cache/mops_lightning'}",
-        metadata=about(
-            "folder for generated data and pretrained task nets, shared between runs",
-            Affects.NOTHING,
-        ),
+    cache: str = setting(
+        "${oc.env:MOPS_CACHE,'~/.cache/mops_lightning'}",
+        "folder for generated data and pretrained task nets, shared between runs",
+        Affects.NOTHING,
     )
-    epochs: Any = field(
-        default=None,
-        metadata=table(
-            "default number of epochs: task for learn=task, sampler for sampler and joint"
-        ),
+    epochs: Any = setting(
+        None,
+        "number of epochs for each value of learn; trainer.max_epochs takes its value from here",
+        Affects.NOTHING,
+        repeat=True,
     )
-    augment: Any = field(
-        default=None,
-        metadata=about(
-            "augmentation of training clouds: task for learn=task, sampler for sampler and joint",
-            Affects.TRAINING,
-            per_learn=True,
-            repeat=True,
-        ),
+    augment: Any = setting(
+        None,
+        "augmentation of training clouds: task for learn=task, sampler for sampler and joint",
+        Affects.TRAINING,
+        per_learn=True,
+        repeat=True,
     )
-    recipe: Any = field(
-        default=None,
-        # What was in force is compared by the record's notes: index samplers have no recipe.
-        metadata=group(Affects.TRAINING, learn=("sampler", "joint"), repeat=False, compare=False),
+    # The recipe in force is compared by the record's notes: index samplers have no recipe.
+    recipe: Any = group(Affects.TRAINING, learn=("sampler", "joint"), repeat=False, compare=False)
+    pretrain: Any = setting(
+        None,
+        "optimizer with which weights=auto trains the task net, for epochs.task epochs",
+        learn=WITH_SAMPLER,
+        compare=False,
     )
-    pretrain: Any = field(
-        default=None,
-        metadata=about(
-            "optimizer with which weights=auto trains the task net, for epochs.task epochs",
-            learn=WITH_SAMPLER,
-            compare=False,
-        ),
+    # Baselines have rows of their own.
+    baselines: Any = group(Affects.SCORES, learn=WITH_SAMPLER, compare=False)
+    names: Any = setting(
+        None, "the chosen groups' names; derived, not to be set", Affects.SCORES, compare=False
     )
-    baselines: Any = field(
-        default=None,
-        metadata=group(
-            Affects.SCORES,
-            learn=WITH_SAMPLER,
-            compare=False,  # they have rows of their own
-        ),
-    )
-    names: Any = field(
-        default=None,
-        metadata=about(
-            "the chosen groups' names; derived, not to be set", Affects.SCORES, compare=False
-        ),
-    )
-    task: Any = field(default=None, metadata=group())
-    dataset: Any = field(default=None, metadata=group(by_content=True, compare=False))
-    sampler: Any = field(default=None, metadata=group(learn=WITH_SAMPLER))
-    optimizer: Any = field(default=None, metadata=group(Affects.TRAINING, repeat=False))
-    trainer: Any = field(
-        default=None, metadata=group(Affects.TRAINING, repeat=False, compare=False)
-    )
-    callbacks: Any = field(
-        default=None,
-        metadata=group(Affects.TRAINING, nullable=True, repeat=False, compare=False),
-    )
-    logger: Any = field(default=None, metadata=group(Affects.NOTHING, nullable=True))
+    task: Any = group()
+    dataset: Any = group(by_content=True, compare=False)
+    sampler: Any = group(learn=WITH_SAMPLER)
+    optimizer: Any = group(Affects.TRAINING, repeat=False)
+    trainer: Any = group(Affects.TRAINING, repeat=False, compare=False)
+    callbacks: Any = group(Affects.TRAINING, nullable=True, repeat=False, compare=False)
+    logger: Any = group(Affects.NOTHING, nullable=True)
 
 
 SCHEMA: type = RunSettings
 """The declaration in use."""
 
-ON_DEMAND: dict[str, Setting] = {
-    "models.path": Setting(
-        "folders with models of your own, searched before those of MOPS_MODELS",
-        Affects.NOTHING,
-        limits=Limits("a text", lambda x: isinstance(x, str)),
-    ),
+_NOTHING = {"affects": Affects.NOTHING}
+INSIDE: dict[str, dict[str, Any]] = {
+    "callbacks.learning_rate": _NOTHING,
+    "callbacks.checkpoint": _NOTHING,
+    "callbacks.progress": _NOTHING,
+    "callbacks.pictures": _NOTHING,
+    # A record may come from anybody: it chooses neither addresses nor where files are written.
+    "dataset.cache": {**_NOTHING, "repeat": False},
+    "dataset.download": {"repeat": False},
+    "dataset.mirrors": {"repeat": False},
+    "dataset.archive_hash": {"repeat": False},
+    "dataset.workers": _NOTHING,
+    "task.pairs.test_seed": {"affects": Affects.SCORES},
+    "sampler.m": {"compare": False},
+    "sampler.m_max": {"compare": False},
+    "sampler.seed": {"compare": False},
+    "sampler.threshold": {"affects": Affects.SCORES},
+    "recipe.task_points": {"learn": None},
+    "augment.task.jitter": {"limits": NOT_NEGATIVE},
+    "augment.sampler.jitter": {"limits": NOT_NEGATIVE},
+    # Before trainer.max_epochs, so that an error names the setting that it takes its value from.
+    "epochs.task": {"limits": whole(1)},
+    "epochs.sampler": {"limits": whole(0)},
+    "trainer.max_epochs": {"limits": whole(0)},
+    "trainer.precision": {"limits": one_of(*PRECISIONS, others=("32", 32, None))},
+    "trainer._target_": _NOTHING,
+    "trainer.accelerator": _NOTHING,
+    "trainer.devices": _NOTHING,
+    "trainer.strategy": _NOTHING,
 }
-"""Settings that a configuration contains only where the command line gives them."""
+"""Settings inside groups: how they differ from their group."""
 
 
 def declared() -> dict[str, Setting]:
@@ -259,7 +330,7 @@ def of(path: str) -> Setting:
 @cache
 def _of(schema: type, path: str) -> Setting:
     top = {one.name: one.metadata["setting"] for one in fields(schema)}
-    found = ON_DEMAND.get(path) or {**ON_DEMAND, **top}.get(path.partition(".")[0], Setting())
+    found = top.get(path.partition(".")[0], Setting())
     for inner, changes in INSIDE.items():
         if path == inner or path.startswith(f"{inner}."):
             # A run is evaluated with its groups as they were.
@@ -269,7 +340,7 @@ def _of(schema: type, path: str) -> Setting:
 
 def limited() -> dict[str, Limits]:
     """Return the limits of all settings that have some, by dotted name."""
-    names = [*declared(), *ON_DEMAND, *INSIDE]
+    names = [*declared(), *INSIDE]
     found = {name: of(name).limits for name in names}
     return {name: limits for name, limits in found.items() if limits is not None}
 
@@ -284,7 +355,7 @@ def refusal(path: str, value: Any) -> UserError:
 
 def help_lines() -> str:
     """Return the run-level keys with their texts, for ``--help``."""
-    shown = {name: one for name, one in declared().items() if not one.group} | ON_DEMAND
+    shown = {name: one for name, one in declared().items() if not one.group}
     width = max(map(len, shown)) + 2
     return "\n".join(
         textwrap.fill(

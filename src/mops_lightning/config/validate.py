@@ -1,4 +1,7 @@
-"""Finding mistakes in a configuration before any heavy work."""
+"""Finding mistakes in a configuration before any heavy work.
+
+Checked are names, types and run-level limits. The range of an argument is checked by its class.
+"""
 
 import math
 from typing import Any
@@ -26,10 +29,9 @@ def check(cfg: DictConfig) -> None:
             ``_target_`` that cannot be imported or does not take one of its arguments.
     """
     declared = settings.declared()
-    on_demand = {name.partition(".")[0] for name in settings.ON_DEMAND}
     for key in map(str, cfg):
-        if key not in declared and key not in on_demand:
-            hint = did_you_mean(key, [*declared, *settings.ON_DEMAND])
+        if key not in declared:
+            hint = did_you_mean(key, declared)
             raise UserError(f"{key}: no such setting.{hint}")
     for name, setting in declared.items():
         if name not in cfg:
@@ -38,9 +40,10 @@ def check(cfg: DictConfig) -> None:
             raise UserError(f"{name} cannot be removed. Choose another one with {name}=...")
         if setting.group or name in TABLES:
             _check_table(cfg.get(name), name)
-    _check_models(cfg.get("models"))
     if not isinstance(cfg.task.get("net"), DictConfig):
         raise UserError("task.net cannot be removed. Choose another one with task/net=NAME.")
+    if cfg.learn not in settings.LEARN:  # trainer.max_epochs is looked up by it
+        raise settings.refusal("learn", cfg.learn)
     # Resolved once: OmegaConf parses an interpolation each time it is read.
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     _check_limits(plain)
@@ -60,12 +63,6 @@ def check(cfg: DictConfig) -> None:
             "Leave it out, or test a sampler."
         )
     distributed.check(cfg)
-    points = cfg.dataset.get("n_points")
-    if isinstance(points, int) and 1 <= points < cfg.m:
-        raise UserError(
-            f"m must be at most dataset.n_points={points}, got m={cfg.m}. "
-            f"Try m={points} or dataset.n_points={cfg.m}."
-        )
 
 
 def misfit_of(error: BaseException) -> UserError | None:
@@ -97,13 +94,6 @@ def _check_table(value: Any, name: str) -> None:
                 f"{name}.{key!s} must be null or settings with a class, got {value[key]!r}. "
                 f"Give its class as {name}.{key!s}._target_=MODULE.CLASS."
             )
-
-
-def _check_models(node: Any) -> None:
-    _check_table(node, "models")
-    for key in node or ():
-        if f"models.{key!s}" not in settings.ON_DEMAND:
-            raise UserError(f"models.{key!s}: no such setting. Did you mean 'models.path'?")
 
 
 def _check_numbers(value: Any, path: str) -> None:
@@ -149,6 +139,8 @@ def _check_node(node: Any, where: str) -> None:
     """Compare every ``_target_`` below ``node`` with its constructor's signature."""
     if not isinstance(node, dict):
         return
+    if node.get("_target_") == MISSING:
+        raise UserError(f"{where}._target_ must be set: give {where}._target_=MODULE.CLASS.")
     if node.get("_target_") is not None:
         parameters = signature(str(node["_target_"]), where)
         takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())

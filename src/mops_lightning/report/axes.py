@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from mops_lightning.config.comparison import compared_by
+from mops_lightning.config.shared_settings import table_settings
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord, dotted
 from mops_lightning.report.collect import epochs, recipe, sampler_row
@@ -77,7 +77,7 @@ def considered(record: RunRecord) -> dict[str, Any]:
     """Return the settings that are compared, with dotted keys, and the epochs trained."""
     config = record.config
     learn = record.evaluated.learn if record.evaluated else config["learn"]
-    settings = {**compared_by(config, learn), **dotted(recipe(record), "recipe")}
+    settings = {**table_settings(config, learn), **dotted(recipe(record), "recipe")}
     return {**settings, "trainer.max_epochs": epochs(record)}
 
 

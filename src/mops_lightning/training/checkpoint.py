@@ -6,7 +6,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mops_lightning.config.comparison import trained_with
+from mops_lightning.config.shared_settings import training_settings
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import set_aside
 from mops_lightning.records import run_record
@@ -34,7 +34,7 @@ def identity(config: dict[str, Any], fingerprint: str) -> dict[str, str]:
         fingerprint: the data set's fingerprint.
     """
     parts = {
-        **trained_with(config),
+        **training_settings(config),
         "dataset": fingerprint,
         **_given_weights(config["weights"]),
     }
@@ -137,7 +137,7 @@ def _run_had(folder: Path, cfg: DictConfig) -> bool:
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     try:
         there = run_record.read(folder).config
-        return trained_with({**there, "trainer": plain["trainer"]}) == trained_with(plain)
+        return training_settings({**there, "trainer": plain["trainer"]}) == training_settings(plain)
     except (UserError, KeyError):
         return False
 

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
+from mops_lightning.config.settings import Learn
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
 from mops_lightning.records.readout_names import FULL, REFINED, SOFT_PROJECTED, size_prefix
@@ -27,7 +28,7 @@ from mops_lightning.training.divergence import check_checkpoint, check_loss
 from mops_lightning.training.readouts import readout_names, readouts
 from mops_lightning.training.recipe import Recipe, draw_points, straight_through
 from mops_lightning.training.scores import Scores
-from mops_lightning.types import Batch, Learn, SampleOutput
+from mops_lightning.types import Batch, SampleOutput
 
 
 class Experiment(L.LightningModule):

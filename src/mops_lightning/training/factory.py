@@ -1,5 +1,6 @@
 """Building the experiment that a configuration describes."""
 
+from dataclasses import replace
 from typing import Any
 
 import lightning as L
@@ -76,12 +77,11 @@ def points_per_cloud(task: Task, dataset: CloudDataset) -> int:
 
 
 def _recipe(cfg: DictConfig, sampler: Sampler | None) -> Recipe:
-    """Return what is in force in this run; the task net's training has a record of its own."""
-    settings: Any = OmegaConf.to_container(cfg.recipe, resolve=True)
-    task_points = settings.pop("task_points", None)
+    """Return the recipe in force; the task net's training has a record of its own."""
+    recipe: Recipe = build(cfg.recipe, "recipe")
     if sampler is None:
-        return Recipe(task_points=task_points)
-    return Recipe(**settings) if sampler.learned else Recipe()
+        return Recipe(task_points=recipe.task_points)
+    return replace(recipe, task_points=None) if sampler.learned else Recipe()
 
 
 def _make_task(cfg: DictConfig, num_classes: int) -> Task:

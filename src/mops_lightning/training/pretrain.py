@@ -83,7 +83,7 @@ def task_config(cfg: DictConfig) -> DictConfig:
             for name in added(cfg.callbacks):  # such as early stopping on a readout's score
                 del own.callbacks[name]
         own.learn = "task"
-        own.trainer.devices, own.trainer.num_nodes, own.trainer.strategy = 1, 1, "auto"
+        own.trainer.devices, own.trainer.strategy = 1, "auto"
         own.ckpt_path = None
         own.evaluate = None
     return own

@@ -38,6 +38,8 @@ HARMLESS = (
 )
 """Warnings about what is intended."""
 
+LOG_EVERY = 10
+"""Steps between two points of a curve."""
 LOGGER_FOLDERS = {"TensorBoardLogger": "tensorboard", "CSVLogger": "csv"}
 """Where a logger writes below the run's folder."""
 
@@ -94,6 +96,7 @@ def make_trainer(
         logger=logger,
         callbacks=callbacks,
         plugins=[AtomicCheckpointIO()],
+        log_every_n_steps=LOG_EVERY,
         default_root_dir=str(folder),
         num_sanity_val_steps=0,
         enable_model_summary=False,

@@ -24,22 +24,6 @@ def folders() -> list[Path]:
     return [*(Path(one).expanduser() for one in given if one), SHIPPED]
 
 
-def search_first(given: str) -> None:
-    """Search folders before those in ``MOPS_MODELS``, here and in processes that start from here.
-
-    Args:
-        given: folders, separated as in ``PATH``.
-
-    Raises:
-        UserError: there is no such folder.
-    """
-    for one in given.split(os.pathsep):
-        if not Path(one).expanduser().is_dir():
-            raise UserError(f"models.path: no folder {one}.")
-    own = os.environ.get(VARIABLE)
-    os.environ[VARIABLE] = f"{given}{os.pathsep}{own}" if own else given
-
-
 def available() -> dict[str, Path]:
     """Return the files of all models by name, sorted."""
     found: dict[str, Path] = {}

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from mops_lightning.config.compose import compose
-from mops_lightning.config.overrides import accepted
+from mops_lightning.config.overrides import readable
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.evaluation.settings import command_line
@@ -24,7 +24,7 @@ def trained(tmp_path_factory):
 
 def evaluated(trained, tmp_path, *arguments):
     chosen = command_line([f"evaluate={trained[0]}", "pictures=0", "logger=none", *arguments])
-    chosen = [accepted(argument) for argument in chosen]
+    chosen = [readable(argument) for argument in chosen]
     return run(compose(chosen), tmp_path / "new", chosen)
 
 
@@ -139,7 +139,7 @@ def test_evaluate_noise_changes_test_clouds_only(trained, tmp_path):
 
 def test_evaluate_threshold_changes_generated_points(trained, tmp_path):
     _, record = trained
-    sparse = evaluated(trained, tmp_path, "+sampler.threshold=0.02")
+    sparse = evaluated(trained, tmp_path, "sampler.threshold=0.02")
     keys = ("test/m8/generated/subset_distance", "test/m8/matrix/nonzero_percent")
     changed, same = keys
     assert sparse.metrics[changed] != record.metrics[changed]
@@ -210,7 +210,7 @@ def test_trained_run_not_evaluable_raises(trained, tmp_path):
 
 def test_evaluate_task_net_on_other_data(tmp_path):
     overrides = [*TINY, "task=reconstruction", "task/net=mfoldingnet", "learn=task"]
-    overrides += ["+task.net.fold_channels=[16,8]"]
+    overrides += ["task.net.fold_channels=[16,8]"]
     made = run(compose(overrides), tmp_path / "made", overrides)
     folder = (tmp_path / "made", made)
     again = evaluated(folder, tmp_path / "same")

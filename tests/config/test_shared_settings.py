@@ -2,13 +2,13 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from mops_lightning.config.comparison import compared_by, trained_with
 from mops_lightning.config.compose import compose
+from mops_lightning.config.shared_settings import table_settings, training_settings
 
 
-def test_trained_with_counts_what_the_run_learns():
-    joint = trained_with(plain("learn=joint"))
-    alone = trained_with(plain("learn=task"))
+def test_training_settings_count_what_the_run_learns():
+    joint = training_settings(plain("learn=joint"))
+    alone = training_settings(plain("learn=task"))
     assert {"task_lr_scale", "sampler.tau_min", "trainer.max_epochs", "learn"} <= set(joint)
     assert not {name for name in alone if name.startswith(("sampler", "task_lr_scale", "pretrain"))}
     assert alone["augment.rotate_up"] is True
@@ -20,7 +20,7 @@ def plain(*overrides: str) -> Any:
     return OmegaConf.to_container(compose(list(overrides)), resolve=True)
 
 
-def test_compared_by_of_an_old_record_takes_defaults():
-    found = compared_by({"m": 8, "out": "here", "sampler": {"alpha": 1.0}}, "sampler")
+def test_table_settings_of_an_old_record_takes_defaults():
+    found = table_settings({"m": 8, "out": "here", "sampler": {"alpha": 1.0}}, "sampler")
     assert (found["sampler.alpha"], found["test_noise_std"]) == (1.0, 0.0)
     assert not {"m", "out", "task_lr_scale"} & set(found)

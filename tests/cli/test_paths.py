@@ -1,8 +1,8 @@
 import pytest
 from omegaconf import OmegaConf
 
+from mops_lightning.cli.start import INPUTS, OUTPUTS, check_paths
 from mops_lightning.config.compose import compose
-from mops_lightning.config.paths import INPUTS, OUTPUTS, check_paths
 from mops_lightning.errors import UserError
 
 

@@ -1,0 +1,39 @@
+"""The examples of docs/extend.md, run as written."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from mops_lightning.records import run_record
+from tests.support.command_line import TINY_ANY_DATA, call_anew, runs
+
+PAGE = (Path(__file__).parents[2] / "docs" / "extend.md").read_text()
+MODULES = dict(re.findall(r"```python\n# (\w+\.py)\n(.*?)```", PAGE, flags=re.S))
+COMMANDS = re.findall(r"```sh\npython -m mops_lightning (.*?)\n```", PAGE)
+SMALL_SHAPES = ["dataset.train_per_class=4", "dataset.test_per_class=3"]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_example_has_at_most_30_lines(name):
+    assert len(MODULES[name].strip().splitlines()) <= 30
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.split("=")[0])
+def test_example_trains_with_a_class_from_outside(command, tmp_path):
+    for name, text in MODULES.items():
+        (tmp_path / name).write_text(text)
+    given = command.split()
+    data = [] if "dataset._target_" in command else SMALL_SHAPES
+    tiny = [one for one in TINY_ANY_DATA if not one.startswith("dataset.") or data]
+    status, _, err = call_anew([*tiny, *data, *given], tmp_path)
+    assert (status, err) == (0, "")
+    (run,) = runs(tmp_path)
+    record = run_record.read(run)
+    assert record.status == "completed"
+    for argument in given:
+        name, _, value = argument.partition("=")
+        node = record.config
+        for part in name.split("."):
+            node = node[part]
+        assert str(node) == value
