@@ -76,7 +76,7 @@ def test_clouds_to_draw_leaves_out_classes_without_test_clouds():
 
 def test_score_loader_repeats_its_pairs_in_every_epoch():
     clouds = small_dataset().test
-    task = Registration(ICP(), Pairs(test_seed=3), quaternion_loss)
+    task = Registration(ICP(), Pairs(), quaternion_loss)
     first = score_loader(clouds, 4, task)
     epochs = [[batch.points for batch in first] for _ in range(2)]
     assert [len(points) for points in epochs[0]] == [8, 8, 4]  # sources and targets
@@ -84,8 +84,6 @@ def test_score_loader_repeats_its_pairs_in_every_epoch():
         assert torch.equal(one, again)
     shares = [list(score_loader(clouds, 4, task, (rank, 2))) for rank in range(2)]
     assert [sum(batch.num_clouds for batch in share) for share in shares] == [5, 5]
-    other = score_loader(clouds, 4, Registration(ICP(), Pairs(test_seed=4), quaternion_loss))
-    assert not torch.equal(next(iter(other)).points, epochs[0][0])
 
 
 def test_augmentation_of_joint_training_is_that_of_the_sampler():

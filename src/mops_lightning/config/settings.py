@@ -293,10 +293,6 @@ INSIDE: dict[str, dict[str, Any]] = {
     # A record may come from anybody: it chooses neither addresses nor where files are written.
     "dataset.cache": {**_NOTHING, "repeat": False},
     "dataset.download": {"repeat": False},
-    "dataset.mirrors": {"repeat": False},
-    "dataset.archive_hash": {"repeat": False},
-    "dataset.workers": _NOTHING,
-    "task.pairs.test_seed": {"affects": Affects.SCORES},
     "sampler.m": {"compare": False},
     "sampler.m_max": {"compare": False},
     "sampler.seed": {"compare": False},

@@ -52,9 +52,6 @@ class Task(nn.Module):
     """Name of the net's method that maps pooled features to the prediction, for tasks whose
     prediction follows from them, as the refined readout needs it."""
 
-    test_seed: int = 0
-    """Seed of the random numbers that ``make_batch`` draws for clouds that are scored."""
-
     def __init__(self, net: nn.Module) -> None:
         super().__init__()
         if not isinstance(net, nn.Module):

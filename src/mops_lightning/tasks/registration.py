@@ -59,7 +59,6 @@ class Registration(Task):
         assert pairs is not None
         assert loss is not None
         self.pairs = pairs
-        self.test_seed = pairs.test_seed
         self.loss = loss
 
     def make_batch(self, batch: Batch, generators: Callable[[], list[Generator]]) -> PairBatch:

@@ -23,9 +23,7 @@ def score_loader(
         task: makes the batches.
         part: rank of this process and number of processes.
     """
-    return CloudLoader(
-        clouds, batch_size, make_batch=task.make_batch, seed=task.test_seed, part=part
-    )
+    return CloudLoader(clouds, batch_size, make_batch=task.make_batch, part=part)
 
 
 def augmentation(cfg: DictConfig) -> Any:

@@ -69,5 +69,5 @@ def _check_largest(sampler: Sampler, m: int, n_points: int, training: bool) -> N
         raise UserError(
             f"{name} must be at most the {n_points} points of a cloud, got {sampler.m}. "
             f"Try {name}={n_points}, or clouds of more points (dataset.n_points; for pairs also "
-            "task.pairs.resample and task.pairs.overlap)."
+            "task.pairs.resample)."
         )

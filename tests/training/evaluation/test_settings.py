@@ -7,7 +7,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from mops_lightning.config.compose import compose
-from mops_lightning.config.overrides import accepted
+from mops_lightning.config.overrides import readable
 from mops_lightning.errors import UserError
 from mops_lightning.training.evaluation.settings import as_trained, command_line
 from mops_lightning.training.evaluation.trained_run import TrainedRun
@@ -39,7 +39,7 @@ def run(tmp_path):
 
 def evaluated(run, *arguments):
     """Return the configuration of an evaluation by a command line."""
-    chosen = [accepted(argument) for argument in command_line([*arguments, f"evaluate={run}"])]
+    chosen = [readable(argument) for argument in command_line([*arguments, f"evaluate={run}"])]
     cfg = compose(chosen)
     return as_trained(cfg, TrainedRun.read(cfg.evaluate), chosen)
 

@@ -10,7 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mops_lightning.config import overrides, settings
 from mops_lightning.config.build import signature
-from mops_lightning.config.declaration import Affects
+from mops_lightning.config.settings import Affects
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import dotted
@@ -23,7 +23,7 @@ OF_SAMPLER = (
 """Settings of the training of a sampler."""
 OF_TRAINING = (
     *OF_SAMPLER,
-    *("pretrain", "val_fraction", "augment", "epochs", "ckpt_path", "trainer.gradient_clip_val"),
+    *("pretrain", "val_fraction", "augment", "epochs", "ckpt_path"),
     *("trainer.gradient_clip_algorithm", "trainer.accumulate_grad_batches"),
 )
 """Settings of any training."""
@@ -179,7 +179,7 @@ def _recorded(cfg: DictConfig, trained: TrainedRun) -> DictConfig:
             if path not in follows and (path in given or _exists(cfg, path)):
                 OmegaConf.update(merged, path, value, merge=False)
         for path in present.keys() - recorded.keys() - follows:
-            parameter = _parameter(cfg, path)
+            parameter = _parameter(merged, path)
             if parameter is not None and parameter.default is not parameter.empty:
                 OmegaConf.update(merged, path, parameter.default, merge=False)
         resolved = dotted(OmegaConf.to_container(merged, resolve=True))
