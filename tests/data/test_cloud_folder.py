@@ -1,3 +1,4 @@
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -5,10 +6,12 @@ import pytest
 import torch
 import trimesh
 
-from mops_lightning.data.cloud_folder import cloud_folder
+from mops_lightning.data import cloud_folder as module
 from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
+
+cloud_folder = partial(module.cloud_folder, test_frames=None, crop="nearest", crops=32)
 
 FORMATS = (".ply", ".pcd", ".bin", ".npy", ".npz", ".xyz", ".txt", ".obj")
 

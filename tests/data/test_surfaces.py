@@ -14,7 +14,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
 from tests.support.meshes import BALL, write_mesh
 
-meshes = partial(cloud_folder, crop="surface", crops=1)
+meshes = partial(cloud_folder, test_frames=None, crop="surface", crops=1)
 
 
 def test_sample_surface_is_uniform_by_area(tmp_path: Path) -> None:

@@ -54,13 +54,15 @@ def cloud_folder(
     n_points: int = 1024,
     classes: Sequence[str] | None = None,
     split_file: str | Path | None = None,
-    test_frames: Literal["last", "spread"] | None = None,
     test_share: float = 0.2,
     gap: int = 0,
-    crop: Crop = "nearest",
-    crops: int = 32,
     seed: int = 0,
     cache: str | Path | None = None,
+    *,
+    # No defaults: a record without these is evaluated with the values of its preset.
+    test_frames: Literal["last", "spread"] | None,
+    crop: Crop,
+    crops: int,
 ) -> CloudDataset:
     """Read the clouds or meshes in a folder and its subfolders, one per file.
 
@@ -81,18 +83,18 @@ def cloud_folder(
         n_points: number of points per cloud.
         classes: names to keep; None or empty means all.
         split_file: path of a list, relative to the working directory or to ``root``.
-        test_frames: for sequences, whose frames are in the order of their numbers: ``last`` tests
-            the last frames of every class, ``spread`` frames at equal distances.
         test_share: share of test files in a class, between 0 and 1.
         gap: number of frames between training and test frames that are not used, because
             neighbouring frames are almost identical.
+        seed: seed of the split and the points.
+        cache: folder for sampled surfaces, found by file content, ``n_points`` and ``seed``; None
+            disables the cache.
+        test_frames: for sequences, whose frames are in the order of their numbers: ``last`` tests
+            the last frames of every class, ``spread`` frames at equal distances.
         crop: ``nearest`` takes the points nearest to a drawn point, as the tiles of ``downsample
             --tile``; ``whole`` random points of the cloud; ``surface`` random points on the
             surface of a mesh, uniform by area.
         crops: number of clouds per file; 1 for ``surface``.
-        seed: seed of the split and the points.
-        cache: folder for sampled surfaces, found by file content, ``n_points`` and ``seed``; None
-            disables the cache.
 
     Returns:
         Float32 clouds ``(S, n_points, 3)`` in the unit sphere, with the centroid at the origin, and
