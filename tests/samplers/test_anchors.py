@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.warm_start import copy_tensors
 from mops_lightning.ops import attention
 from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.ops.points import gather_points
@@ -14,6 +13,7 @@ from mops_lightning.samplers.anchors import SPACING_POINTS
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.streaming import stream_sample
+from mops_lightning.training.warm_start import copy_tensors
 from mops_lightning.zoo.export import plain_net
 
 
@@ -155,7 +155,7 @@ def test_anchors_warm_start_keeps_their_start():
 
 def test_anchors_refuse_chunks_and_export(rng):
     net = small().eval()
-    with pytest.raises(UserError, match=r"anchors=fps needs all points .* chunks"):
+    with pytest.raises(UserError, match=r"needs all points .* chunks.*without anchors=fps"):
         stream_sample(net, lambda: torch.randn(50, 3, generator=rng).split(20))
     with pytest.raises(UserError, match="MOPSNet with anchors=fps cannot be exported"):
         plain_net(net)

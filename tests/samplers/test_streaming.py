@@ -47,7 +47,7 @@ def test_stream_sample_is_nested(rng):
         (
             lambda: SNet(4),
             [torch.zeros(9, 3)],
-            "^sampler must be a MOPSNet or FMOPSNet .* got SNet",
+            "^SNet needs all points .* cannot sample in chunks",
         ),
         (lambda: MOPSNet(4), [], "number of points N=0"),
         (lambda: MOPSNet(4), [torch.zeros(2, 3), torch.zeros(1, 3)], "number of points N=3"),

@@ -1,12 +1,20 @@
 """A run whose sampler starts from the task net or from another run's sampler."""
 
+import copy
 import json
+from typing import Any
 
 import torch
+from torch import nn
 
-from mops_lightning.training.warm_start import described
+from mops_lightning.nets.layers import PointFeatures, PointMLP
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.training.warm_start import copy_pointwise_layers, copy_tensors, described
 from mops_lightning.zoo import weights
 from tests.support.command_line import TINY, call
+
+SIZES: Any = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
+POINTS = torch.randn(4, 60, 3, generator=torch.Generator().manual_seed(0))
 
 
 def run(tmp_path, name, *overrides):
@@ -41,3 +49,57 @@ def test_described_names_tensors_that_are_not_copied():
     assert described(["a"], ["a"], "FILE") == "1 of 1 tensors are copies of FILE"
     assert described(["a"], ["a", "b"], "FILE").endswith("copies of FILE; not copied: b")
     assert described(["a"], list("abcde"), "FILE").endswith("not copied: b, c, d, ...")
+
+
+def test_copy_pointwise_layers_copies_until_shapes_differ():
+    torch.manual_seed(0)
+    source, target = PointMLP([3, 8, 8, 16, 32]), PointFeatures([8, 8, 16, 16])
+    source(POINTS)  # moves the running statistics
+    before = copy.deepcopy(target.state_dict())
+    assert copy_pointwise_layers(nn.Sequential(nn.Linear(3, 3), source), target, POINTS) == 3
+    theirs, mine = source.layers.state_dict(), target.mlp.layers.state_dict()
+    for name, value in mine.items():
+        same = int(name.split(".")[0]) < 9  # three times linear layer, BatchNorm and ReLU
+        expected = theirs[name] if same else before[f"mlp.layers.{name}"]
+        assert torch.equal(value, expected), name
+    with torch.no_grad():
+        next(source.parameters()).zero_()
+    assert next(target.parameters()).any()  # a copy, not the same tensor
+
+
+def test_copy_pointwise_layers_without_batch_norm_computes_the_same():
+    torch.manual_seed(0)
+    source, target = PointMLP([3, 8, 8, 16], norm=False), PointMLP([3, 8, 8, 16])
+    assert copy_pointwise_layers(source, target, POINTS) == 3
+    for mode in (False, True):  # in training, with the statistics of the same points
+        target.train(mode)
+        torch.testing.assert_close(target(POINTS), source(POINTS), rtol=1e-4, atol=1e-5)
+
+
+def test_copy_pointwise_layers_without_counterpart_copies_none():
+    assert copy_pointwise_layers(nn.Linear(3, 8), PointMLP([3, 8]), POINTS) == 0
+    assert copy_pointwise_layers(PointMLP([3, 8]), PointMLP([3, 4]), POINTS) == 0
+    assert copy_pointwise_layers(PointMLP([3, 8]), PointMLP([3, 8], norm=False), POINTS) == 0
+
+
+def test_copy_tensors_takes_the_rows_that_both_have():
+    torch.manual_seed(0)
+    large, small = MOPSNet(12, **SIZES), MOPSNet(8, **SIZES)
+    for source, target in ((large, small), (small, large)):
+        target = copy.deepcopy(target)
+        before = copy.deepcopy(target.state_dict())
+        state = source.state_dict()
+        assert set(copy_tensors(state, target)) == set(state)
+        rows = target.queries.weight
+        assert torch.equal(rows[:8], source.queries.weight[:8])
+        assert torch.equal(rows[8:], before["queries.weight"][8:])
+        assert torch.equal(target.rho_local.weight, source.rho_local.weight)
+
+
+def test_copy_tensors_leaves_other_shapes_and_names():
+    torch.manual_seed(0)
+    source, target = nn.Linear(3, 4), nn.Linear(5, 4)
+    before = target.weight.clone()
+    assert copy_tensors(source.state_dict(), target) == ["bias"]
+    assert torch.equal(target.weight, before)
+    assert copy_tensors({"other": torch.ones(4)}, target) == []

@@ -19,7 +19,6 @@ from mops_lightning.data.formats.cloud_file import CloudFile
 from mops_lightning.data.formats.errors import check_size
 from mops_lightning.data.formats.registry import open_cloud_file
 from mops_lightning.data.formats.table import Table
-from mops_lightning.errors import UserError
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.files.unit_sphere import (
@@ -32,7 +31,6 @@ from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fused import FusedMOPSNet
-from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.streaming import global_part, sum_part
 
 
@@ -83,10 +81,8 @@ def sample_by_chunks(
         UserError: the file is broken or too small, or the sampler cannot work in chunks.
     """
     assert options.chunk is not None
-    if not isinstance(sampler, MOPSNet):
-        raise UserError(f"--chunk works with MOPS-Net and FMOPS-Net, not {type(sampler).__name__}.")
-    sampler.check_m(m)
     net = sampler.fused()
+    sampler.check_m(m)
     whole = open_cloud_file(source)
     cloud, row_ranges = replace(whole, header=None), whole.row_ranges(options.chunk)
 

@@ -20,7 +20,6 @@ from mops_lightning.files.tiles import sample_by_tiles
 from mops_lightning.files.unit_sphere import largest_distance, sum_of, unit_sphere
 from mops_lightning.ops.readout import complete
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.streaming import stream_match, stream_sample
 from mops_lightning.zoo.load import load
 from mops_lightning.zoo.methods import untrained
@@ -153,7 +152,7 @@ def _sample_in_sphere(
     points: Tensor, sampler: Sampler, m: int, readout: str
 ) -> tuple[Tensor | None, Tensor]:
     """Return the rows ``(m,)`` of the points to keep, or None, and the generated points."""
-    if isinstance(sampler, MOPSNet) and sampler.streams:
+    if sampler.streams:
         generated = stream_sample(sampler, lambda: list(points.split(PART)), m)
     else:
         output = sampler(points[None], m)

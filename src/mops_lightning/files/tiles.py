@@ -14,7 +14,6 @@ from mops_lightning.data.formats.errors import BadCloudError
 from mops_lightning.errors import UserError
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.random import RandomSampler
 
 Points = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -51,7 +50,7 @@ def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler, path: P
     """
     tiles = balanced_tiles(points, size)
     sizes = [len(tile) for tile in tiles]
-    thinned = len(tiles) > 1 and not isinstance(sampler, RandomSampler)
+    thinned = len(tiles) > 1 and sampler.spreads
     sampled = min(int(EXTRA * m), len(points)) if thinned else m
     numbers = np.minimum(shares(sampled, sizes), sampler.m).tolist()
     if sum(numbers) < m:

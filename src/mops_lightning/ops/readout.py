@@ -9,6 +9,28 @@ from torch import Tensor
 from mops_lightning.errors import UserError
 from mops_lightning.ops.fps import farthest_point_fill
 from mops_lightning.ops.nearest import nearest
+from mops_lightning.ops.points import gather_points
+
+READOUTS = ("generated", "matched", "completed")
+
+
+def select(points: Tensor, generated: Tensor, readout: str) -> tuple[Tensor, Tensor | None]:
+    """Return the points that a user takes as the sampled set.
+
+    Args:
+        points: ``(B, N, 3)`` the clouds.
+        generated: ``(B, M, 3)`` the points that a sampler generated for them.
+        readout: one of ``READOUTS``.
+
+    Returns:
+        ``(B, M, 3)``, and their rows ``(B, M)`` in the clouds, or None for generated points.
+    """
+    if readout == "generated":
+        return generated, None
+    rows = match(generated, points)
+    if readout == "completed":
+        rows = complete(rows, points)
+    return gather_points(points, rows), rows
 
 
 def match(generated: Tensor, points: Tensor) -> Tensor:

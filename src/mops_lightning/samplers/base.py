@@ -9,11 +9,10 @@ from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.ops.precision import restrict_autocast_to_pointwise
-from mops_lightning.ops.readout import complete, match
+from mops_lightning.ops.readout import READOUTS, select
+from mops_lightning.samplers.fused import FusedMOPSNet
 from mops_lightning.samplers.ragged import select_points
 from mops_lightning.types import SampleOutput
-
-READOUTS = ("generated", "matched", "completed")
 
 
 class Sampler(nn.Module):
@@ -49,6 +48,12 @@ class Sampler(nn.Module):
 
     nested: bool = False
     """Whether the sample of a smaller size is the first part of the sample of a larger one."""
+
+    streams: bool = False
+    """Whether clouds can be sampled in chunks, see ``streaming``; then ``fused`` is implemented."""
+
+    spreads: bool = True
+    """Whether sampled points keep apart from each other, as all but random ones do."""
 
     size_reduction: Literal["mean", "sum"] = "mean"
     """How the losses at several ``training_sizes`` are reduced to one."""
@@ -120,17 +125,13 @@ class Sampler(nn.Module):
         if self.learned and self.training:
             raise UserError("downsample needs a sampler in eval mode: call eval() first.")
 
-        def select(clouds: Tensor, m: int) -> tuple[Tensor | None, Tensor]:
+        def sample(clouds: Tensor, m: int) -> tuple[Tensor, Tensor | None]:
             output = self(clouds.to(next(self.parameters(), clouds)), m)  # dtype and device
             if not self.generates:
-                return output.indices, output.points
-            generated = output.points.to(clouds.device)
-            if readout == "generated":
-                return None, generated
-            rows = match(generated, clouds)
-            return complete(rows, clouds) if readout == "completed" else rows, generated
+                return output.points, output.indices
+            return select(clouds, output.points.to(clouds.device), readout)
 
-        return select_points(select, points, m, lengths, batch)
+        return select_points(sample, points, m, lengths, batch)
 
     def _checked(self, points: Tensor, m: int) -> SampleOutput:
         """Check the points and sample them, without losses."""
@@ -189,6 +190,17 @@ class Sampler(nn.Module):
 
     def anneal(self, progress: float) -> None:
         """Update schedules for the training progress, from 0 to 1; does nothing by default."""
+
+    def fused(self) -> FusedMOPSNet:
+        """Return the network that samples clouds in chunks, with copies of the weights.
+
+        Raises:
+            UserError: the sampler needs all points of a cloud at once.
+        """
+        raise UserError(
+            f"{type(self).__name__} needs all points of a cloud at once and cannot sample in "
+            "chunks. MOPS-Net and FMOPS-Net without anchors=fps can."
+        )
 
     @property
     def learned(self) -> bool:

@@ -101,6 +101,7 @@ class MOPSNet(Sampler):
         self.threshold = threshold
         self.tau_min = tau_min
         self.training_tau = 1.0
+        self.streams = anchors is None  # farthest points need all points at once
         local = feature_channels[-1]
         self.features = PointFeatures(feature_channels)
         # The first layer of ρ acts on [local, global]. The product with the global feature is the
@@ -120,11 +121,6 @@ class MOPSNet(Sampler):
     def tau(self) -> float:
         """The current temperature: annealed in training, ``tau_min`` in evaluation."""
         return self.training_tau if self.training else self.tau_min
-
-    @property
-    def streams(self) -> bool:
-        """Whether clouds can be sampled in chunks; farthest points need all points at once."""
-        return not isinstance(self.queries, FPSAnchors)
 
     def anneal(self, progress: float) -> None:
         """Set tau, exponentially from 1 to ``tau_min`` for a progress from 0 to 1."""
@@ -155,10 +151,7 @@ class MOPSNet(Sampler):
             UserError: the sampler has anchors, which a part of a cloud does not determine.
         """
         if not self.streams:
-            raise UserError(
-                "a sampler with anchors=fps needs all points of a cloud at once and cannot sample "
-                "in chunks. Sample whole clouds, or use a sampler without anchors."
-            )
+            return super().fused()
         return self._fused()
 
     def _fused(self) -> FusedMOPSNet:

@@ -10,9 +10,9 @@ from torch import Tensor
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import gather_points
 
-Select = Callable[[Tensor, int], tuple[Tensor | None, Tensor]]
-"""``select(points, m)`` maps ``(B, N, 3)`` float32 in the unit sphere to rows ``(B, m)``, or None
-for generated points, and the points ``(B, m, 3)``."""
+Select = Callable[[Tensor, int], tuple[Tensor, Tensor | None]]
+"""``select(points, m)`` maps ``(B, N, 3)`` float32 in the unit sphere to points ``(B, m, 3)`` and
+their rows ``(B, m)``, None for generated points."""
 
 
 class Rows(NamedTuple):
@@ -174,7 +174,7 @@ def _selected(select: Select, points: Tensor, m: int) -> tuple[Tensor, Tensor | 
     centre = exact.mean(1, keepdim=True)
     radius = torch.linalg.vector_norm(exact - centre, dim=2, keepdim=True).amax(1, keepdim=True)
     radius = torch.where(radius > 0, radius, 1.0)
-    rows, generated = select(((exact - centre) / radius).float(), m)
+    chosen, rows = select(((exact - centre) / radius).float(), m)
     if rows is not None:
         return gather_points(points, rows), rows
-    return (generated.double() * radius + centre).to(points.dtype), None
+    return (chosen.double() * radius + centre).to(points.dtype), None

@@ -30,6 +30,7 @@ class RandomSampler(Sampler):
 
     flexible = True
     nested = True
+    spreads = False
 
     def __init__(self, m: int, seed: int = 0) -> None:
         super().__init__(m)

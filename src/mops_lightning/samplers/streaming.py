@@ -15,15 +15,14 @@ from torch import Tensor
 from mops_lightning.errors import UserError
 from mops_lightning.ops.attention import Partial, attend
 from mops_lightning.ops.nearest import nearest
-from mops_lightning.samplers.base import check_dtype, check_points
+from mops_lightning.samplers.base import Sampler, check_dtype, check_points
 from mops_lightning.samplers.fused import FusedMOPSNet
-from mops_lightning.samplers.mops import MOPSNet
 
 Chunks = Callable[[], Iterable[Tensor]]
 """Function that iterates over the chunks ``(n, 3)`` of a cloud, in the same order at every call."""
 
 
-def stream_sample(sampler: MOPSNet, chunks: Chunks, m: int | None = None) -> Tensor:
+def stream_sample(sampler: Sampler, chunks: Chunks, m: int | None = None) -> Tensor:
     """Sample a cloud that is read in chunks.
 
     Args:
@@ -35,16 +34,11 @@ def stream_sample(sampler: MOPSNet, chunks: Chunks, m: int | None = None) -> Ten
         ``(m, 3)``, equal to ``sampler(points, m).points`` up to the rounding of sums.
 
     Raises:
-        UserError: the sampler is not a ``MOPSNet`` or has anchors, ``m`` is out of range, or a
-            chunk is invalid.
+        UserError: the sampler needs whole clouds, ``m`` is out of range, or a chunk is invalid.
     """
-    if not isinstance(sampler, MOPSNet):
-        raise UserError(
-            f"sampler must be a MOPSNet or FMOPSNet to sample chunks, got {type(sampler).__name__}."
-        )
     m = sampler.m if m is None else m
-    sampler.check_m(m)
     net = sampler.fused()
+    sampler.check_m(m)
     peaks = (global_part(net, chunk) for chunk in _checked(chunks, m, sampler))
     global_ = reduce(torch.maximum, peaks)
     return reduce(Partial.merge, (sum_part(net, chunk, global_, m) for chunk in chunks())).result()
@@ -100,11 +94,11 @@ def stream_match(generated: Tensor, chunks: Chunks) -> Tensor:
     return rows
 
 
-def _checked(chunks: Chunks, m: int, sampler: MOPSNet) -> Iterable[Tensor]:
+def _checked(chunks: Chunks, m: int, sampler: Sampler) -> Iterable[Tensor]:
     number = 0
     for chunk in chunks():
         check_points(chunk[None])
-        check_dtype(chunk, sampler.queries.weight.dtype)
+        check_dtype(chunk, next(sampler.parameters()).dtype)
         number += len(chunk)
         yield chunk
     if number < m:
