@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mops_lightning.data.formats import pcd
-from mops_lightning.data.formats.lzf import decompress
+from mops_lightning.data.formats.pcd import decompress_lzf
 from mops_lightning.data.formats.registry import read
 from mops_lightning.errors import UserError
 
@@ -87,9 +87,9 @@ def test_pcd_impossible_count_is_broken(number, body, tmp_path):
 
 
 def test_lzf_repeats_and_stops_at_its_size():
-    assert decompress(b"\0a\xe0\x02\0\x01bc\x40\x01", 1 + 11 + 2 + 4) == b"a" * 12 + b"bcbcbc"
+    assert decompress_lzf(b"\0a\xe0\x02\0\x01bc\x40\x01", 1 + 11 + 2 + 4) == b"a" * 12 + b"bcbcbc"
     with pytest.raises(ValueError, match="expected 12"):
-        decompress(b"\0a" + b"\xe0\xff\0" * 100_000, 12)
+        decompress_lzf(b"\0a" + b"\xe0\xff\0" * 100_000, 12)
 
 
 def test_pcd_fields_of_several_numbers_are_kept(tmp_path):

@@ -32,3 +32,9 @@ def test_text_with_header_only_is_broken(tmp_path):
     (tmp_path / "a.xyz").write_text("not a cloud\n")
     with pytest.raises(UserError, match="holds no points"):
         read(tmp_path / "a.xyz", 9, 0)
+
+
+def test_text_with_fewer_points_than_announced_is_broken(tmp_path):
+    (tmp_path / "a.xyz").write_text("3\n1 2 3\n4 5 6\n")
+    with pytest.raises(UserError, match=r"a\.xyz is broken: it announces 3 points, but has 2"):
+        read(tmp_path / "a.xyz", 9, 0)

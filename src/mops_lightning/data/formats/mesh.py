@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mops_lightning.data.formats import ply_header
+from mops_lightning.data.formats.ply import plain_header
 from mops_lightning.errors import UserError, one_line
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def _load(data: bytes, kind: str) -> "Trimesh":
     if kind == ".obj" and data.count(b"usemtl") > MAX_MATERIALS:
         data = re.sub(rb"(?m)^[ ]*usemtl.*$", b"", data)
     if kind == ".ply":
-        data = ply_header.plain(data)
+        data = plain_header(data)
     if kind == ".glb":
         _check_glb(data)
     # Materials do not affect the surface, and their files may be missing.

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mops_lightning.data.formats.errors import BadCloudError
-from mops_lightning.data.formats.lzf import decompress
 from mops_lightning.data.formats.table import (
     Column,
     Table,
@@ -109,7 +108,7 @@ def _body(body: bytes, kind: str, layout: np.dtype[Any], number: int) -> NDArray
     packed, unpacked_size = np.frombuffer(body, "<u4", 2)
     if unpacked_size < number * layout.itemsize:
         raise ValueError(f"{unpacked_size} bytes are not {number} points")
-    unpacked = decompress(body[8 : 8 + int(packed)], int(unpacked_size))
+    unpacked = decompress_lzf(body[8 : 8 + int(packed)], int(unpacked_size))
     array, place = np.empty(number, layout), 0
     for name in layout.names or ():  # one field after the other
         size = layout[name].itemsize * number
@@ -117,3 +116,36 @@ def _body(body: bytes, kind: str, layout: np.dtype[Any], number: int) -> NDArray
         array[name] = column.reshape(number, *layout[name].shape)
         place += size
     return array
+
+
+def decompress_lzf(data: bytes, size: int) -> bytes:
+    """Decompress data of Marc Lehmann's liblzf to ``size`` bytes.
+
+    Raises:
+        ValueError: the data are damaged, or decompress to another number of bytes.
+    """
+    out = bytearray()
+    place = 0
+    while place < len(data) and len(out) <= size:
+        control = data[place]
+        place += 1
+        if control < 32:  # control + 1 literal bytes
+            out += data[place : place + control + 1]
+            place += control + 1
+            continue
+        length = control >> 5
+        if length == 7:
+            length += data[place]
+            place += 1
+        start = len(out) - ((control & 31) << 8) - data[place] - 1
+        place += 1
+        length += 2
+        if start < 0:
+            raise ValueError("compressed data refer to bytes before their start")
+        piece = bytes(out[start : start + length])
+        if len(piece) < length:  # the source overlaps the bytes that the copy appends
+            piece = (piece * (length // max(len(piece), 1) + 1))[:length]
+        out += piece
+    if len(out) != size:
+        raise ValueError(f"compressed data give {len(out)} bytes, expected {size}")
+    return bytes(out)

@@ -1,5 +1,6 @@
 """PLY files: ascii and binary are read, binary is written."""
 
+import re
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.data.formats import ply_header
 from mops_lightning.data.formats.cloud_file import BinaryCloudFile
 from mops_lightning.data.formats.errors import BadCloudError
 from mops_lightning.data.formats.table import (
@@ -26,6 +26,41 @@ KINDS = {
 }  # fmt: skip
 TYPES = {kind: name for name, kind in KINDS.items() if not name[-1].isdigit()}
 
+LONGEST_HEADER = 1 << 20
+"""Most bytes of a header; a file that exceeds it is not PLY."""
+
+
+def split_header(data: bytes) -> tuple[list[str], int] | None:
+    """Return the lines of a header, and where it ends in bytes; None if it does not end.
+
+    Args:
+        data: the first bytes of a file, at least ``LONGEST_HEADER`` if it has as many.
+    """
+    first = re.match(rb"[^\r\n]*(\r?\n|\r)", data)
+    if not first:
+        return None
+    end = b"\r" if first[1] == b"\r" else b"\n"
+    last = re.compile(end + rb"[ \t]*end_header[ \t\r]*?" + end).search(data, 0, LONGEST_HEADER)
+    if not last:
+        return None
+    lines = data[: last.start()].decode("latin-1").split(end.decode())
+    return [line.strip() for line in lines], last.end()
+
+
+def plain_header(data: bytes) -> bytes:
+    """Return a PLY file with a header that trimesh reads: no comments, lines that end in LF.
+
+    A comment may name a texture, which would be a path to any file.
+
+    Raises:
+        ValueError: the header does not end.
+    """
+    found = split_header(data)
+    if found is None:
+        raise ValueError("its header does not end")
+    lines = [line for line in found[0] if line.split()[:1] not in ([], ["comment"], ["obj_info"])]
+    return "\n".join([*lines, "end_header\n"]).encode() + data[found[1] :]
+
 
 def read(path: Path) -> Table | None:
     """Read the vertices with all their properties; None for a mesh, which has faces as well.
@@ -36,7 +71,7 @@ def read(path: Path) -> Table | None:
     from trimesh.exchange.ply import load_ply
 
     with np.errstate(all="ignore"):
-        content = BytesIO(ply_header.plain(path.read_bytes()))
+        content = BytesIO(plain_header(path.read_bytes()))
         found: Any = load_ply(content, skip_materials=True)
     if "faces" in found and len(found["faces"]):
         return None
@@ -115,7 +150,7 @@ def locate(path: Path) -> BinaryCloudFile:
 def _header(path: Path) -> tuple[list[list[str]], int]:
     """Return the words of the header's lines, and where the header ends, in bytes."""
     with path.open("rb") as file:
-        found = ply_header.split(file.read(ply_header.LONGEST))
+        found = split_header(file.read(LONGEST_HEADER))
     if found is None:
         raise BadCloudError(f"{path} is broken: its header does not end.")
     return [line.split() for line in found[0]], found[1]

@@ -21,7 +21,8 @@ def read(path: Path) -> Table:
     """Read rows of numbers separated by spaces, commas or semicolons, with or without a header.
 
     Raises:
-        BadCloudError: the file holds no points, or something else than numbers.
+        BadCloudError: the file has no points, fewer than its first line announces, or something
+            else than numbers.
     """
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     lines = [re.split("#|//", line)[0].strip() for line in text.splitlines()]
@@ -29,8 +30,9 @@ def read(path: Path) -> Table:
     if not lines:
         raise BadCloudError(f"{path} is empty.")
     separator = next((mark for mark in ",;" if mark in lines[-1]), None)
-    if len(lines) > 1 and len(lines[0].split(separator)) == 1 and lines[0].isdigit():
-        lines.pop(0)  # the number of points
+    announced = None
+    if len(lines) > 1 and len(lines[0].split(separator)) == 1 and lines[0].isdecimal():
+        announced = int(lines.pop(0))
     if not any(map(_is_number, lines[0].split(separator))):
         lines.pop(0)  # a header
     if not lines:
@@ -39,6 +41,10 @@ def read(path: Path) -> Table:
         array = np.loadtxt(lines, delimiter=separator, ndmin=2)
     except ValueError as error:
         raise BadCloudError(f"{path} is broken: {str(error).rstrip('.')}.") from None
+    if announced is not None and len(array) < announced:
+        raise BadCloudError(
+            f"{path} is broken: it announces {announced} points, but has {len(array)}."
+        )
     # A header may be a comment: as many words as there are columns, x, y and z among them.
     for line in text.lstrip("\ufeff").splitlines()[:20]:
         words = [word.strip() for word in line.strip().lstrip("#/ ").split(separator)]
