@@ -14,7 +14,7 @@ TREE = 25_000_000
 MODELS = 20_000_000
 PICTURE = 300_000
 PICTURES = {".png", ".svg", ".jpg", ".jpeg", ".gif", ".webp"}
-WEIGHTS = {".pt", ".pth", ".ckpt", ".safetensors", ".onnx"}
+WEIGHTS = {".pt", ".ckpt", ".safetensors", ".onnx"}
 KINDS = ("weights", "task_weights")
 
 
@@ -52,7 +52,8 @@ def test_weights_are_models_of_the_package(tracked):
     assert {path.parent for path in files} == {names.SHIPPED}
     assert sum(path.stat().st_size for path in files) < MODELS
     for path in files:
-        assert model_file.read(path)["card"]["name"] == path.stem
+        assert model_file.read_card(path)["name"] == path.stem
+        model_file.read(path)
 
 
 def test_records_and_models_name_models_that_exist(tracked):

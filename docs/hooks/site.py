@@ -21,6 +21,7 @@ IN_MODULES = (
     "mops_lightning.transforms.Downsample",
     "mops_lightning.config.compose.compose",
     "mops_lightning.training.run.run",
+    "mops_lightning.zoo.publish.add",
     "mops_lightning.zoo.weights.load_into",
 )
 """Public names that are not imported from the package itself."""
@@ -141,9 +142,8 @@ def _reference() -> str:
     ]
     packages: dict[str, list[str]] = {}
     for name in mops_lightning.__all__:
-        module = mops_lightning._MODULE_OF[name]  # asking the object would import torch
-        entry = f"::: {mops_lightning.__name__}.{module}.{name}"
-        packages.setdefault(module.split(".")[0], []).append(entry)
+        module = getattr(mops_lightning, name).__module__
+        packages.setdefault(module.split(".")[1], []).append(f"::: {module}.{name}")
     for package in sorted(packages):
         lines += [f"## {package}", "", *(line for one in packages[package] for line in (one, ""))]
     lines += ["## In modules of their own", ""]

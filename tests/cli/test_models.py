@@ -5,7 +5,7 @@ import pytest
 from mops_lightning.cli.models import main
 from mops_lightning.zoo import model_file, names
 from tests.support import commands
-from tests.support.models import write_run
+from tests.support.models import rewrite, write_run
 
 
 def call(*arguments):
@@ -49,14 +49,6 @@ def test_models_add_publishes_a_run(tmp_path, monkeypatch):
     assert "exists" in call("add", tmp_path / "run", "fmops.mine")[2]
 
 
-def test_models_without_a_readable_record_writes_nothing(tmp_path):
-    write_run(tmp_path / "run")
-    given = ("--folder", tmp_path / "models", "--record", tmp_path / "nowhere")
-    status, _, err = call("add", tmp_path / "run", "fmops.mine", *given)
-    assert (status, "no run record" in err) == (2, True)
-    assert not (tmp_path / "models").exists()
-
-
 def test_models_lists_readable_files_next_to_a_damaged_one(tmp_path, monkeypatch):
     (tmp_path / "fmops.damaged.safetensors").write_bytes(b"none")
     monkeypatch.setenv(names.VARIABLE, str(tmp_path))
@@ -68,6 +60,23 @@ def test_models_lists_readable_files_next_to_a_damaged_one(tmp_path, monkeypatch
     assert call("add", tmp_path / "run", "fmops.mine")[0] == 0
 
 
+def test_models_shows_a_foreign_card_escaped_and_on_its_lines(tmp_path, monkeypatch):
+    write_run(tmp_path / "run")
+    assert call("add", tmp_path / "run", "fmops.mine", "--folder", tmp_path)[0] == 0
+    record = model_file.read_card(tmp_path / "fmops.mine.safetensors")["record"]
+    record["config"] |= {"sampler": {}, "dataset": {"classes": [1]}}
+    figures: dict[str, object] = {"metric": "\x1b[31m", "m": None, "points": None, "values": {}}
+    odd = {"licence": "\x1b]0,title\x07 \ud800", "notes": "one\ntwo", "figures": figures}
+    rewrite(tmp_path / "fmops.mine.safetensors", **odd, record=record)
+    monkeypatch.setenv(names.VARIABLE, str(tmp_path))
+    for arguments in ((), ("fmops.mine",)):
+        status, out, err = call(*arguments)
+        assert (status, err) == (0, "")
+        assert "\\x1b[31m" in out
+        assert "\\x1b]0,title\\x07 \\ud800" in out
+    assert "one two" in out
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -75,7 +84,7 @@ def test_models_lists_readable_files_next_to_a_damaged_one(tmp_path, monkeypatch
         (["add", "run"], "add takes a run and a name"),
         (["a.b", "c.d"], "give one NAME"),
         (["add", "nowhere", "a.b", "--folder", "."], "no run record"),
-        (["pointnet.modelnet40", "--precision", "int8"], "--precision is an option of `models add"),
+        (["pointnet.modelnet40", "--notes", "new"], "--notes is an option of `models add"),
         (["--task-net", "a.b"], "--task-net is an option of `models add RUN NAME`"),
         (["--json"], "--json is an option of `models NAME`"),
         (["add", "run", "a.b", "--json"], "--json is an option of `models NAME`"),

@@ -54,7 +54,7 @@ def test_run_cell_failed_is_repeated(start, tmp_path, caplog):
     assert run_record.read(tmp_path / "cell").status == "failed"
     overrides = [*TINY, "learn=task"]
     run_cell(compose(overrides), tmp_path / "task", overrides)
-    (tmp_path / "task" / "weights.pt").rename(file)
+    (tmp_path / "task" / "weights.safetensors").rename(file)
     assert math.isfinite(start("sampler=fps", f"weights={file}"))
     assert run_record.read(tmp_path / "cell").status == "completed"
     assert run_record.read(tmp_path / "cell" / ASIDE / "1").status == "failed"
@@ -76,7 +76,7 @@ def test_run_cell_interrupted_resumes_to_same_result(start, tmp_path):
     (tmp_path / "cell" / "checkpoints" / "last.ckpt").unlink(missing_ok=True)
     path.write_text(json.dumps({**again.plain(), "status": "interrupted", "score": None}))
     assert start(*longer) == score
-    for name in (run_record.FILE, "weights.pt"):
+    for name in (run_record.FILE, "weights.safetensors"):
         (tmp_path / "cell" / name).unlink()
     (tmp_path / "cell" / "checkpoints" / "last.ckpt").unlink(missing_ok=True)
     assert start(*longer) == score

@@ -56,7 +56,7 @@ def test_main_job_writes_complete_record(main_job):
 
 def test_main_job_writes_weights_pictures_and_curves(main_job):
     folder, run, *_ = main_job
-    content = weights.read(run / "weights.pt")
+    content = weights.read(run / "weights.safetensors")
     assert content["state"]["queries.weight"].shape[0] == 8
     for name in ("clouds.png", "comparison.png", "matrix.png"):
         assert (run / "pictures" / name).read_bytes().startswith(b"\x89PNG")
@@ -111,8 +111,8 @@ def test_joint_training_starts_from_cached_task_net(main_job):
     assert status == 0, err
     assert "training it first" not in out
     (path,) = (folder / "joint").rglob("result.json")
-    before = next((folder / "cache" / "weights").rglob("weights.pt"))
-    after = weights.read(path.parent / "task_weights.pt")
+    before = next((folder / "cache" / "weights").rglob("weights.safetensors"))
+    after = weights.read(path.parent / "task_weights.safetensors")
     assert after["sha256"] != weights.read(before)["sha256"]
 
 
@@ -139,7 +139,7 @@ def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
         "matrix.png",
         "pairs.png",
     }
-    assert (run / "task_weights.pt").is_file()
+    assert (run / "task_weights.safetensors").is_file()
     status, out, err = call(
         [f"evaluate={run}", "task/net=icp", "task.pairs.resample=48", "pictures=0"], tmp_path
     )
@@ -231,7 +231,7 @@ def test_flexible_sampler_is_tested_at_all_sizes_and_evaluated(main_job):
 
 def test_weights_of_another_net_are_rejected(main_job):
     folder, run, *_ = main_job
-    other = next((folder / "cache" / "weights").rglob("weights.pt"))
+    other = next((folder / "cache" / "weights").rglob("weights.safetensors"))
     settings = [
         *TINY,
         f"weights={other}",

@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from mops_lightning.config.compose import compose
 from mops_lightning.config.distributed import check_shares, check_start
@@ -109,7 +110,7 @@ def test_two_processes_equal_one_and_rank_zero_writes(tmp_path):
     one, both = (json.loads((tmp_path / run / "result.json").read_text()) for run in ("one", "two"))
     assert (one["processes"], both["processes"]) == (1, 2)
     assert both["metrics"] == pytest.approx(one["metrics"], rel=1e-4)
-    weights = [torch.load(tmp_path / run / "weights.pt")["state"] for run in ("one", "two")]
+    weights = [load_file(tmp_path / run / "weights.safetensors") for run in ("one", "two")]
     for name, value in weights[0].items():
         torch.testing.assert_close(weights[1][name], value, rtol=1e-3, atol=1e-5)
     # Those that follow have a log of their own and nothing else.

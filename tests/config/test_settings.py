@@ -83,7 +83,7 @@ def test_made_up_setting_that_affects_results_is_repeated_by_evaluate(affects, t
     path = put_cell(tmp_path, "run", "mops", {"generated": 1.0})
     record = json.loads(path.read_text())
     config: Any = OmegaConf.to_container(compose(), resolve=True)
-    changes = {"config": {**config, "haste": 2.0}, "files": {"weights": "weights.pt"}}
+    changes = {"config": {**config, "haste": 2.0}, "files": {"weights": "weights.safetensors"}}
     path.write_text(json.dumps({**record, **changes}))
     chosen = command_line([f"evaluate={path.parent}"])
     cfg = as_trained(compose(chosen), TrainedRun.read(str(path.parent)), chosen)

@@ -24,7 +24,7 @@ def folder(tmp_path_factory):
     torch.manual_seed(0)
     node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 40}
     config = {"learn": "sampler", "sampler": node}
-    weights.save(folder / "weights.pt", FMOPSNet(40), config, {})
+    weights.save(folder / "weights.safetensors", FMOPSNet(40), config, {})
     weights.save(folder / "task.pt", FMOPSNet(40), {**config, "learn": "task"}, {})
     return folder
 
@@ -35,5 +35,5 @@ def anchored(tmp_path_factory):
     folder = tmp_path_factory.mktemp("anchored")
     node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 40, "anchors": "fps"}
     config = {"learn": "sampler", "sampler": node}
-    weights.save(folder / "weights.pt", FMOPSNet(40, anchors="fps"), config, {})
+    weights.save(folder / "weights.safetensors", FMOPSNet(40, anchors="fps"), config, {})
     return folder

@@ -11,7 +11,7 @@ def test_folder_second_run_does_only_missing_files(folder, tmp_path):
     bad = folder / "in" / "bad.xyz"
     bad.write_text("not a cloud\n")
     try:
-        settings = ["--weights", folder / "weights.pt", "--m", 8]
+        settings = ["--weights", folder / "weights.safetensors", "--m", 8]
         status, out, err = call(folder / "in", target, *settings, "--workers", 2)
         assert status == 1
         assert "3 files: " in out

@@ -24,7 +24,9 @@ def folder(tmp_path_factory):
         points = random.normal(size=(700, 3)) * [5, 3, 1] + [400_000, 0, 0]
         WRITERS[f".{name[-3:]}"](folder / name, Table(points, {"intensity": points[:, 0] / 3}))
     node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 32}
-    weights.save(folder / "weights.pt", FMOPSNet(32), {"learn": "sampler", "sampler": node}, {})
+    weights.save(
+        folder / "weights.safetensors", FMOPSNet(32), {"learn": "sampler", "sampler": node}, {}
+    )
     return folder
 
 

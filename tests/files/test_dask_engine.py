@@ -42,7 +42,7 @@ def scan(tmp_path_factory):
     torch.manual_seed(0)
     node = {"_target_": "mops_lightning.samplers.mops.MOPSNet", "m": 24}
     sampler = MOPSNet(24).eval()
-    weights.save(folder / "weights.pt", sampler, {"learn": "sampler", "sampler": node}, {})
+    weights.save(folder / "weights.safetensors", sampler, {"learn": "sampler", "sampler": node}, {})
     return folder / "scan.ply", sampler
 
 

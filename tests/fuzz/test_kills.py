@@ -74,7 +74,7 @@ def results(folder, work):
     if work in ("files", "file"):
         return {path.name: path.read_bytes() for path in (folder / "out").iterdir()}
     found = {}
-    for path in sorted(folder.rglob("weights.pt")):
+    for path in sorted(folder.rglob("weights.safetensors")):
         if ASIDE not in path.parts:
             content = weights.read(path)
             found[content["config"]["learn"]] = (content["sha256"], content["metrics"])

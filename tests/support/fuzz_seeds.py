@@ -51,9 +51,9 @@ def seeds(folder):
     packed = {"compression": "gzip", "chunks": (2, 20, 3)}
     made["hdf5"] = (".h5", [_hdf5(folder / "a.h5", options) for options in ({}, packed)])
     made["names"] = (".txt", [b"chair\ntable\nlamp\n"])
-    made["weights"] = (".pt", [_weights(folder / "a.pt")])
+    made["weights"] = (".safetensors", [_weights(folder / "a.safetensors")])
     made["checkpoint"] = (".ckpt", [_saved(lambda file: torch.save(CHECKPOINT, file))])
-    run_record.write(folder, record(files={"weights": "weights.pt"}))
+    run_record.write(folder, record(files={"weights": "weights.safetensors"}))
     made["record"] = (".json", [(folder / run_record.FILE).read_bytes()])
     save_clouds(
         folder / "c.npz", torch.rand(2, 9, 3), {"generated": torch.rand(2, 3, 3)}, ["a", "b"]

@@ -61,7 +61,7 @@ def test_run_diverged_keeps_last_finite_checkpoint(diverged):
     assert weights.first_nonfinite(content["state_dict"]) is None
     assert content["epoch"] < 2
     assert run_record.read(folder).status == "failed"
-    assert not (folder / "weights.pt").exists()
+    assert not (folder / "weights.safetensors").exists()
 
 
 def test_run_diverged_in_last_step_fails(tmp_path):

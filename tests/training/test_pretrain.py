@@ -13,6 +13,7 @@ from mops_lightning.training.run import run
 from mops_lightning.zoo import weights
 from tests.support.command_line import SMALL_PCRNET, TINY, call
 from tests.support.forked import start_fork
+from tests.support.models import rewrite
 
 
 def train(folder, *arguments):
@@ -26,16 +27,17 @@ def files(folder, pattern):
 
 def test_task_net_from_file_is_not_published(tmp_path):
     train(tmp_path, "learn=task", *SMALL_PCRNET)
-    (published,) = files(tmp_path, "cache/weights/*/weights.pt")
-    first = tmp_path / "run0" / "weights.pt"
+    (published,) = files(tmp_path, "cache/weights/*/weights.safetensors")
+    first = tmp_path / "run0" / "weights.safetensors"
     # A run's folder means its weights file.
     record = train(
         tmp_path, "learn=task", *SMALL_PCRNET, f"weights={first.parent}", "optimizer.lr=0"
     )
     assert record.weights_loaded == published["sha256"]
-    own, again = (weights.read(path)["state"] for path in sorted(tmp_path.glob("run*/weights.pt")))
+    paths = sorted(tmp_path.glob("run*/weights.safetensors"))
+    own, again = (weights.read(path)["state"] for path in paths)
     assert all(torch.equal(own[name], again[name]) for name in own)  # at a rate of 0 nothing moves
-    assert len(files(tmp_path, "cache/weights/*/weights.pt")) == 1
+    assert len(files(tmp_path, "cache/weights/*/weights.safetensors")) == 1
 
 
 def test_weights_file_for_net_without_weights_raises(tmp_path):
@@ -56,20 +58,20 @@ def test_resumed_run_from_file_is_not_published(tmp_path):
     (folder / f"{TEMPORARY}left by a kill.pt").touch()
     train(tmp_path, "learn=task", *SMALL_PCRNET)
     assert [path.name for path in folder.iterdir()] == [weights.FILE]
-    (first,) = tmp_path.glob("run*/weights.pt")
+    (first,) = tmp_path.glob("run*/weights.safetensors")
     given = ["learn=task", *SMALL_PCRNET, f"weights={first}"]
     train(tmp_path, *given)
-    for path in (tmp_path / "cache" / "weights").rglob("weights.pt"):
+    for path in (tmp_path / "cache" / "weights").rglob("weights.safetensors"):
         path.unlink()
     train(tmp_path, *given, f"ckpt_path={sorted(tmp_path.glob('run*'))[-1]}")
-    assert not files(tmp_path, "cache/weights/*/weights.pt")
+    assert not files(tmp_path, "cache/weights/*/weights.safetensors")
 
 
 def test_resume_other_weights_raises(tmp_path):
     task = ["learn=task", *SMALL_PCRNET]
     train(tmp_path, *task)
     anew = tmp_path / "run0"
-    given = f"weights={anew / 'weights.pt'}"
+    given = f"weights={anew / 'weights.safetensors'}"
     train(tmp_path, *task, given)
     begun = tmp_path / "run2"
     for weights_, checkpoint in ((given, anew), ("weights=auto", begun)):
@@ -80,7 +82,7 @@ def test_resume_other_weights_raises(tmp_path):
 def test_diverged_training_fails_without_weights(tmp_path):
     with pytest.raises(UserError, match=r"training diverged: the loss is nan .*No weights"):
         train(tmp_path, "learn=task", *SMALL_PCRNET, "optimizer.lr=1e30")
-    assert not files(tmp_path, "**/weights.pt")
+    assert not files(tmp_path, "**/weights.safetensors")
     record = json.loads((tmp_path / "run0" / "result.json").read_text())
     assert record["status"] == "failed"
 
@@ -102,23 +104,22 @@ def test_diverged_training_fails_without_weights(tmp_path):
 def test_mistake_fails_before_pretraining(settings, said, tmp_path):
     with pytest.raises(UserError, match=said):
         train(tmp_path, "task=registration", *settings)
-    assert not files(tmp_path, "**/weights.pt")
+    assert not files(tmp_path, "**/weights.safetensors")
 
 
 @pytest.mark.parametrize("damage", ["cut", "nan", "not restorable"])
 def test_damaged_cache_is_set_aside_and_trained_again(tmp_path, capsys, damage):
     settings = [*SMALL_PCRNET, "sampler=fps", "epochs.task=2"]
     train(tmp_path, *settings)
-    (path,) = tmp_path.glob("cache/weights/*/weights.pt")
+    (path,) = tmp_path.glob("cache/weights/*/weights.safetensors")
     checkpoint = path.parent / "checkpoints" / "last.ckpt"
     digest = weights.read(path)["sha256"]
     if damage == "cut":
         path.write_bytes(path.read_bytes()[:1000])
         checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
     elif damage == "nan":
-        content = torch.load(path, weights_only=True)
-        next(iter(content["state"].values())).fill_(float("nan"))
-        torch.save({**content, "sha256": weights.digest(content["state"])}, path)
+        name, value = next(iter(weights.read(path)["state"].items()))
+        rewrite(path, {name: value.fill_(float("nan"))})
         content = torch.load(checkpoint, weights_only=True)
         next(iter(content["state_dict"].values())).fill_(float("nan"))
         torch.save(content, checkpoint)
@@ -129,7 +130,7 @@ def test_damaged_cache_is_set_aside_and_trained_again(tmp_path, capsys, damage):
     train(tmp_path, *settings)
     assert weights.read(path)["sha256"] == digest
     assert checkpoint.with_name("last.ckpt.damaged").is_file()
-    assert path.with_name("weights.pt.damaged").is_file() == (damage != "not restorable")
+    assert path.with_name("weights.safetensors.damaged").is_file() == (damage != "not restorable")
     out = capsys.readouterr().out
     assert out.count("Renamed to") == (1 if damage == "not restorable" else 2)
 
@@ -166,7 +167,7 @@ def test_resume_with_fewer_epochs_than_done_raises(tmp_path):
 
 def test_resumed_pretraining_does_not_warn_about_its_folder(tmp_path, capsys, recwarn):
     train(tmp_path, "sampler=fps")
-    (weights_file,) = tmp_path.glob("cache/weights/*/weights.pt")
+    (weights_file,) = tmp_path.glob("cache/weights/*/weights.safetensors")
     weights_file.unlink()
     train(tmp_path, "sampler=fps")
     assert capsys.readouterr().out.count("training it first, 1 epoch.") == 2

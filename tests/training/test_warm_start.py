@@ -26,13 +26,15 @@ def test_sampler_of_another_size_continues_from_a_run(tmp_path):
     status, out, err = run(tmp_path, "first", "sampler=mops", "m=8")
     assert (status, err) == (0, "")
     assert "Warm start: the first" in out
-    first = tmp_path / "first" / "weights.pt"
+    first = tmp_path / "first" / "weights.safetensors"
     still = "optimizer.lr=1e-12"
     folder = first.parent
     status, out, _ = run(tmp_path, "second", "m=5", f"recipe.warm_start={folder}", still)
     assert status == 0
     assert f"tensors are copies of {folder}." in out
-    one, two = (weights.read(tmp_path / name / "weights.pt") for name in ("first", "second"))
+    one, two = (
+        weights.read(tmp_path / name / "weights.safetensors") for name in ("first", "second")
+    )
     rows = two["state"]["queries.weight"]
     torch.testing.assert_close(rows, one["state"]["queries.weight"][:5])
     record = json.loads((tmp_path / "second" / "result.json").read_text())

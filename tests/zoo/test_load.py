@@ -5,13 +5,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-import mops_lightning
-from mops_lightning import Sampler, load
+from mops_lightning import SampleOutput, Sampler, load
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.fmops import FMOPSNet
-from mops_lightning.samplers.samplenet import ProgressiveSampleNet
 from mops_lightning.zoo import weights
-from mops_lightning.zoo.load import SAMPLERS
+from mops_lightning.zoo.load import samplers
+from tests.support.models import write_run
 
 ROOT = Path(__file__).parents[2]
 FMOPS = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 16}
@@ -47,17 +46,6 @@ def test_load_leaves_the_random_state_alone(save):
     before = torch.get_rng_state()
     load(path)
     assert torch.equal(torch.get_rng_state(), before)
-
-
-def test_load_renamed_arguments_of_older_files(save):
-    sampler = load(save({**FMOPS, "sizes_per_step": "uniform", "prefixes": 2}))
-    assert isinstance(sampler, FMOPSNet)
-    assert (sampler.size_sampling, sampler.num_sizes) == ("uniform", 2)
-    node = {"_target_": "mops_lightning.samplers.samplenet.ProgressiveSampleNet", "m_max": 16}
-    older = {**node, "least": 4, "over_sizes": "mean"}
-    sampler = load(save(older, ProgressiveSampleNet(16)))
-    assert isinstance(sampler, ProgressiveSampleNet)
-    assert (sampler.min_size, sampler.size_reduction) == (4, "mean")
 
 
 @pytest.mark.parametrize(
@@ -106,14 +94,15 @@ def test_load_wrong_arguments_are_one_error(save, change, words):
 def test_load_task_net_or_missing_file_is_refused(save, tmp_path):
     with pytest.raises(UserError, match=r"task net.*learn=sampler"):
         load(save(FMOPS, learn="task"))
-    with pytest.raises(UserError, match=r"no file .*nowhere\.pt.*weights\.pt"):
-        load(tmp_path / "nowhere.pt")
+    with pytest.raises(UserError, match=r"no file .*nowhere"):
+        load(tmp_path / "nowhere.safetensors")
     with pytest.raises(UserError, match="path must be a string or a Path, got None"):
         load(None)  # type: ignore[arg-type]
 
 
-def test_load_run_folder_follows_its_record():
-    assert load(ROOT / "results" / "classification_fast" / "runs" / "fmops").m == 512
+def test_load_run_folder_follows_its_record(tmp_path):
+    write_run(tmp_path / "run", files={"weights": "mops.modelnet40-m32"})
+    assert load(tmp_path / "run").m == 32
 
 
 def test_load_model_by_name_or_unknown_name():
@@ -125,14 +114,36 @@ def test_load_model_by_name_or_unknown_name():
         load("pointnet.modelnet40")
 
 
-def test_samplers_of_the_package_can_all_be_loaded():
-    public = {getattr(mops_lightning, name) for name in mops_lightning.__all__}
-    classes = {p for p in public if isinstance(p, type) and issubclass(p, Sampler)}
-    assert set(SAMPLERS) == classes - {Sampler}
-    known = {f"{cls.__module__}.{cls.__qualname__}" for cls in SAMPLERS}
+def test_samplers_of_conf_can_all_be_loaded():
+    known = {f"{cls.__module__}.{cls.__qualname__}" for cls in samplers()}
     for path in (ROOT / "conf" / "sampler").glob("*.yaml"):
         node: Any = OmegaConf.load(path)
         assert node.get("sampler", node)["_target_"] in known, path
+
+
+class Scaled(Sampler):
+    """A sampler from outside the package."""
+
+    def __init__(self, m: int, size: int = 3):
+        super().__init__(m)
+        self.scale = torch.nn.Parameter(torch.ones(size))
+
+    def sample(self, points, m):
+        return SampleOutput(points[:, :m] * self.scale, None, {})
+
+
+def test_load_class_from_outside_is_given(save):
+    own = Scaled(4)
+    torch.nn.init.constant_(own.scale, 2)
+    path = save({"_target_": "my_package.Scaled", "m": 4}, own)
+    with pytest.raises(UserError, match=r"'my_package\.Scaled'.*load\(path, cls=MySampler\)"):
+        load(path)
+    sampler = load(path, cls=Scaled)
+    points = torch.rand(2, 9, 3)
+    assert isinstance(sampler, Scaled)
+    assert torch.equal(sampler(points).points, 2 * points[:, :4])
+    with pytest.raises(UserError, match="another net's weights"):
+        load(save({"_target_": "my_package.Scaled", "m": 4, "size": 2}, own), cls=Scaled)
 
 
 @pytest.mark.parametrize("node", [5, ["a"], "fps", {1: 2}])

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from mops_lightning.errors import UserError, one_line_endings
+from mops_lightning.errors import UserError, one_line_endings, printable
 from mops_lightning.zoo import model_file, names
 
 DESCRIPTION = f"""List trained models, show the card of one, or publish a run as one.
@@ -30,7 +30,7 @@ def main(arguments: list[str], prog: str) -> None:
         parser = make_parser(prog)
         chosen = parser.parse_args(arguments)
         _refuse_unused(chosen, parser)
-        print("\n".join(_run(chosen)))
+        print(printable("\n".join(_run(chosen))))
 
 
 def make_parser(prog: str) -> argparse.ArgumentParser:
@@ -44,19 +44,8 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
     new = parser.add_argument_group("options of add")
     new.add_argument("--folder", type=Path, help=f"where to; default: first of ${names.VARIABLE}")
     new.add_argument("--task-net", metavar="NAME", help="model of the sampler's task net")
-    new.add_argument("--tested", type=Path, metavar="RUN", help="run that has the test figures")
-    new.add_argument(
-        "--precision",
-        choices=("float32", "float16", "bfloat16", "int8"),
-        default="float32",
-        help="of weight matrices with at least 4,096 entries",
-    )
-    new.add_argument("--licence", default="MIT", help="default: MIT")
     new.add_argument("--notes", default="", help="what a user must know besides")
     new.add_argument("--overwrite", action="store_true", help="replace a model of this name")
-    new.add_argument(
-        "--record", type=Path, metavar="FOLDER", help="let the record in FOLDER name the model"
-    )
     return parser
 
 
@@ -98,7 +87,6 @@ def _run(chosen: argparse.Namespace) -> list[str]:
 
 
 def _add(chosen: argparse.Namespace, run: Path, name: str) -> list[str]:
-    from mops_lightning.records import run_record
     from mops_lightning.zoo import publish
 
     own = os.environ.get(names.VARIABLE)
@@ -107,23 +95,20 @@ def _add(chosen: argparse.Namespace, run: Path, name: str) -> list[str]:
         raise UserError(
             f"give --folder FOLDER, or set ${names.VARIABLE} to the folder of your models."
         )
-    if chosen.record is not None:
-        run_record.read(chosen.record)  # before anything is written
     path = publish.add(
         run,
         name,
         folder,
         task_net=chosen.task_net,
-        tested=chosen.tested,
-        precision=chosen.precision,
-        licence=chosen.licence,
         notes=chosen.notes,
         overwrite=chosen.overwrite,
     )
-    if chosen.record is not None:
-        publish.point_to(chosen.record, path)
-    lines = [f"{path}: {_megabytes(path)} MB"]
-    record = model_file.read_card(path)["record"]
+    card = model_file.read_card(path)
+    record = card["record"]
+    lines = [
+        f"{path}: {_megabytes(path)} MB",
+        f"Records name it {names.pinned(name, card['sha256'])}.",
+    ]
     if record["config"]["learn"] != "task" and "task_weights" not in record["files"]:
         lines.append(f"Its task net is no model: evaluate={name} also needs weights=FILE.")
     found = names.available().get(name)
@@ -164,7 +149,7 @@ def _card(card: dict[str, Any], path: Path) -> list[str]:
     config, commit = record["config"], record["git"]["commit"]
     chosen = config["names"]
     classes = config["dataset"].get("classes")
-    data = chosen["dataset"] + (f" ({', '.join(classes)})" if classes else "")
+    data = chosen["dataset"] + (f" ({', '.join(map(str, classes))})" if classes else "")
     points = config["dataset"].get("n_points")
     wide = f", wide layers in {card['precision']}" if card["precision"] != "float32" else ""
     lines = {
@@ -187,7 +172,7 @@ def _card(card: dict[str, Any], path: Path) -> list[str]:
         "sha256": f"{card['sha256']} (of the tensors)",
     }
     width = max(map(len, lines)) + 2
-    return [f"{key:<{width}}{value}" for key, value in lines.items() if value]
+    return [f"{key:<{width}}{' '.join(value.split())}" for key, value in lines.items() if value]
 
 
 def _net(card: dict[str, Any]) -> str:
@@ -202,14 +187,14 @@ def _sizes(card: dict[str, Any]) -> str:
     if config["learn"] == "task":
         return ""
     largest = config["sampler"].get("m_max")
-    return f"1-{largest}" if largest else str(config["sampler"]["m"])
+    return f"1-{largest}" if largest else str(config["m"])
 
 
 def _figures(card: dict[str, Any]) -> str:
     own = card["figures"]
     values = own["values"]
     if own["m"] is None:
-        return f"{own['metric']}: {values['full']} on all points"
+        return f"{own['metric']}: {values.get('full', 'unknown')} on all points"
     listed = ", ".join(f"{value} {readout}" for readout, value in values.items())
     return f"{own['metric']}, m={own['m']}: {listed}"
 

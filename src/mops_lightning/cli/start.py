@@ -109,7 +109,7 @@ def _check_weights(given: str | None) -> None:
         raise UserError(f"weights: {error}") from None
     if not path.exists():
         raise UserError(
-            f"weights: no file {path}. Give a weights.pt, a run, a model, or weights=auto."
+            f"weights: no file {path}. Give a weights file, a run, a model, or weights=auto."
         )
 
 

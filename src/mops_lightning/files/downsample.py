@@ -21,8 +21,8 @@ from mops_lightning.files.unit_sphere import largest_distance, sum_of, unit_sphe
 from mops_lightning.ops.readout import complete
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.streaming import stream_match, stream_sample
+from mops_lightning.zoo.downsample import untrained
 from mops_lightning.zoo.load import load
-from mops_lightning.zoo.methods import untrained
 
 PART = 65536
 """Number of points that a learned sampler processes at a time; it bounds the memory of features."""

@@ -10,7 +10,7 @@ from mops_lightning.config.shared_settings import training_settings
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import set_aside
 from mops_lightning.records import run_record
-from mops_lightning.zoo import nets, weights
+from mops_lightning.zoo import weights
 
 CHECKPOINT = "last.ckpt"
 CHECKPOINT_KEY = "mops_lightning"
@@ -46,7 +46,7 @@ def _given_weights(given: str | None) -> dict[str, str]:
     if given is None or given in ("auto", "run"):
         return {}
     try:
-        return {"weights": str(weights.read(nets.file_of(given))["sha256"])}
+        return {"weights": str(weights.read(weights.of_task_net(given))["sha256"])}
     except UserError as error:
         raise UserError(f"weights: {error}") from None
 

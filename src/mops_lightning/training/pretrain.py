@@ -22,7 +22,7 @@ from mops_lightning.training.evaluation.trained_run import OF_RUN
 from mops_lightning.training.job import Job, prepare
 from mops_lightning.training.recording import recorded
 from mops_lightning.training.stages import fit_and_test
-from mops_lightning.zoo import nets, weights
+from mops_lightning.zoo import weights
 from mops_lightning.zoo.weights import FILE
 
 
@@ -40,7 +40,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
     if cfg.weights == "auto" and cfg.learn == "task":
         return None
     if cfg.weights != "auto":
-        return nets.file_of(cfg.weights)
+        return weights.of_task_net(cfg.weights)
     folder = cache_folder(cfg, dataset)
     remove_temporary(folder)
     if not _is_good(folder / FILE):

@@ -229,7 +229,7 @@ def _save(job: Job, record: RunRecord) -> None:
         return
     files = {weights.FILE: task if cfg.learn == "task" else sampler}
     if cfg.learn == "joint":
-        files["task_weights.pt"] = task
+        files[f"task_{weights.FILE}"] = task
     for name, module in files.items():
         assert module is not None  # only learn=task has no sampler
         classes = job.dataset.class_names if module is task and task.requires_same_classes else ()

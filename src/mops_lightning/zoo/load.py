@@ -1,59 +1,44 @@
 """Samplers by name or from weights files, without Hydra."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache, partial
+from inspect import signature
 from pathlib import Path
+from typing import Any
 
+import torch
+from torch import Tensor
+from torch.nn.modules.module import register_module_parameter_registration_hook
+
+import mops_lightning
+from mops_lightning.config.annotations import misfit
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.critical_points import CriticalSampler
-from mops_lightning.samplers.fmops import FMOPSNet
-from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.gumbel import GumbelSampler
-from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.poisson import PoissonSampler
-from mops_lightning.samplers.random import RandomSampler
-from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
-from mops_lightning.samplers.snet import ProgressiveSNet, SNet
-from mops_lightning.samplers.submodular import SubmodularSampler
-from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.zoo import names, weights
-from mops_lightning.zoo.closed_list import ClosedList
+from mops_lightning.zoo.weights import check_shapes, fit_state
 
-SAMPLERS: tuple[type[Sampler], ...] = (
-    MOPSNet,
-    FMOPSNet,
-    SNet,
-    ProgressiveSNet,
-    SampleNet,
-    ProgressiveSampleNet,
-    GumbelSampler,
-    RandomSampler,
-    VoxelSampler,
-    FPSSampler,
-    PoissonSampler,
-    SubmodularSampler,
-    CriticalSampler,
-)
-"""What ``load`` can build."""
-
-LISTED = ClosedList(
-    SAMPLERS,
-    "sampler",
-    "sampler",
-    "For a sampler of your own, build it and call mops_lightning.zoo.weights.load_into.",
-)
-
-HINT = "Give a sampler, or the weights.pt of a run with learn=sampler or learn=joint."
+HINT = "Give a sampler, or the weights of a run with learn=sampler or learn=joint."
 
 
-def load(path: str | Path) -> Sampler:
+@cache
+def samplers() -> list[type[Sampler]]:
+    """Return the samplers that files may name: those of the public API."""
+    public = [getattr(mops_lightning, name) for name in mops_lightning.__all__]
+    classes = [value for value in public if isinstance(value, type) and issubclass(value, Sampler)]
+    return [cls for cls in classes if cls is not Sampler]
+
+
+def load(path: str | Path, cls: type[Sampler] | None = None) -> Sampler:
     """Load a trained sampler by its name, or from a weights file.
 
     Nothing in the file is executed: it holds tensors and plain data, and only samplers of this
-    package are built. Torch's random state is left as it is.
+    package, or ``cls``, are built. Torch's random state is left as it is.
 
     Args:
         path: a model's name (``mops-lightning models`` lists them), a weights file, the folder of
             a run, or ``hf://OWNER/REPO/FILE.safetensors@sha256:HASH``.
+        cls: the sampler's class, if it is not one of this package.
 
     Returns:
         The sampler in eval mode on the CPU. It maps points ``(B, N, 3)`` to a ``SampleOutput`` with
@@ -74,11 +59,94 @@ def load(path: str | Path) -> Sampler:
         raise UserError(f"path must be a string or a Path, got {path!r}.")
     path = names.resolve(path)
     path = weights.of_run(path) if path.is_dir() else path
-    if not path.is_file():
-        raise UserError(f"no file {path}. Give a model, a weights.pt or the folder of its run.")
     content = weights.read(path)
     config = content["config"]
     if config.get("learn") == "task":
         raise UserError(f"{path} holds a task net, not a sampler. {HINT}")
-    sampler: Sampler = LISTED.build(config.get("sampler"), content["state"], path, HINT)
+    node = config.get("sampler")
+    return _build(cls or _known_class(node, path), node, content["state"], path)
+
+
+def _known_class(node: Any, path: Path) -> type[Sampler]:
+    """Return the class that a file names, if it is one of ours."""
+    target = node.get("_target_") if isinstance(node, dict) else None
+    for cls in samplers():
+        if target == f"{cls.__module__}.{cls.__qualname__}":
+            return cls
+    raise UserError(
+        f"{path}: sampler._target_ must be a sampler of mops_lightning, got {target!r:.99}. For a "
+        "sampler of your own, give load() its class: load(path, cls=MySampler)."
+    )
+
+
+def _build(cls: type[Sampler], node: Any, state: dict[str, Tensor], path: Path) -> Sampler:
+    """Build a sampler with the arguments and tensors of a file.
+
+    Args:
+        cls: its class.
+        node: from the file: the arguments, and ``_target_``, which is not read.
+        state: the file's tensors by name.
+        path: the file, for errors.
+
+    Raises:
+        UserError: an argument is not plain or not the class's, or the tensors do not match the
+            sampler.
+    """
+    if not isinstance(node, dict):
+        raise UserError(f"{path}: sampler must be a group of settings, got {node!r:.99}.")
+    arguments = {name: value for name, value in node.items() if name != "_target_"}
+    parameters = signature(cls).parameters
+    for name, value in arguments.items():
+        if not _is_plain(value):
+            raise UserError(
+                f"{path}: sampler.{name} must be a number, a string, a list of them or null, got "
+                f"{type(value).__name__}."
+            )
+        wanted = misfit(value, parameters[name].annotation) if name in parameters else None
+        if wanted:
+            raise UserError(f"{path}: sampler.{name} must be {wanted}, got {value!r:.99}.")
+    make = partial(_built, cls, arguments, path)
+    with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
+        # Without memory first: a small file can describe a large net.
+        with torch.device("meta"), _at_most(len(state)):
+            check_shapes(make(), state, path, HINT)
+        sampler = make()
+    fit_state(sampler, state, path, HINT)
     return sampler.eval()
+
+
+def _built(cls: type[Sampler], arguments: dict[str, Any], path: Path) -> Sampler:
+    try:
+        return cls(**arguments)
+    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: sizes beyond 64 bits
+        reason = str(error).partition("\n")[0]
+        name = f"{cls.__module__}.{cls.__qualname__}"
+        raise UserError(f"{path}: cannot build {name}: {reason}") from None
+
+
+@contextmanager
+def _at_most(number: int) -> Iterator[None]:
+    """Limit the number of parameters of the modules that are built.
+
+    Raises:
+        ValueError: there are more.
+    """
+    left = number
+
+    def count(*_: Any) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise ValueError(f"it has more than the {number} tensors of the file.")
+
+    hook = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    finally:
+        hook.remove()
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, list):
+        return all(item is not None and _is_plain(item) for item in value)
+    return value is None or isinstance(value, bool | int | float | str)

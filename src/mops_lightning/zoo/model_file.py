@@ -1,8 +1,10 @@
-"""Model files: tensors in the safetensors format, with a card in the header.
+"""The weights format: safetensors, with plain data as JSON in the header.
 
-Listing cards needs neither torch nor the tensors.
+The header of a run's weights file has the configuration and metrics of the run; that of a model has
+a card. Headers are read without torch and without the tensors.
 """
 
+import hashlib
 import json
 from functools import cache
 from importlib.resources import files
@@ -12,103 +14,135 @@ from typing import TYPE_CHECKING, Any
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.records import run_record
-from mops_lightning.zoo.digest import digest
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-SCHEMA = "mops_lightning/model/1"
+MODEL = "mops_lightning/model/1"
+WEIGHTS = "mops_lightning/weights/2"
 SUFFIX = ".safetensors"
 KEY = "mops_lightning"
-"""Key of the card in the header; safetensors writes several keys in random order."""
+"""Key of the plain data in the header; safetensors writes several keys in random order."""
+LONGEST = 1 << 22
+"""Most bytes of a header."""
 
 
-def write(path: Path, card: dict[str, Any], state: "dict[str, Tensor]") -> None:
-    """Write a model file; an existing one is replaced atomically.
+class Damaged(UserError):
+    """A file that this program did not write, or that was changed afterwards."""
+
+
+def damaged(path: str | Path, reason: str = "") -> Damaged:
+    """Return the error for a file that is damaged or of another kind."""
+    because = f" ({reason})" if reason else ""
+    return Damaged(
+        f"{path} is damaged or not a file of this program{because}. Make it again, or give another."
+    )
+
+
+def write(path: Path, header: dict[str, Any], state: "dict[str, Tensor]") -> None:
+    """Write tensors with plain data in the header; an existing file is replaced atomically.
 
     Args:
         path: the file.
-        card: see ``card.schema.json``, without ``schema`` and ``sha256``, which are added.
+        header: see ``header.schema.json``, without ``sha256``, which is added.
         state: tensors by name.
 
     Raises:
-        jsonschema.ValidationError: the card does not fit its schema: a bug in this program.
+        jsonschema.ValidationError: the header does not fit its schema: a bug in this program.
+        OSError: the file cannot be written.
     """
     import jsonschema
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
-    card = {"schema": SCHEMA, **card, "sha256": digest(state)}
-    jsonschema.validate(card, schema())
+    header = {**header, "sha256": digest(state)}
+    jsonschema.validate(header, schema())
+    content = save(state, metadata={KEY: json.dumps(header)})
     with atomic_write(path) as temporary:
-        save_file(state, temporary, metadata={KEY: json.dumps(card, allow_nan=False)})
+        temporary.write_bytes(content)
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read a model file and verify its tensors.
+    """Read a run's weights file or a model, and verify its tensors.
 
     Returns:
-        As ``weights.read``, and the ``card``.
+        ``config``, ``metrics``, ``classes``, ``sha256``, and ``state``, the tensors by name.
 
     Raises:
-        UserError: the file is missing, damaged or not a model file.
+        UserError: the file is missing, or may not be read.
+        Damaged: it is damaged or of another kind.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    from mops_lightning.zoo.packing import unpack
-
-    card = read_card(path)
+    header = _header(path)
     try:
         state = load_file(path)
     except (SafetensorError, OSError):
-        raise _damaged(path) from None
-    if digest(state) != card["sha256"]:
-        raise UserError(f"{path} is damaged (sha256 differs). Install or publish it again.")
-    try:
-        state = unpack(state)
-    except ValueError:
-        raise _damaged(path) from None
+        raise damaged(path) from None
+    if digest(state) != header["sha256"]:
+        raise damaged(path, "sha256 differs")
+    trained = header.get("record", header)
     return {
-        "config": card["record"]["config"],
-        "metrics": card["record"]["metrics"],
-        "classes": card["classes"],
-        "sha256": card["sha256"],
+        "config": trained["config"],
+        "metrics": trained["metrics"],
+        "classes": header["classes"],
+        "sha256": header["sha256"],
         "state": state,
-        "card": card,
     }
 
 
 def read_card(path: Path) -> dict[str, Any]:
-    """Read the card of a model file.
+    """Read the card of a model.
 
     Raises:
-        UserError: the file is missing, damaged or not a model file.
+        UserError: the file is missing, may not be read, or is a run's weights file.
+        Damaged: it is damaged or of another kind.
     """
+    header = _header(path)
+    if header["schema"] != MODEL:
+        raise UserError(
+            f"{path} holds the weights of a run and is no model. `mops-lightning models add` makes "
+            "a model of it."
+        )
+    return header
+
+
+def _header(path: Path) -> dict[str, Any]:
+    """Return the plain data in the header, checked by its schema."""
     import jsonschema
     from safetensors import SafetensorError, safe_open
 
+    if not path.is_file():  # opening a named pipe would wait for its writer
+        raise UserError(f"no file {path}. Give a weights file, the folder of its run, or a model.")
     try:
-        with safe_open(path, framework="numpy") as file:
-            card = json.loads((file.metadata() or {}).get(KEY, "null"))
-        jsonschema.validate(card, schema())
-        jsonschema.validate(card["record"], run_record.schema())
-    except FileNotFoundError:
-        raise UserError(f"no file {path}. Give a model's name, or the file of one.") from None
-    except jsonschema.ValidationError:
-        raise UserError(
-            f"{path} is not a model file of this version of mops_lightning. "
-            "`mops-lightning models add` makes them."
-        ) from None
-    except (SafetensorError, OSError, ValueError, RecursionError):
-        raise _damaged(path) from None
-    return card
+        with path.open("rb") as file:
+            if int.from_bytes(file.read(8), "little") > LONGEST:
+                raise damaged(path)
+        with safe_open(path, framework="numpy") as opened:
+            header = json.loads((opened.metadata() or {}).get(KEY, "null"))
+        jsonschema.validate(header, schema())
+        if "record" in header:
+            jsonschema.validate(header["record"], run_record.schema())
+    except PermissionError:
+        raise UserError(f"{path} may not be read. Check its permissions.") from None
+    except (SafetensorError, OSError, ValueError, RecursionError, jsonschema.ValidationError):
+        raise damaged(path) from None
+    return header
 
 
-def _damaged(path: Path) -> UserError:
-    return UserError(f"{path} is damaged or not a {SUFFIX} file. Install or publish it again.")
+def digest(state: "dict[str, Tensor]") -> str:
+    """Return the sha256 of the names, shapes, types and bytes of tensors, in any order."""
+    import torch
+
+    total = hashlib.sha256()
+    for name in sorted(state):
+        value = state[name].detach().cpu().contiguous()
+        total.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
+        total.update(value.view(-1).view(torch.uint8).numpy().tobytes())
+    return total.hexdigest()
 
 
 @cache
 def schema() -> dict[str, Any]:
-    """Return the JSON schema of a card."""
-    return json.loads(files("mops_lightning.zoo").joinpath("card.schema.json").read_text())
+    """Return the JSON schema of headers."""
+    return json.loads(files("mops_lightning.zoo").joinpath("header.schema.json").read_text())

@@ -1,21 +1,26 @@
-"""Models by name: where they are, and what a user's name, file or address means."""
+"""Models by name or address: where they are, and what a user's name, file or address means."""
 
+import hashlib
 import os
 import re
 from pathlib import Path
 
-from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.zoo import hub, model_file
+from mops_lightning.errors import UserError, did_you_mean, one_line
+from mops_lightning.zoo import model_file
 
 SHIPPED = Path(__file__).parent / "models"
 """The models that the package contains."""
 VARIABLE = "MOPS_MODELS"
 """Environment variable: folders with models of the user's own."""
 NAME = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)+")
-FILES = (".pt", ".pth", ".ckpt", ".safetensors", ".json")
+FILES = (".pt", ".ckpt", ".safetensors", ".json")
 """Suffixes of files; a name does not end in one."""
 PIN = "@sha256:"
 """Between a name and the sha256 that its tensors must have."""
+HUB = "hf://"
+ADDRESS = re.compile(
+    r"hf://(?P<repo>[\w.-]+/[\w.-]+)/(?P<file>[\w./-]+\.safetensors)@sha256:(?P<sha256>[0-9a-f]{64})"
+)
 
 
 def folders() -> list[Path]:
@@ -29,7 +34,7 @@ def available() -> dict[str, Path]:
     found: dict[str, Path] = {}
     for folder in reversed(folders()):
         files = folder.glob(f"*{model_file.SUFFIX}")
-        found |= {path.stem: path for path in files if is_name(path.stem)}
+        found |= {path.stem: path for path in files if is_name(path.stem) and path.is_file()}
     return dict(sorted(found.items()))
 
 
@@ -75,8 +80,8 @@ def resolve(given: str | Path) -> Path:
         UserError: there is no file and no model of this name; the nearest names are listed.
     """
     text = str(given)
-    if text.startswith(hub.SCHEME):
-        return hub.fetch(text)
+    if text.startswith(HUB):
+        return fetch(text)
     path = Path(text).expanduser()
     if path.exists():
         return path
@@ -86,3 +91,37 @@ def resolve(given: str | Path) -> Path:
     if path.name != text or text.endswith(FILES):
         return path
     raise UserError(f"no file or model {text!r}.{did_you_mean(text, available())}")
+
+
+def fetch(address: str) -> Path:
+    """Return a file of the Hugging Face Hub, downloaded if it is not in the cache.
+
+    Args:
+        address: ``hf://OWNER/REPO/FILE.safetensors@sha256:HASH``, with the sha256 of the file.
+
+    Raises:
+        UserError: the address has another form, huggingface_hub is not installed, the file cannot
+            be downloaded, or has another hash.
+    """
+    match = ADDRESS.fullmatch(address)
+    if match is None:
+        raise UserError(
+            f"{address}: the address of a model must be "
+            "hf://OWNER/REPO/FILE.safetensors@sha256:HASH. The publisher names the hash "
+            "(sha256sum FILE)."
+        )
+    try:
+        from huggingface_hub import hf_hub_download
+    except ModuleNotFoundError:
+        raise UserError(
+            f"{address} needs huggingface_hub: pip install 'mops-lightning[hub]'."
+        ) from None
+    try:
+        path = Path(hf_hub_download(match["repo"], match["file"]))
+    except Exception as error:  # errors of several HTTP libraries
+        raise UserError(f"{address} cannot be downloaded: {one_line(error)}") from None
+    with path.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if found != match["sha256"]:
+        raise UserError(f"{address}: the downloaded file has another sha256, {found}.")
+    return path

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
@@ -12,11 +11,10 @@ from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import ROWS, MetricName, parse
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.zoo import model_file, names, weights
-from mops_lightning.zoo.packing import pack
 
-PRECISIONS = ("float32", "float16", "bfloat16", "int8")
+PRECISIONS = ("float32", "float16", "bfloat16")
 WIDE = 4096
-"""Weight matrices with this number of entries may be stored in fewer bits."""
+"""Weight matrices with this number of entries may be stored in 16 bits."""
 
 
 def add(
@@ -25,8 +23,7 @@ def add(
     folder: Path,
     *,
     task_net: str | None = None,
-    tested: Path | None = None,
-    precision: str = "float32",
+    half: bool = False,
     licence: str = "MIT",
     notes: str = "",
     overwrite: bool = False,
@@ -38,9 +35,7 @@ def add(
         name: the model's name, such as ``fmops.chairs-m64``.
         folder: where ``NAME.safetensors`` is written.
         task_net: the model of a sampler's task net; None looks for the one that was used.
-        tested: the run whose test figures the card shows; None: ``run``.
-        precision: of weight matrices with at least ``WIDE`` entries, one of ``PRECISIONS``;
-            tensors that are in 16 bits already stay so.
+        half: store weight matrices with at least ``WIDE`` entries in float16.
         licence: of the model.
         notes: what a user must know besides.
         overwrite: replace a model of this name.
@@ -63,39 +58,24 @@ def add(
     if record.status != "completed" or "weights" not in record.files:
         raise UserError(f"{run}: not a completed run that kept its weights. Give another RUN.")
     content = weights.read(weights.of_run(run))
-    state = _stored(content["state"], precision)
+    state = _halved(content["state"]) if half else content["state"]
     files = {"weights": name}
     if record.config["learn"] == "sampler":
         used = _task_net(task_net, record)
         files |= {"task_weights": used} if used else {}
     card = {
+        "schema": model_file.MODEL,
         "name": name,
         "transform": "unit_sphere",
         "licence": licence,
         "precision": _precision(state),
         "notes": notes,
-        "classes": _classes(content.get("classes", []), record),
-        "figures": figures(run_record.read(tested) if tested else record),
+        "classes": _classes(content["classes"], record),
+        "figures": figures(record),
         "record": {**record.plain(), "files": files},
     }
     model_file.write(path, card, state)
     return path
-
-
-def point_to(run: Path, model: Path) -> None:
-    """Let the record in a folder name a model in place of its own weights files.
-
-    Args:
-        run: the folder of the record, such as one below ``results/``.
-        model: the file of the model.
-    """
-    card = model_file.read_card(model)
-    record = run_record.read(run)
-    record.files["weights"] = names.pinned(card["name"], card["sha256"])
-    task_net = card["record"]["files"].get("task_weights")
-    if task_net:
-        record.files["task_weights"] = task_net
-    run_record.write(run, record)
 
 
 def figures(record: RunRecord) -> dict[str, Any]:
@@ -153,15 +133,11 @@ def _classes(own: list[str], record: RunRecord) -> list[str]:
     return list(record.class_names or [])
 
 
-def _stored(state: dict[str, Tensor], precision: str) -> dict[str, Tensor]:
-    found: dict[str, Tensor] = {}
-    for name, value in state.items():
-        wide = value.ndim == 2 and value.numel() >= WIDE and value.dtype == torch.float32
-        if wide and precision == "int8":
-            found |= pack(name, value)
-        else:
-            found[name] = (value.to(getattr(torch, precision)) if wide else value).contiguous()
-    return found
+def _halved(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {
+        name: value.half() if value.ndim == 2 and value.numel() >= WIDE else value
+        for name, value in state.items()
+    }
 
 
 def _precision(state: dict[str, Tensor]) -> str:

@@ -1,7 +1,6 @@
-"""Weights files: plain tensors and plain data, checked when read."""
+"""Weights of runs and models: saved, read and loaded into modules, strictly."""
 
 import io
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,16 +11,13 @@ from torch import Tensor, nn
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.records import run_record
-from mops_lightning.zoo import bounds, model_file, names
-from mops_lightning.zoo.digest import digest
+from mops_lightning.zoo import model_file, names
+from mops_lightning.zoo.model_file import Damaged as Damaged
+from mops_lightning.zoo.model_file import damaged
+from mops_lightning.zoo.model_file import digest as digest
 
-SCHEMA = "mops_lightning/weights/1"
-FILE = "weights.pt"
+FILE = f"weights{model_file.SUFFIX}"
 OTHER_NET = "Check task, task/net and dataset.classes, or use weights=auto."
-
-
-class Damaged(UserError):
-    """A file of this program that cannot be used any more, or a file of another program."""
 
 
 def save(
@@ -40,16 +36,21 @@ def save(
         metrics: test metrics by name.
         classes: class names in the order of the outputs of a classifier.
     """
-    state = {name: value.detach().cpu().contiguous() for name, value in module.state_dict().items()}
-    content = {
-        "schema": SCHEMA,
+    header = {
+        "schema": model_file.WEIGHTS,
         "config": config,
         "metrics": metrics,
         "classes": list(classes),
-        "sha256": digest(state),
-        "state": state,
     }
-    write_plain(path, content)
+    model_file.write(path, header, plain_state(module))
+
+
+def plain_state(module: nn.Module) -> dict[str, Tensor]:
+    """Return copies of a module's tensors by name, contiguous and on the CPU."""
+    return {
+        name: value.detach().cpu().clone(memory_format=torch.contiguous_format)
+        for name, value in module.state_dict().items()
+    }
 
 
 def write_plain(path: str | Path, content: dict[str, Any]) -> None:
@@ -71,31 +72,15 @@ def read(path: str | Path) -> dict[str, Any]:
         path: a weights file, or what ``names.resolve`` takes.
 
     Returns:
-        The content as saved: ``config``, ``metrics``, ``classes``, ``sha256`` and ``state``.
+        ``config``, ``metrics``, ``classes``, ``sha256``, and ``state``, the tensors by name.
 
     Raises:
         UserError: the file is missing.
         Damaged: it is damaged or not a weights file, or its tensors are not finite.
     """
     path = names.resolve(path)
-    if not path.is_file():
-        raise UserError(f"no file {path}. Give a weights.pt, the folder of its run, or a model.")
-    if path.suffix == model_file.SUFFIX:
-        content = model_file.read(path)
-        check_state(content["state"], path)
-        return content
-    content = read_plain(path, "a weights file")
-    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        raise Damaged(
-            f"{path} is not a weights file of mops_lightning. "
-            "Lightning checkpoints are for ckpt_path; weights.pt is in the run's folder."
-        )
-    content = {"config": {}, "metrics": {}, "classes": [], "sha256": None, **content}
-    check_state(content.get("state"), path)
-    if digest(content["state"]) != content["sha256"]:
-        raise Damaged(f"{path} is damaged (sha256 differs). Delete it and run again.")
-    if not _is_plain(content["config"], dict) or not _is_plain(content["classes"], list):
-        raise Damaged(f"{path} is damaged (config or classes). Delete it and run again.")
+    content = model_file.read(path)
+    check_state(content["state"], path)
     return content
 
 
@@ -107,28 +92,21 @@ def check_state(state: Any, path: str | Path) -> None:
         path: the file, for the error.
 
     Raises:
-        Damaged: it is not one, or a tensor contains NaN or infinity.
+        Damaged: it is not a ``state_dict``, or a tensor is quantised, NaN or infinite.
     """
     if not isinstance(state, dict) or not all(
-        isinstance(name, str)
-        and isinstance(value, Tensor)
-        and value.layout == torch.strided
-        # of 8 bits: torch cannot test these for NaN
-        and not (value.is_floating_point() and value.element_size() == 1)
+        isinstance(name, str) and isinstance(value, Tensor) and value.layout == torch.strided
         for name, value in state.items()
     ):
-        raise Damaged(f"{path} is damaged (no tensors by name). Delete it and run again.")
+        raise damaged(path, "no tensors by name")
+    for name, value in state.items():
+        if value.element_size() == 1 and value.dtype != torch.bool:
+            raise Damaged(
+                f"{path}: {name} is quantised to 8 bits ({value.dtype}). Give weights in 16 or 32 "
+                "bits."
+            )
     if name := first_nonfinite(state):
-        raise Damaged(f"{path}: {name} is not finite, because the training diverged. Train again.")
-
-
-def _is_plain(value: Any, kind: type) -> bool:
-    """Return whether a value of a file is of a kind and holds plain data that JSON can hold."""
-    try:
-        json.dumps(value)
-    except (TypeError, ValueError, RecursionError):
-        return False
-    return isinstance(value, kind)
+        raise damaged(path, f"{name} is not finite, because the training diverged")
 
 
 def read_plain(path: Path, what: str) -> Any:
@@ -143,16 +121,11 @@ def read_plain(path: Path, what: str) -> Any:
         Damaged: it is damaged, or contains more than plain data.
     """
     try:
-        bounds.check_archive(path)
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        bounds.check_content(content, path)
-        return content
+        return torch.load(path, map_location="cpu", weights_only=True)
     except PermissionError:
         raise UserError(f"{path} may not be read. Check its permissions.") from None
     except Exception:  # torch's messages advise to execute the file's code
-        raise Damaged(
-            f"{path} is damaged or not a file of this program (expected {what})."
-        ) from None
+        raise damaged(path, f"expected {what}") from None
 
 
 def of_run(run: Path, kind: str = "weights") -> Path:
@@ -164,7 +137,8 @@ def of_run(run: Path, kind: str = "weights") -> Path:
         kind: ``weights``, of what was trained, or ``task_weights``, of the task net.
 
     Returns:
-        Without a record, or if the record names no file: ``weights.pt`` or ``task_weights.pt``.
+        Without a record, or if the record names no file: ``weights.safetensors`` or
+        ``task_weights.safetensors``.
 
     Raises:
         UserError: the folder contains a ``result.json`` that is not a run record, or the model that
@@ -177,9 +151,26 @@ def of_run(run: Path, kind: str = "weights") -> Path:
     else:
         has_record = (run / run_record.FILE).is_file()
         files = run_record.read(run).files if has_record else {}
-    named = files.get(kind, f"{kind}.pt")
+    named = files.get(kind, f"{kind}{model_file.SUFFIX}")
     path = run / named
     return path if path.exists() else names.find(named) or path
+
+
+def of_task_net(given: str | Path) -> Path:
+    """Return the file of a task net: that of a run's folder; any other path is the file.
+
+    Args:
+        given: what ``names.resolve`` takes, or the folder of a run that trained a task net, alone
+            or with a sampler.
+
+    Raises:
+        UserError: there is no file and no model of this name, or the folder's record is damaged.
+    """
+    path = names.resolve(given)
+    if not path.is_dir():
+        return path
+    joint = of_run(path, "task_weights")
+    return joint if joint.is_file() else of_run(path)
 
 
 def load_into(module: nn.Module, path: str | Path) -> dict[str, Any]:

@@ -36,15 +36,15 @@ def test_evaluate_without_changes_repeats_metrics(trained, tmp_path):
     assert again.task_weights_sha256 == record.task_weights_sha256
     assert "fit" not in again.seconds
     assert again.config["learn"] == "nothing"
-    assert not (tmp_path / "new" / "weights.pt").exists()
+    assert not (tmp_path / "new" / "weights.safetensors").exists()
 
 
 def test_evaluate_follows_weights_path_of_record(trained, tmp_path):
     folder, record = trained
     (tmp_path / "kept").mkdir()
     (tmp_path / "run").mkdir()
-    shutil.copy(folder / "weights.pt", tmp_path / "kept" / "sampler.pt")
-    (cached,) = (folder.parent / "cache" / "weights").rglob("weights.pt")
+    shutil.copy(folder / "weights.safetensors", tmp_path / "kept" / "sampler.pt")
+    (cached,) = (folder.parent / "cache" / "weights").rglob("weights.safetensors")
     shutil.copy(cached, tmp_path / "kept" / "net.pt")
     files = {"weights": "../kept/sampler.pt", "task_weights": "../kept/net.pt"}
     run_record.write(tmp_path / "run", replace(record, files=files))
@@ -150,7 +150,7 @@ def test_evaluate_threshold_changes_generated_points(trained, tmp_path):
 def test_evaluate_another_task_net(trained, tmp_path):
     overrides = [*TINY, "learn=task", "seed=5", "dataset.seed=0"]
     run(compose(overrides), tmp_path / "task", overrides)
-    record = evaluated(trained, tmp_path, f"weights={tmp_path}/task/weights.pt")
+    record = evaluated(trained, tmp_path, f"weights={tmp_path}/task/weights.safetensors")
     ours = trained[1].task_weights_sha256
     assert record.task_weights_sha256 not in (None, ours)
 
@@ -182,7 +182,7 @@ def test_evaluate_mismatch_raises(trained, tmp_path, argument, named):
 def test_task_net_other_classes_raises(tmp_path):
     overrides = [*TINY, "learn=task"]
     run(compose(overrides), tmp_path / "task", overrides)
-    swapped = [*TINY, "sampler=fps", f"weights={tmp_path}/task/weights.pt"]
+    swapped = [*TINY, "sampler=fps", f"weights={tmp_path}/task/weights.safetensors"]
     swapped.append("dataset.classes=[vase,chair,bed]")
     with pytest.raises(UserError, match="classes, which are not the"):
         run(compose(swapped), tmp_path / "new", swapped)
@@ -216,7 +216,7 @@ def test_evaluate_task_net_on_other_data(tmp_path):
     again = evaluated(folder, tmp_path / "same")
     assert again.metrics == made.metrics
     assert "fit" not in again.seconds
-    assert not (tmp_path / "same" / "new" / "weights.pt").exists()
+    assert not (tmp_path / "same" / "new" / "weights.safetensors").exists()
     more = evaluated(folder, tmp_path / "more", "dataset.n_points=90", "test_noise_std=0.01")
     assert more.config["task"]["net"]["n_points"] == 90
     assert more.score != made.score

@@ -27,7 +27,7 @@ def write_run(folder, overrides=OVERRIDES, changes=None, more=()):
         for key in nodes:
             node = node[key]
         node[name] = value
-    made = record(config, overrides=[*overrides, *more], files={"weights": "weights.pt"})
+    made = record(config, overrides=[*overrides, *more], files={"weights": "weights.safetensors"})
     (folder / "result.json").write_text(json.dumps(made.plain()))
     return folder
 

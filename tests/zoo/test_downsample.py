@@ -5,14 +5,15 @@ import torch
 from mops_lightning import downsample, load
 from mops_lightning.errors import UserError
 from mops_lightning.files.options import METHODS
-from mops_lightning.zoo import methods, publish
+from mops_lightning.zoo import downsample as module
+from mops_lightning.zoo import publish
 from tests.support.models import write_run
 
 CLOUD = torch.rand(100, 3, generator=torch.Generator().manual_seed(0)) * 7
 
 
 def test_methods_are_those_of_the_command():
-    assert set(methods.UNTRAINED) == set(METHODS)
+    assert set(module.UNTRAINED) == set(METHODS)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -58,7 +59,7 @@ def test_file_run_and_changed_file_are_loaded(tmp_path):
     [
         ("fpss", {}, "method: unknown 'fpss'. Did you mean 'fps'"),
         ("fmops.modelnet", {}, "Did you mean 'fmops.modelnet40-m512'"),
-        ("nowhere/weights.pt", {}, "method: unknown"),
+        ("nowhere/weights.safetensors", {}, "method: unknown"),
         ("pointnet.modelnet40", {}, "holds a task net"),
         ("random", {"start": 1}, "start is for method='fps'"),
         ("fps", {"start": 100}, "start must be less than the number of points N=100"),

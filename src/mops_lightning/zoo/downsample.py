@@ -13,7 +13,7 @@ from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.poisson import PoissonSampler
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.voxel import VoxelSampler
-from mops_lightning.zoo import hub, names, weights
+from mops_lightning.zoo import names, weights
 from mops_lightning.zoo.load import load
 
 UNTRAINED: dict[str, Callable[..., Sampler]] = {
@@ -93,7 +93,7 @@ def sampler_of(
         return untrained(str(method), m, seed, **({} if start is None else {"start": start}))
     known = {*UNTRAINED, *names.available()}
     text = str(method)
-    if text.startswith(hub.SCHEME) or text in known:
+    if text.startswith(names.HUB) or text in known:
         path = names.resolve(text)
     else:
         path = Path(text).expanduser()

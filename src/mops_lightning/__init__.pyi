@@ -1,0 +1,28 @@
+# The public API, and the samplers that weights files may name (zoo/load.py).
+
+from .ops.chamfer import chamfer_distance as chamfer_distance
+from .ops.emd import earth_movers_distance as earth_movers_distance
+from .ops.fps import farthest_point_sample as farthest_point_sample
+from .ops.nearest import nearest as nearest
+from .ops.readout import complete as complete
+from .ops.readout import match as match
+from .ops.sampling_matrix import SamplingMatrix as SamplingMatrix
+from .samplers.base import Sampler as Sampler
+from .samplers.critical_points import CriticalSampler as CriticalSampler
+from .samplers.fmops import FMOPSNet as FMOPSNet
+from .samplers.fps import FPSSampler as FPSSampler
+from .samplers.gumbel import GumbelSampler as GumbelSampler
+from .samplers.mops import MOPSNet as MOPSNet
+from .samplers.poisson import PoissonSampler as PoissonSampler
+from .samplers.random import RandomSampler as RandomSampler
+from .samplers.samplenet import ProgressiveSampleNet as ProgressiveSampleNet
+from .samplers.samplenet import SampleNet as SampleNet
+from .samplers.snet import ProgressiveSNet as ProgressiveSNet
+from .samplers.snet import SNet as SNet
+from .samplers.submodular import SubmodularSampler as SubmodularSampler
+from .samplers.voxel import VoxelSampler as VoxelSampler
+from .types import SampleOutput as SampleOutput
+from .zoo.downsample import downsample as downsample
+from .zoo.load import load as load
+
+__all__: list[str]
