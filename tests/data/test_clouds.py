@@ -18,7 +18,7 @@ def test_choose_classes_keeps_order_of_dataset(classes, chosen):
 @pytest.mark.parametrize(
     ("classes", "message"),
     [
-        ("chair", r"^classes must be a list, such as \[chair\], got 'chair'"),
+        ("chair", r"^classes must be a list of names, such as \[chair\], got 'chair'"),
         (["chiar"], r"^classes: unknown class 'chiar'.*chair"),
     ],
 )

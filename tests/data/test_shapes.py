@@ -15,9 +15,8 @@ from trimesh import Trimesh
 
 from mops_lightning.data import shapes as source
 from mops_lightning.data.clouds import CloudDataset, Clouds
-from mops_lightning.data.procedural.builders import BUILDERS
 from mops_lightning.data.procedural.mesh_parts import join, turned
-from mops_lightning.data.shapes import shapes
+from mops_lightning.data.shapes import BUILDERS, shapes
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
 
@@ -298,3 +297,13 @@ def test_shapes_progress_on_terminal_is_erased(monkeypatch: pytest.MonkeyPatch) 
     os.close(ours)
     assert "Making shapes" in shown
     assert "\x1b[2K" in shown.split("Making shapes")[-1]  # the line is erased at the end
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_builder_gives_valid_meshes(name: str) -> None:
+    for seed in range(12):
+        mesh = BUILDERS[name](np.random.default_rng(seed))
+        assert np.isfinite(mesh.vertices).all()
+        assert mesh.faces.max() < len(mesh.vertices)
+        assert (mesh.extents > 0.1).all()
+        assert mesh.extents.max() < 4

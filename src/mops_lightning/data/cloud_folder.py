@@ -4,6 +4,7 @@ import hashlib
 import sys
 import zlib
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NamedTuple
 
@@ -14,7 +15,7 @@ from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
-from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
+from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, make_dataset
 from mops_lightning.data.crops import Crop, check_crop, random_crops
 from mops_lightning.data.file_splits import (
     SPLITS,
@@ -27,7 +28,6 @@ from mops_lightning.data.file_splits import (
 )
 from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
 from mops_lightning.data.formats.registry import READABLE, read
-from mops_lightning.data.hdf5 import choose_and_fingerprint
 from mops_lightning.data.surfaces import VERSION, sample_surface
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import remove_temporary
@@ -139,8 +139,7 @@ def cloud_folder(
     clouds = _splits(folder, names, sources, splits, chosen)
     notes = _notes(folder, names, splits, chosen, left_out)
     if crop != "surface":
-        found = choose_and_fingerprint("clouds", clouds, chosen, None, folder)
-        return CloudDataset(chosen, found.train, found.test, found.fingerprint, notes)
+        return replace(make_dataset("clouds", clouds, chosen, None, folder), notes=notes)
     digest = hashlib.sha256(repr(("meshes", VERSION, n_points, seed, chosen)).encode())
     for path, split, source in zip(names, splits, sources, strict=True):
         digest.update(repr((split, str(path), source.digest)).encode())

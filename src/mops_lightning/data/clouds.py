@@ -1,7 +1,9 @@
 """Data sets in memory: a training and a test split of clouds."""
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -47,7 +49,7 @@ class CloudDataset:
         test: the test split; all clouds are scored.
         fingerprint: sha256 of everything that determines the content; part of the cache key of task
             nets.
-        notes: facts for the run record, such as the number of skipped meshes.
+        notes: facts for the run record, such as the number of files.
     """
 
     class_names: tuple[str, ...]
@@ -65,12 +67,16 @@ def choose_classes(classes: Sequence[str] | None, known: Sequence[str]) -> tuple
         known: all classes of the dataset.
 
     Raises:
-        UserError: a class is unknown.
+        UserError: a class is unknown, or ``classes`` is no list of names.
     """
-    if isinstance(classes, str):
-        raise UserError(f"classes must be a list, such as [{classes}], got {classes!r}.")
     if not classes:
         return tuple(known)
+    if (
+        isinstance(classes, str)
+        or not isinstance(classes, Sequence)
+        or not all(isinstance(name, str) for name in classes)
+    ):
+        raise UserError(f"classes must be a list of names, such as [{known[0]}], got {classes!r}.")
     for name in classes:
         if name not in known:
             raise UserError(f"classes: unknown class {name!r}.{did_you_mean(name, known)}")
@@ -94,6 +100,45 @@ def select_classes(clouds: Clouds, known: Sequence[str], chosen: Sequence[str]) 
     labels = table[clouds.labels]
     keep = labels >= 0
     return clouds.take(keep)._replace(labels=labels[keep])
+
+
+def make_dataset(
+    kind: str,
+    splits: Mapping[str, Clouds],
+    known: Sequence[str],
+    classes: Sequence[str] | None,
+    folder: Path,
+    files: Mapping[str, Sequence[str]] | None = None,
+) -> CloudDataset:
+    """Keep the chosen classes of both splits and compute the fingerprint of the result.
+
+    Args:
+        kind: name of the data set, part of the fingerprint.
+        splits: ``train`` and ``test``; labels are positions in ``known``.
+        known: all classes.
+        classes: names to keep; None or empty means all.
+        folder: source of the files, for errors.
+        files: names of the files of every split, part of the fingerprint; None leaves them out.
+
+    Raises:
+        UserError: a class is unknown, or a split has no shapes.
+    """
+    chosen = choose_classes(classes, known)
+    n_points = splits["train"].points.shape[1]
+    digest = hashlib.sha256(repr((kind, n_points, chosen)).encode())
+    kept = []
+    for split, every_class in splits.items():
+        clouds = every_class
+        if len(chosen) < len(known):
+            clouds = select_classes(every_class, known, chosen)
+        if not len(clouds.labels):
+            raise UserError(f"classes: {folder} has no {split} shape of {', '.join(chosen)}.")
+        names = [] if files is None else [list(files[split])]
+        digest.update(repr((split, *names, tuple(clouds.points.shape))).encode())
+        digest.update(clouds.points.numpy().data)
+        digest.update(clouds.labels.numpy().data)
+        kept.append(clouds)
+    return CloudDataset(chosen, kept[0], kept[1], digest.hexdigest())
 
 
 def noisy(clouds: Clouds, noise: float) -> Clouds:

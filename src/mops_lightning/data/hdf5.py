@@ -1,6 +1,5 @@
 """Clouds in HDF5 files: ``data`` (S, N, 3) and ``label`` (S,)."""
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,7 +7,7 @@ import h5py
 import numpy as np
 import torch
 
-from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, select_classes
+from mops_lightning.data.clouds import CloudDataset, Clouds, make_dataset
 from mops_lightning.errors import UserError, one_line
 from mops_lightning.filesystem import memory
 
@@ -49,41 +48,7 @@ def hdf5(
     if known is None:
         highest = max(int(clouds.labels.max()) for clouds in splits.values() if len(clouds.labels))
         known = [f"class_{label}" for label in range(highest + 1)]
-    return choose_and_fingerprint("hdf5", splits, known, classes, folder)
-
-
-def choose_and_fingerprint(
-    kind: str,
-    splits: dict[str, Clouds],
-    known: Sequence[str],
-    classes: Sequence[str] | None,
-    folder: Path,
-) -> CloudDataset:
-    """Keep the chosen classes of both splits and compute the fingerprint of the result.
-
-    Args:
-        kind: name of the dataset, part of the fingerprint.
-        splits: ``train`` and ``test``; labels are positions in ``known``.
-        known: all classes.
-        classes: names to keep; None or empty means all.
-        folder: source of the files, for errors.
-
-    Raises:
-        UserError: a class is unknown, or a split has no shapes.
-    """
-    chosen = choose_classes(classes, known)
-    n_points = splits["train"].points.shape[1]
-    digest = hashlib.sha256(repr((kind, n_points, chosen)).encode())
-    kept = []
-    for split, whole in splits.items():
-        clouds = select_classes(whole, known, chosen) if len(chosen) < len(known) else whole
-        if not len(clouds.labels):
-            raise UserError(f"classes: {folder} has no {split} shape of {', '.join(chosen)}.")
-        digest.update(repr((split, tuple(clouds.points.shape))).encode())
-        digest.update(clouds.points.numpy().data)
-        digest.update(clouds.labels.numpy().data)
-        kept.append(clouds)
-    return CloudDataset(chosen, kept[0], kept[1], digest.hexdigest())
+    return make_dataset("hdf5", splits, known, classes, folder)
 
 
 def read_names(path: Path) -> list[str]:

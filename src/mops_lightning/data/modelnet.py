@@ -1,6 +1,5 @@
 """ModelNet40 in its public HDF5 format, ``modelnet40_ply_hdf5_2048``."""
 
-import hashlib
 import re
 import sys
 import tempfile
@@ -13,7 +12,7 @@ import pooch
 import torch
 from filelock import FileLock
 
-from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, select_classes
+from mops_lightning.data.clouds import CloudDataset, Clouds, make_dataset
 from mops_lightning.data.hdf5 import read_clouds, read_names
 from mops_lightning.errors import UserError, one_line
 from mops_lightning.filesystem import memory
@@ -68,23 +67,15 @@ def modelnet40(
             "Download it (dataset.download=true on the command line), or use another root."
         )
     known = read_names(folder / "shape_names.txt")
-    chosen = choose_classes(classes, known)
-    digest = hashlib.sha256(repr(("modelnet40", n_points, chosen)).encode())
-    splits = []
-    for split in ("train", "test"):
-        files = _files(folder, split)
-        parts = [read_clouds(path, n_points, len(known)) for path in files]
-        whole = Clouds(
+    files = {split: _files(folder, split) for split in ("train", "test")}
+    splits = {}
+    for split, paths in files.items():
+        parts = [read_clouds(path, n_points, len(known)) for path in paths]
+        splits[split] = Clouds(
             torch.cat([part.points for part in parts]), torch.cat([part.labels for part in parts])
         )
-        clouds = select_classes(whole, known, chosen) if len(chosen) < len(known) else whole
-        if not len(clouds.labels):
-            raise UserError(f"classes: {folder} has no {split} shape of {', '.join(chosen)}.")
-        digest.update(repr((split, [f.name for f in files], tuple(clouds.points.shape))).encode())
-        digest.update(clouds.points.numpy().data)
-        digest.update(clouds.labels.numpy().data)
-        splits.append(clouds)
-    return CloudDataset(chosen, splits[0], splits[1], digest.hexdigest())
+    names = {split: [path.name for path in paths] for split, paths in files.items()}
+    return make_dataset("modelnet40", splits, known, classes, folder, names)
 
 
 def _find(root: Path) -> Path | None:

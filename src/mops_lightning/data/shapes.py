@@ -7,22 +7,51 @@ import hashlib
 import json
 import sys
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import torch
 import trimesh
-from numpy.random import SeedSequence
+from numpy.random import Generator, SeedSequence
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
-from mops_lightning.data.procedural.builders import BUILDERS
+from mops_lightning.data.procedural.airplane import airplane
+from mops_lightning.data.procedural.furniture import bed, desk, lamp, shelf, table
+from mops_lightning.data.procedural.seats import chair, sofa, stool
+from mops_lightning.data.procedural.vessels import bottle, bowl, bucket, cup, goblet, teapot, vase
 from mops_lightning.data.surfaces import unit_sphere
 from mops_lightning.errors import UserError
-from mops_lightning.filesystem import atomic_write, remove_temporary
+from mops_lightning.filesystem import atomic_write, load_npz, remove_temporary
+
+BUILDERS: Mapping[str, Callable[[Generator], trimesh.Trimesh]] = MappingProxyType(
+    {
+        builder.__name__: builder
+        for builder in (
+            airplane,
+            bed,
+            bottle,
+            bowl,
+            bucket,
+            chair,
+            cup,
+            desk,
+            goblet,
+            lamp,
+            shelf,
+            sofa,
+            stool,
+            table,
+            teapot,
+            vase,
+        )
+    }
+)
+"""Builders by class name, in the order of the labels; each call draws new proportions."""
 
 GENERATOR_VERSION = 1
 """Part of the fingerprint; increment it with every change of the shapes."""
@@ -73,12 +102,12 @@ def shapes(
     ):
         if not isinstance(value, int) or isinstance(value, bool) or value < minimum:
             raise UserError(f"{name} must be a whole number of at least {minimum}, got {value!r}.")
-    chosen = _chosen(classes)
+    chosen = choose_classes(classes, tuple(BUILDERS))
     counts = (train_per_class, test_per_class)
     fingerprint = _fingerprint(n_points, counts, chosen, seed)
     expected = [(count * len(chosen), n_points, 3) for count in counts]
 
-    path = None if cache is None else _cache_path(cache, fingerprint)
+    path = None if cache is None else Path(cache).expanduser() / f"shapes-{fingerprint[:20]}.npz"
     points = None if path is None else _load(path, expected)
     if points is None:
         points = _generate(expected, counts, chosen, seed)
@@ -89,18 +118,6 @@ def shapes(
         for cloud, count in zip(points, counts, strict=True)
     )
     return CloudDataset(chosen, train, test, fingerprint)
-
-
-def _chosen(classes: Sequence[str] | None) -> tuple[str, ...]:
-    if classes is not None and (
-        isinstance(classes, str)
-        or not isinstance(classes, Sequence)
-        or not all(isinstance(name, str) for name in classes)
-    ):
-        raise UserError(
-            f"classes must be a list of names, got {classes!r}. Allowed: {', '.join(BUILDERS)}."
-        )
-    return choose_classes(classes, tuple(BUILDERS))
 
 
 def _fingerprint(n_points: int, counts: tuple[int, int], chosen: Sequence[str], seed: int) -> str:
@@ -158,41 +175,26 @@ def _cloud(name: str, n_points: int, seed: int, split: int, i: int) -> NDArray[n
     return unit_sphere(cloud @ ((cos, 0, -sin), (0, 1, 0), (sin, 0, cos)))
 
 
-def _cache_path(cache: str | Path, fingerprint: str) -> Path:
-    folder = Path(cache).expanduser()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _unwritable(folder, error) from error
-    return folder / f"shapes-{fingerprint[:20]}.npz"
-
-
 def _load(path: Path, expected: Sequence[tuple[int, int, int]]) -> list[NDArray[np.float32]] | None:
     """Load a cache file; return None if it is missing, damaged or has another shape."""
     try:
-        # Reading verifies the checksums of the arrays.
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            points = [file["train"], file["test"]]
-    except Exception:  # zipfile and numpy raise many types of exception for damaged files
+        arrays = load_npz(path)  # verifies the checksums of the arrays
+    except UserError:
         return None
-    whole = all(
-        cloud.shape == shape and cloud.dtype == np.float32
-        for cloud, shape in zip(points, expected, strict=True)
-    )
-    return points if whole else None
+    points = [arrays[name] for name in ("train", "test") if name in arrays]
+    fits = [(cloud.shape, cloud.dtype) for cloud in points] == [
+        (shape, np.dtype(np.float32)) for shape in expected
+    ]
+    return points if fits else None
 
 
 def _save(path: Path, points: Sequence[NDArray[np.float32]]) -> None:
-    remove_temporary(path.parent, below=False)
     try:
+        remove_temporary(path.parent, below=False)
         with atomic_write(path) as temporary:
             np.savez(temporary, train=points[0], test=points[1])
     except OSError as error:
-        raise _unwritable(path.parent, error) from error
-
-
-def _unwritable(folder: Path, error: OSError) -> UserError:
-    return UserError(
-        f"cache: cannot write to {folder} ({error}). Set it to a writable folder, or to None "
-        "(null on the command line) for no cache."
-    )
+        raise UserError(
+            f"cache: cannot write to {path.parent} ({error}). Set it to a writable folder, or to "
+            "None (null on the command line) for no cache."
+        ) from error
