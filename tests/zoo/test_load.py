@@ -117,8 +117,9 @@ def test_load_model_by_name_or_unknown_name():
 def test_samplers_of_conf_can_all_be_loaded():
     known = {f"{cls.__module__}.{cls.__qualname__}" for cls in samplers()}
     for path in (ROOT / "conf" / "sampler").glob("*.yaml"):
-        node: Any = OmegaConf.load(path)
-        assert node.get("sampler", node)["_target_"] in known, path
+        if path.stem != "own":  # names no class
+            node: Any = OmegaConf.load(path)
+            assert node.get("sampler", node)["_target_"] in known, path
 
 
 class Scaled(Sampler):
