@@ -1,9 +1,15 @@
+import os
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
 import h5py
 import numpy as np
 import pytest
 import torch
 
-from mops_lightning.data.hdf5 import hdf5
+from mops_lightning.data.hdf5 import hdf5, read_clouds
 from mops_lightning.errors import UserError
 
 
@@ -108,3 +114,68 @@ def test_hdf5_real_data(real_data):
     assert data.train.points.shape == (626, 10_000, 3)
     assert data.test.points.shape == (100, 10_000, 3)
     assert data.test.points.norm(dim=2).max() < 1.001
+
+
+def write_file(path: Path, **datasets: Any) -> None:
+    with h5py.File(path, "w") as file:
+        for key, value in datasets.items():
+            file.create_dataset(key, data=value)
+
+
+def set_item(path: Path, key: str, place: Any, value: float) -> None:
+    with h5py.File(path, "r+") as file:
+        file[key][place] = value
+
+
+shaped = partial(np.zeros, dtype=np.float32)
+label = np.zeros((2, 1), dtype=np.uint8)
+DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "cut off": (lambda p: os.truncate(p, p.stat().st_size // 2), "damaged or not an HDF5 file"),
+    "empty": (lambda p: os.truncate(p, 0), "damaged or not an HDF5 file"),
+    "text": (lambda p: p.write_text("<html>Not found</html>"), "damaged or not an HDF5 file"),
+    "no data": (
+        lambda p: write_file(p, label=label),
+        r"no dataset 'data'; it contains \['label'\]",
+    ),
+    "no label": (lambda p: write_file(p, data=shaped((2, 12, 3))), "no dataset 'label'"),
+    "flat": (lambda p: write_file(p, data=shaped((2, 36)), label=label), r"got \(2, 36\)"),
+    "scalar": (lambda p: write_file(p, data=1.0, label=label), r"got \(\)"),
+    "2-D": (lambda p: write_file(p, data=shaped((2, 12, 2)), label=label), r"\(2, 12, 2\)"),
+    "counts": (lambda p: write_file(p, data=shaped((3, 12, 3)), label=label), r"and \(2, 1\)"),
+    "integers": (lambda p: write_file(p, data=np.ones((2, 12, 3), int), label=label), "int64"),
+    "words": (lambda p: write_file(p, data=shaped((2, 12, 3)), label=[b"a", b"b"]), "of integers"),
+    "class 3": (
+        lambda p: set_item(p, "label", 2, 3),
+        "labels from 0 to 2, .* lists 3 classes, got 0 to 3",
+    ),
+    "NaN": (lambda p: set_item(p, "data", (1, 2, 0), np.nan), "NaN or infinite"),
+    "overflow": (
+        lambda p: write_file(p, data=np.full((2, 12, 3), 1e300), label=label),
+        "NaN or infinite",
+    ),
+    "missing": (lambda p: p.unlink(), "is missing"),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGES)
+def test_read_clouds_damaged_file_raises(tmp_path: Path, kind: str) -> None:
+    damage, message = DAMAGES[kind]
+    path = tmp_path / "train.h5"
+    write_file(path, data=shaped((3, 12, 3)), label=np.zeros((3, 1), np.uint8))
+    damage(path)
+    with pytest.raises(UserError, match=rf"(?s)train\.h5.*{message}"):
+        read_clouds(path, 4, 3)
+
+
+def test_read_clouds_corrupted_file_raises(tmp_path: Path) -> None:
+    path = tmp_path / "train.h5"
+    with h5py.File(path, "w") as file:
+        data = np.random.default_rng(0).random((50, 12, 3))
+        file.create_dataset("data", data=data, compression="gzip", fletcher32=True)
+        file.create_dataset("label", data=np.zeros(50, dtype=np.uint8))
+        offset = file["data"].id.get_chunk_info(0).byte_offset
+    content = bytearray(path.read_bytes())
+    content[offset + 100] ^= 0xFF
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=r"train\.h5 is damaged or not an HDF5 file"):
+        read_clouds(path, 4, 3)

@@ -139,60 +139,10 @@ def test_modelnet_missing_folder_raises(tmp_path: Path) -> None:
         assert words in str(caught.value)
 
 
-def set_item(path: Path, key: str, place: Any, value: float) -> None:
-    with h5py.File(path, "r+") as file:
-        file[key][place] = value
-
-
-shaped = partial(np.zeros, dtype=np.float32)
-label = np.zeros((2, 1), dtype=np.uint8)
-DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "cut off": (lambda p: os.truncate(p, p.stat().st_size // 2), "damaged or not an HDF5 file"),
-    "empty": (lambda p: os.truncate(p, 0), "damaged or not an HDF5 file"),
-    "text": (lambda p: p.write_text("<html>Not found</html>"), "damaged or not an HDF5 file"),
-    "no data": (
-        lambda p: write_file(p, label=label),
-        r"no dataset 'data'; it contains \['label'\]",
-    ),
-    "no label": (lambda p: write_file(p, data=shaped((2, 12, 3))), "no dataset 'label'"),
-    "flat": (lambda p: write_file(p, data=shaped((2, 36)), label=label), r"got \(2, 36\)"),
-    "scalar": (lambda p: write_file(p, data=1.0, label=label), r"got \(\)"),
-    "2-D": (lambda p: write_file(p, data=shaped((2, 12, 2)), label=label), r"\(2, 12, 2\)"),
-    "counts": (lambda p: write_file(p, data=shaped((3, 12, 3)), label=label), r"and \(2, 1\)"),
-    "integers": (lambda p: write_file(p, data=np.ones((2, 12, 3), int), label=label), "int64"),
-    "words": (lambda p: write_file(p, data=shaped((2, 12, 3)), label=[b"a", b"b"]), "of integers"),
-    "class 3": (
-        lambda p: set_item(p, "label", 2, 3),
-        "labels from 0 to 2, .* lists 3 classes, got 0 to 3",
-    ),
-    "NaN": (lambda p: set_item(p, "data", (1, 2, 0), np.nan), "NaN or infinite"),
-    "overflow": (
-        lambda p: write_file(p, data=np.full((2, 12, 3), 1e300), label=label),
-        "NaN or infinite",
-    ),
-    "missing": (lambda p: p.unlink(), "is missing"),
-}
-
-
-@pytest.mark.parametrize("kind", DAMAGES)
-def test_modelnet_damaged_file_raises(layout: Path, kind: str) -> None:
-    damage, message = DAMAGES[kind]
+@pytest.mark.parametrize("damage", [os.unlink, lambda path: os.truncate(path, 0)])
+def test_modelnet_damaged_file_raises(layout: Path, damage: Callable[[Path], Any]) -> None:
     damage(layout / "ply_data_train2.h5")
-    with pytest.raises(UserError, match=rf"(?s)ply_data_train2\.h5.*{message}"):
-        modelnet40(layout, n_points=4)
-
-
-def test_modelnet_corrupted_file_raises(layout: Path) -> None:
-    path = layout / "ply_data_test0.h5"
-    with h5py.File(path, "w") as file:
-        data = np.random.default_rng(0).random((50, STORED, 3))
-        file.create_dataset("data", data=data, compression="gzip", fletcher32=True)
-        file.create_dataset("label", data=np.zeros(50, dtype=np.uint8))
-        offset = file["data"].id.get_chunk_info(0).byte_offset
-    content = bytearray(path.read_bytes())
-    content[offset + 100] ^= 0xFF
-    path.write_bytes(content)
-    with pytest.raises(UserError, match=r"ply_data_test0\.h5 is damaged or not an HDF5 file"):
+    with pytest.raises(UserError, match=r"ply_data_train2\.h5 is (missing|damaged)"):
         modelnet40(layout, n_points=4)
 
 
@@ -212,7 +162,7 @@ def test_modelnet_missing_lists_raise(layout: Path) -> None:
 def test_modelnet_class_without_shapes_raises(layout: Path) -> None:
     for number in FILES["test"]:
         path = layout / f"ply_data_test{number}.h5"
-        write_file(path, data=shaped((1, STORED, 3)), label=label[:1])
+        write_file(path, data=np.zeros((1, STORED, 3)), label=np.zeros(1, np.uint8))
     with pytest.raises(UserError, match=r"^classes: .* has no test shape of chair"):
         modelnet40(layout, n_points=4, classes=["chair"])
 

@@ -32,8 +32,8 @@ class Augmentation:
 
     def __post_init__(self) -> None:
         """Check the arguments."""
-        given = (self.jitter, self.jitter_clip)
-        if not all(isinstance(one, int | float) and one >= 0 for one in given):
+        values = (self.jitter, self.jitter_clip)
+        if not all(isinstance(value, int | float) and value >= 0 for value in values):
             raise UserError(
                 "augment: jitter and jitter_clip must be at least 0, "
                 f"got {self.jitter} and {self.jitter_clip}."

@@ -152,8 +152,10 @@ def _files(folder: Path, split: str) -> list[Path]:
     if listing.is_file():
         files = [folder / re.split(r"[/\\]", line)[-1] for line in _lines(listing)]
     else:
-        found = folder.glob(f"ply_data_{split}*.h5")
-        files = sorted(found, key=lambda f: (int(re.sub(r"\D", "", f.stem) or 0), f.name))
+        files = sorted(
+            folder.glob(f"ply_data_{split}*.h5"),
+            key=lambda f: (int(re.sub(r"\D", "", f.stem) or 0), f.name),
+        )
     if not files:
         raise UserError(f"root: no ply_data_{split}*.h5 in {folder}.")
     return files

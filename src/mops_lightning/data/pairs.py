@@ -69,7 +69,7 @@ class Pairs:
         motion = random_motion(ROTATION, TRANSLATION, generators)
         source = target = points
         if self.resample is not None:
-            source, target = (self._drawn(one, generators) for one in (source, target))
+            source, target = (self._drawn(points, generators) for _ in range(2))
         target = motion.apply(target)
         return pair_batch(source, target, motion)
 

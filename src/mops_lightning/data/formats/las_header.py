@@ -104,8 +104,8 @@ def _layers(record: Any) -> int:
     return sum(size if kind == EXTRA_BYTES else LAYERS.get(kind, 0) for kind, size in kinds)
 
 
-def _within(path: Path, what: str, end: int, limit: int) -> None:
+def _within(path: Path, part: str, end: int, limit: int) -> None:
     if end > limit:
         raise BadCloudError(
-            f"{path} is broken: {what} would end at byte {end}, behind the end at {limit}."
+            f"{path} is broken: {part} ends at byte {end}, but must end at byte {limit} at most."
         )
