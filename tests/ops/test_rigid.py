@@ -8,7 +8,6 @@ from mops_lightning.ops.rigid import (
     identity_motion,
     quaternion_conjugate,
     quaternion_from_euler,
-    quaternion_from_matrix,
     quaternion_multiply,
     quaternion_to_matrix,
     random_motion,
@@ -40,13 +39,6 @@ def test_quaternion_to_matrix_equals_scipy():
     given = rotations()
     got = quaternion_to_matrix(quaternions(given))
     torch.testing.assert_close(got, torch.from_numpy(given.as_matrix()), atol=1e-12, rtol=0)
-
-
-def test_quaternion_from_matrix_equals_scipy():
-    given = rotations()
-    got = quaternion_from_matrix(torch.from_numpy(given.as_matrix()))
-    same_rotation(got, quaternions(given), 1e-8)
-    assert (got[:, 0] >= 0).all()
 
 
 def test_multiply_and_conjugate_equal_scipy():
@@ -82,14 +74,11 @@ def test_rotation_angle_is_independent_of_sign_and_norm():
     torch.testing.assert_close(rotation_angle(-3 * a, b), rotation_angle(a, b))
 
 
-def test_motion_composition_and_inverse(rng):
+def test_motion_composition_and_identity(rng):
     points = torch.randn(5, 40, 3, generator=rng)
     first, second = motion(1), motion(2)
     torch.testing.assert_close(
         second.after(first).apply(points), second.apply(first.apply(points)), atol=1e-5, rtol=0
-    )
-    torch.testing.assert_close(
-        first.inverse().apply(first.apply(points)), points, atol=1e-5, rtol=0
     )
     still = identity_motion(points)
     torch.testing.assert_close(still.apply(points), points)

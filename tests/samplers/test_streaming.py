@@ -2,11 +2,10 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.readout import match
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.snet import SNet
-from mops_lightning.samplers.streaming import global_part, stream_match, stream_sample, sum_part
+from mops_lightning.samplers.streaming import global_part, stream_sample, sum_part
 
 
 @pytest.mark.parametrize("size", [1, 7, 1000, 5000])
@@ -16,8 +15,6 @@ def test_stream_sample_equals_whole_cloud(trained, size, rng):
         whole = trained(points).points
     streamed = stream_sample(trained, lambda: points[0].split(size))
     torch.testing.assert_close(streamed, whole[0], rtol=0, atol=1e-5)
-    rows = stream_match(streamed, lambda: points[0].split(size))
-    assert torch.equal(rows, match(streamed[None], points)[0])
 
 
 def test_parts_merge_in_any_order(trained, rng):

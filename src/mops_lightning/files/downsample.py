@@ -18,9 +18,9 @@ from mops_lightning.files.engine import Engine, LocalEngine
 from mops_lightning.files.options import Options
 from mops_lightning.files.tiles import sample_by_tiles
 from mops_lightning.files.unit_sphere import largest_distance, sum_of, unit_sphere
-from mops_lightning.ops.readout import complete
+from mops_lightning.ops.readout import select
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.streaming import stream_match, stream_sample
+from mops_lightning.samplers.streaming import stream_sample
 from mops_lightning.zoo.downsample import untrained
 from mops_lightning.zoo.load import load
 
@@ -159,9 +159,5 @@ def _sample_in_sphere(
         generated = output.points[0]
         if not sampler.generates:
             return output.indices[0], generated
-    if readout == "generated":
-        return None, generated
-    rows = stream_match(generated, lambda: list(points.split(PART)))
-    if readout == "completed":
-        rows = complete(rows[None], points[None])[0]
-    return rows, generated
+    rows = select(points[None], generated[None], readout)[1]
+    return None if rows is None else rows[0], generated

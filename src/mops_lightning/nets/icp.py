@@ -2,10 +2,11 @@
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.rigid import Motion, quaternion_from_matrix
+from mops_lightning.ops.rigid import Motion
 
 
 class ICP(nn.Module):
@@ -38,10 +39,9 @@ class ICP(nn.Module):
         """Return the motion from ``(B, M, 3)`` sources to ``(B, M', 3)`` targets."""
         pairs = zip(_numpy(source), _numpy(target), strict=True)
         matrices = torch.from_numpy(np.stack([self._align(a, b) for a, b in pairs]))
-        rotation, translation = matrices[:, :3, :3], matrices[:, :3, 3]
-        return Motion(
-            quaternion_from_matrix(rotation).to(source), translation.contiguous().to(source)
-        )
+        scalar_last = Rotation.from_matrix(matrices[:, :3, :3].numpy()).as_quat(canonical=True)
+        quaternion = torch.from_numpy(scalar_last).roll(1, 1)
+        return Motion(quaternion.to(source), matrices[:, :3, 3].contiguous().to(source))
 
     def _align(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
         from trimesh.registration import icp

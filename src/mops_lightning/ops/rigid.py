@@ -32,12 +32,6 @@ class Motion(NamedTuple):
         moved = self.apply(first.translation[:, None])[:, 0]
         return Motion(quaternion_multiply(self.quaternion, first.quaternion), moved)
 
-    def inverse(self) -> "Motion":
-        """Return the inverse motion."""
-        back = quaternion_conjugate(self.quaternion)
-        turned = Motion(back, torch.zeros_like(self.translation)).apply(self.translation[:, None])
-        return Motion(back, -turned[:, 0])
-
 
 def identity_motion(points: Tensor) -> Motion:
     """Return the identity for every cloud of ``(B, N, 3)`` points."""
@@ -73,34 +67,6 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
         1 - 2 * (x * x + y * y),
     ]
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
-
-
-def quaternion_from_matrix(matrix: Tensor) -> Tensor:
-    """Convert ``(..., 3, 3)`` rotation matrices to ``(..., 4)`` unit quaternions with w ≥ 0.
-
-    Of the four equivalent formulas, the one with the largest divisor is used, for accuracy.
-    """
-    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-    x, y, z = diagonal.unbind(-1)
-    # Four times the square of each component.
-    squares = torch.stack([1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z], -1)
-    minus, plus = matrix - matrix.mT, matrix + matrix.mT
-    wx, wy, wz = minus[..., 2, 1], minus[..., 0, 2], minus[..., 1, 0]
-    xy, xz, yz = plus[..., 0, 1], plus[..., 0, 2], plus[..., 1, 2]
-    s = squares.unbind(-1)
-    # Row i is 4·q_i·(w, x, y, z).
-    candidates = torch.stack(
-        [
-            torch.stack([s[0], wx, wy, wz], -1),
-            torch.stack([wx, s[1], xy, xz], -1),
-            torch.stack([wy, xy, s[2], yz], -1),
-            torch.stack([wz, xz, yz, s[3]], -1),
-        ],
-        -2,
-    )
-    best = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
-    chosen = torch.nn.functional.normalize(candidates.gather(-2, best)[..., 0, :], dim=-1)
-    return torch.where(chosen[..., :1] < 0, -chosen, chosen)
 
 
 def quaternion_from_euler(angles: Tensor) -> Tensor:

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops.attention import Partial, attend
-from mops_lightning.ops.nearest import nearest
 from mops_lightning.samplers.base import Sampler, check_dtype, check_points
 from mops_lightning.samplers.fused import FusedMOPSNet
 
@@ -70,28 +69,6 @@ def sum_part(net: FusedMOPSNet, points: Tensor, global_: Tensor, m: int) -> Part
         Sums for m points, with values ``(m, 3)``.
     """
     return attend(net.queries[:m], net.keys(net.local_features(points), global_), points)
-
-
-def stream_match(generated: Tensor, chunks: Chunks) -> Tensor:
-    """Match generated points to their nearest points of a cloud in chunks, as ``readout.match``.
-
-    Args:
-        generated: ``(m, 3)``.
-        chunks: the cloud, which is read once.
-
-    Returns:
-        ``(m,)`` int64 rows of the cloud, the lowest row in case of ties.
-    """
-    best = torch.full((len(generated),), torch.inf)
-    rows = torch.zeros(len(generated), dtype=torch.int64)
-    start = 0
-    for chunk in chunks():
-        distance, row = (found[0].cpu() for found in nearest(generated[None], chunk[None]))
-        nearer = distance < best
-        rows[nearer] = row[nearer] + start
-        best = torch.minimum(best, distance)
-        start += len(chunk)
-    return rows
 
 
 def _checked(chunks: Chunks, m: int, sampler: Sampler) -> Iterable[Tensor]:

@@ -49,20 +49,14 @@ def load_clouds(path: Path) -> tuple[list[str], dict[str, NDArray[np.float32]]]:
     """
     try:
         arrays = load_npz(path)
-    except UserError as error:
-        raise UserError(f"{path}: cannot read saved clouds: {error}") from None
-    titles = arrays.pop(TITLES, np.zeros(()))
-    clouds = {name: arrays[name] for name in (INPUT, *arrays) if name in arrays}
-    shapes = [a.shape for a in clouds.values() if a.dtype.kind == "f" and a.ndim == 3]
-    right = len(shapes) == len(clouds) > 1 and titles.ndim == 1 and len(titles) > 0
-    if INPUT not in clouds or not right:
-        raise UserError(f"{path}: cannot read saved clouds: arrays of other names or shapes.")
+        titles = [str(title) for title in arrays.pop(TITLES)]
+        clouds = {INPUT: arrays.pop(INPUT), **arrays}
+    except (UserError, KeyError, TypeError, SystemError) as error:  # numpy's, for odd characters
+        raise UserError(f"{path}: cannot read saved clouds: {error}.") from None
     for name, cloud in clouds.items():
-        if len(cloud) != len(titles) or not cloud.shape[1] or cloud.shape[2] != 3:
-            raise UserError(f"{path}: cannot read saved clouds: {name} has shape {cloud.shape}.")
-        if not np.isfinite(cloud).all():
-            raise UserError(f"{path}: cannot read saved clouds: {name} is not finite.")
-    try:
-        return [str(title) for title in titles], clouds
-    except SystemError:  # numpy's, for characters that do not exist
-        raise UserError(f"{path}: cannot read saved clouds: damaged titles.") from None
+        fits = cloud.dtype.kind == "f" and cloud.shape[2:] == (3,) and cloud.shape[1] > 0
+        if not fits or len(cloud) != len(titles) or not np.isfinite(cloud).all():
+            raise UserError(f"{path}: cannot read saved clouds: {name} is damaged.")
+    if len(clouds) < 2 or not titles:
+        raise UserError(f"{path}: cannot read saved clouds: no samples.")
+    return titles, clouds
