@@ -20,7 +20,7 @@ MAX_BYTES = 1_000_000
 IN_MODULES = (
     "mops_lightning.transforms.Downsample",
     "mops_lightning.config.compose.compose",
-    "mops_lightning.training.run.run",
+    "mops_lightning.training.run.run.run",
     "mops_lightning.zoo.publish.add",
     "mops_lightning.zoo.weights.load_into",
 )

@@ -1,6 +1,6 @@
 """What a refused run leaves."""
 
-from mops_lightning.training.run import claim
+from mops_lightning.training.run.run import claim
 from tests.support.command_line import TINY, TINY_ANY_DATA, call
 
 

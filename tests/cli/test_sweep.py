@@ -147,7 +147,7 @@ def test_run_cell_program_error_continues_sweep(start, tmp_path, monkeypatch, ca
     def broken(*_):
         raise RuntimeError("out of something")
 
-    monkeypatch.setattr("mops_lightning.training.run.fit_and_test", broken)
+    monkeypatch.setattr("mops_lightning.training.run.run.train_and_test", broken)
     assert math.isnan(start("sampler=fps", "weights=null"))
     assert (tmp_path / "cell" / FAILED).read_text() == "RuntimeError: out of something\n"
     assert "Traceback" in caplog.text

@@ -17,7 +17,7 @@ from mops_lightning.report.build import build
 from mops_lightning.training.checkpoint import identity
 from mops_lightning.training.evaluation.settings import as_trained, command_line
 from mops_lightning.training.evaluation.trained_run import TrainedRun
-from mops_lightning.training.pretrain import cache_folder
+from mops_lightning.training.run.pretrain import cache_folder
 from tests.support.command_line import TINY, call
 from tests.support.reports import put_cell
 from tests.support.training import small_dataset

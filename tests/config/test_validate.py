@@ -32,7 +32,7 @@ EXTRA = {
     "task/loss=frobenius_chamfer": ["task=registration"],
 }
 CALLER: dict[str, set[str]] = {
-    # Arguments that code gives, not YAML: see training.factory and training.trainer.
+    # Arguments that code gives, not YAML: see training.run.build and training.run.trainer.
     "PointNetVanilla": {"num_classes"},
     "PointNetTransform": {"num_classes"},
     "DGCNN": {"num_classes"},

@@ -23,7 +23,7 @@ from mops_lightning.files.downsample_cli import main as downsample
 from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE
-from mops_lightning.training.run import run
+from mops_lightning.training.run.run import run
 from mops_lightning.zoo import weights
 from tests.support.command_line import TINY
 

@@ -13,7 +13,7 @@ from mops_lightning.samplers.anchors import SPACING_POINTS
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.streaming import stream_sample
-from mops_lightning.training.warm_start import copy_tensors
+from mops_lightning.training.recipe.warm_start import copy_tensors
 from mops_lightning.zoo.export import plain_net
 
 

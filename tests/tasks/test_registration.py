@@ -20,7 +20,7 @@ from mops_lightning.samplers.samplenet import SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.tasks.registration import Registration
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.visualization import cloud_titles
+from mops_lightning.training.run.pictures import cloud_titles
 from tests.support.rigid import motion
 from tests.support.training import changed, quiet_trainer, small_dataset, state
 

@@ -17,10 +17,10 @@ from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import Interrupted
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.classification import Classification
-from mops_lightning.training.averaging import MovingAverage
-from mops_lightning.training.callbacks import StopBetweenSteps, last_checkpoint
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.recipe import Recipe
+from mops_lightning.training.recipe.moving_average import MovingAverage
+from mops_lightning.training.recipe.recipe import Recipe
+from mops_lightning.training.run.callbacks import StopBetweenSteps, last_checkpoint
 from mops_lightning.training.schedules import one_cycle
 from tests.support.training import quiet_trainer, small_dataset
 

@@ -7,7 +7,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.divergence import Diverged, check_checkpoint, check_loss
-from mops_lightning.training.run import run
+from mops_lightning.training.run.run import run
 from mops_lightning.zoo import weights
 from tests.support.command_line import TINY
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from mops_lightning.config.compose import compose
-from mops_lightning.training.run import run
+from mops_lightning.training.run.run import run
 from tests.support.command_line import TINY_WITH_PICTURES, call
 
 NETS = {

@@ -16,8 +16,8 @@ from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.training.evaluation import nets
 from mops_lightning.training.evaluation.settings import as_trained, command_line
 from mops_lightning.training.evaluation.trained_run import TrainedRun
-from mops_lightning.training.factory import make_experiment
-from mops_lightning.training.loaders import score_loader
+from mops_lightning.training.run.build import make_experiment
+from mops_lightning.training.run.loaders import score_loader
 from mops_lightning.zoo import model_file, names
 
 CLOUDS = Path(__file__).parent / "clouds.npz"

@@ -48,7 +48,7 @@ def begin(config: DictConfig, arguments: Sequence[str]) -> None:
         SystemExit: a setting is wrong, or the folder contains a run; one line says so.
     """
     from mops_lightning.training.evaluation.trained_run import TrainedRun
-    from mops_lightning.training.run import checked, claim
+    from mops_lightning.training.run.run import checked, claim
 
     HydraConfig.instance().set_config(config)  # the folder's name is made from it
     cfg = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])

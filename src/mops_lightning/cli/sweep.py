@@ -55,7 +55,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
     Raises:
         Interrupted: the user stopped the sweep.
     """
-    from mops_lightning.training.run import STARTED, run
+    from mops_lightning.training.run.run import STARTED, run
 
     try:
         with _claimed(folder):

@@ -88,7 +88,7 @@ def _run_job(cfg: "DictConfig") -> float | None:
 
     from mops_lightning.cli.sweep import run_cell
     from mops_lightning.config import distributed
-    from mops_lightning.training.run import run
+    from mops_lightning.training.run.run import run
 
     hydra_cfg = HydraConfig.get()
     folder = Path(os.path.relpath(hydra_cfg.runtime.output_dir))

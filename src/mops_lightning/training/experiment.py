@@ -23,10 +23,10 @@ from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
 from mops_lightning.tasks.refinement import Refinement
 from mops_lightning.training.checkpoint import CHECKPOINT_KEY
-from mops_lightning.training.distillation import Distillation, Targets
 from mops_lightning.training.divergence import check_checkpoint, check_loss
 from mops_lightning.training.readouts import readout_names, readouts
-from mops_lightning.training.recipe import Recipe, draw_points, straight_through
+from mops_lightning.training.recipe.distillation import Distillation, FullClouds, Targets
+from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through
 from mops_lightning.training.scores import Scores
 from mops_lightning.types import Batch, SampleOutput
 
@@ -48,6 +48,7 @@ class Experiment(L.LightningModule):
         recipe: how the sampler is trained beyond its own losses; None: by these alone.
         task_lr_scale: with ``learn="joint"`` the task net's learning rate over that of the sampler.
         refine: passes of the refined readout in tests; 0: without this readout.
+        full_clouds: training clouds whose predictions the distillation computes once.
         m: the size that is validated and gives the run's score; None: the sampler's.
 
     Raises:
@@ -69,6 +70,7 @@ class Experiment(L.LightningModule):
         task_lr_scale: float = 1.0,
         recipe: Recipe | None = None,
         refine: int = 0,
+        full_clouds: FullClouds | None = None,
     ) -> None:
         super().__init__()
         _check_learn(learn, task, sampler)
@@ -82,7 +84,9 @@ class Experiment(L.LightningModule):
         self.identity = identity
         self.task_lr_scale = task_lr_scale
         self.recipe = recipe or Recipe()
-        self.distillation = Distillation(task, self.recipe) if learn == "sampler" else None
+        self.distillation: Distillation | None = None
+        if learn == "sampler":
+            self.distillation = Distillation(task, self.recipe, full_clouds)
         self.total_steps = 1
         self.started = False  # whether a checkpoint, if any, was restored
         for module in self._frozen():
@@ -127,11 +131,15 @@ class Experiment(L.LightningModule):
         """Build the optimizer of what learns, and its schedule over all steps of the run."""
         if self.make_optimizer is None:
             raise UserError("This experiment was built without an optimizer: it can only test.")
-        modules = [module for module in (self.sampler, self.task) if module is not None]
-        groups = [[p for p in module.parameters() if p.requires_grad] for module in modules]
-        optimizer = self.make_optimizer([{"params": group} for group in groups if group])
-        if self.learn == "joint":
-            optimizer.param_groups[-1]["lr"] *= self.task_lr_scale
+        groups = []
+        for name, module in (("sampler", self.sampler), ("task", self.task)):
+            learned = [p for p in module.parameters() if p.requires_grad] if module else []
+            if learned:
+                groups.append({"params": learned, "name": name})
+        optimizer = self.make_optimizer(groups)
+        for group in optimizer.param_groups:
+            if self.learn == "joint" and group["name"] == "task":
+                group["lr"] *= self.task_lr_scale
         self.total_steps = int(self.trainer.estimated_stepping_batches)
         if self.make_schedule is None:
             return optimizer
@@ -155,6 +163,8 @@ class Experiment(L.LightningModule):
         epochs: Any = self.trainer.fit_loop.epoch_progress.current
         if epochs.processed == epochs.ready:
             self.trainer.fit_loop.reset_restart_stage()
+        if self.distillation is not None:
+            self.distillation.start(self.device)
         loader: Any = self.trainer.train_dataloader
         if hasattr(loader, "load_state_dict"):
             begun = self.trainer.fit_loop.epoch_loop.batch_progress.current.ready

@@ -8,7 +8,7 @@ from mops_lightning.losses.registration import quaternion_loss
 from mops_lightning.nets.icp import ICP
 from mops_lightning.seeding import generator
 from mops_lightning.tasks.registration import Registration
-from mops_lightning.training.loaders import (
+from mops_lightning.training.run.loaders import (
     augmentation,
     clouds_to_draw,
     held_out_mask,

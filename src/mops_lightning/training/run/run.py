@@ -13,12 +13,11 @@ from mops_lightning.data.clouds import CloudDataset, noisy
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import closing_lines
-from mops_lightning.training import pretrain
 from mops_lightning.training.evaluation.settings import as_trained
 from mops_lightning.training.evaluation.trained_run import TrainedRun
-from mops_lightning.training.job import prepare
-from mops_lightning.training.recording import recorded
-from mops_lightning.training.stages import fit_and_test
+from mops_lightning.training.run import pretrain, stages
+from mops_lightning.training.run.build import Parts, build_parts
+from mops_lightning.training.run.recording import recorded
 
 STARTED = ".started"
 """Empty file in the folder of a run that has begun."""
@@ -27,7 +26,7 @@ STARTED = ".started"
 def run(
     cfg: DictConfig, folder: Path, overrides: list[str] | None = None, claimed: bool = False
 ) -> RunRecord:
-    """Do what a configuration asks for and leave ``result.json`` in ``folder``.
+    """Train and test as a configuration says, and write ``result.json`` into ``folder``.
 
     Args:
         cfg: a composed configuration.
@@ -49,16 +48,41 @@ def run(
     with recorded(cfg, folder, overrides or []) as record:
         with record.timed("data"):
             dataset = _load_data(cfg)
-        job = prepare(cfg, folder, dataset, record, trained)
+        parts = build_parts(cfg, folder, dataset, record, trained)
         task_weights = None
-        if job.has_task_weights:
+        if parts.has_task_weights:
             with record.timed("pretrain"):
-                task_weights = pretrain.task_weights(cfg, dataset)
-        fit_and_test(job, record, task_weights)
-        pretrain.publish(job)
+                task_weights = pretrain.task_weights(cfg, dataset, _train_task_net)
+        train_and_test(parts, record, task_weights)
+        pretrain.publish(parts)
     if leads:
         closing_lines(folder, record)
     return record
+
+
+def _train_task_net(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
+    """Train a task net by the same stages, with a record of its own."""
+    with recorded(cfg, folder, []) as record:
+        train_and_test(build_parts(cfg, folder, dataset, record), record, None)
+
+
+def train_and_test(parts: Parts, record: RunRecord, task_weights: Path | None) -> None:
+    """Load weights, train the learned parts, test and save them.
+
+    Args:
+        parts: of the run.
+        record: is filled.
+        task_weights: a file for the task net; None leaves it as initialised.
+    """
+    stages.load(parts, record, task_weights)
+    if parts.trains:
+        stages.warm_start(parts, record)
+        with record.timed("fit"):
+            stages.fit(parts, record)
+    with record.timed("test"):
+        stages.test(parts, record)
+    if parts.trainer.is_global_zero:
+        stages.save(parts, record)
 
 
 def checked(cfg: DictConfig, trained: TrainedRun | None, overrides: list[str] | None) -> DictConfig:

@@ -17,9 +17,9 @@ from mops_lightning.ops.readout import complete
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.tasks.reconstruction import Reconstruction
-from mops_lightning.training.averaging import MovingAverage
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.recipe import Recipe, draw_points, straight_through
+from mops_lightning.training.recipe.moving_average import MovingAverage
+from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through
 from mops_lightning.types import Batch, SampleOutput
 from tests.support.training import quiet_trainer, small_dataset
 

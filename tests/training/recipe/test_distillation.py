@@ -1,12 +1,36 @@
-"""The table of the task net's predictions for all points, and the file that keeps it."""
+"""Distances between what the task net makes of a sample and of the whole cloud."""
 
+import pytest
 import torch
 
+from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.tasks.classification import Classification
-from mops_lightning.training.full_predictions import full_predictions
+from mops_lightning.training.recipe.distillation import (
+    FullClouds,
+    feature_distance,
+    full_predictions,
+    pooled_features,
+)
 from tests.support.training import small_dataset
+
+
+def test_feature_distance_is_relative_to_the_reference():
+    found = torch.tensor([[1.0, 2.0], [0.0, 3.0]])
+    reference = torch.tensor([[3.0, 4.0], [0.0, 3.0]])
+    assert feature_distance(found, reference) == pytest.approx((8 / 25 + 0) / 2)
+
+
+def test_pooled_features_are_maxima_over_points():
+    net, points = PointNetVanilla(3).eval(), torch.randn(2, 7, 3)
+    torch.testing.assert_close(net.from_pooled(pooled_features(net, points)), net(points))
+
+
+def test_feature_distillation_of_net_without_point_features_raises():
+    with pytest.raises(UserError, match=r"feature_distillation must be 0 .* got Linear"):
+        pooled_features(torch.nn.Linear(3, 3), torch.randn(2, 7, 3))
+
 
 CPU = torch.device("cpu")
 
@@ -17,7 +41,7 @@ def predictions(tmp_path, seed=0, clouds=None):
     clouds = clouds or small_dataset().train
     with torch.no_grad():
         plain = task.net(clouds.points)
-    return full_predictions(task, clouds, 7, tmp_path, CPU), plain
+    return full_predictions(task, FullClouds(clouds, 7, tmp_path), CPU), plain
 
 
 def test_full_predictions_are_those_of_the_net(tmp_path):

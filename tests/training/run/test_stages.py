@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mops_lightning.config.compose import compose
-from mops_lightning.training.run import run
+from mops_lightning.training.run.run import run
 from tests.support.command_line import TINY_ANY_DATA
 from tests.support.recording import FIRST_TEST_CLOUD, numbered_clouds
 
@@ -14,7 +14,6 @@ EPOCHS, TRAIN, HELD_OUT, TEST, BATCH = 3, 16, 4, 10, 4
 SETTINGS = [
     *(one for one in TINY_ANY_DATA if not one.startswith(("trainer.max_epochs", "batch_size"))),
     "task._target_=tests.support.recording.RecordingTask",
-    "~task.net.dropout",
     "task.net._target_=tests.support.recording.Fingerprint",
     "dataset._target_=tests.support.recording.numbered_clouds",
     f"dataset.train_per_class={TRAIN}",

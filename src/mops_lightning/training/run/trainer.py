@@ -18,11 +18,11 @@ from mops_lightning.config.build import accepted, build
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import dotted
-from mops_lightning.training.averaging import MovingAverage
-from mops_lightning.training.callbacks import StopBetweenSteps, build_callbacks
 from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.loaders import clouds_to_draw, score_loader
+from mops_lightning.training.recipe.moving_average import MovingAverage
+from mops_lightning.training.run.callbacks import StopBetweenSteps, build_callbacks
+from mops_lightning.training.run.loaders import clouds_to_draw, score_loader
 from mops_lightning.zoo.weights import write_plain
 
 HARMLESS = (
@@ -68,9 +68,16 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 def make_trainer(
-    cfg: DictConfig, folder: Path, dataset: CloudDataset, experiment: Experiment
+    cfg: DictConfig, folder: Path, dataset: CloudDataset, experiment: Experiment, clouds: int
 ) -> L.Trainer:
     """Build the trainer with this run's callbacks and logger.
+
+    Args:
+        cfg: a composed configuration.
+        folder: the run's folder.
+        dataset: for the pictured clouds.
+        experiment: for its task and recipe.
+        clouds: number of clouds to train on.
 
     Raises:
         UserError: a setting of the trainer, a callback or the logger is wrong, or this machine
@@ -86,20 +93,23 @@ def make_trainer(
     if titles:
         batch = score_loader(dataset.test, cfg.batch_size, task).batch_of(rows)
         offered |= {"batch": batch, "titles": titles}
-    callbacks = build_callbacks(cfg.callbacks, offered, logged=bool(logger))
-    callbacks.append(StopBetweenSteps(folder / "checkpoints" / CHECKPOINT))
-    if experiment.recipe.ema_span:  # before those that save
-        callbacks.insert(0, MovingAverage(experiment.recipe.ema_span))
+    span = experiment.recipe.ema_span
+    callbacks = [
+        *([MovingAverage(span)] if span else []),  # before the callbacks that save
+        *build_callbacks(cfg.callbacks, offered, logged=bool(logger)),
+        StopBetweenSteps(folder / "checkpoints" / CHECKPOINT),
+    ]
     trainer: L.Trainer = build(
         cfg.trainer,
         "trainer",
         logger=logger,
         callbacks=callbacks,
         plugins=[AtomicCheckpointIO()],
-        log_every_n_steps=LOG_EVERY,
         default_root_dir=str(folder),
         num_sanity_val_steps=0,
         enable_model_summary=False,
+        # An epoch of a small data set may be shorter than the logging interval.
+        log_every_n_steps=max(1, min(LOG_EVERY, clouds // cfg.batch_size)),
         enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
     )
     if cfg.trainer.get("precision") == "16-mixed" and trainer.precision != "16-mixed":

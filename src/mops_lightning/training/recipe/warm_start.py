@@ -1,44 +1,46 @@
-"""Starting a sampler with copies of other weights; see ``Recipe.warm_start``."""
+"""Starting a sampler with copies of the task net's layers, or of another sampler's tensors."""
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.layers import PointMLP
-from mops_lightning.records.run_record import RunRecord
-from mops_lightning.training.job import Job
 from mops_lightning.zoo import names, weights
-
-Block = tuple[nn.Linear, nn.BatchNorm1d | None]
 
 CLOUDS = 64
 """Clouds whose statistics BatchNorm takes where the task net has none."""
 
+Block = tuple[nn.Linear, nn.BatchNorm1d | None]
 
-def warm_start(job: Job, record: RunRecord) -> None:
-    """Copy layers to the sampler, unless the run is resumed; print and note which.
+
+def warm_start(
+    source: bool | str, sampler: nn.Module, net: nn.Module, clouds: Tensor
+) -> tuple[dict[str, Any], str]:
+    """Copy layers or tensors to a sampler, as ``recipe.warm_start`` says.
+
+    Args:
+        source: true for the task net's first layers, or a sampler's weights file.
+        sampler: the sampler.
+        net: the task net.
+        clouds: ``(B, N, 3)`` training clouds, for BatchNorm where the task net has none.
+
+    Returns:
+        The numbers for the record, and a sentence about them.
 
     Raises:
-        UserError: ``recipe.warm_start`` names a file that is no sampler's or that fits nowhere.
+        UserError: ``source`` names a file that is no sampler's or that fits nowhere.
     """
-    experiment, given = job.experiment, job.experiment.recipe.warm_start
-    if not given or experiment.sampler is None or job.resumed is not None:
-        return
-    if isinstance(given, str):
-        said = _from_file(given, experiment.sampler, record)
-    else:
-        typical = job.dataset.train.points[:CLOUDS]
-        copied = copy_pointwise_layers(experiment.task.net, experiment.sampler, typical)
-        record.warm_start = {"layers": copied}
-        said = f"the first {copied} layers are copies of {job.cfg.names.net}'s"
-    if job.trainer.is_global_zero:
-        print(f"Warm start: {said}.")
+    if isinstance(source, str):
+        return _from_file(source, sampler)
+    copied = copy_pointwise_layers(net, sampler, clouds[:CLOUDS])
+    return {"layers": copied}, f"the first {copied} layers are copies of the task net's"
 
 
-def _from_file(given: str, sampler: nn.Module, record: RunRecord) -> str:
+def _from_file(given: str, sampler: nn.Module) -> tuple[dict[str, Any], str]:
     try:
         path = names.resolve(given)
         content = weights.read(weights.of_run(path) if path.is_dir() else path)
@@ -55,8 +57,8 @@ def _from_file(given: str, sampler: nn.Module, record: RunRecord) -> str:
             f"recipe.warm_start: no tensor of {given} fits this sampler. Give the weights file of "
             "a sampler of the same kind."
         )
-    record.warm_start = {"sha256": content["sha256"], "tensors": len(copied)}
-    return described(copied, list(sampler.state_dict()), given)
+    numbers = {"sha256": content["sha256"], "tensors": len(copied)}
+    return numbers, described(copied, list(sampler.state_dict()), given)
 
 
 def described(copied: Sequence[str], tensors: Sequence[str], given: str) -> str:
@@ -92,19 +94,19 @@ def copy_pointwise_layers(source: nn.Module, target: nn.Module, points: Tensor) 
         The number of linear layers copied; 0 if a net has no ``PointMLP``.
     """
     rows, copied = points.flatten(0, 1), 0
-    for (theirs, norm), (mine, own_norm) in zip(_blocks(source), _blocks(target), strict=False):
-        same = theirs.weight.shape == mine.weight.shape
+    for (original, norm), (layer, own_norm) in zip(_blocks(source), _blocks(target), strict=False):
+        same = original.weight.shape == layer.weight.shape
         if not same or (norm is not None and own_norm is None):
             break
-        mine.weight.copy_(theirs.weight)
-        if mine.bias is not None and theirs.bias is not None:
-            mine.bias.copy_(theirs.bias)
+        layer.weight.copy_(original.weight)
+        if layer.bias is not None and original.bias is not None:
+            layer.bias.copy_(original.bias)
         if own_norm is not None:
             if norm is not None:
                 own_norm.load_state_dict(norm.state_dict())
             else:
-                _undo(own_norm, mine(rows), theirs.bias)
-        rows = mine(rows)
+                _undo(own_norm, layer(rows), original.bias)
+        rows = layer(rows)
         if own_norm is not None:
             rows = nn.functional.batch_norm(
                 rows, own_norm.running_mean, own_norm.running_var, own_norm.weight, own_norm.bias
@@ -129,15 +131,15 @@ def copy_tensors(source: dict[str, Tensor], target: nn.Module) -> list[str]:
         The names of the tensors that got values.
     """
     copied = []
-    for name, mine in target.state_dict().items():
-        theirs = source.get(name)
-        if theirs is None or theirs.shape[1:] != mine.shape[1:] or theirs.ndim != mine.ndim:
+    for name, tensor in target.state_dict().items():
+        values = source.get(name)
+        if values is None or values.shape[1:] != tensor.shape[1:] or values.ndim != tensor.ndim:
             continue
-        if mine.ndim == 0:
-            mine.copy_(theirs)
+        if tensor.ndim == 0:
+            tensor.copy_(values)
         else:
-            rows = min(len(mine), len(theirs))
-            mine[:rows] = theirs[:rows].to(mine.dtype)
+            rows = min(len(tensor), len(values))
+            tensor[:rows] = values[:rows].to(tensor.dtype)
         copied.append(name)
     return copied
 

@@ -9,7 +9,7 @@ from torch import nn
 
 from mops_lightning.nets.layers import PointFeatures, PointMLP
 from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.training.warm_start import copy_pointwise_layers, copy_tensors, described
+from mops_lightning.training.recipe.warm_start import copy_pointwise_layers, copy_tensors, described
 from mops_lightning.zoo import weights
 from tests.support.command_line import TINY, call
 

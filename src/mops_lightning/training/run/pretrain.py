@@ -3,7 +3,7 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,17 +16,18 @@ from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.filesystem import atomic_write, remove_temporary, set_aside
 from mops_lightning.training import checkpoint
-from mops_lightning.training.callbacks import added
 from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.evaluation.trained_run import OF_RUN
-from mops_lightning.training.job import Job, prepare
-from mops_lightning.training.recording import recorded
-from mops_lightning.training.stages import fit_and_test
+from mops_lightning.training.run.build import Parts
+from mops_lightning.training.run.callbacks import added
 from mops_lightning.zoo import weights
 from mops_lightning.zoo.weights import FILE
 
+Train = Callable[[DictConfig, Path, CloudDataset], None]
+"""All stages of a run in a folder."""
 
-def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
+
+def task_weights(cfg: DictConfig, dataset: CloudDataset, train: Train) -> Path | None:
     """Return the file that ``weights`` names; ``auto`` trains the net when it is not cached.
 
     With ``learn=task``, training starts from the given file; with ``auto`` from scratch.
@@ -58,7 +59,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset) -> Path | None:
                     f"first, {epochs} {'epoch' if epochs == 1 else 'epochs'}. Cache: {folder}",
                     flush=True,
                 )
-                _train(cfg, folder, dataset)
+                _train(cfg, folder, dataset, train)
     return folder / FILE
 
 
@@ -98,27 +99,27 @@ def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
     return Path(cfg.cache).expanduser() / "weights" / name
 
 
-def publish(job: Job) -> None:
+def publish(parts: Parts) -> None:
     """Copy a task net that was trained with ``learn=task`` into the cache, unless one is there.
 
     Not from a run that was resumed with another number of epochs, whose learning rates differed,
     not from one that started from given weights, and not from several devices, each of which has
     BatchNorm statistics of its own share.
     """
-    cfg = job.cfg
-    if cfg.learn != "task" or not job.trains or job.trainer.world_size > 1:
+    cfg = parts.cfg
+    if cfg.learn != "task" or not parts.trains or parts.trainer.world_size > 1:
         return
     if cfg.weights not in (None, "auto"):
         return
-    if job.resumed is not None:
-        planned = checkpoint.planned_epochs(checkpoint.read(job.resumed))
+    if parts.resumed is not None:
+        planned = checkpoint.planned_epochs(checkpoint.read(parts.resumed))
         if planned != cfg.trainer.max_epochs:
             return
-    target = cache_folder(cfg, job.dataset) / FILE
+    target = cache_folder(cfg, parts.dataset) / FILE
     if not _is_good(target):
         remove_temporary(target.parent, below=False)
         with atomic_write(target) as temporary:
-            shutil.copyfile(job.folder / FILE, temporary)
+            shutil.copyfile(parts.folder / FILE, temporary)
 
 
 @contextmanager
@@ -141,7 +142,7 @@ def _locked(folder: Path, net: str) -> Iterator[None]:
         lock.release()
 
 
-def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
+def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset, train: Train) -> None:
     """Train the task net in its cache folder, or resume a training that was interrupted there."""
     own = task_config(cfg)
     if (folder / FILE).exists():
@@ -151,20 +152,14 @@ def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
         own.ckpt_path = str(folder)
     try:
         try:
-            _run(own, folder, dataset)
+            train(own, folder, dataset)
         except weights.Damaged as error:
             if own.ckpt_path is None:
                 raise
             print(f"{error} Renamed to {set_aside(path).name}.", flush=True)
             own.ckpt_path = None
-            _run(own, folder, dataset)
+            train(own, folder, dataset)
     except (KeyboardInterrupt, Interrupted):
         raise Interrupted(
             "The task net was being trained; the same command resumes its training."
         ) from None
-
-
-def _run(own: DictConfig, folder: Path, dataset: CloudDataset) -> None:
-    with recorded(own, folder, []) as record:
-        job = prepare(own, folder, dataset, record)
-        fit_and_test(job, record, None)

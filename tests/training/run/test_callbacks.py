@@ -5,7 +5,7 @@ from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
-from mops_lightning.training.callbacks import (
+from mops_lightning.training.run.callbacks import (
     STANDARD,
     EpochLines,
     added,

@@ -1,14 +1,21 @@
 """Losses that compare what the frozen task net makes of a sample and of the whole cloud."""
 
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from mops_lightning.data.clouds import Clouds
+from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
+from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.tasks.base import Task
-from mops_lightning.training.recipe import Recipe
+from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.types import Batch, PointFeatureNet
+from mops_lightning.zoo import weights
 
 
 class Targets(NamedTuple):
@@ -24,18 +31,23 @@ class Distillation:
     Args:
         task: with the frozen task net.
         recipe: for the weights of the losses.
-
-    Attributes:
-        predicts: whether predictions are compared.
-        table: the predictions for all points of every training cloud; None: they are computed in
-            every step.
+        clouds: whose predictions are computed once; None: they are computed in every step.
     """
 
-    def __init__(self, task: Task, recipe: Recipe) -> None:
+    def __init__(self, task: Task, recipe: Recipe, clouds: "FullClouds | None" = None) -> None:
         self.task = task
         self.recipe = recipe
         self.predicts = recipe.distillation > 0
+        self.clouds = clouds if self.predicts and task.clouds_are_batches else None
         self.table: Tensor | None = None
+
+    def start(self, device: torch.device) -> None:
+        """Read or compute the predictions for all points of every training cloud.
+
+        Not earlier, because a resumed run has its task net from the checkpoint.
+        """
+        if self.clouds is not None:
+            self.table = full_predictions(self.task, self.clouds, device)
 
     @torch.no_grad()
     def targets(self, batch: Batch, seen: Tensor) -> Targets:
@@ -93,3 +105,69 @@ def feature_distance(found: Tensor, reference: Tensor) -> Tensor:
     """Return ‖f − r‖² / ‖r‖², the mean over clouds, of pooled features ``(B, C)``."""
     apart = (found - reference).square().sum(1)
     return (apart / reference.square().sum(1).clamp_min(1e-12)).mean()
+
+
+@dataclass(frozen=True)
+class FullClouds:
+    """The training clouds, without augmentation, whose predictions are kept in a file.
+
+    Attributes:
+        clouds: in the order of their rows in a batch.
+        batch_size: clouds per batch.
+        cache: folder for the file.
+    """
+
+    clouds: Clouds
+    batch_size: int
+    cache: Path
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "FullClouds":
+        """Return itself: the moving average copies the experiment, but needs no clouds."""
+        return self
+
+
+def full_predictions(task: Task, full: FullClouds, device: torch.device) -> Tensor:
+    """Return the predictions of a task whose batches are the clouds themselves.
+
+    They are kept in a file, which is named by the weights and the clouds.
+
+    Args:
+        task: in evaluation mode; its net is moved to ``device``.
+        full: the clouds.
+        device: where to compute.
+
+    Returns:
+        One row per cloud, on the CPU; see ``Task.predict``.
+    """
+    named = hashlib.sha256(weights.digest(task.state_dict()).encode())
+    named.update(full.clouds.points.numpy().tobytes())
+    path = full.cache / "predictions" / f"{named.hexdigest()[:16]}.pt"
+    predictions = _read(path, len(full.clouds.points))
+    if predictions is None:
+        predictions = _predict(task, full, device)
+        remove_temporary(path.parent, below=False)
+        with atomic_write(path) as temporary:
+            torch.save(predictions, temporary)
+    return predictions
+
+
+def _read(path: Path, rows: int) -> Tensor | None:
+    """Return the predictions in a file; None if it holds none for these clouds."""
+    if not path.is_file():
+        return None
+    try:
+        kept = weights.read_plain(path, "predictions")
+    except UserError:
+        return None
+    usable = isinstance(kept, Tensor) and len(kept) == rows and bool(kept.isfinite().all())
+    return kept if usable else None
+
+
+@torch.no_grad()
+def _predict(task: Task, full: FullClouds, device: torch.device) -> Tensor:
+    task.to(device)
+    parts = []
+    for batch in CloudLoader(full.clouds, full.batch_size):
+        points = batch.points.to(device)
+        parts.append(task.predict(batch._replace(points=points), points).cpu())
+    return torch.cat(parts)

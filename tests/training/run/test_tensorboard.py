@@ -10,7 +10,7 @@ from urllib.parse import urlparse
 import pytest
 
 from mops_lightning.config.compose import compose
-from mops_lightning.training.run import run
+from mops_lightning.training.run.run import run
 from tests.support.command_line import TINY
 
 

@@ -8,8 +8,8 @@ from mops_lightning.config.build import build
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
-from mops_lightning.training.pretrain import cache_folder
-from mops_lightning.training.run import run
+from mops_lightning.training.run.pretrain import cache_folder
+from mops_lightning.training.run.run import run
 from mops_lightning.zoo import weights
 from tests.support.command_line import SMALL_PCRNET, TINY, call
 from tests.support.forked import start_fork

@@ -8,7 +8,7 @@ import pytest
 from mops_lightning.config.compose import compose
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
-from mops_lightning.training.run import run
+from mops_lightning.training.run.run import run
 from tests.support.command_line import TINY
 
 CURVES = ["sampler=mops", "weights=null", "val_fraction=0.2"]

@@ -1,0 +1,1 @@
+"""Training beyond the losses of the publications: ``recipe=fast``."""

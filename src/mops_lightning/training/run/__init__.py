@@ -1,0 +1,1 @@
+"""One run: its stages, and the parts that they share."""

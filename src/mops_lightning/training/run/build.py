@@ -1,0 +1,250 @@
+"""The parts of a run, built so that mistakes in settings end it before anything is trained.
+
+Besides the settings of its node, a constructor is offered these values, by argument name:
+
+| argument | of | value |
+|---|---|---|
+| ``num_classes`` | task, task net | number of classes of the data |
+| ``net`` | task, samplers, baselines | the task net |
+| ``seed`` | baselines | the run's seed, unless the node sets one |
+| ``m`` | baselines, untrained samplers | the largest tested size |
+| ``folder``, ``checkpoint`` | callbacks | the run's folder, its checkpoint |
+| ``score`` | callbacks | name of the task's score |
+| ``batch``, ``titles`` | callbacks | the pictured test clouds and their classes |
+| ``name``, ``save_dir`` | loggers | empty, the run's folder |
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from mops_lightning.config import distributed
+from mops_lightning.config.build import accepted, build, settings_named
+from mops_lightning.data.clouds import CloudDataset, Clouds
+from mops_lightning.data.loader import Augmentation
+from mops_lightning.errors import UserError
+from mops_lightning.records.run_record import RunRecord
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.seeding import derive_seed
+from mops_lightning.tasks.base import Task
+from mops_lightning.training import checkpoint
+from mops_lightning.training.evaluation.trained_run import OF_RUN, TrainedRun
+from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.recipe.distillation import FullClouds
+from mops_lightning.training.recipe.recipe import Recipe
+from mops_lightning.training.run.loaders import augmentation, split
+from mops_lightning.training.run.trainer import device_name, make_trainer
+from mops_lightning.training.sizes import sizes_to_test
+from mops_lightning.types import Batch
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The parts of one run, which its stages share.
+
+    Attributes:
+        cfg: the composed configuration.
+        folder: the run's folder.
+        dataset: the loaded data.
+        train: the clouds to train on.
+        held_out: the training clouds for the curves under ``val/``.
+        experiment: task, sampler and baselines.
+        trainer: Lightning's.
+        resumed: the checkpoint that training starts from; None starts at the beginning.
+        trained: the run that is evaluated.
+    """
+
+    cfg: DictConfig
+    folder: Path
+    dataset: CloudDataset
+    train: Clouds
+    held_out: Clouds
+    experiment: Experiment
+    trainer: L.Trainer
+    resumed: Path | None
+    trained: TrainedRun | None
+
+    @property
+    def trains(self) -> bool:
+        """Whether anything is trained."""
+        return self.experiment.trainable and self.trained is None
+
+    @property
+    def has_task_weights(self) -> bool:
+        """Whether the task net has weights; ICP has none."""
+        return any(True for _ in self.experiment.task.parameters())
+
+    @property
+    def part(self) -> tuple[int, int]:
+        """Rank of this process and number of processes."""
+        return self.trainer.global_rank, self.trainer.world_size
+
+
+def build_parts(
+    cfg: DictConfig,
+    folder: Path,
+    dataset: CloudDataset,
+    record: RunRecord,
+    trained: TrainedRun | None = None,
+) -> Parts:
+    """Build all parts of a run, so that mistakes in settings end it before anything is trained.
+
+    Raises:
+        UserError: settings that do not fit each other, the data or the checkpoint to resume.
+    """
+    identity = checkpoint.identity(record.config, dataset.fingerprint)
+    resumed = checkpoint.find(cfg, identity)
+    record.dataset_fingerprint = dataset.fingerprint
+    record.train_clouds, record.test_clouds = len(dataset.train.labels), len(dataset.test.labels)
+    record.class_names = list(dataset.class_names)
+    record.dataset_facts = dataset.notes
+    record.resumed_from = None if resumed is None else str(resumed)
+    record.lengthened = resumed is not None and checkpoint.lengthened(cfg, resumed)
+    train, held_out = split(dataset.train, cfg.val_fraction, cfg.seed)
+    experiment = make_experiment(cfg, dataset, identity, train)
+    trainer = make_trainer(cfg, folder, dataset, experiment, len(train.labels))
+    parts = Parts(cfg, folder, dataset, train, held_out, experiment, trainer, resumed, trained)
+    distributed.check_shares(
+        cfg.batch_size,
+        len(dataset.test.labels),
+        len(held_out.labels),
+        trainer.world_size,
+    )
+    if not parts.has_task_weights and cfg.weights not in (None, "auto", OF_RUN):
+        raise UserError(
+            f"weights: {cfg.names.net} has no weights to load, got {cfg.weights}. "
+            "Leave weights out."
+        )
+    learned = experiment.sampler is not None and experiment.sampler.learned
+    if cfg.learn == "nothing" and learned and not cfg.evaluate:
+        raise UserError("learn=nothing needs a trained sampler: give its run with evaluate=RUN.")
+    record.device = device_name(trainer)
+    return parts
+
+
+def make_experiment(
+    cfg: DictConfig, dataset: CloudDataset, identity: dict[str, str], train: Clouds | None = None
+) -> Experiment:
+    """Build task, sampler and baselines.
+
+    Args:
+        cfg: a composed configuration.
+        dataset: says how many classes and points there are.
+        identity: see ``checkpoint.identity``.
+        train: the clouds to train on, whose predictions may be computed once.
+
+    Raises:
+        UserError: a setting that its part or the data do not allow.
+    """
+    task = _make_task(cfg, len(dataset.class_names))
+    # A seed of its own: the sampler's initial weights must not depend on the task net's size.
+    L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
+    # For samplers that select points by the task net's features.
+    net = {"net": task.net}
+    own = accepted(cfg.sampler, net)
+    sampler = build(cfg.sampler, "sampler", **own) if cfg.learn != "task" else None
+    points = points_per_cloud(task, dataset)
+    sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, points, training=cfg.learn != "nothing")
+    baselines: dict[str, Sampler] = {}
+    if sampler is not None and sampler.learned:
+        baselines = _make_baselines(cfg, max(sizes), net)
+    elif sampler is not None and sampler.flexible:
+        sampler = build(cfg.sampler, "sampler", m=max(sizes), **own)
+    _check_cloud_size(cfg, sampler, baselines, points)
+    make_optimizer, make_schedule = optimizer_makers(cfg.optimizer)
+    if cfg.learn != "nothing":
+        _try_optimizer(make_optimizer, make_schedule)
+    return Experiment(
+        task,
+        sampler,
+        learn=cfg.learn,
+        make_optimizer=make_optimizer,
+        make_schedule=make_schedule,
+        baselines=baselines,
+        seed=cfg.seed,
+        identity=identity,
+        sizes=sizes,
+        m=cfg.m,
+        task_lr_scale=cfg.task_lr_scale,
+        refine=cfg.refine,
+        recipe=_recipe(cfg, sampler),
+        full_clouds=_full_clouds(cfg, train),
+    )
+
+
+def _full_clouds(cfg: DictConfig, train: Clouds | None) -> FullClouds | None:
+    """Return the clouds whose predictions are computed once; None with augmentation."""
+    if train is None or Augmentation(**augmentation(cfg)).active:
+        return None
+    return FullClouds(train, cfg.batch_size, Path(cfg.cache).expanduser())
+
+
+def points_per_cloud(task: Task, dataset: CloudDataset) -> int:
+    """Return the number of points that a sampler gets of every cloud.
+
+    Raises:
+        UserError: the data have too few points for the task.
+    """
+    clouds = Batch(dataset.test.points[:1], dataset.test.labels[:1])
+    batch = task.make_batch(clouds, lambda: [torch.Generator()])
+    return batch.points.shape[1]
+
+
+def _recipe(cfg: DictConfig, sampler: Sampler | None) -> Recipe:
+    """Return the recipe in force; the task net's training has a record of its own."""
+    recipe: Recipe = build(cfg.recipe, "recipe")
+    if sampler is None:
+        return Recipe(task_points=recipe.task_points)
+    return replace(recipe, task_points=None) if sampler.learned else Recipe()
+
+
+def _make_task(cfg: DictConfig, num_classes: int) -> Task:
+    L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
+    net = build(cfg.task.net, "task.net", **accepted(cfg.task.net, {"num_classes": num_classes}))
+    return build(cfg.task, "task", net=net, **accepted(cfg.task, {"num_classes": num_classes}))
+
+
+def _make_baselines(cfg: DictConfig, m: int, net: dict[str, Any]) -> dict[str, Sampler]:
+    nodes = {str(name): node for name, node in cfg.baselines.items() if node}
+    return {name: _make_baseline(name, node, m, cfg.seed, net) for name, node in nodes.items()}
+
+
+def _make_baseline(name: str, node: DictConfig, m: int, seed: int, net: dict[str, Any]) -> Any:
+    """Build an index sampler for ``m`` points, with the run's seed unless it has its own."""
+    own = accepted(node, net if "seed" in node else {**net, "seed": seed})
+    return build(node, f"baselines.{name}", m=m, **own)
+
+
+def _check_cloud_size(
+    cfg: DictConfig, sampler: Sampler | None, baselines: dict[str, Sampler], n: int
+) -> None:
+    """Let samplers refuse clouds of ``n`` points before anything is trained."""
+    if sampler is not None:
+        with settings_named(cfg.sampler, "sampler", "m"):
+            sampler.check_cloud_size(n)
+    for name, baseline in baselines.items():
+        with settings_named(cfg.baselines[name], f"baselines.{name}", "m", "seed"):
+            baseline.check_cloud_size(n)
+
+
+def _try_optimizer(make_optimizer: Any, make_schedule: Any) -> None:
+    """Make an optimizer of nothing, so that its mistakes end a run before a net is pretrained."""
+    optimizer = make_optimizer([torch.nn.Parameter(torch.zeros(1))])
+    if make_schedule:
+        make_schedule(optimizer, total_steps=2)
+
+
+def optimizer_makers(node: DictConfig) -> tuple[Any, Any]:
+    """Return what makes an optimizer of parameters, and a schedule of an optimizer, or None."""
+    settings: Any = OmegaConf.to_container(node, resolve=True)
+    schedule = settings.pop("schedule", None)
+    makers = {"optimizer": settings, "optimizer.schedule": schedule}
+    make_optimizer, make_schedule = (
+        one and build(OmegaConf.create({**one, "_partial_": True}), where)
+        for where, one in makers.items()
+    )
+    return make_optimizer, make_schedule

@@ -1,0 +1,219 @@
+"""The stages of a run whose parts are built: load weights, warm start, fit, test, save."""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from torch import nn
+
+from mops_lightning.data.loader import Augmentation, CloudLoader
+from mops_lightning.errors import Interrupted, UserError
+from mops_lightning.records.metric_info import foreign_metrics
+from mops_lightning.records.readout_names import parse
+from mops_lightning.records.run_record import RunRecord
+from mops_lightning.training.divergence import Diverged, with_checkpoint
+from mops_lightning.training.evaluation import nets
+from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.recipe.recipe import Recipe
+from mops_lightning.training.recipe.warm_start import warm_start as warm_start_sampler
+from mops_lightning.training.run.build import Parts
+from mops_lightning.training.run.loaders import augmentation, score_loader
+from mops_lightning.training.run.trainer import log_hparams
+from mops_lightning.viz.snapshots import CLOUDS
+from mops_lightning.zoo import weights
+
+OUTPUTS = {
+    "checkpoint": "checkpoints/last.ckpt",
+    "pictures": "pictures",
+    "clouds": f"pictures/{CLOUDS}",
+    "tensorboard": "tensorboard",
+}
+"""What callbacks and loggers may have written."""
+
+
+def warm_start(parts: Parts, record: RunRecord) -> None:
+    """Start the sampler from copies of other weights, unless the run is resumed."""
+    task, sampler = parts.experiment.task, parts.experiment.sampler
+    source = parts.experiment.recipe.warm_start
+    if sampler is None or not source or parts.resumed is not None:
+        return
+    points = parts.dataset.train.points
+    record.warm_start, text = warm_start_sampler(source, sampler, task.net, points)
+    if parts.trainer.is_global_zero:
+        print(f"Warm start: {text}.")
+
+
+def _recipe(parts: Parts) -> dict[str, Any] | None:
+    recipe = parts.experiment.recipe
+    if recipe == Recipe():
+        return None
+    if parts.experiment.sampler is None:
+        return {"task_points": recipe.task_points}
+    return {"name": parts.cfg.names.recipe, **asdict(recipe)}
+
+
+def load(parts: Parts, record: RunRecord, task_weights: Path | None) -> None:
+    """Load the weights of the task net, and those of an evaluated run.
+
+    Raises:
+        UserError: they do not fit.
+    """
+    task = parts.experiment.task
+    if task_weights is not None:
+        try:
+            content = weights.read(task_weights)
+            weights.fit_state(task, content["state"], task_weights)
+        except UserError as error:
+            raise UserError(f"weights: {error}") from None
+        record.weights_loaded = content["sha256"]
+        if task.requires_same_classes and content.get("classes"):
+            nets.check_classes(content["classes"], parts.dataset, f"weights: {task_weights}")
+    if parts.trained is not None:
+        record.evaluated = nets.load(parts.trained, parts.cfg, parts.experiment, parts.dataset)
+
+
+def fit(parts: Parts, record: RunRecord) -> None:
+    """Train the learned parts, from the checkpoint if the run is resumed.
+
+    Raises:
+        UserError: too little data, or training that diverged.
+    """
+    record.recipe = _recipe(parts)
+    cfg, trainer, experiment = parts.cfg, parts.trainer, parts.experiment
+    task, clouds = experiment.task, len(parts.train.labels)
+    if clouds < 2 * trainer.world_size:
+        raise UserError(
+            f"val_fraction={cfg.val_fraction} leaves {clouds} training "
+            f"{'cloud' if clouds == 1 else 'clouds'}; "
+            "at least two are needed for each device. Lower it, or give more data."
+        )
+    loader = CloudLoader(
+        parts.train,
+        cfg.batch_size,
+        shuffle=True,
+        augment=Augmentation(**augmentation(cfg)),
+        make_batch=task.make_batch,
+        drop_last=True,
+        seed=cfg.seed,
+        part=parts.part,
+    )
+    validation = None
+    if len(parts.held_out.labels):
+        validation = score_loader(parts.held_out, cfg.batch_size, task, parts.part)
+    try:
+        with _interruptible(), _monitoring():
+            trainer.fit(parts.experiment, loader, validation, ckpt_path=parts.resumed)
+        if name := weights.first_nonfinite(parts.experiment.state_dict()):
+            raise Diverged(f"training diverged: {name} is not finite.")
+    except Diverged as error:
+        raise with_checkpoint(error, _last_checkpoint(parts)) from None
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        if parts.resumed is None or parts.experiment.started or isinstance(error, UserError):
+            raise
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise weights.Damaged(
+            f"ckpt_path: cannot resume from {parts.resumed}: {reason}."
+        ) from error
+    record.validation = {
+        name: float(value)
+        for name, value in trainer.callback_metrics.items()
+        if name.startswith("val/")
+    }
+
+
+def _last_checkpoint(parts: Parts) -> Path | None:
+    """Return the newest checkpoint of this run, or the one that it was resumed from."""
+    own = parts.folder / OUTPUTS["checkpoint"]
+    return own if own.is_file() else parts.resumed
+
+
+def test(parts: Parts, record: RunRecord) -> None:
+    """Score all test clouds."""
+    experiment, trainer = parts.experiment, parts.trainer
+    with _interruptible():
+        loader = score_loader(parts.dataset.test, parts.cfg.batch_size, experiment.task, parts.part)
+        trainer.test(experiment, loader, verbose=False)
+    record.metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
+    log_hparams(trainer, record.config, _scores_at_own_size(record.metrics, experiment))
+    if experiment.learn in ("sampler", "nothing") and parts.has_task_weights:
+        # A resumed run has its task net from the checkpoint, not from a weights file.
+        record.task_weights_sha256 = weights.digest(experiment.task.state_dict())
+
+
+def _scores_at_own_size(metrics: dict[str, float], experiment: Experiment) -> dict[str, float]:
+    """Select the task's score of every readout, at the run's own size."""
+    chosen = {}
+    for name, value in metrics.items():
+        parts = parse(name)
+        if parts and parts.metric == experiment.task.score and parts.m in (None, experiment.m):
+            chosen[name] = value
+    return chosen
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Raise ``Interrupted`` where Lightning turns Ctrl-C into ``SystemExit``."""
+    try:
+        yield
+    except SystemExit:
+        raise Interrupted("Resume with the same command and ckpt_path=last.") from None
+
+
+@contextmanager
+def _monitoring() -> Iterator[None]:
+    """Raise ``UserError`` where a callback of Lightning's monitors a metric that is not there."""
+    try:
+        yield
+    except (RuntimeError, MisconfigurationException) as error:
+        text = str(error)
+        if not (text.startswith("Early stopping conditioned on metric") or "monitor=" in text):
+            raise
+        raise UserError(f"callbacks: {' '.join(text.split())}") from None
+
+
+def _check_scores(parts: Parts, metrics: dict[str, float]) -> None:
+    """Refuse a test whose score or losses are not finite, though the weights are."""
+    score = parts.experiment.score_name
+    judged = [name for name in metrics if name == score or name.split("/")[-2] == "loss"]
+    bad = [name for name in judged if not math.isfinite(metrics[name])]
+    if not bad:
+        return
+    text = f"{bad[0]} is {metrics[bad[0]]}"
+    if not parts.trains:
+        raise UserError(f"{text}. Check the data and the weights.")
+    error = UserError(f"training diverged: {text}.")
+    raise with_checkpoint(error, _last_checkpoint(parts))
+
+
+def save(parts: Parts, record: RunRecord) -> None:
+    """Fill in what the run wrote and scored, and save what it trained."""
+    cfg, experiment = parts.cfg, parts.experiment
+    task, sampler = experiment.task, experiment.sampler
+    for kind, name in OUTPUTS.items():
+        if (parts.folder / name).exists():
+            record.files[kind] = name
+    record.score = record.metrics[experiment.score_name]
+    modules: dict[str, nn.Module | None] = {"task": task, "sampler": sampler}
+    record.score_name = experiment.score_name
+    record.metric_info = foreign_metrics(task.metrics().items())
+    record.processes = parts.trainer.world_size
+    record.parameters = {
+        name: sum(parameter.numel() for parameter in module.parameters())
+        for name, module in modules.items()
+        if module is not None
+    }
+    _check_scores(parts, record.metrics)
+    if not parts.trains:
+        return
+    files = {weights.FILE: task if cfg.learn == "task" else sampler}
+    if cfg.learn == "joint":
+        files[f"task_{weights.FILE}"] = task
+    for name, module in files.items():
+        assert module is not None  # only learn=task has no sampler
+        classes = parts.dataset.class_names if module is task and task.requires_same_classes else ()
+        weights.save(parts.folder / name, module, record.config, record.metrics, classes)
+        record.files[Path(name).stem] = name
