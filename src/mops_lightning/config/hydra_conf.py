@@ -1,5 +1,6 @@
 """The folder ``conf/``, the resolvers that it uses, and composing a configuration from it."""
 
+import textwrap
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -66,6 +67,18 @@ def run_label(_root_: DictConfig) -> str:
     return f"{_root_.names.sampler}-m{size}{LABELS.get(_root_.learn, '')}"
 
 
+def run_level_keys() -> str:
+    """Return the run-level keys with their texts, for ``--help``."""
+    shown = {name: one for name, one in settings.declared().items() if not one.group}
+    width = max(map(len, shown)) + 2
+    return "\n".join(
+        textwrap.fill(
+            one.help, 100, initial_indent=f"{name:<{width}}", subsequent_indent=" " * width
+        )
+        for name, one in shown.items()
+    )
+
+
 def selectable_groups() -> str:
     """Return the groups that users choose from with their choices, one per line, for ``--help``.
 
@@ -90,7 +103,7 @@ def selectable_groups() -> str:
 
 def register() -> None:
     """Register the resolvers."""
-    for resolver in (group_choices, run_label, selectable_groups):
+    for resolver in (group_choices, run_label, run_level_keys, selectable_groups):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
 
 

@@ -6,7 +6,6 @@ class behind the group, which checks it; it has a line in ``INSIDE`` where it af
 than its group.
 """
 
-import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from enum import Flag, auto
@@ -14,7 +13,6 @@ from functools import cache
 from typing import Any, Literal, get_args, get_type_hints
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import OmegaConf
 
 from mops_lightning.config.annotations import describe
 from mops_lightning.errors import UserError, did_you_mean
@@ -23,8 +21,6 @@ Learn = Literal["task", "sampler", "joint", "nothing"]
 LEARN = get_args(Learn)
 """What a run may train."""
 WITH_SAMPLER = ("sampler", "joint", "nothing")
-NAME = "run_settings"
-"""Name of the schema in the defaults list of ``conf/config.yaml``."""
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 """Allowed values of ``trainer.precision``; Lightning has more."""
 
@@ -81,13 +77,6 @@ def one_of(*choices: str, others: tuple[Any, ...] = ()) -> Limits:
 
 
 NOT_NEGATIVE = number("of at least 0", lambda x: x >= 0)
-SIZES = Limits(
-    "auto or a list of whole numbers of at least 1",
-    lambda x: (
-        x == "auto"
-        or (isinstance(x, list) and bool(x) and all(type(m) is int and m >= 1 for m in x))
-    ),
-)
 
 
 @dataclass(frozen=True)
@@ -161,7 +150,10 @@ class RunSettings:
         "sizes tested in addition to m: auto (the usual sizes, for multi-size samplers) or "
         "[8,100,...]",
         Affects.SCORES,
-        limits=SIZES,
+        limits=Limits(
+            "auto or a list of whole numbers of at least 1",
+            lambda x: x == "auto" or (type(x) is list and x and all(map(whole(1).fits, x))),
+        ),
         compare=False,
     )
     # What a run learned, its weights, data and task net are compared by the record's notes.
@@ -349,22 +341,9 @@ def refusal(path: str, value: Any) -> UserError:
     return UserError(f"{path} must be {allowed}, got {value!r}.{near.partition(' Allowed:')[0]}")
 
 
-def help_lines() -> str:
-    """Return the run-level keys with their texts, for ``--help``."""
-    shown = {name: one for name, one in declared().items() if not one.group}
-    width = max(map(len, shown)) + 2
-    return "\n".join(
-        textwrap.fill(
-            one.help, 100, initial_indent=f"{name:<{width}}", subsequent_indent=" " * width
-        )
-        for name, one in shown.items()
-    )
-
-
 def register() -> None:
-    """Make the declaration known to Hydra: as a schema, and as text for the help."""
-    ConfigStore.instance().store(NAME, SCHEMA)
-    OmegaConf.register_new_resolver("run_level_keys", help_lines, replace=True)
+    """Make the declaration known to Hydra as the schema that ``conf/config.yaml`` begins with."""
+    ConfigStore.instance().store("run_settings", SCHEMA)
 
 
 register()
