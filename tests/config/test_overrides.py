@@ -29,3 +29,13 @@ def test_value_is_read_as_typed(text):
         assert override is not None
         assert override.value() == text
         assert compose([overrides.readable(argument)]).out == text
+
+
+def test_own_class_chooses_the_group_of_own_and_takes_any_setting():
+    given = ["sampler._target_=my.Sampler", "sampler.width=3", "m=8", "task.net.dropout=0"]
+    assert overrides.with_own_classes(given) == [
+        *("++sampler._target_=my.Sampler", "++sampler.width=3", "m=8", "task.net.dropout=0"),
+        "sampler=own",
+    ]
+    kept = ["sampler=mops", "sampler._target_=my.MOPSNet", "~sampler.overlap"]
+    assert overrides.with_own_classes(kept) == [kept[0], f"++{kept[1]}", kept[2]]

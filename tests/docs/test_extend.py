@@ -37,3 +37,18 @@ def test_example_trains_with_a_class_from_outside(command, tmp_path):
         for part in name.split("."):
             node = node[part]
         assert str(node) == value
+
+
+def test_run_of_own_sampler_is_evaluated_with_its_class_only(tmp_path):
+    (tmp_path / "my_sampler.py").write_text(MODULES["my_sampler.py"])
+    named, setting = COMMANDS[0].split()
+    status, _, err = call_anew([*TINY_ANY_DATA, *SMALL_SHAPES, named, setting], tmp_path)
+    assert (status, err) == (0, "")
+    (run,) = runs(tmp_path)
+    status, _, err = call_anew([f"evaluate={run}"], tmp_path)
+    assert status == 2
+    assert "not accepted from a record" in err
+    again = [f"evaluate={run}", named, "pictures=0", "trainer=cpu", "hydra.run.dir=again"]
+    status, _, err = call_anew(again, tmp_path)
+    assert (status, err) == (0, "")
+    assert run_record.read(tmp_path / "again").score == run_record.read(run).score
