@@ -43,7 +43,7 @@ VALUES = (
     *("-inf", "9223372036854775808", "true", "null", "abc", "''", "[]", "[1,2]", "[nan]", "{}"),
     *("{a:1}", "'5'", "nowhere/x", "/proc/x", "n" * 300, "${m}", "${nosuch}", "???", "é", "a=b"),
 )
-LEFT_OUT = ("trainer.devices", "trainer.num_nodes", "trainer.strategy", "names.", "_target_")
+LEFT_OUT = ("trainer.devices", "trainer.strategy", "names.", "_target_")
 """Settings that start further processes or are derived."""
 
 

@@ -47,7 +47,7 @@ def put_cell(folder, name, sampler, values, seed=0, **settings):
             "sampler": sampler,
         },
         "trainer": {"max_epochs": 3},
-        "task": {"emd_rounds": 2},
+        "task": {"exact_up_to": 2048},
         "sampler": {"m": 32, **settings.pop("of", {})},
         **settings,
     }

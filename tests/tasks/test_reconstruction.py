@@ -25,8 +25,8 @@ def batch(rng, number=4, points=48):
 
 
 def test_step_loss_is_chamfer_plus_emd(rng):
-    given = batch(rng)
-    module = task(emd_block=48).eval()
+    given = batch(rng, points=32)  # a single block
+    module = Reconstruction(AutoEncoder(32, 8, (8, 8), (16,))).eval()
     losses = module.step(given, given.points).losses
     built = module.net(given.points)
     assert set(losses) == {"chamfer", "emd"}

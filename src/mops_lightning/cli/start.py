@@ -20,8 +20,6 @@ INPUTS = {
     "ckpt_path": ("last",),
     "evaluate": (),
     "dataset.root": (),
-    "dataset.motions": (),
-    "dataset.calib": (),
 }
 """Settings that name what must exist, with values that are no paths."""
 OUTPUTS = ("out", "cache", "dataset.cache")

@@ -59,7 +59,7 @@ def started_together(cfg: DictConfig) -> bool:
     return is_distributed(cfg) and _number("WORLD_SIZE") + _number("SLURM_NTASKS") > 1
 
 
-def check(cfg: DictConfig) -> None:
+def check_devices(cfg: DictConfig) -> None:
     """Check the number of devices and the strategy.
 
     Raises:

@@ -295,6 +295,7 @@ INSIDE: dict[str, dict[str, Any]] = {
     # Before trainer.max_epochs, so that an error names the setting that it takes its value from.
     "epochs.task": {"limits": whole(1)},
     "epochs.sampler": {"limits": whole(0)},
+    "epochs.joint": {"limits": whole(0)},
     "trainer.max_epochs": {"limits": whole(0)},
     "trainer.precision": {"limits": one_of(*PRECISIONS, others=("32", 32, None))},
     "trainer._target_": _NOTHING,

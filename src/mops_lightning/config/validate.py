@@ -62,7 +62,7 @@ def check(cfg: DictConfig) -> None:
             f"refine must be 0 with learn={cfg.learn}, which samples nothing, got {cfg.refine}. "
             "Leave it out, or test a sampler."
         )
-    distributed.check(cfg)
+    distributed.check_devices(cfg)
 
 
 def misfit_of(error: BaseException) -> UserError | None:

@@ -28,6 +28,8 @@ from mops_lightning.types import Batch, TaskOutput
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+TRAINED_BLOCK, TRAINED_ROUNDS = 32, 1
+"""Blocks and rounds of the earth mover's distances in training; every published net had these."""
 SCORED_BLOCK, SCORED_ROUNDS = 128, 8
 """Blocks and rounds of the earth mover's distances of clouds above ``exact_up_to``, in scores."""
 
@@ -36,14 +38,11 @@ class Reconstruction(Task):
     """Reconstructs clouds from their sampled points with an auto-encoder.
 
     The loss is the chamfer distance plus the earth mover's distance. In training the latter is
-    computed by blocks (see ``ops.emd``), because exact matching would take
-    most of the time. In scores it is exact up to ``exact_up_to`` points, and by larger blocks
-    above.
+    computed by blocks (see ``ops.emd``), because exact matching would take most of the time. In
+    scores it is exact up to ``exact_up_to`` points, and by larger blocks above.
 
     Args:
         net: maps ``(B, M, 3)`` points and a number n to ``(B, n, 3)``.
-        emd_block: points per block, in training.
-        emd_rounds: rounds of blocks, in training.
         exact_up_to: largest number of points for the exact distance in scores.
     """
 
@@ -52,16 +51,8 @@ class Reconstruction(Task):
     net_takes = ("points", "n_points")
     maps_pooled = "from_pooled"
 
-    def __init__(
-        self,
-        net: nn.Module,
-        emd_block: int = 64,
-        emd_rounds: int = 2,
-        exact_up_to: int = 2048,
-    ) -> None:
+    def __init__(self, net: nn.Module, exact_up_to: int = 2048) -> None:
         super().__init__(net)
-        self.emd_block = emd_block
-        self.emd_rounds = emd_rounds
         self.exact_up_to = exact_up_to
 
     def predict(self, batch: Batch, points: Tensor) -> Tensor:
@@ -84,7 +75,7 @@ class Reconstruction(Task):
         """
         built, clouds = self.predict(batch, points), batch.points
         chamfer = chamfer_distance(built, clouds)
-        emd = _emd(built, clouds, self.emd_block, self.emd_rounds)
+        emd = _emd(built, clouds, TRAINED_BLOCK, TRAINED_ROUNDS)
         losses = {"chamfer": chamfer.mean(), "emd": emd.mean()}
         return TaskOutput(losses, Distances(chamfer, emd), None, built)
 

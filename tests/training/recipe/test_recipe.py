@@ -151,7 +151,7 @@ def test_training_sees_drawn_points_then_all_and_validation_always_all():
 
 
 def test_reconstruction_from_drawn_points_is_of_the_whole_cloud():
-    task = Reconstruction(AutoEncoder(POINTS, 8, (8,), (8,)), emd_block=16)
+    task = Reconstruction(AutoEncoder(POINTS, 8, (8,), (8,)))
     data = small_dataset(points=POINTS)
     sampler = SeenBy()
     module = Experiment(
