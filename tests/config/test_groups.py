@@ -225,7 +225,7 @@ def test_baselines_are_left_out_added_and_checked(tmp_path):
         ("task", "pointnet"),
         ("sampler", "fmops-m512"),
         ("joint", "fmops-m512-joint"),
-        ("nothing", "fmops-m512-evaluated"),
+        ("nothing", "fmops-m512"),
     ],
 )
 def test_run_label_names_net_or_sampler(learn, label):

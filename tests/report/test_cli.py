@@ -15,7 +15,9 @@ from tests.support.reports import (
 def test_user_metric_appears_in_closing_table_and_report(tmp_path, capsys):
     """Its class declares unit and label; nothing else names it."""
     target = "task._target_=tests.support.made_up.DoubtfulClassification"
-    status, out, err = call([*TINY, target, "sampler=fps", "weights=null"], tmp_path)
+    status, out, err = call(
+        [*TINY, "task=classification", target, "sampler=fps", "weights=null"], tmp_path
+    )
     assert status == 0, err
     closing = [line for line in out.splitlines() if "sampled by" in line]
     assert "wrong answers (‰)" in closing[0]

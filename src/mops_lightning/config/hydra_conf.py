@@ -16,8 +16,6 @@ GROUPS_BY_NAME = {
     "recipe": "recipe",
 }
 """The group of every entry of ``names``."""
-LABELS = {"joint": "-joint", "nothing": "-evaluated"}
-"""The end of a run's label by ``learn``."""
 
 
 def conf_dir() -> Path:
@@ -61,10 +59,13 @@ def group_choices() -> DictConfig:
 
 def run_label(_root_: DictConfig) -> str:
     """Return the label of a run's folder: the net that it trains, or the sampler and its size."""
+    names = _root_.names
     if _root_.learn == "task":
-        return str(_root_.names.net)
+        return str(names.net)
+    if _root_.evaluate:  # the size is in the run's record
+        return f"{names.sampler}-evaluated"
     size = _root_.sampler.get("m_max", _root_.m)
-    return f"{_root_.names.sampler}-m{size}{LABELS.get(_root_.learn, '')}"
+    return f"{names.sampler}-m{size}{'-joint' if _root_.learn == 'joint' else ''}"
 
 
 def run_level_keys() -> str:

@@ -152,7 +152,7 @@ class RunSettings:
         Affects.SCORES,
         limits=Limits(
             "auto or a list of whole numbers of at least 1",
-            lambda x: x == "auto" or (type(x) is list and x and all(map(whole(1).fits, x))),
+            lambda x: x == "auto" or (type(x) is list and x != [] and all(map(whole(1).fits, x))),
         ),
         compare=False,
     )
