@@ -38,3 +38,13 @@ def test_matched_and_completed_readouts_keep_rows(folder, tmp_path):
     finite = whole[np.isfinite(whole).all(1)]
     assert (found["generated"] > finite.min(0)).all()
     assert (found["generated"] < finite.max(0)).all()
+
+
+@pytest.mark.parametrize("size", [1e200, 1e307])
+def test_huge_coordinates_are_rejected(size, folder, tmp_path):
+    np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(1, 9, size=(90, 3)) * size)
+    learned = ["--weights", folder, "--readout", "matched", "--chunk", 60]
+    for settings in (["--method", "fps", "--m", 4], learned):
+        status, _, err = call(tmp_path / "a.npy", tmp_path / "b.npy", *settings)
+        assert status == 2
+        assert "too large" in err

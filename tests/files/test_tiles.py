@@ -1,7 +1,6 @@
 """Tiles: cut, sampled, and thinned where they meet."""
 
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +15,6 @@ from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.random import RandomSampler
 from tests.support.downsample import call
-
-PATH = Path("scan.ply")
 
 
 def cloud(number, seed=0):
@@ -104,21 +101,21 @@ def test_thin_equal_points_leaves_m():
 def test_sample_by_tiles_returns_m_different_rows(sampler):
     points = street()
     for one in (sampler, FPSSampler(201), RandomSampler(201)):
-        rows = sample_by_tiles(points, 256, 201, one, PATH)
+        rows = sample_by_tiles(points, 256, 201, one)
         assert len(set(rows.tolist())) == 201
         assert rows.tolist() == sorted(rows)
 
 
 def test_sample_by_tiles_keeps_seams_free():
     points = street()
-    kept = points[sample_by_tiles(points, 256, 400, FPSSampler(400), PATH)]
+    kept = points[sample_by_tiles(points, 256, 400, FPSSampler(400))]
     nearest = np.asarray(cKDTree(kept).query(kept, k=2)[0])[:, 1]
     assert nearest.min() > 0.4 * np.median(nearest)
 
 
 def test_sample_by_tiles_keeps_points_in_proportion():
     points = street()
-    kept = points[sample_by_tiles(points, 256, 400, RandomSampler(400), PATH)]
+    kept = points[sample_by_tiles(points, 256, 400, RandomSampler(400))]
     near = (points[:, 0] < 431_010).mean()
     assert abs((kept[:, 0] < 431_010).mean() - near) < 0.03
 
@@ -128,16 +125,16 @@ def test_sample_by_tiles_samples_a_tile_as_the_sampler_does():
     centred = points - points.mean(0)
     sphere = torch.from_numpy((centred / np.linalg.norm(centred, axis=1).max()).astype("f4"))
     rows = FPSSampler(40)(sphere[None]).indices[0]
-    kept = sample_by_tiles(points, 256, 40, FPSSampler(40), PATH)
+    kept = sample_by_tiles(points, 256, 40, FPSSampler(40))
     assert kept.tolist() == rows.sort().values.tolist()
 
 
 def test_sample_by_tiles_all_points_and_too_many(sampler):
     points = street(500)
-    assert sample_by_tiles(points, 60, 500, sampler, PATH).tolist() == list(range(500))
-    assert len(sample_by_tiles(points, 250, 128, sampler, PATH)) == 128
+    assert sample_by_tiles(points, 60, 500, sampler).tolist() == list(range(500))
+    assert len(sample_by_tiles(points, 250, 128, sampler)) == 128
     with pytest.raises(UserError, match=r"2 tiles of up to 250 points .* up to 64 points of each"):
-        sample_by_tiles(points, 250, 129, sampler, PATH)
+        sample_by_tiles(points, 250, 129, sampler)
 
 
 def test_tile_keeps_rows_with_attributes(scan, tmp_path):

@@ -19,11 +19,11 @@ from mops_lightning.data.formats import limits
 from mops_lightning.errors import UserError, one_line, printable
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
-from mops_lightning.files.paths import FilePair, check_writable
+from mops_lightning.files.paths import FilePair
 from mops_lightning.files.processes import Died, processes
 
 if TYPE_CHECKING:
-    from mops_lightning.files.downsample import Outcome
+    from mops_lightning.files.chunks import Outcome
 
 
 def attempt(
@@ -69,7 +69,7 @@ def process_file(source: Path, target: Path, options: Options, engine: Engine | 
     more = f" ({result.dropped:,} more without finite coordinates left out)"
     print(
         printable(
-            f"{target}: {result.written:,} of {result.number:,} points"
+            f"{target}: {result.kept:,} of {result.number:,} points"
             f"{more if result.dropped else ''}, {time.perf_counter() - start:.1f} s"
         )
     )
@@ -97,7 +97,9 @@ def process_folder(
     todo = [pair for pair in pairs if overwrite or not pair[1].exists()]
     failures, dropped = {}, 0
     if todo:
-        check_writable(target)
+        target.mkdir(parents=True, exist_ok=True)
+        if not os.access(target, os.W_OK):
+            raise UserError(f"OUT: cannot write into {target}. Give another OUT.")
     results = _results(todo, options, workers, engine)
     with closing(results):  # ends the processes when the user interrupts
         for (source, _), result in track(

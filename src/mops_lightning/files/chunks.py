@@ -16,22 +16,43 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.data.formats.cloud_file import CloudFile
-from mops_lightning.data.formats.errors import check_size
+from mops_lightning.data.formats.errors import check_coordinates, check_size
 from mops_lightning.data.formats.registry import open_cloud_file
 from mops_lightning.data.formats.table import Table
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
-from mops_lightning.files.unit_sphere import (
-    UnitSphere,
-    largest_distance,
-    sum_of,
-    unit_sphere,
-)
 from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fused import FusedMOPSNet
 from mops_lightning.samplers.streaming import global_part, sum_part
+
+
+class UnitSphere(NamedTuple):
+    """A cloud's centre ``(3,)`` and the largest distance of a point from it."""
+
+    centre: NDArray[np.float64]
+    radius: float
+
+    @classmethod
+    def around(cls, points: NDArray[np.float64]) -> "UnitSphere":
+        """Measure a cloud ``(n, 3)``."""
+        centre = points.sum(0) / len(points)
+        return cls(centre, largest_distance(points, centre) or 1.0)
+
+    def normalise(self, points: NDArray[np.float64]) -> Tensor:
+        """Return points ``(n, 3)`` of the cloud in the unit sphere, float32."""
+        return torch.from_numpy(((points - self.centre) / self.radius).astype(np.float32))
+
+    def restore(self, points: Tensor) -> NDArray[np.float64]:
+        """Return points ``(n, 3)`` of the unit sphere in the file's own unit."""
+        restored: NDArray[np.float64] = points.double().numpy() * self.radius + self.centre
+        return restored
+
+
+def largest_distance(points: NDArray[np.float64], centre: NDArray[np.float64]) -> float:
+    """Return the largest distance of points ``(n, 3)`` from ``centre`` ``(3,)``."""
+    return float(np.linalg.norm(points - centre, axis=1).max(initial=0.0))
 
 
 class Nearest(NamedTuple):
@@ -51,23 +72,23 @@ class Nearest(NamedTuple):
         return Nearest(np.minimum(self.distance, other.distance), Table(points, columns))
 
 
-class Kept(NamedTuple):
-    """What is kept of a file.
+class Outcome(NamedTuple):
+    """Numbers of points of a downsampled file.
 
     Attributes:
-        table: the sampled points.
-        number: how many points with finite coordinates the file has.
+        kept: number of points that were kept.
+        number: how many points with finite coordinates the cloud has.
         dropped: how many it has without.
     """
 
-    table: Table
+    kept: int
     number: int
     dropped: int
 
 
 def sample_by_chunks(
     source: Path, sampler: Sampler, m: int, options: Options, engine: Engine
-) -> Kept:
+) -> tuple[Table, Outcome]:
     """Sample a file by a trained MOPS-Net without reading it as a whole.
 
     Args:
@@ -96,24 +117,25 @@ def sample_by_chunks(
         summed += part
     check_size(source, number, m)
     centre = summed / number
-    sphere = unit_sphere(centre, max(over("radius", _largest_distance, centre)), source)
+    sphere = UnitSphere(centre, max(over("radius", _radius, centre)) or 1.0)
     global_ = reduce(torch.maximum, over("global feature", _global, sphere, net))
     sums: Partial = reduce(Partial.merge, over("sampling", _sum, sphere, net, global_, m))
     generated = sums.result()
-    dropped = whole.number - number
+    outcome = Outcome(m, number, whole.number - number)
     if options.readout == "generated":
-        return Kept(Table(sphere.restore(generated)), number, dropped)
+        return Table(sphere.restore(generated)), outcome
     found: Nearest = reduce(Nearest.merge, over("matching", _nearest, sphere, generated))
     kept = replace(found.table, header=whole.header)
-    return Kept(kept if options.keep_attributes else kept.without_attributes(), number, dropped)
+    return kept if options.keep_attributes else kept.without_attributes(), outcome
 
 
 def _count_and_sum(cloud: CloudFile, rows: range) -> tuple[int, NDArray[np.float64]]:
-    table = cloud.read(rows)
-    return len(table.points), sum_of(table.points)
+    points = cloud.read(rows).points
+    check_coordinates(cloud.path, points)
+    return len(points), points.sum(0)
 
 
-def _largest_distance(cloud: CloudFile, centre: NDArray[np.float64], rows: range) -> float:
+def _radius(cloud: CloudFile, centre: NDArray[np.float64], rows: range) -> float:
     return largest_distance(cloud.read(rows).points, centre)
 
 

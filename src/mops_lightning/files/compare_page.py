@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mops_lightning.files.compare import TRAINED, FileResult
+from mops_lightning.files.compare import FileResult
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.report.page import render
 from mops_lightning.report.text import Grid, markdown
@@ -16,15 +16,6 @@ from mops_lightning.viz.snapshots import INPUT, MAX_INPUT_POINTS
 
 FILES = ("table.csv", "compare.html")
 """The files of a comparison."""
-
-COLOURS = {
-    INPUT: "rgb(190, 190, 190)",
-    "random": "rgb(148, 103, 189)",
-    "voxel": "rgb(140, 86, 75)",
-    "fps": "rgb(44, 140, 60)",
-    "poisson": "rgb(23, 160, 170)",
-    TRAINED: "rgb(31, 119, 220)",
-}
 
 COLUMNS = {"chamfer": ".4g", "hausdorff": ".4g", "density": ".2f", "seconds": ".2f"}
 """The measures, and their formats."""
@@ -83,6 +74,6 @@ def _clouds(compared: FileResult) -> dict[str, Any]:
         "name": f"{compared.path.name}, {compared.m:,} points",
         "titles": [compared.path.stem],
         "points": {name: [cloud.round(3).tolist()] for name, cloud in sets.items()},
-        "colours": {name: COLOURS[name] for name in sets},
+        "colours": {INPUT: "lightgrey"},  # the page chooses the others
         "hidden": [name for name in sets if name not in shown],
     }

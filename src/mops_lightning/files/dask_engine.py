@@ -1,13 +1,10 @@
-"""Dask as the engine: ranges of a file's rows, distributed over processes or machines.
+"""Dask as the engine: ranges of a file's rows, distributed over machines.
 
 Dask instead of Ray, because it is plain Python, small, and runs wherever torch does, and little is
 needed here: distribute ranges, and distribute them again when a worker dies.
 """
 
 import logging
-import os
-import signal
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,7 +13,6 @@ from typing import Any
 from mops_lightning.errors import UserError
 from mops_lightning.files.engine import with_progress
 
-LOCAL = "local"
 PATIENCE = 20
 """Seconds to wait for a scheduler and its first worker."""
 
@@ -25,83 +21,32 @@ AHEAD = 4
 
 
 @contextmanager
-def dask_engine(address: str, workers: int, progress: bool) -> Iterator["DaskEngine"]:
+def dask_engine(address: str, progress: bool) -> Iterator["DaskEngine"]:
     """Yield an engine that distributes its work by Dask.
 
     Args:
-        address: of a running scheduler, or ``local`` for processes on this machine.
-        workers: number of local processes.
+        address: of a running scheduler.
         progress: show the progress on a terminal.
 
     Raises:
         UserError: Dask is not installed, or no scheduler with workers answers at the address.
     """
-    distributed = _distributed()
-    import dask
-
-    # Errors say what a user needs to know.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    # The net is part of the task graph, so that workers that join later get it.
-    with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}):
-        if address != LOCAL:
-            with _client(distributed, address) as client:
-                yield DaskEngine(client, progress)
-            return
-        with environment_kept():
-            with _no_interrupts():
-                # Workers inherit this, so Ctrl-C reaches this process only.
-                processes = distributed.LocalCluster(
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    dashboard_address=":0",
-                    silence_logs=logging.CRITICAL,
-                )
-            with processes, distributed.Client(processes) as client:
-                yield DaskEngine(client, progress)
-
-
-@contextmanager
-def environment_kept() -> Iterator[None]:
-    """Restore the environment: Dask sets OMP_NUM_THREADS=1 for its workers in this process too."""
-    before = dict(os.environ)
     try:
-        yield
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
-
-
-@contextmanager
-def _no_interrupts() -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _distributed() -> Any:
-    try:
+        import dask
         import distributed
     except ModuleNotFoundError:
         raise UserError("--cluster needs Dask: pip install 'mops-lightning[cluster]'.") from None
-    return distributed
-
-
-@contextmanager
-def _client(distributed: Any, address: str) -> Iterator[Any]:
+    # Errors say what a user needs to know.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
         client = distributed.Client(address, timeout=PATIENCE)
     except (OSError, ValueError, TypeError) as error:
         raise UserError(
             f"--cluster: no Dask scheduler answers at {address} ({type(error).__name__}). Start "
-            "one with `dask scheduler`, and `dask worker ADDRESS` on every machine, or use "
-            "--cluster local."
+            "one with `dask scheduler`, and `dask worker ADDRESS` on every machine."
         ) from None
-    with client:
+    # The net is part of the task graph, so that workers that join later get it.
+    with client, dask.config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}):
         try:
             client.wait_for_workers(1, timeout=PATIENCE)
         except TimeoutError:
@@ -109,7 +54,7 @@ def _client(distributed: Any, address: str) -> Iterator[Any]:
                 f"--cluster: the scheduler at {address} has no workers. Start some with "
                 f"`dask worker {address}`."
             ) from None
-        yield client
+        yield DaskEngine(client, progress)
 
 
 class DaskEngine:

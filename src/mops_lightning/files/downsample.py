@@ -2,22 +2,20 @@
 
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.data.formats.errors import check_size
+from mops_lightning.data.formats.errors import check_coordinates, check_size
 from mops_lightning.data.formats.registry import read, write
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
-from mops_lightning.files.chunks import Kept, sample_by_chunks
+from mops_lightning.files.chunks import Outcome, UnitSphere, sample_by_chunks
 from mops_lightning.files.engine import Engine, LocalEngine
 from mops_lightning.files.options import Options
 from mops_lightning.files.tiles import sample_by_tiles
-from mops_lightning.files.unit_sphere import largest_distance, sum_of, unit_sphere
 from mops_lightning.ops.readout import select
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.streaming import stream_sample
@@ -29,20 +27,6 @@ PART = 65536
 
 SURFACE = 10_000
 """Least number of points that are sampled from a mesh."""
-
-
-class Outcome(NamedTuple):
-    """Numbers of points of a downsampled file.
-
-    Attributes:
-        written: number of points that were written.
-        number: how many points with finite coordinates the cloud has.
-        dropped: how many it has without.
-    """
-
-    written: int
-    number: int
-    dropped: int
 
 
 @cache
@@ -95,14 +79,16 @@ def downsample_file(
     sampler = load_sampler(options)
     m = options.m or sampler.m
     if options.chunk is None:
-        kept = _sample_whole(source, sampler, m, options)
+        table, outcome = _sample_whole(source, sampler, m, options)
     else:
-        kept = sample_by_chunks(source, sampler, m, options, engine or LocalEngine())
-    write(target, kept.table)
-    return Outcome(len(kept.table.points), kept.number, kept.dropped)
+        table, outcome = sample_by_chunks(source, sampler, m, options, engine or LocalEngine())
+    write(target, table)
+    return outcome
 
 
-def _sample_whole(source: Path, sampler: Sampler, m: int, options: Options) -> Kept:
+def _sample_whole(
+    source: Path, sampler: Sampler, m: int, options: Options
+) -> tuple[Table, Outcome]:
     """Sample a file that is read as a whole."""
     table = read(source, options.surface or max(SURFACE, 8 * m), options.seed)
     finite = table.finite()
@@ -114,7 +100,7 @@ def _sample_whole(source: Path, sampler: Sampler, m: int, options: Options) -> K
     else:
         kept = finite.take(rows)
         kept = kept if options.keep_attributes else kept.without_attributes()
-    return Kept(kept, number, len(table.points) - number)
+    return kept, Outcome(m, number, len(table.points) - number)
 
 
 def sample_cloud(
@@ -135,12 +121,12 @@ def sample_cloud(
     Raises:
         UserError: the coordinates are too large, or tiles keep more points than the sampler can.
     """
+    check_coordinates(source, points)
     if options.tile is not None:
-        rows = sample_by_tiles(points, options.tile, m, sampler, source)
+        rows = sample_by_tiles(points, options.tile, m, sampler)
         return rows, points[rows]
-    centre = sum_of(points) / len(points)
-    sphere = unit_sphere(centre, largest_distance(points, centre), source)
-    chosen, generated = _sample_in_sphere(sphere.normalise(points), sampler, m, options.readout)
+    sphere = UnitSphere.around(points)
+    chosen, generated = _select(sampler, sphere.normalise(points), m, options.readout)
     if chosen is None:
         return None, sphere.restore(generated)
     rows = chosen.numpy()
@@ -148,9 +134,7 @@ def sample_cloud(
 
 
 @torch.no_grad()
-def _sample_in_sphere(
-    points: Tensor, sampler: Sampler, m: int, readout: str
-) -> tuple[Tensor | None, Tensor]:
+def _select(sampler: Sampler, points: Tensor, m: int, readout: str) -> tuple[Tensor | None, Tensor]:
     """Return the rows ``(m,)`` of the points to keep, or None, and the generated points."""
     if sampler.streams:
         generated = stream_sample(sampler, lambda: list(points.split(PART)), m)

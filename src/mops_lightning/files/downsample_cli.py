@@ -57,7 +57,7 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
         "--workers",
         type=int,
         default=1,
-        help="processes that share a folder's files, or with --cluster local their chunks",
+        help="processes that share a folder's files",
     )
     add(
         "--tile",
@@ -70,8 +70,7 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
     add(
         "--cluster",
         metavar="ADDRESS",
-        help="distribute the chunks of every file over Dask workers: the address of a scheduler, "
-        "or 'local' for --workers processes on this machine",
+        help="distribute the chunks of every file over the workers of this Dask scheduler",
     )
     add("--seed", type=int, default=0, help="seed of random choices")
     add("--overwrite", action="store_true", help="replace existing files")
@@ -109,7 +108,7 @@ def _options(chosen: argparse.Namespace) -> Options:
     if chosen.workers < 1:
         raise UserError(f"--workers must be at least 1, got {chosen.workers}.")
     if chosen.cluster == "":
-        raise UserError("--cluster must be 'local' or the address of a Dask scheduler, got ''.")
+        raise UserError("--cluster must be the address of a Dask scheduler, got ''.")
     if chosen.cluster and chosen.chunk is None:
         raise UserError("--cluster distributes the chunks of a file: give --chunk as well.")
     return Options(
@@ -132,4 +131,4 @@ def _engine(chosen: argparse.Namespace) -> AbstractContextManager[Engine | None]
         return nullcontext(LocalEngine(progress=True) if is_file else None)
     from mops_lightning.files.dask_engine import dask_engine
 
-    return dask_engine(chosen.cluster, chosen.workers, progress=is_file)
+    return dask_engine(chosen.cluster, progress=is_file)

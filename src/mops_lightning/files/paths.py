@@ -1,11 +1,11 @@
 """Input files, and the output file of each."""
 
 from collections import Counter
+from os.path import realpath  # unlike Path.resolve, it accepts loops of symbolic links
 from pathlib import Path
-from tempfile import TemporaryFile
 
 from mops_lightning.data.formats.registry import READABLE, WRITERS
-from mops_lightning.errors import UserError, one_line
+from mops_lightning.errors import UserError
 from mops_lightning.filesystem import is_temporary
 
 FilePair = tuple[Path, Path]
@@ -25,20 +25,11 @@ def file_pairs(source: Path, target: Path, keep_attributes: bool) -> list[FilePa
     Raises:
         UserError: an input is missing, or an output is ambiguous or cannot be written.
     """
-    try:
-        return _file_pairs(source, target, keep_attributes)
-    except OSError as error:  # a name that is too long, a folder that may not be read
-        raise UserError(f"IN or OUT cannot be used: {one_line(error)}.") from None
-    except RuntimeError:  # of pathlib
-        raise UserError(f"IN or OUT: {source} or {target} is a loop of symbolic links.") from None
-
-
-def _file_pairs(source: Path, target: Path, keep_attributes: bool) -> list[FilePair]:
     if not source.exists():
         raise UserError(f"{source}: no such file or folder.")
     if keep_attributes and target.suffix.lower() == ".obj":
         raise UserError("--keep-attributes: .obj holds coordinates only. Use .ply, .pcd or .npz.")
-    if target.resolve() == source.resolve():
+    if realpath(target) == realpath(source):
         raise UserError(f"OUT must differ from IN, got {source} for both.")
     if blocking := next((p for p in target.parents if p.exists() and not p.is_dir()), None):
         raise UserError(f"OUT: {blocking} is a file, not a folder. Give another OUT.")
@@ -58,30 +49,14 @@ def _file_pairs(source: Path, target: Path, keep_attributes: bool) -> list[FileP
     return [(source, target)]
 
 
-def check_writable(folder: Path) -> None:
-    """Create a folder for outputs, unless it exists.
-
-    Raises:
-        UserError: no file can be written there.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise UserError(
-            f"OUT: cannot write into {folder} ({error.strerror}). Give another OUT."
-        ) from None
-
-
 def _inputs(source: Path, target: Path) -> list[Path]:
     """Return the readable files below a folder, without those below ``target``."""
     if target.is_file():
         raise UserError(f"OUT must be a folder because IN is one, got the file {target}.")
     found = (p for p in source.rglob("*") if p.suffix.lower() in READABLE and p.is_file())
     files = sorted(path for path in found if not is_temporary(path))
-    outputs = target.resolve()
-    files = [p for p in files if outputs not in p.resolve().parents]
+    outputs = Path(realpath(target))
+    files = [path for path in files if outputs not in Path(realpath(path)).parents]
     if not files:
         raise UserError(f"{source} contains no file that ends in {', '.join(READABLE)}.")
     return files

@@ -58,7 +58,8 @@ class Processes:
         try:
             while True:
                 while len(busy) < self.number and (job := next(waiting, None)) is not None:
-                    process = self._start(function, job[1])
+                    process = self._idle.pop() if self._idle else _Process()
+                    process.connection.send((function, job[1]))
                     busy[process.connection] = (process, job[0])
                 if not busy:
                     return
@@ -74,18 +75,6 @@ class Processes:
         finally:
             for process, _ in busy.values():
                 process.stop()
-
-    def _start(self, function: Callable[..., Any], job: tuple[Any, ...]) -> "_Process":
-        while self._idle:
-            process = self._idle.pop()
-            try:
-                process.connection.send((function, job))
-                return process
-            except OSError:  # it died while it was idle
-                process.stop()
-        process = _Process()
-        process.connection.send((function, job))
-        return process
 
 
 class _Process:

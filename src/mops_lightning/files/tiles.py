@@ -1,7 +1,6 @@
 """Downsampling large scenes by tiles: cut, sample every tile as in training, thin the seams."""
 
 from collections import defaultdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from mops_lightning.data.formats.errors import BadCloudError
 from mops_lightning.errors import UserError
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.samplers.base import Sampler
@@ -28,7 +26,7 @@ NEIGHBOURS = 8
 """Nearest sampled points that the thinning compares a point with."""
 
 
-def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler, path: Path) -> Rows:
+def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler) -> Rows:
     """Sample every tile of a cloud, then thin the points where tiles meet.
 
     Points of neighbouring tiles may be nearly equal. Therefore a quarter more points are sampled,
@@ -40,7 +38,6 @@ def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler, path: P
         size: most points of a tile.
         m: number of points to keep of all tiles together.
         sampler: a flexible sampler.
-        path: the file, for errors.
 
     Returns:
         ``(m,)`` different rows, ascending.
@@ -68,7 +65,7 @@ def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler, path: P
         for first in range(0, len(places) if number else 0, step):
             batch = places[first : first + step]
             stacked = np.stack([points[tiles[place]] for place in batch])
-            rows = sample_tiles(sampler, _normalised(stacked, path), number).numpy()
+            rows = sample_tiles(sampler, _normalised(stacked), number).numpy()
             for place, chosen in zip(batch, rows, strict=True):
                 found[place] = tiles[place][chosen]
     kept = np.concatenate(found)
@@ -112,13 +109,10 @@ def shares(m: int, sizes: list[int]) -> Rows:
     return np.diff(m * ends // ends[-1])
 
 
-def _normalised(tiles: Points, path: Path) -> Tensor:
+def _normalised(tiles: Points) -> Tensor:
     """Return tiles ``(B, n, 3)`` in the unit sphere, as in training."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        centred = tiles - tiles.mean(1, keepdims=True)
-        radius = np.linalg.norm(centred, axis=2).max(1)[:, None, None]
-    if not np.isfinite(radius).all():
-        raise BadCloudError(f"{path}: its coordinates are too large for float64 distances.")
+    centred = tiles - tiles.mean(1, keepdims=True)
+    radius = np.linalg.norm(centred, axis=2).max(1)[:, None, None]
     return torch.from_numpy((centred / np.where(radius > 0, radius, 1.0)).astype(np.float32))
 
 

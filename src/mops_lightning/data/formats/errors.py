@@ -5,7 +5,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mops_lightning.errors import UserError, one_line
+
+LARGEST = 1e150
+"""Largest coordinate."""
 
 
 class BadCloudError(UserError):
@@ -46,3 +52,13 @@ def check_size(path: Path, number: int, m: int) -> None:
     """
     if number < m:
         raise BadCloudError(f"{path} holds {number} points, fewer than --m {m}.")
+
+
+def check_coordinates(path: Path, points: NDArray[np.float64]) -> None:
+    """Reject points ``(n, 3)`` whose squared distances float64 cannot hold.
+
+    Raises:
+        BadCloudError: a coordinate is too large.
+    """
+    if np.abs(points).max(initial=0.0) > LARGEST:
+        raise BadCloudError(f"{path}: its coordinates are too large for float64 distances.")
