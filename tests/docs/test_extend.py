@@ -2,9 +2,12 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
+from mops_lightning import load
 from mops_lightning.records import run_record
 from tests.support.command_line import TINY_ANY_DATA, call_anew, runs
 
@@ -52,3 +55,6 @@ def test_run_of_own_sampler_is_evaluated_with_its_class_only(tmp_path):
     status, _, err = call_anew(again, tmp_path)
     assert (status, err) == (0, "")
     assert run_record.read(tmp_path / "again").score == run_record.read(run).score
+    own: dict[str, Any] = {"__name__": "my_sampler"}
+    exec(MODULES["my_sampler.py"], own)
+    assert load(run, cls=own["MySampler"])(torch.rand(2, 64, 3)).points.shape == (2, 8, 3)

@@ -1,7 +1,7 @@
 """The settings that two runs must share: to resume one, to reuse a net, to make one table."""
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import asdict, fields
 from functools import cache
 from typing import Any
 
@@ -47,13 +47,16 @@ def table_settings(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
 
     A setting that the record's version did not have yet counts with its default.
     """
-    defaults = {
+    from mops_lightning.data.loader import Augmentation  # imports torch
+
+    defaults: dict[str, Any] = {
         one.name: one.default
         for one in fields(settings.SCHEMA)
         if one.default is not None and not one.metadata["setting"].group
     }
     known = {name: node for name, node in config.items() if name in settings.declared()}
-    flat = effective({**defaults, **with_defaults(known)}, learn)
+    defaults["augment"] = dict.fromkeys(("task", "sampler"), asdict(Augmentation()))
+    flat = effective(defaults, learn) | effective(with_defaults(known), learn)
     return {path: value for path, value in flat.items() if settings.of(path).compared}
 
 
