@@ -61,5 +61,5 @@ def test_records_and_models_name_models_that_exist(tracked):
     records = [json.loads(line) for path in tables for line in path.read_text().splitlines()]
     records += [model_file.read_card(path)["record"] for path in tracked if path.suffix in WEIGHTS]
     named = {record["files"][k] for record in records for k in record["files"] if k in KINDS}
-    found = {names.find(name) for name in named}
+    found = {names.find_model(name) for name in named}
     assert found == {path for path in tracked if path.suffix in WEIGHTS}

@@ -1,6 +1,7 @@
 """A run that is stopped and resumed, also several times, gets the weights of an unbroken one."""
 
 import os
+import pickle
 import signal
 from functools import cache, partial
 from itertools import product
@@ -14,9 +15,10 @@ from torch import nn
 
 from mops_lightning.config.settings import Learn
 from mops_lightning.data.loader import Augmentation, CloudLoader
-from mops_lightning.errors import Interrupted
+from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.classification import Classification
+from mops_lightning.training.checkpoint import read_plain
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.moving_average import MovingAverage
 from mops_lightning.training.recipe.recipe import Recipe
@@ -176,3 +178,23 @@ def test_checkpoint_written_in_last_step_of_epoch_resumes_to_same_weights(unbrok
     attempt(setting, path, saves, StopAt(("kill", "validation"), 3))
     assert attempt(setting, path, StopAt(("ctrl-c", "step"), 2)) is None
     assert_same(attempt(setting, path), unbroken(setting))
+
+
+class Touch:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+@pytest.mark.parametrize("plain", [True, False])
+def test_read_plain_runs_no_pickled_code(plain, tmp_path):
+    content = {"state": Touch(tmp_path / "ran")}
+    if plain:
+        (tmp_path / "a.ckpt").write_bytes(pickle.dumps(content))
+    else:
+        torch.save(content, tmp_path / "a.ckpt")
+    with pytest.raises(UserError, match="expected a checkpoint"):
+        read_plain(tmp_path / "a.ckpt", "a checkpoint")
+    assert not (tmp_path / "ran").exists()

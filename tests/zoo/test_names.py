@@ -38,7 +38,7 @@ def test_available_leaves_out_named_pipes_and_folders(own):
 
 def test_own_model_comes_before_one_of_the_package(own):
     (own / "pointnet.modelnet40.safetensors").touch()
-    assert names.find("pointnet.modelnet40") == own / "pointnet.modelnet40.safetensors"
+    assert names.find_model("pointnet.modelnet40") == own / "pointnet.modelnet40.safetensors"
 
 
 def test_resolve_prefers_existing_path(own, tmp_path):
@@ -59,9 +59,9 @@ def test_resolve_unknown_name_lists_near_ones(given):
 
 
 def test_find_refuses_other_weights():
-    assert names.find(f"nothing.here@sha256:{SHA256}") is None
+    assert names.find_model(f"nothing.here@sha256:{SHA256}") is None
     with pytest.raises(UserError, match=f"now has other weights than those with sha256 {SHA256}"):
-        names.find(names.pinned("pointnet.modelnet40", SHA256))
+        names.find_model(names.pinned("pointnet.modelnet40", SHA256))
 
 
 def test_record_cannot_name_an_address(tmp_path, monkeypatch):

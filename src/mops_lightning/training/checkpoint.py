@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config.shared_settings import training_settings
@@ -168,7 +169,7 @@ def read(path: Path) -> dict[str, Any]:
         UserError: the file cannot be opened.
         Damaged: it is damaged, not finite, or not a checkpoint of this program.
     """
-    content = weights.read_plain(path, "a checkpoint")
+    content = read_plain(path, "a checkpoint")
     try:
         planned, done = planned_epochs(content), _epochs_done(content)
         complete = min(planned, done) >= 0 and all(
@@ -180,6 +181,25 @@ def read(path: Path) -> dict[str, Any]:
         raise weights.Damaged(f"{path} is not a checkpoint of this program.")
     weights.check_state(content["state_dict"], path)
     return content
+
+
+def read_plain(path: Path, what: str) -> Any:
+    """Read a file of plain tensors and plain data; pickled code is refused, not executed.
+
+    Args:
+        path: the file.
+        what: kind of file that was expected, for the error.
+
+    Raises:
+        UserError: the file cannot be opened.
+        Damaged: it is damaged, or contains more than plain data.
+    """
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except PermissionError:
+        raise UserError(f"{path} may not be read. Check its permissions.") from None
+    except Exception:  # torch's messages advise to execute the file's code
+        raise weights.damaged(path, f"expected {what}") from None
 
 
 def planned_epochs(content: dict[str, Any]) -> int:

@@ -93,13 +93,9 @@ def sampler_of(
         return untrained(str(method), m, seed, **({} if start is None else {"start": start}))
     known = {*UNTRAINED, *names.available()}
     text = str(method)
-    if text.startswith(names.HUB) or text in known:
-        path = names.resolve(text)
-    else:
-        path = Path(text).expanduser()
-        if not path.exists():
-            raise UserError(f"method: unknown {text!r}.{did_you_mean(text, known)}")
-        path = weights.of_run(path)
+    if not (text.startswith(names.HUB) or text in known or Path(text).expanduser().exists()):
+        raise UserError(f"method: unknown {text!r}.{did_you_mean(text, known)}")
+    path = weights.of_run(names.resolve(text))
     return _model(path, path.stat().st_mtime_ns, str(device))
 
 

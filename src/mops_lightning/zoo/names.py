@@ -48,7 +48,7 @@ def pinned(name: str, sha256: str) -> str:
     return f"{name}{PIN}{sha256}"
 
 
-def find(reference: str) -> Path | None:
+def find_model(reference: str) -> Path | None:
     """Return the file of a model, or None if there is no model of this name.
 
     Args:
@@ -85,7 +85,7 @@ def resolve(given: str | Path) -> Path:
     path = Path(text).expanduser()
     if path.exists():
         return path
-    found = find(text)
+    found = find_model(text)
     if found is not None:
         return found
     if path.name != text or text.endswith(FILES):

@@ -105,7 +105,7 @@ def _readouts(main: MetricName) -> tuple[str, ...]:
 def _task_net(given: str | None, record: RunRecord) -> str | None:
     """Return a reference to the model of a sampler's task net, or None if it is no model."""
     if given is not None:
-        path = names.find(given)
+        path = names.find_model(given)
         if path is None:
             raise UserError(
                 f"--task-net: no model {given!r}. `mops-lightning models` lists all of them."

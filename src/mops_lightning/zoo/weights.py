@@ -1,6 +1,5 @@
 """Weights of runs and models: saved, read and loaded into modules, strictly."""
 
-import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,11 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.filesystem import atomic_write
 from mops_lightning.records import run_record
 from mops_lightning.zoo import model_file, names
 from mops_lightning.zoo.model_file import Damaged as Damaged
-from mops_lightning.zoo.model_file import damaged
+from mops_lightning.zoo.model_file import damaged as damaged
 from mops_lightning.zoo.model_file import digest as digest
 
 FILE = f"weights{model_file.SUFFIX}"
@@ -51,18 +49,6 @@ def plain_state(module: nn.Module) -> dict[str, Tensor]:
         name: value.detach().cpu().clone(memory_format=torch.contiguous_format)
         for name, value in module.state_dict().items()
     }
-
-
-def write_plain(path: str | Path, content: dict[str, Any]) -> None:
-    """Write plain tensors and plain data; an existing file is replaced when all is written.
-
-    Raises:
-        OSError: the file cannot be written. ``torch.save`` raises other errors at a full disk.
-    """
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(buffer.getbuffer())
 
 
 def read(path: str | Path) -> dict[str, Any]:
@@ -109,25 +95,6 @@ def check_state(state: Any, path: str | Path) -> None:
         raise damaged(path, f"{name} is not finite, because the training diverged")
 
 
-def read_plain(path: Path, what: str) -> Any:
-    """Read a file of plain tensors and plain data; pickled code is refused, not executed.
-
-    Args:
-        path: the file.
-        what: kind of file that was expected, for the error.
-
-    Raises:
-        UserError: the file cannot be opened.
-        Damaged: it is damaged, or contains more than plain data.
-    """
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except PermissionError:
-        raise UserError(f"{path} may not be read. Check its permissions.") from None
-    except Exception:  # torch's messages advise to execute the file's code
-        raise damaged(path, f"expected {what}") from None
-
-
 def of_run(run: Path, kind: str = "weights") -> Path:
     """Return the file with the weights of a run.
 
@@ -153,7 +120,7 @@ def of_run(run: Path, kind: str = "weights") -> Path:
         files = run_record.read(run).files if has_record else {}
     named = files.get(kind, f"{kind}{model_file.SUFFIX}")
     path = run / named
-    return path if path.exists() else names.find(named) or path
+    return path if path.exists() else names.find_model(named) or path
 
 
 def of_task_net(given: str | Path) -> Path:

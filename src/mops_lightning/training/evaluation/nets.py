@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import Evaluated
-from mops_lightning.training.checkpoint import CHECKPOINT
+from mops_lightning.training.checkpoint import CHECKPOINT, read_plain
 from mops_lightning.training.evaluation.trained_run import KEY, OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.zoo import weights
@@ -94,7 +94,7 @@ def _load_task(task: torch.nn.Module, trained: TrainedRun) -> None:
         raise UserError(
             f"{path}, which contains the run's task net, does not exist. Give weights=FILE."
         )
-    state = weights.read_plain(path, "a checkpoint")["state_dict"]
+    state = read_plain(path, "a checkpoint")["state_dict"]
     own = {
         key.removeprefix("task."): value for key, value in state.items() if key.startswith("task.")
     }

@@ -13,6 +13,7 @@ from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.tasks.base import Task
+from mops_lightning.training.checkpoint import read_plain
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.types import Batch, PointFeatureNet
 from mops_lightning.zoo import weights
@@ -156,7 +157,7 @@ def _read(path: Path, rows: int) -> Tensor | None:
     if not path.is_file():
         return None
     try:
-        kept = weights.read_plain(path, "predictions")
+        kept = read_plain(path, "predictions")
     except UserError:
         return None
     usable = isinstance(kept, Tensor) and len(kept) == rows and bool(kept.isfinite().all())

@@ -1,6 +1,7 @@
 """Building Lightning's trainer, and what is asked of it besides training."""
 
 import ctypes
+import io
 import logging
 import sys
 import warnings
@@ -17,13 +18,13 @@ from omegaconf import DictConfig
 from mops_lightning.config.build import accepted, build
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
+from mops_lightning.filesystem import atomic_write
 from mops_lightning.records.run_record import dotted
 from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.moving_average import MovingAverage
 from mops_lightning.training.run.callbacks import StopBetweenSteps, build_callbacks
 from mops_lightning.training.run.loaders import clouds_to_draw, score_loader
-from mops_lightning.zoo.weights import write_plain
 
 HARMLESS = (
     ".*does not have many workers.*",  # the data are in memory; workers would only copy them
@@ -64,7 +65,10 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             path: of a local file.
             storage_options: not used.
         """
-        write_plain(path, checkpoint)
+        buffer = io.BytesIO()  # torch.save hides the OSError of a full disk
+        torch.save(checkpoint, buffer)
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(buffer.getbuffer())
 
 
 def make_trainer(
