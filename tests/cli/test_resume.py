@@ -1,6 +1,5 @@
 """Runs that are stopped and resumed by the same command."""
 
-import os
 import signal
 import time
 
@@ -74,7 +73,7 @@ def test_stopped_run_resumed_by_same_command_tests_same_weights(tmp_path, monkey
     def stop_at(place):
         if place in stops:
             stops.remove(place)
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(
         Experiment, "on_before_zero_grad", lambda self, _: stop_at(self.global_step)

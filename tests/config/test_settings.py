@@ -14,7 +14,7 @@ from mops_lightning.config.settings import Affects, RunSettings, number, setting
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.report.build import build
-from mops_lightning.training.checkpoint import identity
+from mops_lightning.training.checkpoint import checkpoint_identity
 from mops_lightning.training.evaluation.settings import as_trained, command_line
 from mops_lightning.training.evaluation.trained_run import TrainedRun
 from mops_lightning.training.run.pretrain import cache_folder
@@ -27,7 +27,7 @@ DATA = small_dataset(train=4, test=4)
 
 def identity_of(cfg):
     config: Any = OmegaConf.to_container(cfg, resolve=True)
-    return identity(config, "data")
+    return checkpoint_identity(config, "data")
 
 
 @pytest.fixture(params=[Affects.TRAINING, Affects.SCORES, Affects.NOTHING], ids=str)

@@ -67,9 +67,9 @@ def read_weights(path):
 
 
 def read_checkpoint(path):
-    from mops_lightning.training.checkpoint import read
+    from mops_lightning.training.checkpoint import Checkpoint
 
-    read(path)
+    Checkpoint.read(path)
 
 
 def read_record(path):

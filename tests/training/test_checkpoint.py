@@ -1,6 +1,5 @@
 """A run that is stopped and resumed, also several times, gets the weights of an unbroken one."""
 
-import os
 import pickle
 import signal
 from functools import cache, partial
@@ -82,7 +81,7 @@ class StopAt(Callback):
             self.place = ""
             if self.kind == "kill":
                 raise Killed
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
         self.left -= 1

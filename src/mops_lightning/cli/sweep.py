@@ -164,7 +164,7 @@ def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
 
     Neither a failed attempt nor any attempt before it is resumed.
     """
-    from mops_lightning.training.checkpoint import CHECKPOINT, set_aside_if_damaged
+    from mops_lightning.training.checkpoint import CHECKPOINT, read_or_set_aside
 
     for attempt in sorted(_attempts(folder), key=lambda path: int(path.name), reverse=True):
         try:
@@ -174,7 +174,7 @@ def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
         if record.status == "failed" or _differences(cfg, record):
             return None
         path = attempt / "checkpoints" / CHECKPOINT
-        if path.is_file() and not set_aside_if_damaged(path):
+        if path.is_file() and read_or_set_aside(path):
             return path
     return None
 

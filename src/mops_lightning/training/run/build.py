@@ -31,7 +31,7 @@ from mops_lightning.records.run_record import RunRecord
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
-from mops_lightning.training import checkpoint
+from mops_lightning.training.checkpoint import Checkpoint, checkpoint_identity, find_checkpoint
 from mops_lightning.training.evaluation.trained_run import OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.distillation import FullClouds
@@ -65,7 +65,7 @@ class Parts:
     held_out: Clouds
     experiment: Experiment
     trainer: L.Trainer
-    resumed: Path | None
+    resumed: Checkpoint | None
     trained: TrainedRun | None
 
     @property
@@ -96,14 +96,14 @@ def build_parts(
     Raises:
         UserError: settings that do not fit each other, the data or the checkpoint to resume.
     """
-    identity = checkpoint.identity(record.config, dataset.fingerprint)
-    resumed = checkpoint.find(cfg, identity)
+    identity = checkpoint_identity(record.config, dataset.fingerprint)
+    resumed = find_checkpoint(cfg, identity)
     record.dataset_fingerprint = dataset.fingerprint
     record.train_clouds, record.test_clouds = len(dataset.train.labels), len(dataset.test.labels)
     record.class_names = list(dataset.class_names)
     record.dataset_facts = dataset.notes
-    record.resumed_from = None if resumed is None else str(resumed)
-    record.lengthened = resumed is not None and checkpoint.lengthened(cfg, resumed)
+    record.resumed_from = None if resumed is None else str(resumed.path)
+    record.lengthened = resumed is not None and cfg.trainer.max_epochs > resumed.planned
     train, held_out = split(dataset.train, cfg.val_fraction, cfg.seed)
     experiment = make_experiment(cfg, dataset, identity, train)
     trainer = make_trainer(cfg, folder, dataset, experiment, len(train.labels))
@@ -134,7 +134,7 @@ def make_experiment(
     Args:
         cfg: a composed configuration.
         dataset: says how many classes and points there are.
-        identity: see ``checkpoint.identity``.
+        identity: see ``checkpoint_identity``.
         train: the clouds to train on, whose predictions may be computed once.
 
     Raises:

@@ -15,8 +15,11 @@ from mops_lightning.config import distributed
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.filesystem import atomic_write, remove_temporary, set_aside
-from mops_lightning.training import checkpoint
-from mops_lightning.training.checkpoint import CHECKPOINT
+from mops_lightning.training.checkpoint import (
+    CHECKPOINT,
+    checkpoint_identity,
+    read_or_set_aside,
+)
 from mops_lightning.training.evaluation.trained_run import OF_RUN
 from mops_lightning.training.run.build import Parts
 from mops_lightning.training.run.callbacks import added
@@ -93,7 +96,7 @@ def task_config(cfg: DictConfig) -> DictConfig:
 def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
     """Return the cache folder of the task net for these settings and data; it may not exist."""
     own: Any = OmegaConf.to_container(task_config(cfg), resolve=True)
-    key = checkpoint.identity(own, dataset.fingerprint)
+    key = checkpoint_identity(own, dataset.fingerprint)
     digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:12]
     name = f"{cfg.names.task}-{cfg.names.net}-{cfg.names.dataset}-{digest}"
     return Path(cfg.cache).expanduser() / "weights" / name
@@ -111,10 +114,8 @@ def publish(parts: Parts) -> None:
         return
     if cfg.weights not in (None, "auto"):
         return
-    if parts.resumed is not None:
-        planned = checkpoint.planned_epochs(checkpoint.read(parts.resumed))
-        if planned != cfg.trainer.max_epochs:
-            return
+    if parts.resumed is not None and parts.resumed.planned != cfg.trainer.max_epochs:
+        return
     target = cache_folder(cfg, parts.dataset) / FILE
     if not _is_good(target):
         remove_temporary(target.parent, below=False)
@@ -148,7 +149,7 @@ def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset, train: Train) -
     if (folder / FILE).exists():
         print(f"{folder / FILE} is damaged. Renamed to {set_aside(folder / FILE).name}.")
     path = folder / "checkpoints" / CHECKPOINT
-    if path.is_file() and not checkpoint.set_aside_if_damaged(path):
+    if path.is_file() and read_or_set_aside(path):
         own.ckpt_path = str(folder)
     try:
         try:

@@ -84,6 +84,7 @@ def fit(parts: Parts, record: RunRecord) -> None:
     """
     record.recipe = _recipe(parts)
     cfg, trainer, experiment = parts.cfg, parts.trainer, parts.experiment
+    resumed = parts.resumed.path if parts.resumed else None
     task, clouds = experiment.task, len(parts.train.labels)
     if clouds < 2 * trainer.world_size:
         raise UserError(
@@ -106,18 +107,16 @@ def fit(parts: Parts, record: RunRecord) -> None:
         validation = score_loader(parts.held_out, cfg.batch_size, task, parts.part)
     try:
         with _interruptible(), _monitoring():
-            trainer.fit(parts.experiment, loader, validation, ckpt_path=parts.resumed)
+            trainer.fit(parts.experiment, loader, validation, ckpt_path=resumed)
         if name := weights.first_nonfinite(parts.experiment.state_dict()):
             raise Diverged(f"training diverged: {name} is not finite.")
     except Diverged as error:
         raise with_checkpoint(error, _last_checkpoint(parts)) from None
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        if parts.resumed is None or parts.experiment.started or isinstance(error, UserError):
+        if resumed is None or parts.experiment.started or isinstance(error, UserError):
             raise
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise weights.Damaged(
-            f"ckpt_path: cannot resume from {parts.resumed}: {reason}."
-        ) from error
+        raise weights.Damaged(f"ckpt_path: cannot resume from {resumed}: {reason}.") from error
     record.validation = {
         name: float(value)
         for name, value in trainer.callback_metrics.items()
@@ -128,7 +127,9 @@ def fit(parts: Parts, record: RunRecord) -> None:
 def _last_checkpoint(parts: Parts) -> Path | None:
     """Return the newest checkpoint of this run, or the one that it was resumed from."""
     own = parts.folder / OUTPUTS["checkpoint"]
-    return own if own.is_file() else parts.resumed
+    if own.is_file():
+        return own
+    return parts.resumed.path if parts.resumed else None
 
 
 def test(parts: Parts, record: RunRecord) -> None:
