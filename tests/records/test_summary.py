@@ -48,26 +48,6 @@ def test_columns_follow_declared_order_and_hide_the_rest():
     assert cells(text)[0] == ["sampled by", "c", "a"]
 
 
-def test_further_nets_have_table_of_their_own():
-    metrics = {"test/full/accuracy": 0.9}
-    for m in (8, 32):
-        for readout in ("generated", "fps"):
-            metrics[f"test/m{m}/{readout}/accuracy"] = m / 100
-            metrics[f"transfer/dgcnn seed 0/m{m}/{readout}/accuracy"] = m / 200
-    metrics |= {"transfer/dgcnn seed 0/full/accuracy": 0.8, "transfer/dgcnn seed 0/full/x": 0.1}
-    text = printed(metrics, "test/m32/generated/accuracy")
-    first, second = text.split("the same samples under other nets, accuracy (%)")
-    assert "dgcnn" not in first
-    assert cells(second) == [
-        ["sampled by", "pointnet of the training", "dgcnn seed 0"],
-        ["m=8 fps", "8.00", "4.00"],
-        ["m=8 mops generated", "8.00", "4.00"],
-        ["m=32 fps", "32.00", "16.00"],
-        ["m=32 mops generated", "32.00", "16.00"],
-        ["all points", "90.00", "80.00"],
-    ]
-
-
 def test_readout_without_task_metrics_has_no_row():
     metrics = {
         "test/sampled/accuracy": 0.5,
@@ -115,3 +95,15 @@ def test_sampler_with_anchors_is_named_as_in_reports():
     metrics = {"test/generated/accuracy": 0.5, "test/full/accuracy": 0.875}
     text = printed(metrics, "test/generated/accuracy", sampler={"anchors": "fps"})
     assert cells(text)[1] == ["mops anchored generated", "50.00"]
+
+
+def test_fps_names_its_start():
+    """The baseline of a run and a run of FPS may start from other points."""
+    metrics = {"test/generated/accuracy": 0.5, "test/fps/accuracy": 0.25, "test/full/accuracy": 1.0}
+    farthest = {"fps": {"start": "farthest"}}
+    text = printed(metrics, "test/generated/accuracy", baselines=farthest)
+    assert cells(text)[1] == ["fps from farthest", "25.00"]
+    names = {**NAMES, "sampler": "fps"}
+    metrics = {"test/sampled/accuracy": 0.5, "test/full/accuracy": 0.875}
+    text = printed(metrics, "test/sampled/accuracy", names=names, sampler={"start": 0})
+    assert cells(text)[1] == ["fps from row 0 sampled", "50.00"]

@@ -52,8 +52,8 @@ def test_report_writes_all_files(tmp_path, capsys):
     svg = (tmp_path / "nre_cd_planes.svg").read_text()
     assert "samplenet" in svg or "<path" in svg
     tex = (tmp_path / "table.tex").read_text()
-    assert r"1.0 & 1.5 / 2 & 1.9 / 2 \\" in tex
-    assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 3
+    assert r"1 & 1.5 / 2 & 1.9 / 2 \\" in tex
+    assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 2
     with (tmp_path / "table.csv").open() as file:
         lines = list(csv.DictReader(file))
     assert len(lines) == 20

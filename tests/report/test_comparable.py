@@ -1,28 +1,39 @@
+"""Which runs share a table, and what its columns are."""
+
 import json
+import re
 
 import pytest
 
-from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from tests.support.records import evaluated
-from tests.support.reports import (
-    put,
-    put_cell,
-    put_pairs,
-    rows,
-    table,
-)
+from tests.support.reports import put, put_cell, put_pairs, put_planes, rows, table
+
+
+def titles(text):
+    return [line for line in text.splitlines() if line.startswith("Test ")]
+
+
+def edited(path, **changes):
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
 @pytest.mark.parametrize("name", ["dataset_fingerprint", "task_weights_sha256"])
-def test_comparable_other_data_or_weights_are_refused(tmp_path, name):
+def test_other_data_or_weights_have_table_of_their_own(tmp_path, name):
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
     put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.8}, **{name: "other"})
-    with pytest.raises(UserError, match="differ in"):
-        table(tmp_path)
+    text = table(tmp_path, mixed=True)
+    first, second = titles(text)
+    assert first.endswith(("(data d)", "(task weights w)"))
+    assert second.endswith(("(data other)", "(task weights other)"))
+    assert "2 groups of runs are not comparable" in text
+    assert [row[0] for row in rows(text) if "paper" not in row[0]] == [
+        *("sampled by", "fps"),
+        *("sampled by", "mops"),
+    ]
 
 
-def test_comparable_joint_runs_have_own_task_nets(tmp_path):
+def test_joint_runs_have_own_task_nets(tmp_path):
     for name in ("snet", "mops"):
         metrics = {"test/generated/accuracy": 0.5, "test/fps/accuracy": 0.2}
         joint = {"task_weights_sha256": name, "evaluated": evaluated(learn="joint")}
@@ -31,42 +42,150 @@ def test_comparable_joint_runs_have_own_task_nets(tmp_path):
     assert [row[0] for row in rows(text) if "paper" not in row[0]] == ["sampled by", "snet", "mops"]
     assert "pointnet on all points after joint training with snet, m=32: 90.00" in text
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
-    with pytest.raises(UserError, match=r"differ in what was trained"):
-        table(tmp_path)
+    joint_title, other = sorted(titles(table(tmp_path)))
+    assert "learn=joint" in joint_title
+    assert "learn=sampler alone" in other
 
 
-def test_comparable_other_pairs_are_refused(tmp_path):
+def test_other_pairs_have_table_of_their_own(tmp_path):
     put_pairs(tmp_path, "fps", 32, 12.0)
     put_pairs(tmp_path, "mops", 32, 9.0, rotation=30)
-    with pytest.raises(UserError, match=r"differ in pairs"):
-        table(tmp_path)
+    assert [re.findall("rotation.: ([0-9]+)", one) for one in titles(table(tmp_path))] == [
+        ["45"],
+        ["30"],
+    ]
 
 
-def test_comparable_other_net_settings_are_refused(tmp_path):
+def test_other_net_settings_have_table_of_their_own(tmp_path):
     for name, passes in (("fps", 1), ("mops", 3)):
-        put(
-            tmp_path,
-            name,
-            32,
-            {"test/sampled/accuracy": 0.5},
-            settings={"net": {"iterations": passes}},
-        )
-    with pytest.raises(UserError, match=r"differ in settings of pointnet"):
-        table(tmp_path)
+        net = {"net": {"iterations": passes}}
+        put(tmp_path, name, 32, {"test/sampled/accuracy": 0.5}, settings=net)
+    assert [re.findall("iterations.: ([0-9])", one) for one in titles(table(tmp_path))] == [
+        ["1"],
+        ["3"],
+    ]
 
 
-def test_comparable_data_per_seed_need_every_sampler_per_seed(tmp_path):
+def test_data_per_seed_need_every_sampler_per_seed(tmp_path):
     for seed in (0, 1):
         for name in ("mops", "fps"):
             values = {"generated": 1.0 + seed}
             path = put_cell(tmp_path, f"{name}{seed}", name, values, seed=seed)
-            content = json.loads(path.read_text())
-            content |= {
-                "dataset_fingerprint": f"d{seed}",
-                "task_weights_sha256": f"w{seed}",
-            }
-            path.write_text(json.dumps(content))
-    assert rows(table(tmp_path))[1] == ["fps", "1.5 ± 0.71 (n=2)"]
+            edited(path, dataset_fingerprint=f"d{seed}", task_weights_sha256=f"w{seed}")
+    assert rows(table(tmp_path))[1][:2] == ["fps", "1.5 ± 0.71 (n=2)"]
     path.parent.joinpath(run_record.FILE).unlink()
-    with pytest.raises(UserError, match="every sampler must have every seed"):
-        table(tmp_path)
+    assert [one.rsplit("(")[-1] for one in titles(table(tmp_path))] == ["data d0)", "data d1)"]
+
+
+def test_other_commit_has_table_of_its_own_unless_mixed(tmp_path):
+    path = put_cell(tmp_path, "a", "mops", {"generated": 1.0})
+    put_cell(tmp_path, "b", "snet", {"generated": 2.0}, batch_size=7)  # may differ by sampler
+    assert len(rows(table(tmp_path))) == 3
+    edited(path, git={"commit": "f" * 40, "dirty": False})
+    assert any(one.endswith("(commit ffffffffff)") for one in titles(table(tmp_path)))
+    assert len(rows(table(tmp_path, mixed=True))) == 3
+
+
+def test_runs_of_two_lengths_and_sizes_have_tables_by_size(tmp_path):
+    for name, m, length in (("a", 32, 3), ("b", 8, 3), ("c", 32, 9)):
+        put_cell(tmp_path, name, "mops", {"generated": 1.0}, m=m, trainer={"max_epochs": length})
+    text = table(tmp_path)
+    assert [one.rsplit("(")[-1] for one in titles(text)] == ["m 32)", "m 8)"]
+    assert rows(text)[0] == ["sampled by", "trainer.max_epochs=3", "trainer.max_epochs=9"]
+    assert rows(table(tmp_path, mixed=True))[0][:3] == ["sampled by", "m=32", "m=8"]
+
+
+def test_runs_of_differing_settings_have_tables_of_their_own(tmp_path):
+    put_cell(tmp_path, "fps", "fps", {"sampled": 3.0})
+    for name in ("adam", "sgd"):
+        put_cell(tmp_path, name, "mops", {"generated": 1.0}, optimizer={"name": name})
+    text = table(tmp_path)
+    assert [one.rsplit("(")[-1] for one in titles(text)] == [
+        "optimizer.name=adam)",
+        "optimizer.name=sgd)",
+    ]
+    assert [row[0] for row in rows(text)].count("fps") == 2, "comparable with both"
+    assert len(titles(table(tmp_path, mixed=True))) == 1
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_setting_that_only_one_run_has_is_no_column(tmp_path, mixed):
+    put_cell(tmp_path, "a", "mops", {"generated": 1.0}, optimizer={"weight_decay": 0.1})
+    put_cell(tmp_path, "b", "mops", {"generated": 2.0}, optimizer={}, seed=1)
+    text = table(tmp_path, mixed=mixed)
+    assert len(titles(text)) == (1 if mixed else 2)
+    assert mixed or "(optimizer.weight_decay=0.1)" in text
+
+
+def test_one_differing_setting_gives_columns(tmp_path):
+    for noise in (0.0, 0.1, 0.02):
+        values = {"generated": 1 + noise, "full": 0.5 + noise}
+        put_cell(tmp_path, f"a{noise}", "mops", values, test_noise_std=noise)
+        put_cell(tmp_path, f"b{noise}", "fps", {"sampled": 2 + noise}, test_noise_std=noise)
+    expected = [
+        ["sampled by", "test_noise_std=0.0", "test_noise_std=0.02", "test_noise_std=0.1"],
+        ["fps", "2", "2.02", "2.1"],
+        ["mops", "1", "1.02", "1.1"],
+        ["all points", "0.5", "0.52", "0.6"],
+    ]
+    assert rows(table(tmp_path)) == expected
+    for noise in (0.0, 0.1):
+        name = f"c{noise}"
+        put_cell(tmp_path, name, "mops", {"generated": 1.5}, test_noise_std=noise, m=8)
+    text = table(tmp_path)
+    assert [one.rsplit("(")[-1] for one in titles(text)] == ["m 32)", "m 8)"]
+    assert rows(text)[:4] == expected
+    assert ["mops", "1.5", "1.5"] in rows(text)
+
+
+def test_mixed_sizes_and_settings_give_columns_by_size(tmp_path):
+    put_cell(tmp_path, "a", "mops", {"generated": 1.0}, test_noise_std=0.0, m=32)
+    put_cell(tmp_path, "b", "mops", {"generated": 2.0}, test_noise_std=0.1, m=8)
+    assert rows(table(tmp_path, mixed=True))[:2] == [
+        ["sampled by", "m=32", "m=8", "training"],
+        ["mops", "1", "2", "1 s"],
+    ]
+
+
+def test_two_differing_settings_give_plane_per_sampler(tmp_path):
+    put_planes(tmp_path)
+    text = table(tmp_path)
+    assert "Test nre cd of samplenet" in text
+    assert rows(text) == [
+        ["beta \\ gamma", "1e-05", "0.001", "0.1"],
+        ["0.1", "0.1 / 3", "0.101 / 3", "0.2 / 3"],
+        ["1", "1 / 3", "1.001 / 3", "1.1 / 3"],
+        ["alpha \\ tau", "0.5", "0.9"],
+        ["0.1", "1 / 2", "1 / 2"],
+        ["1", "1.5 / 2", "1.9 / 2"],
+    ]
+    assert "of mops: reconstruction on shapes, m=32, under autoencoder" in text
+    assert "plane of mops: generated 1 to 1.9 (factor 1.9), matched 2 to 2 (factor 1)." in text
+
+
+def test_planes_of_several_sizes_have_tables_of_their_own(tmp_path):
+    put_planes(tmp_path)
+    put_cell(tmp_path, "other", "mops", {"generated": 1.0}, m=8, of={"alpha": 0.1, "tau": 0.7})
+    assert {one.rsplit("(")[-1] for one in titles(table(tmp_path))} == {"m 32)", "m 8)"}
+
+
+def test_same_samples_under_several_nets_have_column_per_net(tmp_path):
+    nets = {"w": ("pointnet", "run"), "a": ("pointnet", "outputs/pointnet-1"), "b": ("dgcnn", "x")}
+    for digest, (net, weights) in nets.items():
+        value = {"w": 0.8, "a": 0.6, "b": 0.4}[digest]
+        metrics = {f"test/m{m}/generated/accuracy": value - m / 100 for m in (8, 32)}
+        metrics |= {"test/m8/fps/accuracy": 0.1, "test/full/accuracy": 0.9}
+        folder = tmp_path / digest
+        folder.mkdir()
+        changes = {"evaluated": evaluated(), "task_weights_sha256": digest}
+        put(folder, "fmops", 32, metrics, net=net, **changes)
+        path = next(folder.rglob("result.json"))
+        edited(path, config={**json.loads(path.read_text())["config"], "weights": weights})
+    text = table(tmp_path)
+    assert rows(text) == [
+        ["m", "sampled by", "pointnet of the training", "dgcnn (x)", "pointnet-1"],
+        ["32", "fmops", "48.00", "8.00", "28.00"],
+        ["8", "fps", "10.00", "10.00", "10.00"],
+        ["8", "fmops", "72.00", "32.00", "52.00"],
+        ["", "all points", "90.00", "90.00", "90.00"],
+    ]

@@ -1,6 +1,9 @@
 """The page of a report, opened in a browser."""
 
+import base64
+import hashlib
 import json
+import re
 
 import pytest
 import torch
@@ -115,6 +118,17 @@ def test_page_planes_have_table_and_plot(tmp_path, opened):
     assert page.locator("img").evaluate("image => image.naturalWidth") > 300
     assert page.locator("#view").count() == 0, "no run has saved clouds"
     assert errors == []
+
+
+def test_page_runs_its_own_scripts_only(reported):
+    text = reported.read_text()
+    (policy,) = re.findall('Content-Security-Policy" content="([^"]*)"', text)
+    assert "default-src 'none'" in policy
+    scripts = re.findall("<script>(.*?)</script>", text, re.DOTALL)
+    digests = {base64.b64encode(hashlib.sha256(one.encode()).digest()).decode() for one in scripts}
+    assert digests == set(re.findall("'sha256-([^']*)'", policy))
+    assert len(digests) == 2
+    assert '<meta name="viewport"' in text
 
 
 def test_page_embeds_png_where_svg_is_missing(tmp_path):

@@ -1,5 +1,7 @@
 """Folders of made-up runs, and their tables."""
 
+import re
+
 from mops_lightning.records import run_record
 from mops_lightning.report.build import build
 from mops_lightning.report.text import markdown
@@ -28,14 +30,16 @@ def put(folder, sampler, m, metrics, task="classification", net="pointnet", **ch
 
 
 def rows(text):
+    """The cells of all tables of a report, without marks of the best values."""
+    plain = re.sub(r"\*\*|</?u>", "", text)
     return [
         [cell.strip() for cell in line.strip()[1:-1].split("|")]
-        for line in text.splitlines()
+        for line in plain.splitlines()
         if line.startswith("| ")
     ]
 
 
-def put_cell(folder, name, sampler, values, seed=0, **settings):
+def put_cell(folder, name, sampler, values, seed=0, cost=0.5, **settings):
     """A run of a sweep, whose settings beside the size are given dotted."""
     config = {
         "m": settings.pop("m", 32),
@@ -53,7 +57,7 @@ def put_cell(folder, name, sampler, values, seed=0, **settings):
     }
     metrics = {f"test/{readout}/nre_cd": value for readout, value in values.items()}
     (folder / name).mkdir(parents=True)
-    seconds = {"total": 1.0, "fit": 0.5}
+    seconds = {"total": 1.0, "fit": cost}
     score = {"score_name": "test/generated/nre_cd", "dataset_fingerprint": "d"}
     content = record(config=config, metrics=metrics, seed=seed, seconds=seconds, **score)
     run_record.write(folder / name, content)

@@ -13,9 +13,6 @@ FULL = "full"
 SOFT_PROJECTED = "soft_projected"
 """Input of SampleNet's task net in training; logged under ``train/`` only, never a result."""
 
-TRANSFER = "transfer"
-"""Stage of scores under further task nets, as in ``transfer/NET/generated/accuracy``."""
-
 ROWS = (*GENERATED_READOUTS, INDEX_READOUT, REFINED, FULL)
 """Readouts in the order of tables, after the baselines."""
 
@@ -52,15 +49,3 @@ def parse(name: str, stage: str = "test") -> MetricName | None:
     if first != stage or len(parts) != 2 or parts[0] in ("loss", "matrix"):
         return None
     return MetricName(m, parts[0], parts[1])
-
-
-def parse_transfer(name: str) -> tuple[str, MetricName] | None:
-    """Split a name such as ``transfer/dgcnn seed 0/m32/generated/accuracy``.
-
-    Returns:
-        The label of the task net and the rest; None for any other name.
-    """
-    stage, _, rest = name.partition("/")
-    label, _, rest = rest.partition("/")
-    parts = parse(f"{stage}/{rest}", TRANSFER)
-    return parts and (label, parts)

@@ -89,7 +89,6 @@ class RunRecord:
         warm_start: number of copied layers or tensors, and the sha256 of the file they are from.
         weights_loaded: sha256 of the file that the task net was loaded from.
         task_weights_sha256: of the task net that was tested, unless the run trained it.
-        task_nets: further task nets by label.
         resumed_from: the checkpoint that the training continued from.
         lengthened: whether it continued with another number of epochs than planned.
         evaluated: the run that was tested; None: this one.
@@ -126,7 +125,6 @@ class RunRecord:
     warm_start: dict[str, Any] | None = None
     weights_loaded: str | None = None
     task_weights_sha256: str | None = None
-    task_nets: dict[str, dict[str, Any]] = field(default_factory=dict)
     resumed_from: str | None = None
     lengthened: bool = False
     evaluated: Evaluated | None = None

@@ -7,15 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mops_lightning.records.metric_info import in_summary_order, metric_info
-from mops_lightning.records.readout_names import (
-    FULL,
-    REFINED,
-    ROWS,
-    MetricName,
-    parse,
-    parse_transfer,
-    size_prefix,
-)
+from mops_lightning.records.readout_names import FULL, REFINED, ROWS, parse
 from mops_lightning.records.run_record import FILE, RunRecord
 
 Rows = dict[str, dict[str, float | None]]
@@ -57,9 +49,6 @@ def closing_lines(folder: Path, record: RunRecord, console: Console | None = Non
     title, table = results_table(record)
     console.print(title, soft_wrap=True, highlight=False, style="italic")
     console.print(table)
-    if transferred := transfer_table(record):
-        console.print(transferred[0], soft_wrap=True, highlight=False, style="italic")
-        console.print(transferred[1])
     files = ", ".join([FILE, *sorted(record.files.values())])
     seconds = record.seconds["total"]
     console.print(
@@ -97,53 +86,35 @@ def results_table(record: RunRecord) -> tuple[str, Table]:
             "" if value is None else columns[column][1].format(value)
             for column, value in values.items()
         ]
-        table.add_row(_label(readout, sampler_name(config)), *cells)
+        table.add_row(_label(readout, config), *cells)
     return f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test", table
 
 
-def transfer_table(record: RunRecord) -> tuple[str, Table] | None:
-    """Return a title and the scores of the same samples under further task nets.
-
-    Returns:
-        None for a record of a run without ``task_nets``.
-    """
-    names, score = record.config["names"], parse(record.score_name)
-    values: dict[MetricName, dict[str, float | None]] = {}
-    for name, value in record.metrics.items():
-        found = parse_transfer(name)
-        if found and score and found[1].metric == score.metric:
-            values.setdefault(found[1], {})[found[0]] = value
-    if not values or score is None:
-        return None
-    info = metric_info(score.metric, [record])
-    nets = list(next(iter(values.values())))
-    order = {name: position for position, name in enumerate(ROWS)}
-    table = Table("sampled by")
-    for head in (f"{names['net']} of the training", *nets):
-        table.add_column(head, justify="right")
-    # By size; full clouds, which have none, last.
-    for parts in sorted(
-        values, key=lambda one: (one.readout == FULL, one.m or 0, order.get(one.readout, -1))
-    ):
-        size = f"m={parts.m} " if parts.m else ""
-        own = record.metrics.get(f"test/{size_prefix(parts.m)}{parts.readout}/{parts.metric}")
-        cells = [own, *(values[parts].get(net) for net in nets)]
-        table.add_row(
-            size + _label(parts.readout, sampler_name(record.config)),
-            *("" if cell is None else info.format(cell) for cell in cells),
-        )
-    return f"the same samples under other nets, {info.title}", table
-
-
 def sampler_name(config: dict[str, Any]) -> str:
-    """Return the name of a run's sampler; a MOPS-Net with anchors is ``mops anchored``."""
-    anchored = (config.get("sampler") or {}).get("anchors")
-    return config["names"]["sampler"] + (" anchored" if anchored else "")
+    """Return the name of a run's sampler, with what it starts from.
+
+    A MOPS-Net with anchors is ``mops anchored``, FPS from the farthest point ``fps from farthest``.
+    """
+    sampler = config.get("sampler") or {}
+    name = config["names"]["sampler"] + (" anchored" if sampler.get("anchors") else "")
+    return name + _start(sampler)
 
 
-def _label(readout: str, sampler: str) -> str:
+def baseline_name(config: dict[str, Any], name: str) -> str:
+    """Return the name of a run's baseline, with what it starts from."""
+    return name + _start((config.get("baselines") or {}).get(name) or {})
+
+
+def _start(sampler: dict[str, Any]) -> str:
+    start = sampler.get("start")
+    return "" if start is None else f" from {start if isinstance(start, str) else f'row {start}'}"
+
+
+def _label(readout: str, config: dict[str, Any]) -> str:
     """Return the label of a readout's row."""
     if readout == FULL:
         return "all points"
-    label = f"{sampler} {readout}" if readout in ROWS[:-1] else readout
+    if readout not in ROWS:
+        return baseline_name(config, readout)
+    label = f"{sampler_name(config)} {readout}"
     return f"{label} (with the task net)" if readout == REFINED else label

@@ -1,24 +1,20 @@
-"""From records to tables: by size, by another setting, as a plane of two, or of task nets."""
+"""From records to tables: by size, by another setting, as a plane of two, by net, or of nets."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from mops_lightning.errors import UserError
-from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import metric_info
-from mops_lightning.records.readout_names import FULL, parse
+from mops_lightning.records.readout_names import FULL, INDEX_READOUT, parse
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report import paper
-from mops_lightning.report.axes import Axes, axes, value
-from mops_lightning.report.cells import Cells, make_cells, sort_key
 from mops_lightning.report.collect import Found, collect, sampler_row, score, trained_with
-from mops_lightning.report.comparable import shared_names
+from mops_lightning.report.comparable import Group, groups, net_groups, value, weightless
 from mops_lightning.report.nets import nets_grid
 from mops_lightning.report.provenance import provenance, without_result
+from mops_lightning.report.tables import Table, make_table, net_labels, sort_key
 from mops_lightning.report.text import PAPER, Grid
-from mops_lightning.report.transfer import transfer_grid
-from mops_lightning.report.windows import equal_ratios
 from mops_lightning.viz.snapshots import load_clouds
 
 
@@ -28,49 +24,69 @@ class Report:
 
     Attributes:
         found: the runs.
-        scored: the records in the tables.
-        names: what these share; see ``comparable.shared_names``. Empty for task nets alone.
-        axes: the layout of the tables.
-        tables: one for each metric; none for task nets alone.
-        grids: their texts.
+        tables: one for each group of comparable runs and metric; none for task nets alone.
+        grids: the texts of all tables.
         remarks: how the runs were made, and which have no result.
     """
 
     found: Found
-    scored: list[RunRecord]
-    names: dict[str, str]
-    axes: Axes
-    tables: list[Cells]
     grids: list[Grid]
     remarks: list[str]
+    tables: list[Table] = field(default_factory=list)
 
 
 def build(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Report:
-    """Make the tables of all completed records below ``folder``, one for each metric.
+    """Make the tables of all completed records below ``folder``, one for each group and metric.
 
     Args:
         folder: the records' folder.
         metrics: names of the metrics to show; none: the main metric of the records' task.
-        mixed: whether runs of different commits and settings are allowed in one table.
+        mixed: whether runs of different commits and settings may be in one table.
 
     Raises:
-        UserError: there is no record, or the results are not comparable.
+        UserError: there is no record, or no record has a metric.
     """
     found = collect(folder)
-    without_clouds = _without_bad_clouds(found.done)
+    last = [*without_result(found), *_without_bad_clouds(found.done)]
+    chosen = list(metrics)
     scored = [record for record in found.done if record.config["learn"] != "task"]
     if not scored:
-        grid = nets_grid(found.done, list(metrics), mixed)
-        remarks = [*provenance(found.done, ""), *without_result(found), *without_clouds]
-        return Report(found, [], {}, Axes(), [], [grid], remarks)
-    names = shared_names(scored, mixed)
-    layout = axes(scored, names["net"], mixed)
-    chosen = list(metrics) or [score(scored)]
-    tables = [make_cells(scored, metric, names["net"], layout) for metric in chosen]
-    grids = [grid for table in tables for grid in _grids(scored, table, names, layout)]
-    same = [r for r in found.done if r.config["names"]["task"] == names["task"]]
-    remarks = [*provenance(same, names["net"]), *without_result(found), *without_clouds]
-    return Report(found, scored, names, layout, tables, grids, remarks)
+        parts = net_groups(found.done, mixed)
+        grids = [nets_grid(part, chosen) for part in parts]
+        return Report(found, grids, [*provenance(found.done, ""), *_joining(parts), *last])
+    parts = groups(scored, mixed)
+    tables = [
+        make_table(part, metric, _net(part))
+        for part in parts
+        for metric in chosen or [score(part.records)]
+    ]
+    grids = [grid for table in tables for grid in _grids(table)]
+    tasks = {record.config["names"]["task"] for record in scored}
+    same = [record for record in found.done if record.config["names"]["task"] in tasks]
+    hidden = sorted({folder for table in tables for folder in table.hidden})
+    lines = [f"- {one}: not shown; a later run has the same row, column and seed" for one in hidden]
+    net = tables[0].net if len({table.net for table in tables}) == 1 else ""
+    made = provenance(same, net)
+    return Report(found, grids, [*made, *lines, *_joining(parts), *last], tables)
+
+
+def _joining(parts: list[Group]) -> list[str]:
+    """Return lines about tables of their own."""
+    if len(parts) == 1:
+        return []
+    return [
+        "",
+        f"{len(parts)} groups of runs are not comparable and have tables of their own. --mixed "
+        "joins groups that differ in commit or settings only.",
+    ]
+
+
+def _net(group: Group) -> str:
+    """Return the task net of a group's table; empty for a table by net."""
+    if group.layout.column == "net":
+        return ""
+    trained = [record for record in group.records if not weightless(record)] or group.records
+    return trained[0].config["names"]["net"]
 
 
 def _without_bad_clouds(found: list[RunRecord]) -> list[str]:
@@ -87,98 +103,157 @@ def _without_bad_clouds(found: list[RunRecord]) -> list[str]:
     return ["", "Saved clouds that are not shown:", "", *lines] if lines else []
 
 
-def _grids(found: list[RunRecord], table: Cells, names: dict[str, str], layout: Axes) -> list[Grid]:
-    """Return the texts of one metric's table, with the values of full clouds."""
+def _grids(table: Table) -> list[Grid]:
+    """Return the texts of a table, with the values of full clouds."""
+    layout = table.group.layout
     if layout.planes:
-        compared = equal_ratios(table, layout.planes)
-        grids = [*_planes(table, names, layout), *([compared] if compared else [])]
+        grids = [_plane(table, name) for name in sorted(layout.planes, key=sort_key)]
+        grids[-1].below += _full_lines(table)
+    elif layout.column == "net":
+        grids = [_by_net(table)]
     else:
-        grids = [_by_column(found, table, names, layout)]
-    if layout.column == "m":
-        grids[-1].below += _full_lines(found, names, table.metric)
-    else:
-        grids[-1].rows.append(_full_row(found, table, layout))
-    transferred = transfer_grid(found, table, names, layout)
-    return [*grids, *([transferred] if transferred else [])]
-
-
-def _by_column(found: list[RunRecord], table: Cells, names: dict[str, str], layout: Axes) -> Grid:
-    columns = table.columns()
-    if layout.column != "m":
-        columns = columns[::-1]
-    published = paper.table(
-        names["task"], names["dataset"], table.metric.name, names["learned"] == "joint"
-    )
-    samplers = {sampler_row(one): one.config["names"]["sampler"] for one in found}
-    rows = []
-    for name in table.rows():
-        rows.append([name, *(table.text(name, column) for column in columns)])
-        sampler = samplers.get(name, name)
-        theirs = published.get("rows", {}).get(sampler, {}) if layout.column == "m" else {}
-        if any(str(column) in theirs for column in columns):
-            values = [theirs.get(str(column), []) for column in columns]
-            rows.append([PAPER, *(" / ".join(f"{one:.2f}" for one in cell) for cell in values)])
-    below = [published["note"]] if "note" in published and any(r[0] == PAPER for r in rows) else []
-    size = "" if layout == Axes() else f", m={names['m']},"
-    title = (
-        f"Test {table.metric.title}: {names['task']} on {names['dataset']}{size} "
-        f"under {names['net']}; generated / matched / completed sets, or one figure for "
-        "samplers that choose input points."
-    )
-    return Grid(title, ["sampled by", *(f"{layout.column}={one}" for one in columns)], rows, below)
-
-
-def _planes(table: Cells, names: dict[str, str], layout: Axes) -> list[Grid]:
-    """Return one grid per sampler: rows are one setting's values, columns the other's."""
-    assert layout.planes is not None
-    grids = []
-    for name in sorted(layout.planes, key=sort_key):
-        down, across = layout.planes[name]
-        columns = sorted({column[1] for column in table.values[name]})
-        rows = [
-            [f"{left}", *(table.text(name, (left, top)) for top in columns)]
-            for left in sorted({column[0] for column in table.values[name]})
-        ]
-        title = (
-            f"Test {table.metric.title} of {name}: {names['task']} on {names['dataset']}, "
-            f"m={names['m']}, under {names['net']}; generated / matched / completed sets."
-        )
-        head = [f"{down.split('.')[-1]} \\ {across.split('.')[-1]}", *map(str, columns)]
-        grids.append(Grid(title, head, rows, [_spread(table, name)]))
+        grids = [_by_column(table)]
+    about = f" ({table.group.about})" if table.group.about else ""
+    for grid in grids:
+        grid.title += about
+    grids[0].below += _unchanged(table)
     return grids
 
 
-def _spread(table: Cells, name: str) -> str:
+def _by_column(table: Table) -> Grid:
+    names, layout = _names(table), table.group.layout
+    joint = trained_with(table.group.records[0]) == "joint"
+    published = paper.table(names["task"], names["dataset"], table.metric.name, joint)
+    samplers = {sampler_row(one): one.config["names"]["sampler"] for one in table.group.records}
+    cells, columns, costs = table.cells(["row"]), table.columns(), _costs(table)
+    rows: list[list] = []
+    for name in table.rows():
+        shown = [cells.loc[name].get(column) for column in columns]
+        own = ["" if one is None or one != one else one for one in shown]
+        rows.append([name, *own, *([costs.get(name, "")] if costs else [])])
+        sampler = samplers.get(name, name.partition(" from ")[0])
+        theirs = published.get("rows", {}).get(sampler, {}) if layout.column == "m" else {}
+        if any(str(column) in theirs for column in columns):
+            values = [theirs.get(str(column), []) for column in columns]
+            texts = [" / ".join(f"{one:.2f}" for one in cell) for cell in values]
+            rows.append([PAPER, *texts, *([""] if costs else [])])
+    below = [published["note"]] if "note" in published and any(r[0] == PAPER for r in rows) else []
+    size = "" if layout.column == "m" else f", m={names['m']},"
+    title = (
+        f"Test {table.metric.title}: {names['task']} on {names['dataset']}{size} "
+        f"under {table.net}; generated / matched / completed sets, or one figure for "
+        "samplers that choose input points."
+    )
+    head = ["sampled by", *(f"{layout.column}={one}" for one in columns)]
+    if layout.column == "m":
+        below += _full_lines(table)
+    else:
+        rows.append(_full_row(table))
+    return Grid(title, head + ["training"] * bool(costs), rows, below)
+
+
+def _by_net(table: Table) -> Grid:
+    """Return the scores of the same samples under several nets: size and sampler by net."""
+    names, cells = _names(table), table.cells(["m", "row"])
+    labels, records = net_labels(table.group.records), table.group.records
+    columns = sorted(cells.columns, key=lambda label: ("of the training" not in label, label))
+    rows: list[list] = [
+        [str(m), name, *("" if one != one else one for one in cells.loc[(m, name), columns])]
+        for m, name in sorted(cells.index, key=lambda one: (-one[0], sort_key(one[1])))
+    ]
+    # Errors that are normalized by those of full clouds are 1 there.
+    full = metric_info(table.metric.full_cloud_metric or table.metric.name, records)
+    label = f"all points ({full.title})" if table.metric.full_cloud_metric else "all points"
+    by_net: dict[str, dict[float, None]] = {name: {} for name in columns}
+    for record, net in zip(records, labels, strict=True):
+        figure = record.metrics.get(f"test/{FULL}/{full.name}")
+        if figure is not None:
+            by_net[net][figure] = None  # one for each seed where data depend on it
+    means = [full.format(sum(by) / len(by)) if by else "" for by in by_net.values()]
+    title = (
+        f"Test {table.metric.title} of the same samples under several task nets: {names['task']} "
+        f"on {names['dataset']}; generated / matched / completed sets, or one figure for samplers "
+        "that choose input points."
+    )
+    return Grid(title, ["m", "sampled by", *columns], [*rows, ["", label, *means]])
+
+
+def _plane(table: Table, name: str) -> Grid:
+    """Return the grid of a sampler: rows are one setting's values, columns the other's."""
+    names, (down, across) = _names(table), table.group.layout.planes[name]
+    cells = table.cells(["row", "down"]).loc[name].sort_index().sort_index(axis=1)
+    cells = cells.dropna(axis=1, how="all")
+    rows: list[list] = [
+        [f"{left:g}", *("" if one != one else one for one in line)]
+        for left, line in zip(cells.index, cells.to_numpy(), strict=True)
+    ]
+    title = (
+        f"Test {table.metric.title} of {name}: {names['task']} on {names['dataset']}, "
+        f"m={names['m']}, under {table.net}; generated / matched / completed sets."
+    )
+    corner = f"{down.split('.')[-1]} \\ {across.split('.')[-1]}"
+    head = [corner, *(f"{one:g}" for one in cells.columns)]
+    return Grid(title, head, rows, [_spread(table, name)])
+
+
+def _spread(table: Table, name: str) -> str:
     """Return the range of a heat map's values by readout: a measure of sensitivity."""
     parts = []
-    for readout, values in table.plane(name).items():
-        low, high = min(values.values()), max(values.values())
+    for readout in table.readouts(name):
+        means = table.of(name, readout)["mean"]
+        low, high = means.min(), means.max()
         times = f" (factor {high / low:.3g})" if low > 0 else ""
         parts.append(f"{readout} {table.metric.format(low)} to {table.metric.format(high)}{times}")
     return f"Spread over the plane of {name}: {', '.join(parts)}."
 
 
-def _full_row(found: list[RunRecord], table: Cells, layout: Axes) -> list[str]:
+def _unchanged(table: Table) -> list[str]:
+    """Return a line for each learned sampler whose values are equal in all cells."""
+    lines = []
+    for name in table.rows():
+        readouts = [one for one in table.readouts(name) if one != INDEX_READOUT]
+        texts = [set(table.of(name, one)["mean"].map(table.metric.format)) for one in readouts]
+        several = readouts and len(table.of(name, readouts[0])) > 1
+        if several and all(len(one) == 1 for one in texts):
+            lines.append(f"All cells of {name} are equal: what differs changed nothing here.")
+    return lines
+
+
+def _costs(table: Table) -> dict[str, str]:
+    """Return the seconds of training of every row by size, over all its runs, per seed."""
+    costs: dict[str, list[float]] = {}
+    seeds: dict[str, set[int]] = {}
+    if table.group.layout.column != "m":
+        return {}
+    for record in table.group.records:
+        if "fit" in record.seconds:
+            costs.setdefault(sampler_row(record), []).append(record.seconds["fit"])
+            seeds.setdefault(sampler_row(record), set()).add(record.seed)
+    return {name: f"{sum(one) / len(seeds[name]):,.0f} s" for name, one in costs.items()}
+
+
+def _full_row(table: Table) -> list[str]:
     """Return the task net's values on full clouds, by the setting of the columns."""
     texts = {}
-    for record in found:
+    for record in table.group.records:
         figure = record.metrics.get(f"test/{FULL}/{table.metric.name}")
         if figure is not None:
-            texts[value(record, layout.column)] = table.metric.format(figure)
-    return ["all points", *(texts.get(column, "") for column in table.columns()[::-1])]
+            texts[value(record, table.group.layout.column)] = table.metric.format(figure)
+    return ["all points", *(texts.get(column, "") for column in table.columns())]
 
 
-def _full_lines(found: list[RunRecord], names: dict[str, str], metric: MetricInfo) -> list[str]:
+def _full_lines(table: Table) -> list[str]:
     """Return a line for each task net with its value on full clouds."""
-    joint = names["learned"] == "joint"
+    names, metric, records = _names(table), table.metric, table.group.records
+    joint = trained_with(records[0]) == "joint"
     theirs = paper.table(names["task"], names["dataset"], metric.name, joint)
     published = f" (the paper: {theirs['full']:.2f})" if "full" in theirs else ""
     label = ""
     if metric.full_cloud_metric:
-        metric = metric_info(metric.full_cloud_metric, found)
+        metric = metric_info(metric.full_cloud_metric, records)
         label = f"{metric.title} "
     lines: dict[str, None] = {}  # a dictionary as a set in order
-    for record in sorted(found, key=lambda one: (sampler_row(one), -one.config["m"])):
+    for record in sorted(records, key=lambda one: (sampler_row(one), -one.config["m"])):
         figure = record.metrics.get(f"test/{FULL}/{metric.name}")
         if figure is None:
             continue
@@ -188,6 +263,13 @@ def _full_lines(found: list[RunRecord], names: dict[str, str], metric: MetricInf
             several = any(parts.m for parts in map(parse, record.metrics) if parts)
             size = "" if several else f", m={record.config['m']}"
             after = f" after joint training with {sampler_row(record)}{size}"
-        compared = published if net == names["net"] else ""
+        compared = published if net == table.net else ""
         lines[f"{net} on all points{after}: {label}{metric.format(figure)}{compared}."] = None
     return list(lines)
+
+
+def _names(table: Table) -> dict[str, str]:
+    """Return what the records share: names of task and dataset; and their sizes."""
+    names = table.group.records[0].config["names"]
+    sizes = "/".join(str(m) for m in sorted({one.config["m"] for one in table.group.records}))
+    return {"task": names["task"], "dataset": names["dataset"], "m": sizes}

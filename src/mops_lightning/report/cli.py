@@ -3,11 +3,12 @@
 import argparse
 from pathlib import Path
 
-from mops_lightning.errors import one_line_endings, printable
+from mops_lightning.errors import one_line_endings
 from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.records import run_record
 from mops_lightning.report.build import Report, build
-from mops_lightning.report.text import latex, long_csv, markdown
+from mops_lightning.report.tables import long_form
+from mops_lightning.report.text import latex, markdown
 
 PAGE = "report.html"
 
@@ -33,7 +34,7 @@ def main(arguments: list[str] | None = None, prog: str = "python -m mops_lightni
         written = write(report, chosen.folder)
         if chosen.records:
             run_record.write_many(chosen.records, report.found.done)
-        print(printable(markdown(report.grids, report.remarks)))
+        print(markdown(report.grids, report.remarks))
         print(f"files in {chosen.folder}/: {', '.join(written)}")
 
 
@@ -66,14 +67,15 @@ def write(report: Report, folder: Path) -> list[str]:
     from mops_lightning.viz.figures import save_figure, save_svg
 
     remove_temporary(folder, below=False)
-    layout = report.axes
-    planes = layout.planes or {}
-    keys = [layout.column] if layout.column != "m" else []
-    keys += sorted({key for pair in planes.values() for key in pair})
+    layouts = [table.group.layout for table in report.tables]
+    keys = {one.column for one in layouts} - {"m", "net", ""}
+    keys |= {key for one in layouts for pair in one.planes.values() for key in pair}
+    net = report.tables[0].net if report.tables else ""
+    long = long_form(report.found.done, net, sorted(keys)).drop(columns="run")
     texts = {
         "table.md": markdown(report.grids, report.remarks),
         "table.tex": latex(report.grids, report.remarks),
-        "table.csv": long_csv(report.found.done, report.names.get("net", ""), keys),
+        "table.csv": long.to_csv(index=False, lineterminator="\n"),
     }
     for name, text in texts.items():
         with atomic_write(folder / name) as temporary:

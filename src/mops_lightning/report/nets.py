@@ -1,7 +1,9 @@
-"""A table of task nets: their results on full clouds, and their sizes."""
+"""A table of task nets: their results on full clouds, their sizes and costs."""
 
 from collections.abc import Sequence
 from typing import Any
+
+import pandas as pd
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics.info import MetricInfo
@@ -9,75 +11,54 @@ from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report import paper
-from mops_lightning.report.axes import varying
-from mops_lightning.report.cells import over_seeds
 from mops_lightning.report.collect import score, seed
-from mops_lightning.report.comparable import require_one, require_one_commit, same_for_every_seed
+from mops_lightning.report.comparable import Group
+from mops_lightning.report.tables import over_seeds
 from mops_lightning.report.text import PAPER, Grid
 
 HIDDEN = ("_target_", "n_points")
 """Settings of a net that get no column; the number of points has its own."""
 
 
-def nets_grid(found: list[RunRecord], metrics: Sequence[str] = (), mixed: bool = False) -> Grid:
+def nets_grid(group: Group, metrics: Sequence[str] = ()) -> Grid:
     """Return a table with a row for each net, sorted by number of points and settings.
 
     Sizes are of float32 parameters, in MB of a million bytes. Values of several seeds are means ±
-    standard deviations. The last column has the paper's values for the same net, if there are any.
+    standard deviations; of two runs of a net and a seed, the later one counts. The last column has
+    the paper's values for the same net, if there are any.
 
     Args:
-        found: completed records of runs with ``learn=task``.
-        metrics: names of the metrics to show; none: those of the closing table.
-        mixed: whether different commits and settings of the training are allowed.
+        group: completed records of runs with ``learn=task``.
+        metrics: names of the metrics to show; none: the metrics of the closing table.
 
     Raises:
-        UserError: the runs are not comparable, two have the same net and seed, or no record has a
-            metric.
+        UserError: no record has a metric.
     """
-    _require_comparable(found, mixed)
+    found = sorted(group.records, key=lambda record: record.started)
     names = found[0].config["names"]
-    nets = [_net(record) for record in found]
-    keys = sorted({key for net in nets for key in net} - set(HIDDEN))
-    keys = [key for key in keys if len({str(net[key]) for net in nets if key in net}) > 1]
+    settings = pd.DataFrame([_net(record) for record in found])
+    settings = settings.drop(columns=[*HIDDEN], errors="ignore")
+    keys = [key for key in sorted(settings) if settings[key].dropna().map(str).nunique() > 1]
     infos = _metrics(found, metrics)
-    groups = _by_net(found, keys)
-    rows = [_row(list(groups[place].values()), keys, infos) for place in sorted(groups)]
-    head = ["net", *keys, "points", *(info.title for info in infos), "MB", PAPER]
-    if not any(row[-1] for row in rows):
-        head, rows = head[:-1], [row[:-1] for row in rows]
-    title = f"No sampler was tested; {names['task']} on {names['dataset']} from all points."
-    return Grid(title, head, rows)
-
-
-def _require_comparable(found: list[RunRecord], mixed: bool) -> None:
-    for what in ("task", "dataset"):
-        require_one(what, {record.config["names"][what] for record in found})
-    require_one_commit(found, mixed)
-    for points in {_points(record) for record in found}:
-        same = [record for record in found if _points(record) == points]
-        same_for_every_seed("data (dataset_fingerprint)", "dataset_fingerprint", same)
-    different = [key for key in varying(found) if not key.startswith(("task.net.", "sampler."))]
-    if different and not mixed:
-        raise UserError(
-            f"The runs differ in their settings ({', '.join(different)}). Add --mixed to show them "
-            "in one table."
-        )
-
-
-def _by_net(found: list[RunRecord], keys: list[str]) -> dict[tuple[Any, ...], dict[int, RunRecord]]:
-    """Return sort key of a net → seed → record."""
-    groups: dict[tuple[Any, ...], dict[int, RunRecord]] = {}
+    rows: dict[tuple[Any, ...], dict[int, RunRecord]] = {}
     for record in found:
-        net, names = _net(record), record.config["names"]
-        label = [(net.get(key) is not None, net.get(key) or 0) for key in keys]
-        place = (_points(record) or 0, *label, names["net"])
-        if seed(record) in groups.setdefault(place, {}):
-            raise UserError(
-                f"Two runs of {names['task']} have the same net and seed; the second is "
-                f"{record.folder}. Give a folder with one of each."
-            )
-        groups[place][seed(record)] = record
-    return groups
+        label = [(value is not None, value or 0) for value in map(_net(record).get, keys)]
+        place = (_points(record) or 0, *label, record.config["names"]["net"])
+        rows.setdefault(place, {})[seed(record)] = record
+    lines = [_row(list(rows[place].values()), keys, infos) for place in sorted(rows, key=_order)]
+    head = ["net", *keys, "points", *(info.title for info in infos), "MB", "training", PAPER]
+    table = pd.DataFrame(lines, columns=head)
+    # Not every table has costs and figures of the paper.
+    table = table.drop(columns=[name for name in head[-2:] if not any(table[name])])
+    title = f"No sampler was tested; {names['task']} on {names['dataset']} from all points."
+    title += f" ({group.about})" if group.about else ""
+    return Grid(title, list(table), table.to_numpy().tolist())
+
+
+def _order(place: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return a key that sorts places whose settings may be of several types."""
+    points, *label, name = place
+    return points, *((given, isinstance(one, str), one) for given, one in label), name
 
 
 def _row(records: list[RunRecord], keys: list[str], metrics: list[MetricInfo]) -> list[str]:
@@ -86,12 +67,15 @@ def _row(records: list[RunRecord], keys: list[str], metrics: list[MetricInfo]) -
     label = [first.config["names"]["net"], *map(_net(first).get, keys), _points(first)]
     texts = ["" if value is None else str(value) for value in label]
     for metric in metrics:
-        values = [record.metrics.get(f"test/{FULL}/{metric.name}") for record in records]
-        present = [value for value in values if value is not None]
-        count = f" (n={len(present)})" if len(present) > 1 else ""
-        texts.append(over_seeds(metric, present) + count if present else "")
-    size = first.parameters.get("task")
-    return [*texts, "" if size is None else f"{4e-6 * size:.1f}", _paper(first)]
+        values = pd.Series([one.metrics.get(f"test/{FULL}/{metric.name}") for one in records])
+        count = int(values.count())
+        std = float(values.std()) if count > 1 else None
+        text = over_seeds(metric, float(values.mean()), std) if count else ""
+        texts.append(text + (f" (n={count})" if count > 1 else ""))
+    size, costs = first.parameters.get("task"), [one.seconds.get("fit") for one in records]
+    known = [cost for cost in costs if cost is not None]
+    texts.append("" if size is None else f"{4e-6 * size:.1f}")
+    return [*texts, f"{sum(known) / len(known):,.0f} s" if known else "", _paper(first)]
 
 
 def _net(record: RunRecord) -> dict[str, Any]:
@@ -99,7 +83,7 @@ def _net(record: RunRecord) -> dict[str, Any]:
 
 
 def _points(record: RunRecord) -> int | None:
-    return record.config.get("dataset", {}).get("n_points")
+    return record.config["dataset"].get("n_points")
 
 
 def _metrics(found: list[RunRecord], requested: Sequence[str]) -> list[MetricInfo]:

@@ -1,6 +1,7 @@
 """A report as one self-contained HTML page: sortable tables, plots, clouds in 3-D."""
 
 import base64
+import hashlib
 import html
 import json
 from collections.abc import Mapping, Sequence
@@ -10,7 +11,7 @@ from string import Template
 from typing import Any
 
 from mops_lightning.report.build import Report
-from mops_lightning.report.text import PAPER, Grid
+from mops_lightning.report.text import PAPER, Grid, marked
 from mops_lightning.viz.clouds import COLOURS, INPUT_COLOUR
 from mops_lightning.viz.snapshots import INPUT, load_clouds
 
@@ -66,7 +67,10 @@ def render(
         plots: SVG or PNG files.
         choice: what a group of clouds is called.
     """
-    template = Template(files("mops_lightning.report").joinpath("page.html").read_text())
+    own = files("mops_lightning.report")
+    template = Template(own.joinpath("page.html").read_text())
+    script = own.joinpath("page.js").read_text()
+    plotly = files("plotly").joinpath(PLOTLY).read_text() if clouds else ""
     return template.substitute(
         title=html.escape(title),
         tables="\n".join(map(_table, grids)),
@@ -74,9 +78,25 @@ def render(
         clouds=VIEW.format(choice=html.escape(choice)) if clouds else "",
         remarks_title=html.escape(remarks_title),
         remarks="".join(map(_remark, filter(None, remarks))),
-        plotly=files("plotly").joinpath(PLOTLY).read_text() if clouds else "",
+        policy=_policy(script, plotly),
+        plotly=plotly,
+        script=script,
         # "</script>" in a title must not end the script.
         data=json.dumps(list(clouds)).replace("<", "\\u003c"),
+    )
+
+
+def _policy(script: str, plotly: str) -> str:
+    """Return a Content-Security-Policy that runs these scripts only and loads nothing.
+
+    WebGL in plotly compiles functions, for which it needs ``unsafe-eval``.
+    """
+    digests = (hashlib.sha256(text.encode()).digest() for text in (script, plotly) if text)
+    allowed = " ".join(f"'sha256-{base64.b64encode(one).decode()}'" for one in digests)
+    evaluates = " 'unsafe-eval'" if plotly else ""
+    return (
+        f"default-src 'none'; script-src {allowed}{evaluates}; style-src 'unsafe-inline'; "
+        "img-src data: blob:"
     )
 
 
@@ -88,7 +108,7 @@ def _remark(line: str) -> str:
 def _table(grid: Grid) -> str:
     rows: list[list[str]] = []
     for cells in grid.rows:
-        texts = [html.escape(cell) for cell in cells]
+        texts = [marked(cell, html.escape, "<b>{}</b>", "<u>{}</u>") for cell in cells]
         if cells[0] == PAPER:
             # Part of the row above, so that sorting keeps them together.
             rows[-1] = [

@@ -1,17 +1,19 @@
 """Curves, heat maps and clouds of a report."""
 
+from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib import colormaps
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from mops_lightning.records.readout_names import GENERATED_READOUTS, INDEX_READOUT
-from mops_lightning.report.axes import Axes, row, value
 from mops_lightning.report.build import Report
-from mops_lightning.report.cells import Cells, sort_key
+from mops_lightning.report.comparable import value
+from mops_lightning.report.tables import Table, row_name, sort_key
 from mops_lightning.viz.clouds import draw_cloud, upright
 from mops_lightning.viz.figures import cloud_axes, new_figure
 from mops_lightning.viz.snapshots import INPUT, load_clouds
@@ -25,25 +27,36 @@ LOG_SCALE_RATIO = 20
 
 def plots(report: Report) -> dict[str, Figure]:
     """Return the figures of a report by file name without suffix."""
-    figures = {}
+    figures: dict[str, Figure] = {}
     for table in report.tables:
-        if report.axes.planes:
-            figures[f"{table.metric.name}_planes"] = heat_maps(table, report.axes)
-        elif len(table.columns()) > 1:
-            figures[f"{table.metric.name}_curves"] = curves(table, report.axes)
-    if report.axes.column != "m" and (figure := clouds_by_column(report)):
-        figures["clouds"] = figure
+        name, layout = table.metric.name, table.group.layout
+        if layout.planes:
+            figures[_free(f"{name}_planes", figures)] = heat_maps(table)
+        elif layout.column != "net" and len(table.columns()) > 1:
+            figures[_free(f"{name}_curves", figures)] = curves(table)
+        if layout.column not in ("m", "net") and not layout.planes:
+            figure = clouds_by_column(table)
+            figures |= {_free("clouds", figures): figure} if figure else {}
     return figures
 
 
-def clouds_by_column(report: Report) -> Figure | None:
+def _free(name: str, taken: Container[str]) -> str:
+    """Return a name that is not taken: those of further groups get a number."""
+    number = 1
+    while (name if number == 1 else f"{name}_{number}") in taken:
+        number += 1
+    return name if number == 1 else f"{name}_{number}"
+
+
+def clouds_by_column(table: Table) -> Figure | None:
     """Draw the first saved cloud of every sampler at every value of a setting, such as noise."""
+    key = table.group.layout.column
     found: dict[str, dict[Any, Path]] = {}
-    for record in report.scored:
+    for record in table.group.records:
         path = Path(record.folder) / record.files.get("clouds", "")
         if path.is_file():
-            name = row(record, report.names["net"])
-            found.setdefault(name, {}).setdefault(value(record, report.axes.column), path)
+            name = row_name(record, table.net)
+            found.setdefault(name, {}).setdefault(value(record, key), path)
     columns = sorted({column for paths in found.values() for column in paths})
     if not columns:
         return None
@@ -55,14 +68,14 @@ def clouds_by_column(report: Report) -> Figure | None:
             _, arrays = load_clouds(found[name][column])
             cloud = upright(arrays.pop(INPUT)[0])
             readout, samples = next(iter(arrays.items()))
-            title = f"{report.axes.column}={column:g}" if i == 0 else ""
+            title = f"{key}={column:g}" if i == 0 else ""
             below = f"{name}, {readout}"
             axes = cloud_axes(figure, len(found), len(columns), i, j, title, below)
             draw_cloud(axes, cloud, upright(samples[0]), readout)
     return figure
 
 
-def curves(table: Cells, axes: Axes) -> Figure:
+def curves(table: Table) -> Figure:
     """Draw a metric against the size or another setting, one panel for each readout.
 
     Samplers that choose input points are dashed and the same in all panels. Error bars are
@@ -70,21 +83,17 @@ def curves(table: Cells, axes: Axes) -> Figure:
     """
     figure = new_figure(4.2 * len(GENERATED_READOUTS), 3.4)
     panels = figure.subplots(1, len(GENERATED_READOUTS), sharey=True)
-    columns = table.columns()[::-1]
+    columns = sorted(table.columns())
     for axis, readout in zip(panels, GENERATED_READOUTS, strict=True):
         for number, name in enumerate(table.rows()):
-            cells = table.values[name]
-            # Index samplers have one readout for all panels.
-            dashed = INDEX_READOUT in next(iter(cells.values()))
-            key = INDEX_READOUT if dashed else readout
-            xs = [column for column in columns if cells.get(column, {}).get(key)]
-            if not xs:
+            dashed = INDEX_READOUT in table.readouts(name)
+            values = table.of(name, INDEX_READOUT if dashed else readout).sort_values("column")
+            if values.empty:
                 continue
-            values = [np.array(list(cells[x][key].values())) * table.metric.scale for x in xs]
             axis.errorbar(
-                [columns.index(x) for x in xs],
-                [one.mean() for one in values],
-                yerr=[one.std(ddof=1) if len(one) > 1 else 0.0 for one in values],
+                [columns.index(x) for x in values["column"]],
+                values["mean"] * table.metric.scale,
+                yerr=values["std"].fillna(0.0) * table.metric.scale,
                 label=name,
                 color=COLOURS[number % len(COLOURS)],
                 linestyle="--" if dashed else "-",
@@ -93,7 +102,7 @@ def curves(table: Cells, axes: Axes) -> Figure:
                 capsize=2,
             )
         axis.set_title(readout)
-        axis.set_xlabel(axes.column)
+        axis.set_xlabel(table.group.layout.column)
         axis.set_xticks(range(len(columns)), [f"{column:g}" for column in columns])
         axis.grid(alpha=0.3)
     panels[0].set_ylabel(table.metric.title)
@@ -101,21 +110,20 @@ def curves(table: Cells, axes: Axes) -> Figure:
     return figure
 
 
-def heat_maps(table: Cells, axes: Axes) -> Figure:
+def heat_maps(table: Table) -> Figure:
     """Draw the planes of all samplers, a row each and a column per readout, on one colour scale."""
-    assert axes.planes is not None
-    names = sorted(axes.planes, key=sort_key)
-    found = {name: table.plane(name) for name in names}
-    everything = [one for by in found.values() for values in by.values() for one in values.values()]
-    scale = table.metric.scale
-    norm = _colour_scale(scale * min(everything), scale * max(everything))
-    width = max(len(by) for by in found.values())
+    planes, scale = table.group.layout.planes, table.metric.scale
+    names = sorted(planes, key=sort_key)
+    means = table.values["mean"] * scale
+    norm = _colour_scale(means.min(), means.max())
+    width = max(len(table.readouts(name)) for name in names)
     figure = new_figure(3.6 * width + 1, 3.2 * len(names))
     panels = figure.subplots(len(names), width, squeeze=False)
     for line, name in zip(panels, names, strict=True):
-        down, across = (key.split(".")[-1] for key in axes.planes[name])
-        for axis, (readout, values) in zip(line, found[name].items(), strict=False):
-            image = _heat_map(axis, {place: scale * one for place, one in values.items()}, norm)
+        down, across = (key.split(".")[-1] for key in planes[name])
+        for axis, readout in zip(line, table.readouts(name), strict=False):
+            plane = table.of(name, readout).pivot(index="down", columns="column", values="mean")
+            image = _heat_map(axis, plane.sort_index().sort_index(axis=1) * scale, norm)
             axis.set(xlabel=across, ylabel=down, title=f"{name}, {readout}")
     figure.colorbar(image, ax=panels, label=table.metric.title)
     return figure
@@ -127,18 +135,13 @@ def _colour_scale(low: float, high: float) -> Normalize:
     return LogNorm(low, high) if logarithmic else Normalize(low, high)
 
 
-def _heat_map(axis: Any, values: dict[Any, float], norm: Normalize) -> Any:
-    """Draw values by (y, x) with their numbers; return the image."""
-    ys = sorted({y for y, _ in values})
-    xs = sorted({x for _, x in values})
-    grid = np.full((len(ys), len(xs)), np.nan)
-    for (y, x), one in values.items():
-        grid[ys.index(y), xs.index(x)] = one
-    for (i, j), one in np.ndenumerate(grid):
+def _heat_map(axis: Any, plane: pd.DataFrame, norm: Normalize) -> Any:
+    """Draw a plane with its numbers; return the image."""
+    for (i, j), one in np.ndenumerate(plane.to_numpy()):
         if not np.isnan(one):
             colour = "white" if norm(one) < 0.5 else "black"
             text = f"{one:.4g}" if one < 1e4 else f"{one:,.0f}"
             axis.text(j, i, text, ha="center", va="center", color=colour, fontsize=7)
-    axis.set_xticks(range(len(xs)), [f"{x:g}" for x in xs])
-    axis.set_yticks(range(len(ys)), [f"{y:g}" for y in ys])
-    return axis.imshow(grid, norm=norm, origin="lower", aspect="auto")
+    axis.set_xticks(range(plane.shape[1]), [f"{x:g}" for x in plane.columns])
+    axis.set_yticks(range(plane.shape[0]), [f"{y:g}" for y in plane.index])
+    return axis.imshow(plane.to_numpy(), norm=norm, origin="lower", aspect="auto")

@@ -1,16 +1,16 @@
-"""Tables as Markdown, LaTeX and CSV."""
+"""Tables as Markdown and LaTeX."""
 
-import csv
-import io
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from mops_lightning.records.readout_names import parse, parse_transfer
-from mops_lightning.records.run_record import RunRecord
-from mops_lightning.report.axes import row, value
-from mops_lightning.report.collect import epochs, seed, trained_with
+from mops_lightning.errors import printable
+from mops_lightning.report.tables import Cell
 
 PAPER = "*the paper's*"
 """Label of a row with the paper's values for the sampler in the row above."""
+
+BEST, SECOND = 1, 2
+"""Ranks of the values that are set in bold and underlined."""
 
 
 @dataclass
@@ -26,8 +26,24 @@ class Grid:
 
     title: str
     head: list[str]
-    rows: list[list[str]]
+    rows: Sequence[Sequence[str | Cell]]
     below: list[str] = field(default_factory=list)
+
+
+def marked(cell: str | Cell, escape: Callable[[str], str], best: str, second: str) -> str:
+    """Return a cell as text, with its best and second values marked.
+
+    Args:
+        cell: a text, or ranked values.
+        escape: escapes a text.
+        best: the markup of the best value, with ``{}`` for the value.
+        second: the markup of the second.
+    """
+    if isinstance(cell, str):
+        return escape(cell)
+    marks = {BEST: best, SECOND: second}
+    texts = (marks.get(part.rank, "{}").format(escape(part.text)) for part in cell.parts)
+    return " / ".join(texts) + escape(cell.suffix)
 
 
 def markdown(grids: list[Grid], remarks: list[str]) -> str:
@@ -37,11 +53,12 @@ def markdown(grids: list[Grid], remarks: list[str]) -> str:
         title, *below = map(_escaped, (grid.title, *grid.below))
         lines += [title, "", _line(grid.head), "|---|" + "--:|" * (len(grid.head) - 1)]
         lines += [*map(_line, grid.rows), "", *below, *([""] if below else [])]
-    return "\n".join([*lines, *map(_escaped, remarks)]) + "\n"
+    return printable("\n".join([*lines, *map(_escaped, remarks)]) + "\n")
 
 
-def _line(cells: list[str]) -> str:
-    return f"| {' | '.join(cell if cell == PAPER else _escaped(cell) for cell in cells)} |"
+def _line(cells: Sequence[str | Cell]) -> str:
+    texts = (one if one == PAPER else marked(one, _escaped, "**{}**", "<u>{}</u>") for one in cells)
+    return f"| {' | '.join(map(str, texts))} |"
 
 
 SPECIAL = {ord(letter): f"&#{ord(letter)};" for letter in "&|<*`["}
@@ -58,16 +75,17 @@ TEX = {letter: f"\\{letter}" for letter in "&%_#${}"} | {
     "~": r"\textasciitilde{}",
     "<": "$<$",
     ">": "$>$",
+    "[": "{[}",  # no optional argument of the line before
     "°": r"$^\circ$",
     "±": r"$\pm$",
 }
 
 
 def latex(grids: list[Grid], remarks: list[str]) -> str:
-    """Return all tables as ``tabular`` environments (package booktabs); remarks as comments."""
-    parts = []
+    r"""Return all tables as ``tabular`` environments, for ``\input``; remarks as comments."""
+    parts = ["% needs \\usepackage{booktabs}\n"]
     for grid in grids:
-        body = "\n".join(f"{' & '.join(map(_tex, cells))} \\\\" for cells in grid.rows)
+        body = "\n".join(f"{' & '.join(map(_tex_cell, cells))} \\\\" for cells in grid.rows)
         parts.append(
             "\\begin{table}\n\\centering\n"
             f"\\caption{{{_tex(grid.title)}}}\n"
@@ -79,50 +97,19 @@ def latex(grids: list[Grid], remarks: list[str]) -> str:
 
 
 def _comments(lines: list[str]) -> str:
-    return "".join(f"% {' '.join(line.split())}\n" for line in lines)
+    return "".join(f"% {_ascii(' '.join(line.split()))}\n" for line in lines)
+
+
+def _tex_cell(cell: str | Cell) -> str:
+    return marked(cell, _tex, r"\textbf{{{}}}", r"\underline{{{}}}")
 
 
 def _tex(text: str) -> str:
     if text.startswith("*") and text.endswith("*"):
         return f"\\emph{{{_tex(text[1:-1])}}}"
-    return "".join(TEX.get(letter, letter) for letter in " ".join(text.splitlines()))
+    return "".join(TEX.get(letter) or _ascii(letter) for letter in " ".join(text.splitlines()))
 
 
-def long_csv(found: list[RunRecord], net: str, keys: list[str]) -> str:
-    """Return one line for every test value of every record.
-
-    The column ``net`` is there if some values are those of further task nets (``task_nets``).
-
-    Args:
-        found: completed records.
-        net: the table's task net.
-        keys: settings that get a column, dotted.
-    """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    fixed = ["folder", "sampler", "learn", "seed", "epochs", "m", "readout", "metric", "value"]
-    has_nets = any(parse_transfer(name) for record in found for name in record.metrics)
-    writer.writerow([*fixed, *keys, *(["net"] if has_nets else []), "commit", "device"])
-    for record in found:
-        for name, figure in record.metrics.items():
-            other, parts = parse_transfer(name) or (record.config["names"]["net"], parse(name))
-            if parts is None or figure is None:
-                continue
-            writer.writerow(
-                [
-                    record.folder,
-                    row(record, net),
-                    trained_with(record),
-                    seed(record),
-                    epochs(record) or 0,
-                    parts.m or record.config.get("m"),
-                    parts.readout,
-                    parts.metric,
-                    repr(figure),
-                    *(value(record, key) for key in keys),
-                    *([other] if has_nets else []),
-                    record.git["commit"],
-                    record.device,
-                ]
-            )
-    return out.getvalue()
+def _ascii(text: str) -> str:
+    """Return a text whose letters every TeX engine knows; others become question marks."""
+    return text.encode("ascii", "replace").decode()

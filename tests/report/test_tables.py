@@ -1,0 +1,96 @@
+import pytest
+
+from mops_lightning.errors import UserError
+from tests.support.reports import put, put_cell, rows, table
+
+
+def test_cells_run_of_many_sizes_fills_columns(tmp_path):
+    metrics = {"test/full/accuracy": 0.9}
+    for m in (8, 32):
+        metrics |= {f"test/m{m}/{name}/accuracy": m / 100 for name in ("generated", "matched")}
+        metrics |= {f"test/m{m}/fps/accuracy": m / 200, f"test/m{m}/matrix/nonzero_percent": 3.0}
+    put(tmp_path, "fmops", 32, metrics)
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    ours = [row for row in rows(table(tmp_path)) if "paper" not in row[0]]
+    assert ours == [
+        ["sampled by", "m=32", "m=8"],
+        ["fps", "30.00", "4.00"],  # its own run replaces a baseline's values
+        ["fmops", "32.00 / 32.00", "8.00 / 8.00"],
+    ]
+    put(tmp_path, "fmops", 8, {"test/generated/accuracy": 0.8})
+    text = table(tmp_path)
+    assert ["fmops", "32.00 / 32.00", "80.00"] in rows(text)
+    assert "fmops-32-pointnet: not shown; a later run has the same row" in text
+
+
+def test_cells_of_several_seeds_show_mean_and_deviation(tmp_path):
+    for seed, value in enumerate((1.0, 2.0, 3.0)):
+        put_cell(tmp_path, f"{seed}", "mops", {"generated": value, "matched": 1.5}, seed=seed)
+    assert rows(table(tmp_path))[1][:2] == ["mops", "2 ± 1.00 / 1.5 ± 0.00 (n=3)"]
+
+
+def test_later_of_two_equal_runs_counts(tmp_path):
+    for name, value, hour in (("b", 0.3, "02"), ("a", 0.4, "03")):
+        (tmp_path / name).mkdir()
+        started = f"2026-01-01T{hour}:00:00+00:00"
+        put(tmp_path / name, "fps", 32, {"test/sampled/accuracy": value}, started=started)
+    text = table(tmp_path)
+    assert ["fps", "40.00"] in rows(text)
+    assert f"- {tmp_path}/b/fps-32-pointnet: not shown" in text
+
+
+def test_best_is_bold_and_second_underlined(tmp_path):
+    for name, value in (("mops", 0.8), ("snet", 0.7), ("samplenet", 0.8), ("gumbel", 0.6)):
+        put(tmp_path, name, 32, {"test/generated/accuracy": value, "test/completed/accuracy": 0.5})
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.9, "test/refined/accuracy": 0.95})
+    text = table(tmp_path)
+    lines = dict(line.strip("| ").split(" | ", 1) for line in text.splitlines() if ".00" in line)
+    assert lines["fps"] == "**90.00**"  # competes with completed sets
+    assert lines["fps refined (with the task net)"] == "95.00"
+    assert lines["mops"] == lines["samplenet"] == "**80.00** / <u>50.00</u>"
+    assert lines["snet"] == "<u>70.00</u> / <u>50.00</u>"
+    assert lines["gumbel"] == "60.00 / <u>50.00</u>"
+
+
+def test_smallest_error_is_best(tmp_path):
+    put_cell(tmp_path, "a", "mops", {"generated": 1.0})
+    put_cell(tmp_path, "b", "snet", {"generated": 2.0})
+    assert "**1**" in table(tmp_path)
+    assert "<u>2</u>" in table(tmp_path)
+
+
+def test_training_is_summed_over_sizes_per_seed(tmp_path):
+    for number, (m, seed) in enumerate(((8, 0), (32, 0), (8, 1), (32, 1))):
+        put_cell(tmp_path, f"{number}", "mops", {"generated": 1.0}, m=m, seed=seed, cost=1000.0)
+    put_cell(tmp_path, "snet", "snet", {"generated": 2.0}, cost=700.4)
+    found = rows(table(tmp_path))
+    assert [row[-1] for row in found] == ["training", "700 s", "2,000 s"]
+
+
+def test_equal_cells_of_a_learned_sampler_are_remarked(tmp_path):
+    for alpha in (0.1, 1.0):
+        put_cell(tmp_path, f"{alpha}", "mops", {"generated": 1.037}, of={"alpha": alpha})
+    assert "All cells of mops are equal: what differs changed nothing here." in table(tmp_path)
+    put_cell(tmp_path, "more", "mops", {"generated": 1.5}, of={"alpha": 10.0})
+    assert "are equal" not in table(tmp_path)
+
+
+def test_cells_unknown_metric_is_refused(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    with pytest.raises(UserError, match=r"--metric: no run has 'acuracy'.*accuracy"):
+        table(tmp_path, "acuracy")
+
+
+def test_cells_refined_samples_have_row_of_their_own(tmp_path):
+    metrics = {"test/full/accuracy": 0.9}
+    for m in (8, 32):
+        metrics |= {f"test/m{m}/{name}/accuracy": m / 100 for name in ("sampled", "refined")}
+    put(tmp_path, "fps", 32, metrics)
+    put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.3, "test/refined/accuracy": 0.7})
+    ours = [row for row in rows(table(tmp_path)) if "paper" not in row[0]]
+    assert ours[1:] == [
+        ["fps", "32.00", "8.00"],
+        ["fps refined (with the task net)", "32.00", "8.00"],
+        ["mops", "30.00", ""],
+        ["mops refined (with the task net)", "70.00", ""],
+    ]
