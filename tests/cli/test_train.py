@@ -69,7 +69,7 @@ def test_main_job_writes_weights_pictures_and_curves(main_job):
         for kind, names in accumulator.Tags().items():
             if isinstance(names, list):
                 tags.setdefault(kind, set()).update(names)
-    for tag in ("train/loss/cross_entropy", "train/loss/subset", "train/tau", "lr-Adam"):
+    for tag in ("train/loss/cross_entropy", "train/loss/subset", "train/tau", "lr-Adam/sampler"):
         assert tag in tags["scalars"]
     assert "test/generated/accuracy" in tags["scalars"]
     assert "val/matched/accuracy" in tags["scalars"]
