@@ -1,6 +1,7 @@
 """The files that git tracks: a small tree, with all weights in the models of the package."""
 
 import json
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -63,3 +64,10 @@ def test_records_and_models_name_models_that_exist(tracked):
     named = {record["files"][k] for record in records for k in record["files"] if k in KINDS}
     found = {names.find_model(name) for name in named}
     assert found == {path for path in tracked if path.suffix in WEIGHTS}
+
+
+def test_pages_set_arguments_without_a_plus():
+    added = re.compile(r"(^|[ `])\+(sampler|recipe|task|optimizer)\.", re.MULTILINE)
+    pages = [ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("results/**/README.md")]
+    for path in [*pages, *ROOT.glob("sweeps/**/*.yaml")]:
+        assert not added.search(path.read_text()), path
