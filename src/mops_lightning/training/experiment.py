@@ -277,8 +277,8 @@ class Experiment(L.LightningModule):
             samples = readouts(batch.points, outputs, self.sampler, refine)
             for name, baseline in self.baselines.items():
                 assert isinstance(baseline, Sampler)
-                found = baseline.sample_sizes(batch.points, self.sizes)
-                for m, output in found.items():
+                sampled = baseline.sample_sizes(batch.points, self.sizes)
+                for m, output in sampled.items():
                     samples[m].setdefault(name, output.points)
             sets = {prefix: samples[m] for m, prefix in self.prefixes.items()}
             # The same for all sizes; without a sampler, the full clouds are in it already.
@@ -297,8 +297,8 @@ class Experiment(L.LightningModule):
         clouds = len(batch.points)
         samples = {
             (prefix, readout): points
-            for prefix, found in sets.items()
-            for readout, points in found.items()
+            for prefix, by_readout in sets.items()
+            for readout, points in by_readout.items()
         }
         for (prefix, readout), result in self.task.scores(batch, samples).items():
             for name, metric in self.scores.update_readout(f"{prefix}{readout}", result).items():

@@ -38,7 +38,7 @@ def readouts(
         ``completed`` of a sampler that generates points, ``sampled`` of one that selects them,
         ``full`` without a sampler. With ``refine`` also ``refined``, from the last of these.
     """
-    found: dict[int, dict[str, Tensor]] = {}
+    samples: dict[int, dict[str, Tensor]] = {}
     rows: dict[int, Tensor] = {}
     names = readout_names(sampler)
     generates = sampler is not None and sampler.generates
@@ -53,8 +53,8 @@ def readouts(
             sets += [gather_points(points, matched), gather_points(points, rows[m])]
         elif output.indices is not None:
             rows[m] = output.indices
-        found[m] = dict(zip(names, sets, strict=True))
+        samples[m] = dict(zip(names, sets, strict=True))
     if refine is not None and rows:
         for m, refined in refine(rows).items():
-            found[m][REFINED] = gather_points(points, refined)
-    return found
+            samples[m][REFINED] = gather_points(points, refined)
+    return samples

@@ -46,13 +46,13 @@ def command_line(arguments: list[str]) -> list[str]:
     trained = TrainedRun.read(str(path) if path.exists() else name)
     _check_given(arguments, trained)
     rest = [argument for argument in arguments if argument not in named]
-    given = [overrides.path(argument) for argument in rest]
+    paths = [overrides.path(argument) for argument in rest]
     learn = "task" if trained.trained_task_net else "nothing"
     run = f"{KEY}={overrides.quote(trained.name)}"
     inserted = [
         argument
         for argument in (*trained.choices(), f"learn={learn}", f"weights={OF_RUN}", run)
-        if not any(_covers(path, overrides.path(argument)) for path in given)
+        if not any(_covers(path, overrides.path(argument)) for path in paths)
     ]
     return [*rest, *inserted]
 
@@ -106,7 +106,7 @@ def _covers(path: str, other: str) -> bool:
     return other == path or other.startswith(f"{path}.")
 
 
-def as_trained(cfg: DictConfig, trained: TrainedRun, given: list[str]) -> DictConfig:
+def as_trained(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -> DictConfig:
     """Return the checked configuration of an evaluation: the run's settings, then the user's.
 
     Interpolations stay where they lead to the run's values, so that ``sampler.seed`` follows a
@@ -115,13 +115,13 @@ def as_trained(cfg: DictConfig, trained: TrainedRun, given: list[str]) -> DictCo
     Args:
         cfg: composed from the run's groups.
         trained: the run.
-        given: the overrides it was composed from.
+        arguments: the overrides it was composed from.
 
     Raises:
         UserError: a value in the record or in ``cfg`` is wrong, or not accepted from a record.
     """
     chosen = trained.choices()
-    changed = [overrides.path(argument) for argument in given if argument not in chosen]
+    changed = [overrides.path(argument) for argument in arguments if argument not in chosen]
     trained.check_classes(changed)
     try:
         merged = _recorded(cfg, trained)
@@ -167,7 +167,7 @@ def _recorded(cfg: DictConfig, trained: TrainedRun) -> DictConfig:
     """
     recorded = _leaves(trained.record.config)
     present = _leaves(OmegaConf.to_container(cfg, resolve=False))
-    given = {overrides.path(argument) for argument in trained.record.overrides}
+    overridden = {overrides.path(argument) for argument in trained.record.overrides}
     follows = {path for path, value in present.items() if "${" in str(value)}
     merged = deepcopy(cfg)
     with open_dict(merged):
@@ -176,7 +176,7 @@ def _recorded(cfg: DictConfig, trained: TrainedRun) -> DictConfig:
         for path, value in recorded.items():
             if not all(map(NAME.fullmatch, path.split("."))) or _names_code(value):
                 raise trained.not_accepted(path)
-            if path not in follows and (path in given or _exists(cfg, path)):
+            if path not in follows and (path in overridden or _exists(cfg, path)):
                 OmegaConf.update(merged, path, value, merge=False)
         for path in present.keys() - recorded.keys() - follows:
             parameter = _parameter(merged, path)

@@ -90,11 +90,11 @@ class TrainedRun:
                 raise self.not_accepted(argument)
         return chosen
 
-    def check_classes(self, given: list[str]) -> None:
+    def check_classes(self, paths: list[str]) -> None:
         """Refuse a run whose command line named classes, unless the user names them, too.
 
         Args:
-            given: paths of the settings on the user's command line.
+            paths: of the settings on the user's command line.
 
         Raises:
             UserError: an override of the record has a key such as ``_target_``.
@@ -102,7 +102,7 @@ class TrainedRun:
         for argument in self.record.overrides:
             path = overrides.path(argument)
             special = any(part.startswith("_") for part in path.split("."))
-            if special and _is_repeated(argument) and path not in given:
+            if special and _is_repeated(argument) and path not in paths:
                 raise self.not_accepted(argument)
 
     def not_accepted(self, setting: str) -> UserError:

@@ -102,9 +102,9 @@ def pooled_features(net: nn.Module, points: Tensor) -> Tensor:
     return net.point_features(points).amax(1)
 
 
-def feature_distance(found: Tensor, reference: Tensor) -> Tensor:
+def feature_distance(features: Tensor, reference: Tensor) -> Tensor:
     """Return ‖f − r‖² / ‖r‖², the mean over clouds, of pooled features ``(B, C)``."""
-    apart = (found - reference).square().sum(1)
+    apart = (features - reference).square().sum(1)
     return (apart / reference.square().sum(1).clamp_min(1e-12)).mean()
 
 

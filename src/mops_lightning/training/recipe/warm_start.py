@@ -40,28 +40,28 @@ def warm_start(
     return {"layers": copied}, f"the first {copied} layers are copies of the task net's"
 
 
-def _from_file(given: str, sampler: nn.Module) -> tuple[dict[str, Any], str]:
+def _from_file(name: str, sampler: nn.Module) -> tuple[dict[str, Any], str]:
     try:
-        path = names.resolve(given)
+        path = names.resolve(name)
         content = weights.read(weights.of_run(path) if path.is_dir() else path)
     except UserError as error:
         raise UserError(f"recipe.warm_start: {error}") from None
     if content["config"].get("learn") == "task":
         raise UserError(
-            f"recipe.warm_start: {given} holds a task net. Give the weights file of a sampler, or "
+            f"recipe.warm_start: {name} holds a task net. Give the weights file of a sampler, or "
             "true for a start from the task net's first layers."
         )
     copied = copy_tensors(content["state"], sampler)
     if not copied:
         raise UserError(
-            f"recipe.warm_start: no tensor of {given} fits this sampler. Give the weights file of "
+            f"recipe.warm_start: no tensor of {name} fits this sampler. Give the weights file of "
             "a sampler of the same kind."
         )
     numbers = {"sha256": content["sha256"], "tensors": len(copied)}
-    return numbers, described(copied, list(sampler.state_dict()), given)
+    return numbers, described(copied, list(sampler.state_dict()), name)
 
 
-def described(copied: Sequence[str], tensors: Sequence[str], given: str) -> str:
+def described(copied: Sequence[str], tensors: Sequence[str], name: str) -> str:
     """Return how many of a sampler's tensors are copies, and which are not.
 
     Between samplers with and without anchors, the last layer is not.
@@ -69,11 +69,11 @@ def described(copied: Sequence[str], tensors: Sequence[str], given: str) -> str:
     Args:
         copied: names of the copies.
         tensors: all names.
-        given: the file that the copies are from.
+        name: the file that the copies are from.
     """
-    said = f"{len(copied)} of {len(tensors)} tensors are copies of {given}"
-    new = [name for name in tensors if name not in copied]
-    return f"{said}; not copied: {', '.join(new[:3])}{', ...' if new[3:] else ''}" if new else said
+    text = f"{len(copied)} of {len(tensors)} tensors are copies of {name}"
+    new = [tensor for tensor in tensors if tensor not in copied]
+    return f"{text}; not copied: {', '.join(new[:3])}{', ...' if new[3:] else ''}" if new else text
 
 
 @torch.no_grad()

@@ -153,7 +153,7 @@ def build_callbacks(nodes: DictConfig, offered: dict[str, Any], logged: bool) ->
         chosen.pop("learning_rate", None)
     if "batch" not in offered:
         chosen.pop("pictures", None)
-    made = []
+    built = []
     for name, node in chosen.items():
         where = f"callbacks.{name}"
         callback = build(node, where, **accepted(node, offered)) if "_target_" in node else None
@@ -162,5 +162,5 @@ def build_callbacks(nodes: DictConfig, offered: dict[str, Any], logged: bool) ->
                 f"{where} must be a Lightning callback, got {node.get('_target_')!r}. "
                 f"Give its class as {where}._target_=MODULE.CLASS."
             )
-        made.append(callback)
-    return made
+        built.append(callback)
+    return built
