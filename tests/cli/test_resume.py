@@ -67,6 +67,7 @@ SHORT = [*TINY, "trainer.max_epochs=3", "weights=null", "baselines={}"]
 
 @pytest.mark.parametrize("stops", [[1, 3], ["test"]], ids=["two ends of epochs", "test"])
 def test_stopped_run_resumed_by_same_command_tests_same_weights(tmp_path, monkeypatch, stops):
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     status, _, err = call([*SHORT, "out=unbroken"], tmp_path)
     assert status == 0, err
 
