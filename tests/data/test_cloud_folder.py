@@ -1,4 +1,5 @@
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,8 @@ import torch
 import trimesh
 
 from mops_lightning.data import cloud_folder as module
+from mops_lightning.data.cloud_folder import random_crops
+from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
@@ -199,6 +202,7 @@ def test_cloud_folder_real_sequences(real_data):
         ({"crop": "near"}, "crop: unknown 'near'.*'nearest'"),
         ({"crop": "surface"}, "crops must be 1 with crop=surface, got 32"),
         ({"test_share": 1.0}, "test_share must be between 0 and 1, got 1.0"),
+        ({"test_frames": "lats"}, "test_frames: unknown 'lats'.*last"),
         ({"crops": 0}, "crops must be at least 1"),
         ({"n_points": 0}, "n_points must be at least 2, got 0"),
         ({"gap": -1}, "gap must be at least 0, got -1"),
@@ -216,3 +220,52 @@ def test_cloud_folder_without_cloud_raises(tmp_path):
         cloud_folder(tmp_path)
     with pytest.raises(UserError, match=r"^root: .*none is not a folder"):
         cloud_folder(tmp_path / "none")
+
+
+PATH = Path("scan.ply")
+FAR = np.array([431_000.0, 5_412_000.0, 120.0])
+
+
+def cloud(number=2000, side=10.0):
+    return np.random.default_rng(0).uniform(0, side, (number, 3)) + FAR
+
+
+def draw(points, crop="nearest", n_points=50, number=6, seed=1):
+    rng = np.random.default_rng(seed)
+    return random_crops(points, n_points, number, crop, rng, PATH)
+
+
+def test_random_crops_nearest_is_a_ball_around_a_point():
+    points = cloud()
+    crops = draw(points)
+    assert crops.shape == (6, 50, 3)
+    assert np.abs(crops.mean(1)).max() < 1e-5
+    first = points[np.random.default_rng(1).integers(len(points))]
+    distances = np.sort(np.linalg.norm(points - first, axis=1))[:50]
+    near = points[np.linalg.norm(points - first, axis=1) <= distances[-1]]
+    assert np.allclose(crops[0], near - near.mean(0), atol=1e-5)
+
+
+def test_random_crops_whole():
+    points = cloud()
+    whole = draw(points, "whole", n_points=1000, number=2)
+    assert np.ptp(whole, axis=1).min() > 9
+    assert not np.array_equal(whole[0], whole[1])
+    assert len(np.unique(whole[0], axis=0)) == 1000
+
+
+def test_random_crops_same_seed_same_crops():
+    assert np.array_equal(draw(cloud()), draw(cloud()))
+    assert not np.array_equal(draw(cloud()), draw(cloud(), seed=2))
+
+
+@pytest.mark.parametrize(
+    ("points", "crop", "message"),
+    [
+        (cloud(40), "nearest", "scan.ply has 40 points, fewer than dataset.n_points=50"),
+        (np.ones((60, 3)), "whole", "the 50 points of a crop coincide"),
+    ],
+)
+def test_random_crops_unusable_cloud_raises(points, crop, message):
+    with pytest.raises(BadCloudError, match=message):
+        draw(points, crop)

@@ -66,9 +66,9 @@ def test_sampling_cache_depends_on_content_and_arguments(mesh_layout: Path, tmp_
     cache = tmp_path / "new" / "cache"
     first = meshes(mesh_layout, n_points=20, cache=cache)
     kept = sorted(cache.iterdir())
-    assert [path.suffix for path in kept] == [".npy"] * 5
+    assert [path.suffix for path in kept] == [".npz"] * 5
     for path in kept:  # the result comes from the cache
-        np.save(path, np.load(path) + np.float32(1))
+        np.savez(path, np.load(path)["arr_0"] + np.float32(1))
     shutil.move(mesh_layout, tmp_path / "moved")
     again = meshes(tmp_path / "moved", n_points=20, cache=str(cache))
     assert torch.equal(again.train.points, first.train.points + 1)
@@ -89,7 +89,7 @@ def test_sampling_damaged_cache_is_replaced(
     kept = {path: path.read_bytes() for path in (tmp_path / "cache").iterdir()}
     for path in kept:
         path.write_bytes(damage)
-    (tmp_path / "cache" / f"{TEMPORARY}left by a kill.npy").touch()
+    (tmp_path / "cache" / f"{TEMPORARY}left by a kill.npz").touch()
     again = meshes(mesh_layout, n_points=20, cache=tmp_path / "cache")
     assert torch.equal(again.train.points, first.train.points)
     assert {path: path.read_bytes() for path in (tmp_path / "cache").iterdir()} == kept

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mops_lightning import filesystem
-from mops_lightning.data.formats import limits
+from mops_lightning.data.formats import guard
 from mops_lightning.files.processes import Died, Processes
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="the system has no timer")
@@ -16,9 +16,9 @@ pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="the syst
 
 def job(path, kind):
     """Read a file well, for ever, with too much memory, or die."""
-    limits.SECONDS = 0.2
+    guard.SECONDS = 0.2
     try:
-        with limits.limited(path):
+        with guard.limited(path):
             if kind == "abort":
                 os.abort()
             if kind == "hang":

@@ -5,7 +5,7 @@ import traceback
 from pathlib import Path
 
 from mops_lightning import filesystem
-from mops_lightning.data.formats import limits
+from mops_lightning.data.formats import guard
 from mops_lightning.errors import UserError
 
 SECONDS, MEMORY = 60.0, 1 << 30
@@ -20,10 +20,10 @@ MODULES = {
 
 def outcome(kind, path):
     """Read a file: ``read``, ``refused``, or the traceback of what must not happen."""
-    limits.SECONDS, filesystem.MEMORY = SECONDS, MEMORY
+    guard.SECONDS, filesystem.MEMORY = SECONDS, MEMORY
     importlib.import_module(MODULES.get(kind.split()[0], "mops_lightning.data.formats.registry"))
     try:
-        with limits.limited(path):
+        with guard.limited(path):
             READERS.get(kind.split()[0], read_cloud)(path)
     except UserError as error:
         said = str(error)

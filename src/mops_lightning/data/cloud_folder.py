@@ -16,9 +16,9 @@ from rich.progress import track
 from torch import Tensor
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, make_dataset
-from mops_lightning.data.crops import Crop, check_crop, random_crops
 from mops_lightning.data.file_splits import (
     SPLITS,
+    TEST_FRAMES,
     Box,
     class_of,
     read_split_list,
@@ -26,13 +26,20 @@ from mops_lightning.data.file_splits import (
     split_by_share,
     split_by_time,
 )
+from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
 from mops_lightning.data.formats.registry import READABLE, read
 from mops_lightning.data.surfaces import VERSION, sample_surface
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.ops.points import normalize_unit_sphere
 from mops_lightning.seeding import derive_seed
+
+Crop = Literal["nearest", "whole", "surface"]
+CROPS = ("nearest", "whole", "surface")
+
+DRAWS = 50
+"""Crops that are drawn before a file is rejected because all points of a crop coincide."""
 
 
 class Source(NamedTuple):
@@ -40,7 +47,7 @@ class Source(NamedTuple):
 
     Attributes:
         clouds: ``(K, n_points, 3)`` in the unit sphere.
-        box: the bounding box in the file's own unit; None where it does not matter.
+        box: the bounding box in the file's own unit; None for a mesh.
         digest: sha256 of a mesh's file; empty for other files.
     """
 
@@ -104,11 +111,7 @@ def cloud_folder(
     Raises:
         UserError: an argument or a file is invalid, or a split is empty.
     """
-    minima = {"n_points": (n_points, 2), "crops": (crops, 1), "seed": (seed, 0), "gap": (gap, 0)}
-    for argument, (value, minimum) in minima.items():
-        if value < minimum:
-            raise UserError(f"{argument} must be at least {minimum}, got {value}.")
-    check_crop(crop, crops)
+    _check_arguments(n_points, test_share, gap, seed, test_frames, crop, crops)
     folder = Path(root).expanduser()
     if not folder.is_dir():
         raise UserError(f"root: {folder} is not a folder.")
@@ -123,21 +126,19 @@ def cloud_folder(
         splits: list[str] | None = [listed[name] for name in names]
     elif test_frames is not None:
         splits = split_by_time(names, test_share, gap, test_frames)
+        names = [name for name, split in zip(names, splits, strict=True) if split]
+        splits = [split for split in splits if split]
     else:
         splits = split_by_folder(names)
-    if splits is not None:
-        names, splits = _used(names, splits)
     if crop == "surface":
         sources = _surfaces(folder, names, n_points, seed, cache)
     else:
         sources = _crops(folder, names, n_points, crop, crops, seed)
-    left_out = 0
     if splits is None:
         boxes = [source.box for source in sources if source.box is not None]
         splits = split_by_share(names, boxes if crop == "nearest" else None, test_share, seed)
-        left_out = splits.count("")
     clouds = _splits(folder, names, sources, splits, chosen)
-    notes = _notes(folder, names, splits, chosen, left_out)
+    notes = _notes(folder, names, splits, chosen)
     if crop != "surface":
         return replace(make_dataset("clouds", clouds, chosen, None, folder), notes=notes)
     digest = hashlib.sha256(repr(("meshes", VERSION, n_points, seed, chosen)).encode())
@@ -146,16 +147,32 @@ def cloud_folder(
     return CloudDataset(chosen, clouds["train"], clouds["test"], digest.hexdigest(), notes)
 
 
+def _check_arguments(
+    n_points: int,
+    test_share: float,
+    gap: int,
+    seed: int,
+    test_frames: str | None,
+    crop: str,
+    crops: int,
+) -> None:
+    minima = {"n_points": (n_points, 2), "crops": (crops, 1), "seed": (seed, 0), "gap": (gap, 0)}
+    for argument, (value, minimum) in minima.items():
+        if value < minimum:
+            raise UserError(f"{argument} must be at least {minimum}, got {value}.")
+    if not 0 < test_share < 1:
+        raise UserError(f"test_share must be between 0 and 1, got {test_share}.")
+    if crop not in CROPS:
+        raise UserError(f"crop: unknown {crop!r}.{did_you_mean(crop, CROPS)}")
+    if crop == "surface" and crops != 1:
+        raise UserError(f"crops must be 1 with crop=surface, got {crops}.")
+    if test_frames is not None and test_frames not in TEST_FRAMES:
+        hint = did_you_mean(test_frames, TEST_FRAMES)
+        raise UserError(f"test_frames: unknown {test_frames!r}.{hint}")
+
+
 def files(folder: Path, suffixes: Sequence[str]) -> list[PurePosixPath]:
-    """Return the relative paths of the files in a folder and its subfolders, sorted.
-
-    Args:
-        folder: the folder.
-        suffixes: what the paths may end in.
-
-    Raises:
-        UserError: there is none.
-    """
+    """Return the relative paths of the files with these suffixes below a folder, sorted."""
     names = sorted(
         PurePosixPath(path.relative_to(folder).as_posix())
         for path in folder.rglob("*")
@@ -167,14 +184,6 @@ def files(folder: Path, suffixes: Sequence[str]) -> list[PurePosixPath]:
             f"root: no file in {folder} or its subfolders ends in {', '.join(suffixes)}."
         )
     return names
-
-
-def _used(
-    names: list[PurePosixPath], splits: list[str]
-) -> tuple[list[PurePosixPath], list[str] | None]:
-    """Leave out the files that are in neither split."""
-    kept = [i for i, split in enumerate(splits) if split]
-    return [names[i] for i in kept], [splits[i] for i in kept]
 
 
 def _with_progress(names: list[PurePosixPath]) -> Iterable[PurePosixPath]:
@@ -194,6 +203,55 @@ def _crops(
         box: NDArray[np.float64] = np.stack([points.min(0), points.max(0)])
         sources.append(Source(normalize_unit_sphere(drawn), box))
     return sources
+
+
+def random_crops(
+    points: NDArray[np.float64],
+    n_points: int,
+    number: int,
+    crop: Crop,
+    rng: np.random.Generator,
+    path: Path,
+) -> NDArray[np.float32]:
+    """Draw crops of a cloud, each with its centroid at the origin.
+
+    Args:
+        points: ``(N, 3)``, finite, in the file's own unit.
+        n_points: number of points per crop.
+        number: of crops.
+        crop: ``nearest`` or ``whole``, see ``cloud_folder``.
+        rng: draws all of this.
+        path: for errors.
+
+    Returns:
+        ``(number, n_points, 3)``, in the file's own unit.
+
+    Raises:
+        BadCloudError: the cloud has fewer than ``n_points`` points, or they coincide.
+    """
+    if len(points) < n_points:
+        raise BadCloudError(
+            f"{path} has {len(points)} points, fewer than dataset.n_points={n_points}. Lower "
+            "dataset.n_points, or remove the file."
+        )
+    crops = np.empty((number, n_points, 3), np.float32)
+    for place in range(number):
+        for _ in range(DRAWS):
+            if crop == "nearest":
+                distance = np.square(points - points[rng.integers(len(points))]).sum(1)
+                rows = np.sort(np.argpartition(distance, n_points - 1)[:n_points])
+            else:
+                rows = rng.choice(len(points), n_points, replace=False)
+            drawn = points[rows]
+            if (drawn != drawn[0]).any():
+                break
+        else:
+            raise BadCloudError(
+                f"{path}: the {n_points} points of a crop coincide. Clean the file."
+            )
+        # Before float32, which has too few digits for coordinates of a map.
+        crops[place] = drawn - drawn.mean(0)
+    return crops
 
 
 def _surfaces(
@@ -234,29 +292,21 @@ def _splits(
 
 
 def _notes(
-    folder: Path,
-    names: list[PurePosixPath],
-    splits: list[str],
-    classes: tuple[str, ...],
-    left_out: int,
+    folder: Path, names: list[PurePosixPath], splits: list[str], classes: tuple[str, ...]
 ) -> dict[str, Any]:
     """Return facts for the run record; print what a user may not expect."""
+    left_out = splits.count("")
     notes: dict[str, Any] = {f"{split}_files": splits.count(split) for split in SPLITS}
     notes["left_out_files"] = left_out
+    warnings = []
     if left_out:
-        print(
-            f"{folder}: {left_out} training files left out because they touch a test file.",
-            file=sys.stderr,
-        )
+        warnings.append(f"{left_out} training files left out because they touch a test file.")
+    found = {(class_of(name), split) for name, split in zip(names, splits, strict=True)}
     for split, consequence in zip(SPLITS, ("never learned", "never scored"), strict=True):
-        found = {
-            class_of(name) for name, of_file in zip(names, splits, strict=True) if of_file == split
-        }
-        missing = [name for name in classes if name not in found]
+        missing = [name for name in classes if (name, split) not in found]
         if missing:
             notes[f"classes_without_{split}_files"] = missing
-            print(
-                f"{folder}: no {split} file of {', '.join(missing)}: {consequence}.",
-                file=sys.stderr,
-            )
+            warnings.append(f"no {split} file of {', '.join(missing)}: {consequence}.")
+    for warning in warnings:
+        print(f"{folder}: {warning}", file=sys.stderr)
     return notes

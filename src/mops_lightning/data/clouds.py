@@ -83,25 +83,6 @@ def choose_classes(classes: Sequence[str] | None, known: Sequence[str]) -> tuple
     return tuple(name for name in known if name in set(classes))
 
 
-def select_classes(clouds: Clouds, known: Sequence[str], chosen: Sequence[str]) -> Clouds:
-    """Keep the clouds of the chosen classes and renumber their labels from 0.
-
-    Args:
-        clouds: labels are positions in ``known``.
-        known: all classes.
-        chosen: a subset of ``known``, from ``choose_classes``.
-
-    Returns:
-        Clouds whose labels are positions in ``chosen``.
-    """
-    table = torch.full((len(known),), -1, dtype=torch.int64)
-    for position, name in enumerate(chosen):
-        table[list(known).index(name)] = position
-    labels = table[clouds.labels]
-    keep = labels >= 0
-    return clouds.take(keep)._replace(labels=labels[keep])
-
-
 def make_dataset(
     kind: str,
     splits: Mapping[str, Clouds],
@@ -126,11 +107,13 @@ def make_dataset(
     chosen = choose_classes(classes, known)
     n_points = splits["train"].points.shape[1]
     digest = hashlib.sha256(repr((kind, n_points, chosen)).encode())
+    # The new label of every class; -1 for those that are left out.
+    table = torch.tensor([chosen.index(name) if name in chosen else -1 for name in known])
     kept = []
-    for split, every_class in splits.items():
-        clouds = every_class
+    for split, clouds in splits.items():
         if len(chosen) < len(known):
-            clouds = select_classes(every_class, known, chosen)
+            rows = table[clouds.labels] >= 0
+            clouds = clouds.take(rows)._replace(labels=table[clouds.labels[rows]])
         if not len(clouds.labels):
             raise UserError(f"classes: {folder} has no {split} shape of {', '.join(chosen)}.")
         names = [] if files is None else [list(files[split])]

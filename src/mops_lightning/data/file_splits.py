@@ -9,7 +9,7 @@ from pathlib import Path, PurePath, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.errors import UserError
 from mops_lightning.seeding import derive_seed
 
 SPLITS = ("train", "test")
@@ -86,12 +86,8 @@ def split_by_time(
         A split per file: ``train``, ``test``, or an empty one for files in the gap.
 
     Raises:
-        UserError: an argument is invalid, or a sequence has no training frame.
+        UserError: ``gap`` leaves a sequence no training frame.
     """
-    check_test_share(test_share)
-    if test_frames not in TEST_FRAMES:
-        hint = did_you_mean(test_frames, TEST_FRAMES)
-        raise UserError(f"test_frames: unknown {test_frames!r}.{hint}")
     splits = [""] * len(names)
     for sequence in sorted({class_of(name) for name in names}):
         members = [i for i, name in enumerate(names) if class_of(name) == sequence]
@@ -100,16 +96,6 @@ def split_by_time(
         for i, split in zip(members, of_sequence, strict=True):
             splits[i] = split
     return splits
-
-
-def check_test_share(test_share: float) -> None:
-    """Check the share of test files.
-
-    Raises:
-        UserError: it is not between 0 and 1.
-    """
-    if not 0 < test_share < 1:
-        raise UserError(f"test_share must be between 0 and 1, got {test_share}.")
 
 
 def _split_frames(
@@ -183,9 +169,8 @@ def split_by_share(
         A split per file: ``train``, ``test``, or an empty one for files that are left out.
 
     Raises:
-        UserError: ``test_share`` is invalid, or no file is left for one of the splits.
+        UserError: no file is left for one of the splits.
     """
-    check_test_share(test_share)
     touching = [[] for _ in names] if boxes is None else neighbouring_tiles(boxes)
     classes = [class_of(name) for name in names]
     splits = ["train"] * len(names)

@@ -57,14 +57,23 @@ def read_names(path: Path) -> list[str]:
     Raises:
         UserError: the file cannot be read, is empty or lists a class twice.
     """
+    names = read_lines(path)
+    if not names or len(set(names)) != len(names):
+        raise UserError(f"{path} must list each class once, one per line.")
+    return names
+
+
+def read_lines(path: Path) -> list[str]:
+    """Read the lines of a file, without empty ones.
+
+    Raises:
+        UserError: the file cannot be read.
+    """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"root: cannot read {path}: {error}.") from error
-    names = [line.strip() for line in lines if line.strip()]
-    if not names or len(set(names)) != len(names):
-        raise UserError(f"{path} must list each class once, one per line.")
-    return names
+    return [line.strip() for line in lines if line.strip()]
 
 
 def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:

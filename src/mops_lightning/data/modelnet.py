@@ -4,7 +4,6 @@ import re
 import sys
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import torch
 from filelock import FileLock
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, make_dataset
-from mops_lightning.data.hdf5 import read_clouds, read_names
+from mops_lightning.data.hdf5 import read_clouds, read_lines, read_names
 from mops_lightning.errors import UserError, one_line
 from mops_lightning.filesystem import memory
 
@@ -122,35 +121,19 @@ def _fetch(folder: Path) -> Path:
 def _unpack(archive: Path, folder: Path) -> None:
     """Unpack the archive's top folder as ``folder``, completely or not at all."""
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as name:
-        try:
-            with zipfile.ZipFile(archive) as packed:
-                size = sum(member.file_size for member in packed.infolist())
-                if size > memory(archive):
-                    raise UserError(f"{archive} unpacks to {size:,} bytes, far more than its own.")
-                packed.extractall(name)
-        except (zipfile.BadZipFile, zlib.error) as error:
-            raise UserError(f"{archive} is damaged ({one_line(error)}). Remove it.") from error
-        unpacked = _find(Path(name))
-        if unpacked is None:
-            raise UserError(f"{archive} is not ModelNet40; it lacks {LOOKED_FOR}. Remove it.")
-        unpacked.replace(folder)
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(
-            f"root: cannot read {path}: {error}. ModelNet40 needs {LOOKED_FOR}."
-        ) from error
-    return [line.strip() for line in text.splitlines() if line.strip()]
+        with zipfile.ZipFile(archive) as packed:
+            size = sum(member.file_size for member in packed.infolist())
+            if size > memory(archive):
+                raise UserError(f"{archive} unpacks to {size:,} bytes, far more than its own.")
+            packed.extractall(name)
+        (Path(name) / FOLDER).replace(folder)
 
 
 def _files(folder: Path, split: str) -> list[Path]:
     """Return the files of a split; lists contain paths of other machines, so only names count."""
     listing = folder / f"{split}_files.txt"
     if listing.is_file():
-        files = [folder / re.split(r"[/\\]", line)[-1] for line in _lines(listing)]
+        files = [folder / re.split(r"[/\\]", line)[-1] for line in read_lines(listing)]
     else:
         files = sorted(
             folder.glob(f"ply_data_{split}*.h5"),

@@ -24,9 +24,9 @@ from mops_lightning.data.procedural.airplane import airplane
 from mops_lightning.data.procedural.furniture import bed, desk, lamp, shelf, table
 from mops_lightning.data.procedural.seats import chair, sofa, stool
 from mops_lightning.data.procedural.vessels import bottle, bowl, bucket, cup, goblet, teapot, vase
-from mops_lightning.data.surfaces import unit_sphere
+from mops_lightning.data.surfaces import cached, unit_sphere
 from mops_lightning.errors import UserError
-from mops_lightning.filesystem import atomic_write, load_npz, remove_temporary
+from mops_lightning.filesystem import remove_temporary
 
 BUILDERS: Mapping[str, Callable[[Generator], trimesh.Trimesh]] = MappingProxyType(
     {
@@ -104,23 +104,6 @@ def shapes(
             raise UserError(f"{name} must be a whole number of at least {minimum}, got {value!r}.")
     chosen = choose_classes(classes, tuple(BUILDERS))
     counts = (train_per_class, test_per_class)
-    fingerprint = _fingerprint(n_points, counts, chosen, seed)
-    expected = [(count * len(chosen), n_points, 3) for count in counts]
-
-    path = None if cache is None else Path(cache).expanduser() / f"shapes-{fingerprint[:20]}.npz"
-    points = None if path is None else _load(path, expected)
-    if points is None:
-        points = _generate(expected, counts, chosen, seed)
-        if path is not None:
-            _save(path, points)
-    train, test = (
-        Clouds(torch.from_numpy(cloud), torch.arange(len(chosen)).repeat_interleave(count))
-        for cloud, count in zip(points, counts, strict=True)
-    )
-    return CloudDataset(chosen, train, test, fingerprint)
-
-
-def _fingerprint(n_points: int, counts: tuple[int, int], chosen: Sequence[str], seed: int) -> str:
     settings = {
         "dataset": "shapes",
         "version": GENERATOR_VERSION,
@@ -129,33 +112,42 @@ def _fingerprint(n_points: int, counts: tuple[int, int], chosen: Sequence[str], 
         "classes": chosen,
         "seed": seed,
     }
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+    fingerprint = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+    path = None
+    if cache is not None:
+        path = Path(cache).expanduser() / f"shapes-{fingerprint[:20]}.npz"
+        remove_temporary(path.parent, below=False)
+    expected = [(count * len(chosen), n_points, 3) for count in counts]
+    points = cached(path, expected, lambda: _generate(n_points, counts, chosen, seed))
+    train, test = (
+        Clouds(torch.from_numpy(cloud), torch.arange(len(chosen)).repeat_interleave(count))
+        for cloud, count in zip(points, counts, strict=True)
+    )
+    return CloudDataset(chosen, train, test, fingerprint)
 
 
 def _generate(
-    expected: Sequence[tuple[int, int, int]],
-    counts: tuple[int, int],
-    chosen: Sequence[str],
-    seed: int,
+    n_points: int, counts: tuple[int, int], chosen: Sequence[str], seed: int
 ) -> list[NDArray[np.float32]]:
-    points = [np.empty(shape, dtype=np.float32) for shape in expected]
+    """Return the clouds of both splits, ``(S, n_points, 3)``, class by class."""
     jobs = [
-        (split, label * count + i, name, i)
+        (name, split, i)
         for split, count in enumerate(counts)
-        for label, name in enumerate(chosen)
+        for name in chosen
         for i in range(count)
     ]
     # Not rich's is_terminal, which FORCE_COLOR makes true for log files.
     silent = not sys.stderr.isatty()
-    for split, row, name, i in track(
-        jobs,
-        "Making shapes",
-        console=Console(stderr=True),
-        transient=True,
-        disable=silent,
-    ):
-        points[split][row] = _cloud(name, expected[split][1], seed, split, i)
-    return points
+    console = Console(stderr=True)
+    clouds = np.stack(
+        [
+            _cloud(name, n_points, seed, split, i)
+            for name, split, i in track(
+                jobs, "Making shapes", console=console, transient=True, disable=silent
+            )
+        ]
+    )
+    return np.split(clouds, [counts[0] * len(chosen)])
 
 
 def _cloud(name: str, n_points: int, seed: int, split: int, i: int) -> NDArray[np.float32]:
@@ -173,28 +165,3 @@ def _cloud(name: str, n_points: int, seed: int, split: int, i: int) -> NDArray[n
     number = int(spread.generate_state(1, np.uint64)[0])
     cloud = np.asarray(trimesh.sample.sample_surface(mesh, n_points, seed=number)[0])
     return unit_sphere(cloud @ ((cos, 0, -sin), (0, 1, 0), (sin, 0, cos)))
-
-
-def _load(path: Path, expected: Sequence[tuple[int, int, int]]) -> list[NDArray[np.float32]] | None:
-    """Load a cache file; return None if it is missing, damaged or has another shape."""
-    try:
-        arrays = load_npz(path)  # verifies the checksums of the arrays
-    except UserError:
-        return None
-    points = [arrays[name] for name in ("train", "test") if name in arrays]
-    fits = [(cloud.shape, cloud.dtype) for cloud in points] == [
-        (shape, np.dtype(np.float32)) for shape in expected
-    ]
-    return points if fits else None
-
-
-def _save(path: Path, points: Sequence[NDArray[np.float32]]) -> None:
-    try:
-        remove_temporary(path.parent, below=False)
-        with atomic_write(path) as temporary:
-            np.savez(temporary, train=points[0], test=points[1])
-    except OSError as error:
-        raise UserError(
-            f"cache: cannot write to {path.parent} ({error}). Set it to a writable folder, or to "
-            "None (null on the command line) for no cache."
-        ) from error

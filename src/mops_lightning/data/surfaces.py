@@ -1,6 +1,7 @@
-"""Clouds from the surfaces of mesh files."""
+"""Clouds from the surfaces of mesh files, and a cache of clouds."""
 
 import hashlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +9,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.data.formats.mesh import BrokenMeshError, parse_mesh
+from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.data.formats.mesh import parse_mesh
 from mops_lightning.errors import UserError
-from mops_lightning.filesystem import atomic_write
+from mops_lightning.filesystem import atomic_write, load_npz
 
 VERSION = 1
 """Part of the cache key; increment it when the same file gives another cloud."""
+
+FLOAT = np.dtype(np.float32)
 
 
 def sample_surface(
@@ -35,30 +39,25 @@ def sample_surface(
         farthest point at distance 1.
 
     Raises:
-        BrokenMeshError: the file cannot be read, or has no surface.
+        BadCloudError: the file cannot be read, or has no surface.
         UserError: the cache cannot be written.
     """
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise BrokenMeshError(f"{path} cannot be read: {error}.") from error
+        raise BadCloudError(f"{path} cannot be read: {error}.") from error
     digest = hashlib.sha256(data).hexdigest()
     key = repr((VERSION, digest, path.suffix.lower(), n_points, seed))
-    cached = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.npy" if cache else None
-    if cached is not None and (points := _load_cached(cached, n_points)) is not None:
-        return digest, torch.from_numpy(points)
-    from trimesh import sample
+    kept = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.npz" if cache else None
 
-    mesh = parse_mesh(data, path)
-    random = np.random.default_rng([seed, int(digest[:16], 16)])
-    points = unit_sphere(np.asarray(sample.sample_surface(mesh, n_points, seed=random)[0]))
-    if cached is not None:
-        try:
-            with atomic_write(cached) as temporary:
-                np.save(temporary, points)
-        except OSError as error:
-            raise UserError(f"cache: cannot write {cached}: {error}.") from error
-    return digest, torch.from_numpy(points)
+    def sample() -> list[NDArray[np.float32]]:
+        from trimesh.sample import sample_surface
+
+        mesh = parse_mesh(data, path)
+        random = np.random.default_rng([seed, int(digest[:16], 16)])
+        return [unit_sphere(np.asarray(sample_surface(mesh, n_points, seed=random)[0]))]
+
+    return digest, torch.from_numpy(cached(kept, [(n_points, 3)], sample)[0])
 
 
 def unit_sphere(points: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -68,11 +67,36 @@ def unit_sphere(points: NDArray[np.float64]) -> NDArray[np.float32]:
     return (points / radius if radius > 0 else points).astype(np.float32)
 
 
-def _load_cached(path: Path, n_points: int) -> NDArray[np.float32] | None:
-    """Load a cached cloud; return None if it is missing or damaged."""
+def cached(
+    path: Path | None,
+    shapes: Sequence[tuple[int, ...]],
+    make: Callable[[], list[NDArray[np.float32]]],
+) -> list[NDArray[np.float32]]:
+    """Return clouds from a cache file, or make them and write the file.
+
+    Args:
+        path: the file, an .npz; a missing or damaged one is written again. None: no cache.
+        shapes: of the clouds; a file with other ones is replaced.
+        make: makes the clouds.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    if path is None:
+        return make()
     try:
-        points: NDArray[np.float32] = np.load(path)
-    except (OSError, ValueError, EOFError):
-        return None
-    fits = points.shape == (n_points, 3) and points.dtype == np.float32
-    return points if fits else None
+        clouds = list(load_npz(path).values())  # verifies the checksums of the arrays
+    except UserError:
+        clouds = []
+    if [(cloud.shape, cloud.dtype) for cloud in clouds] == [(shape, FLOAT) for shape in shapes]:
+        return clouds
+    clouds = make()
+    try:
+        with atomic_write(path) as temporary:
+            np.savez(temporary, *clouds)
+    except OSError as error:
+        raise UserError(
+            f"cache: cannot write to {path.parent} ({error}). Set it to a writable folder, or to "
+            "None (null on the command line) for no cache."
+        ) from error
+    return clouds

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from rich.progress import track
 
-from mops_lightning.data.formats import limits
+from mops_lightning.data.formats import guard
 from mops_lightning.errors import UserError, one_line, printable
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
@@ -143,7 +143,7 @@ def _death(source: Path, died: Died) -> UserError:
     if died.signal == getattr(signal, "SIGALRM", -1):
         return UserError(
             f"{source} is broken or very slow to read: it took more than "
-            f"{limits.seconds(source):.0f} s. Downsample it alone, without a limit."
+            f"{guard.seconds(source):.0f} s. Downsample it alone, without a limit."
         )
     how = f" (signal {died.signal})" if died.signal else ""
     return UserError(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mops_lightning.data.formats.errors import check_size
+from mops_lightning.data.formats.guard import check_size
 from mops_lightning.data.formats.registry import read
 from mops_lightning.errors import UserError
 from mops_lightning.files.downsample import SURFACE, load_sampler, sample_cloud

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.data.formats.errors import check_coordinates, check_size
+from mops_lightning.data.formats.guard import check_coordinates, check_size
 from mops_lightning.data.formats.registry import read, write
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError

@@ -11,7 +11,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
-from mops_lightning.data.formats import limits
+from mops_lightning.data.formats import guard
 from mops_lightning.ops.workers import start_worker
 
 GRACE = 2.0
@@ -35,7 +35,7 @@ def processes(number: int) -> "Processes":
 
 
 class Processes:
-    """Processes for files: reading has limits in time and memory, see ``data.formats.limits``.
+    """Processes for files: reading has limits in time and memory, see ``data.formats.guard``.
 
     Args:
         number: how many.
@@ -105,7 +105,7 @@ def _work(connection: Connection) -> None:
     start_worker()
     # Ends the process by an exception, so that temporary files are deleted.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
-    limits.turn_on()
+    guard.turn_on_limits()
     while True:
         try:
             function, job = connection.recv()

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from mops_lightning.data.formats.mesh import MAX_MATERIALS, BrokenMeshError, parse_mesh
+from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.data.formats.mesh import MAX_MATERIALS, parse_mesh
 
 BOX = trimesh.creation.box((1.0, 2.0, 3.0))
 BALL = trimesh.creation.icosphere(subdivisions=1)
@@ -128,7 +129,7 @@ BROKEN = {
 @pytest.mark.parametrize("name", BROKEN)
 def test_parse_broken_mesh_raises(name: str) -> None:
     data, message = BROKEN[name]
-    with pytest.raises(BrokenMeshError, match=rf"{name}.*({message})"):
+    with pytest.raises(BadCloudError, match=rf"{name}.*({message})"):
         parse_mesh(data, Path(name))
 
 
@@ -140,7 +141,7 @@ def test_parse_real_obj() -> None:
 
 
 def test_obj_vertices_of_two_coordinates_are_broken():
-    with pytest.raises(BrokenMeshError, match=r"a\.obj is broken"):
+    with pytest.raises(BadCloudError, match=r"a\.obj is broken"):
         parse_mesh(b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", Path("a.obj"))
 
 
@@ -197,7 +198,7 @@ def circle(tree):
 )
 def test_glb_crafted_is_broken(change, said, tmp_path):
     path = crafted(tmp_path / "a.glb", change)
-    with pytest.raises(BrokenMeshError, match=said):
+    with pytest.raises(BadCloudError, match=said):
         parse_mesh(path.read_bytes(), path)
 
 
@@ -210,5 +211,5 @@ def test_glb_buffer_of_another_file_is_broken(tmp_path):
     (tmp_path / "b.bin").write_bytes(bytes(9))
     other = {"uri": "b.bin", "byteLength": 9}
     path = crafted(tmp_path / "a.glb", lambda tree: tree["buffers"].append(other))
-    with pytest.raises(BrokenMeshError, match=r"a\.glb is broken"):
+    with pytest.raises(BadCloudError, match=r"a\.glb is broken"):
         parse_mesh(path.read_bytes(), path)

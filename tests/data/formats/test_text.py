@@ -38,3 +38,8 @@ def test_text_with_fewer_points_than_announced_is_broken(tmp_path):
     (tmp_path / "a.xyz").write_text("3\n1 2 3\n4 5 6\n")
     with pytest.raises(UserError, match=r"a\.xyz is broken: it announces 3 points, but has 2"):
         read(tmp_path / "a.xyz", 9, 0)
+
+
+def test_obj_faces_after_tab_make_a_mesh(tmp_path):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf\t1 2 3\n")
+    assert len(read(tmp_path / "a.obj", 70, 0).points) == 70

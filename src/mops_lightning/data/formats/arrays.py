@@ -1,29 +1,32 @@
-"""NumPy files: .npy with one array, .npz with an array of points and others."""
+"""NumPy files, .npy with one array and .npz with several, and KITTI's laser scans (.bin)."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from mops_lightning.data.formats.cloud_file import BinaryCloudFile
-from mops_lightning.data.formats.errors import BadCloudError
+from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.table import (
+    BinaryCloudFile,
     Column,
     Table,
     column_names,
-    from_unnamed,
+    compact_coordinates,
+    from_array,
+    split_array,
     unique_names,
 )
-from mops_lightning.errors import one_line
 from mops_lightning.filesystem import load_npz
 
 POINTS = ("points", "xyz", "pos")
 """Names of the array of an .npz file that holds the coordinates."""
 
+KITTI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
+"""A row of a laser scan; its file has no header."""
+
 
 def read_npy(path: Path) -> Table:
     """Read one array: ``(N, K)`` numbers, x, y and z first, or ``(N,)`` rows of named fields."""
-    return from_unnamed(_load_npy(path), path)
+    return from_array(np.load(path, allow_pickle=False), path)
 
 
 def write_npy(path: Path, table: Table) -> None:
@@ -61,17 +64,12 @@ def read_npz(path: Path) -> Table:
         raise BadCloudError(
             f"{path} has no array named points, got {', '.join(arrays) or 'no arrays'}."
         )
-    table = from_unnamed(arrays[chosen], path)
+    table = from_array(arrays.pop(chosen), path)
     columns: dict[str, Column] = dict(table.columns)
     for name, array in arrays.items():
-        if name == chosen or array.ndim == 0 or len(array) != len(table.points):
-            continue
-        if array.dtype.kind not in "fiub":
-            continue
-        if array.ndim == 1:
-            columns[name] = array
-        elif array.ndim == 2:
-            columns |= {f"{name}_{place}": array[:, place] for place in range(array.shape[1])}
+        numbers = array.dtype.kind in "fiub" and array.ndim in (1, 2)
+        if numbers and len(array) == len(table.points):
+            columns |= split_array(name, array)
     return Table(table.points, columns)
 
 
@@ -82,8 +80,37 @@ def write_npz(path: Path, table: Table) -> None:
         np.savez_compressed(file, allow_pickle=False, points=table.points, **named)
 
 
-def _load_npy(path: Path) -> Any:
-    try:
-        return np.load(path, allow_pickle=False)
-    except Exception as error:
-        raise BadCloudError(f"{path} is broken: {one_line(error)}.") from None
+def read_kitti(path: Path) -> Table:
+    """Read a laser scan."""
+    scan = locate_kitti(path)
+    return scan.read_all(range(scan.number))
+
+
+def write_kitti(path: Path, table: Table) -> None:
+    """Write a laser scan; without an ``intensity`` column the intensity is 0.
+
+    Raises:
+        BadCloudError: float32 would move the points.
+    """
+    points = compact_coordinates(table)
+    if points.dtype != np.float32:
+        raise BadCloudError(
+            f"{path}: .bin holds float32, which would move these points, far from the origin, by "
+            "more than a millionth of their extent. Write .ply, .npy or .las."
+        )
+    intensity = table.columns.get("intensity", np.zeros(len(points)))
+    path.write_bytes(np.column_stack([points, intensity]).astype("<f4").tobytes())
+
+
+def locate_kitti(path: Path) -> BinaryCloudFile:
+    """Find the rows of a laser scan.
+
+    Raises:
+        BadCloudError: the file is not a scan.
+    """
+    length = path.stat().st_size
+    if not length or length % KITTI.itemsize:
+        raise BadCloudError(
+            f"{path} is not a KITTI scan: {length} bytes are not rows of four float32 numbers."
+        )
+    return BinaryCloudFile(path=path, number=length // KITTI.itemsize, kind=KITTI)

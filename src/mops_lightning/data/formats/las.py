@@ -1,20 +1,38 @@
-"""LAS and LAZ files, read and written by laspy, an extra."""
+"""LAS and LAZ files, read and written by laspy, an extra.
 
+laspy and lazrs trust the counts and offsets of a file: a wrong one makes them read for hours or ask
+for more memory than the machine has. Both are therefore compared with the length of the file first.
+"""
+
+import struct
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
-from mops_lightning.data.formats import las_header
-from mops_lightning.data.formats.cloud_file import CloudFile
-from mops_lightning.data.formats.errors import BadCloudError, ends_early
-from mops_lightning.data.formats.table import Column, Table, split_array, unique_names
+from mops_lightning.data.formats.guard import BadCloudError, ends_early
+from mops_lightning.data.formats.table import CloudFile, Column, Table, split_array, unique_names
 from mops_lightning.errors import UserError
 
 COPC = "copc"
 """The user of the records that index the points of a COPC file."""
+
+SMALLEST = 227
+"""Bytes of the shortest header, that of LAS 1.0 to 1.2."""
+
+VLR, EVLR = 54, 60
+"""Bytes of the header of a variable length record, and of an extended one."""
+
+POINTS_PER_BYTE = 1024
+"""Most points that a byte of compressed data stands for."""
+
+LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+"""Separately compressed parts of the items of point formats 6 to 10; extra bytes have one each."""
+
+EXTRA_BYTES = 14
 
 
 def read(path: Path) -> Table:
@@ -24,7 +42,7 @@ def read(path: Path) -> Table:
         UserError: laspy is not installed, or the file is broken.
     """
     laspy = _laspy(path)
-    las_header.check(path)
+    _check_counts(path)
     with laspy.open(path) as file:
         declared = file.header.point_count
         table = _table(file.read_points(declared), file.header)
@@ -48,17 +66,13 @@ class LasFile(CloudFile):
 def locate(path: Path) -> LasFile:
     """Open a file to read ranges of its rows."""
     laspy = _laspy(path)
-    las_header.check(path)
+    _check_counts(path)
     with laspy.open(path) as file:
         return LasFile(path=path, number=file.header.point_count, header=file.header)
 
 
 def _check_bounds(path: Path, table: Table, header: Any) -> None:
-    """Reject points far outside of the header's bounds: a damaged LAZ file may give any numbers.
-
-    Raises:
-        BadCloudError: there is such a point.
-    """
+    """Reject points far outside of the header's bounds: a damaged LAZ file may give any numbers."""
     low, high = np.asarray(header.mins), np.asarray(header.maxs)
     far = (high - low).max()
     if far > 0 and ((table.points < low - far) | (table.points > high + far)).any():
@@ -119,23 +133,16 @@ def _header(laspy: Any, table: Table) -> Any:
 
 def _stored_exactly(cloud: Any, name: str, column: Column) -> bool:
     """Store a column in a dimension of LAS, if the dimension's type holds its numbers."""
-    try:
-        with np.errstate(all="ignore"):
-            cloud[name] = column
-        exact = np.array_equal(np.asarray(cloud[name]), column)
-    except (OverflowError, TypeError, ValueError):
-        exact = False
-    if not exact:
-        cloud[name] = np.zeros(len(column), np.uint8)
-    return exact
+    with suppress(OverflowError, TypeError, ValueError), np.errstate(all="ignore"):
+        cloud[name] = column
+        if np.array_equal(np.asarray(cloud[name]), column):
+            return True
+    cloud[name] = np.zeros(len(column), np.uint8)
+    return False
 
 
 def _laspy(path: Path) -> Any:
-    """Return laspy.
-
-    Raises:
-        UserError: it is not installed.
-    """
+    """Return laspy, or raise an error that says how to install it."""
     try:
         import laspy
     except ModuleNotFoundError:
@@ -143,3 +150,85 @@ def _laspy(path: Path) -> Any:
             f"{path}: LAS and LAZ need laspy: pip install 'mops-lightning[las]'."
         ) from None
     return laspy
+
+
+def _check_counts(path: Path) -> None:
+    """Reject a file that is not LAS, or whose counts and offsets do not fit its length."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(375)
+        if len(head) < SMALLEST or head[:4] != b"LASF":
+            raise BadCloudError(f"{path} is broken: it has no LAS header.")
+        header_size, start, vlrs, form, length, number = struct.unpack_from("<HIIBHI", head, 94)
+        _within(path, "the point data", start, size)
+        _within(path, f"{vlrs} variable length records", header_size + vlrs * VLR, start)
+        if head[25] >= 4 and len(head) == 375:
+            first, evlrs, number = struct.unpack_from("<QIQ", head, 235)
+            end = first + evlrs * EVLR if evlrs else 0
+            _within(path, f"{evlrs} extended variable length records", end, size)
+            for _ in range(evlrs):
+                file.seek(first)
+                (record_length,) = struct.unpack_from("<Q", file.read(EVLR).ljust(EVLR, b"\0"), 20)
+                first += EVLR + record_length
+                _within(path, "an extended variable length record", first, size)
+        if not length:
+            raise BadCloudError(f"{path} is broken: its points have no bytes.")
+        if not form & 0xC0:
+            if number * length > size - start:
+                raise ends_early(path, (size - start) // length)
+        elif number:
+            _check_compressed(path, file, start, size, number, length)
+
+
+def _check_compressed(
+    path: Path, file: IO[bytes], start: int, size: int, number: int, length: int
+) -> None:
+    """Compare the chunks of a LAZ file with its length and its number of points."""
+    import laspy
+    import lazrs
+
+    file.seek(0)
+    vlrs = laspy.LasHeader.read_from(file, read_evlrs=False).vlrs
+    record = vlrs[vlrs.index("LasZipVlr")].record_data
+    vlr = lazrs.LazVlr(record)
+    if vlr.item_size() != length:
+        raise BadCloudError(
+            f"{path} is broken: points of {length} bytes, items of {vlr.item_size()} bytes."
+        )
+    file.seek(start)
+    (table,) = struct.unpack("<q", file.read(8))
+    if table == -1:  # written by a program that could not go back; the offset is at the end
+        file.seek(-8, 2)
+        (table,) = struct.unpack("<q", file.read(8))
+    _within(path, "the chunk table", table + 8 if table >= start else size + 1, size)
+    file.seek(table + 4)
+    (chunks,) = struct.unpack("<I", file.read(4))
+    _within(path, f"{chunks} chunks", start + 8 + chunks * vlr.item_size(), size)
+    file.seek(start)
+    found = lazrs.read_chunk_table(file, vlr)
+    if sum(points for points, _ in found) < number or number > POINTS_PER_BYTE * size:
+        raise BadCloudError(f"{path} is broken: {chunks} chunks cannot hold {number} points.")
+    layers = _layers(record)
+    place = start + 8
+    for _, used in found:
+        _within(path, "a chunk", place + used, table)
+        if layers:
+            file.seek(place + vlr.item_size() + 4)
+            sizes = struct.unpack(f"<{layers}I", file.read(4 * layers))
+            needed = vlr.item_size() + 4 + 4 * layers + sum(sizes)
+            _within(path, "a chunk's layers", place + needed, place + used)
+        place += used
+
+
+def _layers(record: Any) -> int:
+    """Return the number of layers of a chunk, 0 for the formats that have none."""
+    (items,) = struct.unpack_from("<H", record, 32)
+    kinds = [struct.unpack_from("<HH", record, 34 + 6 * place) for place in range(items)]
+    return sum(size if kind == EXTRA_BYTES else LAYERS.get(kind, 0) for kind, size in kinds)
+
+
+def _within(path: Path, part: str, end: int, limit: int) -> None:
+    if end > limit:
+        raise BadCloudError(
+            f"{path} is broken: {part} ends at byte {end}, but must end at byte {limit} at most."
+        )

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mops_lightning.data.formats.guard import BadCloudError, naming_file
 from mops_lightning.data.formats.ply import plain_header
-from mops_lightning.errors import UserError, one_line
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -19,16 +19,11 @@ SUFFIXES = (".off", ".obj", ".ply", ".stl", ".glb")
 FLAT = 1e-12
 """Smallest ratio of area to squared extent; below, a mesh is a line or a point."""
 
-
 MAX_MATERIALS = 1000
 """In an OBJ file with more, materials are ignored: trimesh's time grows with their square."""
 
 VALUES_PER_BYTE = 100
 """Most values that a GLB scene may have per byte of its file, by repeating meshes."""
-
-
-class BrokenMeshError(UserError):
-    """A mesh file without a readable surface."""
 
 
 def parse_mesh(data: bytes, path: Path) -> "Trimesh":
@@ -44,38 +39,35 @@ def parse_mesh(data: bytes, path: Path) -> "Trimesh":
         Triangles with a positive, finite area.
 
     Raises:
-        BrokenMeshError: the file is not a valid mesh with a surface.
+        BadCloudError: the file is not a valid mesh with a surface.
     """
     kind = path.suffix.lower()
     if kind not in SUFFIXES:
-        raise BrokenMeshError(f"{path} must end in {', '.join(SUFFIXES)}.")
+        raise BadCloudError(f"{path} must end in {', '.join(SUFFIXES)}.")
     if not data.strip():
-        raise BrokenMeshError(f"{path} is empty.")
-    try:
-        with np.errstate(all="ignore"):
-            mesh = _triangles_off(data) if kind == ".off" else None
-            mesh = _load(data, kind) if mesh is None else mesh
-            if mesh.vertices.shape[1] != 3:
-                raise ValueError(f"vertices must have 3 coordinates, got {mesh.vertices.shape[1]}")
-            faces = np.asarray(mesh.faces).reshape(-1, 3)
-            outside = len(faces) and not 0 <= faces.min() <= faces.max() < len(mesh.vertices)
-            area = float(mesh.area) if len(faces) and not outside else 0.0
-            extent = float(np.ptp(mesh.triangles, axis=(0, 1)).max()) if area else 0.0
-    except Exception as error:  # parsers raise many types of exception for broken files
-        raise BrokenMeshError(f"{path} is broken: {one_line(error)}.") from error
+        raise BadCloudError(f"{path} is empty.")
+    with naming_file(path), np.errstate(all="ignore"):
+        mesh = _triangles_off(data) if kind == ".off" else None
+        mesh = _load(data, kind) if mesh is None else mesh
+        if mesh.vertices.shape[1] != 3:
+            raise ValueError(f"vertices must have 3 coordinates, got {mesh.vertices.shape[1]}")
+        faces = np.asarray(mesh.faces).reshape(-1, 3)
+        outside = len(faces) and not 0 <= faces.min() <= faces.max() < len(mesh.vertices)
+        area = float(mesh.area) if len(faces) and not outside else 0.0
+        extent = float(np.ptp(mesh.triangles, axis=(0, 1)).max()) if area else 0.0
     if outside:
-        raise BrokenMeshError(f"{path} is broken: a face refers to a vertex that does not exist.")
+        raise BadCloudError(f"{path} is broken: a face refers to a vertex that does not exist.")
     if not len(faces):
-        raise BrokenMeshError(f"{path} has no faces, so there is no surface to sample.")
+        raise BadCloudError(f"{path} has no faces, so there is no surface to sample.")
     announced = _announced_faces(data, kind)
     if len(faces) < announced:
-        raise BrokenMeshError(
+        raise BadCloudError(
             f"{path} is broken: its header announces {announced} faces, but it has {len(faces)}."
         )
     if not np.isfinite(area):
-        raise BrokenMeshError(f"{path} is broken: its vertices are not all finite numbers.")
+        raise BadCloudError(f"{path} is broken: its vertices are not all finite numbers.")
     if area <= FLAT * extent**2:
-        raise BrokenMeshError(f"{path} has a surface of area zero.")
+        raise BadCloudError(f"{path} has a surface of area zero.")
     return mesh
 
 
@@ -91,7 +83,10 @@ def _load(data: bytes, kind: str) -> "Trimesh":
             raise ValueError(f"{count} triangles take {84 + 50 * count} bytes, not {len(data)}")
     if text:
         # Comments may have any encoding, for which trimesh would need another package.
-        data = data.decode("utf-8" if _is_utf8(data) else "latin-1").encode()
+        try:
+            data.decode()
+        except UnicodeDecodeError:
+            data = data.decode("latin-1").encode()
         data = data.replace(b"\t", b" ")  # trimesh recognises faces of OBJ files by "f " only
     if kind == ".obj" and data.count(b"usemtl") > MAX_MATERIALS:
         data = re.sub(rb"(?m)^[ ]*usemtl.*$", b"", data)
@@ -131,14 +126,6 @@ def _triangles_off(data: bytes) -> "Trimesh | None":
     from trimesh import Trimesh
 
     return Trimesh(vertices, faces[:, 1:], process=False)
-
-
-def _is_utf8(data: bytes) -> bool:
-    try:
-        data.decode()
-    except UnicodeDecodeError:
-        return False
-    return True
 
 
 def _announced_faces(data: bytes, kind: str) -> int:

@@ -6,83 +6,69 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.data.formats.errors import BadCloudError
 from mops_lightning.data.formats.table import (
     Column,
     Table,
-    compact_coordinates,
-    from_array,
+    from_columns,
     split_array,
-    unique_names,
+    to_columns,
+    to_rows,
 )
 
 KINDS = {"F": "f", "I": "i", "U": "u"}
-HEADER = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS")
 
 
 def read(path: Path) -> Table:
-    """Read a PCD file; a field with a COUNT of k becomes k columns.
-
-    Raises:
-        BadCloudError: the file is broken.
-    """
+    """Read a PCD file; a field with a COUNT of k becomes k columns."""
     data = path.read_bytes()
-    header, start = _header(data, path)
-    try:
-        names, sizes = header["FIELDS"], [int(size) for size in header["SIZE"]]
-        counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
-        number = int(header.get("POINTS", [header["WIDTH"][0]])[0])
-        kinds = [f"<{KINDS[kind]}{size}" for kind, size in zip(header["TYPE"], sizes, strict=True)]
-        fields = [
-            (name if name != "_" else f"_{place}", kind, (count,))
-            for place, (name, kind, count) in enumerate(zip(names, kinds, counts, strict=True))
+    header, start = _header(data)
+    names = header["FIELDS"]
+    counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
+    number = int(header.get("POINTS", [header["WIDTH"][0]])[0])
+    kinds = zip(header["TYPE"], header["SIZE"], counts, strict=True)
+    layout = np.dtype(
+        [
+            (name if name != "_" else f"_{place}", f"<{KINDS[kind]}{int(size)}", (count,))
+            for place, (name, (kind, size, count)) in enumerate(zip(names, kinds, strict=True))
         ]
-        layout = np.dtype(fields)
-        array = _body(data[start:], header["DATA"][0], layout, number)
-    except (KeyError, ValueError, IndexError) as error:
-        raise BadCloudError(f"{path} is broken: {type(error).__name__}: {error}.") from None
+    )
+    array = _body(data[start:], header["DATA"][0], layout, number)
     columns: dict[str, Column] = {}
     for name in layout.names or ():
         values = array[name][:, 0] if layout[name].shape == (1,) else array[name]
         columns |= {} if name.startswith("_") else split_array(name, values)
-    flat = np.empty(number, [(name, column.dtype) for name, column in columns.items()])
-    for name, column in columns.items():
-        flat[name] = column
-    return from_array(flat, list(columns), path)
+    return from_columns(columns, path)
 
 
 def write(path: Path, table: Table) -> None:
     """Write a binary PCD file: coordinates as float32, or double where that would lose digits."""
-    arrays = dict(zip("xyz", compact_coordinates(table).T, strict=True)) | unique_names(table)
+    columns = to_columns(table)
     kinds = {"f": "F", "i": "I", "u": "U", "b": "U"}
-    fields = [(name, a.dtype.newbyteorder("<").str) for name, a in arrays.items()]
-    array = np.empty(len(table.points), fields)
-    for name, values in arrays.items():
-        array[name] = values
-    types = [kinds[a.dtype.kind] for a in arrays.values()]
-    rows = {
-        "VERSION": ["0.7"],
-        "FIELDS": list(arrays),
-        "SIZE": [str(a.dtype.itemsize) for a in arrays.values()],
-        "TYPE": types,
-        "COUNT": ["1"] * len(arrays),
-        "WIDTH": [str(len(array))],
-        "HEIGHT": ["1"],
-        "VIEWPOINT": ["0", "0", "0", "1", "0", "0", "0"],
-        "POINTS": [str(len(array))],
+    rows = to_rows(columns)
+    header = {
+        "VERSION": "0.7",
+        "FIELDS": " ".join(columns),
+        "SIZE": " ".join(str(column.dtype.itemsize) for column in columns.values()),
+        "TYPE": " ".join(kinds[column.dtype.kind] for column in columns.values()),
+        "COUNT": " ".join("1" for _ in columns),
+        "WIDTH": str(len(rows)),
+        "HEIGHT": "1",
+        "VIEWPOINT": "0 0 0 1 0 0 0",
+        "POINTS": str(len(rows)),
+        "DATA": "binary\n",
     }
-    lines = [f"{name} {' '.join(rows[name])}" for name in HEADER]
-    text = "\n".join(["# .PCD v0.7 - Point Cloud Data file format", *lines, "DATA binary\n"])
-    path.write_bytes(text.encode() + array.tobytes())
+    lines = [f"{name} {values}" for name, values in header.items()]
+    text = "\n".join(["# .PCD v0.7 - Point Cloud Data file format", *lines])
+    path.write_bytes(text.encode() + rows.tobytes())
 
 
-def _header(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
+def _header(data: bytes) -> tuple[dict[str, list[str]], int]:
     header: dict[str, list[str]] = {}
     start = 0
     while "DATA" not in header:
         end = data.find(b"\n", start)
         if end < 0 or start > 65536:
-            raise BadCloudError(f"{path} is broken: its header has no DATA line.")
+            raise ValueError("its header has no DATA line")
         words = data[start:end].decode("latin-1").split()
         if words and not words[0].startswith("#"):
             header[words[0].upper()] = words[1:]

@@ -6,17 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mops_lightning.data.formats.cloud_file import BinaryCloudFile
-from mops_lightning.data.formats.errors import BadCloudError
+from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.table import (
+    BinaryCloudFile,
     Column,
     Table,
-    columns_to_rows,
-    compact_coordinates,
-    from_array,
-    unique_names,
+    from_columns,
+    to_columns,
+    to_rows,
 )
 
 KINDS = {
@@ -30,36 +28,32 @@ LONGEST_HEADER = 1 << 20
 """Most bytes of a header; a file that exceeds it is not PLY."""
 
 
-def split_header(data: bytes) -> tuple[list[str], int] | None:
-    """Return the lines of a header, and where it ends in bytes; None if it does not end.
+def split_header(data: bytes) -> tuple[list[list[str]], int]:
+    """Return the words of a header's lines, without comments, and where it ends in bytes.
 
     Args:
         data: the first bytes of a file, at least ``LONGEST_HEADER`` if it has as many.
+
+    Raises:
+        ValueError: the header does not end.
     """
     first = re.match(rb"[^\r\n]*(\r?\n|\r)", data)
-    if not first:
-        return None
-    end = b"\r" if first[1] == b"\r" else b"\n"
+    end = b"\r" if first and first[1] == b"\r" else b"\n"
     last = re.compile(end + rb"[ \t]*end_header[ \t\r]*?" + end).search(data, 0, LONGEST_HEADER)
     if not last:
-        return None
+        raise ValueError("its header does not end")
     lines = data[: last.start()].decode("latin-1").split(end.decode())
-    return [line.strip() for line in lines], last.end()
+    words = [line.split() for line in lines]
+    return [line for line in words if line[:1] not in ([], ["comment"], ["obj_info"])], last.end()
 
 
 def plain_header(data: bytes) -> bytes:
     """Return a PLY file with a header that trimesh reads: no comments, lines that end in LF.
 
     A comment may name a texture, which would be a path to any file.
-
-    Raises:
-        ValueError: the header does not end.
     """
-    found = split_header(data)
-    if found is None:
-        raise ValueError("its header does not end")
-    lines = [line for line in found[0] if line.split()[:1] not in ([], ["comment"], ["obj_info"])]
-    return "\n".join([*lines, "end_header\n"]).encode() + data[found[1] :]
+    lines, end = split_header(data)
+    return "\n".join([*map(" ".join, lines), "end_header\n"]).encode() + data[end:]
 
 
 def read(path: Path) -> Table | None:
@@ -76,38 +70,29 @@ def read(path: Path) -> Table | None:
     if "faces" in found and len(found["faces"]):
         return None
     vertex = found["metadata"]["_ply_raw"]["vertex"]
-    data, declared = vertex["data"], vertex["length"]
-    if isinstance(data, dict):
-        data = _rows_of_ascii(data)
-    if len(data) < declared:
+    columns = _columns(vertex["data"])
+    number, declared = len(next(iter(columns.values()))), vertex["length"]
+    if number < declared:
         raise BadCloudError(
-            f"{path} is broken: its header declares {declared} points, it holds {len(data)}."
+            f"{path} is broken: its header declares {declared} points, it holds {number}."
         )
-    return from_array(data, list(data.dtype.names), path)
+    return from_columns(columns, path)
 
 
-def _rows_of_ascii(data: dict[str, Any]) -> NDArray[Any]:
-    """Make rows of the columns ``(N, 1)`` that trimesh reads from an ascii file."""
-    flat = {name: np.asarray(column) for name, column in data.items()}
-    flat = {n: c[:, 0] if c.ndim == 2 and c.shape[1] == 1 else c for n, c in flat.items()}
-    flat = {name: column for name, column in flat.items() if column.ndim == 1}
-    rows = np.empty(len(next(iter(flat.values()))), [(n, c.dtype) for n, c in flat.items()])
-    for name, column in flat.items():
-        rows[name] = column
-    return rows
+def _columns(data: Any) -> dict[str, Column]:
+    """Return the columns of trimesh's rows, or of its arrays ``(N, 1)`` from an ascii file."""
+    if not isinstance(data, dict):
+        return {name: data[name] for name in data.dtype.names}
+    columns = {name: np.asarray(column) for name, column in data.items()}
+    return {name: column.ravel() for name, column in columns.items() if column.size == len(column)}
 
 
 def write(path: Path, table: Table) -> None:
     """Write binary PLY: float coordinates, or double where float would lose digits."""
-    named = unique_names(table)
-    columns = [
-        *compact_coordinates(table).T,
-        *(column.astype(_ply_kind(column)) for column in named.values()),
-    ]
-    rows = columns_to_rows(columns)
+    columns = to_columns(table)
+    rows = to_rows({name: column.astype(_ply_kind(column)) for name, column in columns.items()})
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    for name, column in zip(["x", "y", "z", *named], columns, strict=True):
-        lines.append(f"property {TYPES[column.dtype.str[1:]]} {name}")
+    lines += [f"property {TYPES[rows.dtype[name].str[1:]]} {name}" for name in columns]
     path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + rows.tobytes())
 
 
@@ -128,8 +113,9 @@ def locate(path: Path) -> BinaryCloudFile:
     Raises:
         BadCloudError: the file is broken, a mesh, or its vertices are not rows of fixed length.
     """
-    lines, offset = _header(path)
-    words = [line for line in lines if line and line[0] not in ("ply", "comment", "obj_info")]
+    with path.open("rb") as file:
+        lines, offset = split_header(file.read(LONGEST_HEADER))
+    words = [line for line in lines if line[0] != "ply"]
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}
     form, *elements = words or [["format", "missing"]]
     begin = [place for place, line in enumerate(elements) if line[0] == "element"]
@@ -145,12 +131,3 @@ def locate(path: Path) -> BinaryCloudFile:
         raise BadCloudError(f"{path}: --chunk needs vertices without lists.")
     kind = np.dtype([(name, order[form[1]] + KINDS[typed]) for _, typed, name in fields])
     return BinaryCloudFile(path=path, number=int(first[2]), kind=kind, offset=offset)
-
-
-def _header(path: Path) -> tuple[list[list[str]], int]:
-    """Return the words of the header's lines, and where the header ends, in bytes."""
-    with path.open("rb") as file:
-        found = split_header(file.read(LONGEST_HEADER))
-    if found is None:
-        raise BadCloudError(f"{path} is broken: its header does not end.")
-    return [line.split() for line in found[0]], found[1]

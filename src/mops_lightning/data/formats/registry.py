@@ -5,31 +5,29 @@ from pathlib import Path
 
 import numpy as np
 
-from mops_lightning.data.formats import arrays, kitti, las, obj, pcd, ply, text
-from mops_lightning.data.formats.cloud_file import CloudFile
-from mops_lightning.data.formats.errors import BadCloudError, naming_file
-from mops_lightning.data.formats.limits import limited
+from mops_lightning.data.formats import arrays, las, pcd, ply, text
+from mops_lightning.data.formats.guard import BadCloudError, reading
 from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
 from mops_lightning.data.formats.mesh import parse_mesh
-from mops_lightning.data.formats.table import Table
+from mops_lightning.data.formats.table import CloudFile, Table
 from mops_lightning.errors import one_line
 from mops_lightning.filesystem import atomic_write
 
 READERS: dict[str, Callable[[Path], Table | None]] = {
-    ".ply": ply.read, ".pcd": pcd.read, ".las": las.read, ".laz": las.read, ".bin": kitti.read,
-    ".npy": arrays.read_npy, ".npz": arrays.read_npz, ".xyz": text.read, ".txt": text.read,
-    ".obj": obj.read,
+    ".ply": ply.read, ".pcd": pcd.read, ".las": las.read, ".laz": las.read,
+    ".bin": arrays.read_kitti, ".npy": arrays.read_npy, ".npz": arrays.read_npz,
+    ".xyz": text.read, ".txt": text.read, ".obj": text.read_obj,
 }  # fmt: skip
 """Readers of clouds; they return None for a mesh."""
 
 WRITERS: dict[str, Callable[[Path, Table], None]] = {
-    ".ply": ply.write, ".pcd": pcd.write, ".las": las.write, ".laz": las.write, ".bin": kitti.write,
-    ".npy": arrays.write_npy, ".npz": arrays.write_npz, ".xyz": text.write, ".txt": text.write,
-    ".obj": obj.write,
+    ".ply": ply.write, ".pcd": pcd.write, ".las": las.write, ".laz": las.write,
+    ".bin": arrays.write_kitti, ".npy": arrays.write_npy, ".npz": arrays.write_npz,
+    ".xyz": text.write, ".txt": text.write, ".obj": text.write_obj,
 }  # fmt: skip
 
 CHUNKED: dict[str, Callable[[Path], CloudFile]] = {
-    ".npy": arrays.locate_npy, ".bin": kitti.locate, ".ply": ply.locate,
+    ".npy": arrays.locate_npy, ".bin": arrays.locate_kitti, ".ply": ply.locate,
     ".las": las.locate, ".laz": las.locate,
 }  # fmt: skip
 """Formats of which any range of rows can be read alone."""
@@ -51,9 +49,7 @@ def read(path: Path, surface: int, seed: int) -> Table:
     suffix = path.suffix.lower()
     if suffix not in READABLE:
         raise BadCloudError(f"{path} must end in {', '.join(READABLE)}.")
-    if not path.is_file():
-        raise BadCloudError(f"{path}: no such file.")
-    with limited(path), naming_file(path):
+    with reading(path):
         table = READERS[suffix](path) if suffix in READERS else None
         if table is not None:
             return table
@@ -90,7 +86,5 @@ def open_cloud_file(path: Path) -> CloudFile:
     suffix = path.suffix.lower()
     if suffix not in CHUNKED:
         raise BadCloudError(f"{path}: --chunk works with {', '.join(CHUNKED)}.")
-    if not path.is_file():
-        raise BadCloudError(f"{path}: no such file.")
-    with limited(path), naming_file(path):
+    with reading(path):
         return CHUNKED[suffix](path)

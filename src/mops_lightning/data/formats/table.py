@@ -1,5 +1,6 @@
-"""A cloud as its file has it: coordinates, and columns of attributes."""
+"""A cloud as its file has it: coordinates and columns of attributes, whole or in ranges of rows."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.data.formats.errors import BadCloudError
+from mops_lightning.data.formats.guard import BadCloudError, ends_early, reading
 
 Column = NDArray[Any]
 
@@ -46,38 +47,110 @@ class Table:
         return Table(self.points, {}, self.header)
 
 
-def from_array(array: NDArray[Any], names: list[str], path: Path, header: Any = None) -> Table:
-    """Make a table of the columns of a plain or structured array.
+@dataclass(frozen=True, kw_only=True)
+class CloudFile(ABC):
+    """A file of which any range of rows can be read alone, so that it need not fit in memory.
+
+    Attributes:
+        path: the file.
+        number: how many points it has, including those with non-finite coordinates.
+        header: see ``Table``; the tables that are read have none.
+    """
+
+    path: Path
+    number: int
+    header: Any = None
+
+    def row_ranges(self, size: int) -> list[range]:
+        """Split the rows into ranges of up to ``size``."""
+        starts = range(0, self.number, size)
+        return [range(start, min(start + size, self.number)) for start in starts]
+
+    def read(self, rows: range) -> Table:
+        """Read a range of rows, without the points that are not finite.
+
+        Raises:
+            BadCloudError: the file is broken or missing.
+        """
+        with reading(self.path):
+            return self.read_all(rows).finite()
+
+    def read_all(self, rows: range) -> Table:
+        """Read a range of rows with all its points; a parser's own errors pass through.
+
+        Raises:
+            BadCloudError: the file ends too early.
+        """
+        table = self._parse(rows)
+        if len(table.points) < len(rows):
+            raise ends_early(self.path, rows.start + len(table.points))
+        return table
+
+    @abstractmethod
+    def _parse(self, rows: range) -> Table:
+        """Read a range of rows, or fewer where the file ends too early."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BinaryCloudFile(CloudFile):
+    """A file whose points are rows of a fixed number of bytes.
+
+    Attributes:
+        kind: the data type of a row, with the names of the columns.
+        offset: of the first row, in bytes.
+
+    Raises:
+        BadCloudError: the file is too short for its rows.
+    """
+
+    kind: np.dtype[Any]
+    offset: int = 0
+
+    def __post_init__(self) -> None:
+        """Reject a number of rows that the file is too short for."""
+        if not self.kind.itemsize or self.number < 0:
+            raise BadCloudError(f"{self.path} is broken: {self.number} points of {self.kind}.")
+        room = max(self.path.stat().st_size - self.offset, 0) // self.kind.itemsize
+        if self.number > room:
+            raise ends_early(self.path, room)
+
+    def _parse(self, rows: range) -> Table:
+        start = self.offset + rows.start * self.kind.itemsize
+        return from_array(np.fromfile(self.path, self.kind, len(rows), offset=start), self.path)
+
+
+def from_columns(columns: Mapping[str, Column], path: Path) -> Table:
+    """Make a table of columns ``(N,)``, x, y and z among them.
 
     Args:
-        array: ``(N, K)``, K ≥ 3, or ``(N,)`` with named fields.
-        names: of the columns; must include x, y and z.
+        columns: in the order of the file. Strings, dates and lists are left out.
         path: for errors.
-        header: see ``Table``.
 
     Raises:
         BadCloudError: there are no coordinates.
     """
-    lower = {name.lower(): name for name in reversed(names)}
+    lower = {name.lower(): name for name in reversed(list(columns))}
     if not {"x", "y", "z"} <= set(lower):
-        raise BadCloudError(f"{path} must have columns x, y and z, got {', '.join(names)}.")
-
-    def column(name: str) -> Column:
-        return array[name] if array.dtype.names else array[:, names.index(name)]
-
+        raise BadCloudError(f"{path} must have columns x, y and z, got {', '.join(columns)}.")
     axes = [lower[axis] for axis in "xyz"]
     for name in axes:
-        if column(name).dtype.kind not in "fiu":
-            raise BadCloudError(f"{path}: {name} must be numbers, got {column(name).dtype}.")
-    points = np.stack([np.asarray(column(axis), np.float64) for axis in axes], 1)
-    rest = {name: column(name) for name in names if name not in axes}
-    numbers = {name: c for name, c in rest.items() if c.ndim == 1 and c.dtype.kind in "fiub"}
-    return Table(points, numbers, header)
+        if columns[name].dtype.kind not in "fiu":
+            raise BadCloudError(f"{path}: {name} must be numbers, got {columns[name].dtype}.")
+    points = np.stack([np.asarray(columns[name], np.float64) for name in axes], 1)
+    attributes = {
+        name: column
+        for name, column in columns.items()
+        if name not in axes and column.ndim == 1 and column.dtype.kind in "fiub"
+    }
+    return Table(points, attributes)
 
 
-def from_unnamed(array: NDArray[Any], path: Path) -> Table:
-    """Make a table of an array whose first columns are x, y and z; see ``column_names``."""
-    return from_array(array, column_names(array, path), path)
+def from_array(array: NDArray[Any], path: Path) -> Table:
+    """Make a table of the columns of an array; see ``column_names``."""
+    names = column_names(array, path)
+    if array.dtype.names:
+        return from_columns({name: array[name] for name in names}, path)
+    return from_columns(dict(zip(names, array.T, strict=True)), path)
 
 
 def column_names(array: NDArray[Any], path: Path) -> list[str]:
@@ -130,9 +203,15 @@ def compact_coordinates(table: Table) -> NDArray[Any]:
     return single if lost <= 1e-6 * extent else table.points
 
 
-def columns_to_rows(columns: list[Column]) -> NDArray[Any]:
-    """Return columns ``(N,)`` as one structured array of N rows."""
-    rows = np.empty(len(columns[0]), [(f"f{i}", column.dtype) for i, column in enumerate(columns)])
-    for i, column in enumerate(columns):
-        rows[f"f{i}"] = column
+def to_columns(table: Table) -> dict[str, Column]:
+    """Return ``compact_coordinates`` as x, y and z, and the columns of ``unique_names``."""
+    return dict(zip("xyz", compact_coordinates(table).T, strict=True)) | unique_names(table)
+
+
+def to_rows(columns: Mapping[str, Column]) -> NDArray[Any]:
+    """Return columns ``(N,)`` as a structured array of N rows, in little-endian order."""
+    fields = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
+    rows = np.empty(len(columns["x"]), fields)
+    for name, column in columns.items():
+        rows[name] = column
     return rows

@@ -1,19 +1,19 @@
-"""Text files (.xyz, .txt): one point per line."""
+"""Text files: .xyz and .txt with one point per line, and Wavefront OBJ files without faces."""
 
 import re
 from pathlib import Path
 
 import numpy as np
 
-from mops_lightning.data.formats.errors import BadCloudError
+from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.table import (
     Column,
     Table,
-    columns_to_rows,
     compact_coordinates,
     from_array,
-    from_unnamed,
-    unique_names,
+    from_columns,
+    to_columns,
+    to_rows,
 )
 
 
@@ -21,8 +21,7 @@ def read(path: Path) -> Table:
     """Read rows of numbers separated by spaces, commas or semicolons, with or without a header.
 
     Raises:
-        BadCloudError: the file has no points, fewer than its first line announces, or something
-            else than numbers.
+        BadCloudError: the file has no points, or fewer than its first line announces.
     """
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     lines = [re.split("#|//", line)[0].strip() for line in text.splitlines()]
@@ -30,18 +29,15 @@ def read(path: Path) -> Table:
     if not lines:
         raise BadCloudError(f"{path} is empty.")
     separator = next((mark for mark in ",;" if mark in lines[-1]), None)
-    announced = None
+    announced = 0
     if len(lines) > 1 and len(lines[0].split(separator)) == 1 and lines[0].isdecimal():
         announced = int(lines.pop(0))
     if not any(map(_is_number, lines[0].split(separator))):
         lines.pop(0)  # a header
     if not lines:
         raise BadCloudError(f"{path} holds no points.")
-    try:
-        array = np.loadtxt(lines, delimiter=separator, ndmin=2)
-    except ValueError as error:
-        raise BadCloudError(f"{path} is broken: {str(error).rstrip('.')}.") from None
-    if announced is not None and len(array) < announced:
+    array = np.loadtxt(lines, delimiter=separator, ndmin=2)
+    if len(array) < announced:
         raise BadCloudError(
             f"{path} is broken: it announces {announced} points, but has {len(array)}."
         )
@@ -49,21 +45,42 @@ def read(path: Path) -> Table:
     for line in text.lstrip("\ufeff").splitlines()[:20]:
         words = [word.strip() for word in line.strip().lstrip("#/ ").split(separator)]
         if len(words) == array.shape[1] and {"x", "y", "z"} <= {word.lower() for word in words}:
-            return from_array(array, words, path)
-    return from_unnamed(array, path)
+            first = {word: words.index(word) for word in words}  # a name may be there twice
+            return from_columns({word: array[:, place] for word, place in first.items()}, path)
+    return from_array(array, path)
 
 
 def write(path: Path, table: Table) -> None:
     """Write ``x y z`` and the columns, separated by spaces, without loss of digits."""
-    named = unique_names(table)
-    columns = [*compact_coordinates(table).T, *named.values()]
-    unnamed = all(name.startswith("column_") for name in named)
-    header = "" if unnamed else " ".join(["x", "y", "z", *named])
-    formats = [number_format(column) for column in columns]
-    np.savetxt(path, columns_to_rows(columns), fmt=formats, header=header, comments="# ")
+    columns = to_columns(table)
+    unnamed = all(name.startswith("column_") for name in list(columns)[3:])
+    header = "" if unnamed else " ".join(columns)
+    formats = [_number_format(column) for column in columns.values()]
+    np.savetxt(path, to_rows(columns), fmt=formats, header=header, comments="# ")
 
 
-def number_format(column: Column) -> str:
+def read_obj(path: Path) -> Table | None:
+    """Read the vertices of an OBJ file; None for a mesh, which has faces as well.
+
+    Raises:
+        BadCloudError: there are no vertices.
+    """
+    data = path.read_bytes()
+    if re.search(rb"^f\s", data, re.M):
+        return None
+    words = [line.split()[1:4] for line in data.splitlines() if line[:2] in (b"v ", b"v\t")]
+    if not words:
+        raise BadCloudError(f"{path} holds no vertices.")
+    return Table(np.array(words, np.float64))
+
+
+def write_obj(path: Path, table: Table) -> None:
+    """Write the vertices alone."""
+    points = compact_coordinates(table)
+    np.savetxt(path, points, fmt=f"v {' '.join([_number_format(points)] * 3)}")
+
+
+def _number_format(column: Column) -> str:
     """Return the shortest ``%`` format that keeps every number of a column."""
     if column.dtype.kind != "f":
         return "%d"
