@@ -3,7 +3,7 @@
 import hashlib
 import sys
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NamedTuple
@@ -18,7 +18,6 @@ from torch import Tensor
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, make_dataset
 from mops_lightning.data.file_splits import (
     SPLITS,
-    TEST_FRAMES,
     Box,
     class_of,
     read_split_list,
@@ -111,7 +110,16 @@ def cloud_folder(
     Raises:
         UserError: an argument or a file is invalid, or a split is empty.
     """
-    _check_arguments(n_points, test_share, gap, seed, test_frames, crop, crops)
+    minima = {"n_points": (n_points, 2), "crops": (crops, 1), "seed": (seed, 0), "gap": (gap, 0)}
+    for argument, (value, minimum) in minima.items():
+        if value < minimum:
+            raise UserError(f"{argument} must be at least {minimum}, got {value}.")
+    if not 0 < test_share < 1:
+        raise UserError(f"test_share must be between 0 and 1, got {test_share}.")
+    if crop not in CROPS:
+        raise UserError(f"crop: unknown {crop!r}.{did_you_mean(crop, CROPS)}")
+    if crop == "surface" and crops != 1:
+        raise UserError(f"crops must be 1 with crop=surface, got {crops}.")
     folder = Path(root).expanduser()
     if not folder.is_dir():
         raise UserError(f"root: {folder} is not a folder.")
@@ -130,10 +138,7 @@ def cloud_folder(
         splits = [split for split in splits if split]
     else:
         splits = split_by_folder(names)
-    if crop == "surface":
-        sources = _surfaces(folder, names, n_points, seed, cache)
-    else:
-        sources = _crops(folder, names, n_points, crop, crops, seed)
+    sources = _read_files(folder, names, n_points, crop, crops, seed, cache)
     if splits is None:
         boxes = [source.box for source in sources if source.box is not None]
         splits = split_by_share(names, boxes if crop == "nearest" else None, test_share, seed)
@@ -145,30 +150,6 @@ def cloud_folder(
     for path, split, source in zip(names, splits, sources, strict=True):
         digest.update(repr((split, str(path), source.digest)).encode())
     return CloudDataset(chosen, clouds["train"], clouds["test"], digest.hexdigest(), notes)
-
-
-def _check_arguments(
-    n_points: int,
-    test_share: float,
-    gap: int,
-    seed: int,
-    test_frames: str | None,
-    crop: str,
-    crops: int,
-) -> None:
-    minima = {"n_points": (n_points, 2), "crops": (crops, 1), "seed": (seed, 0), "gap": (gap, 0)}
-    for argument, (value, minimum) in minima.items():
-        if value < minimum:
-            raise UserError(f"{argument} must be at least {minimum}, got {value}.")
-    if not 0 < test_share < 1:
-        raise UserError(f"test_share must be between 0 and 1, got {test_share}.")
-    if crop not in CROPS:
-        raise UserError(f"crop: unknown {crop!r}.{did_you_mean(crop, CROPS)}")
-    if crop == "surface" and crops != 1:
-        raise UserError(f"crops must be 1 with crop=surface, got {crops}.")
-    if test_frames is not None and test_frames not in TEST_FRAMES:
-        hint = did_you_mean(test_frames, TEST_FRAMES)
-        raise UserError(f"test_frames: unknown {test_frames!r}.{hint}")
 
 
 def files(folder: Path, suffixes: Sequence[str]) -> list[PurePosixPath]:
@@ -186,21 +167,31 @@ def files(folder: Path, suffixes: Sequence[str]) -> list[PurePosixPath]:
     return names
 
 
-def _with_progress(names: list[PurePosixPath]) -> Iterable[PurePosixPath]:
-    console = Console(stderr=True)
-    return track(names, "Reading files", console=console, disable=not console.is_terminal)
-
-
-def _crops(
-    folder: Path, names: list[PurePosixPath], n_points: int, crop: Crop, number: int, seed: int
+def _read_files(
+    folder: Path,
+    names: list[PurePosixPath],
+    n_points: int,
+    crop: Crop,
+    crops: int,
+    seed: int,
+    cache: str | Path | None,
 ) -> list[Source]:
-    """Draw crops of clouds."""
+    """Sample the surfaces of meshes, or draw crops of clouds."""
+    kept = Path(cache).expanduser() if cache else None
+    if kept is not None:
+        remove_temporary(kept, below=False)
+    console = Console(stderr=True)
     sources = []
-    for name in _with_progress(names):
+    for name in track(names, "Reading files", console=console, disable=not console.is_terminal):
+        path = folder / name
+        if crop == "surface":
+            digest, cloud = sample_surface(path, n_points, seed, kept)
+            sources.append(Source(cloud[None], digest=digest))
+            continue
         rng = np.random.default_rng(derive_seed(seed, zlib.crc32(str(name).encode())))
-        points = read(folder / name, max(10_000, 8 * n_points), seed).finite().points
-        drawn = torch.from_numpy(random_crops(points, n_points, number, crop, rng, folder / name))
-        box: NDArray[np.float64] = np.stack([points.min(0), points.max(0)])
+        points = read(path, max(10_000, 8 * n_points), seed).finite().points
+        drawn = torch.from_numpy(random_crops(points, n_points, crops, crop, rng, path))
+        box: Box = np.stack([points.min(0), points.max(0)])
         sources.append(Source(normalize_unit_sphere(drawn), box))
     return sources
 
@@ -213,18 +204,7 @@ def random_crops(
     rng: np.random.Generator,
     path: Path,
 ) -> NDArray[np.float32]:
-    """Draw crops of a cloud, each with its centroid at the origin.
-
-    Args:
-        points: ``(N, 3)``, finite, in the file's own unit.
-        n_points: number of points per crop.
-        number: of crops.
-        crop: ``nearest`` or ``whole``, see ``cloud_folder``.
-        rng: draws all of this.
-        path: for errors.
-
-    Returns:
-        ``(number, n_points, 3)``, in the file's own unit.
+    """Draw crops of a cloud ``(N, 3)``: ``(number, n_points, 3)``, each with its centroid at 0.
 
     Raises:
         BadCloudError: the cloud has fewer than ``n_points`` points, or they coincide.
@@ -252,20 +232,6 @@ def random_crops(
         # Before float32, which has too few digits for coordinates of a map.
         crops[place] = drawn - drawn.mean(0)
     return crops
-
-
-def _surfaces(
-    folder: Path, names: list[PurePosixPath], n_points: int, seed: int, cache: str | Path | None
-) -> list[Source]:
-    """Sample the surfaces of meshes."""
-    kept = Path(cache).expanduser() if cache else None
-    if kept is not None:
-        remove_temporary(kept, below=False)
-    sources = []
-    for name in _with_progress(names):
-        digest, points = sample_surface(folder / name, n_points, seed, kept)
-        sources.append(Source(points[None], digest=digest))
-    return sources
 
 
 def _splits(

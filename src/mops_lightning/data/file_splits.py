@@ -9,7 +9,7 @@ from pathlib import Path, PurePath, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.seeding import derive_seed
 
 SPLITS = ("train", "test")
@@ -28,15 +28,7 @@ OVERLAP = 0.25
 def read_split_list(
     root: Path, split_file: Path, suffixes: tuple[str, ...]
 ) -> dict[PurePosixPath, str]:
-    """Read and check a list of files: a path relative to ``root`` and a split per line.
-
-    Args:
-        root: the folder of the files.
-        split_file: relative to the working directory or to ``root``.
-        suffixes: what the paths may end in.
-
-    Returns:
-        The split of every path.
+    """Read the split of every file in a list; see ``cloud_folder.cloud_folder``.
 
     Raises:
         UserError: the list cannot be read, or a line is wrong.
@@ -74,20 +66,17 @@ def read_split_list(
 def split_by_time(
     names: Sequence[PurePosixPath], test_share: float, gap: int, test_frames: str
 ) -> list[str]:
-    """Split every sequence of frames, which are in the order of their numbers.
-
-    Args:
-        names: of the files; the sequences are their first folders.
-        test_share: share of test frames in a sequence, between 0 and 1; at least one frame.
-        gap: number of frames between training and test frames that are not used.
-        test_frames: ``last`` or ``spread``, frames at equal distances.
+    """Split every sequence of frames; the arguments are those of ``cloud_folder.cloud_folder``.
 
     Returns:
         A split per file: ``train``, ``test``, or an empty one for files in the gap.
 
     Raises:
-        UserError: ``gap`` leaves a sequence no training frame.
+        UserError: ``test_frames`` is unknown, or ``gap`` leaves a sequence no training frame.
     """
+    if test_frames not in TEST_FRAMES:
+        hint = did_you_mean(test_frames, TEST_FRAMES)
+        raise UserError(f"test_frames: unknown {test_frames!r}.{hint}")
     splits = [""] * len(names)
     for sequence in sorted({class_of(name) for name in names}):
         members = [i for i, name in enumerate(names) if class_of(name) == sequence]
@@ -160,9 +149,9 @@ def split_by_share(
     left out.
 
     Args:
-        names: of the files; the classes are their first folders.
+        names: of the files.
         boxes: of the files; None: no file is a tile.
-        test_share: share of test files in a class, between 0 and 1; at least one file of two.
+        test_share: share of test files in a class; at least one file of two.
         seed: of the draw.
 
     Returns:

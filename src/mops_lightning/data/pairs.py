@@ -39,19 +39,6 @@ class Pairs:
         if self.resample is not None and self.resample < 1:
             raise UserError(f"resample must be None or at least 1, got {self.resample}.")
 
-    def points_of(self, n_points: int) -> int:
-        """Return the number of points of source and target for shapes with ``n_points``.
-
-        Raises:
-            UserError: ``resample`` is larger than ``n_points``.
-        """
-        if self.resample is not None and self.resample > n_points:
-            raise UserError(
-                f"resample must be at most the {n_points} points of a shape, got {self.resample} "
-                "(task.pairs.resample and dataset.n_points on the command line)."
-            )
-        return self.resample or n_points
-
     def __call__(self, points: Tensor, generators: Sequence[Generator]) -> PairBatch:
         """Convert every cloud to a pair.
 
@@ -65,7 +52,12 @@ class Pairs:
         Raises:
             UserError: ``resample`` is larger than N.
         """
-        self.points_of(points.shape[1])  # checks ``resample``
+        n_points = points.shape[1]
+        if self.resample is not None and self.resample > n_points:
+            raise UserError(
+                f"resample must be at most the {n_points} points of a shape, got {self.resample} "
+                "(task.pairs.resample and dataset.n_points on the command line)."
+            )
         motion = random_motion(ROTATION, TRANSLATION, generators)
         source = target = points
         if self.resample is not None:

@@ -28,29 +28,12 @@ from mops_lightning.data.surfaces import cached, unit_sphere
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import remove_temporary
 
-BUILDERS: Mapping[str, Callable[[Generator], trimesh.Trimesh]] = MappingProxyType(
-    {
-        builder.__name__: builder
-        for builder in (
-            airplane,
-            bed,
-            bottle,
-            bowl,
-            bucket,
-            chair,
-            cup,
-            desk,
-            goblet,
-            lamp,
-            shelf,
-            sofa,
-            stool,
-            table,
-            teapot,
-            vase,
-        )
-    }
-)
+BUILDERS: Mapping[str, Callable[[Generator], trimesh.Trimesh]] = MappingProxyType({
+    builder.__name__: builder for builder in (
+        airplane, bed, bottle, bowl, bucket, chair, cup, desk,
+        goblet, lamp, shelf, sofa, stool, table, teapot, vase,
+    )
+})  # fmt: skip
 """Builders by class name, in the order of the labels; each call draws new proportions."""
 
 GENERATOR_VERSION = 1
@@ -94,16 +77,13 @@ def shapes(
     Raises:
         UserError: an argument is invalid, or ``cache`` cannot be written.
     """
-    for name, value, minimum in (
-        ("n_points", n_points, 1),
-        ("train_per_class", train_per_class, 1),
-        ("test_per_class", test_per_class, 1),
-        ("seed", seed, 0),
-    ):
+    counts = (train_per_class, test_per_class)
+    values = (n_points, *counts, seed)
+    names = ("n_points", "train_per_class", "test_per_class", "seed")
+    for name, value, minimum in zip(names, values, (1, 1, 1, 0), strict=True):
         if not isinstance(value, int) or isinstance(value, bool) or value < minimum:
             raise UserError(f"{name} must be a whole number of at least {minimum}, got {value!r}.")
     chosen = choose_classes(classes, tuple(BUILDERS))
-    counts = (train_per_class, test_per_class)
     settings = {
         "dataset": "shapes",
         "version": GENERATOR_VERSION,

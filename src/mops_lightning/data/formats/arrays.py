@@ -6,9 +6,10 @@ import numpy as np
 
 from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.table import (
-    BinaryCloudFile,
+    CloudFile,
     Column,
     Table,
+    binary_file,
     column_names,
     compact_coordinates,
     from_array,
@@ -35,7 +36,7 @@ def write_npy(path: Path, table: Table) -> None:
         np.save(file, np.column_stack([table.points, *table.columns.values()]))
 
 
-def locate_npy(path: Path) -> BinaryCloudFile:
+def locate_npy(path: Path) -> CloudFile:
     """Find the rows of an .npy file.
 
     Raises:
@@ -47,7 +48,7 @@ def locate_npy(path: Path) -> BinaryCloudFile:
         if not array.flags.c_contiguous:
             raise BadCloudError(f"{path}: --chunk needs an array in C order, got Fortran order.")
         kind = np.dtype([(name, kind) for name in names])
-    return BinaryCloudFile(path=path, number=array.shape[0], kind=kind, offset=array.offset)
+    return binary_file(path, array.shape[0], kind, array.offset)
 
 
 def read_npz(path: Path) -> Table:
@@ -83,7 +84,7 @@ def write_npz(path: Path, table: Table) -> None:
 def read_kitti(path: Path) -> Table:
     """Read a laser scan."""
     scan = locate_kitti(path)
-    return scan.read_all(range(scan.number))
+    return scan.parse(path, range(scan.number))
 
 
 def write_kitti(path: Path, table: Table) -> None:
@@ -102,7 +103,7 @@ def write_kitti(path: Path, table: Table) -> None:
     path.write_bytes(np.column_stack([points, intensity]).astype("<f4").tobytes())
 
 
-def locate_kitti(path: Path) -> BinaryCloudFile:
+def locate_kitti(path: Path) -> CloudFile:
     """Find the rows of a laser scan.
 
     Raises:
@@ -113,4 +114,4 @@ def locate_kitti(path: Path) -> BinaryCloudFile:
         raise BadCloudError(
             f"{path} is not a KITTI scan: {length} bytes are not rows of four float32 numbers."
         )
-    return BinaryCloudFile(path=path, number=length // KITTI.itemsize, kind=KITTI)
+    return binary_file(path, length // KITTI.itemsize, KITTI)

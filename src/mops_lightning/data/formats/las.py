@@ -7,7 +7,6 @@ for more memory than the machine has. Both are therefore compared with the lengt
 import struct
 from contextlib import suppress
 from copy import deepcopy
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -51,32 +50,29 @@ def read(path: Path) -> Table:
     return table
 
 
-@dataclass(frozen=True, kw_only=True)
-class LasFile(CloudFile):
-    """A file that laspy reads in ranges of rows."""
-
-    def _parse(self, rows: range) -> Table:
-        with _laspy(self.path).open(self.path, read_evlrs=False) as file:
-            file.seek(rows.start)
-            table = _table(file.read_points(len(rows)), None)
-            _check_bounds(self.path, table, file.header)
-        return table
-
-
-def locate(path: Path) -> LasFile:
+def locate(path: Path) -> CloudFile:
     """Open a file to read ranges of its rows."""
     laspy = _laspy(path)
     _check_counts(path)
     with laspy.open(path) as file:
-        return LasFile(path=path, number=file.header.point_count, header=file.header)
+        return CloudFile(path, file.header.point_count, _parse_rows, file.header)
 
 
-def _check_bounds(path: Path, table: Table, header: Any) -> None:
-    """Reject points far outside of the header's bounds: a damaged LAZ file may give any numbers."""
-    low, high = np.asarray(header.mins), np.asarray(header.maxs)
+def _parse_rows(path: Path, rows: range) -> Table:
+    """Read a range of rows.
+
+    Raises:
+        BadCloudError: points are far outside of the header's bounds: a damaged LAZ file may give
+            any numbers.
+    """
+    with _laspy(path).open(path, read_evlrs=False) as file:
+        file.seek(rows.start)
+        table = _table(file.read_points(len(rows)), None)
+        low, high = np.asarray(file.header.mins), np.asarray(file.header.maxs)
     far = (high - low).max()
     if far > 0 and ((table.points < low - far) | (table.points > high + far)).any():
         raise BadCloudError(f"{path} is broken: it has points far outside of its header's bounds.")
+    return table
 
 
 def _table(cloud: Any, header: Any) -> Table:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 
 from mops_lightning.data.formats.table import (
@@ -81,12 +82,7 @@ def _body(body: bytes, kind: str, layout: np.dtype[Any], number: int) -> NDArray
         if number > len(body):
             raise ValueError(f"{len(body)} bytes are not {number} points")
         numbers = np.array(body.split(), dtype=np.float64).reshape(number, -1)
-        array, place = np.empty(number, layout), 0
-        for name in layout.names or ():
-            width = layout[name].shape[0]
-            array[name] = numbers[:, place : place + width]
-            place += width
-        return array
+        return unstructured_to_structured(numbers, layout)
     if kind == "binary":
         return np.frombuffer(body, layout, number)
     if kind != "binary_compressed":

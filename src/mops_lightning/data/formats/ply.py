@@ -9,9 +9,10 @@ import numpy as np
 
 from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.table import (
-    BinaryCloudFile,
+    CloudFile,
     Column,
     Table,
+    binary_file,
     from_columns,
     to_columns,
     to_rows,
@@ -107,7 +108,7 @@ def _ply_kind(column: Column) -> str:
     return "<u1" if kind == "b" else column.dtype.newbyteorder("<").str
 
 
-def locate(path: Path) -> BinaryCloudFile:
+def locate(path: Path) -> CloudFile:
     """Find the vertices of a binary PLY file.
 
     Raises:
@@ -130,4 +131,4 @@ def locate(path: Path) -> BinaryCloudFile:
     if any(field[1] not in KINDS for field in fields):
         raise BadCloudError(f"{path}: --chunk needs vertices without lists.")
     kind = np.dtype([(name, order[form[1]] + KINDS[typed]) for _, typed, name in fields])
-    return BinaryCloudFile(path=path, number=int(first[2]), kind=kind, offset=offset)
+    return binary_file(path, int(first[2]), kind, offset)

@@ -1,8 +1,8 @@
 """A cloud as its file has it: coordinates and columns of attributes, whole or in ranges of rows."""
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,18 +47,20 @@ class Table:
         return Table(self.points, {}, self.header)
 
 
-@dataclass(frozen=True, kw_only=True)
-class CloudFile(ABC):
+@dataclass(frozen=True)
+class CloudFile:
     """A file of which any range of rows can be read alone, so that it need not fit in memory.
 
     Attributes:
         path: the file.
         number: how many points it has, including those with non-finite coordinates.
+        parse: reads a range of rows, or fewer where the file ends too early.
         header: see ``Table``; the tables that are read have none.
     """
 
     path: Path
     number: int
+    parse: Callable[[Path, range], Table]
     header: Any = None
 
     def row_ranges(self, size: int) -> list[range]:
@@ -70,53 +72,38 @@ class CloudFile(ABC):
         """Read a range of rows, without the points that are not finite.
 
         Raises:
-            BadCloudError: the file is broken or missing.
+            BadCloudError: the file is missing or broken, or ends too early.
         """
         with reading(self.path):
-            return self.read_all(rows).finite()
-
-    def read_all(self, rows: range) -> Table:
-        """Read a range of rows with all its points; a parser's own errors pass through.
-
-        Raises:
-            BadCloudError: the file ends too early.
-        """
-        table = self._parse(rows)
-        if len(table.points) < len(rows):
-            raise ends_early(self.path, rows.start + len(table.points))
-        return table
-
-    @abstractmethod
-    def _parse(self, rows: range) -> Table:
-        """Read a range of rows, or fewer where the file ends too early."""
+            table = self.parse(self.path, rows)
+            if len(table.points) < len(rows):
+                raise ends_early(self.path, rows.start + len(table.points))
+            return table.finite()
 
 
-@dataclass(frozen=True, kw_only=True)
-class BinaryCloudFile(CloudFile):
-    """A file whose points are rows of a fixed number of bytes.
+def binary_file(path: Path, number: int, kind: np.dtype[Any], offset: int = 0) -> CloudFile:
+    """Return a file whose points are rows of a fixed number of bytes.
 
-    Attributes:
+    Args:
+        path: the file.
+        number: of rows.
         kind: the data type of a row, with the names of the columns.
         offset: of the first row, in bytes.
 
     Raises:
         BadCloudError: the file is too short for its rows.
     """
+    if not kind.itemsize or number < 0:
+        raise BadCloudError(f"{path} is broken: {number} points of {kind}.")
+    room = max(path.stat().st_size - offset, 0) // kind.itemsize
+    if number > room:
+        raise ends_early(path, room)
+    return CloudFile(path, number, partial(_parse_rows, kind, offset))
 
-    kind: np.dtype[Any]
-    offset: int = 0
 
-    def __post_init__(self) -> None:
-        """Reject a number of rows that the file is too short for."""
-        if not self.kind.itemsize or self.number < 0:
-            raise BadCloudError(f"{self.path} is broken: {self.number} points of {self.kind}.")
-        room = max(self.path.stat().st_size - self.offset, 0) // self.kind.itemsize
-        if self.number > room:
-            raise ends_early(self.path, room)
-
-    def _parse(self, rows: range) -> Table:
-        start = self.offset + rows.start * self.kind.itemsize
-        return from_array(np.fromfile(self.path, self.kind, len(rows), offset=start), self.path)
+def _parse_rows(kind: np.dtype[Any], offset: int, path: Path, rows: range) -> Table:
+    start = offset + rows.start * kind.itemsize
+    return from_array(np.fromfile(path, kind, len(rows), offset=start), path)
 
 
 def from_columns(columns: Mapping[str, Column], path: Path) -> Table:

@@ -6,15 +6,16 @@ import numpy as np
 from numpy.random import Generator
 from trimesh import Trimesh
 
-from mops_lightning.data.procedural.legs import four_legs, rungs
 from mops_lightning.data.procedural.mesh_parts import (
     Span,
     around,
     box,
     cushion,
     disc,
+    four_legs,
     join,
     rod,
+    rungs,
     smooth,
     tube,
     turned,

@@ -1,4 +1,4 @@
-"""Parts of procedural shapes: boxes, cushions, tubes and surfaces of revolution.
+"""Parts of procedural shapes: boxes, cushions, tubes, surfaces of revolution and legs.
 
 Axes are those of the shapes: x to the side, y up, z to the front. Lengths have no unit; clouds are
 normalised afterwards. All parts are ``trimesh.Trimesh``.
@@ -9,6 +9,7 @@ from functools import cache
 
 import numpy as np
 import trimesh
+from numpy.random import Generator
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
 from trimesh import Trimesh
@@ -163,3 +164,38 @@ def join(*parts: Trimesh | Sequence[Trimesh]) -> Trimesh:
     vertices = np.concatenate([part.vertices for part in flat])
     faces = np.concatenate([part.faces + start for part, start in zip(flat, starts, strict=True)])
     return Trimesh(vertices, faces, process=False)
+
+
+def four_legs(
+    rng: Generator, width: float, depth: float, height: float, radius: float, splay: float = 0.0
+) -> tuple[list[Trimesh], Array]:
+    """Return four legs, round or square, straight or tapered, and their ends.
+
+    Args:
+        rng: chooses the form of the legs.
+        width: distance between the outer sides along x at the top.
+        depth: distance between the outer sides along z at the top.
+        height: y of the top; the feet are at 0.
+        radius: half the thickness of a leg at the top.
+        splay: horizontal distance from top to foot, relative to the height.
+
+    Returns:
+        The legs, and their tops and feet ``(4, 2, 3)``: left front, right front, right back,
+        left back.
+    """
+    sections = int(rng.choice((4, 12)))
+    taper = rng.uniform(0.5, 1.0)
+    corners = np.array([(-1, 1), (1, 1), (1, -1), (-1, -1)])
+    tops = corners * (width / 2 - radius, depth / 2 - radius)
+    feet = tops + corners * splay * height
+    ends = np.stack((np.insert(tops, 1, height, axis=1), np.insert(feet, 1, 0.0, axis=1)), axis=1)
+    return [rod(top, foot, (radius, radius * taper), sections) for top, foot in ends], ends
+
+
+def rungs(ends: Array, level: float, radius: float, sides: tuple[int, ...]) -> list[Trimesh]:
+    """Return a bar to the next leg for each leg in ``sides``.
+
+    ``ends`` is from ``four_legs``, ``level`` relative to the height of the legs.
+    """
+    at = ends[:, 1] + level * (ends[:, 0] - ends[:, 1])
+    return [rod(at[i], at[(i + 1) % len(at)], radius, 8) for i in sides]
