@@ -1,10 +1,9 @@
-"""Sample elimination: the compiled loops, the torch form for GPUs, and the formula as published."""
+"""Sample elimination: the compiled loops, a plain form in torch, and the formula as published."""
 
 import pytest
 import torch
 
-from mops_lightning.ops import elimination
-from mops_lightning.ops.elimination import eliminate, eliminate_in_steps, spacing_bound
+from mops_lightning.ops.elimination import eliminate, spacing_bound
 from tests.support.clouds import cloud_of
 
 KINDS = ["sphere", "grid", "copies", "one point", "offset", "tiny", "huge", "outlier"]
@@ -23,47 +22,52 @@ def published(cloud, m, reach):
 
 
 def in_steps(points, m):
-    """Return the result of the torch form, with the arguments that ``eliminate`` gives it."""
+    """Sample elimination with whole weights and the distances to all points in a step."""
     points = points.double()
+    number = points.shape[1]
     reach = spacing_bound(points, m).clamp_min(torch.finfo(torch.float64).tiny)
-    scale = 2.0 ** min(50, 62 - points.shape[1].bit_length())
-    return eliminate_in_steps(points, m, reach, scale)
+    scale = 2.0 ** min(50, 62 - number.bit_length())
+
+    def weights(cloud, others, bound):
+        squared = sum((cloud[..., axis] - others[..., axis]) ** 2 for axis in range(3))
+        return ((1 - squared.sqrt() / bound).clamp_min(0).square().square().square() * scale).long()
+
+    kept = []
+    for cloud, bound in zip(points, reach, strict=True):
+        crowding = weights(cloud, cloud[:, None], bound).sum(1)
+        for _ in range(number - m):
+            worst = crowding.argmax()
+            crowding -= weights(cloud, cloud[worst], bound)
+            crowding[worst] = -1
+        kept.append((crowding > 0).nonzero()[:, 0])
+    return torch.stack(kept)
 
 
-@pytest.mark.parametrize("form", [eliminate, in_steps])
 @pytest.mark.parametrize("m", [2, 9, 23, 24])  # the last two points are equally crowded
-def test_eliminate_equals_published_formula(m, form, rng):
+def test_eliminate_equals_published_formula(m, rng):
     points = torch.randn(3, 24, 3, generator=rng, dtype=torch.float64)
     reach = spacing_bound(points, m)
     clouds = zip(points, reach, strict=True)
     expected = [published(cloud, m, float(bound)) for cloud, bound in clouds]
-    assert form(points, m).tolist() == expected
+    assert eliminate(points, m).tolist() == expected
 
 
-@pytest.mark.parametrize("form", [eliminate, in_steps])
-def test_eliminate_to_one_point_has_reach_of_bounding_box(form, rng):
+def test_eliminate_to_one_point_has_reach_of_bounding_box(rng):
     points = torch.randn(1, 24, 3, generator=rng, dtype=torch.float64)
     reach = float((points[0].amax(0) - points[0].amin(0)).norm())
-    assert form(points, 1).tolist() == [published(points[0], 1, reach)]
+    assert eliminate(points, 1).tolist() == [published(points[0], 1, reach)]
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (40, 39), (40, 40), (300, 1), (300, 20), (300, 150)])
-def test_eliminate_equals_torch_form(n, m, kind, rng):
+def test_eliminate_equals_plain_form(n, m, kind, rng):
     points = cloud_of(kind, (2, n), torch.float32, rng)
     assert torch.equal(eliminate(points, m), in_steps(points, m))
 
 
-def test_eliminate_non_contiguous_equals_torch_form(rng):
+def test_eliminate_non_contiguous_equals_plain_form(rng):
     points = torch.rand(3, 400, 2, generator=rng, dtype=torch.float64).transpose(0, 2)[:, ::2]
     assert torch.equal(eliminate(points, 30), in_steps(points, 30))
-
-
-def test_eliminate_in_steps_in_blocks_equals_whole(rng, monkeypatch):
-    points = torch.randn(2, 24, 3, generator=rng)
-    whole = in_steps(points, 9)
-    monkeypatch.setattr(elimination, "BLOCK", 24 * 5)
-    assert torch.equal(in_steps(points, 9), whole)
 
 
 def test_eliminate_of_many_copies_does_not_overflow():

@@ -1,8 +1,8 @@
 """Sample elimination: remove the most crowded point of a cloud until m points remain.
 
 Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets", Computer Graphics Forum 2015.
-On a CPU, numba compiles the loops, which visit the points of neighbouring cells only. Other devices
-use torch, with the same result.
+Numba compiles the loops, which visit the points of neighbouring cells only. They run on the CPU,
+for clouds on other devices, too.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -17,9 +17,6 @@ from torch import Tensor
 from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.ops.kernels import cached, jit
 from mops_lightning.ops.points import gather_points
-
-BLOCK = 2**22
-"""Distances in memory at a time while torch sums the weights."""
 
 FINEST = 2**20
 """Maximum number of cells along an axis: three positions fit into an integer of 64 bits."""
@@ -43,10 +40,9 @@ def eliminate(points: Tensor, m: int) -> Tensor:
     reach = spacing_bound(points, m).clamp_min(torch.finfo(points.dtype).tiny)
     # Sums of integers do not depend on the order of the points.
     scale = 2.0 ** min(50, 62 - number.bit_length())
-    if points.device.type != "cpu":
-        return eliminate_in_steps(points, m, reach, scale)
-    clouds = zip(points.numpy(), reach.flatten().tolist(), strict=True)
-    return torch.stack([_eliminate_by_cells(cloud, m, bound, scale) for cloud, bound in clouds])
+    clouds = zip(points.cpu().numpy(), reach.flatten().tolist(), strict=True)
+    rows = [_eliminate_by_cells(cloud, m, bound, scale) for cloud, bound in clouds]
+    return torch.stack(rows).to(points.device)
 
 
 def spacing_bound(points: Tensor, m: int) -> Tensor:
@@ -68,52 +64,6 @@ def spacing_bound(points: Tensor, m: int) -> Tensor:
     chosen = gather_points(points, farthest_point_sample(points, m))
     last = torch.linalg.vector_norm(chosen[:, :-1] - chosen[:, -1:], dim=2)
     return 2 * last.amin(1, keepdim=True)
-
-
-def eliminate_in_steps(points: Tensor, m: int, reach: Tensor, scale: float) -> Tensor:
-    """Return the rows ``(B, m)`` that remain, by torch, with the distances to all points in a step.
-
-    Args:
-        points: ``(B, N, C)`` float64.
-        m: number of points that remain, 1 ≤ m ≤ N.
-        reach: ``(B, 1)`` distance from which weights are 0, positive.
-        scale: factor of the weights before they are truncated to integers.
-    """
-    batch, number, _ = points.shape
-    planes = points.permute(2, 0, 1).contiguous()  # every step runs along memory
-    crowding = _crowding(planes, reach, scale)
-    for _ in range(number - m):
-        worst = crowding.argmax(1, keepdim=True)
-        removed = planes.gather(2, worst.expand(len(planes), -1, -1))
-        crowding -= _weights(planes - removed, reach, scale)
-        crowding.scatter_(1, worst, -1)
-    return (crowding > 0).nonzero()[:, 1].view(batch, m)
-
-
-def _weights(differences: Tensor, reach: Tensor, scale: float) -> Tensor:
-    """Return weights of differences ``(C, ...)``: ``scale`` at 0, and 0 from ``reach`` on; int64.
-
-    Changes the differences.
-    """
-    squared, *others = differences.square_().unbind(0)
-    for other in others:
-        squared += other
-    share = squared.sqrt_().div_(reach).neg_().add_(1).clamp_min_(0)
-    # Eighth power, as published.
-    return share.square_().square_().square_().mul_(scale).long()
-
-
-def _crowding(planes: Tensor, reach: Tensor, scale: float) -> Tensor:
-    """Return the sum of the weights of all points, ``(B, N)`` int64, computed in blocks."""
-    _, batch, number = planes.shape
-    total = torch.empty(batch, number, dtype=torch.int64, device=planes.device)
-    height = max(1, BLOCK // number)
-    for cloud in range(batch):
-        for start in range(0, number, height):
-            part = planes[:, cloud, start : start + height, None]
-            weights = _weights(planes[:, cloud, None] - part, reach[cloud], scale)
-            total[cloud, start : start + height] = weights.sum(1)
-    return total
 
 
 def _eliminate_by_cells(points: NDArray[np.float64], m: int, reach: float, scale: float) -> Tensor:
@@ -138,8 +88,8 @@ def _around(cells: Places) -> NDArray[np.int32]:
     around = np.empty((len(cells), 27), np.int32)
     for column, (x, y, z) in enumerate(itertools.product((-1, 0, 1), repeat=3)):
         wanted = cells + ((x * 2 * FINEST + y) * 2 * FINEST + z)
-        found = np.minimum(np.searchsorted(cells, wanted), len(cells) - 1)
-        around[:, column] = np.where(cells[found] == wanted, found, -1)
+        place = np.minimum(np.searchsorted(cells, wanted), len(cells) - 1)
+        around[:, column] = np.where(cells[place] == wanted, place, -1)
     return around
 
 
@@ -183,8 +133,8 @@ def _sink(heap, keys, order, top):
 
 
 @jit
-def _before(keys, order, one, other):
-    return keys[one] > keys[other] or (keys[one] == keys[other] and order[one] < order[other])
+def _before(keys, order, point, other):
+    return keys[point] > keys[other] or (keys[point] == keys[other] and order[point] < order[other])
 
 
 @cached
@@ -213,8 +163,8 @@ def _remove_crowded(planes, order, starts, numbers, cell_of, around, m, reach, s
         keys[point] = _change(
             planes, starts, numbers, near, nothing, reach, scale, x, y, z, crowding
         )
-    # Removed points move to the end of their cell: ``at`` is where each point is now.
-    heap, at, here = np.arange(size), np.arange(size), np.arange(size)
+    # Removed points move to the end of their cell: ``at`` is the place of each point.
+    heap, at, point_at = np.arange(size), np.arange(size), np.arange(size)
     for i in range(size):
         crowding[i] = keys[i]
     for top in range(size // 2 - 1, -1, -1):
@@ -234,8 +184,8 @@ def _remove_crowded(planes, order, starts, numbers, cell_of, around, m, reach, s
             last = starts[cell] + numbers[cell]
             for axis in range(3):
                 planes[axis, place] = planes[axis, last]
-            crowding[place], here[place] = crowding[last], here[last]
-            at[here[place]] = place
+            crowding[place], point_at[place] = crowding[last], point_at[last]
+            at[point_at[place]] = place
             near = around[cell]
             _change(planes, starts, numbers, near, np.int64(-1), reach, scale, x, y, z, crowding)
             remains[order[point]] = False

@@ -1,7 +1,4 @@
-"""Poisson-disk sampling by sample elimination, with exactly m points.
-
-Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets", Computer Graphics Forum 2015.
-"""
+"""Poisson-disk sampling by sample elimination, with exactly m points."""
 
 from torch import Tensor
 
@@ -25,8 +22,8 @@ class PoissonSampler(Sampler):
     which is omitted here.
 
     The seeded order of the cloud (see ``ordering``) breaks ties, so that the sample depends on the
-    seed and the cloud only. Flexible, but not nested. On a CPU, time is proportional to the number
-    of pairs of points that are nearer than d_max; on a GPU, it is O(N·(N − m)).
+    seed and the cloud only. Flexible, but not nested. It runs on the CPU; time is proportional to
+    the number of pairs of points that are nearer than d_max.
 
     Args:
         m: largest number of points to return.
