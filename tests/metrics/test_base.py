@@ -104,5 +104,4 @@ class TwiceTheError(TranslationError):
     name = "twice"
 
     def update(self, predicted, true):
-        self.total += 2 * RotationError.of(predicted, true).sum()
-        self.pairs += len(predicted.quaternion)
+        self.add(2 * RotationError.of(predicted, true))

@@ -1,7 +1,9 @@
-"""The base class of this package's metrics."""
+"""The base classes of this package's metrics."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import torch
+from torch import Tensor
 from torchmetrics import Metric, MetricCollection
 
 from mops_lightning.metrics.info import DEFAULT_ORDER
@@ -24,6 +26,27 @@ class TableMetric(Metric):
 
     is_differentiable = False
     full_state_update = False
+
+
+class MeanOverClouds(TableMetric):
+    """Mean over clouds or pairs of one number each; ``update`` passes the numbers to ``add``."""
+
+    total: Tensor
+    clouds: Tensor
+
+    def __init__(self, **extra: Any) -> None:
+        super().__init__(**extra)
+        self.add_state("total", default=torch.tensor(0.0), dist_reduce_fx="sum")
+        self.add_state("clouds", default=torch.tensor(0), dist_reduce_fx="sum")
+
+    def add(self, values: Tensor) -> None:
+        """Add one number per cloud, ``(B,)``."""
+        self.total += values.sum()
+        self.clouds += len(values)
+
+    def compute(self) -> Tensor:
+        """Return the mean over all clouds so far."""
+        return self.total / self.clouds
 
 
 def collection(*metrics: TableMetric) -> MetricCollection:

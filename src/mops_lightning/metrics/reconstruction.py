@@ -5,14 +5,14 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from mops_lightning.metrics.base import TableMetric
+from mops_lightning.metrics.base import MeanOverClouds, TableMetric
 
 
 class Distances(NamedTuple):
     """Distances of reconstructions from their clouds, one of each kind per cloud.
 
     Attributes:
-        chamfer: ``(B,)``, see ``ops.chamfer.chamfer_distance``.
+        chamfer: ``(B,)``, see ``ops.nearest.chamfer_distance``.
         emd: ``(B,)``, see ``ops.emd.earth_movers_distance``.
     """
 
@@ -23,7 +23,7 @@ class Distances(NamedTuple):
 Kind = Literal["chamfer", "emd"]
 
 
-class MeanDistance(TableMetric):
+class MeanDistance(MeanOverClouds):
     """Mean over all clouds of the distance between a cloud and its reconstruction.
 
     Attributes:
@@ -32,23 +32,10 @@ class MeanDistance(TableMetric):
 
     kind: ClassVar[Kind]
     higher_is_better = False
-    total: Tensor
-    clouds: Tensor
 
-    def __init__(self, **extra: Any) -> None:
-        super().__init__(**extra)
-        self.add_state("total", default=torch.tensor(0.0), dist_reduce_fx="sum")
-        self.add_state("clouds", default=torch.tensor(0), dist_reduce_fx="sum")
-
-    def update(self, found: Distances, reference: Distances | None) -> None:
+    def update(self, distances: Distances, reference: Distances | None) -> None:
         """Add a batch; the reference is not used."""
-        values = getattr(found, self.kind).detach()
-        self.total += values.sum()
-        self.clouds += len(values)
-
-    def compute(self) -> Tensor:
-        """Return the mean over all clouds so far."""
-        return self.total / self.clouds
+        self.add(getattr(distances, self.kind).detach())
 
 
 class MeanChamfer(MeanDistance):
@@ -84,27 +71,28 @@ class NormalizedError(TableMetric):
     of_means: ClassVar[bool] = False
     higher_is_better = False
     ratios: Tensor
-    found: Tensor
-    wanted: Tensor
+    sampled: Tensor
+    full: Tensor
     clouds: Tensor
 
     def __init__(self, **extra: Any) -> None:
         super().__init__(**extra)
-        for state in ("ratios", "found", "wanted", "clouds"):
+        for state in ("ratios", "sampled", "full", "clouds"):
             self.add_state(state, default=torch.tensor(0.0).double(), dist_reduce_fx="sum")
 
-    def update(self, found: Distances, reference: Distances) -> None:
+    def update(self, distances: Distances, reference: Distances) -> None:
         """Add a batch of distances and those of the full clouds' reconstructions."""
-        mine, full = (getattr(one, self.kind).detach().double() for one in (found, reference))
+        sampled = getattr(distances, self.kind).detach().double()
+        full = getattr(reference, self.kind).detach().double()
         # 0/0, an exact reconstruction from sampled points too, counts as 1.
-        self.ratios += torch.where(mine == full, 1.0, mine / full).sum()
-        self.found += mine.sum()
-        self.wanted += full.sum()
-        self.clouds += len(mine)
+        self.ratios += torch.where(sampled == full, 1.0, sampled / full).sum()
+        self.sampled += sampled.sum()
+        self.full += full.sum()
+        self.clouds += len(sampled)
 
     def compute(self) -> Tensor:
         """Return the mean ratio or the ratio of means over all clouds so far."""
-        value = self.found / self.wanted if self.of_means else self.ratios / self.clouds
+        value = self.sampled / self.full if self.of_means else self.ratios / self.clouds
         return value.float()
 
 

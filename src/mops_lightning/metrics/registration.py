@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
-from mops_lightning.metrics.base import TableMetric
+from mops_lightning.metrics.base import MeanOverClouds, TableMetric
 from mops_lightning.ops.rigid import Motion, rotation_angle
 
 
@@ -76,7 +76,7 @@ class DoubledRotationError(RotationError):
     factor = 2.0
 
 
-class RotationRecall(TableMetric):
+class RotationRecall(MeanOverClouds):
     """Fraction of pairs whose geodesic rotation error is at most ``degrees``.
 
     Attributes:
@@ -87,23 +87,10 @@ class RotationRecall(TableMetric):
     scale = 100.0
     higher_is_better = True
     degrees: ClassVar[float]
-    within: Tensor
-    pairs: Tensor
-
-    def __init__(self, **extra: Any) -> None:
-        super().__init__(**extra)
-        self.add_state("within", default=torch.tensor(0), dist_reduce_fx="sum")
-        self.add_state("pairs", default=torch.tensor(0), dist_reduce_fx="sum")
 
     def update(self, predicted: Motion, true: Motion) -> None:
         """Add a batch of motions."""
-        angles = RotationError.of(predicted, true)
-        self.within += (angles <= self.degrees).sum()
-        self.pairs += len(angles)
-
-    def compute(self) -> Tensor:
-        """Return the fraction of all pairs so far."""
-        return self.within / self.pairs
+        self.add(RotationError.of(predicted, true) <= self.degrees)
 
 
 class RotationRecall5(RotationRecall):
@@ -122,26 +109,14 @@ class RotationRecall10(RotationRecall):
     degrees = 10.0
 
 
-class TranslationError(TableMetric):
+class TranslationError(MeanOverClouds):
     """Mean Euclidean distance of predicted and true translations, in units of the coordinates."""
 
     name = "translation_error"
     higher_is_better = False
     summary_order = 5
-    total: Tensor
-    pairs: Tensor
-
-    def __init__(self, **extra: Any) -> None:
-        super().__init__(**extra)
-        self.add_state("total", default=torch.tensor(0.0), dist_reduce_fx="sum")
-        self.add_state("pairs", default=torch.tensor(0), dist_reduce_fx="sum")
 
     def update(self, predicted: Motion, true: Motion) -> None:
         """Add a batch of motions."""
         difference = predicted.translation.detach() - true.translation
-        self.total += torch.linalg.vector_norm(difference, dim=1).sum()
-        self.pairs += len(difference)
-
-    def compute(self) -> Tensor:
-        """Return the mean over all pairs so far."""
-        return self.total / self.pairs
+        self.add(torch.linalg.vector_norm(difference, dim=1))
