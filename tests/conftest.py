@@ -26,7 +26,7 @@ gc.set_threshold(50_000, 20, 50)
 
 SLOW_FILES = (
     *("training/test_tensorboard", "docs/test_notebooks", "cli/test_train", "cli/test_launchers"),
-    *("config/test_distributed", "samplers/test_memory", "files/test_dask_engine"),
+    *("config/test_distributed", "samplers/test_memory", "files/test_engine"),
     *("training/test_checkpoint", "training/test_pretrain", "cli/test_resume", "docs/test_site"),
     *("report/test_page", "fuzz/test_command_lines", "test_wheel", "training/test_precision"),
     *("training/test_evaluate", "zoo/test_export", "training/test_warm_start"),

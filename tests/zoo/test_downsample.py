@@ -4,19 +4,14 @@ import torch
 
 from mops_lightning import downsample, load
 from mops_lightning.errors import UserError
-from mops_lightning.files.options import METHODS
-from mops_lightning.zoo import downsample as module
 from mops_lightning.zoo import publish
+from mops_lightning.zoo.names import UNTRAINED
 from tests.support.models import write_run
 
 CLOUD = torch.rand(100, 3, generator=torch.Generator().manual_seed(0)) * 7
 
 
-def test_methods_are_those_of_the_command():
-    assert set(module.UNTRAINED) == set(METHODS)
-
-
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", UNTRAINED)
 def test_untrained_methods_return_rows(method):
     points, indices = downsample(CLOUD, 10, method)
     assert torch.equal(points, CLOUD[indices])

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from mops_lightning.errors import UserError, did_you_mean, one_line_endings
-from mops_lightning.files.options import METHODS
+from mops_lightning.zoo.names import UNTRAINED
 
 DESCRIPTION = """Compare downsampling methods on your own files.
 
@@ -35,7 +35,7 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
     add(
         "--weights", help="a trained sampler: a model's name, a weights file or the folder of a run"
     )
-    add("--methods", nargs="+", default=list(METHODS), help="untrained methods; default: all")
+    add("--methods", nargs="+", default=list(UNTRAINED), help="untrained methods; default: all")
     add("--tile", type=int, metavar="POINTS", help="the trained sampler by tiles, as in downsample")
     add("--out", type=Path, default=Path("compare"), help="folder to write; default: compare")
     add("--seed", type=int, default=0, help="seed of random choices")
@@ -47,10 +47,14 @@ def _run(chosen: argparse.Namespace) -> None:
     if chosen.weights is None and chosen.tile is not None:
         raise UserError("--tile is for the trained sampler: give --weights.")
     for name in chosen.methods:
-        if name not in METHODS:
-            raise UserError(f"--methods: unknown {name!r}.{did_you_mean(name, METHODS)}")
-    from mops_lightning.files.compare import compare_file, options_by_method
-    from mops_lightning.files.compare_page import FILES, write_comparison
+        if name not in UNTRAINED:
+            raise UserError(f"--methods: unknown {name!r}.{did_you_mean(name, UNTRAINED)}")
+    from mops_lightning.files.compare import (
+        FILES,
+        compare_file,
+        options_by_method,
+        write_comparison,
+    )
     from mops_lightning.files.downsample import load_sampler
 
     _check_folder(chosen.out, FILES, chosen.overwrite)

@@ -7,9 +7,10 @@ from pathlib import Path
 
 from mops_lightning.errors import UserError, one_line_endings
 from mops_lightning.files.engine import Engine, LocalEngine
-from mops_lightning.files.options import METHODS, Options
+from mops_lightning.files.options import Options
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.records.readout_names import GENERATED_READOUTS
+from mops_lightning.zoo.names import UNTRAINED
 
 DESCRIPTION = """Downsample clouds and meshes from files.
 
@@ -44,7 +45,7 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
     add(
         "--weights", help="a trained sampler: a model's name, a weights file or the folder of a run"
     )
-    add("--method", choices=METHODS, help="an untrained method, instead of --weights")
+    add("--method", choices=UNTRAINED, help="an untrained method, instead of --weights")
     add(
         "--readout",
         choices=GENERATED_READOUTS,
@@ -129,6 +130,6 @@ def _engine(chosen: argparse.Namespace) -> AbstractContextManager[Engine | None]
     is_file = not chosen.source.is_dir()
     if not chosen.cluster:
         return nullcontext(LocalEngine(progress=True) if is_file else None)
-    from mops_lightning.files.dask_engine import dask_engine
+    from mops_lightning.files.engine import dask_engine
 
     return dask_engine(chosen.cluster, progress=is_file)

@@ -1,10 +1,25 @@
-"""Engines: where the ranges of a file's rows are processed."""
+"""Engines: where the ranges of a file's rows are processed, in this process or by Dask.
 
+Dask instead of Ray, because it is plain Python, small, and runs wherever torch does, and little is
+needed here: distribute ranges, and distribute them again when a worker dies.
+"""
+
+import logging
 import sys
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 from rich.progress import track
+
+from mops_lightning.errors import UserError
+
+PATIENCE = 20
+"""Seconds to wait for a scheduler and its first worker."""
+
+AHEAD = 4
+"""Ranges per thread that are submitted before the first result is used."""
 
 
 class Engine(Protocol):
@@ -44,3 +59,103 @@ def with_progress(results: Iterable[Any], title: str, total: int) -> Iterable[An
     """Pass results on, and show the progress on a terminal."""
     hidden = not sys.stdout.isatty()
     return track(results, title, total=total, disable=hidden, transient=True)
+
+
+@contextmanager
+def dask_engine(address: str, progress: bool) -> Iterator["DaskEngine"]:
+    """Yield an engine that distributes its work by Dask.
+
+    Args:
+        address: of a running scheduler.
+        progress: show the progress on a terminal.
+
+    Raises:
+        UserError: Dask is not installed, or no scheduler with workers answers at the address.
+    """
+    try:
+        import dask
+        import distributed
+    except ModuleNotFoundError:
+        raise UserError("--cluster needs Dask: pip install 'mops-lightning[cluster]'.") from None
+    # Errors say what a user needs to know.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    try:
+        client = distributed.Client(address, timeout=PATIENCE)
+    except (OSError, ValueError, TypeError) as error:
+        raise UserError(
+            f"--cluster: no Dask scheduler answers at {address} ({type(error).__name__}). Start "
+            "one with `dask scheduler`, and `dask worker ADDRESS` on every machine."
+        ) from None
+    # The net is part of the task graph, so that workers that join later get it.
+    with client, dask.config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}):
+        try:
+            client.wait_for_workers(1, timeout=PATIENCE)
+        except TimeoutError:
+            raise UserError(
+                f"--cluster: the scheduler at {address} has no workers. Start some with "
+                f"`dask worker {address}`."
+            ) from None
+        yield DaskEngine(client, progress)
+
+
+class DaskEngine:
+    """Submits ranges to a Dask client; a range is repeated when its worker dies.
+
+    Args:
+        client: a ``distributed.Client``.
+        progress: show the progress on a terminal.
+    """
+
+    def __init__(self, client: Any, progress: bool = False) -> None:
+        self.client = client
+        self.progress = progress
+
+    def map(
+        self, title: str, function: Callable[[range], Any], row_ranges: list[range]
+    ) -> Iterator[Any]:
+        """See ``Engine.map``.
+
+        Raises:
+            UserError: workers die repeatedly, or the scheduler is lost.
+        """
+        from distributed import CancelledError, KilledWorker
+        from distributed.comm import CommClosedError
+
+        try:
+            results = self._results(function, row_ranges)
+            total = len(row_ranges)
+            yield from with_progress(results, title, total) if self.progress else results
+        except KilledWorker:
+            raise UserError(
+                f"--cluster: workers died repeatedly ({title}), perhaps for lack of memory. Try a "
+                "smaller --chunk."
+            ) from None
+        except Exception as error:  # Dask raises several kinds when the connection is lost
+            lost = isinstance(error, CancelledError | CommClosedError)
+            if not lost and self.client.status == "running":
+                raise
+            raise UserError(
+                f"--cluster: lost the connection to the scheduler ({type(error).__name__}). "
+                "Restart it and run the same command again."
+            ) from None
+
+    def _results(self, function: Callable[[range], Any], row_ranges: list[range]) -> Iterator[Any]:
+        # A task, not scattered data: Dask repeats it when the worker that holds it dies.
+        shared = self.client.submit(_same, function, pure=False)
+        ahead = AHEAD * max(sum(self.client.nthreads().values()), 1)
+        futures: deque[Any] = deque()
+        rest = iter(row_ranges)
+        while True:
+            while len(futures) < ahead and (rows := next(rest, None)) is not None:
+                futures.append(self.client.submit(_call, shared, rows, pure=False))
+            if not futures:
+                return
+            yield futures.popleft().result()
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+def _call(function: Callable[[range], Any], rows: range) -> Any:
+    return function(rows)

@@ -4,9 +4,7 @@ from dataclasses import dataclass
 
 from mops_lightning.errors import UserError
 from mops_lightning.records.readout_names import GENERATED_READOUTS
-
-METHODS = ("fps", "random", "voxel", "poisson")
-"""Untrained samplers."""
+from mops_lightning.zoo.names import UNTRAINED
 
 
 @dataclass(frozen=True)
@@ -16,7 +14,7 @@ class Options:
     Attributes:
         m: number of points to keep; None: as many as the weights were trained for.
         weights: of a trained sampler: a model, a weights file, or the folder of its run.
-        method: one of ``METHODS``, instead of weights.
+        method: one of ``zoo.names.UNTRAINED``, instead of weights.
         readout: of a trained sampler: generated, matched or completed.
         keep_attributes: keep colours, normals and the like of the kept points.
         surface: number of points to sample from a mesh's surface first.
@@ -42,7 +40,7 @@ class Options:
         """Reject values out of range and options that exclude each other."""
         if self.weights is None and self.method is None:
             raise UserError(
-                f"give --method {'|'.join(METHODS)}, or --weights MODEL of a trained sampler."
+                f"give --method {'|'.join(UNTRAINED)}, or --weights MODEL of a trained sampler."
             )
         if self.weights is not None and self.method is not None:
             raise UserError(f"give --weights or --method {self.method}, not both.")

@@ -1,28 +1,16 @@
 """Downsampling by the name of a method or of a model."""
 
-from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
 
+import mops_lightning
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.poisson import PoissonSampler
-from mops_lightning.samplers.random import RandomSampler
-from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.zoo import names, weights
 from mops_lightning.zoo.load import load
-
-UNTRAINED: dict[str, Callable[..., Sampler]] = {
-    "fps": FPSSampler,
-    "random": RandomSampler,
-    "voxel": VoxelSampler,
-    "poisson": PoissonSampler,
-}
-"""Methods without weights."""
 
 
 def downsample(
@@ -70,44 +58,36 @@ def downsample(
     """
     if start is not None and method != "fps":
         raise UserError(f"start is for method='fps', got method={str(method)!r}.")
-    sampler = sampler_of(method, m, seed or 0, start, getattr(points, "device", "cpu"))
+    if method in names.UNTRAINED:
+        arguments = {} if start is None else {"start": start}
+        sampler = untrained(str(method), m, seed or 0, **arguments)
+    else:
+        sampler = _model(str(method), str(getattr(points, "device", "cpu")))
     return sampler.downsample(points, m, readout, lengths, batch)
-
-
-def sampler_of(
-    method: str | Path, m: int, seed: int = 0, start: int | str | None = None, device: Any = "cpu"
-) -> Sampler:
-    """Return the sampler of a method, or a model, which is loaded once.
-
-    Args:
-        method: as for ``downsample``.
-        m: number of points.
-        seed: of random choices.
-        start: with ``fps``, the row of the first point, or ``"farthest"``; see ``FPSSampler``.
-        device: of the sampler.
-
-    Raises:
-        UserError: there is no such method or model.
-    """
-    if method in UNTRAINED:
-        return untrained(str(method), m, seed, **({} if start is None else {"start": start}))
-    known = {*UNTRAINED, *names.available()}
-    text = str(method)
-    if not (text.startswith(names.HUB) or text in known or Path(text).expanduser().exists()):
-        raise UserError(f"method: unknown {text!r}.{did_you_mean(text, known)}")
-    path = weights.of_run(names.resolve(text))
-    return _model(path, path.stat().st_mtime_ns, str(device))
 
 
 def untrained(method: str, m: int, seed: int = 0, **arguments: Any) -> Sampler:
     """Return the sampler of one of the ``UNTRAINED`` methods; ``voxel`` has no seed."""
     if method != "voxel":
         arguments["seed"] = seed
-    return UNTRAINED[method](m, **arguments)
+    make: type[Sampler] = getattr(mops_lightning, names.UNTRAINED[method])
+    return make(m, **arguments)
+
+
+def _model(name: str, device: str) -> Sampler:
+    """Return a model's sampler, which is loaded once.
+
+    Raises:
+        UserError: there is no such method or model.
+    """
+    known = {*names.UNTRAINED, *names.available()}
+    if not (name.startswith(names.HUB) or name in known or Path(name).expanduser().exists()):
+        raise UserError(f"method: unknown {name!r}.{did_you_mean(name, known)}")
+    path = weights.of_run(names.resolve(name))
+    return _loaded(path, path.stat().st_mtime_ns, device)
 
 
 @lru_cache(maxsize=4)
-def _model(path: Path, changed: int, device: str) -> Sampler:
+def _loaded(path: Path, changed: int, device: str) -> Sampler:
     """Load a sampler; a file that has changed since is loaded again."""
-    sampler = load(path)
-    return sampler.to(torch.device(device))
+    return load(path).to(torch.device(device))

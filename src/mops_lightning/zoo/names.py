@@ -8,6 +8,13 @@ from pathlib import Path
 from mops_lightning.errors import UserError, did_you_mean, one_line
 from mops_lightning.zoo import model_file
 
+UNTRAINED = {
+    "fps": "FPSSampler",
+    "random": "RandomSampler",
+    "voxel": "VoxelSampler",
+    "poisson": "PoissonSampler",
+}
+"""Samplers without weights, public names of the package, by the name of the method."""
 SHIPPED = Path(__file__).parent / "models"
 """The models that the package contains."""
 VARIABLE = "MOPS_MODELS"

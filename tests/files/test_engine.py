@@ -14,8 +14,7 @@ from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from mops_lightning.files.chunks import sample_by_chunks
-from mops_lightning.files.dask_engine import DaskEngine, dask_engine
-from mops_lightning.files.engine import LocalEngine
+from mops_lightning.files.engine import DaskEngine, LocalEngine, dask_engine
 from mops_lightning.files.options import Options
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.zoo import weights
@@ -131,7 +130,7 @@ def test_broken_file_is_named(client, scan, tmp_path):
 
 
 def test_missing_scheduler_is_reported(scan, tmp_path, monkeypatch):
-    monkeypatch.setattr("mops_lightning.files.dask_engine.PATIENCE", 1)
+    monkeypatch.setattr("mops_lightning.files.engine.PATIENCE", 1)
     settings = ["--weights", scan[0].parent, "--readout", "generated", "--chunk", 500]
     for address in ("tcp://127.0.0.1:9", "nonsense://"):
         status, _, err = call(scan[0], tmp_path / "a.ply", *settings, "--cluster", address)
@@ -140,7 +139,7 @@ def test_missing_scheduler_is_reported(scan, tmp_path, monkeypatch):
 
 
 def test_scheduler_without_workers_is_reported(monkeypatch):
-    monkeypatch.setattr("mops_lightning.files.dask_engine.PATIENCE", 1)
+    monkeypatch.setattr("mops_lightning.files.engine.PATIENCE", 1)
     with (
         environment_kept(),
         distributed.LocalCluster(n_workers=0, dashboard_address=":0") as empty,
