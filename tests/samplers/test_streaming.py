@@ -5,7 +5,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.snet import SNet
-from mops_lightning.samplers.streaming import global_part, stream_sample, sum_part
+from mops_lightning.samplers.streaming import stream_sample
 
 
 @pytest.mark.parametrize("size", [1, 7, 1000, 5000])
@@ -21,8 +21,8 @@ def test_parts_merge_in_any_order(trained, rng):
     points = torch.randn(1000, 3, generator=rng)
     parts = points.split([1, 400, 99, 500])
     net = trained.fused()
-    global_ = torch.stack([global_part(net, part) for part in parts]).amax(0)
-    sums = [sum_part(net, part, global_, 24) for part in parts]
+    global_ = torch.stack([net.global_part(part) for part in parts]).amax(0)
+    sums = [net.sum_part(part, global_, 24) for part in parts]
     forwards = sums[0].merge(sums[1]).merge(sums[2]).merge(sums[3]).result()
     by_pairs = sums[3].merge(sums[1]).merge(sums[0].merge(sums[2])).result()
     torch.testing.assert_close(forwards, by_pairs, rtol=0, atol=1e-6)

@@ -24,7 +24,6 @@ from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fused import FusedMOPSNet
-from mops_lightning.samplers.streaming import global_part, sum_part
 
 
 class UnitSphere(NamedTuple):
@@ -140,14 +139,14 @@ def _radius(cloud: CloudFile, centre: NDArray[np.float64], rows: range) -> float
 
 def _global(cloud: CloudFile, sphere: UnitSphere, net: FusedMOPSNet, rows: range) -> Tensor | None:
     points = sphere.normalise(cloud.read(rows).points)
-    return global_part(net, points) if len(points) else None
+    return net.global_part(points) if len(points) else None
 
 
 def _sum(
     cloud: CloudFile, sphere: UnitSphere, net: FusedMOPSNet, global_: Tensor, m: int, rows: range
 ) -> Partial | None:
     points = sphere.normalise(cloud.read(rows).points)
-    return sum_part(net, points, global_, m) if len(points) else None
+    return net.sum_part(points, global_, m) if len(points) else None
 
 
 def _nearest(

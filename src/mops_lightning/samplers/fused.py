@@ -7,6 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_linear_bn_weights
 
+from mops_lightning.ops.attention import Partial, attend
+
 BLOCK_ROWS = {"cpu": 2048, "cuda": 2**18}
 """Points per block: on a CPU, the widest layer of a block stays in the cache."""
 
@@ -73,45 +75,38 @@ class FusedMOPSNet(NamedTuple):
             out.copy_(_through(layers, rows))
         return result
 
+    def global_part(self, points: Tensor) -> Tensor:
+        """Return the contribution ``(D,)`` of a chunk ``(n, 3)`` to the global feature.
 
-def fuse(
-    features: nn.Sequential,
-    rho_local: nn.Linear,
-    rho_global: nn.Linear,
-    rho_norm: nn.BatchNorm1d,
-    rho: nn.Sequential,
-    queries: Tensor,
-) -> FusedMOPSNet:
-    """Fuse BatchNorm with its running statistics into the preceding linear layers.
+        Contributions merge by maximum.
+        """
+        return self.local_features(points).amax(0)
 
-    Args:
-        features: the pointwise layers of the feature extraction.
-        rho_local: the first layer of ρ for local features.
-        rho_global: the first layer of ρ for the global feature.
-        rho_norm: BatchNorm after the sum of both.
-        rho: the other hidden layers of ρ.
-        queries: ``(M, C)``, the last layer of ρ divided by the temperature.
+    def sum_part(self, points: Tensor, global_: Tensor, m: int) -> Partial:
+        """Return the contribution of a chunk to the generated points; ``Partial.merge`` merges.
 
-    Returns:
-        The network for inference, with copies of the weights.
-    """
-    # The shift of BatchNorm applies to the sum once, so only one of the parts gets it.
-    local = _fused(rho_local, rho_norm)
-    of_global = _fused(rho_global, rho_norm)
-    return FusedMOPSNet(_layers(features), local, of_global.weight, _layers(rho), queries)
+        Args:
+            points: ``(n, 3)``.
+            global_: ``(D,)``, the global feature of the whole cloud.
+            m: number of points to generate.
+
+        Returns:
+            Sums for m points, with values ``(m, 3)``.
+        """
+        return attend(self.queries[:m], self.keys(self.local_features(points), global_), points)
 
 
-def _layers(stack: nn.Sequential) -> tuple[Layer, ...]:
-    modules = list(stack)
-    pairs = pairwise(modules)
+def fused_layers(stack: nn.Sequential) -> tuple[Layer, ...]:
+    """Return the linear layers, with the BatchNorm that follows each."""
     return tuple(
-        _fused(linear, norm)
-        for linear, norm in pairs
+        fused_layer(linear, norm)
+        for linear, norm in pairwise(stack)
         if isinstance(linear, nn.Linear) and isinstance(norm, nn.BatchNorm1d)
     )
 
 
-def _fused(linear: nn.Linear, norm: nn.BatchNorm1d) -> Layer:
+def fused_layer(linear: nn.Linear, norm: nn.BatchNorm1d) -> Layer:
+    """Return a linear layer with BatchNorm's running statistics fused into it, as a copy."""
     assert norm.running_mean is not None
     assert norm.running_var is not None
     weight, bias = fuse_linear_bn_weights(

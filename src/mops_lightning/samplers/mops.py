@@ -14,7 +14,7 @@ from mops_lightning.ops.precision import pointwise_autocast, pointwise_autocast_
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.anchors import FPSAnchors
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.fused import FusedMOPSNet, fuse
+from mops_lightning.samplers.fused import FusedMOPSNet, fused_layer, fused_layers
 from mops_lightning.types import SampleOutput
 
 DEFAULT_WIDTH = 0.5
@@ -158,8 +158,14 @@ class MOPSNet(Sampler):
         norm = self.rho_first[0]
         assert isinstance(norm, nn.BatchNorm1d)
         queries = self.queries.weight.detach() / self.tau_min
-        layers = self.features.mlp.layers
-        return fuse(layers, self.rho_local, self.rho_global, norm, self.rho, queries)
+        return FusedMOPSNet(
+            fused_layers(self.features.mlp.layers),
+            # The shift of BatchNorm applies to the sum once, so only one of the parts gets it.
+            fused_layer(self.rho_local, norm),
+            fused_layer(self.rho_global, norm).weight,
+            fused_layers(self.rho),
+            queries,
+        )
 
     def _fused_keys(self, points: Tensor) -> Tensor:
         """Return the keys without gradients, from the fused network."""

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.attention import Partial, attend
+from mops_lightning.ops.attention import Partial
 from mops_lightning.samplers.base import Sampler, check_dtype, check_points
-from mops_lightning.samplers.fused import FusedMOPSNet
 
 Chunks = Callable[[], Iterable[Tensor]]
 """Function that iterates over the chunks ``(n, 3)`` of a cloud, in the same order at every call."""
@@ -38,37 +37,9 @@ def stream_sample(sampler: Sampler, chunks: Chunks, m: int | None = None) -> Ten
     m = sampler.m if m is None else m
     net = sampler.fused()
     sampler.check_m(m)
-    peaks = (global_part(net, chunk) for chunk in _checked(chunks, m, sampler))
+    peaks = (net.global_part(chunk) for chunk in _checked(chunks, m, sampler))
     global_ = reduce(torch.maximum, peaks)
-    return reduce(Partial.merge, (sum_part(net, chunk, global_, m) for chunk in chunks())).result()
-
-
-def global_part(net: FusedMOPSNet, points: Tensor) -> Tensor:
-    """Return the contribution of a chunk to the global feature; contributions merge by maximum.
-
-    Args:
-        net: the network.
-        points: ``(n, 3)``.
-
-    Returns:
-        ``(D,)``.
-    """
-    return net.local_features(points).amax(0)
-
-
-def sum_part(net: FusedMOPSNet, points: Tensor, global_: Tensor, m: int) -> Partial:
-    """Return the contribution of a chunk to the generated points; ``Partial.merge`` merges them.
-
-    Args:
-        net: the network.
-        points: ``(n, 3)``.
-        global_: ``(D,)``, the global feature of the whole cloud.
-        m: number of points to generate.
-
-    Returns:
-        Sums for m points, with values ``(m, 3)``.
-    """
-    return attend(net.queries[:m], net.keys(net.local_features(points), global_), points)
+    return reduce(Partial.merge, (net.sum_part(chunk, global_, m) for chunk in chunks())).result()
 
 
 def _checked(chunks: Chunks, m: int, sampler: Sampler) -> Iterable[Tensor]:
