@@ -1,8 +1,8 @@
 # The public API, and the samplers that weights files may name (zoo/load.py).
 
-from .ops.chamfer import chamfer_distance as chamfer_distance
 from .ops.emd import earth_movers_distance as earth_movers_distance
 from .ops.fps import farthest_point_sample as farthest_point_sample
+from .ops.nearest import chamfer_distance as chamfer_distance
 from .ops.nearest import nearest as nearest
 from .ops.readout import complete as complete
 from .ops.readout import match as match

@@ -1,12 +1,12 @@
 import pytest
 
-from mops_lightning.ops import argextreme, compiled
+from mops_lightning.ops import compiled, points
 
 
-@pytest.fixture(params=[0, argextreme.PLAIN_MAX_VALUES], ids=["blocked", "plain"])
+@pytest.fixture(params=[0, points.PLAIN_MAX_VALUES], ids=["blocked", "plain"])
 def argextreme_path(request, monkeypatch):
     """Small inputs through both code paths of ``blocked_argextreme``."""
-    monkeypatch.setattr(argextreme, "PLAIN_MAX_VALUES", request.param)
+    monkeypatch.setattr(points, "PLAIN_MAX_VALUES", request.param)
 
 
 @pytest.fixture(params=["compiled", "torch"])

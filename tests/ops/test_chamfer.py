@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from mops_lightning.ops.chamfer import chamfer_distance
+from mops_lightning.ops.nearest import chamfer_distance
 
 
 def pair(kind, rng):

@@ -1,7 +1,12 @@
 import pytest
 import torch
 
-from mops_lightning.ops.points import gather_points, normalize_unit_sphere
+from mops_lightning.ops.points import (
+    GROUP,
+    blocked_argextreme,
+    gather_points,
+    normalize_unit_sphere,
+)
 
 
 def test_gather_points_equals_double_loop(rng):
@@ -38,3 +43,12 @@ def test_normalize_of_coincident_points_is_zero():
 def test_normalize_gradcheck(rng):
     points = torch.randn(2, 6, 3, dtype=torch.float64, generator=rng, requires_grad=True)
     assert torch.autograd.gradcheck(normalize_unit_sphere, (points,))
+
+
+@pytest.mark.usefixtures("argextreme_path")
+@pytest.mark.parametrize("largest", [True, False])
+def test_argextreme_of_ties_is_lowest_position(largest, rng):
+    values = torch.randint(0, 9, (50, 3 * GROUP), generator=rng).float()
+    rows = values.tolist()
+    expected = [row.index(max(row) if largest else min(row)) for row in rows]
+    assert blocked_argextreme(values, largest).squeeze(1).tolist() == expected

@@ -5,8 +5,8 @@ from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
-from mops_lightning.ops.chamfer import chamfer_distance
 from mops_lightning.ops.emd import earth_movers_distance
+from mops_lightning.ops.nearest import chamfer_distance
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.reconstruction import Reconstruction

@@ -11,7 +11,7 @@ from mops_lightning.losses.registration import frobenius_chamfer_loss, quaternio
 from mops_lightning.metrics.registration import RotationError
 from mops_lightning.nets.icp import ICP
 from mops_lightning.nets.pcrnet import PCRNet
-from mops_lightning.ops.chamfer import chamfer_distance
+from mops_lightning.ops.nearest import chamfer_distance
 from mops_lightning.ops.rigid import Motion, identity_motion, quaternion_conjugate
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler

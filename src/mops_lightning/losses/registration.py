@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from mops_lightning.ops.chamfer import chamfer_distance
+from mops_lightning.ops.nearest import chamfer_distance
 from mops_lightning.ops.rigid import Motion, quaternion_to_matrix
 
 

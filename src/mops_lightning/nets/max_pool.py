@@ -8,7 +8,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from mops_lightning.ops.argextreme import GROUP, blocked_argextreme
+from mops_lightning.ops.points import GROUP, blocked_argextreme
 
 PLAIN_MAX_POINTS = 32
 """Up to this number of points, ``PointMaxPool`` computes the plain layers."""

@@ -30,8 +30,6 @@ def earth_movers_distance(
 ) -> Tensor:
     """Return the earth mover's distance between clouds with the same number of points.
 
-    EMD(P, Q) = min over bijections φ of 1/N Σ_i ‖p_i − q_φ(i)‖.
-
     Args:
         points: ``(B, N, 3)`` clouds P.
         others: ``(B, N, 3)`` clouds Q.
@@ -68,18 +66,10 @@ def assignment(
 ) -> Tensor:
     """Return the assignment whose mean distance is the earth mover's distance.
 
-    Args:
-        points: ``(B, N, 3)`` clouds P.
-        others: ``(B, N, 3)`` clouds Q.
-        block: see ``earth_movers_distance``.
-        rounds: see there.
-        workers: see there.
+    Arguments and errors are those of ``earth_movers_distance``.
 
     Returns:
         ``(B, N)`` int64 rows of ``others``, a permutation for every cloud.
-
-    Raises:
-        UserError: see ``earth_movers_distance``.
     """
     if points.shape != others.shape or points.ndim != 3:
         raise UserError(

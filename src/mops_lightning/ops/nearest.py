@@ -1,4 +1,6 @@
-"""Nearest neighbours by exhaustive search, or by compiled loops over a tree on a CPU.
+"""Nearest neighbours and the chamfer distance.
+
+The search is exhaustive, or runs in compiled loops over a tree on a CPU.
 
 Distances are computed from differences of coordinates. The form |a|² + |b|² − 2⟨a, b⟩ would be a
 single matrix product, but its cancellation error gives wrong neighbours for points that are 1e-3
@@ -12,8 +14,12 @@ from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops import compiled
-from mops_lightning.ops.argextreme import blocked_argextreme
-from mops_lightning.ops.points import distance_dtype, gather_points, to_planes
+from mops_lightning.ops.points import (
+    blocked_argextreme,
+    distance_dtype,
+    gather_points,
+    to_planes,
+)
 
 BLOCK = {"cpu": 2**19, "other": 2**24}
 """Distances in memory at a time: a CPU keeps these in its cache; 64 MiB on other devices."""
@@ -71,6 +77,31 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
         indices = _search(queries, points, k)
     neighbours = gather_points(points, indices.flatten(1)).unflatten(1, indices.shape[1:])
     return (queries[:, :, None] - neighbours).square().sum(3), indices
+
+
+def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
+    """Return the squared chamfer distance: the sum of the mean over both directions.
+
+    CD(P, Q) = 1/|P| Σ_p min_q ‖p − q‖² + 1/|Q| Σ_q min_p ‖q − p‖². Memory does not grow with
+    |P|·|Q|; gradients flow to both clouds through the nearest points.
+
+    Args:
+        points: ``(B, N, 3)`` clouds P.
+        others: ``(B, M, 3)`` clouds Q.
+
+    Returns:
+        ``(B,)`` in squared units of the coordinates.
+
+    Raises:
+        UserError: the shapes do not match, or a cloud is empty.
+
+    Examples:
+        >>> import torch
+        >>> from mops_lightning import chamfer_distance
+        >>> chamfer_distance(torch.zeros(1, 4, 3), torch.ones(1, 2, 3))
+        tensor([6.])
+    """
+    return nearest(points, others)[0].mean(1) + nearest(others, points)[0].mean(1)
 
 
 def _check_shapes(queries: Tensor, points: Tensor) -> None:

@@ -20,8 +20,8 @@ from mops_lightning.metrics.reconstruction import (
     NormalizedEMD,
     NormalizedEMDOfMeans,
 )
-from mops_lightning.ops.chamfer import chamfer_distance
 from mops_lightning.ops.emd import earth_movers_distance
+from mops_lightning.ops.nearest import chamfer_distance
 from mops_lightning.tasks.base import K, Task
 from mops_lightning.types import Batch, TaskOutput
 
@@ -105,7 +105,7 @@ class Reconstruction(Task):
             samples: sampled points ``(B, M, 3)`` by readout.
             titles: one per cloud.
         """
-        from mops_lightning.viz.reconstruction import ReconstructionResult, reconstruction_grid
+        from mops_lightning.viz.task_results import ReconstructionResult, reconstruction_grid
 
         clouds, n = batch.points, batch.points.shape[1]
         full = self.net(clouds, n)

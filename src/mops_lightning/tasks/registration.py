@@ -121,7 +121,7 @@ class Registration(Task):
             samples: sampled points ``(2B, M, 3)`` by readout.
             titles: one per pair.
         """
-        from mops_lightning.viz.pairs import RegistrationResult, pair_grid
+        from mops_lightning.viz.task_results import RegistrationResult, pair_grid
 
         source, target = batch.points.chunk(2)
         columns = {}

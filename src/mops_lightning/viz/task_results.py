@@ -1,7 +1,7 @@
-"""Figures of reconstructed clouds (after the paper's figures of reconstruction)."""
+"""Figures of registered pairs and of reconstructed clouds, after the paper's figures."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,8 +11,67 @@ from torch import Tensor
 from mops_lightning.viz.clouds import draw_cloud, frame_cloud, upright
 from mops_lightning.viz.figures import cloud_axes, new_figure
 
+SOURCE_COLOUR, TARGET_COLOUR = (0.12, 0.47, 0.86), (0.84, 0.3, 0.05)
+SAMPLE_SIZE = 14
+
 MAX_POINTS = 8192
 """Most points drawn of a cloud: more are indistinguishable and take minutes."""
+
+
+class RegistrationResult(NamedTuple):
+    """Pairs aligned from the points of one readout.
+
+    Attributes:
+        source: ``(K, N, 3)`` the sources after the predicted motion.
+        source_points: ``(K, M, 3)`` their sampled points after the predicted motion.
+        target_points: ``(K, M, 3)`` the sampled points of the targets.
+        errors: rotation errors in degrees, one per pair.
+    """
+
+    source: Tensor
+    source_points: Tensor
+    target_points: Tensor
+    errors: Sequence[float]
+
+
+def pair_grid(
+    source: Tensor,
+    target: Tensor,
+    before: Sequence[float],
+    aligned: Mapping[str, RegistrationResult],
+    titles: Sequence[str],
+) -> Figure:
+    """Draw pairs as rows: unaligned, then aligned by every readout with sampled points ringed.
+
+    Args:
+        source: ``(K, N, 3)``, y up, drawn blue.
+        target: ``(K, N, 3)``, drawn orange.
+        before: the angles of the true rotations in degrees, one per pair.
+        aligned: by readout.
+        titles: one per pair.
+    """
+    columns = {"before (centred)": None, **{f"by {name}": aligned[name] for name in aligned}}
+    figure = new_figure(2.8 * len(columns), 2.8 * len(source), "tight")
+    for row in range(len(source)):
+        for column, (head, result) in enumerate(columns.items()):
+            below = f"{titles[row]}, {before[row]:.1f}° apart"
+            if result is not None:
+                below = f"rotation error {result.errors[row]:.1f}°"
+            title = head if row == 0 else ""
+            axes = cloud_axes(figure, len(source), len(columns), row, column, title, below)
+            moved = (source if result is None else result.source)[row]
+            _draw_pair(axes, moved, target[row], s=1.5, alpha=0.35)
+            if result is not None and result.source_points.shape[1] < source.shape[1]:
+                samples = result.source_points[row], result.target_points[row]
+                _draw_pair(axes, *samples, s=SAMPLE_SIZE, edgecolors="black", linewidths=0.4)
+            frame_cloud(axes, np.concatenate([upright(moved), upright(target[row])]))
+    figure.supxlabel("source blue, target orange, sampled points ringed", fontsize=9)
+    return figure
+
+
+def _draw_pair(axes: Axes3D, source: Tensor, target: Tensor, **style: Any) -> None:
+    for points, colour in ((source, SOURCE_COLOUR), (target, TARGET_COLOUR)):
+        axes.scatter(*upright(points).T, color=colour, depthshade=False, **style)
 
 
 class ReconstructionResult(NamedTuple):
@@ -53,8 +112,8 @@ def reconstruction_grid(
     for number, cloud in enumerate(map(_thinned, upright(points))):
         above, under = 2 * number, 2 * number + 1
         _draw_depth(cell(above, 0, "input", titles[number]), cloud, cloud)
-        whole = _thinned(upright(full)[number])
-        _draw_depth(cell(under, 0, "from all points", ""), whole, cloud)
+        from_full = _thinned(upright(full)[number])
+        _draw_depth(cell(under, 0, "from all points", ""), from_full, cloud)
         for column, (name, result) in enumerate(results.items(), start=1):
             samples = upright(result.samples)[number]
             axes = cell(above, column, name, f"{len(samples)} points")
