@@ -102,8 +102,8 @@ def sample_by_chunks(
     assert options.chunk is not None
     net = sampler.fused()
     sampler.check_m(m)
-    whole = open_cloud_file(source)
-    cloud, row_ranges = replace(whole, header=None), whole.row_ranges(options.chunk)
+    file = open_cloud_file(source)
+    cloud, row_ranges = replace(file, header=None), file.row_ranges(options.chunk)
 
     def over(title: str, function: Callable[..., Any], *common: Any) -> Iterable[Any]:
         results = engine.map(title, partial(function, cloud, *common), row_ranges)
@@ -119,11 +119,11 @@ def sample_by_chunks(
     global_ = reduce(torch.maximum, over("global feature", _global, sphere, net))
     sums: Partial = reduce(Partial.merge, over("sampling", _sum, sphere, net, global_, m))
     generated = sums.result()
-    outcome = Outcome(m, number, whole.number - number)
+    outcome = Outcome(m, number, file.number - number)
     if options.readout == "generated":
         return Table(sphere.restore(generated)), outcome
-    found: Nearest = reduce(Nearest.merge, over("matching", _nearest, sphere, generated))
-    kept = replace(found.table, header=whole.header)
+    matched: Nearest = reduce(Nearest.merge, over("matching", _nearest, sphere, generated))
+    kept = replace(matched.table, header=file.header)
     return kept if options.keep_attributes else kept.without_attributes(), outcome
 
 

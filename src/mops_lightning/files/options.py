@@ -69,8 +69,8 @@ class Options:
             raise UserError(f"--tile keeps different input points: no --readout {self.readout}.")
         if self.chunk is not None and self.chunk < 1:
             raise UserError(f"--chunk must be at least 1, got {self.chunk}.")
-        whole = self.method or self.tile is not None or self.readout == "completed"
-        if self.chunk is not None and whole:
+        needs_all = self.method or self.tile is not None or self.readout == "completed"
+        if self.chunk is not None and needs_all:
             raise UserError(
                 "--chunk needs --weights of MOPS-Net and --readout generated or matched, without "
                 "--tile: everything else needs the whole cloud in memory."

@@ -53,20 +53,23 @@ def _inputs(source: Path, target: Path) -> list[Path]:
     """Return the readable files below a folder, without those below ``target``."""
     if target.is_file():
         raise UserError(f"OUT must be a folder because IN is one, got the file {target}.")
-    found = (p for p in source.rglob("*") if p.suffix.lower() in READABLE and p.is_file())
-    files = sorted(path for path in found if not is_temporary(path))
     outputs = Path(realpath(target))
-    files = [path for path in files if outputs not in Path(realpath(path)).parents]
+    files = sorted(
+        path
+        for path in source.rglob("*")
+        if path.suffix.lower() in READABLE and path.is_file() and not is_temporary(path)
+        if outputs not in Path(realpath(path)).parents
+    )
     if not files:
         raise UserError(f"{source} contains no file that ends in {', '.join(READABLE)}.")
     return files
 
 
-def _distinct(found: list[FilePair]) -> list[FilePair]:
+def _distinct(pairs: list[FilePair]) -> list[FilePair]:
     """Reject two input files with the same output file."""
-    targets = Counter(path for _, path in found)
+    targets = Counter(path for _, path in pairs)
     twice = next((path for path, number in targets.items() if number > 1), None)
     if twice:
-        both = " and ".join(str(source) for source, target in found if target == twice)
+        both = " and ".join(str(source) for source, target in pairs if target == twice)
         raise UserError(f"{both} have the same output {twice}. Rename one.")
-    return found
+    return pairs

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.readout import complete, match
+from mops_lightning.ops.readout import select
 from mops_lightning.samplers.base import Sampler
 
 Points = NDArray[np.float64]
@@ -59,7 +59,7 @@ def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler) -> Rows
     same: dict[tuple[int, int], list[int]] = defaultdict(list)
     for place, pair in enumerate(zip(sizes, numbers, strict=True)):
         same[pair].append(place)
-    found: list[Rows] = [np.empty(0, np.int64)] * len(tiles)
+    selected: list[Rows] = [np.empty(0, np.int64)] * len(tiles)
     for (n, number), places in same.items():
         step = max(BATCH // n, 1)
         for first in range(0, len(places) if number else 0, step):
@@ -67,8 +67,8 @@ def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler) -> Rows
             stacked = np.stack([points[tiles[place]] for place in batch])
             rows = sample_tiles(sampler, _normalised(stacked), number).numpy()
             for place, chosen in zip(batch, rows, strict=True):
-                found[place] = tiles[place][chosen]
-    kept = np.concatenate(found)
+                selected[place] = tiles[place][chosen]
+    kept = np.concatenate(selected)
     return np.sort(kept[thin(points[kept], m)])
 
 
@@ -124,7 +124,9 @@ def sample_tiles(sampler: Sampler, tiles: Tensor, m: int) -> Tensor:
     output = sampler(tiles, m)
     if output.indices is not None:
         return output.indices
-    return complete(match(output.points, tiles), tiles)
+    rows = select(tiles, output.points, "completed")[1]
+    assert rows is not None
+    return rows
 
 
 def thin(points: Points, m: int) -> Rows:
@@ -140,17 +142,17 @@ def thin(points: Points, m: int) -> Rows:
     excess = len(points) - m
     if not excess:
         return np.arange(m)
-    found: Any = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)))
-    distance, other = found
+    nearest: Any = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)))
+    distance, other = nearest
     rows, column = (other != np.arange(len(points))[:, None]).nonzero()
     nearest_first = distance[rows, column].argsort(kind="stable")
     pairs = np.stack([rows, other[rows, column]], 1)[nearest_first]
     remains = np.ones(len(points), bool)
-    for one, neighbour in pairs.tolist():
+    for row, neighbour in pairs.tolist():
         if not excess:
             break
-        if remains[one] and remains[neighbour]:
-            remains[max(one, neighbour)] = False
+        if remains[row] and remains[neighbour]:
+            remains[max(row, neighbour)] = False
             excess -= 1
     kept = np.flatnonzero(remains)
     # Too many remain only where many points are equal.

@@ -121,13 +121,13 @@ def attend(queries: Tensor, keys: Tensor, values: Tensor) -> Partial:
     sums = extended.new_empty(len(powers), extended.shape[1])
     with full_precision(keys.device.type):
         for columns in slices(len(powers), blocks_on(keys.device).queries):
-            here = powers[columns]
-            estimate = (here @ probes.mT).amax(1)
-            found = _sums(here, keys, extended, estimate)
-            unsure = ~((found[:, -1] > 0.5) & (found[:, -1] < limit))
+            block = powers[columns]
+            estimate = (block @ probes.mT).amax(1)
+            total = _sums(block, keys, extended, estimate)
+            unsure = ~((total[:, -1] > 0.5) & (total[:, -1] < limit))
             if unsure.any():
-                estimate[unsure], found[unsure] = _sums_from_maxima(here[unsure], keys, extended)
-            level[columns], sums[columns] = estimate, found
+                estimate[unsure], total[unsure] = _sums_from_maxima(block[unsure], keys, extended)
+            level[columns], sums[columns] = estimate, total
     return Partial(level, sums[:, -1], sums[:, :-1])
 
 
@@ -147,15 +147,15 @@ def _sums(powers: Tensor, keys: Tensor, extended: Tensor, level: Tensor) -> Tens
 
 def _sums_from_maxima(powers: Tensor, keys: Tensor, extended: Tensor) -> tuple[Tensor, Tensor]:
     """Return the maximum logits, and the sums with these as levels."""
-    whole: Partial | None = None
+    merged: Partial | None = None
     for rows in slices(len(keys), blocks_on(keys.device).points):
         logits = powers @ keys[rows].mT
         peak = logits.amax(1)
         sums = logits.sub_(peak[:, None]).exp2_() @ extended[rows]
         part = Partial(peak, sums[:, -1], sums)
-        whole = part if whole is None else whole.merge(part)
-    assert whole is not None
-    return whole.level, whole.weighted
+        merged = part if merged is None else merged.merge(part)
+    assert merged is not None
+    return merged.level, merged.weighted
 
 
 def per_cloud(queries: Tensor, clouds: int) -> list[Tensor]:

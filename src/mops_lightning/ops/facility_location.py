@@ -29,7 +29,7 @@ def facility_location(features: Tensor, m: int) -> tuple[Tensor, Tensor]:
     """
     clouds = len(features)
     chosen = torch.zeros(clouds, m, dtype=torch.int64, device=features.device)
-    given = torch.full((clouds,), m, device=features.device)
+    counts = torch.full((clouds,), m, device=features.device)
     covered = torch.zeros_like(features[:, 0])
     bounds = features.sum(2)
     active = torch.arange(clouds, device=features.device)
@@ -37,14 +37,14 @@ def facility_location(features: Tensor, m: int) -> tuple[Tensor, Tensor]:
         best = _best(features, covered, bounds, active)
         gains = bounds[active, best]
         if step:
-            given[active[gains <= 0]] = step
+            counts[active[gains <= 0]] = step
             active, best = active[gains > 0], best[gains > 0]
             if len(active) == 0:
                 break
         chosen[active, step] = best
         covered[active] = torch.maximum(covered[active], features[active, best])
         bounds[active, best] = 0.0  # it has nothing more to add
-    return chosen, given
+    return chosen, counts
 
 
 def _best(features: Tensor, covered: Tensor, bounds: Tensor, active: Tensor) -> Tensor:

@@ -56,32 +56,32 @@ def farthest_point_sample(
     return _farthest(points, distances.scatter_(1, first[:, None], torch.inf), m)
 
 
-def farthest_point_fill(points: Tensor, indices: Tensor, given: Tensor) -> Tensor:
+def farthest_point_fill(points: Tensor, indices: Tensor, counts: Tensor) -> Tensor:
     """Fill up subsets of every cloud by farthest point sampling.
 
     Args:
         points: ``(B, N, C)``.
-        indices: ``(B, M)`` int64, M ≤ N; the first ``given[b]`` entries of row b are the given
+        indices: ``(B, M)`` int64, M ≤ N; the first ``counts[b]`` entries of row b are the given
             points, all distinct. The remaining entries are replaced.
-        given: ``(B,)`` int64, 1 ≤ given ≤ M.
+        counts: ``(B,)`` int64, 1 ≤ counts ≤ M.
 
     Returns:
         ``(B, M)`` int64, all distinct: the given points, followed by points that are each farthest
         from all points before them.
     """
     wanted = indices.shape[1]
-    missing = wanted - int(given.min())
+    missing = wanted - int(counts.min())
     if missing == 0:
         return indices
     slot = torch.arange(wanted, device=indices.device)
-    chosen = torch.where(slot < given[:, None], indices, indices[:, :1])
-    distinct = chosen[:, : int(given.max())]
+    chosen = torch.where(slot < counts[:, None], indices, indices[:, :1])
+    distinct = chosen[:, : int(counts.max())]
     distances, _ = nearest(points.detach(), gather_points(points.detach(), distinct))
     distances = distances.to(distance_dtype(points)).scatter_(1, chosen, -1.0)
     added = _farthest(points, distances, missing)
     # Clouds that lack fewer points write the surplus beyond column M, which is then cut off.
     filled = torch.cat([chosen, added], 1)
-    return filled.scatter_(1, given[:, None] + slot[:missing], added)[:, :wanted]
+    return filled.scatter_(1, counts[:, None] + slot[:missing], added)[:, :wanted]
 
 
 @torch.no_grad()

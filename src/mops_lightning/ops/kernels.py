@@ -211,12 +211,12 @@ def _lower(bits, new):
 @jit
 def _place(bits, wanted):
     """Return the first place of a value that occurs."""
-    start, found = 0, 0
-    while not found:
+    start, matches = 0, 0
+    while not matches:
         part = bits[start : start + 64]
         for i in range(len(part)):
-            found += part[i] == wanted
-        start += 0 if found else 64
+            matches += part[i] == wanted
+        start += 0 if matches else 64
     while bits[start] != wanted:
         start += 1
     return start
@@ -313,10 +313,10 @@ def nearest(planes, queries, scratch, channels, leaf):
         return np.empty(0, np.int64)
     rows, nodes, boxes = _build(planes, channels, leaf)
     known = len(nodes) // 4
-    found = np.empty(len(queries) // channels, np.int64)
+    nearest_rows = np.empty(len(queries) // channels, np.int64)
     distances, point = scratch.view(planes.dtype), np.empty(channels, planes.dtype)
     bounds, stack = np.empty(known + FANOUT, planes.dtype), np.empty(known + FANOUT, np.int64)
-    for query in range(len(found)):
+    for query in range(len(nearest_rows)):
         for axis in range(channels):
             point[axis] = queries[query * channels + axis]
         best, row = planes.dtype.type(np.inf), np.int64(size)
@@ -346,5 +346,5 @@ def nearest(planes, queries, scratch, channels, leaf):
                 i = _place(scratch[: stop - start], low)
                 if distances[i] < best or (distances[i] == best and rows[start + i] < row):
                     best, row = distances[i], rows[start + i]
-        found[query] = row
-    return found
+        nearest_rows[query] = row
+    return nearest_rows

@@ -161,9 +161,9 @@ class Sampler(nn.Module):
             return {m: self(points, m) for m in sizes}
         for m in sizes:
             self.check_m(m)
-        whole = self._checked(points, max(sizes))
-        losses = self.losses(points, whole, sizes) if self.training else {}
-        return {m: whole.first(m)._replace(losses=losses.get(m, {})) for m in sizes}
+        largest = self._checked(points, max(sizes))
+        losses = self.losses(points, largest, sizes) if self.training else {}
+        return {m: largest.first(m)._replace(losses=losses.get(m, {})) for m in sizes}
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Sample checked input; arguments and result are those of ``forward``."""
@@ -213,8 +213,8 @@ class Sampler(nn.Module):
         Raises:
             UserError: it does not.
         """
-        given: object = m  # mypy would take the check for needless
-        if not isinstance(given, Integral):
+        size: object = m  # mypy would take the check for needless
+        if not isinstance(size, Integral):
             raise UserError(f"m must be a whole number, got {m!r}.")
         if self.flexible and not 1 <= m <= self.m:
             raise UserError(f"m must be between 1 and {self.m}, got {m}.")

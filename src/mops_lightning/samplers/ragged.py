@@ -1,4 +1,4 @@
-"""Clouds as people have them: arrays or tensors, one or many, of one or several sizes."""
+"""Input clouds: arrays or tensors, one or many, of one or several sizes."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ their rows ``(B, m)``, None for generated points."""
 
 
 class Rows(NamedTuple):
-    """What is selected of one cloud.
+    """The selection from one cloud.
 
     Attributes:
         points: ``(m, 3)`` in the cloud's own unit.
@@ -49,26 +49,27 @@ def select_points(
     Raises:
         UserError: an argument has a wrong type, shape or value.
     """
-    as_array = isinstance(points, np.ndarray)
-    tensor = _floating(_tensor("points", points))
+    tensor = _tensor("points", points)
+    if not tensor.is_floating_point():
+        raise UserError(f"points must be floating point, got {tensor.dtype}. Try points.float().")
     if lengths is not None and batch is not None:
         raise UserError("lengths and batch exclude each other. Give lengths for (B, N, 3) points.")
     if batch is not None:
         _check_shape(tensor, 2, "(P, 3) with batch")
-        found = _flat(select, tensor, m, _tensor("batch", batch))
+        result = _flat(select, tensor, m, _tensor("batch", batch))
     elif lengths is not None:
         _check_shape(tensor, 3, "(B, N, 3) with lengths")
-        found = _padded(select, tensor, m, _tensor("lengths", lengths))
+        result = _padded(select, tensor, m, _tensor("lengths", lengths))
     elif tensor.ndim == 2:
         _check_shape(tensor, 2, "(N, 3) or (B, N, 3)")
-        one = _selected(select, tensor[None], m)
-        found = one[0][0], None if one[1] is None else one[1][0]
+        chosen, rows = _selected(select, tensor[None], m)
+        result = chosen[0], None if rows is None else rows[0]
     else:
         _check_shape(tensor, 3, "(N, 3) or (B, N, 3)")
-        found = _selected(select, tensor, m)
-    if not as_array:
-        return found
-    return found[0].numpy(), None if found[1] is None else found[1].numpy()
+        result = _selected(select, tensor, m)
+    if not isinstance(points, np.ndarray):
+        return result
+    return result[0].numpy(), None if result[1] is None else result[1].numpy()
 
 
 def _tensor(name: str, value: Any) -> Tensor:
@@ -89,12 +90,6 @@ def _tensor(name: str, value: Any) -> Tensor:
     return value
 
 
-def _floating(points: Tensor) -> Tensor:
-    if not points.is_floating_point():
-        raise UserError(f"points must be floating point, got {points.dtype}. Try points.float().")
-    return points
-
-
 def _check_shape(points: Tensor, ndim: int, wanted: str) -> None:
     if points.ndim != ndim or points.shape[-1] != 3:
         raise UserError(f"points must have shape {wanted}, got {tuple(points.shape)}.")
@@ -105,37 +100,37 @@ def _padded(
 ) -> tuple[Tensor, Tensor | None]:
     """Select from padded clouds; the result is padded with zeros, its rows with −1."""
     number = points.shape[1]
-    lengths = _whole("lengths", lengths, len(points), f"B={len(points)}")
+    lengths = _integers("lengths", lengths, len(points), f"B={len(points)}")
     if len(lengths) and (int(lengths.min()) < 1 or int(lengths.max()) > number):
         raise UserError(f"lengths must be from 1 to N={number}, got {lengths.tolist()}.")
     clouds = [cloud[:length] for cloud, length in zip(points, lengths.tolist(), strict=True)]
-    found = _each(select, clouds, m)
+    samples = _each(select, clouds, m)
     chosen = points.new_zeros(len(clouds), m, points.shape[2])
     rows = torch.full((len(clouds), m), -1, dtype=torch.int64, device=points.device)
-    for cloud, one in enumerate(found):
-        chosen[cloud, : len(one.points)] = one.points
-        if one.rows is not None:
-            rows[cloud, : len(one.rows)] = one.rows
-    return chosen, None if any(one.rows is None for one in found) else rows
+    for cloud, sample in enumerate(samples):
+        chosen[cloud, : len(sample.points)] = sample.points
+        if sample.rows is not None:
+            rows[cloud, : len(sample.rows)] = sample.rows
+    return chosen, None if any(sample.rows is None for sample in samples) else rows
 
 
 def _flat(select: Select, points: Tensor, m: int, batch: Tensor) -> tuple[Tensor, Tensor | None]:
     """Select from clouds one after the other; rows count through all clouds."""
-    batch = _whole("batch", batch, len(points), f"P={len(points)}")
+    batch = _integers("batch", batch, len(points), f"P={len(points)}")
     if len(batch) and (int(batch.min()) < 0 or bool((batch[1:] < batch[:-1]).any())):
         raise UserError("batch must be ascending and at least 0. Sort the points by cloud.")
     counts = batch.bincount().tolist()
     if 0 in counts:
         raise UserError(f"batch: cloud {counts.index(0)} has no points. Number clouds from 0.")
-    found = _each(select, list(points.split(counts)), m)
+    samples = _each(select, list(points.split(counts)), m)
     starts = np.cumsum([0, *counts[:-1]]).tolist()
-    chosen = torch.cat([one.points for one in found])
-    parts = zip(found, starts, strict=True)
-    rows = [one.rows + start for one, start in parts if one.rows is not None]
-    return chosen, torch.cat(rows) if len(rows) == len(found) else None
+    chosen = torch.cat([sample.points for sample in samples])
+    parts = zip(samples, starts, strict=True)
+    rows = [sample.rows + start for sample, start in parts if sample.rows is not None]
+    return chosen, torch.cat(rows) if len(rows) == len(samples) else None
 
 
-def _whole(name: str, values: Tensor, size: int, wanted: str) -> Tensor:
+def _integers(name: str, values: Tensor, size: int, wanted: str) -> Tensor:
     """Return whole numbers as int64; torch computes with few of the unsigned types."""
     if values.ndim != 1 or len(values) != size or values.is_floating_point():
         raise UserError(
@@ -149,17 +144,17 @@ def _each(select: Select, clouds: list[Tensor], m: int) -> list[Rows]:
     """Select from every cloud; clouds of one size are processed together."""
     if not clouds:
         raise UserError("points must have at least one cloud.")
-    found: dict[int, Rows] = {}
+    samples: dict[int, Rows] = {}
     for size in sorted({len(cloud) for cloud in clouds}):
         members = [i for i, cloud in enumerate(clouds) if len(cloud) == size]
         if size < m:
             everything = torch.arange(size, device=clouds[0].device)
-            found |= {i: Rows(clouds[i], everything) for i in members}
+            samples |= {i: Rows(clouds[i], everything) for i in members}
             continue
         points, rows = _selected(select, torch.stack([clouds[i] for i in members]), m)
         for place, i in enumerate(members):
-            found[i] = Rows(points[place], None if rows is None else rows[place])
-    return [found[i] for i in range(len(clouds))]
+            samples[i] = Rows(points[place], None if rows is None else rows[place])
+    return [samples[i] for i in range(len(clouds))]
 
 
 def _selected(select: Select, points: Tensor, m: int) -> tuple[Tensor, Tensor | None]:

@@ -78,20 +78,20 @@ class TaskNetSampler(Sampler):
         """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice."""
         order = seeded_order(points, self.seed)
         ordered = gather_points(points.detach(), order)
-        chosen, given = self._chosen(ordered, m)
-        indices = order.gather(1, farthest_point_fill(ordered, chosen, given))
+        filled = farthest_point_fill(ordered, *self._chosen(ordered, m))
+        indices = order.gather(1, filled)
         return SampleOutput(gather_points(points, indices), indices, {})
 
     @torch.no_grad()
     def _chosen(self, points: Tensor, m: int) -> tuple[Tensor, Tensor]:
         net = self._net[0]
         like = next(net.parameters(), points)
-        found = []
+        parts = []
         with evaluating(net):
             for part in points.split(max(1, BATCH_POINTS // points.shape[1])):
-                found.append(self.choose(self.net.point_features(part.to(like)), m))
-        chosen, given = (torch.cat(parts).to(points.device) for parts in zip(*found, strict=True))
-        return chosen, given
+                parts.append(self.choose(self.net.point_features(part.to(like)), m))
+        rows, counts = zip(*parts, strict=True)
+        return torch.cat(rows).to(points.device), torch.cat(counts).to(points.device)
 
 
 @contextmanager

@@ -32,17 +32,17 @@ ADDRESS = re.compile(
 
 def folders() -> list[Path]:
     """Return the folders with models: those in ``MOPS_MODELS`` first, then the package's own."""
-    given = os.environ.get(VARIABLE, "").split(os.pathsep)
-    return [*(Path(one).expanduser() for one in given if one), SHIPPED]
+    own = os.environ.get(VARIABLE, "").split(os.pathsep)
+    return [*(Path(folder).expanduser() for folder in own if folder), SHIPPED]
 
 
 def available() -> dict[str, Path]:
     """Return the files of all models by name, sorted."""
-    found: dict[str, Path] = {}
+    models: dict[str, Path] = {}
     for folder in reversed(folders()):
         files = folder.glob(f"*{model_file.SUFFIX}")
-        found |= {path.stem: path for path in files if is_name(path.stem) and path.is_file()}
-    return dict(sorted(found.items()))
+        models |= {path.stem: path for path in files if is_name(path.stem) and path.is_file()}
+    return dict(sorted(models.items()))
 
 
 def is_name(text: str) -> bool:
@@ -74,11 +74,11 @@ def find_model(reference: str) -> Path | None:
     return path
 
 
-def resolve(given: str | Path) -> Path:
+def resolve(reference: str | Path) -> Path:
     """Return the path that a user means: an existing file or folder, a model or an address.
 
     Args:
-        given: a path, the name of a model, or ``hf://OWNER/REPO/FILE@sha256:HASH``.
+        reference: a path, the name of a model, or ``hf://OWNER/REPO/FILE@sha256:HASH``.
 
     Returns:
         A path. It may not exist if it contains a folder or ends like a file.
@@ -86,15 +86,15 @@ def resolve(given: str | Path) -> Path:
     Raises:
         UserError: there is no file and no model of this name; the nearest names are listed.
     """
-    text = str(given)
+    text = str(reference)
     if text.startswith(HUB):
         return fetch(text)
     path = Path(text).expanduser()
     if path.exists():
         return path
-    found = find_model(text)
-    if found is not None:
-        return found
+    model = find_model(text)
+    if model is not None:
+        return model
     if path.name != text or text.endswith(FILES):
         return path
     raise UserError(f"no file or model {text!r}.{did_you_mean(text, available())}")
@@ -128,7 +128,7 @@ def fetch(address: str) -> Path:
     except Exception as error:  # errors of several HTTP libraries
         raise UserError(f"{address} cannot be downloaded: {one_line(error)}") from None
     with path.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if found != match["sha256"]:
-        raise UserError(f"{address}: the downloaded file has another sha256, {found}.")
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if digest != match["sha256"]:
+        raise UserError(f"{address}: the downloaded file has another sha256, {digest}.")
     return path

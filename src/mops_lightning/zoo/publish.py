@@ -82,10 +82,10 @@ def figures(record: RunRecord) -> dict[str, Any]:
     """Return a record's score by readout, at the run's own size, for a card."""
     scores = {key: value for key, value in record.metrics.items() if value is not None}
     named = record.score_name
-    found = {key: part for key in scores if (part := parse(key))}
-    if named not in found:
+    parts = {key: part for key in scores if (part := parse(key))}
+    if named not in parts:
         raise UserError("the record of the run has no test score. Give a run that was tested.")
-    main = found[named]
+    main = parts[named]
     info = metric_info(main.metric, [record])
     shown = {MetricName(main.m, readout, main.metric) for readout in _readouts(main)}
     return {
@@ -93,7 +93,7 @@ def figures(record: RunRecord) -> dict[str, Any]:
         "m": None if main.readout == ROWS[-1] else main.m or record.config["m"],
         "points": record.config["dataset"].get("n_points"),
         "values": {
-            part.readout: info.format(scores[key]) for key, part in found.items() if part in shown
+            part.readout: info.format(scores[key]) for key, part in parts.items() if part in shown
         },
     }
 
@@ -102,26 +102,26 @@ def _readouts(main: MetricName) -> tuple[str, ...]:
     return ROWS[-1:] if main.readout == ROWS[-1] else ROWS[:-1]
 
 
-def _task_net(given: str | None, record: RunRecord) -> str | None:
+def _task_net(name: str | None, record: RunRecord) -> str | None:
     """Return a reference to the model of a sampler's task net, or None if it is no model."""
-    if given is not None:
-        path = names.find_model(given)
+    if name is not None:
+        path = names.find_model(name)
         if path is None:
             raise UserError(
-                f"--task-net: no model {given!r}. `mops-lightning models` lists all of them."
+                f"--task-net: no model {name!r}. `mops-lightning models` lists all of them."
             )
         card = model_file.read_card(path)
         if card["record"]["config"]["learn"] != "task":
-            raise UserError(f"--task-net: {given} is a sampler. Give the model of a task net.")
-        return names.pinned(given, card["sha256"])
+            raise UserError(f"--task-net: {name} is a sampler. Give the model of a task net.")
+        return names.pinned(name, card["sha256"])
     used = {record.weights_loaded, record.task_weights_sha256}
-    for name, path in names.available().items():
+    for model, path in names.available().items():
         try:
             sha256 = model_file.read_card(path)["sha256"]
         except UserError:  # a damaged or foreign file is not the one that was used
             continue
         if sha256 in used:
-            return names.pinned(name, sha256)
+            return names.pinned(model, sha256)
     return None
 
 

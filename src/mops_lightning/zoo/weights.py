@@ -123,17 +123,17 @@ def of_run(run: Path, kind: str = "weights") -> Path:
     return path if path.exists() else names.find_model(named) or path
 
 
-def of_task_net(given: str | Path) -> Path:
+def of_task_net(reference: str | Path) -> Path:
     """Return the file of a task net: that of a run's folder; any other path is the file.
 
     Args:
-        given: what ``names.resolve`` takes, or the folder of a run that trained a task net, alone
-            or with a sampler.
+        reference: what ``names.resolve`` takes, or the folder of a run that trained a task net,
+            alone or with a sampler.
 
     Raises:
         UserError: there is no file and no model of this name, or the folder's record is damaged.
     """
-    path = names.resolve(given)
+    path = names.resolve(reference)
     if not path.is_dir():
         return path
     joint = of_run(path, "task_weights")
