@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.data.formats.guard import reading
 from mops_lightning.data.formats.mesh import parse_mesh
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write, load_npz
@@ -42,10 +42,8 @@ def sample_surface(
         BadCloudError: the file cannot be read, or has no surface.
         UserError: the cache cannot be written.
     """
-    try:
+    with reading(path):
         data = path.read_bytes()
-    except OSError as error:
-        raise BadCloudError(f"{path} cannot be read: {error}.") from error
     digest = hashlib.sha256(data).hexdigest()
     key = repr((VERSION, digest, path.suffix.lower(), n_points, seed))
     kept = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.npz" if cache else None

@@ -120,8 +120,14 @@ BROKEN = {
     "nan.obj": (TRIANGLE.format("nan", 3).encode(), "not all finite"),
     "huge.obj": (TRIANGLE.format("1e308", 3).replace("1 0", "1e308 0").encode(), "not all finite"),
     "outside.obj": (TRIANGLE.format(1, 9).encode(), "is broken"),
-    "outside.off": (SQUARE.replace("0 2 3", "0 2 4").encode(), "a face refers to a vertex"),
-    "negative.off": (SQUARE.replace("3 0 2 3", "3 0 2 -1").encode(), "a face refers to a vertex"),
+    "outside.off": (
+        SQUARE.replace("0 2 3", "0 2 4").encode(),
+        "face index outside the range of its vertices",
+    ),
+    "negative.off": (
+        SQUARE.replace("3 0 2 3", "3 0 2 -1").encode(),
+        "face index outside the range of its vertices",
+    ),
     "mesh.dae": (b"<COLLADA/>", "must end in"),
 }
 

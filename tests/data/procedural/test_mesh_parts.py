@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from mops_lightning.data.procedural.mesh_parts import (
-    bow,
     box,
     cushion,
     join,
@@ -59,12 +58,6 @@ def test_smooth_interpolates_without_overshoot() -> None:
     assert np.allclose(curve[[0, -1]], [(1, 0), (0.5, 2)])
     assert curve[:, 0].min() >= 0.5
     assert curve[:, 0].max() <= 3
-
-
-def test_bow_has_ends_and_reach() -> None:
-    path = bow((1, 2), (1, 0), 0.5, steps=15)
-    assert np.allclose(path[[0, -1]], [(1, 2, 0), (1, 0, 0)])
-    assert path[:, 0].max() == pytest.approx(1.5)
 
 
 def test_join_keeps_all_faces() -> None:

@@ -54,15 +54,13 @@ def table(rng: Generator) -> Trimesh:
         )
         parts += legs
         if rng.random() < 0.4:
-            parts += _apron(width * inset, depth * inset, (under - rng.uniform(0.07, 0.14), under))
+            apron = (under - rng.uniform(0.07, 0.14), under)
+            wide, deep = width * inset, depth * inset
+            parts += [box(around(wide - 0.1), apron, around(0.03, z)) for z in around(deep - 0.06)]
+            parts += [box(around(0.03, x), apron, around(deep - 0.1)) for x in around(wide - 0.06)]
         if rng.random() < 0.25:
             parts += rungs(ends, rng.uniform(0.12, 0.25), 0.03, (0, 1, 2, 3))
     return join(parts)
-
-
-def _apron(width: float, depth: float, y: Span) -> list[Trimesh]:
-    parts = [box(around(width - 0.1), y, around(0.03, z)) for z in around(depth - 0.06)]
-    return parts + [box(around(0.03, x), y, around(depth - 0.1)) for x in around(width - 0.06)]
 
 
 def desk(rng: Generator) -> Trimesh:

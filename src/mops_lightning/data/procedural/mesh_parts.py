@@ -138,22 +138,6 @@ def smooth(points: ArrayLike, steps: int = 24) -> Array:
     return PchipInterpolator(np.arange(len(knots)), knots)(np.linspace(0, len(knots) - 1, steps))
 
 
-def bow(start: Sequence[float], end: Sequence[float], reach: float, steps: int = 14) -> Array:
-    """Return half an oval in the xy plane, as of a handle: ``(steps, 3)``.
-
-    Args:
-        start: x and y of the start; the curve leaves it along x.
-        end: x and y of the end.
-        reach: largest distance along x; negative to the left.
-        steps: number of points.
-    """
-    turn = np.linspace(0, np.pi, steps)
-    share = ((1 - np.cos(turn)) / 2)[:, None]
-    path = np.asarray(start) * (1 - share) + np.asarray(end) * share
-    path[:, 0] += reach * np.sin(turn) ** 0.8
-    return np.column_stack((path, np.zeros(steps)))
-
-
 def join(*parts: Trimesh | Sequence[Trimesh]) -> Trimesh:
     """Return one mesh of all parts, which may be given in lists."""
     flat: list[Trimesh] = []

@@ -97,7 +97,11 @@ def stool(rng: Generator) -> Trimesh:
         base = width * rng.uniform(0.4, 0.55)
         parts += [disc(base, (0, 0.05)), rod((0, 0, 0), (0, height - thick, 0), 0.05)]
         if height > 0.9:
-            parts.append(_ring(width * 0.33, height * rng.uniform(0.3, 0.45)))
+            ring, y_ring = width * 0.33, height * rng.uniform(0.3, 0.45)
+            turn = np.linspace(0, 2 * np.pi, 25)
+            path = np.column_stack((np.cos(turn) * ring, np.full(25, y_ring), np.sin(turn) * ring))
+            parts.append(tube(path, 0.025, 8, across=(0, 1, 0)))
+            parts.append(rod((-ring, y_ring, 0), (ring, y_ring, 0), 0.02, 8))
         return join(parts)
     splay, radius = rng.uniform(0.03, 0.2), rng.uniform(0.03, 0.055)
     inset = 0.75 if is_round else 1.0
@@ -113,15 +117,6 @@ def stool(rng: Generator) -> Trimesh:
     if rng.random() < 0.7:
         parts += rungs(ends, rng.uniform(0.2, 0.45), 0.025, tuple(range(len(ends))))
     return join(parts)
-
-
-def _ring(radius: float, y: float) -> Trimesh:
-    turn = np.linspace(0, 2 * np.pi, 25)
-    path = np.column_stack((np.cos(turn) * radius, np.full(25, y), np.sin(turn) * radius))
-    return join(
-        tube(path, 0.025, 8, across=(0, 1, 0)),
-        rod((-radius, y, 0), (radius, y, 0), 0.02, 8),
-    )
 
 
 def sofa(rng: Generator) -> Trimesh:

@@ -9,7 +9,6 @@ from trimesh import Trimesh
 
 from mops_lightning.data.procedural.mesh_parts import (
     Array,
-    bow,
     disc,
     join,
     rod,
@@ -189,6 +188,10 @@ def _handle(wall: Array, top: float, low: float, reach: float, thick: float) -> 
     side = np.sign(reach)
     # The ends are slightly inside the wall, so that there is no gap.
     start, end = (
-        (side * 0.96 * float(np.interp(y, wall[:, 1], wall[:, 0])), y) for y in (top, low)
+        np.array((side * 0.96 * np.interp(y, wall[:, 1], wall[:, 0]), y, 0)) for y in (top, low)
     )
-    return tube(bow(start, end, reach), thick, 10, across=(0, 0, 1))
+    turn = np.linspace(0, np.pi, 14)
+    share = ((1 - np.cos(turn)) / 2)[:, None]
+    path = start * (1 - share) + end * share  # half an oval
+    path[:, 0] += reach * np.sin(turn) ** 0.8
+    return tube(path, thick, 10, across=(0, 0, 1))
