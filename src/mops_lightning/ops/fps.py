@@ -86,17 +86,7 @@ def farthest_point_fill(points: Tensor, indices: Tensor, counts: Tensor) -> Tens
 
 @torch.no_grad()
 def _farthest(points: Tensor, distances: Tensor, steps: int) -> Tensor:
-    """Repeatedly choose the point with the largest distance and update the distances.
-
-    Args:
-        points: ``(B, N, C)``.
-        distances: ``(B, N)`` initial squared distances; -1 marks chosen points, so that none is
-            chosen twice.
-        steps: number of points to choose.
-
-    Returns:
-        ``(B, steps)`` int64, the lowest row in case of ties.
-    """
+    """Choose farthest points; arguments and result are those of ``compiled.farthest``."""
     rows = compiled.farthest(points, steps, distances)
     return farthest_in_steps(points, distances, steps) if rows is None else rows
 

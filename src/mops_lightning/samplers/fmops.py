@@ -1,7 +1,4 @@
-"""FMOPS-Net: one network for any number of points.
-
-Paper section "Flexible MOPS-Net for Arbitrary Ratios".
-"""
+"""FMOPS-Net: one network for any number of points."""
 
 from typing import Any, Literal
 

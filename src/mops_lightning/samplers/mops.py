@@ -180,13 +180,12 @@ class MOPSNet(Sampler):
         """Generate points; see ``Sampler.forward``."""
         matrix = self.sampling_matrix(points, m)
         # With anchors, S is at least float32, also where points and weights are half.
-        sampled = self._sampled(matrix, points.to(matrix.keys.dtype)).to(points.dtype)
-        return SampleOutput(sampled, None, {}, matrix)
-
-    def _sampled(self, matrix: SamplingMatrix, points: Tensor) -> Tensor:
+        values = points.to(matrix.keys.dtype)
         if self.threshold and not self.training:
-            return torch.bmm(matrix.sparse(self.threshold).mT, points)
-        return matrix.sample(points)
+            sampled = torch.bmm(matrix.sparse(self.threshold).mT, values)
+        else:
+            sampled = matrix.sample(values)
+        return SampleOutput(sampled.to(points.dtype), None, {}, matrix)
 
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]

@@ -1,7 +1,7 @@
 """Input clouds: arrays or tensors, one or many, of one or several sizes."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,16 +15,9 @@ Select = Callable[[Tensor, int], tuple[Tensor, Tensor | None]]
 their rows ``(B, m)``, None for generated points."""
 
 
-class Rows(NamedTuple):
-    """The selection from one cloud.
-
-    Attributes:
-        points: ``(m, 3)`` in the cloud's own unit.
-        rows: ``(m,)`` rows of the cloud, or None for generated points.
-    """
-
-    points: Tensor
-    rows: Tensor | None
+Sample = tuple[Tensor, Tensor | None]
+"""Selected points in the clouds' own unit, and their rows, None for generated points: ``(m, 3)``
+and ``(m,)`` of one cloud, ``(B, m, 3)`` and ``(B, m)`` of a batch."""
 
 
 def select_points(
@@ -37,14 +30,12 @@ def select_points(
     """Move clouds into the unit sphere, select points, and map them back.
 
     Args:
-        select: see ``Select``.
-        points: ``(N, 3)``, ``(B, N, 3)``, or ``(P, 3)`` with ``batch``; a tensor or an array.
-        m: number of points to return of each cloud.
-        lengths: ``(B,)`` numbers of points of the clouds in ``(B, N, 3)``, the rest being padding.
-        batch: ``(P,)`` the cloud of every point, ascending from 0.
-
-    Returns:
-        See ``Sampler.downsample``.
+        select: see ``Select``. The other arguments and the result are those of
+            ``Sampler.downsample``.
+        points: see there.
+        m: see there.
+        lengths: see there.
+        batch: see there.
 
     Raises:
         UserError: an argument has a wrong type, shape or value.
@@ -95,9 +86,7 @@ def _check_shape(points: Tensor, ndim: int, wanted: str) -> None:
         raise UserError(f"points must have shape {wanted}, got {tuple(points.shape)}.")
 
 
-def _padded(
-    select: Select, points: Tensor, m: int, lengths: Tensor
-) -> tuple[Tensor, Tensor | None]:
+def _padded(select: Select, points: Tensor, m: int, lengths: Tensor) -> Sample:
     """Select from padded clouds; the result is padded with zeros, its rows with −1."""
     number = points.shape[1]
     lengths = _integers("lengths", lengths, len(points), f"B={len(points)}")
@@ -107,14 +96,17 @@ def _padded(
     samples = _each(select, clouds, m)
     chosen = points.new_zeros(len(clouds), m, points.shape[2])
     rows = torch.full((len(clouds), m), -1, dtype=torch.int64, device=points.device)
-    for cloud, sample in enumerate(samples):
-        chosen[cloud, : len(sample.points)] = sample.points
-        if sample.rows is not None:
-            rows[cloud, : len(sample.rows)] = sample.rows
-    return chosen, None if any(sample.rows is None for sample in samples) else rows
+    generated = False
+    for cloud, (sampled, sampled_rows) in enumerate(samples):
+        chosen[cloud, : len(sampled)] = sampled
+        if sampled_rows is None:
+            generated = True
+        else:
+            rows[cloud, : len(sampled_rows)] = sampled_rows
+    return chosen, None if generated else rows
 
 
-def _flat(select: Select, points: Tensor, m: int, batch: Tensor) -> tuple[Tensor, Tensor | None]:
+def _flat(select: Select, points: Tensor, m: int, batch: Tensor) -> Sample:
     """Select from clouds one after the other; rows count through all clouds."""
     batch = _integers("batch", batch, len(points), f"P={len(points)}")
     if len(batch) and (int(batch.min()) < 0 or bool((batch[1:] < batch[:-1]).any())):
@@ -124,9 +116,9 @@ def _flat(select: Select, points: Tensor, m: int, batch: Tensor) -> tuple[Tensor
         raise UserError(f"batch: cloud {counts.index(0)} has no points. Number clouds from 0.")
     samples = _each(select, list(points.split(counts)), m)
     starts = np.cumsum([0, *counts[:-1]]).tolist()
-    chosen = torch.cat([sample.points for sample in samples])
+    chosen = torch.cat([sampled for sampled, _ in samples])
     parts = zip(samples, starts, strict=True)
-    rows = [sample.rows + start for sample, start in parts if sample.rows is not None]
+    rows = [rows + start for (_, rows), start in parts if rows is not None]
     return chosen, torch.cat(rows) if len(rows) == len(samples) else None
 
 
@@ -140,24 +132,24 @@ def _integers(name: str, values: Tensor, size: int, wanted: str) -> Tensor:
     return values.long()
 
 
-def _each(select: Select, clouds: list[Tensor], m: int) -> list[Rows]:
+def _each(select: Select, clouds: list[Tensor], m: int) -> list[Sample]:
     """Select from every cloud; clouds of one size are processed together."""
     if not clouds:
         raise UserError("points must have at least one cloud.")
-    samples: dict[int, Rows] = {}
+    samples: dict[int, Sample] = {}
     for size in sorted({len(cloud) for cloud in clouds}):
         members = [i for i, cloud in enumerate(clouds) if len(cloud) == size]
         if size < m:
             everything = torch.arange(size, device=clouds[0].device)
-            samples |= {i: Rows(clouds[i], everything) for i in members}
+            samples |= {i: (clouds[i], everything) for i in members}
             continue
         points, rows = _selected(select, torch.stack([clouds[i] for i in members]), m)
         for place, i in enumerate(members):
-            samples[i] = Rows(points[place], None if rows is None else rows[place])
+            samples[i] = points[place], None if rows is None else rows[place]
     return [samples[i] for i in range(len(clouds))]
 
 
-def _selected(select: Select, points: Tensor, m: int) -> tuple[Tensor, Tensor | None]:
+def _selected(select: Select, points: Tensor, m: int) -> Sample:
     """Select from clouds of one size, in their own unit."""
     if not bool(torch.isfinite(points).all()):
         raise UserError("points must be finite, got NaN or infinity.")

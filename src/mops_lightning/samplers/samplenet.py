@@ -1,8 +1,4 @@
-"""SampleNet and its progressive variant: S-Net with a soft projection onto the cloud.
-
-Lang, Manor and Avidan, "SampleNet: Differentiable Point Cloud Sampling", CVPR 2020; a baseline in
-the paper's tables.
-"""
+"""SampleNet, a baseline in the paper's tables: S-Net with a soft projection onto the cloud."""
 
 import math
 from collections.abc import Sequence

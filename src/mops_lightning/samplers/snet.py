@@ -1,7 +1,4 @@
-"""S-Net and its progressive variant: points generated from the global feature.
-
-Dovrat, Lang and Avidan, "Learning to Sample", CVPR 2019; a baseline in the paper's tables.
-"""
+"""S-Net, a baseline in the paper's tables: points generated from the global feature."""
 
 import math
 from collections.abc import Sequence
@@ -92,18 +89,8 @@ class Progressive(Sampler):
     """Mixin for progressive training, in which every power of two is a training size.
 
     This is ProgressiveNet of the S-Net paper: the first m points are the sample of size m, for any
-    m up to the largest. The mixin precedes the net in the bases of a class.
-
-    Args:
-        m_max: largest number of points; 1,024 in the publication.
-        min_size: smallest training size, or m_max if that is smaller; in the publication 2 for
-            classification and 16 for reconstruction.
-        size_reduction: whether the losses at all sizes are summed (classification) or averaged
-            (reconstruction).
-        **settings: arguments of the net.
-
-    Raises:
-        UserError: an argument is out of range.
+    m up to the largest. The mixin precedes the net in the bases of a class. Arguments and errors
+    are those of ``ProgressiveSNet``, with ``settings`` of the net.
     """
 
     flexible = True
@@ -143,8 +130,9 @@ class ProgressiveSNet(Progressive, SNet):
     Args:
         m_max: largest number of points; 1,024 in the publication.
         min_size: smallest training size, or m_max if that is smaller; training sizes are m_max and
-            the powers of two from here on.
-        size_reduction: ``sum`` or ``mean`` of the losses at all sizes.
+            the doubles of min_size. In the publication 2 for classification, 16 for reconstruction.
+        size_reduction: ``sum`` (classification) or ``mean`` (reconstruction) of the losses at all
+            sizes.
         **settings: arguments of ``SNet``.
 
     Raises:

@@ -1,7 +1,5 @@
 """Voxel sampling with exactly m points, a baseline in the paper's tables."""
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -16,18 +14,6 @@ COARSEST, FINEST = -1.0, 20.0
 """Range of log₂(side of the cloud / side of a voxel): one voxel, and the precision of float32."""
 BISECTIONS = 24
 """Bisection steps; the relative error of the voxel size is about one in a million."""
-
-
-class Voxels(NamedTuple):
-    """The occupied voxels of every cloud in ascending (x, y, z) order, followed by empty slots.
-
-    Attributes:
-        population: ``(B, N)`` int64 number of points in the voxel; 0 for an empty slot.
-        nearest: ``(B, N)`` int64 row of the input point nearest to the mean of these points.
-    """
-
-    population: Tensor
-    nearest: Tensor
 
 
 class VoxelSampler(Sampler):
@@ -58,23 +44,28 @@ class VoxelSampler(Sampler):
         """Return one point for each of m voxels of ``(B, N, 3)`` points."""
         order = seeded_order(points, seed=0)  # ties do not depend on the input order
         ordered = gather_points(points, order)
-        voxels = group_voxels(ordered, m)
-        fullest = voxels.population.argsort(dim=1, descending=True, stable=True)[:, :m]
-        occupied = voxels.population.gather(1, fullest) > 0
-        chosen = voxels.nearest.gather(1, fullest)
+        population, nearest = group_voxels(ordered, m)
+        fullest = population.argsort(dim=1, descending=True, stable=True)[:, :m]
+        occupied = population.gather(1, fullest) > 0
+        chosen = nearest.gather(1, fullest)
         chosen = farthest_point_fill(ordered, chosen, occupied.sum(1))
         indices = order.gather(1, chosen)
         return SampleOutput(gather_points(points, indices), indices, {})
 
 
 @torch.no_grad()
-def group_voxels(points: Tensor, m: int) -> Voxels:
+def group_voxels(points: Tensor, m: int) -> tuple[Tensor, Tensor]:
     """Group points into voxels of the largest size with at least m occupied voxels.
 
     Args:
         points: ``(B, N, 3)``; the first of several points nearest to a mean is chosen.
         m: smallest number of occupied voxels, 1 ≤ m ≤ N; there are fewer only if the smallest size
             gives fewer.
+
+    Returns:
+        The occupied voxels of every cloud in ascending (x, y, z) order, followed by empty slots:
+        ``(B, N)`` int64 number of points in the voxel, 0 for an empty slot, and ``(B, N)`` int64
+        row of the input point nearest to the mean of these points.
     """
     key, perm = _voxel_keys(points, m).sort(dim=1, stable=True)
     begins = torch.ones_like(key)
@@ -91,7 +82,7 @@ def group_voxels(points: Tensor, m: int) -> Voxels:
     near = distance <= smallest.gather(1, slot) * (1 + 1e-6)
     rank = torch.where(near, perm, points.shape[1] - 1)
     nearest = torch.full_like(slot, points.shape[1] - 1)
-    return Voxels(population, nearest.scatter_reduce_(1, slot, rank, "amin"))
+    return population, nearest.scatter_reduce_(1, slot, rank, "amin")
 
 
 def _voxel_keys(points: Tensor, m: int) -> Tensor:

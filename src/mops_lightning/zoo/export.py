@@ -135,12 +135,12 @@ def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
         program = torch.export.export(net, (example,), dynamic_shapes=dynamic)
         if path.suffix == ".pt2":
             torch.export.save(program, temporary)
-            run: Callable[[Tensor], Tensor] = torch.export.load(temporary).module()
+            exported: Callable[[Tensor], Tensor] = torch.export.load(temporary).module()
         else:
-            _to_onnx(program, temporary)
-            run = _onnx_session(temporary)
+            exported = _to_onnx(program, temporary)
         difference = max(
-            float((run(points) - sampler(points, m).points).abs().max()) for points in _clouds(m)
+            float((exported(points) - sampler(points, m).points).abs().max())
+            for points in _clouds(m)
         )
         if difference > TOLERANCE:
             raise UserError(
@@ -157,11 +157,13 @@ def _clouds(m: int) -> Iterable[Tensor]:
         yield points / points.norm(dim=2).amax(1)[:, None, None]
 
 
-def _to_onnx(program: Any, path: Path) -> None:
+def _to_onnx(program: Any, path: Path) -> Callable[[Tensor], Tensor]:
+    """Write a program as ONNX and return the function of the file."""
     try:
+        import onnxruntime
         import onnxscript  # noqa: F401, torch.onnx needs it
     except ModuleNotFoundError:
-        raise _missing() from None
+        raise UserError(".onnx files need an extra: pip install 'mops-lightning[onnx]'.") from None
     # It warns that torchvision, which is not needed, is missing.
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     with warnings.catch_warnings():
@@ -177,18 +179,7 @@ def _to_onnx(program: Any, path: Path) -> None:
             external_data=False,
             verbose=False,
         )
-
-
-def _onnx_session(path: Path) -> Callable[[Tensor], Tensor]:
-    try:
-        import onnxruntime
-    except ModuleNotFoundError:
-        raise _missing() from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     return lambda points: torch.from_numpy(session.run(None, {"points": points.numpy()})[0])
-
-
-def _missing() -> UserError:
-    return UserError(".onnx files need an extra: pip install 'mops-lightning[onnx]'.")

@@ -87,19 +87,17 @@ def figures(record: RunRecord) -> dict[str, Any]:
         raise UserError("the record of the run has no test score. Give a run that was tested.")
     main = parts[named]
     info = metric_info(main.metric, [record])
-    shown = {MetricName(main.m, readout, main.metric) for readout in _readouts(main)}
+    full = main.readout == ROWS[-1]
+    readouts = ROWS[-1:] if full else ROWS[:-1]
+    shown = {MetricName(main.m, readout, main.metric) for readout in readouts}
     return {
         "metric": info.title,
-        "m": None if main.readout == ROWS[-1] else main.m or record.config["m"],
+        "m": None if full else main.m or record.config["m"],
         "points": record.config["dataset"].get("n_points"),
         "values": {
             part.readout: info.format(scores[key]) for key, part in parts.items() if part in shown
         },
     }
-
-
-def _readouts(main: MetricName) -> tuple[str, ...]:
-    return ROWS[-1:] if main.readout == ROWS[-1] else ROWS[:-1]
 
 
 def _task_net(name: str | None, record: RunRecord) -> str | None:

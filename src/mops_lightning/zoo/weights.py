@@ -40,15 +40,11 @@ def save(
         "metrics": metrics,
         "classes": list(classes),
     }
-    model_file.write(path, header, plain_state(module))
-
-
-def plain_state(module: nn.Module) -> dict[str, Tensor]:
-    """Return copies of a module's tensors by name, contiguous and on the CPU."""
-    return {
+    state = {
         name: value.detach().cpu().clone(memory_format=torch.contiguous_format)
         for name, value in module.state_dict().items()
     }
+    model_file.write(path, header, state)
 
 
 def read(path: str | Path) -> dict[str, Any]:
