@@ -18,12 +18,12 @@ from mops_lightning.ops.elimination import eliminate
 from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.readout import complete, match
+from mops_lightning.samplers.base import stream_sample
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.samplenet import SampleNet
 from mops_lightning.samplers.snet import SNet
-from mops_lightning.samplers.streaming import stream_sample
 from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.training.run.trainer import keep_freed_memory
 

@@ -10,9 +10,9 @@ from mops_lightning.ops import attention
 from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.anchors import SPACING_POINTS
+from mops_lightning.samplers.base import stream_sample
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.streaming import stream_sample
 from mops_lightning.training.recipe.warm_start import copy_tensors
 from mops_lightning.zoo.export import plain_net
 

@@ -2,10 +2,10 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
+from mops_lightning.samplers.base import stream_sample
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.snet import SNet
-from mops_lightning.samplers.streaming import stream_sample
 
 
 @pytest.mark.parametrize("size", [1, 7, 1000, 5000])

@@ -17,8 +17,7 @@ from mops_lightning.files.engine import Engine, LocalEngine
 from mops_lightning.files.options import Options
 from mops_lightning.files.tiles import sample_by_tiles
 from mops_lightning.ops.readout import select
-from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.streaming import stream_sample
+from mops_lightning.samplers.base import Sampler, stream_sample
 from mops_lightning.zoo.downsample import untrained
 from mops_lightning.zoo.load import load
 

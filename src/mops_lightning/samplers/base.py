@@ -1,6 +1,7 @@
-"""Base class of all samplers."""
+"""Base class of all samplers, and sampling in chunks."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import reduce
 from numbers import Integral
 from typing import Any, Literal
 
@@ -8,11 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.precision import restrict_autocast_to_pointwise
 from mops_lightning.ops.readout import READOUTS, select
 from mops_lightning.samplers.fused import FusedMOPSNet
 from mops_lightning.samplers.ragged import select_points
 from mops_lightning.types import SampleOutput
+
+Chunks = Callable[[], Iterable[Tensor]]
+"""Function that iterates over the chunks ``(n, 3)`` of a cloud, in the same order at every call."""
 
 
 class Sampler(nn.Module):
@@ -50,7 +55,7 @@ class Sampler(nn.Module):
     """Whether the sample of a smaller size is the first part of the sample of a larger one."""
 
     streams: bool = False
-    """Whether clouds can be sampled in chunks, see ``streaming``; then ``fused`` is implemented."""
+    """Whether clouds can be sampled in chunks (``stream_sample``), by ``fused``."""
 
     spreads: bool = True
     """Whether sampled points keep apart from each other, as all but random ones do."""
@@ -268,3 +273,41 @@ def check_dtype(points: Tensor, weights: torch.dtype) -> None:
     """
     if points.dtype != weights:
         raise UserError(f"points must be {weights} like the sampler's weights, got {points.dtype}.")
+
+
+def stream_sample(sampler: Sampler, chunks: Chunks, m: int | None = None) -> Tensor:
+    """Sample a cloud that is read in chunks.
+
+    MOPS-Net reduces the points of a cloud twice: to a maximum (the global feature) and to a
+    softmax-weighted sum (paper section "Efficient Regression of the Sampled Set"). Both reductions
+    are associative: chunks may be merged in any order, also by several machines, and memory does
+    not grow with N.
+
+    Args:
+        sampler: a trained sampler; it is used in evaluation mode.
+        chunks: the cloud, which is read twice; the largest chunk bounds the memory.
+        m: number of points; None means ``sampler.m``.
+
+    Returns:
+        ``(m, 3)``, equal to ``sampler(points, m).points`` up to the rounding of sums.
+
+    Raises:
+        UserError: the sampler needs whole clouds, ``m`` is out of range, or a chunk is invalid.
+    """
+    m = sampler.m if m is None else m
+    net = sampler.fused()
+    sampler.check_m(m)
+    peaks = (net.global_part(chunk) for chunk in _checked_chunks(chunks, m, sampler))
+    global_ = reduce(torch.maximum, peaks)
+    return reduce(Partial.merge, (net.sum_part(chunk, global_, m) for chunk in chunks())).result()
+
+
+def _checked_chunks(chunks: Chunks, m: int, sampler: Sampler) -> Iterable[Tensor]:
+    number = 0
+    for chunk in chunks():
+        check_points(chunk[None])
+        check_dtype(chunk, next(sampler.parameters()).dtype)
+        number += len(chunk)
+        yield chunk
+    if number < m:
+        raise UserError(f"m must be at most the number of points N={number}, got m={m}.")
