@@ -74,7 +74,7 @@ def test_wheel_contains_package_and_configs_only(wheel: Path) -> None:
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
     configs = files_below(ROOT / "conf", "mops_lightning/conf")
     assert "mops_lightning/conf/config.yaml" in configs
-    assert {"mops_lightning/records/result.schema.json", "mops_lightning/py.typed"} <= names
+    assert {"mops_lightning/report/paper.json", "mops_lightning/py.typed"} <= names
     assert names == configs | files_below(ROOT / "src/mops_lightning", "mops_lightning")
 
 

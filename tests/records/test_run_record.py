@@ -2,7 +2,6 @@ import json
 import math
 import os
 
-import jsonschema
 import pytest
 
 from mops_lightning.errors import UserError
@@ -35,8 +34,8 @@ def test_write_nan_becomes_null(tmp_path):
         {"config": {"sampler": "mops"}},
     ],
 )
-def test_write_schema_violation_raises_and_writes_nothing(tmp_path, changes):
-    with pytest.raises(jsonschema.ValidationError):
+def test_write_of_wrong_type_raises_and_writes_nothing(tmp_path, changes):
+    with pytest.raises(ValueError, match=r"Expected|Invalid|missing"):
         run_record.write(tmp_path, record(**changes))
     assert not list(tmp_path.iterdir())
 
@@ -47,15 +46,18 @@ def test_read_no_record_raises(tmp_path):
     (tmp_path / "result.json").write_text('{"schema": ')
     with pytest.raises(UserError, match="not a run record"):
         run_record.read(tmp_path)
-    (tmp_path / "result.json").write_text("{}")
-    with pytest.raises(UserError, match="not a run record"):
-        run_record.read(tmp_path)
+    shorter = {**record().plain()}
+    del shorter["error"]
+    for plain in (shorter, {**record().plain(), "foreign": 3}):
+        (tmp_path / "result.json").write_text(json.dumps(plain))
+        with pytest.raises(UserError, match="not a run record: unknown or missing"):
+            run_record.read(tmp_path)
 
 
 @pytest.mark.parametrize(
     "text",
-    ['{"schema": ' + "1" * 5000 + "}", "[" * 2000 + "]" * 2000, '"\x1b[31m"'],
-    ids=["digits", "levels", "escape"],
+    ['{"schema": ' + "1" * 5000 + "}", "[" * 2000 + "]" * 2000, "[" * 60 + "]" * 60, '"\x1b[31m"'],
+    ids=["digits", "levels", "depth", "escape"],
 )
 def test_read_hostile_file_ends_in_one_printable_line(tmp_path, text):
     (tmp_path / "result.json").write_text(text)
@@ -75,13 +77,12 @@ def test_evaluated_run_is_read_as_written(tmp_path):
     assert run_record.read(tmp_path).evaluated == evaluated(seed=7)
 
 
-def test_run_record_plain_matches_schema(tmp_path):
+def test_begun_record_is_read_as_written(tmp_path):
     started = RunRecord.begin(CONFIG, ["m=32"], seed=3)
     with started.timed("fit"):
         pass
     run_record.write(tmp_path, started)
     found = run_record.read(tmp_path)
     assert found == started
-    assert set(found.plain()) == set(run_record.schema()["properties"])
     assert (found.status, found.seed) == ("running", 3)
     assert found.seconds["fit"] >= 0

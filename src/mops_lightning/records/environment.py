@@ -2,7 +2,7 @@
 
 import platform
 import subprocess
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,8 @@ def environment() -> dict[str, Any]:
     import torch
 
     return {
-        "versions": {"python": platform.python_version(), **_versions()},
+        "versions": {"python": platform.python_version()}
+        | {name: version(name) for name in PACKAGES},
         "platform": f"{platform.system()} {platform.machine()}",
         "threads": torch.get_num_threads(),
         "git": git_state(),
@@ -50,13 +51,3 @@ def git_state() -> dict[str, Any]:
 def _git(top: Path, *arguments: str) -> str:
     command = ["git", "-C", str(top), *arguments]
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found

@@ -6,18 +6,19 @@ import os
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypedDict
+
+import msgspec
 
 from mops_lightning.errors import UserError, printable
 from mops_lightning.filesystem import atomic_write
+from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.environment import environment
 
-SCHEMA = "mops_lightning/result/2"
+SCHEMA: Literal["mops_lightning/result/2"] = "mops_lightning/result/2"
 FILE = "result.json"
 MANY = "runs.jsonl"
 """File with the records of several runs, one a line."""
@@ -27,6 +28,46 @@ MAX_DEPTH = 50
 """Deepest nesting of a record that is read."""
 FAILED = ".failed"
 """File in a cell's folder that says why its last start failed, with or without a record."""
+
+
+class Names(TypedDict):
+    """Names of a run's groups."""
+
+    task: str
+    net: str
+    dataset: str
+    sampler: str
+
+
+class TaskSettings(TypedDict, total=False):
+    """Settings of a task."""
+
+    net: dict[str, Any] | None
+
+
+class TrainerSettings(TypedDict):
+    """Settings of a trainer."""
+
+    max_epochs: int | None
+
+
+class Configuration(TypedDict):
+    """The settings that tables read; a configuration has more."""
+
+    names: Names
+    learn: str
+    m: int
+    task: TaskSettings
+    dataset: dict[str, Any]
+    sampler: dict[str, Any]
+    trainer: TrainerSettings
+
+
+class Git(TypedDict):
+    """The commit of the code, and whether it was changed; None outside of a checkout."""
+
+    commit: str | None
+    dirty: bool | None
 
 
 @dataclass(kw_only=True)
@@ -95,22 +136,22 @@ class RunRecord:
         folder: of the run, relative to the file that holds the record.
     """
 
-    schema: str = SCHEMA
-    status: str = "running"
+    schema: Literal["mops_lightning/result/2"] = SCHEMA
+    status: Literal["running", "completed", "failed", "interrupted"] = "running"
     config: dict[str, Any]
     overrides: list[str]
     metrics: dict[str, Any] = field(default_factory=dict)
     score_name: str = ""
     score: float | None = None
     metric_info: dict[str, dict[str, Any]] = field(default_factory=dict)
-    validation: dict[str, Any] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-    seed: int
+    validation: dict[str, float | None] = field(default_factory=dict)
+    seconds: dict[str, Annotated[float, msgspec.Meta(ge=0)]] = field(default_factory=dict)
+    seed: Annotated[int, msgspec.Meta(ge=0)]
     started: str
     versions: dict[str, str]
     platform: str
-    threads: int
-    git: dict[str, Any]
+    threads: Annotated[int, msgspec.Meta(ge=1)]
+    git: Git
     device: str | None = None
     files: dict[str, str] = field(default_factory=dict)
     error: str | None = None
@@ -150,42 +191,31 @@ class RunRecord:
         return asdict(self)
 
 
-@cache
-def schema() -> dict[str, Any]:
-    """Return the JSON schema of a run record."""
-    text = files("mops_lightning.records").joinpath("result.schema.json").read_text()
-    return json.loads(text)
-
-
 def from_plain(plain: Any) -> RunRecord:
     """Return a record from plain data, such as the content of ``result.json``.
 
     Raises:
-        jsonschema.ValidationError: it does not fit the schema.
+        ValueError: it does not fit the types of ``RunRecord`` and the settings that tables read.
     """
-    import jsonschema
-
-    jsonschema.validate(plain, schema())
-    record = RunRecord(**plain)
-    if plain["evaluated"] is not None:
-        record.evaluated = Evaluated(**plain["evaluated"])
+    record = msgspec.convert(plain, RunRecord)
+    known = {one.name for one in fields(RunRecord)}
+    if different := known ^ (plain.keys() | {"folder"}):  # models have no folder
+        raise ValueError(f"unknown or missing: {', '.join(sorted(different))}")
+    msgspec.convert(record.config, Configuration)
+    msgspec.convert(record.metrics, dict[str, float | None])
+    for name, values in record.metric_info.items():
+        msgspec.convert({**values, "name": name}, MetricInfo)
     return record
 
 
 def write(folder: Path, record: RunRecord) -> Path:
-    """Validate a record and write it as ``result.json``; NaN and infinity become null.
-
-    Args:
-        folder: the run's folder.
-        record: see ``result.schema.json``.
+    """Check a record and write it as ``result.json``; NaN and infinity become null.
 
     Raises:
-        jsonschema.ValidationError: the record does not fit the schema: a bug in this program.
+        ValueError: the record does not fit its types: a bug in this program.
     """
-    import jsonschema
-
     plain = _finite(record.plain())
-    jsonschema.validate(plain, schema())
+    from_plain(plain)
     path = folder / FILE
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n")
@@ -196,8 +226,8 @@ def write_many(path: Path, records: Iterable[RunRecord]) -> None:
     """Write records to one file, one a line; their folders become relative to its own."""
     with atomic_write(path) as temporary, temporary.open("w") as file:
         for record in records:
-            plain = _finite(record.plain())
-            plain["folder"] = Path(os.path.relpath(record.folder, path.parent)).as_posix()
+            folder = Path(os.path.relpath(record.folder, path.parent)).as_posix()
+            plain = _finite(replace(record, folder=folder).plain())
             file.write(json.dumps(plain, allow_nan=False) + "\n")
 
 
@@ -208,16 +238,15 @@ def read(folder: Path) -> RunRecord:
         UserError: the folder has no ``result.json``, or it is not a run record.
     """
     path = folder / FILE
-    if path.exists() and not path.is_file():  # reading a named pipe would wait forever
+    if not path.exists():
+        raise UserError(f"{path}: no run record. Give a run's folder.")
+    if not path.is_file():  # reading a named pipe would wait forever
         raise UserError(f"{path}: not a regular file.")
     try:
-        return from_json(path.read_text(), str(path))
-    except (FileNotFoundError, NotADirectoryError):
-        raise UserError(f"{path}: no run record. Give a run's folder.") from None
+        text = path.read_text(errors="replace")
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}.") from None
-    except UnicodeDecodeError:
-        raise UserError(f"{path}: not a run record: it is no text in UTF-8.") from None
+    return from_json(text, str(path))
 
 
 def from_json(text: str, place: str) -> RunRecord:
@@ -230,29 +259,22 @@ def from_json(text: str, place: str) -> RunRecord:
     Raises:
         UserError: it is not a run record.
     """
-    import jsonschema
-
     try:
         plain = json.loads(text)
-        if _depth(plain) > MAX_DEPTH:
-            raise ValueError(f"nested more than {MAX_DEPTH} levels deep")
+        _check_depth(plain, MAX_DEPTH)
         return from_plain(plain)
-    except (ValueError, RecursionError, jsonschema.ValidationError) as error:
+    except (ValueError, RecursionError) as error:
         reason = printable(str(error).splitlines()[0][:200])
         raise UserError(f"{place}: not a run record: {reason}") from None
 
 
-def _depth(plain: Any) -> int:
-    """Return how deeply lists and dictionaries are nested."""
-    depth, level = 0, [plain]
-    while level := [
-        below
-        for node in level
-        if isinstance(node, dict | list)
-        for below in (node.values() if isinstance(node, dict) else node)
-    ]:
-        depth += 1
-    return depth
+def _check_depth(plain: Any, deepest: int) -> None:
+    """Check that lists and dictionaries are not nested too deeply."""
+    if deepest < 0:
+        raise ValueError(f"nested more than {MAX_DEPTH} levels deep")
+    if isinstance(plain, dict | list):
+        for item in plain.values() if isinstance(plain, dict) else plain:
+            _check_depth(item, deepest - 1)
 
 
 def dotted(tree: Any, prefix: str = "") -> dict[str, Any]:

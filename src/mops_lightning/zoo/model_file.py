@@ -6,10 +6,10 @@ a card. Headers are read without torch and without the tensors.
 
 import hashlib
 import json
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import msgspec
 
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
@@ -25,6 +25,67 @@ KEY = "mops_lightning"
 """Key of the plain data in the header; safetensors writes several keys in random order."""
 LONGEST = 1 << 22
 """Most bytes of a header."""
+
+SHA256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+NAME = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9_-]+(\.[a-z0-9_-]+)+$", max_length=100)]
+
+
+class Figures(msgspec.Struct, forbid_unknown_fields=True):
+    """Test figures of a model by readout, in the metric's unit.
+
+    Attributes:
+        metric: its name.
+        m: number of sampled points; None for all points.
+        values: the figures.
+        points: of a test cloud.
+    """
+
+    metric: str
+    m: int | None
+    values: dict[str, str]
+    points: int | None
+
+
+class RunHeader(msgspec.Struct, forbid_unknown_fields=True, tag_field="schema", tag=WEIGHTS):
+    """Plain data in the header of a run's weights file.
+
+    Attributes:
+        classes: of a classifier's outputs, in order.
+        sha256: of the tensors.
+        config: the configuration of the run.
+        metrics: its test metrics.
+    """
+
+    classes: list[str]
+    sha256: SHA256
+    config: dict[str, Any]
+    metrics: dict[str, Any]
+
+
+class Card(msgspec.Struct, forbid_unknown_fields=True, tag_field="schema", tag=MODEL):
+    """Plain data in the header of a model.
+
+    Attributes:
+        classes: of a classifier's outputs, in order.
+        sha256: of the tensors.
+        name: of the model.
+        transform: of the input: centroid at the origin, largest distance from it 1.
+        licence: of the weights.
+        precision: of most weight matrices with 4,096 entries or more; the rest is float32.
+        notes: further facts for users.
+        figures: its test figures.
+        record: of the run that trained the model; ``files.task_weights`` names its task net.
+    """
+
+    classes: list[str]
+    sha256: SHA256
+    name: NAME
+    transform: Literal["unit_sphere"]
+    licence: str
+    precision: Literal["float32", "float16", "bfloat16"]
+    notes: str
+    figures: Figures
+    record: dict[str, Any]
 
 
 class Damaged(UserError):
@@ -44,18 +105,17 @@ def write(path: Path, header: dict[str, Any], state: "dict[str, Tensor]") -> Non
 
     Args:
         path: the file.
-        header: see ``header.schema.json``, without ``sha256``, which is added.
+        header: see ``RunHeader`` and ``Card``, without ``sha256``, which is added.
         state: tensors by name.
 
     Raises:
-        jsonschema.ValidationError: the header does not fit its schema: a bug in this program.
+        msgspec.ValidationError: the header does not fit its types: a bug in this program.
         OSError: the file cannot be written.
     """
-    import jsonschema
     from safetensors.torch import save
 
     header = {**header, "sha256": digest(state)}
-    jsonschema.validate(header, schema())
+    msgspec.convert(header, RunHeader | Card)
     content = save(state, metadata={KEY: json.dumps(header)})
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
@@ -108,8 +168,7 @@ def read_card(path: Path) -> dict[str, Any]:
 
 
 def _header(path: Path) -> dict[str, Any]:
-    """Return the plain data in the header, checked by its schema."""
-    import jsonschema
+    """Return the plain data in the header, checked by its types."""
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():  # opening a named pipe would wait for its writer
@@ -120,12 +179,12 @@ def _header(path: Path) -> dict[str, Any]:
                 raise damaged(path)
         with safe_open(path, framework="numpy") as opened:
             header = json.loads((opened.metadata() or {}).get(KEY, "null"))
-        jsonschema.validate(header, schema())
+        msgspec.convert(header, RunHeader | Card)
         if "record" in header:
-            jsonschema.validate(header["record"], run_record.schema())
+            run_record.from_plain(header["record"])
     except PermissionError:
         raise UserError(f"{path} may not be read. Check its permissions.") from None
-    except (SafetensorError, OSError, ValueError, RecursionError, jsonschema.ValidationError):
+    except (SafetensorError, OSError, ValueError, RecursionError):
         raise damaged(path) from None
     return header
 
@@ -140,9 +199,3 @@ def digest(state: "dict[str, Tensor]") -> str:
         total.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
         total.update(value.view(-1).view(torch.uint8).numpy().tobytes())
     return total.hexdigest()
-
-
-@cache
-def schema() -> dict[str, Any]:
-    """Return the JSON schema of headers."""
-    return json.loads(files("mops_lightning.zoo").joinpath("header.schema.json").read_text())
