@@ -130,9 +130,9 @@ def set_item(path: Path, key: str, place: Any, value: float) -> None:
 shaped = partial(np.zeros, dtype=np.float32)
 label = np.zeros((2, 1), dtype=np.uint8)
 DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "cut off": (lambda p: os.truncate(p, p.stat().st_size // 2), "damaged or not an HDF5 file"),
-    "empty": (lambda p: os.truncate(p, 0), "damaged or not an HDF5 file"),
-    "text": (lambda p: p.write_text("<html>Not found</html>"), "damaged or not an HDF5 file"),
+    "cut off": (lambda p: os.truncate(p, p.stat().st_size // 2), "is broken"),
+    "empty": (lambda p: os.truncate(p, 0), "is broken"),
+    "text": (lambda p: p.write_text("<html>Not found</html>"), "is broken"),
     "no data": (
         lambda p: write_file(p, label=label),
         r"no dataset 'data'; it contains \['label'\]",
@@ -177,5 +177,5 @@ def test_read_clouds_corrupted_file_raises(tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[offset + 100] ^= 0xFF
     path.write_bytes(content)
-    with pytest.raises(UserError, match=r"train\.h5 is damaged or not an HDF5 file"):
+    with pytest.raises(UserError, match=r"train\.h5 is broken"):
         read_clouds(path, 4, 3)

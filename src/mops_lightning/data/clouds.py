@@ -60,11 +60,7 @@ class CloudDataset:
 
 
 def choose_classes(classes: Sequence[str] | None, known: Sequence[str]) -> tuple[str, ...]:
-    """Return the classes to load, in the order of the dataset.
-
-    Args:
-        classes: names to keep; None or empty means all.
-        known: all classes of the dataset.
+    """Return the classes to load, in the order of ``known``; None or empty means all.
 
     Raises:
         UserError: a class is unknown, or ``classes`` is no list of names.

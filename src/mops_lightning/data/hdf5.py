@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, make_dataset
-from mops_lightning.errors import UserError, one_line
+from mops_lightning.data.formats.guard import naming_file
+from mops_lightning.errors import UserError
 from mops_lightning.filesystem import memory
 
 NAMES = "shape_names.txt"
@@ -33,8 +34,6 @@ def hdf5(
     Raises:
         UserError: an argument or a file is invalid.
     """
-    if n_points < 1:
-        raise UserError(f"n_points must be at least 1, got {n_points}.")
     folder = Path(root).expanduser()
     if not folder.is_dir():
         raise UserError(
@@ -46,7 +45,7 @@ def hdf5(
         for split in ("train", "test")
     }
     if known is None:
-        highest = max(int(clouds.labels.max()) for clouds in splits.values() if len(clouds.labels))
+        highest = max(int(clouds.labels.max()) for clouds in splits.values())
         known = [f"class_{label}" for label in range(highest + 1)]
     return make_dataset("hdf5", splits, known, classes, folder)
 
@@ -87,44 +86,37 @@ def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:
     Raises:
         UserError: the file is missing, damaged or has other content.
     """
+    if n_points < 1:
+        raise UserError(f"n_points must be at least 1, got {n_points}.")
     if not path.is_file():
         raise UserError(f"root: {path} is missing. Complete the folder, or use another root.")
-    try:
-        with h5py.File(path, "r") as file:
-            data, label = _dataset(path, file, "data"), _dataset(path, file, "label")
-            shapes, kinds = (data.shape, label.shape), data.dtype.kind + label.dtype.kind
-            if (
-                data.ndim != 3
-                or data.shape[2] != 3
-                or label.shape not in ((len(data),), (len(data), 1))
-                or kinds not in ("fu", "fi")
-            ):
-                raise UserError(
-                    f"{path} must contain data (S, N, 3) of floats and label (S, 1) or (S,) of "
-                    f"integers, got {shapes[0]} {data.dtype} and {shapes[1]} {label.dtype}."
-                )
-            if data.shape[1] < n_points:
-                raise UserError(
-                    f"n_points must be at most {data.shape[1]}, the points per shape in {path}, "
-                    f"got {n_points}."
-                )
-            if not len(data):
-                raise UserError(f"{path} contains no shapes.")
-            if len(data) * n_points * 3 * data.dtype.itemsize > memory(path):
-                raise UserError(
-                    f"{path} announces {len(data):,} shapes, much more than its "
-                    f"{path.stat().st_size:,} bytes hold. Replace it by an intact copy."
-                )
-            with np.errstate(over="ignore"):  # overflows are detected below
-                points = np.asarray(data[:, :n_points], dtype=np.float32)
-            labels = np.asarray(label[()], dtype=np.int64).reshape(-1)
-    except UserError:
-        raise
-    except Exception as error:  # h5py raises many types of exception for damaged files
-        raise UserError(
-            f"{path} is damaged or not an HDF5 file ({one_line(error)}). Replace it by an intact "
-            "copy."
-        ) from error
+    with naming_file(path), h5py.File(path, "r") as file:
+        data, label = _dataset(path, file, "data"), _dataset(path, file, "label")
+        if (
+            data.ndim != 3
+            or data.shape[2] != 3
+            or label.shape not in ((len(data),), (len(data), 1))
+            or data.dtype.kind + label.dtype.kind not in ("fu", "fi")
+        ):
+            raise UserError(
+                f"{path} must contain data (S, N, 3) of floats and label (S, 1) or (S,) of "
+                f"integers, got {data.shape} {data.dtype} and {label.shape} {label.dtype}."
+            )
+        if data.shape[1] < n_points:
+            raise UserError(
+                f"n_points must be at most {data.shape[1]}, the points per shape in {path}, "
+                f"got {n_points}."
+            )
+        if not len(data):
+            raise UserError(f"{path} contains no shapes.")
+        if len(data) * n_points * 3 * data.dtype.itemsize > memory(path):
+            raise UserError(
+                f"{path} announces {len(data):,} shapes, much more than its "
+                f"{path.stat().st_size:,} bytes hold. Replace it by an intact copy."
+            )
+        with np.errstate(over="ignore"):  # overflows are detected below
+            points = np.asarray(data[:, :n_points], dtype=np.float32)
+        labels = np.asarray(label[()], dtype=np.int64).reshape(-1)
     if not np.isfinite(points).all():
         raise UserError(f"{path} contains NaN or infinite values. Replace it by an intact copy.")
     low, high = labels.min(), labels.max()

@@ -54,8 +54,6 @@ def modelnet40(
     Raises:
         UserError: an argument is invalid, or files are missing or damaged.
     """
-    if n_points < 1:
-        raise UserError(f"n_points must be at least 1, got {n_points}.")
     root = Path(root).expanduser()
     folder = _find(root)
     if folder is None and download:

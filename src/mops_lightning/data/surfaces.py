@@ -28,15 +28,10 @@ def sample_surface(
     The random numbers depend on ``seed`` and the content of the file only, so that a mesh gives the
     same cloud in any folder and order.
 
-    Args:
-        path: a file with one of ``formats.mesh.SUFFIXES``.
-        n_points: number of points, uniform by area.
-        seed: a non-negative number.
-        cache: folder for sampled clouds, found by file content and arguments, or None.
+    The arguments are described in ``cloud_folder.cloud_folder``.
 
     Returns:
-        sha256 of the file's bytes, and the cloud ``(n_points, 3)``: centroid at the origin, the
-        farthest point at distance 1.
+        sha256 of the file's bytes, and the cloud ``(n_points, 3)``, uniform by area.
 
     Raises:
         BadCloudError: the file cannot be read, or has no surface.

@@ -40,9 +40,7 @@ def read(path: Path) -> Table:
     Raises:
         UserError: laspy is not installed, or the file is broken.
     """
-    laspy = _laspy(path)
-    _check_counts(path)
-    with laspy.open(path) as file:
+    with _open(path) as file:
         declared = file.header.point_count
         table = _table(file.read_points(declared), file.header)
     if len(table.points) < declared:
@@ -52,9 +50,7 @@ def read(path: Path) -> Table:
 
 def locate(path: Path) -> CloudFile:
     """Open a file to read ranges of its rows."""
-    laspy = _laspy(path)
-    _check_counts(path)
-    with laspy.open(path) as file:
+    with _open(path) as file:
         return CloudFile(path, file.header.point_count, _parse_rows, file.header)
 
 
@@ -115,9 +111,8 @@ def _header(laspy: Any, table: Table) -> Any:
         header.scales = np.full(3, max(extent, 1e-9) / 2**30)
         return header
     source = table.header
-    header = laspy.LasHeader(
-        point_format=deepcopy(source.point_format), version=str(source.version)
-    )
+    form = deepcopy(source.point_format)
+    header = laspy.LasHeader(point_format=form, version=str(source.version))
     header.offsets, header.scales = source.offsets, source.scales
     header.vlrs = [record for record in source.vlrs if record.user_id != COPC]
     extended = [record for record in source.evlrs or () if record.user_id != COPC]
@@ -146,6 +141,12 @@ def _laspy(path: Path) -> Any:
             f"{path}: LAS and LAZ need laspy: pip install 'mops-lightning[las]'."
         ) from None
     return laspy
+
+
+def _open(path: Path) -> Any:
+    laspy = _laspy(path)
+    _check_counts(path)
+    return laspy.open(path)
 
 
 def _check_counts(path: Path) -> None:
