@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mops_lightning.zoo import model_file, names
+from mops_lightning.zoo import model_file, names, weights
 
 ROOT = Path(__file__).parents[1]
 TREE = 25_000_000
@@ -54,7 +54,7 @@ def test_weights_are_models_of_the_package(tracked):
     assert sum(path.stat().st_size for path in files) < MODELS
     for path in files:
         assert model_file.read_card(path)["name"] == path.stem
-        model_file.read(path)
+        weights.read(path)
 
 
 def test_records_and_models_name_models_that_exist(tracked):

@@ -22,14 +22,14 @@ def test_read_changed_tensors_are_refused(path):
     sha256 = model_file.read_card(path)["sha256"]
     rewrite(path, {"queries.weight": torch.zeros(16, 128)}, sha256=sha256)
     with pytest.raises(model_file.Damaged, match=r"fmops\.mine\.safetensors is damaged.*sha256"):
-        model_file.read(path)
+        weights.read(path)
 
 
 @pytest.mark.parametrize("size", [0, 5, 500, 50_000])
 def test_read_truncated_file_is_refused(path, size):
     path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(model_file.Damaged, match="is damaged"):
-        model_file.read(path)
+        weights.read(path)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_read_truncated_file_is_refused(path, size):
 def test_read_other_cards_are_refused(path, card):
     rewrite(path, **card)
     with pytest.raises(model_file.Damaged, match="not a file of this program"):
-        model_file.read(path)
+        weights.read(path)
 
 
 def test_read_header_that_is_no_json_or_missing_is_refused(path):
@@ -72,7 +72,7 @@ def test_read_card_of_weights_of_a_run_is_refused(path, tmp_path):
 def test_read_named_pipe_does_not_wait(tmp_path):
     os.mkfifo(tmp_path / "a.b.safetensors")
     with pytest.raises(UserError, match="no file"):
-        model_file.read(tmp_path / "a.b.safetensors")
+        weights.read(tmp_path / "a.b.safetensors")
 
 
 def test_cards_are_read_without_torch():

@@ -3,6 +3,7 @@
 import argparse
 import sys
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields
 from pathlib import Path
 
 from mops_lightning.errors import UserError, one_line_endings
@@ -112,17 +113,8 @@ def _options(chosen: argparse.Namespace) -> Options:
         raise UserError("--cluster must be the address of a Dask scheduler, got ''.")
     if chosen.cluster and chosen.chunk is None:
         raise UserError("--cluster distributes the chunks of a file: give --chunk as well.")
-    return Options(
-        chosen.m,
-        chosen.weights,
-        chosen.method,
-        chosen.readout or "completed",
-        chosen.keep_attributes,
-        chosen.surface,
-        chosen.seed,
-        chosen.chunk,
-        chosen.tile,
-    )
+    values = {field.name: getattr(chosen, field.name) for field in fields(Options)}
+    return Options(**{**values, "readout": chosen.readout or "completed"})
 
 
 def _engine(chosen: argparse.Namespace) -> AbstractContextManager[Engine | None]:

@@ -1,6 +1,6 @@
 """Accuracy of predicted classes over all clouds of a test."""
 
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 from torchmetrics.classification import MulticlassAccuracy
 
@@ -17,13 +17,14 @@ class Accuracy(TableMetric, MulticlassAccuracy):
     name = "accuracy"
     unit = "%"
     scale = 100.0
-    summary_order = 1
+    summary_order: ClassVar[int | None] = 1
+    averaging: ClassVar[Literal["micro", "macro"]] = "micro"
 
     def __init__(self, num_classes: int, **extra: Any) -> None:
-        super().__init__(num_classes, average="micro", **extra)
+        super().__init__(num_classes, average=self.averaging, **extra)
 
 
-class MeanClassAccuracy(TableMetric, MulticlassAccuracy):
+class MeanClassAccuracy(Accuracy):
     """Mean over classes of the fraction of their clouds that are assigned to them.
 
     Args:
@@ -31,9 +32,5 @@ class MeanClassAccuracy(TableMetric, MulticlassAccuracy):
     """
 
     name = "mean_class_accuracy"
-    unit = "%"
-    scale = 100.0
     summary_order = 2
-
-    def __init__(self, num_classes: int, **extra: Any) -> None:
-        super().__init__(num_classes, average="macro", **extra)
+    averaging = "macro"

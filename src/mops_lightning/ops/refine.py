@@ -85,28 +85,16 @@ def _one_pass(
 
 def _shortlist(features: Tensor, indices: Tensor, chosen: Tensor, gradient: Tensor) -> Tensor:
     """Return the candidates with the lowest estimates for every place, ``(B, M, K)``."""
-    largest, winner = chosen.max(1)
-    # The maxima without the winning row.
-    second = chosen.scatter(1, winner[:, None], -1.0).amax(1).clamp_(min=0)
     estimates = features.new_empty(*indices.shape, features.shape[1])
-    for number, cloud in enumerate(features):
-        estimates[number] = estimated_changes(
-            cloud,
-            largest[number],
-            second[number],
-            winner[number],
-            gradient[number],
-            indices.shape[1],
-        )
+    for number, cloud in enumerate(zip(features, chosen, gradient, strict=True)):
+        estimates[number] = estimated_changes(*cloud)
     members = indices[:, None].expand(-1, indices.shape[1], -1)
     estimates.scatter_(2, members, torch.inf)
     count = min(SHORTLIST, features.shape[1])
     return estimates.topk(count, dim=2, largest=False).indices
 
 
-def estimated_changes(
-    features: Tensor, largest: Tensor, second: Tensor, winner: Tensor, gradient: Tensor, m: int
-) -> Tensor:
+def estimated_changes(features: Tensor, chosen: Tensor, gradient: Tensor) -> Tensor:
     """Estimate the change of the objective when row i replaces place j of one sample.
 
     The estimate is Σ_c g_c (max(r_jc, f_ic) − p_c) for the gradient g, the pooled features p and
@@ -116,17 +104,16 @@ def estimated_changes(
 
     Args:
         features: ``(N, C)``.
-        largest: ``(C,)`` the maxima over the sample.
-        second: ``(C,)`` the maxima over the sample without the winning places.
-        winner: ``(C,)`` the winning places.
+        chosen: ``(M, C)`` the features of the sample.
         gradient: ``(C,)``.
-        m: number of places.
 
     Returns:
-        ``(m, N)``.
+        ``(M, N)``.
     """
+    largest, winner = chosen.max(0)
+    second = chosen.scatter(0, winner[None], -1.0).amax(0).clamp_(min=0)  # without the winner
     channels = features.T.contiguous()
     peak, floor, slope = largest[:, None], second[:, None], gradient[:, None]
     lost = channels.clamp(floor, peak).sub_(peak).mul_(slope)
-    estimate = features.new_zeros(m, len(features)).index_add_(0, winner, lost)
+    estimate = features.new_zeros(len(chosen), len(features)).index_add_(0, winner, lost)
     return estimate.add_(gradient @ channels.sub_(peak).relu_())

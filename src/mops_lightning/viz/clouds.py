@@ -41,8 +41,8 @@ def cloud_grid(points: Tensor, readouts: Mapping[str, Tensor], titles: Sequence[
     for row, cloud in enumerate(upright(points)):
         for column, (name, samples) in enumerate(columns.items()):
             title = name if row == 0 else ""
-            below = titles[row] if column == 0 else ""
-            axes = cloud_axes(figure, len(points), len(columns), row, column, title, below)
+            label = titles[row] if column == 0 else ""
+            axes = cloud_axes(figure, len(points), len(columns), row, column, title, label)
             draw_cloud(axes, cloud, None if samples is None else upright(samples)[row], name)
     return figure
 

@@ -23,7 +23,7 @@ def new_figure(width: float, height: float, layout: Any = "constrained") -> Figu
 
 
 def cloud_axes(
-    figure: Figure, rows: int, columns: int, row: int, column: int, title: str = "", below: str = ""
+    figure: Figure, rows: int, columns: int, row: int, column: int, title: str = "", label: str = ""
 ) -> Axes3D:
     """Add 3-D axes to a grid of clouds.
 
@@ -34,12 +34,12 @@ def cloud_axes(
         row: of the new axes, from the top.
         column: of the new axes, from the left.
         title: text above.
-        below: text in the lower left corner.
+        label: text in the lower left corner.
     """
     number = row * columns + column + 1
     axes: Any = figure.add_subplot(rows, columns, number, projection="3d")
     axes.set_title(title, fontsize=11)
-    axes.text2D(0.02, 0.04, below, transform=axes.transAxes, fontsize=9)
+    axes.text2D(0.02, 0.04, label, transform=axes.transAxes, fontsize=9)
     return axes
 
 

@@ -54,11 +54,11 @@ def pair_grid(
     figure = new_figure(2.8 * len(columns), 2.8 * len(source), "tight")
     for row in range(len(source)):
         for column, (head, result) in enumerate(columns.items()):
-            below = f"{titles[row]}, {before[row]:.1f}° apart"
+            label = f"{titles[row]}, {before[row]:.1f}° apart"
             if result is not None:
-                below = f"rotation error {result.errors[row]:.1f}°"
+                label = f"rotation error {result.errors[row]:.1f}°"
             title = head if row == 0 else ""
-            axes = cloud_axes(figure, len(source), len(columns), row, column, title, below)
+            axes = cloud_axes(figure, len(source), len(columns), row, column, title, label)
             moved = (source if result is None else result.source)[row]
             _draw_pair(axes, moved, target[row], s=1.5, alpha=0.35)
             if result is not None and result.source_points.shape[1] < source.shape[1]:
@@ -104,10 +104,10 @@ def reconstruction_grid(
     columns, rows = 1 + len(results), 2 * len(points)
     figure = new_figure(2.4 * columns, 2.4 * rows, "tight")
 
-    def cell(row: int, column: int, title: str, below: str) -> Axes3D:
+    def cell(row: int, column: int, title: str, label: str) -> Axes3D:
         # Titles of later clouds would repeat those of the first row.
         shown = title if row % 2 == 1 or row == 0 else ""
-        return cloud_axes(figure, rows, columns, row, column, shown, below)
+        return cloud_axes(figure, rows, columns, row, column, shown, label)
 
     for number, cloud in enumerate(map(_thinned, upright(points))):
         above, under = 2 * number, 2 * number + 1

@@ -80,13 +80,7 @@ def _known_class(node: Any, path: Path) -> type[Sampler]:
 
 
 def _build(cls: type[Sampler], node: Any, state: dict[str, Tensor], path: Path) -> Sampler:
-    """Build a sampler with the arguments and tensors of a file.
-
-    Args:
-        cls: its class.
-        node: from the file: the arguments, and ``_target_``, which is not read.
-        state: the file's tensors by name.
-        path: the file, for errors.
+    """Build a sampler with the arguments (``node``) and the tensors of a file.
 
     Raises:
         UserError: an argument is not plain or not the class's, or the tensors do not match the

@@ -121,54 +121,13 @@ def write(path: Path, header: dict[str, Any], state: "dict[str, Tensor]") -> Non
         temporary.write_bytes(content)
 
 
-def read(path: Path) -> dict[str, Any]:
-    """Read a run's weights file or a model, and verify its tensors.
-
-    Returns:
-        ``config``, ``metrics``, ``classes``, ``sha256``, and ``state``, the tensors by name.
+def read_header(path: Path) -> dict[str, Any]:
+    """Read the plain data in the header, checked by its types.
 
     Raises:
         UserError: the file is missing, or may not be read.
         Damaged: it is damaged or of another kind.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    header = _header(path)
-    try:
-        state = load_file(path)
-    except (SafetensorError, OSError):
-        raise damaged(path) from None
-    if digest(state) != header["sha256"]:
-        raise damaged(path, "sha256 differs")
-    trained = header.get("record", header)
-    return {
-        "config": trained["config"],
-        "metrics": trained["metrics"],
-        "classes": header["classes"],
-        "sha256": header["sha256"],
-        "state": state,
-    }
-
-
-def read_card(path: Path) -> dict[str, Any]:
-    """Read the card of a model.
-
-    Raises:
-        UserError: the file is missing, may not be read, or is a run's weights file.
-        Damaged: it is damaged or of another kind.
-    """
-    header = _header(path)
-    if header["schema"] != MODEL:
-        raise UserError(
-            f"{path} holds the weights of a run and is no model. `mops-lightning models add` makes "
-            "a model of it."
-        )
-    return header
-
-
-def _header(path: Path) -> dict[str, Any]:
-    """Return the plain data in the header, checked by its types."""
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():  # opening a named pipe would wait for its writer
@@ -186,6 +145,21 @@ def _header(path: Path) -> dict[str, Any]:
         raise UserError(f"{path} may not be read. Check its permissions.") from None
     except (SafetensorError, OSError, ValueError, RecursionError):
         raise damaged(path) from None
+    return header
+
+
+def read_card(path: Path) -> dict[str, Any]:
+    """Read the card of a model; errors are those of ``read_header``.
+
+    Raises:
+        UserError: it is a run's weights file.
+    """
+    header = read_header(path)
+    if header["schema"] != MODEL:
+        raise UserError(
+            f"{path} holds the weights of a run and is no model. `mops-lightning models add` makes "
+            "a model of it."
+        )
     return header
 
 

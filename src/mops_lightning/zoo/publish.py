@@ -58,7 +58,10 @@ def add(
     if record.status != "completed" or "weights" not in record.files:
         raise UserError(f"{run}: not a completed run that kept its weights. Give another RUN.")
     content = weights.read(weights.of_run(run))
-    state = _halved(content["state"]) if half else content["state"]
+    state = content["state"]
+    if half:
+        wide = {name for name, value in state.items() if value.ndim == 2 and value.numel() >= WIDE}
+        state = {name: value.half() if name in wide else value for name, value in state.items()}
     files = {"weights": name}
     if record.config["learn"] == "sampler":
         used = _task_net(task_net, record)
@@ -129,13 +132,6 @@ def _classes(own: list[str], record: RunRecord) -> list[str]:
     if own or config["learn"] != "task" or config["names"]["task"] != "classification":
         return list(own)
     return list(record.class_names or [])
-
-
-def _halved(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {
-        name: value.half() if value.ndim == 2 and value.numel() >= WIDE else value
-        for name, value in state.items()
-    }
 
 
 def _precision(state: dict[str, Tensor]) -> str:

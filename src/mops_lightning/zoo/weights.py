@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
@@ -57,13 +59,26 @@ def read(path: str | Path) -> dict[str, Any]:
         ``config``, ``metrics``, ``classes``, ``sha256``, and ``state``, the tensors by name.
 
     Raises:
-        UserError: the file is missing.
+        UserError: the file is missing, or may not be read.
         Damaged: it is damaged or not a weights file, or its tensors are not finite.
     """
     path = names.resolve(path)
-    content = model_file.read(path)
-    check_state(content["state"], path)
-    return content
+    header = model_file.read_header(path)
+    try:
+        state = load_file(path)
+    except (SafetensorError, OSError):
+        raise damaged(path) from None
+    if digest(state) != header["sha256"]:
+        raise damaged(path, "sha256 differs")
+    check_state(state, path)
+    trained = header.get("record", header)
+    return {
+        "config": trained["config"],
+        "metrics": trained["metrics"],
+        "classes": header["classes"],
+        "sha256": header["sha256"],
+        "state": state,
+    }
 
 
 def check_state(state: Any, path: str | Path) -> None:
