@@ -50,10 +50,7 @@ class FusedMOPSNet(NamedTuple):
     def local_features(self, points: Tensor) -> Tensor:
         """Map points ``(N, 3)`` to local features ``(N, D)``."""
         result = points.new_empty(len(points), len(self.features[-1].bias))
-        size = _block(points)
-        for rows, out in zip(points.split(size), result.split(size), strict=True):
-            out.copy_(_through(self.features, rows))
-        return result
+        return _in_blocks(self.features, points, result)
 
     @torch.no_grad()
     def keys(self, local: Tensor, global_: Tensor, into: Tensor | None = None) -> Tensor:
@@ -70,10 +67,7 @@ class FusedMOPSNet(NamedTuple):
         bias = torch.addmv(self.local.bias, self.global_weight, global_)
         layers = (self.local._replace(bias=bias), *self.rest)
         result = local.new_empty(len(local), self.queries.shape[1]) if into is None else into
-        size = _block(local)
-        for rows, out in zip(local.split(size), result.split(size), strict=True):
-            out.copy_(_through(layers, rows))
-        return result
+        return _in_blocks(layers, local, result)
 
     def global_part(self, points: Tensor) -> Tensor:
         """Return the contribution ``(D,)`` of a chunk ``(n, 3)`` to the global feature.
@@ -121,11 +115,11 @@ def fused_layer(linear: nn.Linear, norm: nn.BatchNorm1d) -> Layer:
     return Layer(weight.detach(), bias.detach())
 
 
-def _through(layers: tuple[Layer, ...], rows: Tensor) -> Tensor:
-    for layer in layers:
-        rows = layer(rows)
-    return rows
-
-
-def _block(rows: Tensor) -> int:
-    return BLOCK_ROWS.get(rows.device.type, BLOCK_ROWS["cuda"])
+def _in_blocks(layers: tuple[Layer, ...], rows: Tensor, result: Tensor) -> Tensor:
+    """Write the output of layers for rows ``(N, in)`` into ``(N, out)``, block by block."""
+    size = BLOCK_ROWS.get(rows.device.type, BLOCK_ROWS["cuda"])
+    for block, out in zip(rows.split(size), result.split(size), strict=True):
+        for layer in layers:
+            block = layer(block)
+        out.copy_(block)
+    return result
