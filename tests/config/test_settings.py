@@ -15,8 +15,7 @@ from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.report.build import build
 from mops_lightning.training.checkpoint import checkpoint_identity
-from mops_lightning.training.evaluation.settings import as_trained, command_line
-from mops_lightning.training.evaluation.trained_run import TrainedRun
+from mops_lightning.training.evaluation import TrainedRun, as_trained, command_line
 from mops_lightning.training.run.pretrain import cache_folder
 from tests.support.command_line import TINY, call
 from tests.support.reports import put_cell

@@ -12,12 +12,11 @@ import torch
 
 from mops_lightning.config.compose import compose
 from mops_lightning.data.clouds import CloudDataset, Clouds
+from mops_lightning.data.loader import CloudLoader
 from mops_lightning.metrics.info import MetricInfo
-from mops_lightning.training.evaluation import nets
-from mops_lightning.training.evaluation.settings import as_trained, command_line
-from mops_lightning.training.evaluation.trained_run import TrainedRun
+from mops_lightning.training.evaluation import TrainedRun, as_trained, command_line
 from mops_lightning.training.run.build import make_experiment
-from mops_lightning.training.run.loaders import score_loader
+from mops_lightning.training.run.load import load_trained
 from mops_lightning.zoo import model_file, names
 
 CLOUDS = Path(__file__).parent / "clouds.npz"
@@ -53,11 +52,11 @@ def figures(name):
     cfg = as_trained(compose(chosen), trained, chosen)
     data = dataset(cfg.names.task, card["record"]["class_names"])
     experiment = make_experiment(cfg, data, {}).eval()
-    nets.load(trained, cfg, experiment, data)
+    load_trained(trained, cfg, experiment, data)
     task, sampler = experiment.task, experiment.sampler
     score = task.full_score or task.score if m is None else task.score
     metric = task.metrics()[score]
-    for batch in score_loader(data.test, 16, task):
+    for batch in CloudLoader(data.test, 16, make_batch=task.make_batch):
         points = batch.points if sampler is None else sampler(batch.points, m).points
         output = task.scores(batch, {"": points})[""]
         metric.update(output.predictions, output.targets)

@@ -45,15 +45,13 @@ def begin(config: DictConfig, arguments: Sequence[str]) -> None:
     Raises:
         SystemExit: a setting is wrong, or the folder contains a run; one line says so.
     """
-    from mops_lightning.training.evaluation.trained_run import TrainedRun
     from mops_lightning.training.run.run import checked, claim
 
     HydraConfig.instance().set_config(config)  # the folder's name is made from it
     cfg = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     try:
         folder = Path(config.hydra.run.dir)
-        trained = TrainedRun.read(cfg.evaluate) if cfg.evaluate else None
-        checked(cfg, trained, list(config.hydra.overrides.task))
+        checked(cfg, list(config.hydra.overrides.task))
         check_paths(cfg)
         _check_weights(cfg.weights)
         distributed.check_start(cfg, config.hydra.overrides.hydra)

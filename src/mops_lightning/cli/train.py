@@ -51,7 +51,7 @@ def _run() -> None:
         sys.argv[1:] = flags_first(sys.argv[1:])
         refuse_plain_groups(sys.argv[1:])
         if any(key(argument) == "evaluate" for argument in sys.argv[1:]):
-            from mops_lightning.training.evaluation.settings import command_line
+            from mops_lightning.training.evaluation import command_line
 
             sys.argv[1:] = command_line(sys.argv[1:])
         sys.argv[1:] = with_own_classes([readable(argument) for argument in sys.argv[1:]])

@@ -7,8 +7,9 @@ from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.submodular import SubmodularSampler
+from mops_lightning.seeding import generator
 from mops_lightning.training.recipe.recipe import Recipe
-from mops_lightning.training.run.build import make_experiment
+from mops_lightning.training.run.build import augmentation, make_experiment, split
 from tests.support.training import small_dataset
 
 BASELINE = "+baselines.submodular._target_=mops_lightning.samplers.submodular.SubmodularSampler"
@@ -66,3 +67,49 @@ def test_factory_sampler_sees_weights_loaded_later(rng):
     torch.manual_seed(9)
     made.task.net.load_state_dict(PointNetVanilla(3).state_dict())
     assert not torch.equal(made.sampler(points).indices, before)
+
+
+def rows(part, whole):
+    """Rows of a part's clouds in the whole split."""
+    return [int((whole == cloud).all(2).all(1).nonzero()) for cloud in part]
+
+
+def test_split_holds_out_fraction_in_order():
+    clouds = small_dataset(train=20).train
+    train, held_out = split(clouds, 0.2, seed=5)
+    kept, out = rows(train.points, clouds.points), rows(held_out.points, clouds.points)
+    assert len(out) == 4
+    assert sorted([*kept, *out]) == list(range(20))
+    assert (kept, out) == (sorted(kept), sorted(out))
+    assert torch.equal(held_out.labels, clouds.labels[out])
+    # The stream of random numbers stays, so that old runs can be repeated.
+    assert out == sorted(torch.randperm(20, generator=generator(5, 2))[:4].tolist())
+
+
+def test_split_other_seed_holds_out_others():
+    clouds = small_dataset(train=20).train
+    first, again, other = (split(clouds, 0.2, seed)[1].points for seed in (5, 5, 6))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_split_zero_fraction_holds_out_nothing():
+    train, held_out = split(small_dataset(train=20).train, 0.0, seed=5)
+    assert (len(train.points), len(held_out.points)) == (20, 0)
+
+
+def test_split_holds_out_whole_sources():
+    clouds = small_dataset(train=20).train
+    clouds = clouds._replace(sources=torch.arange(5).repeat_interleave(4))
+    sources = split(clouds, 0.4, seed=5)[1].sources
+    assert sources is not None
+    assert sources.unique(return_counts=True)[1].tolist() == [4, 4]
+
+
+def test_augmentation_of_joint_training_is_that_of_the_sampler():
+    changed = ["augment.task.jitter=0.01", "augment.sampler.jitter=0.02"]
+    found = {
+        learn: augmentation(compose([*changed, f"learn={learn}"])).jitter
+        for learn in ("task", "sampler", "joint")
+    }
+    assert found == {"task": 0.01, "sampler": 0.02, "joint": 0.02}

@@ -1,5 +1,6 @@
 import sys
 import tempfile
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,7 +9,12 @@ from mops_lightning.config.compose import compose
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.run.trainer import AtomicCheckpointIO, keep_freed_memory, make_trainer
+from mops_lightning.training.run.trainer import (
+    AtomicCheckpointIO,
+    clouds_to_draw,
+    keep_freed_memory,
+    make_trainer,
+)
 from tests.support.command_line import TINY
 from tests.support.training import small_dataset
 
@@ -49,3 +55,22 @@ def test_keep_freed_memory_on_linux_is_accepted():
 def test_keep_freed_memory_elsewhere_does_nothing(monkeypatch):
     monkeypatch.setattr(sys, "platform", "win32")
     assert not keep_freed_memory()
+
+
+def test_clouds_to_draw_spreads_over_classes():
+    dataset = small_dataset()
+    chosen, names = clouds_to_draw(dataset, 2)
+    assert names == ["long", "round"]
+    assert dataset.test.labels[chosen].tolist() == [0, 2]
+    assert chosen.tolist() == [0, 2]  # the first of each class
+    assert clouds_to_draw(dataset, 9)[1] == ["long", "tall", "round"]
+    assert clouds_to_draw(dataset, 1)[1] == ["long"]
+    assert clouds_to_draw(dataset, 0)[1] == []
+
+
+def test_clouds_to_draw_leaves_out_classes_without_test_clouds():
+    dataset = small_dataset()
+    test = dataset.test.take(dataset.test.labels != 0)
+    chosen, names = clouds_to_draw(replace(dataset, test=test), 3)
+    assert names == ["tall", "round"]
+    assert test.labels[chosen].tolist() == [1, 2]

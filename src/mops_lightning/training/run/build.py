@@ -14,6 +14,7 @@ Besides the settings of its node, a constructor is offered these values, by argu
 | ``name``, ``save_dir`` | loggers | empty, the run's folder |
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,21 +26,27 @@ from omegaconf import DictConfig, OmegaConf
 from mops_lightning.config import distributed
 from mops_lightning.config.build import accepted, build, settings_named
 from mops_lightning.data.clouds import CloudDataset, Clouds
-from mops_lightning.data.loader import Augmentation
+from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.seeding import derive_seed
+from mops_lightning.seeding import derive_seed, generator
 from mops_lightning.tasks.base import Task
 from mops_lightning.training.checkpoint import Checkpoint, checkpoint_identity, find_checkpoint
-from mops_lightning.training.evaluation.trained_run import OF_RUN, TrainedRun
+from mops_lightning.training.evaluation import OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.distillation import FullClouds
 from mops_lightning.training.recipe.recipe import Recipe
-from mops_lightning.training.run.loaders import augmentation, split
 from mops_lightning.training.run.trainer import device_name, make_trainer
-from mops_lightning.training.sizes import sizes_to_test
 from mops_lightning.types import Batch
+
+STANDARD = (8, 16, 32, 64, 128, 256, 512)
+"""The sizes of the paper's tables."""
+AUTO = "auto"
+MORE_POINTS = (
+    "Lower it, or give clouds of more points (dataset.n_points; for pairs also "
+    "task.pairs.resample)."
+)
 
 
 @dataclass(frozen=True)
@@ -82,6 +89,11 @@ class Parts:
     def part(self) -> tuple[int, int]:
         """Rank of this process and number of processes."""
         return self.trainer.global_rank, self.trainer.world_size
+
+    def score_loader(self, clouds: Clouds) -> CloudLoader:
+        """Return a loader whose batches are the same in every epoch and for every sampler."""
+        make_batch = self.experiment.task.make_batch
+        return CloudLoader(clouds, self.cfg.batch_size, make_batch=make_batch, part=self.part)
 
 
 def build_parts(
@@ -158,6 +170,9 @@ def make_experiment(
     make_optimizer, make_schedule = optimizer_makers(cfg.optimizer)
     if cfg.learn != "nothing":
         _try_optimizer(make_optimizer, make_schedule)
+    full_clouds = None
+    if train is not None and not augmentation(cfg).active:
+        full_clouds = FullClouds(train, cfg.batch_size, Path(cfg.cache).expanduser())
     return Experiment(
         task,
         sampler,
@@ -172,15 +187,88 @@ def make_experiment(
         task_lr_scale=cfg.task_lr_scale,
         refine=cfg.refine,
         recipe=_recipe(cfg, sampler),
-        full_clouds=_full_clouds(cfg, train),
+        full_clouds=full_clouds,
     )
 
 
-def _full_clouds(cfg: DictConfig, train: Clouds | None) -> FullClouds | None:
-    """Return the clouds whose predictions are computed once; None with augmentation."""
-    if train is None or Augmentation(**augmentation(cfg)).active:
-        return None
-    return FullClouds(train, cfg.batch_size, Path(cfg.cache).expanduser())
+def augmentation(cfg: DictConfig) -> Augmentation:
+    """Return the augmentation of this run; joint training has the sampler's."""
+    return Augmentation(**(cfg.augment.task if cfg.learn == "task" else cfg.augment.sampler))
+
+
+def split(clouds: Clouds, fraction: float, seed: int) -> tuple[Clouds, Clouds]:
+    """Hold out a random share of the training clouds for the curves under ``val/``.
+
+    Clouds of one source, such as the crops of a file, are held out together.
+
+    Returns:
+        The clouds to train on and the held-out clouds, each in their original order.
+    """
+    sources = clouds.sources
+    if sources is None:
+        sources = torch.arange(len(clouds.labels))
+    names = sources.unique()
+    order = torch.randperm(len(names), generator=generator(seed, 2))
+    chosen = torch.isin(sources, names[order[: round(len(names) * fraction)]])
+    return clouds.take(~chosen), clouds.take(chosen)
+
+
+def sizes_to_test(
+    sizes: str | Sequence[int],
+    m: int,
+    sampler: Sampler | None,
+    n_points: int,
+    training: bool = True,
+) -> tuple[int, ...]:
+    """Return the sizes that are tested, in ascending order.
+
+    Args:
+        sizes: ``auto`` tests a flexible learned sampler at those standard sizes that it and the
+            clouds allow, any other sampler at ``m`` alone. A list is used as given.
+        m: the run's own size, which is always tested.
+        sampler: None where only the task net learns.
+        n_points: N of the test clouds.
+        training: whether the sampler is trained, which includes its largest size.
+
+    Raises:
+        UserError: the sampler or the clouds do not allow a size.
+    """
+    if sampler is None:
+        return ()
+    if m > n_points:
+        raise UserError(
+            f"m must be at most the {n_points} points of a cloud, got m={m}. {MORE_POINTS}"
+        )
+    if sampler.learned and m > sampler.m:
+        raise UserError(
+            f"m must be at most sampler.m_max={sampler.m}, got m={m}. "
+            f"Lower m, or train with sampler.m_max={m}."
+        )
+    if sampler.learned and training and sampler.m > n_points:
+        raise UserError(
+            f"sampler.m_max must be at most the {n_points} points of a cloud, got {sampler.m}. "
+            f"{MORE_POINTS}"
+        )
+    if sizes == AUTO:
+        most = min(sampler.m, n_points)
+        more = STANDARD if sampler.flexible and sampler.learned else ()
+        return tuple(sorted({m, *(size for size in more if size <= most)}))
+    wanted = sorted({m, *map(int, sizes)})
+    if not sampler.flexible and wanted != [m]:
+        raise UserError(
+            f"sizes: this sampler returns {m} points only, got sizes={list(sizes)}. "
+            "Train one that returns any number, such as sampler=fmops, or run with -m m=8,16,32."
+        )
+    if wanted[0] < 1 or wanted[-1] > n_points:
+        raise UserError(
+            f"sizes must be from 1 to the {n_points} points of a cloud, got {list(sizes)}."
+        )
+    if sampler.learned and wanted[-1] > sampler.m:
+        raise UserError(
+            f"sizes must be at most sampler.m_max={sampler.m}, the largest size of this net, "
+            f"got {list(sizes)}."
+        )
+    return tuple(wanted)
 
 
 def points_per_cloud(task: Task, dataset: CloudDataset) -> int:
@@ -209,14 +297,13 @@ def _make_task(cfg: DictConfig, num_classes: int) -> Task:
 
 
 def _make_baselines(cfg: DictConfig, m: int, net: dict[str, Any]) -> dict[str, Sampler]:
-    nodes = {str(name): node for name, node in cfg.baselines.items() if node}
-    return {name: _make_baseline(name, node, m, cfg.seed, net) for name, node in nodes.items()}
-
-
-def _make_baseline(name: str, node: DictConfig, m: int, seed: int, net: dict[str, Any]) -> Any:
-    """Build an index sampler for ``m`` points, with the run's seed unless it has its own."""
-    own = accepted(node, net if "seed" in node else {**net, "seed": seed})
-    return build(node, f"baselines.{name}", m=m, **own)
+    """Build the index samplers for ``m`` points, with the run's seed unless they have their own."""
+    baselines = {}
+    for name, node in cfg.baselines.items():
+        if node:
+            own = accepted(node, net if "seed" in node else {**net, "seed": cfg.seed})
+            baselines[str(name)] = build(node, f"baselines.{name}", m=m, **own)
+    return baselines
 
 
 def _check_cloud_size(

@@ -20,7 +20,7 @@ from mops_lightning.training.checkpoint import (
     checkpoint_identity,
     read_or_set_aside,
 )
-from mops_lightning.training.evaluation.trained_run import OF_RUN
+from mops_lightning.training.evaluation import OF_RUN
 from mops_lightning.training.run.build import Parts
 from mops_lightning.training.run.callbacks import added
 from mops_lightning.zoo import weights

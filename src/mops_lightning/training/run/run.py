@@ -1,23 +1,26 @@
 """One run: load the data, pretrain the task net if needed, fit, test, save."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config import distributed
 from mops_lightning.config.build import build
 from mops_lightning.config.validate import check
 from mops_lightning.data.clouds import CloudDataset, noisy
-from mops_lightning.errors import UserError
+from mops_lightning.errors import Interrupted, UserError, closed_outputs
+from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import closing_lines
-from mops_lightning.training.evaluation.settings import as_trained
-from mops_lightning.training.evaluation.trained_run import TrainedRun
+from mops_lightning.training.evaluation import TrainedRun, as_trained
 from mops_lightning.training.run import pretrain, stages
 from mops_lightning.training.run.build import Parts, build_parts
-from mops_lightning.training.run.recording import recorded
+from mops_lightning.training.run.load import load
 
 STARTED = ".started"
 """Empty file in the folder of a run that has begun."""
@@ -40,8 +43,7 @@ def run(
     Raises:
         UserError: a mistake in settings or files.
     """
-    trained = TrainedRun.read(cfg.evaluate) if cfg.evaluate else None
-    cfg = checked(cfg, trained, overrides)
+    cfg, trained = checked(cfg, overrides, claimed)
     leads = not distributed.is_worker_rank(cfg)
     if leads and not claimed:
         claim(folder)
@@ -74,7 +76,7 @@ def train_and_test(parts: Parts, record: RunRecord, task_weights: Path | None) -
         record: is filled.
         task_weights: a file for the task net; None leaves it as initialised.
     """
-    stages.load(parts, record, task_weights)
+    load(parts, record, task_weights)
     if parts.trains:
         stages.warm_start(parts, record)
         with record.timed("fit"):
@@ -85,16 +87,59 @@ def train_and_test(parts: Parts, record: RunRecord, task_weights: Path | None) -
         stages.save(parts, record)
 
 
-def checked(cfg: DictConfig, trained: TrainedRun | None, overrides: list[str] | None) -> DictConfig:
-    """Return the settings of a run, after mistakes in them were looked for.
+def checked(
+    cfg: DictConfig, overrides: list[str] | None, claimed: bool = False
+) -> tuple[DictConfig, TrainedRun | None]:
+    """Check the settings of a run, unless that was done before its folder was claimed.
+
+    Returns:
+        The settings, of an evaluation with those of the trained run, and the trained run.
 
     Raises:
-        UserError: there is one.
+        UserError: a mistake in the settings.
     """
+    trained = TrainedRun.read(cfg.evaluate) if cfg.evaluate else None
     if trained is not None and overrides is not None:
-        return as_trained(cfg, trained, overrides)
-    check(cfg)
-    return cfg
+        return as_trained(cfg, trained, overrides), trained
+    if not claimed:
+        check(cfg)
+    return cfg, trained
+
+
+@contextmanager
+def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[RunRecord]:
+    """Write ``result.json`` when the block begins and when it ends, however it ends.
+
+    Only the first process of a run writes.
+
+    Args:
+        cfg: a composed configuration.
+        folder: the run's folder.
+        overrides: what the user changed.
+
+    Yields:
+        The record, for the block to fill.
+    """
+    config: Any = OmegaConf.to_container(cfg, resolve=True)
+    record = RunRecord.begin(config, overrides, cfg.seed)
+    writes = not distributed.is_worker_rank(cfg)
+    if writes:
+        run_record.write(folder, record)
+    try:
+        with record.timed("total"):
+            yield record
+        record.status = "completed"
+    except (KeyboardInterrupt, Interrupted) as stop:
+        record.status, record.error = "interrupted", str(stop) or "interrupted"
+        raise
+    except BaseException as error:
+        stopped = isinstance(error, BrokenPipeError) and closed_outputs()
+        record.status = "interrupted" if stopped else "failed"
+        record.error = f"{type(error).__name__}: {error}"
+        raise
+    finally:
+        if writes:
+            run_record.write(folder, record)
 
 
 def claim(folder: Path) -> None:
@@ -127,9 +172,6 @@ def _load_data(cfg: DictConfig) -> CloudDataset:
             f"dataset: {cfg.dataset.get('_target_')} must return a CloudDataset, got "
             f"{type(dataset).__name__}."
         )
-    points = dataset.train.points.shape[1]
-    if cfg.m > points:
-        raise UserError(f"m must be at most the {points} points of a cloud, got m={cfg.m}.")
     test = noisy(dataset.test, cfg.test_noise_std)
     if not torch.isfinite(test.points).all():
         raise UserError(

@@ -1,27 +1,24 @@
-"""The stages of a run whose parts are built: load weights, warm start, fit, test, save."""
+"""The stages of a run after its weights are loaded: warm start, fit, test, save."""
 
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import nn
 
-from mops_lightning.data.loader import Augmentation, CloudLoader
+from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records.metric_info import foreign_metrics
 from mops_lightning.records.readout_names import parse
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.divergence import Diverged, with_checkpoint
-from mops_lightning.training.evaluation import nets
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.recipe.warm_start import warm_start as warm_start_sampler
-from mops_lightning.training.run.build import Parts
-from mops_lightning.training.run.loaders import augmentation, score_loader
+from mops_lightning.training.run.build import Parts, augmentation
 from mops_lightning.training.run.trainer import log_hparams
 from mops_lightning.viz.snapshots import CLOUDS
 from mops_lightning.zoo import weights
@@ -47,42 +44,17 @@ def warm_start(parts: Parts, record: RunRecord) -> None:
         print(f"Warm start: {text}.")
 
 
-def _recipe(parts: Parts) -> dict[str, Any] | None:
-    recipe = parts.experiment.recipe
-    if recipe == Recipe():
-        return None
-    if parts.experiment.sampler is None:
-        return {"task_points": recipe.task_points}
-    return {"name": parts.cfg.names.recipe, **asdict(recipe)}
-
-
-def load(parts: Parts, record: RunRecord, task_weights: Path | None) -> None:
-    """Load the weights of the task net, and those of an evaluated run.
-
-    Raises:
-        UserError: they do not fit.
-    """
-    task = parts.experiment.task
-    if task_weights is not None:
-        try:
-            content = weights.read(task_weights)
-            weights.fit_state(task, content["state"], task_weights)
-        except UserError as error:
-            raise UserError(f"weights: {error}") from None
-        record.weights_loaded = content["sha256"]
-        if task.requires_same_classes and content.get("classes"):
-            nets.check_classes(content["classes"], parts.dataset, f"weights: {task_weights}")
-    if parts.trained is not None:
-        record.evaluated = nets.load(parts.trained, parts.cfg, parts.experiment, parts.dataset)
-
-
 def fit(parts: Parts, record: RunRecord) -> None:
     """Train the learned parts, from the checkpoint if the run is resumed.
 
     Raises:
         UserError: too little data, or training that diverged.
     """
-    record.recipe = _recipe(parts)
+    recipe = parts.experiment.recipe
+    if recipe != Recipe():
+        named = {"name": parts.cfg.names.recipe, **asdict(recipe)}
+        only_task = {"task_points": recipe.task_points}
+        record.recipe = only_task if parts.experiment.sampler is None else named
     cfg, trainer, experiment = parts.cfg, parts.trainer, parts.experiment
     resumed = parts.resumed.path if parts.resumed else None
     task, clouds = experiment.task, len(parts.train.labels)
@@ -96,15 +68,13 @@ def fit(parts: Parts, record: RunRecord) -> None:
         parts.train,
         cfg.batch_size,
         shuffle=True,
-        augment=Augmentation(**augmentation(cfg)),
+        augment=augmentation(cfg),
         make_batch=task.make_batch,
         drop_last=True,
         seed=cfg.seed,
         part=parts.part,
     )
-    validation = None
-    if len(parts.held_out.labels):
-        validation = score_loader(parts.held_out, cfg.batch_size, task, parts.part)
+    validation = parts.score_loader(parts.held_out) if len(parts.held_out.labels) else None
     try:
         with _interruptible(), _monitoring():
             trainer.fit(parts.experiment, loader, validation, ckpt_path=resumed)
@@ -136,8 +106,7 @@ def test(parts: Parts, record: RunRecord) -> None:
     """Score all test clouds."""
     experiment, trainer = parts.experiment, parts.trainer
     with _interruptible():
-        loader = score_loader(parts.dataset.test, parts.cfg.batch_size, experiment.task, parts.part)
-        trainer.test(experiment, loader, verbose=False)
+        trainer.test(experiment, parts.score_loader(parts.dataset.test), verbose=False)
     record.metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
     log_hparams(trainer, record.config, _scores_at_own_size(record.metrics, experiment))
     if experiment.learn in ("sampler", "nothing") and parts.has_task_weights:

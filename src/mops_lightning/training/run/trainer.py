@@ -14,9 +14,11 @@ from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig
+from torch import Tensor
 
 from mops_lightning.config.build import accepted, build
 from mops_lightning.data.clouds import CloudDataset
+from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.records.run_record import dotted
@@ -24,7 +26,6 @@ from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.moving_average import MovingAverage
 from mops_lightning.training.run.callbacks import StopBetweenSteps, build_callbacks
-from mops_lightning.training.run.loaders import clouds_to_draw, score_loader
 
 HARMLESS = (
     ".*does not have many workers.*",  # the data are in memory; workers would only copy them
@@ -95,7 +96,7 @@ def make_trainer(
     offered = {"folder": folder, "checkpoint": folder / "checkpoints" / CHECKPOINT, "score": score}
     rows, titles = clouds_to_draw(dataset, cfg.pictures)
     if titles:
-        batch = score_loader(dataset.test, cfg.batch_size, task).batch_of(rows)
+        batch = CloudLoader(dataset.test, cfg.batch_size, make_batch=task.make_batch).batch_of(rows)
         offered |= {"batch": batch, "titles": titles}
     span = experiment.recipe.ema_span
     callbacks = [
@@ -122,6 +123,21 @@ def make_trainer(
             "bf16-mixed."
         )
     return trainer
+
+
+def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str]]:
+    """Choose test clouds of different classes, spread over all classes.
+
+    Returns:
+        Rows of the test split, at most ``number``, and the names of their classes.
+    """
+    labels = dataset.test.labels
+    classes = len(dataset.class_names)
+    wanted = torch.linspace(0, classes - 1, min(max(number, 1), classes)).round().long()
+    rows = [int((labels == label).nonzero()[0]) for label in wanted.unique() if label in labels]
+    rows = rows[:number]
+    names = [dataset.class_names[int(labels[row])] for row in rows]
+    return torch.tensor(rows, dtype=torch.int64), names
 
 
 def _logger(node: DictConfig, folder: Path) -> Any:

@@ -1,5 +1,6 @@
-"""Loading the nets of a trained run, and refusing settings that they do not fit."""
+"""The first stage of a run whose parts are built: weights from files, and what they must fit."""
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -7,14 +8,34 @@ from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
-from mops_lightning.records.run_record import Evaluated
+from mops_lightning.records.run_record import Evaluated, RunRecord
 from mops_lightning.training.checkpoint import CHECKPOINT, read_plain
-from mops_lightning.training.evaluation.trained_run import KEY, OF_RUN, TrainedRun
+from mops_lightning.training.evaluation import KEY, OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.run.build import Parts
 from mops_lightning.zoo import weights
 
 
-def load(
+def load(parts: Parts, record: RunRecord, task_weights: Path | None) -> None:
+    """Load the weights of the task net, and those of an evaluated run.
+
+    Raises:
+        UserError: they do not fit.
+    """
+    task = parts.experiment.task
+    if task_weights is not None:
+        try:
+            content = weights.load_into(task, task_weights)
+        except UserError as error:
+            raise UserError(f"weights: {error}") from None
+        record.weights_loaded = content["sha256"]
+        if task.requires_same_classes and content.get("classes"):
+            check_classes(content["classes"], parts.dataset, f"weights: {task_weights}")
+    if parts.trained is not None:
+        record.evaluated = load_trained(parts.trained, parts.cfg, parts.experiment, parts.dataset)
+
+
+def load_trained(
     trained: TrainedRun, cfg: DictConfig, experiment: Experiment, dataset: CloudDataset
 ) -> Evaluated:
     """Load the nets of a trained run into an experiment.
@@ -83,8 +104,8 @@ def check_classes(names: list[str] | None, dataset: CloudDataset, what: str) -> 
 
 def _load_task(task: torch.nn.Module, trained: TrainedRun) -> None:
     """Load the task net from a jointly trained run's weights, or from the run's checkpoint."""
-    place, record = trained.place, trained.record
-    if "task_weights" in record.files:
+    place = trained.place
+    if "task_weights" in trained.record.files:
         weights.load_into(task, weights.of_run(place, "task_weights"))
         return
     if place.is_file():
@@ -98,7 +119,7 @@ def _load_task(task: torch.nn.Module, trained: TrainedRun) -> None:
     own = {
         key.removeprefix("task."): value for key, value in state.items() if key.startswith("task.")
     }
-    if weights.digest(own) != record.task_weights_sha256:
+    if weights.digest(own) != trained.record.task_weights_sha256:
         raise UserError(f"{path} does not belong to the run in its folder. Give weights=FILE.")
     weights.fit_state(task, own, path)
 

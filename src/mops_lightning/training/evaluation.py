@@ -1,6 +1,12 @@
-"""The settings of an evaluation: those of the trained run's record, then those of the user."""
+"""``evaluate=RUN``: the trained run, and the settings of its evaluation.
 
+RUN is a folder, or a model, whose header contains a record. A record may come from anybody: nothing
+that names code is taken from it, and no path in place of a choice.
+"""
+
+import re
 from copy import deepcopy
+from dataclasses import dataclass
 from inspect import Parameter
 from pathlib import Path
 from typing import Any
@@ -13,8 +19,16 @@ from mops_lightning.config.build import signature
 from mops_lightning.config.settings import Affects
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
-from mops_lightning.records.run_record import dotted
-from mops_lightning.training.evaluation.trained_run import KEY, NAME, OF_RUN, TrainedRun
+from mops_lightning.records import run_record
+from mops_lightning.records.run_record import RunRecord, dotted
+from mops_lightning.training.checkpoint import CHECKPOINT
+from mops_lightning.zoo import model_file, names
+
+KEY = "evaluate"
+OF_RUN = "run"
+"""``weights=run``: the task net that the evaluated run was trained with."""
+NAME = re.compile(r"[A-Za-z0-9_-]+")
+"""A choice of a group, or a part of a setting's name."""
 
 OF_SAMPLER = (
     *("learn", "experiment", "optimizer", "task_lr_scale", "recipe", "trainer.max_epochs"),
@@ -27,6 +41,96 @@ OF_TRAINING = (
     *("trainer.gradient_clip_algorithm", "trainer.accumulate_grad_batches"),
 )
 """Settings of any training."""
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A completed run that trained something, or a model.
+
+    Attributes:
+        name: as the user gave it.
+        place: the run's folder, or the model's file.
+        record: its record.
+    """
+
+    name: str
+    place: Path
+    record: RunRecord
+
+    @classmethod
+    def read(cls, name: str) -> "TrainedRun":
+        """Read the record of a run or model.
+
+        Raises:
+            UserError: there is none, or it is not the record of a completed run with weights.
+        """
+        name = name.removesuffix(f"/{run_record.FILE}")
+        try:
+            place = names.resolve(name)
+            if place.is_file() and place.suffix == model_file.SUFFIX:
+                card = model_file.read_card(place)
+                return cls(name, place, run_record.from_plain(card["record"]))
+            if not place.is_dir():
+                raise UserError(
+                    f"no folder {place}. Give a model, or the folder of a run, with result.json."
+                )
+            record = run_record.read(place)
+        except UserError as error:
+            raise UserError(f"{KEY}: {error}") from None
+        if record.status != "completed":
+            hint = "Give a completed run."
+            if (place / "checkpoints" / CHECKPOINT).is_file():
+                hint = f"Finish it with its own command and ckpt_path={place}."
+            state = {"failed": "failed", "running": "is still running or was killed"}
+            raise UserError(f"{KEY}: {place} {state.get(record.status, 'was interrupted')}. {hint}")
+        if "weights" not in record.files:
+            raise UserError(
+                f"{KEY}: {place} trained nothing, or its weights were not kept; "
+                "run its own command with other settings."
+            )
+        return cls(name, place, record)
+
+    @property
+    def trained_task_net(self) -> bool:
+        """Whether it trained a task net alone."""
+        return bool(self.record.config["learn"] == "task")
+
+    def choices(self) -> list[str]:
+        """Return the choices of groups that it was composed from, as overrides.
+
+        Raises:
+            UserError: the record chooses a file by a path.
+        """
+        used = self.record.config["names"]
+        groups = {group: used[group] for group in ("task", "dataset", "sampler")}
+        chosen = [f"{group}={choice}" for group, choice in groups.items()]
+        for argument in self.record.overrides:
+            key = overrides.key(argument)
+            if ("/" in key or "@" in key) and _is_repeated(overrides.path(argument)):
+                chosen.append(overrides.readable(argument))
+        for argument in chosen:
+            override = overrides.parse(argument)
+            if override is None or not NAME.fullmatch(str(override.value())):
+                raise self.not_accepted(argument)
+        return chosen
+
+    def not_accepted(self, setting: str) -> UserError:
+        """Return the error about a setting that no record may choose."""
+        return UserError(
+            f"{KEY}: the record of {self.name} sets {setting}, which is not accepted from a "
+            "record. If you trust it, give it on the command line."
+        )
+
+
+def _is_repeated(path: str) -> bool:
+    """Return whether an evaluation repeats a setting of the run."""
+    top = path.partition(".")[0]
+    return top in settings.declared() and top != "names" and settings.of(path).repeated
+
+
+def _is_special(path: str) -> bool:
+    """Return whether a setting is a special key such as ``_target_``, or is below one."""
+    return any(part.startswith("_") for part in path.split("."))
 
 
 def command_line(arguments: list[str]) -> list[str]:
@@ -122,7 +226,9 @@ def as_trained(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -> Di
     """
     chosen = trained.choices()
     changed = [overrides.path(argument) for argument in arguments if argument not in chosen]
-    trained.check_classes(changed)
+    for path in map(overrides.path, trained.record.overrides):
+        if _is_special(path) and _is_repeated(path) and path not in changed:
+            raise trained.not_accepted(path)
     try:
         merged = _recorded(cfg, trained)
         sampler = _plain(merged.sampler)
@@ -176,13 +282,16 @@ def _recorded(cfg: DictConfig, trained: TrainedRun) -> DictConfig:
         for path, value in recorded.items():
             if not all(map(NAME.fullmatch, path.split("."))) or _names_code(value):
                 raise trained.not_accepted(path)
-            if path not in follows and (path in overridden or _exists(cfg, path)):
+            node, name = _node_of(cfg, path)
+            exists = path in overridden or name in node or name in _parameters(node, path)
+            if exists and path not in follows:
                 OmegaConf.update(merged, path, value, merge=False)
         for path in present.keys() - recorded.keys() - follows:
-            parameter = _parameter(merged, path)
+            node, name = _node_of(merged, path)
+            parameter = _parameters(node, path).get(name)
             if parameter is not None and parameter.default is not parameter.empty:
                 OmegaConf.update(merged, path, parameter.default, merge=False)
-        resolved = dotted(OmegaConf.to_container(merged, resolve=True))
+        resolved = dotted(_plain(merged))
         for path in follows & recorded.keys():
             if resolved.get(path) != recorded[path]:
                 OmegaConf.update(merged, path, recorded[path], merge=False)
@@ -191,41 +300,32 @@ def _recorded(cfg: DictConfig, trained: TrainedRun) -> DictConfig:
 
 def _leaves(config: Any) -> dict[str, Any]:
     """Return the settings that an evaluation repeats, by dotted path, without classes."""
-    known = settings.declared()
     return {
         path: value
         for path, value in dotted(config).items()
-        if (top := path.partition(".")[0]) in known
-        and top != "names"
-        and settings.of(path).repeated
-        and not any(part.startswith("_") for part in path.split("."))
+        if _is_repeated(path) and not _is_special(path)
     }
 
 
-def _exists(cfg: DictConfig, path: str) -> bool:
-    """Return whether a configuration has a setting, or the class of its node takes it."""
+def _node_of(cfg: DictConfig, path: str) -> tuple[Any, str]:
+    """Return the node of a setting, empty if there is none, and the setting's name in it."""
     where, _, name = path.rpartition(".")
-    node = OmegaConf.select(cfg, where) if where else cfg
-    return isinstance(node, DictConfig) and (name in node or _parameter(cfg, path) is not None)
+    node = OmegaConf.select(cfg, where)
+    return node if isinstance(node, DictConfig) else {}, name
 
 
-def _parameter(cfg: DictConfig, path: str) -> Parameter | None:
-    """Return the argument that a setting is of the class of its node, if the class has it."""
-    where, _, name = path.rpartition(".")
-    node = OmegaConf.select(cfg, where) if where else None
-    if not isinstance(node, DictConfig) or "_target_" not in node:
-        return None
-    return signature(str(node["_target_"]), where).get(name)
+def _parameters(node: Any, path: str) -> dict[str, Parameter]:
+    """Return the arguments of the class that a setting's node describes, if any."""
+    return signature(str(node["_target_"]), path.rpartition(".")[0]) if "_target_" in node else {}
 
 
 def _restore(merged: DictConfig, cfg: DictConfig, path: str) -> None:
     """Set a setting that the user gave to the user's value, or remove it as the user did."""
-    where, _, name = path.rpartition(".")
-    source = OmegaConf.select(cfg, where) if where else cfg
-    target = OmegaConf.select(merged, where) if where else merged
-    if isinstance(source, DictConfig) and name in source:
+    source, name = _node_of(cfg, path)
+    target, _ = _node_of(merged, path)
+    if name in source:
         OmegaConf.update(merged, path, source._get_node(name), merge=False)
-    elif isinstance(target, DictConfig) and name in target:
+    elif name in target:
         del target[name]
 
 

@@ -14,7 +14,7 @@ from mops_lightning.samplers.snet import ProgressiveSNet
 from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.sizes import sizes_to_test
+from mops_lightning.training.run.build import sizes_to_test
 from tests.support.recording import Fingerprint, RecordingTask
 from tests.support.training import quiet_trainer, small_dataset
 

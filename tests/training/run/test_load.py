@@ -8,7 +8,7 @@ from mops_lightning.config.compose import compose
 from mops_lightning.config.overrides import readable
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-from mops_lightning.training.evaluation.settings import command_line
+from mops_lightning.training.evaluation import command_line
 from mops_lightning.training.run.run import run
 from mops_lightning.zoo import publish
 from tests.support.command_line import SMALL_PCRNET, TINY, call, runs

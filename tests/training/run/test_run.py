@@ -3,7 +3,7 @@ import pytest
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records import run_record
-from mops_lightning.training.run.recording import recorded
+from mops_lightning.training.run.run import recorded
 
 
 def test_recorded_running_then_completed(tmp_path):

@@ -9,8 +9,7 @@ from omegaconf import OmegaConf
 from mops_lightning.config.compose import compose
 from mops_lightning.config.overrides import readable
 from mops_lightning.errors import UserError
-from mops_lightning.training.evaluation.settings import as_trained, command_line
-from mops_lightning.training.evaluation.trained_run import TrainedRun
+from mops_lightning.training.evaluation import TrainedRun, as_trained, command_line
 from tests.support.command_line import TINY
 from tests.support.records import record
 
