@@ -11,7 +11,6 @@ from mops_lightning.filesystem import (
     is_temporary,
     load_npz,
     remove_temporary,
-    set_aside,
 )
 
 
@@ -61,15 +60,6 @@ def test_remove_temporary_keeps_what_is_being_written(tmp_path):
         remove_temporary(tmp_path)
     assert path.read_text() == "text"
     remove_temporary(path / "below")  # no folder
-
-
-def test_set_aside_keeps_every_damaged_file(tmp_path):
-    path = tmp_path / "last.ckpt"
-    for text in ("first", "second", "third"):
-        path.write_text(text)
-        assert set_aside(path).read_text() == text
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"last.ckpt.damaged", "last.ckpt.damaged-2", "last.ckpt.damaged-3"}
 
 
 def test_load_npz_small_file_of_large_arrays_is_refused(tmp_path, monkeypatch):

@@ -17,9 +17,6 @@ if sys.platform != "win32":
 TEMPORARY = ".mops_lightning-"
 """What names of temporary files start with."""
 
-DAMAGED = "damaged"
-"""Part of the names of files that were set aside."""
-
 MEMORY, MEMORY_PER_BYTE = 2 << 30, 200
 """Bytes that the content of a file may take, and more per byte of the file."""
 
@@ -106,22 +103,6 @@ def remove_temporary(folder: Path, below: bool = True) -> None:
             with suppress(OSError), path.open("rb+") as file:  # in use, gone, or another user's
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 path.unlink()
-
-
-def set_aside(path: Path) -> Path:
-    """Rename a damaged file so that nothing reads it any more.
-
-    Args:
-        path: the file.
-
-    Returns:
-        Its new path, in the same folder: ``last.ckpt.damaged``, or ``last.ckpt.damaged-2``.
-    """
-    number, target = 1, path.with_name(f"{path.name}.{DAMAGED}")
-    while target.exists():
-        number += 1
-        target = path.with_name(f"{path.name}.{DAMAGED}-{number}")
-    return path.rename(target)
 
 
 def memory(path: Path) -> int:

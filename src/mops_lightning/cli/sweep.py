@@ -21,7 +21,7 @@ from mops_lightning.cli.start import make
 from mops_lightning.config import settings
 from mops_lightning.config.settings import Affects
 from mops_lightning.errors import Interrupted, UserError, file_error, memory_error
-from mops_lightning.filesystem import remove_temporary, set_aside
+from mops_lightning.filesystem import remove_temporary
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
 
@@ -123,18 +123,14 @@ def _claimed(folder: Path) -> Iterator[None]:
 
 
 def _earlier(cfg: DictConfig, folder: Path) -> tuple[str, float] | None:
-    """Return status and score of the record in the cell's folder; a damaged one is set aside.
+    """Return status and score of the record in the cell's folder.
 
     Raises:
-        UserError: it has other settings.
+        UserError: it is damaged, or has other settings.
     """
     if not (folder / run_record.FILE).exists():
         return None
-    try:
-        record = run_record.read(folder)
-    except UserError as error:
-        log.warning(f"{error} Renamed to {set_aside(folder / run_record.FILE).name}.")
-        return "damaged", math.nan
+    record = run_record.read(folder)
     different = _differences(cfg, record)
     if different:
         # The setting itself, not one that is derived from it.
@@ -164,7 +160,7 @@ def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
 
     Neither a failed attempt nor any attempt before it is resumed.
     """
-    from mops_lightning.training.checkpoint import CHECKPOINT, read_or_set_aside
+    from mops_lightning.training.checkpoint import CHECKPOINT
 
     for attempt in sorted(_attempts(folder), key=lambda path: int(path.name), reverse=True):
         try:
@@ -174,7 +170,7 @@ def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
         if record.status == "failed" or _differences(cfg, record):
             return None
         path = attempt / "checkpoints" / CHECKPOINT
-        if path.is_file() and read_or_set_aside(path):
+        if path.is_file():
             return path
     return None
 

@@ -1,17 +1,16 @@
 """Finding the checkpoint to resume from, and checking that it belongs to this run."""
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from mops_lightning.config.shared_settings import training_settings
 from mops_lightning.errors import UserError
-from mops_lightning.filesystem import set_aside
-from mops_lightning.records import run_record
 from mops_lightning.zoo import weights
 
 CHECKPOINT = "last.ckpt"
@@ -35,22 +34,14 @@ def checkpoint_identity(config: dict[str, Any], fingerprint: str) -> dict[str, s
         config: the run's settings as plain data, interpolations resolved.
         fingerprint: the data set's fingerprint.
     """
-    parts = {
-        **training_settings(config),
-        "dataset": fingerprint,
-        **_weights_hash(config["weights"]),
-    }
+    parts = {**training_settings(config), "dataset": fingerprint}
+    if config["weights"] not in (None, "auto", "run"):
+        try:
+            content = weights.read(weights.of_task_net(config["weights"]))
+        except UserError as error:
+            raise UserError(f"weights: {error}") from None
+        parts["weights"] = str(content["sha256"])
     return {name: json.dumps(value, sort_keys=True) for name, value in parts.items()}
-
-
-def _weights_hash(name: str | None) -> dict[str, str]:
-    """Return the hash of the weights file that the user gave, if any."""
-    if name is None or name in ("auto", "run"):
-        return {}
-    try:
-        return {"weights": str(weights.read(weights.of_task_net(name))["sha256"])}
-    except UserError as error:
-        raise UserError(f"weights: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -108,8 +99,8 @@ def find_checkpoint(cfg: DictConfig, identity: dict[str, str]) -> Checkpoint | N
     if cfg.ckpt_path is None:
         return None
     newest = cfg.ckpt_path == "last"
-    checkpoint = _newest(cfg, identity) if newest else _named(cfg.ckpt_path, identity)
-    if checkpoint is not None and cfg.trainer.max_epochs < checkpoint.done:
+    checkpoint = _newest(Path(cfg.out), identity) if newest else _named(cfg.ckpt_path, identity)
+    if cfg.trainer.max_epochs < checkpoint.done:
         raise UserError(
             f"trainer.max_epochs must be at least {checkpoint.done}, the epochs of "
             f"{checkpoint.path}, got {cfg.trainer.max_epochs}."
@@ -144,53 +135,25 @@ def _named(name: str, identity: dict[str, str]) -> Checkpoint:
     return checkpoint
 
 
-def _newest(cfg: DictConfig, identity: dict[str, str]) -> Checkpoint | None:
-    """Return the newest checkpoint of these settings; None if it was damaged and has no older one.
-
-    Damaged ones are set aside.
-    """
-    out = Path(cfg.out)
+def _newest(out: Path, identity: dict[str, str]) -> Checkpoint:
+    """Return the newest checkpoint of these settings below ``out``."""
     paths = sorted(
         out.glob(f"**/checkpoints/{CHECKPOINT}"), key=lambda p: p.stat().st_mtime, reverse=True
     )
-    lost = False
     for path in paths:
-        checkpoint = read_or_set_aside(path)
-        if checkpoint is None:
-            lost |= _has_settings(path.parents[1], cfg)
-        elif not _different(checkpoint.identity, identity):
-            return checkpoint
-    if lost:
-        print("No other checkpoint has these settings: the run starts again.", flush=True)
-        return None
+        with suppress(weights.Damaged):
+            checkpoint = Checkpoint.read(path)
+            if not _different(checkpoint.identity, identity):
+                return checkpoint
     raise UserError(
         f"ckpt_path=last: none of the {len(paths)} checkpoints below {out} has these settings. "
         "Leave ckpt_path out to start a new run, or give a run's folder."
     )
 
 
-def _has_settings(folder: Path, cfg: DictConfig) -> bool:
-    """Return whether the record in a folder has the settings that affect training here."""
-    plain: Any = OmegaConf.to_container(cfg, resolve=True)
-    try:
-        recorded = {**run_record.read(folder).config, "trainer": plain["trainer"]}
-        return training_settings(recorded) == training_settings(plain)
-    except (UserError, KeyError):
-        return False
-
-
 def _different(old: dict[str, str], new: dict[str, str]) -> list[str]:
     names = [name for name in {**new, **old} if name != LENGTH]
     return [name for name in names if old.get(name) != new.get(name)]
-
-
-def read_or_set_aside(path: Path) -> Checkpoint | None:
-    """Read a checkpoint; rename one that cannot be resumed, and print one line about it."""
-    try:
-        return Checkpoint.read(path)
-    except weights.Damaged as error:
-        print(f"{error} Renamed to {set_aside(path).name}.", flush=True)
-        return None
 
 
 def read_plain(path: Path, what: str) -> Any:

@@ -9,7 +9,7 @@ from torch import nn
 
 from mops_lightning.nets.layers import PointFeatures, PointMLP
 from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.training.recipe.warm_start import copy_pointwise_layers, copy_tensors, described
+from mops_lightning.training.recipe.warm_start import copy_pointwise_layers, copy_tensors
 from mops_lightning.zoo import weights
 from tests.support.command_line import TINY, call
 
@@ -45,12 +45,6 @@ def test_sampler_of_another_size_continues_from_a_run(tmp_path):
     status, _, err = run(tmp_path, "fourth", f"recipe.warm_start={tmp_path / 'nothing.pt'}")
     assert status != 0
     assert "recipe.warm_start: no file" in err
-
-
-def test_described_names_tensors_that_are_not_copied():
-    assert described(["a"], ["a"], "FILE") == "1 of 1 tensors are copies of FILE"
-    assert described(["a"], ["a", "b"], "FILE").endswith("copies of FILE; not copied: b")
-    assert described(["a"], list("abcde"), "FILE").endswith("not copied: b, c, d, ...")
 
 
 def test_copy_pointwise_layers_copies_until_shapes_differ():

@@ -143,25 +143,14 @@ def full_predictions(task: Task, full: FullClouds, device: torch.device) -> Tens
     named = hashlib.sha256(weights.digest(task.state_dict()).encode())
     named.update(full.clouds.points.numpy().tobytes())
     path = full.cache / "predictions" / f"{named.hexdigest()[:16]}.pt"
-    predictions = _read(path, len(full.clouds.points))
-    if predictions is None:
-        predictions = _predict(task, full, device)
-        remove_temporary(path.parent, below=False)
-        with atomic_write(path) as temporary:
-            torch.save(predictions, temporary)
+    if path.is_file():
+        kept: Tensor = read_plain(path, "predictions")
+        return kept
+    predictions = _predict(task, full, device)
+    remove_temporary(path.parent, below=False)
+    with atomic_write(path) as temporary:
+        torch.save(predictions, temporary)
     return predictions
-
-
-def _read(path: Path, rows: int) -> Tensor | None:
-    """Return the predictions in a file; None if it holds none for these clouds."""
-    if not path.is_file():
-        return None
-    try:
-        kept = read_plain(path, "predictions")
-    except UserError:
-        return None
-    usable = isinstance(kept, Tensor) and len(kept) == rows and bool(kept.isfinite().all())
-    return kept if usable else None
 
 
 @torch.no_grad()

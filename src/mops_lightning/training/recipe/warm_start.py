@@ -1,6 +1,5 @@
 """Starting a sampler with copies of the task net's layers, or of another sampler's tensors."""
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -58,22 +57,13 @@ def _from_file(name: str, sampler: nn.Module) -> tuple[dict[str, Any], str]:
             "a sampler of the same kind."
         )
     numbers = {"sha256": content["sha256"], "tensors": len(copied)}
-    return numbers, described(copied, list(sampler.state_dict()), name)
-
-
-def described(copied: Sequence[str], tensors: Sequence[str], name: str) -> str:
-    """Return how many of a sampler's tensors are copies, and which are not.
-
-    Between samplers with and without anchors, the last layer is not.
-
-    Args:
-        copied: names of the copies.
-        tensors: all names.
-        name: the file that the copies are from.
-    """
+    tensors = list(sampler.state_dict())
     text = f"{len(copied)} of {len(tensors)} tensors are copies of {name}"
+    # Between samplers with and without anchors, the last layer is not copied.
     new = [tensor for tensor in tensors if tensor not in copied]
-    return f"{text}; not copied: {', '.join(new[:3])}{', ...' if new[3:] else ''}" if new else text
+    if new:
+        text += f"; not copied: {', '.join(new[:3])}{', ...' if new[3:] else ''}"
+    return numbers, text
 
 
 @torch.no_grad()

@@ -157,22 +157,15 @@ def _add_meshes(
     """Show ``MESHES`` clouds with each readout, to be turned with the mouse."""
     for name, chosen in samples.items():
         for number, title in enumerate(titles[:MESHES]):
-            vertices, colours = _coloured(points[number], chosen[number], name)
+            shown = (points[number], chosen[number])
+            colours = [
+                torch.tensor(colour, dtype=torch.uint8).expand(len(part), 3)
+                for colour, part in zip((INPUT_COLOUR, COLOURS[name]), shown, strict=True)
+            ]
             board.experiment.add_mesh(
                 f"{name}/{number}_{title}",
-                vertices=vertices,
-                colors=colours,
+                vertices=torch.cat(shown).cpu()[None],
+                colors=torch.cat(colours)[None],
                 config_dict={"material": {"cls": "PointsMaterial", "size": 0.03}},
                 global_step=step,
             )
-
-
-def _coloured(points: Tensor, samples: Tensor, readout: str) -> tuple[Tensor, Tensor]:
-    """Join one cloud and its samples, ``(1, N + M, 3)``, with a colour for each point."""
-    colours = np.concatenate(
-        [
-            np.tile(np.array(INPUT_COLOUR, np.uint8), (len(points), 1)),
-            np.tile(np.array(COLOURS[readout], np.uint8), (len(samples), 1)),
-        ]
-    )
-    return torch.cat([points, samples]).cpu()[None], torch.from_numpy(colours)[None]

@@ -14,12 +14,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from mops_lightning.config import distributed
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
-from mops_lightning.filesystem import atomic_write, remove_temporary, set_aside
-from mops_lightning.training.checkpoint import (
-    CHECKPOINT,
-    checkpoint_identity,
-    read_or_set_aside,
-)
+from mops_lightning.filesystem import atomic_write, remove_temporary
+from mops_lightning.training.checkpoint import CHECKPOINT, checkpoint_identity
 from mops_lightning.training.evaluation import OF_RUN
 from mops_lightning.training.run.build import Parts
 from mops_lightning.training.run.callbacks import added
@@ -47,7 +43,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, train: Train) -> Path |
         return weights.of_task_net(cfg.weights)
     folder = cache_folder(cfg, dataset)
     remove_temporary(folder)
-    if not _is_good(folder / FILE):
+    if not (folder / FILE).is_file():
         if distributed.started_together(cfg):
             raise UserError(
                 f"weights: {cfg.names.net} must be trained before a launcher starts several "
@@ -55,25 +51,23 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, train: Train) -> Path |
                 "the launcher, or give weights=FILE."
             )
         with _locked(folder, cfg.names.net):
-            if not _is_good(folder / FILE):  # otherwise another process trained it meanwhile
+            if not (folder / FILE).is_file():  # otherwise another process trained it meanwhile
                 epochs = cfg.epochs.task
                 print(
                     f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it "
                     f"first, {epochs} {'epoch' if epochs == 1 else 'epochs'}. Cache: {folder}",
                     flush=True,
                 )
-                _train(cfg, folder, dataset, train)
+                own = task_config(cfg)
+                if (folder / "checkpoints" / CHECKPOINT).is_file():  # of an interrupted training
+                    own.ckpt_path = str(folder)
+                try:
+                    train(own, folder, dataset)
+                except (KeyboardInterrupt, Interrupted):
+                    raise Interrupted(
+                        "The task net was being trained; the same command resumes its training."
+                    ) from None
     return folder / FILE
-
-
-def _is_good(path: Path) -> bool:
-    """Return whether there is a weights file that can be loaded."""
-    try:
-        return path.is_file() and bool(weights.read(path))
-    except weights.Damaged:
-        return False
-    except UserError as error:
-        raise UserError(f"weights: {error}") from None
 
 
 def task_config(cfg: DictConfig) -> DictConfig:
@@ -117,7 +111,7 @@ def publish(parts: Parts) -> None:
     if parts.resumed is not None and parts.resumed.planned != cfg.trainer.max_epochs:
         return
     target = cache_folder(cfg, parts.dataset) / FILE
-    if not _is_good(target):
+    if not target.is_file():
         remove_temporary(target.parent, below=False)
         with atomic_write(target) as temporary:
             shutil.copyfile(parts.folder / FILE, temporary)
@@ -141,26 +135,3 @@ def _locked(folder: Path, net: str) -> Iterator[None]:
         yield
     finally:
         lock.release()
-
-
-def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset, train: Train) -> None:
-    """Train the task net in its cache folder, or resume a training that was interrupted there."""
-    own = task_config(cfg)
-    if (folder / FILE).exists():
-        print(f"{folder / FILE} is damaged. Renamed to {set_aside(folder / FILE).name}.")
-    path = folder / "checkpoints" / CHECKPOINT
-    if path.is_file() and read_or_set_aside(path):
-        own.ckpt_path = str(folder)
-    try:
-        try:
-            train(own, folder, dataset)
-        except weights.Damaged as error:
-            if own.ckpt_path is None:
-                raise
-            print(f"{error} Renamed to {set_aside(path).name}.", flush=True)
-            own.ckpt_path = None
-            train(own, folder, dataset)
-    except (KeyboardInterrupt, Interrupted):
-        raise Interrupted(
-            "The task net was being trained; the same command resumes its training."
-        ) from None
