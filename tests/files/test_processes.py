@@ -36,12 +36,12 @@ def test_processes_bad_files_fail_alone(tmp_path):
     path.write_text("1 2 3\n")
     kinds = ["good", "abort", "good", "hang", "eat", "good"]
     processes = Processes(2)
-    results = dict(processes.run(job, [(path, kind) for kind in kinds]))
+    results = dict(processes.map(job, [(path, kind) for kind in kinds]))
     assert results[1] == Died(signal.SIGABRT)
     assert results[3] == Died(signal.SIGALRM)
     assert results[4] == "too much memory"
     assert all(isinstance(results[place], int) for place in (0, 2, 5))
-    again = dict(processes.run(job, [(path, "good")] * 3))
+    again = dict(processes.map(job, [(path, "good")] * 3))
     assert set(again.values()) & set(results.values()), "live processes are used again"
 
 
@@ -49,7 +49,7 @@ def test_processes_closed_early_end_their_jobs(tmp_path):
     path = tmp_path / "a.xyz"
     path.write_text("1 2 3\n")
     processes = Processes(2)
-    results = processes.run(sleep, [(tmp_path / "begun", 0), (tmp_path / "deleted", 60)])
+    results = processes.map(sleep, [(tmp_path / "begun", 0), (tmp_path / "deleted", 60)])
     assert next(results) == (0, None)
     while not (tmp_path / "deleted").exists():
         time.sleep(0.01)

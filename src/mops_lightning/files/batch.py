@@ -134,7 +134,7 @@ def _results(
         return
     shared = workers if workers > 1 else None
     calls = ((*pair, options, shared) for pair in pairs)
-    for place, result in processes(min(workers, len(pairs))).run(attempt, calls):
+    for place, result in processes(min(workers, len(pairs))).map(attempt, calls):
         yield pairs[place], _death(pairs[place][0], result) if isinstance(result, Died) else result
 
 

@@ -45,7 +45,7 @@ class Processes:
         self.number = number
         self._idle: list[_Process] = []
 
-    def run(
+    def map(
         self, function: Callable[..., Any], jobs: Iterable[tuple[Any, ...]]
     ) -> Generator[tuple[int, Any], None, None]:
         """Call ``function(*job)`` for every job.
