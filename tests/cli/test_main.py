@@ -19,12 +19,6 @@ def test_subcommand_help_names_the_subcommand(name, tmp_path):
     assert out.startswith(f"usage: mops_lightning {name} [-h]")
 
 
-def test_report_module_help_names_the_module():
-    command = [sys.executable, "-m", "mops_lightning.report", "--help"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("usage: python -m mops_lightning.report [-h]")
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -63,7 +57,6 @@ def test_unknown_subcommand_names_the_nearest(typed, near, tmp_path):
         ["mops_lightning", "--help"],
         ["mops_lightning", "--cfg", "job"],
         ["mops_lightning", "report", "--help"],
-        ["mops_lightning.report", "--help"],
         ["mops_lightning", "downsample", "--help"],
     ],
 )

@@ -1,5 +1,5 @@
 from tests.support.records import evaluated
-from tests.support.reports import put, put_pairs, rows, table
+from tests.support.reports import put, put_cell, put_pairs, rows, table
 
 
 def test_build_shows_records_and_paper(tmp_path):
@@ -81,3 +81,26 @@ def test_recipes_have_rows_of_their_own_with_the_papers_values(tmp_path):
     found = rows(table(tmp_path))
     anchored = [["mops anchored fast", "70.00"], paper]
     assert found[1:] == [["mops", "50.00"], paper, *anchored, ["mops fast", "60.00"], paper]
+
+
+def test_provenance_several_ways_name_runs(tmp_path):
+    values = {"generated": 1.0, "matched": 1.5}
+    for name, m, length in (("short-8", 8, 3), ("short-16", 16, 3), ("long", 32, 9)):
+        put_cell(tmp_path, name, "mops", values, m=m, trainer={"max_epochs": length})
+    put_cell(tmp_path, "other", "samplenet", values, m=8, trainer={"max_epochs": 9})
+    text = table(tmp_path, mixed=True)
+    assert "- mops (short-16, short-8): 3 epochs, seed 0" in text
+    assert "- mops (long): 9 epochs, seed 0" in text
+    assert "- samplenet: 9 epochs, seed 0" in text
+
+
+def test_provenance_hides_other_tasks_and_names_other_nets(tmp_path):
+    put_pairs(tmp_path, "fps", 32, 12.0)
+    put_pairs(tmp_path, "fps", 32, 20.0, net="icp")
+    put(tmp_path, "snet", 32, {"test/full/accuracy": 0.9})
+    path = tmp_path / "snet-32-pointnet" / "result.json"
+    path.write_text(path.read_text().replace('"learn": "sampler"', '"learn": "task"'))
+    text = table(tmp_path)
+    assert "pointnet" not in text
+    assert "- fps under icp: nothing to train" in text
+    assert "- fps: nothing to train" in text

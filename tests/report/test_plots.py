@@ -1,13 +1,10 @@
-import json
 from typing import Any
 
 import pytest
-import torch
 from matplotlib.colors import LogNorm, Normalize
 
 from mops_lightning.report.build import build
 from mops_lightning.report.plots import plots
-from mops_lightning.viz.snapshots import save_clouds
 from tests.support.reports import put, put_cell
 
 
@@ -39,19 +36,3 @@ def test_curves_show_values_by_size(tmp_path):
     assert mops.lines[0].get_ydata().tolist() == [16, 64]
     assert second[1].lines[0].get_ydata().tolist() == [50, 50]
     assert len(third) == 1  # no run has completed sets of MOPS-Net
-
-
-def test_clouds_by_column_draws_each_noise_level(tmp_path, rng):
-    for noise in (0.0, 0.1):
-        for name, readout in (("mops", "generated"), ("fps", "sampled")):
-            path = put_cell(tmp_path, f"{name}{noise}", name, {readout: 1.0}, test_noise_std=noise)
-            content = json.loads(path.read_text())
-            path.write_text(json.dumps({**content, "files": {"clouds": "clouds.npz"}}))
-            points = torch.rand(1, 40, 3, generator=rng)
-            save_clouds(path.parent / "clouds.npz", points, {readout: points[:, :4]}, ["chair"])
-    figure = plots(build(tmp_path))["clouds"]
-    assert [axes.get_title() for axes in figure.axes[:2]] == [
-        "test_noise_std=0",
-        "test_noise_std=0.1",
-    ]
-    assert len(figure.axes) == 4

@@ -67,14 +67,6 @@ def test_training_is_summed_over_sizes_per_seed(tmp_path):
     assert [row[-1] for row in found] == ["training", "700 s", "2,000 s"]
 
 
-def test_equal_cells_of_a_learned_sampler_are_remarked(tmp_path):
-    for alpha in (0.1, 1.0):
-        put_cell(tmp_path, f"{alpha}", "mops", {"generated": 1.037}, of={"alpha": alpha})
-    assert "All cells of mops are equal: what differs changed nothing here." in table(tmp_path)
-    put_cell(tmp_path, "more", "mops", {"generated": 1.5}, of={"alpha": 10.0})
-    assert "are equal" not in table(tmp_path)
-
-
 def test_cells_unknown_metric_is_refused(tmp_path):
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
     with pytest.raises(UserError, match=r"--metric: no run has 'acuracy'.*accuracy"):

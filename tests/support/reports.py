@@ -23,7 +23,8 @@ def put(folder, sampler, m, metrics, task="classification", net="pointnet", **ch
         "task": changes.pop("settings", {}),
         "sampler": changes.pop("of", {}),
     }
-    changes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **changes}
+    score = {"score_name": next(iter(metrics))}
+    changes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **score, **changes}
     target = folder / f"{sampler}-{m}-{net}"
     target.mkdir()
     run_record.write(target, record(config=config, metrics=metrics, **changes))

@@ -1,1 +1,1 @@
-"""Tables, plots and a page from run records: ``python -m mops_lightning.report FOLDER``."""
+"""Tables, plots and a page from run records: ``mops-lightning report FOLDER``."""

@@ -4,18 +4,35 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mops_lightning.errors import UserError
+import pandas as pd
+
 from mops_lightning.records.metric_info import metric_info
-from mops_lightning.records.readout_names import FULL, INDEX_READOUT, parse
+from mops_lightning.records.readout_names import FULL, parse
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report import paper
-from mops_lightning.report.collect import Found, collect, sampler_row, score, trained_with
-from mops_lightning.report.comparable import Group, groups, net_groups, value, weightless
+from mops_lightning.report.collect import (
+    Found,
+    collect,
+    epochs,
+    sampler_row,
+    score,
+    seed,
+    trained_with,
+)
+from mops_lightning.report.comparable import (
+    Group,
+    commit,
+    groups,
+    net_groups,
+    value,
+    weightless,
+)
 from mops_lightning.report.nets import nets_grid
-from mops_lightning.report.provenance import provenance, without_result
 from mops_lightning.report.tables import Table, make_table, net_labels, sort_key
 from mops_lightning.report.text import PAPER, Grid
-from mops_lightning.viz.snapshots import load_clouds
+
+MAX_NAMED = 8
+"""Most runs listed by name that were made in the same way."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +64,13 @@ def build(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Rep
         UserError: there is no record, or no record has a metric.
     """
     found = collect(folder)
-    last = [*without_result(found), *_without_bad_clouds(found.done)]
+    last = _without_result(found)
     chosen = list(metrics)
     scored = [record for record in found.done if record.config["learn"] != "task"]
     if not scored:
         parts = net_groups(found.done, mixed)
         grids = [nets_grid(part, chosen) for part in parts]
-        return Report(found, grids, [*provenance(found.done, ""), *_joining(parts), *last])
+        return Report(found, grids, [*_provenance(found.done, ""), *_joining(parts), *last])
     parts = groups(scored, mixed)
     tables = [
         make_table(part, metric, _net(part))
@@ -66,7 +83,7 @@ def build(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Rep
     hidden = sorted({folder for table in tables for folder in table.hidden})
     lines = [f"- {one}: not shown; a later run has the same row, column and seed" for one in hidden]
     net = tables[0].net if len({table.net for table in tables}) == 1 else ""
-    made = provenance(same, net)
+    made = _provenance(same, net)
     return Report(found, grids, [*made, *lines, *_joining(parts), *last], tables)
 
 
@@ -89,20 +106,6 @@ def _net(group: Group) -> str:
     return trained[0].config["names"]["net"]
 
 
-def _without_bad_clouds(found: list[RunRecord]) -> list[str]:
-    """Take clouds that cannot be read from the records, and return a line for each."""
-    lines = []
-    for record in found:
-        path = Path(record.folder) / record.files.get("clouds", "")
-        try:
-            if path.is_file():
-                load_clouds(path)
-        except (OSError, UserError) as error:
-            del record.files["clouds"]
-            lines.append(f"- {error}")
-    return ["", "Saved clouds that are not shown:", "", *lines] if lines else []
-
-
 def _grids(table: Table) -> list[Grid]:
     """Return the texts of a table, with the values of full clouds."""
     layout = table.group.layout
@@ -116,7 +119,6 @@ def _grids(table: Table) -> list[Grid]:
     about = f" ({table.group.about})" if table.group.about else ""
     for grid in grids:
         grid.title += about
-    grids[0].below += _unchanged(table)
     return grids
 
 
@@ -207,29 +209,18 @@ def _spread(table: Table, name: str) -> str:
     return f"Spread over the plane of {name}: {', '.join(parts)}."
 
 
-def _unchanged(table: Table) -> list[str]:
-    """Return a line for each learned sampler whose values are equal in all cells."""
-    lines = []
-    for name in table.rows():
-        readouts = [one for one in table.readouts(name) if one != INDEX_READOUT]
-        texts = [set(table.of(name, one)["mean"].map(table.metric.format)) for one in readouts]
-        several = readouts and len(table.of(name, readouts[0])) > 1
-        if several and all(len(one) == 1 for one in texts):
-            lines.append(f"All cells of {name} are equal: what differs changed nothing here.")
-    return lines
-
-
 def _costs(table: Table) -> dict[str, str]:
     """Return the seconds of training of every row by size, over all its runs, per seed."""
-    costs: dict[str, list[float]] = {}
-    seeds: dict[str, set[int]] = {}
-    if table.group.layout.column != "m":
+    rows = [
+        {"row": sampler_row(one), "seed": one.seed, "fit": one.seconds["fit"]}
+        for one in table.group.records
+        if "fit" in one.seconds
+    ]
+    if table.group.layout.column != "m" or not rows:
         return {}
-    for record in table.group.records:
-        if "fit" in record.seconds:
-            costs.setdefault(sampler_row(record), []).append(record.seconds["fit"])
-            seeds.setdefault(sampler_row(record), set()).add(record.seed)
-    return {name: f"{sum(one) / len(seeds[name]):,.0f} s" for name, one in costs.items()}
+    by_row = pd.DataFrame(rows).groupby("row")
+    costs = by_row["fit"].sum() / by_row["seed"].nunique()
+    return costs.map("{:,.0f} s".format).to_dict()
 
 
 def _full_row(table: Table) -> list[str]:
@@ -273,3 +264,56 @@ def _names(table: Table) -> dict[str, str]:
     names = table.group.records[0].config["names"]
     sizes = "/".join(str(m) for m in sorted({one.config["m"] for one in table.group.records}))
     return {"task": names["task"], "dataset": names["dataset"], "m": sizes}
+
+
+def _provenance(found: list[RunRecord], net: str) -> list[str]:
+    """Return a line for each way in which runs were made: epochs, seed, device, commit.
+
+    If runs of one kind were made in several ways, the lines name their folders.
+
+    Args:
+        found: completed records.
+        net: the table's task net; other nets are named.
+    """
+    rows = [(_kind(record, net), _way(record), Path(record.folder).name) for record in found]
+    made = pd.DataFrame(rows, columns=["kind", "way", "folder"])
+    lines = []
+    for kind, runs in made.groupby("kind", sort=False):
+        ways = runs.groupby("way", sort=False)["folder"]
+        for way, folders in ways:
+            named = len(ways) > 1 and len(folders) <= MAX_NAMED
+            listed = f" ({', '.join(folders)})" if named else ""
+            lines.append(f"- {kind}{listed}: {way}")
+    return lines
+
+
+def _kind(record: RunRecord, net: str) -> str:
+    names = record.config["names"]
+    kind = names["net"] if record.config["learn"] == "task" else sampler_row(record)
+    if names["net"] not in (net, kind):
+        kind += f" under {names['net']}"
+    joint = trained_with(record) == "joint" and "fit" in record.seconds
+    return f"{kind}, jointly trained" if joint else kind
+
+
+def _way(record: RunRecord) -> str:
+    length = "nothing to train"
+    if (number := epochs(record)) is not None:
+        evaluated = "" if "fit" in record.seconds else "evaluated after "
+        length = f"{evaluated}{number} {'epoch' if number == 1 else 'epochs'}"
+    threads = "thread" if record.threads == 1 else "threads"
+    changes = " with changes" if record.git["dirty"] else ""
+    return (
+        f"{length}, seed {seed(record)}, {record.device}, {record.threads} {threads}, "
+        f"commit {commit(record)}{changes}"
+    )
+
+
+def _without_result(found: Found) -> list[str]:
+    """Return a line for each run that is not completed, and their number."""
+    if not found.undone:
+        return []
+    lines = [f"- {folder}: {why}" for folder, why in found.undone.items()]
+    verb = "is" if len(lines) == 1 else "are"
+    number = len(found.done) + len(lines)
+    return ["", f"{len(lines)} of {number} runs {verb} not completed:", "", *lines]

@@ -21,7 +21,7 @@ as in an ablation, each sampler gets a heat map. Several seeds give means and st
 The paper's values are shown next to ours. A folder of task nets only gives a table of nets."""
 
 
-def main(arguments: list[str] | None = None, prog: str = "python -m mops_lightning.report") -> None:
+def main(arguments: list[str] | None = None, prog: str = "mops-lightning report") -> None:
     """Write the tables, the plots and the page into the folder.
 
     Args:

@@ -6,7 +6,6 @@ from typing import Any
 
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import parse
 from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
 from mops_lightning.records.summary import sampler_name
@@ -119,13 +118,6 @@ def seed(record: RunRecord) -> int:
 
 
 def score(found: list[RunRecord]) -> str:
-    """Return the name of the records' main metric.
-
-    Early records do not name it; it is the first metric of the closing table.
-    """
-    for record in found:
-        if parts := parse(record.score_name):
-            return parts.metric
-    names = {parts.metric for record in found for parts in map(parse, record.metrics) if parts}
-    infos = in_summary_order(metric_info(name, found) for name in names)
-    return infos[0].name if infos else ""
+    """Return the name of the records' main metric; empty if none names it."""
+    names = (parts.metric for record in found if (parts := parse(record.score_name)))
+    return next(names, "")

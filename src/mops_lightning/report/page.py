@@ -10,6 +10,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from mops_lightning.errors import UserError
 from mops_lightning.report.build import Report
 from mops_lightning.report.text import PAPER, Grid, marked
 from mops_lightning.viz.clouds import COLOURS, INPUT_COLOUR
@@ -36,11 +37,12 @@ def page(report: Report, folder: Path, plots: Sequence[Path]) -> str:
         folder: the folder of the report; its name is the title.
         plots: SVG or PNG files.
     """
+    clouds, damaged = _clouds(report, folder)
     return render(
         folder.resolve().name,
         report.grids,
-        _clouds(report, folder),
-        report.remarks,
+        clouds,
+        [*report.remarks, *damaged],
         "How the runs were made",
         plots,
     )
@@ -133,15 +135,20 @@ def _image(path: Path) -> str:
     return f'<img alt="{html.escape(path.stem)}" src="{source}">'
 
 
-def _clouds(report: Report, folder: Path) -> list[dict[str, Any]]:
-    """Return the clouds that the runs have saved, as plain data."""
+def _clouds(report: Report, folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the clouds that the runs have saved, as plain data, and a line for damaged files."""
     found: list[dict[str, Any]] = []
+    damaged: list[str] = []
     colours = {INPUT: INPUT_COLOUR, **COLOURS}
     for record in report.found.done:
         path = Path(record.folder) / record.files.get("clouds", "")
         if not path.is_file() or len(found) == MAX_RUNS:
             continue
-        titles, arrays = load_clouds(path)
+        try:
+            titles, arrays = load_clouds(path)
+        except (OSError, UserError) as error:
+            damaged.append(f"- {error}")
+            continue
         found.append(
             {
                 "name": str(Path(record.folder).relative_to(folder)),
@@ -152,4 +159,4 @@ def _clouds(report: Report, folder: Path) -> list[dict[str, Any]]:
                 "hidden": ["completed"],
             }
         )
-    return found
+    return found, damaged

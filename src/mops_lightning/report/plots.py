@@ -1,7 +1,7 @@
-"""Curves, heat maps and clouds of a report."""
+"""Curves and heat maps of a report."""
 
 from collections.abc import Container
-from pathlib import Path
+from itertools import chain, count
 from typing import Any
 
 import numpy as np
@@ -12,11 +12,8 @@ from matplotlib.figure import Figure
 
 from mops_lightning.records.readout_names import GENERATED_READOUTS, INDEX_READOUT
 from mops_lightning.report.build import Report
-from mops_lightning.report.comparable import value
-from mops_lightning.report.tables import Table, row_name, sort_key
-from mops_lightning.viz.clouds import draw_cloud, upright
-from mops_lightning.viz.figures import cloud_axes, new_figure
-from mops_lightning.viz.snapshots import INPUT, load_clouds
+from mops_lightning.report.tables import Table, sort_key
+from mops_lightning.viz.figures import new_figure
 
 COLOURS = (*(f"C{i}" for i in range(10)), *(colormaps["Dark2"](i) for i in range(8)))
 """Of curves, in the order of the rows."""
@@ -34,45 +31,13 @@ def plots(report: Report) -> dict[str, Figure]:
             figures[_free(f"{name}_planes", figures)] = heat_maps(table)
         elif layout.column != "net" and len(table.columns()) > 1:
             figures[_free(f"{name}_curves", figures)] = curves(table)
-        if layout.column not in ("m", "net") and not layout.planes:
-            figure = clouds_by_column(table)
-            figures |= {_free("clouds", figures): figure} if figure else {}
     return figures
 
 
 def _free(name: str, taken: Container[str]) -> str:
-    """Return a name that is not taken: those of further groups get a number."""
-    number = 1
-    while (name if number == 1 else f"{name}_{number}") in taken:
-        number += 1
-    return name if number == 1 else f"{name}_{number}"
-
-
-def clouds_by_column(table: Table) -> Figure | None:
-    """Draw the first saved cloud of every sampler at every value of a setting, such as noise."""
-    key = table.group.layout.column
-    found: dict[str, dict[Any, Path]] = {}
-    for record in table.group.records:
-        path = Path(record.folder) / record.files.get("clouds", "")
-        if path.is_file():
-            name = row_name(record, table.net)
-            found.setdefault(name, {}).setdefault(value(record, key), path)
-    columns = sorted({column for paths in found.values() for column in paths})
-    if not columns:
-        return None
-    figure = new_figure(2.6 * len(columns), 2.6 * len(found), "tight")
-    for i, name in enumerate(sorted(found, key=sort_key)):
-        for j, column in enumerate(columns):
-            if column not in found[name]:
-                continue
-            _, arrays = load_clouds(found[name][column])
-            cloud = upright(arrays.pop(INPUT)[0])
-            readout, samples = next(iter(arrays.items()))
-            title = f"{key}={column:g}" if i == 0 else ""
-            below = f"{name}, {readout}"
-            axes = cloud_axes(figure, len(found), len(columns), i, j, title, below)
-            draw_cloud(axes, cloud, upright(samples[0]), readout)
-    return figure
+    """Return a name that is not taken: figures of further groups get a number."""
+    numbered = (f"{name}_{number}" for number in count(2))
+    return next(one for one in chain([name], numbered) if one not in taken)
 
 
 def curves(table: Table) -> Figure:
