@@ -1,6 +1,6 @@
 import pytest
 
-from mops_lightning.cli.flags import flags_first
+from mops_lightning.cli.train import flags_first
 from mops_lightning.errors import UserError
 from tests.support.command_line import call
 

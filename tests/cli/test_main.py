@@ -7,7 +7,7 @@ from importlib.metadata import version
 
 import pytest
 
-from mops_lightning.cli.commands import COMMANDS
+from mops_lightning.cli.main import COMMANDS
 from mops_lightning.records import run_record
 from tests.support.command_line import TINY, call, call_anew, runs, start
 

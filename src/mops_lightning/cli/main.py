@@ -9,8 +9,16 @@ from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
-from mops_lightning.cli.commands import COMMANDS
 from mops_lightning.errors import USER_ERROR, did_you_mean, end, quiet_on_closed_pipe
+
+COMMANDS = {
+    "report": "mops_lightning.report.cli",
+    "downsample": "mops_lightning.files.downsample_cli",
+    "compare": "mops_lightning.files.compare_cli",
+    "models": "mops_lightning.cli.models",
+    "export": "mops_lightning.cli.export",
+}
+"""Subcommands and their modules, whose ``main(arguments, prog)`` runs them."""
 
 WORD = re.compile(r"[^-+~=][^=]*")
 """An argument that is neither an option nor an override."""
@@ -24,8 +32,7 @@ def main() -> None:
         if first == "--version":
             print(f"mops_lightning {version('mops-lightning')}")
         elif first in COMMANDS:
-            command = import_module(COMMANDS[first].module)
-            command.main(arguments[1:], f"{program()} {first}")
+            import_module(COMMANDS[first]).main(arguments[1:], f"{program()} {first}")
         elif WORD.fullmatch(first):
             hint = did_you_mean(first, COMMANDS)
             end(

@@ -57,13 +57,10 @@ def _refuse_unused(chosen: argparse.Namespace, parser: argparse.ArgumentParser) 
     """
     values = {name: value for name, value in vars(chosen).items() if name != "words"}
     given = {name for name, value in values.items() if value != parser.get_default(name)}
-    match chosen.words:
-        case []:
-            unused = sorted(given)
-        case ["add", *_]:
-            unused = sorted(given & {"json"})
-        case _:
-            unused = sorted(given - {"json"})
+    used = {"json"} if chosen.words else set()
+    if chosen.words[:1] == ["add"]:
+        used = given - {"json"}
+    unused = sorted(given - used)
     if unused:
         option = unused[0].replace("_", "-")
         use = "models NAME" if option == "json" else "models add RUN NAME"
@@ -148,13 +145,14 @@ def _card(card: dict[str, Any], path: Path) -> list[str]:
     record = card["record"]
     config, commit = record["config"], record["git"]["commit"]
     chosen = config["names"]
+    alone = config["learn"] == "task"
     classes = config["dataset"].get("classes")
     data = chosen["dataset"] + (f" ({', '.join(map(str, classes))})" if classes else "")
     points = config["dataset"].get("n_points")
     wide = f", wide layers in {card['precision']}" if card["precision"] != "float32" else ""
     lines = {
         "name": card["name"],
-        "net": _net(card),
+        "net": f"{chosen['net']} (task net)" if alone else f"{chosen['sampler']} (sampler)",
         "task": f"{chosen['task']} by {chosen['net']}",
         "sizes": _sizes(card),
         "input": "clouds in the unit sphere (centroid at the origin, largest distance from it 1)",
@@ -173,13 +171,6 @@ def _card(card: dict[str, Any], path: Path) -> list[str]:
     }
     width = max(map(len, lines)) + 2
     return [f"{key:<{width}}{' '.join(value.split())}" for key, value in lines.items() if value]
-
-
-def _net(card: dict[str, Any]) -> str:
-    config = card["record"]["config"]
-    kind = "task_net" if config["learn"] == "task" else "sampler"
-    chosen = config["names"]["net" if kind == "task_net" else "sampler"]
-    return f"{chosen} ({kind.replace('_', ' ')})"
 
 
 def _sizes(card: dict[str, Any]) -> str:

@@ -1,7 +1,6 @@
 """Checks before Hydra writes anything into the folder of a single run."""
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mops_lightning.config import distributed
 from mops_lightning.config.explain import explain
-from mops_lightning.errors import USER_ERROR, UserError, end, file_error
+from mops_lightning.errors import USER_ERROR, UserError, end, file_error, memory_error
 from mops_lightning.zoo import names
 
 INPUTS = {
@@ -23,44 +22,37 @@ INPUTS = {
 }
 """Settings that name what must exist, with values that are no paths."""
 OUTPUTS = ("out", "cache", "dataset.cache")
-MISSING = {"ckpt_path": "no checkpoint {}. Give a run's folder, a .ckpt file, or last."}
+MISSING = {
+    "ckpt_path": "no checkpoint {}. Give a run's folder, a .ckpt file, or last.",
+    "weights": "no file {}. Give a weights file, a run, a model, or weights=auto.",
+}
 """Errors of inputs that nothing else checks before a run begins."""
 
 
 class RunStart(Callback):
-    """Checks a single run before Hydra writes into its folder."""
+    """Checks a single run and claims its folder, so that a refused run leaves nothing."""
 
     def on_run_start(self, config: DictConfig, **extra: Any) -> None:
-        """Check the settings and claim the folder."""
-        begin(config, sys.argv[1:])
+        """Check the settings and claim the folder, before Hydra writes into it.
 
+        Raises:
+            SystemExit: a setting is wrong, or the folder contains a run; one line says so.
+        """
+        from mops_lightning.training.run.run import checked, claim
 
-def begin(config: DictConfig, arguments: Sequence[str]) -> None:
-    """Check the settings of a run and claim its folder, so that a refused run leaves nothing.
-
-    Args:
-        config: with Hydra's own settings.
-        arguments: of the command line.
-
-    Raises:
-        SystemExit: a setting is wrong, or the folder contains a run; one line says so.
-    """
-    from mops_lightning.training.run.run import checked, claim
-
-    HydraConfig.instance().set_config(config)  # the folder's name is made from it
-    cfg = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-    try:
-        folder = Path(config.hydra.run.dir)
-        checked(cfg, list(config.hydra.overrides.task))
-        check_paths(cfg)
-        _check_weights(cfg.weights)
-        distributed.check_start(cfg, config.hydra.overrides.hydra)
-        if not distributed.is_worker_rank(cfg):
-            claim(folder)
-    except (UserError, OmegaConfBaseException) as error:
-        end("mops_lightning", explain(error, arguments), USER_ERROR)
-    except OSError as error:
-        end("mops_lightning", file_error(error), USER_ERROR)
+        HydraConfig.instance().set_config(config)  # the folder's name is made from it
+        cfg = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+        try:
+            folder = Path(config.hydra.run.dir)
+            checked(cfg, list(config.hydra.overrides.task))
+            check_paths(cfg)
+            distributed.check_start(cfg, config.hydra.overrides.hydra)
+            if not distributed.is_worker_rank(cfg):
+                claim(folder)
+        except (UserError, OmegaConfBaseException) as error:
+            end("mops_lightning", explain(error, sys.argv[1:]), USER_ERROR)
+        except OSError as error:
+            end("mops_lightning", file_error(error), USER_ERROR)
 
 
 def check_paths(cfg: DictConfig) -> None:
@@ -79,44 +71,29 @@ def check_paths(cfg: DictConfig) -> None:
             path = Path(value).expanduser()
             path.stat()
         except FileNotFoundError:
-            if name in MISSING:
-                raise UserError(f"{name}: {MISSING[name].format(path)}") from None
+            _check_missing(name, value)
         except (OSError, RuntimeError, ValueError) as error:
             # Python: no such user, a null byte.
             reason = error.strerror if isinstance(error, OSError) else str(error)
             raise UserError(f"{name}: {_short(value)}: {reason}.") from None
 
 
+def _check_missing(name: str, value: str) -> None:
+    """Refuse a path that does not exist where the setting needs one; ``weights`` may be a model."""
+    try:
+        found = names.resolve(value).exists() if name == "weights" else False
+    except UserError as error:
+        raise UserError(f"{name}: {error}") from None
+    if name in MISSING and not found:
+        raise UserError(f"{name}: {MISSING[name].format(value)}")
+
+
 def _short(text: str) -> str:
     return text if len(text) <= 100 else f"{text[:60]} ... ({len(text)} characters)"
 
 
-def _check_weights(given: str | None) -> None:
-    """Check that there is a file, run or model where ``weights`` names one.
-
-    Raises:
-        UserError: there is none.
-    """
-    if given is None or given in INPUTS["weights"]:
-        return
-    try:
-        path = names.resolve(given)
-    except UserError as error:
-        raise UserError(f"weights: {error}") from None
-    if not path.exists():
-        raise UserError(
-            f"weights: no file {path}. Give a weights file, a run, a model, or weights=auto."
-        )
-
-
-def make(folder: Path) -> None:
-    """Make the folder of a sweep, or end the program.
-
-    Raises:
-        SystemExit: it cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        text = f"out: cannot write to {folder}: {error.strerror}."
-        end("mops_lightning", text, USER_ERROR)
+def line_about(error: BaseException) -> str | None:
+    """Return one line about an error that the user can mend; None for a fault of the program."""
+    if isinstance(error, UserError):
+        return str(error)
+    return file_error(error) if isinstance(error, OSError) else memory_error(error)

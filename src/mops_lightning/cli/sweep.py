@@ -17,10 +17,10 @@ from filelock import FileLock, Timeout
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from mops_lightning.cli.start import make
+from mops_lightning.cli.start import line_about
 from mops_lightning.config import settings
 from mops_lightning.config.settings import Affects
-from mops_lightning.errors import Interrupted, UserError, file_error, memory_error
+from mops_lightning.errors import USER_ERROR, Interrupted, UserError, end, one_line
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
@@ -84,23 +84,15 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
         raise
     except Busy:
         log.warning(f"{folder}: skipped, because another process runs this cell")
-    except (UserError, OSError) as error:
-        text = file_error(error) if isinstance(error, OSError) else str(error)
-        log.error(f"{folder} failed: {text}")
-        _note_failure(folder, text)
     except Exception as error:
-        text = memory_error(error) or f"{type(error).__name__}: {error}"
-        _note_failure(folder, text)
-        if memory_error(error):
-            log.error(f"{folder} failed: {text}")
-        else:
+        text = line_about(error)
+        if text is None:
             log.exception(f"{folder} failed")
+        else:
+            log.error(f"{folder} failed: {text}")
+        with suppress(OSError):  # the disk may be full
+            (folder / FAILED).write_text(f"{text or one_line(error)}\n")
     return math.nan
-
-
-def _note_failure(folder: Path, text: str) -> None:
-    with suppress(OSError):  # the disk may be full
-        (folder / FAILED).write_text(f"{text}\n")
 
 
 @contextmanager
@@ -218,8 +210,11 @@ class SweepSummary(Callback):
     def on_multirun_start(self, config: DictConfig, **extra: Any) -> None:
         """Mark the start, on the clock of the folder's file system."""
         folder = Path(config.hydra.sweep.dir)
-        make(folder)
-        (folder / BEGUN).touch()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / BEGUN).touch()
+        except OSError as error:
+            end("mops_lightning", f"out: cannot write to {folder}: {error.strerror}.", USER_ERROR)
 
     def on_multirun_end(self, config: DictConfig, **extra: Any) -> None:
         """Count the cells of this start by state."""

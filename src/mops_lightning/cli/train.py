@@ -1,11 +1,10 @@
 """Training from the command line: one run, or a sweep, composed by Hydra."""
 
+import argparse
 import os
 import sys
 from typing import TYPE_CHECKING
 
-from mops_lightning.cli.commands import help_lines
-from mops_lightning.cli.flags import flags_first
 from mops_lightning.config.hydra_conf import conf_dir
 from mops_lightning.config.overrides import key, readable, with_own_classes
 from mops_lightning.errors import (
@@ -13,9 +12,9 @@ from mops_lightning.errors import (
     USER_ERROR,
     Interrupted,
     UserError,
+    did_you_mean,
     end,
     file_error,
-    memory_error,
     quiet_on_closed_pipe,
 )
 
@@ -37,13 +36,11 @@ def main() -> None:
 def _run() -> None:
     import hydra
     from hydra.errors import HydraException
-    from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError  # type: ignore[import-untyped]
 
     from mops_lightning.config.explain import explain, refuse_plain_groups
 
-    OmegaConf.register_new_resolver("subcommands", help_lines, replace=True)
     show_traceback = bool(os.environ.get("HYDRA_FULL_ERROR"))
     # Makes Hydra raise instead of printing its own shortened traceback.
     os.environ["HYDRA_FULL_ERROR"] = "1"
@@ -67,18 +64,59 @@ def _run() -> None:
         end(NAME, file_error(error), USER_ERROR)
 
 
-def _job(cfg: "DictConfig") -> float | None:
-    """Run one job and return its score, which an optimising sweeper reads."""
-    # Here and not around Hydra, which adds lines of its own to an error.
-    with quiet_on_closed_pipe():
-        return _run_job(cfg)
+def flags_first(arguments: list[str]) -> list[str]:
+    """Move Hydra's flags, such as ``--multirun``, before the settings: Hydra wants these together.
 
+    Args:
+        arguments: of the command line, such as ``["m=8", "--cfg", "job", "sampler=fps"]``.
 
-def _run_job(cfg: "DictConfig") -> float | None:
-    """Run one job; the user's mistakes end the program in one line.
+    Returns:
+        The same arguments; flags with their values and settings keep their order.
 
     Raises:
-        BrokenPipeError: the reader of the output has ended.
+        UserError: there is no such flag, flags exclude each other, or a flag's value is missing
+            or not allowed.
+    """
+    from hydra._internal.utils import get_args_parser
+
+    parser = get_args_parser()
+    parser.exit_on_error = False
+    parser.allow_abbrev = False  # an ambiguous abbreviation exits in any case
+    try:
+        read, unknown = parser.parse_known_intermixed_args(arguments)
+    except argparse.ArgumentError as error:
+        raise UserError(f"{error.argument_name}: {error.message}.") from None
+    known = [action.option_strings[0] for action in parser._actions if action.option_strings]
+    for flag in unknown:
+        hint = did_you_mean(flag.split("=")[0], known)
+        raise UserError(f"no flag {flag!r}.{hint} Settings are KEY=VALUE, without dashes.")
+    _check_combination(read)
+    flags = list(arguments)
+    for setting in read.overrides:
+        flags.remove(setting)
+    return [*flags, *read.overrides]
+
+
+def _check_combination(read: argparse.Namespace) -> None:
+    actions = ("run", "multirun", "cfg", "info", "shell_completion")
+    chosen = [f"--{name.replace('_', '-')}" for name in actions if getattr(read, name)]
+    if len(chosen) > 1 and not (read.help or read.hydra_help):
+        raise UserError(f"{' and '.join(chosen)}: give one of them. `--cfg job` shows one run.")
+    if read.resolve and not (read.cfg or read.help):
+        raise UserError("--resolve belongs to --cfg: write --cfg job --resolve.")
+    if read.experimental_rerun:
+        raise UserError(
+            "--experimental-rerun is not available, because the pickle that it reads can run code. "
+            "Repeat the run with the overrides in its result.json."
+        )
+
+
+def _job(cfg: "DictConfig") -> float | None:
+    """Run one job and return its score, which an optimising sweeper reads.
+
+    The user's mistakes end the program here, because Hydra adds lines of its own to an error.
+
+    Raises:
         KeyboardInterrupt: the user has stopped the job.
     """
     from pathlib import Path
@@ -86,34 +124,32 @@ def _run_job(cfg: "DictConfig") -> float | None:
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
+    from mops_lightning.cli.start import line_about
     from mops_lightning.cli.sweep import run_cell
     from mops_lightning.config import distributed
     from mops_lightning.training.run.run import run
 
     hydra_cfg = HydraConfig.get()
+    swept = hydra_cfg.mode == RunMode.MULTIRUN
     folder = Path(os.path.relpath(hydra_cfg.runtime.output_dir))
     overrides = list(hydra_cfg.overrides.task)
-    try:
-        if hydra_cfg.mode == RunMode.MULTIRUN:
-            distributed.check_multirun(cfg)
-            return run_cell(cfg, folder, overrides)
-        return run(cfg, folder, overrides, claimed=True).score
-    except UserError as error:
-        end(NAME, str(error), USER_ERROR)
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        end(NAME, file_error(error), USER_ERROR)
-    except (MemoryError, RuntimeError) as error:
-        text = memory_error(error)
-        if text is None:
+    with quiet_on_closed_pipe():
+        try:
+            if swept:
+                distributed.check_multirun(cfg)
+                return run_cell(cfg, folder, overrides)
+            return run(cfg, folder, overrides, claimed=True).score
+        except BrokenPipeError:
             raise
-        end(NAME, text, USER_ERROR)
-    except Interrupted as stop:
-        if distributed.is_worker_rank(cfg):
-            sys.exit(INTERRUPTED)  # rank 0 prints the message
-        # Hydra passes this on like any other error.
-        again = "Run the same command with hydra.sweep.dir={} to continue the sweep."
-        swept = hydra_cfg.mode == RunMode.MULTIRUN
-        text = again.format(os.path.relpath(hydra_cfg.sweep.dir)) if swept else str(stop)
-        raise KeyboardInterrupt(text) from None
+        except Interrupted as stop:
+            if distributed.is_worker_rank(cfg):
+                sys.exit(INTERRUPTED)  # rank 0 prints the message
+            # Hydra passes this on like any other error.
+            again = "Run the same command with hydra.sweep.dir={} to continue the sweep."
+            text = again.format(os.path.relpath(hydra_cfg.sweep.dir)) if swept else str(stop)
+            raise KeyboardInterrupt(text) from None
+        except Exception as error:
+            line = line_about(error)
+            if line is None:
+                raise
+            end(NAME, line, USER_ERROR)
