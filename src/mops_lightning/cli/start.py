@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mops_lightning.config import distributed
-from mops_lightning.config.explain import explain
+from mops_lightning.config.compose import explain
 from mops_lightning.errors import USER_ERROR, UserError, end, file_error, memory_error
 from mops_lightning.zoo import names
 

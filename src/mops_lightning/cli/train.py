@@ -39,7 +39,7 @@ def _run() -> None:
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError  # type: ignore[import-untyped]
 
-    from mops_lightning.config.explain import explain, refuse_plain_groups
+    from mops_lightning.config.compose import explain, refuse_plain_groups
 
     show_traceback = bool(os.environ.get("HYDRA_FULL_ERROR"))
     # Makes Hydra raise instead of printing its own shortened traceback.

@@ -1,13 +1,29 @@
-"""Composing a configuration as the command line does."""
+"""Composing a configuration; a mistake becomes one line with the setting and the nearest known."""
 
-from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError  # type: ignore[import-untyped]
+import re
+from collections.abc import Sequence
+from typing import Any
 
-from mops_lightning.config.explain import explain, refuse_plain_groups
-from mops_lightning.config.hydra_conf import composed
-from mops_lightning.config.overrides import with_own_classes
-from mops_lightning.errors import UserError
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException, ValidationError
+from yaml import MarkedYAMLError, YAMLError  # type: ignore[import-untyped]
+
+from mops_lightning.config import settings
+from mops_lightning.config.build import signature
+from mops_lightning.config.hydra_conf import composed, conf_dir
+from mops_lightning.config.overrides import key as key_of
+from mops_lightning.config.overrides import parse, with_own_classes
+from mops_lightning.config.validate import refusal
+from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.records.run_record import dotted
+
+OTHERWISE = {
+    "logger": " (logger=none for none)",
+    "callbacks": " or leave single callbacks out with callbacks.NAME=null",
+    "baselines": " or leave single baselines out with baselines.NAME=null",
+    "experiment": " or leave it out",
+}
+"""How to do without a choice, by group."""
 
 
 def compose(overrides: list[str] | None = None) -> DictConfig:
@@ -27,3 +43,120 @@ def compose(overrides: list[str] | None = None) -> DictConfig:
         return composed(given)
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise UserError(explain(error, given)) from None
+
+
+def refuse_plain_groups(arguments: Sequence[str]) -> None:
+    """Refuse ``logger=null`` and the like, at which Hydra raises an error without the key.
+
+    Raises:
+        UserError: a group of choices is set to something else than a name.
+    """
+    groups = _groups()
+    for argument in arguments:
+        override = parse(argument)
+        name = key_of(argument)
+        if override is None or override.is_delete() or name not in groups:
+            continue
+        values = [override.value()]
+        if override.is_sweep_override():
+            values = override.value().list if override.is_choice_sweep() else []
+        if not all(map(_is_choice, values)):
+            raise UserError(f"{argument}: choose one with {name}=NAME{OTHERWISE.get(name, '')}.")
+
+
+def _is_choice(value: Any) -> bool:
+    """Return whether Hydra takes a value as a choice of a group: a name, or a list of names."""
+    from hydra.core.override_parser.types import QuotedString
+
+    if isinstance(value, list):
+        return all(isinstance(one, str | QuotedString) for one in value)
+    return isinstance(value, str | dict | QuotedString)
+
+
+def explain(error: BaseException, arguments: Sequence[str]) -> str:
+    """Turn an error into one line that names the setting and the nearest known one.
+
+    Args:
+        error: raised while a configuration was composed.
+        arguments: of the command line, or the overrides.
+    """
+    from hydra.errors import MissingConfigException
+
+    if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
+        mark = error.problem_mark
+        return f"{mark.name}, line {mark.line + 1}: not valid YAML: {error.problem}."
+    texts = []
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, ValidationError) and cause.full_key:
+            return str(refusal(cause.full_key, cause.value))
+        if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
+            if not cause.options:
+                return f"no file {cause.missing_cfg_file} in --config-dir."
+            group, _, choice = cause.missing_cfg_file.rpartition("/")
+            return f"{group}={choice}: no such choice.{did_you_mean(choice, cause.options or ())}"
+        texts.append(str(cause).strip())
+        cause = cause.__cause__
+    if isinstance(error, UserError):
+        return texts[0]
+    for text in texts:
+        if "Could not override '" in text:
+            key = text.split("Could not override '")[1].split("'")[0]
+            return _no_such_setting(key, arguments)
+        if unknown := re.search(r"In '(.+)': ConfigKeyError .*\nKey '(\w+)' not in 'Run", text):
+            hint = did_you_mean(unknown.group(2), settings.declared())
+            return f"{unknown.group(1)}.yaml: {unknown.group(2)}: no such setting.{hint}"
+        if removed := re.search(r"Key '(\w+)' not in 'RunSettings'", text):
+            return f"{removed.group(1)} cannot be removed."
+    # Hydra's and OmegaConf's own messages, without their notes for developers.
+    lines = [line for text in texts for line in text.splitlines() if line.strip()]
+    return " ".join(dict.fromkeys(line.strip() for line in lines if line[0] != " "))
+
+
+def _groups() -> list[str]:
+    """List the groups of choices, such as ``task/net``."""
+    root = conf_dir()
+    paths = [path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_dir()]
+    return [path for path in paths if not path.startswith("hydra")]
+
+
+def _is_offered(group: str) -> bool:
+    """Return whether users choose from a group; of some, other choices choose the file."""
+    top = group.partition("/")[0]
+    named = top in settings.declared() or top == "experiment"
+    return named and not (conf_dir() / f"{group}.yaml").is_file()
+
+
+def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
+    """Name the nearest group or setting, or say how to set an argument that no YAML file sets."""
+    groups = _groups()
+    if key in groups:
+        return f"{key}: its files are chosen by other groups. --cfg job shows what they set."
+    if "/" in key or "@" in key:
+        offered = [group for group in groups if _is_offered(group)]
+        return f"{key}: no such group of choices.{did_you_mean(key, offered)}"
+    cfg = _composed(groups, arguments)
+    node, _, name = key.rpartition(".")
+    target = OmegaConf.select(cfg, f"{node}._target_")
+    if target and name in signature(target, node):
+        return f"{key}: {target} accepts it, but no file sets it. Write +{key}=..."
+    choices = _choices_with(node, name)
+    if choices:
+        return f"{key}: no such setting here. It belongs to {' and '.join(choices)}."
+    leaves = dotted(OmegaConf.to_container(cfg, resolve=False))
+    known = {*settings.declared(), *(one for one in leaves if "._" not in one)} - {key}
+    return f"{key}: no such setting.{did_you_mean(key, known)} --cfg job shows all of them."
+
+
+def _choices_with(group: str, name: str) -> list[str]:
+    """Return the choices of a group, such as ``dataset=clouds``, whose files set a key."""
+    files = sorted(conf_dir().joinpath(group).glob("*.yaml")) if group in _groups() else []
+    return [f"{group}={file.stem}" for file in files if name in (OmegaConf.load(file) or {})]
+
+
+def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
+    """Compose the groups that the command line chooses, without its other settings."""
+    try:
+        return composed([part for part in arguments if key_of(part) in groups])
+    except Exception:  # the mistake may be among them
+        return composed([])

@@ -59,24 +59,12 @@ def started_together(cfg: DictConfig) -> bool:
     return is_distributed(cfg) and _number("WORLD_SIZE") + _number("SLURM_NTASKS") > 1
 
 
-def check_devices(cfg: DictConfig) -> None:
-    """Check the number of devices and the strategy.
+def check_strategy(cfg: DictConfig) -> None:
+    """Check how several devices work together; Lightning checks the devices.
 
     Raises:
-        UserError: a value out of range, or a strategy that this program does not support.
+        UserError: a strategy or a synchronisation that this program does not support.
     """
-    devices = cfg.trainer.get("devices")
-    if OmegaConf.is_list(devices):
-        good = bool(devices) and all(type(device) is int and device >= 0 for device in devices)
-    else:
-        good = devices in ("auto", -1) or (type(devices) is int and devices >= 1)
-    if not good:
-        raise UserError(
-            f"trainer.devices must be a number of devices, a list of GPUs, auto or -1 (all), got "
-            f"{devices!r}. Try trainer.devices=1."
-        )
-    if devices == -1 and cfg.trainer.get("accelerator") == "cpu":
-        raise UserError("trainer.devices=-1 means all GPUs; on the CPU give a number of processes.")
     if cfg.trainer.get("sync_batchnorm"):
         raise UserError(
             "trainer.sync_batchnorm must be false: the nets pool and normalise in one step, each "
@@ -109,14 +97,13 @@ def check_shares(batch_size: int, test_clouds: int, held_out: int, processes: in
     """Reject sizes that cannot be split across processes.
 
     Args:
-        batch_size: clouds in a batch of all processes together.
+        batch_size: clouds in a batch of all processes together; each needs two for BatchNorm.
         test_clouds: number of test clouds.
         held_out: number of training clouds that are held out for ``val/``.
         processes: number of processes.
 
     Raises:
-        UserError: ``batch_size`` is not a multiple of the number of processes, leaves fewer than
-            two clouds to a process, or there are fewer clouds than processes.
+        UserError: a process would have no clouds, too few, or fewer than another one.
     """
     if test_clouds < processes:
         raise UserError(
@@ -125,15 +112,14 @@ def check_shares(batch_size: int, test_clouds: int, held_out: int, processes: in
         )
     if 0 < held_out < processes:
         raise UserError(
-            f"val_fraction holds out {held_out} training {'cloud' if held_out == 1 else 'clouds'}, "
-            f"fewer than the {processes} devices. Try val_fraction=0, or a larger one."
+            f"val_fraction holds out {held_out} of the training clouds, fewer than the {processes} "
+            "devices. Try val_fraction=0, or a larger one."
         )
     if processes > 1 and (batch_size % processes or batch_size < 2 * processes):
-        least = 2 * processes
-        near = max(round(batch_size / processes) * processes, least)
+        near = max(round(batch_size / processes), 2) * processes
         raise UserError(
             f"batch_size={batch_size} is the batch of all {processes} devices together: it must "
-            f"be a multiple of {processes} and at least {least}. Try batch_size={near}."
+            f"be a multiple of {processes} and at least {2 * processes}. Try batch_size={near}."
         )
 
 

@@ -10,12 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from enum import Flag, auto
 from functools import cache
-from typing import Any, Literal, get_args, get_type_hints
+from typing import Any, Literal, get_args
 
 from hydra.core.config_store import ConfigStore
-
-from mops_lightning.config.annotations import describe
-from mops_lightning.errors import UserError, did_you_mean
 
 Learn = Literal["task", "sampler", "joint", "nothing"]
 LEARN = get_args(Learn)
@@ -332,14 +329,6 @@ def limited() -> dict[str, Limits]:
     names = [*declared(), *INSIDE]
     found = {name: of(name).limits for name in names}
     return {name: limits for name, limits in found.items() if limits is not None}
-
-
-def refusal(path: str, value: Any) -> UserError:
-    """Return the error about a value that does not fit a setting's type or limits."""
-    limits = of(path).limits
-    allowed = limits.allowed if limits else describe(get_type_hints(SCHEMA).get(path, Any))
-    near = did_you_mean(str(value), limits.choices) if limits and limits.choices else ""
-    return UserError(f"{path} must be {allowed}, got {value!r}.{near.partition(' Allowed:')[0]}")
 
 
 def register() -> None:

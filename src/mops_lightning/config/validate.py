@@ -3,19 +3,31 @@
 Checked are names, types and run-level limits. The range of an argument is checked by its class.
 """
 
+import collections.abc
 import math
-from typing import Any
+import types
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from omegaconf import MISSING, DictConfig, OmegaConf
-from omegaconf.errors import ValidationError
 
 from mops_lightning.config import distributed, settings
-from mops_lightning.config.annotations import misfit
 from mops_lightning.config.build import signature
 from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.records.run_record import dotted
 
 OPTIMIZERS = ("optimizer", "pretrain")
 """Nodes whose ``schedule`` is not an argument of the optimizer."""
+
+PLAIN: dict[Any, str] = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "a text",
+    type(None): "null",
+}
+"""Annotations in words, behind "must be"."""
+LISTS = (list, tuple, collections.abc.Sequence)
+"""Origins of annotations of lists."""
 
 TABLES = ("epochs", "augment")
 """Settings that have settings of their own but are no groups of choices."""
@@ -34,16 +46,14 @@ def check(cfg: DictConfig) -> None:
             hint = did_you_mean(key, declared)
             raise UserError(f"{key}: no such setting.{hint}")
     for name, setting in declared.items():
-        if name not in cfg:
-            raise UserError(f"{name} cannot be removed. Choose another value with {name}=...")
-        if cfg.get(name) is None and not setting.nullable:
+        if name not in cfg or (cfg.get(name) is None and not setting.nullable):
             raise UserError(f"{name} cannot be removed. Choose another one with {name}=...")
         if setting.group or name in TABLES:
             _check_table(cfg.get(name), name)
     if not isinstance(cfg.task.get("net"), DictConfig):
         raise UserError("task.net cannot be removed. Choose another one with task/net=NAME.")
     if cfg.learn not in settings.LEARN:  # trainer.max_epochs is looked up by it
-        raise settings.refusal("learn", cfg.learn)
+        raise refusal("learn", cfg.learn)
     # Resolved once: OmegaConf parses an interpolation each time it is read.
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     _check_limits(plain)
@@ -62,24 +72,15 @@ def check(cfg: DictConfig) -> None:
             f"refine must be 0 with learn={cfg.learn}, which samples nothing, got {cfg.refine}. "
             "Leave it out, or test a sampler."
         )
-    distributed.check_devices(cfg)
+    distributed.check_strategy(cfg)
 
 
-def misfit_of(error: BaseException) -> UserError | None:
-    """Return what is wrong with a value that the schema of the settings refused.
-
-    Args:
-        error: raised while a configuration was composed.
-
-    Returns:
-        None where the error is about something else.
-    """
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, ValidationError) and cause.full_key:
-            return settings.refusal(cause.full_key, cause.value)
-        cause = cause.__cause__
-    return None
+def refusal(path: str, value: Any) -> UserError:
+    """Return the error about a value that does not fit a setting's type or limits."""
+    limits = settings.of(path).limits
+    allowed = limits.allowed if limits else describe(get_type_hints(settings.SCHEMA).get(path, Any))
+    near = did_you_mean(str(value), limits.choices) if limits and limits.choices else ""
+    return UserError(f"{path} must be {allowed}, got {value!r}.{near.partition(' Allowed:')[0]}")
 
 
 def _check_table(value: Any, name: str) -> None:
@@ -111,15 +112,12 @@ def _check_numbers(value: Any, path: str) -> None:
 
 
 def _check_limits(config: dict[str, Any]) -> None:
+    values = dotted(config)
     for path, limits in settings.limited().items():
-        below: Any = config
-        *nodes, name = path.split(".")
-        for node in nodes:
-            below = below.get(node) if isinstance(below, dict) else None
-        if not isinstance(below, dict) or below.get(name, MISSING) == MISSING:
-            continue
-        if settings.of(path).counts(config["learn"]) and not limits.fits(below[name]):
-            raise settings.refusal(path, below[name])
+        value = values.get(path, MISSING)
+        counts = settings.of(path).counts(config["learn"])
+        if value != MISSING and counts and not limits.fits(value):
+            raise refusal(path, value)
 
 
 def _check_evaluation(config: dict[str, Any]) -> None:
@@ -161,3 +159,48 @@ def _check_node(node: Any, where: str) -> None:
                     raise UserError(f"{where}.{name} must be {wanted}, got {node[key]!r}.")
     for key in node:
         _check_node(node[key], f"{where}.{key!s}")
+
+
+def misfit(value: Any, annotation: Any) -> str | None:
+    """Say what an annotation wants when a value does not fit it.
+
+    Args:
+        value: plain data: a number, a text, a truth value, None, a list or a dict.
+        annotation: as written in the signature. What is neither plain, a list of plain nor a choice
+            of these cannot be judged, and any value fits.
+
+    Returns:
+        Such as "a whole number or null"; None where the value fits.
+    """
+    return None if _fits(value, annotation) else describe(annotation)
+
+
+def _fits(value: Any, annotation: Any) -> bool:
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin in (Union, types.UnionType):
+        return any(_fits(value, part) for part in inner)
+    if origin is Literal:
+        # A wrong text is left to the constructor, which names the nearest right one.
+        return isinstance(value, str) or any(value is part for part in inner)
+    if origin in LISTS:
+        return isinstance(value, list) and all(_fits(item, inner[0]) for item in value)
+    if annotation is float:
+        return type(value) in (int, float)
+    if annotation in PLAIN:
+        return type(value) is annotation
+    # A tensor, a callable, Any ...: a number or nothing may be right, a text is not a tensor.
+    return getattr(annotation, "__name__", "") != "Tensor" or isinstance(value, int | float)
+
+
+def describe(annotation: Any) -> str:
+    """Say in words what an annotation wants."""
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin in (Union, types.UnionType):
+        wanted = [describe(part) for part in inner if getattr(part, "__name__", "") != "Tensor"]
+        return " or ".join(dict.fromkeys(wanted))
+    if origin is Literal:
+        return " or ".join(map(str, inner))
+    if origin in LISTS:
+        kinds = {int: " of whole numbers", float: " of numbers", str: " of strings"}
+        return f"a list{kinds.get(inner[0], '')}"
+    return PLAIN.get(annotation, str(annotation))
