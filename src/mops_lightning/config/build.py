@@ -41,11 +41,12 @@ def build(node: Any, where: str = "", **extra: Any) -> Any:
     from hydra.errors import InstantiationException
     from hydra.utils import instantiate
 
-    below = {
-        str(key): build(child, f"{where}.{key!s}" if where else str(key))
-        for key, child in _children(node)
-        if key not in extra
-    }
+    below: dict[str, Any] = {}
+    for key in node if isinstance(node, DictConfig) else ():
+        name = str(key)
+        child = None if OmegaConf.is_missing(node, key) else node[key]
+        if name not in extra and isinstance(child, DictConfig) and "_target_" in child:
+            below[name] = build(child, f"{where}.{name}" if where else name)
     try:
         made = instantiate(node, **below, **extra, _convert_="all")
     except (InstantiationException, *REJECTIONS) as error:
@@ -58,18 +59,6 @@ def build(node: Any, where: str = "", **extra: Any) -> Any:
     if isinstance(node, DictConfig) and node.get("_partial_"):
         return partial(_call, made, node, where)
     return made
-
-
-def _children(node: Any) -> list[tuple[Any, DictConfig]]:
-    """Return the nodes directly below ``node`` that describe objects themselves."""
-    if not isinstance(node, DictConfig):
-        return []
-    found = [(key, node[key]) for key in node if not OmegaConf.is_missing(node, key)]
-    return [
-        (key, child)
-        for key, child in found
-        if isinstance(child, DictConfig) and child.get("_target_") is not None
-    ]
 
 
 def _known_cause(error: BaseException, node: Any, where: str) -> UserError | None:
@@ -160,9 +149,9 @@ def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
     try:
         found = get_object(target)
     except Exception as error:
-        raise UserError(
-            f"{where}._target_: cannot import {target!r}: {_last_line(error)}"
-        ) from None
+        # The last line says what failed; Hydra puts others before and after it.
+        reason = str(error.__cause__ or error).strip().splitlines()[-1]
+        raise UserError(f"{where}._target_: cannot import {target!r}: {reason}") from None
     if not inspect.isclass(found):
         return _own_signature(found)
     parameters: dict[str, inspect.Parameter] = {}
@@ -179,11 +168,6 @@ def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
         if not rest:
             return parameters
     return {**parameters, **own}  # the target takes any further argument
-
-
-def _last_line(error: BaseException) -> str:
-    """Return what failed, without the lines that Hydra puts before and after it."""
-    return str(error.__cause__ or error).strip().splitlines()[-1]
 
 
 def _own_signature(function: Any) -> dict[str, inspect.Parameter]:

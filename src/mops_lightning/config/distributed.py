@@ -21,8 +21,7 @@ STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true")
 def is_distributed(cfg: DictConfig) -> bool:
     """Return whether the settings request more than one device."""
     devices = cfg.trainer.get("devices")
-    one = len(devices) == 1 if OmegaConf.is_list(devices) else devices == 1
-    return not one
+    return devices != 1 and not (OmegaConf.is_list(devices) and len(devices) == 1)
 
 
 def is_worker_rank(cfg: DictConfig) -> bool:
@@ -40,14 +39,12 @@ def check_start(cfg: DictConfig, hydra_overrides: Sequence[str]) -> None:
     Raises:
         UserError: the settings request one process, or every process would have its own folder.
     """
-    number = _number("WORLD_SIZE")
-    if number > 1 and not is_distributed(cfg):
+    if (number := _number("WORLD_SIZE")) > 1 and not is_distributed(cfg):
         raise UserError(
             f"{number} processes were started (WORLD_SIZE), but trainer.devices=1. Give "
             "trainer=ddp trainer.devices=N, as many as on this host, or start one process."
         )
-    named = "hydra.run.dir" in map(key, hydra_overrides)
-    if started_together(cfg) and not named:
+    if started_together(cfg) and "hydra.run.dir" not in map(key, hydra_overrides):
         raise UserError(
             "hydra.run.dir: processes that were started together need one folder. Give "
             "hydra.run.dir=FOLDER, which all of them see."
@@ -86,10 +83,8 @@ def check_multirun(cfg: DictConfig) -> None:
     """
     if is_distributed(cfg):
         raise UserError(
-            f"trainer.devices={cfg.trainer.get('devices')}: a sweep (-m) gives each run one "
-            "device. Use "
-            "trainer.devices=1 hydra/launcher=joblib (or submitit_slurm) for parallel runs, or "
-            "start each large run separately, without -m."
+            "trainer.devices must be 1 in a sweep (-m). For runs side by side give "
+            "hydra/launcher=joblib (or submitit_slurm), or start each large run without -m."
         )
 
 

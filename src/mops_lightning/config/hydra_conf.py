@@ -8,14 +8,8 @@ from omegaconf import DictConfig, OmegaConf
 from mops_lightning.config import settings
 from mops_lightning.errors import UserError
 
-GROUPS_BY_NAME = {
-    "task": "task",
-    "net": "task/net",
-    "dataset": "dataset",
-    "sampler": "sampler",
-    "recipe": "recipe",
-}
-"""The group of every entry of ``names``."""
+NAMED = ("task", "task/net", "dataset", "sampler", "recipe")
+"""The groups whose choices are in ``names``."""
 
 
 def conf_dir() -> Path:
@@ -54,7 +48,7 @@ def group_choices() -> DictConfig:
 
     choices = HydraConfig.get().runtime.choices
     # A node, so that interpolations find the names below it.
-    return OmegaConf.create({name: choices.get(group) for name, group in GROUPS_BY_NAME.items()})
+    return OmegaConf.create({group.rpartition("/")[2]: choices.get(group) for group in NAMED})
 
 
 def run_label(_root_: DictConfig) -> str:
@@ -102,10 +96,5 @@ def selectable_groups() -> str:
     return "\n".join(sorted(lines))
 
 
-def register() -> None:
-    """Register the resolvers."""
-    for resolver in (group_choices, run_label, run_level_keys, selectable_groups):
-        OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
-
-
-register()
+for resolver in (group_choices, run_label, run_level_keys, selectable_groups):
+    OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
