@@ -8,8 +8,7 @@ import logging
 import math
 import os
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +57,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
     from mops_lightning.training.run.run import STARTED, run
 
     try:
-        with _claimed(folder):
+        with _lock(folder):
             (folder / FAILED).unlink(missing_ok=True)
             remove_temporary(folder)
             if (folder / ASIDE / MOVING).is_dir():
@@ -82,7 +81,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
             return math.nan if new is None else float(new)
     except (Interrupted, BrokenPipeError):
         raise
-    except Busy:
+    except Timeout:
         log.warning(f"{folder}: skipped, because another process runs this cell")
     except Exception as error:
         text = line_about(error)
@@ -95,23 +94,13 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
     return math.nan
 
 
-@contextmanager
-def _claimed(folder: Path) -> Iterator[None]:
-    """Hold the cell's lock; a killed process releases it.
+def _lock(folder: Path) -> FileLock:
+    """Return the cell's lock, which raises ``Timeout`` where another process runs the cell.
 
-    Raises:
-        Busy: another process runs this cell.
+    A killed process releases it.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / ".lock")
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise Busy from None
-    try:
-        yield
-    finally:
-        lock.release()
+    return FileLock(folder / ".lock", timeout=0)
 
 
 def _earlier(cfg: DictConfig, folder: Path) -> tuple[str, float] | None:
@@ -186,15 +175,11 @@ def _move_aside(folder: Path) -> None:
     moving.rename(folder / ASIDE / str(max(numbers, default=0) + 1))
 
 
-class Busy(Exception):
-    """Another process runs a cell."""
-
-
 def _state(cell: Path) -> str:
     try:
-        with _claimed(cell):
+        with _lock(cell):
             pass
-    except Busy:
+    except Timeout:
         return ELSEWHERE
     if (cell / FAILED).exists():
         return "failed"

@@ -57,9 +57,10 @@ def refuse_plain_groups(arguments: Sequence[str]) -> None:
         name = key_of(argument)
         if override is None or override.is_delete() or name not in groups:
             continue
-        values = [override.value()]
+        value: Any = override.value()
+        values = [value]
         if override.is_sweep_override():
-            values = override.value().list if override.is_choice_sweep() else []
+            values = value.list if override.is_choice_sweep() else []
         if not all(map(_is_choice, values)):
             raise UserError(f"{argument}: choose one with {name}=NAME{OTHERWISE.get(name, '')}.")
 
