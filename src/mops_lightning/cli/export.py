@@ -19,12 +19,6 @@ def main(arguments: list[str], prog: str) -> None:
         arguments: those of the command line.
         prog: what the user typed to start this command.
     """
-    with one_line_endings(prog):
-        _run(make_parser(prog).parse_args(arguments))
-
-
-def make_parser(prog: str) -> argparse.ArgumentParser:
-    """Return the parser of this command's arguments."""
     parser = argparse.ArgumentParser(
         prog=prog, description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -33,15 +27,15 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
     add("target", metavar="OUT", type=Path, help="a file that ends in .onnx or .pt2")
     add("--m", type=int, help="number of points; default: as the sampler was trained for")
     add("--overwrite", action="store_true", help="replace an existing file")
-    return parser
+    with one_line_endings(prog):
+        chosen = parser.parse_args(arguments)
+        if chosen.target.exists() and not chosen.overwrite:
+            raise UserError(f"{chosen.target} exists. Give another OUT, or --overwrite.")
+        from mops_lightning.zoo.export import export
+        from mops_lightning.zoo.load import load
 
-
-def _run(chosen: argparse.Namespace) -> None:
-    if chosen.target.exists() and not chosen.overwrite:
-        raise UserError(f"{chosen.target} exists. Give another OUT, or --overwrite.")
-    from mops_lightning.zoo.export import export
-    from mops_lightning.zoo.load import load
-
-    difference = export(load(chosen.sampler), chosen.target, chosen.m)
-    size = chosen.target.stat().st_size / 1e6
-    print(f"{chosen.target}: {size:.2f} MB; largest difference from the sampler {difference:.1e}")
+        difference = export(load(chosen.sampler), chosen.target, chosen.m)
+        size = chosen.target.stat().st_size / 1e6
+        print(
+            f"{chosen.target}: {size:.2f} MB; largest difference from the sampler {difference:.1e}"
+        )

@@ -26,15 +26,6 @@ def main(arguments: list[str], prog: str) -> None:
         arguments: those of the command line.
         prog: what the user typed to start this command.
     """
-    with one_line_endings(prog):
-        parser = make_parser(prog)
-        chosen = parser.parse_args(arguments)
-        _refuse_unused(chosen, parser)
-        print(printable("\n".join(_run(chosen))))
-
-
-def make_parser(prog: str) -> argparse.ArgumentParser:
-    """Return the parser of this command's arguments."""
     parser = argparse.ArgumentParser(
         prog=prog, description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -46,7 +37,10 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
     new.add_argument("--task-net", metavar="NAME", help="model of the sampler's task net")
     new.add_argument("--notes", default="", help="what a user must know besides")
     new.add_argument("--overwrite", action="store_true", help="replace a model of this name")
-    return parser
+    with one_line_endings(prog):
+        chosen = parser.parse_args(arguments)
+        _refuse_unused(chosen, parser)
+        print(printable("\n".join(_run(chosen))))
 
 
 def _refuse_unused(chosen: argparse.Namespace, parser: argparse.ArgumentParser) -> None:

@@ -326,8 +326,7 @@ def _of(schema: type, path: str) -> Setting:
 
 def limited() -> dict[str, Limits]:
     """Return the limits of all settings that have some, by dotted name."""
-    names = [*declared(), *INSIDE]
-    found = {name: of(name).limits for name in names}
+    found = {name: of(name).limits for name in (*declared(), *INSIDE)}
     return {name: limits for name, limits in found.items() if limits is not None}
 
 
