@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import FULL, parse
 from mops_lightning.records.run_record import RunRecord
@@ -163,15 +164,13 @@ def _by_net(table: Table) -> Grid:
         [str(m), name, *("" if one != one else one for one in cells.loc[(m, name), columns])]
         for m, name in sorted(cells.index, key=lambda one: (-one[0], sort_key(one[1])))
     ]
-    # Errors that are normalized by those of full clouds are 1 there.
-    full = metric_info(table.metric.full_cloud_metric or table.metric.name, records)
+    full = _full_metric(table)
     label = f"all points ({full.title})" if table.metric.full_cloud_metric else "all points"
-    by_net: dict[str, dict[float, None]] = {name: {} for name in columns}
-    for record, net in zip(records, labels, strict=True):
-        figure = record.metrics.get(f"test/{FULL}/{full.name}")
-        if figure is not None:
-            by_net[net][figure] = None  # one for each seed where data depend on it
-    means = [full.format(sum(by) / len(by)) if by else "" for by in by_net.values()]
+    figures = [record.metrics.get(f"test/{FULL}/{full.name}") for record in records]
+    # Figures differ by seed where data depend on it; equal ones are of the same data.
+    tested = pd.DataFrame({"net": labels, "figure": figures}).dropna().drop_duplicates()
+    by_net = tested.groupby("net")["figure"].mean().map(full.format)
+    means = [by_net.get(name, "") for name in columns]
     title = (
         f"Test {table.metric.title} of the same samples under several task nets: {names['task']} "
         f"on {names['dataset']}; generated / matched / completed sets, or one figure for samplers "
@@ -225,25 +224,19 @@ def _costs(table: Table) -> dict[str, str]:
 
 def _full_row(table: Table) -> list[str]:
     """Return the task net's values on full clouds, by the setting of the columns."""
-    texts = {}
-    for record in table.group.records:
-        figure = record.metrics.get(f"test/{FULL}/{table.metric.name}")
-        if figure is not None:
-            texts[value(record, table.group.layout.column)] = table.metric.format(figure)
+    key, name = table.group.layout.column, f"test/{FULL}/{table.metric.name}"
+    figures = [(value(one, key), one.metrics.get(name)) for one in table.group.records]
+    texts = {column: table.metric.format(one) for column, one in figures if one is not None}
     return ["all points", *(texts.get(column, "") for column in table.columns())]
 
 
 def _full_lines(table: Table) -> list[str]:
     """Return a line for each task net with its value on full clouds."""
-    names, metric, records = _names(table), table.metric, table.group.records
+    names, records, metric = _names(table), table.group.records, _full_metric(table)
     joint = trained_with(records[0]) == "joint"
     theirs = paper.table(names["task"], names["dataset"], metric.name, joint)
-    published = f" (the paper: {theirs['full']:.2f})" if "full" in theirs else ""
-    label = ""
-    if metric.full_cloud_metric:
-        metric = metric_info(metric.full_cloud_metric, records)
-        label = f"{metric.title} "
-    lines: dict[str, None] = {}  # a dictionary as a set in order
+    label = f"{metric.title} " if table.metric.full_cloud_metric else ""
+    lines = []
     for record in sorted(records, key=lambda one: (sampler_row(one), -one.config["m"])):
         figure = record.metrics.get(f"test/{FULL}/{metric.name}")
         if figure is None:
@@ -254,9 +247,16 @@ def _full_lines(table: Table) -> list[str]:
             several = any(parts.m for parts in map(parse, record.metrics) if parts)
             size = "" if several else f", m={record.config['m']}"
             after = f" after joint training with {sampler_row(record)}{size}"
-        compared = published if net == table.net else ""
-        lines[f"{net} on all points{after}: {label}{metric.format(figure)}{compared}."] = None
-    return list(lines)
+        published = net == table.net and "full" in theirs
+        compared = f" (the paper: {theirs['full']:.2f})" if published else ""
+        lines.append(f"{net} on all points{after}: {label}{metric.format(figure)}{compared}.")
+    return list(dict.fromkeys(lines))
+
+
+def _full_metric(table: Table) -> MetricInfo:
+    """Return the metric of full clouds: errors that are normalized by theirs are 1 there."""
+    name = table.metric.full_cloud_metric or table.metric.name
+    return metric_info(name, table.group.records)
 
 
 def _names(table: Table) -> dict[str, str]:

@@ -5,6 +5,8 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import pandas as pd
+
 from mops_lightning.config.shared_settings import table_settings
 from mops_lightning.records.run_record import RunRecord, dotted
 from mops_lightning.report.collect import epochs, recipe, sampler_row, seed, trained_with
@@ -73,15 +75,12 @@ def net_groups(found: list[RunRecord], mixed: bool = False) -> list[Group]:
     result = _by_content(result, "data", "dataset_fingerprint") if len(points) == 1 else result
     if mixed:
         return result
-    result = _split(result, "commit", commit)
-    return [
-        one
-        for group in result
-        for one in _by_settings(
-            group,
-            [k for k in varying(group.records) if not k.startswith(("task.net.", "sampler."))],
-        )
-    ]
+    parts = []
+    for group in _split(result, "commit", commit):
+        keys = varying(group.records)
+        keys = [key for key in keys if not key.startswith(("task.net.", "sampler."))]
+        parts += _by_settings(group, keys)
+    return parts
 
 
 def _split(found: list[Group], what: str, key: Callable[[RunRecord], Hashable]) -> list[Group]:
@@ -93,8 +92,7 @@ def _split(found: list[Group], what: str, key: Callable[[RunRecord], Hashable]) 
             parts.setdefault(key(record), []).append(record)
         for value, records in parts.items():
             text = value if isinstance(value, str) else " ".join(map(str, _differing(value, parts)))
-            about = f"{what} {text}" if len(parts) > 1 else ""
-            result.append(_part(group, about, records))
+            result.append(_part(group, f"{what} {text}" if len(parts) > 1 else "", records))
     return result
 
 
@@ -127,14 +125,12 @@ def _by_content(found: list[Group], what: str, name: str) -> list[Group]:
 
 def _agree(found: list[RunRecord], name: str) -> bool:
     """Return whether runs have the same value of a field, or one for each seed of all samplers."""
-    by_seed: dict[int, set[str]] = {}
-    seeds: dict[str, set[int]] = {}
-    for record in found:
-        by_seed.setdefault(seed(record), set()).add(getattr(record, name))
-        seeds.setdefault(record.config["names"]["sampler"], set()).add(seed(record))
-    distinct = {one for values in by_seed.values() for one in values}
-    uneven = len(distinct) > 1 and len({frozenset(one) for one in seeds.values()}) > 1
-    return not uneven and all(len(values) == 1 for values in by_seed.values())
+    rows = [(one.config["names"]["sampler"], seed(one), getattr(one, name)) for one in found]
+    runs = pd.DataFrame(rows, columns=["sampler", "seed", "value"])
+    if runs["value"].nunique() <= 1:
+        return True
+    seeds = runs.groupby("sampler")["seed"].agg(frozenset)
+    return seeds.nunique() == 1 and (runs.groupby("seed")["value"].nunique() == 1).all()
 
 
 def _with_layout(group: Group, mixed: bool) -> list[Group]:

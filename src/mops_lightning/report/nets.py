@@ -68,14 +68,14 @@ def _row(records: list[RunRecord], keys: list[str], metrics: list[MetricInfo]) -
     texts = ["" if value is None else str(value) for value in label]
     for metric in metrics:
         values = pd.Series([one.metrics.get(f"test/{FULL}/{metric.name}") for one in records])
-        count = int(values.count())
-        std = float(values.std()) if count > 1 else None
-        text = over_seeds(metric, float(values.mean()), std) if count else ""
+        count = values.count()
+        std = values.std() if count > 1 else None
+        text = over_seeds(metric, values.mean(), std) if count else ""
         texts.append(text + (f" (n={count})" if count > 1 else ""))
-    size, costs = first.parameters.get("task"), [one.seconds.get("fit") for one in records]
-    known = [cost for cost in costs if cost is not None]
+    size = first.parameters.get("task")
+    cost = pd.Series([one.seconds.get("fit") for one in records], dtype=float).mean()
     texts.append("" if size is None else f"{4e-6 * size:.1f}")
-    return [*texts, f"{sum(known) / len(known):,.0f} s" if known else "", _paper(first)]
+    return [*texts, "" if pd.isna(cost) else f"{cost:,.0f} s", _paper(first)]
 
 
 def _net(record: RunRecord) -> dict[str, Any]:
