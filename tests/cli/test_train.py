@@ -148,7 +148,7 @@ def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
     )
     assert status == 0, err
     assert "registration by icp" in out
-    status, _, err = call(["task=registration", "task/net=icp", *TINY], tmp_path)
+    status, _, err = call(["task=registration", "task/net=icp", "weights=null", *TINY], tmp_path)
     assert status == 2
     assert "learn=sampler: ICP has no weights" in err
 

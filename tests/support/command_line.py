@@ -36,6 +36,7 @@ TINY = [
 
 SMALL_PCRNET = [
     "task=registration",
+    "weights=auto",
     "task.net.feature_channels=[16,32]",
     "task.net.head_channels=[32]",
 ]

@@ -129,7 +129,7 @@ def build_parts(
     if not parts.has_task_weights and cfg.weights not in (None, "auto", OF_RUN):
         raise UserError(
             f"weights: {cfg.names.net} has no weights to load, got {cfg.weights}. "
-            "Leave weights out."
+            "Give weights=null."
         )
     learned = experiment.sampler is not None and experiment.sampler.learned
     if cfg.learn == "nothing" and learned and not cfg.evaluate:
