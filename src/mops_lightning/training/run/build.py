@@ -152,14 +152,19 @@ def make_experiment(
     Raises:
         UserError: a setting that its part or the data do not allow.
     """
-    task = _make_task(cfg, len(dataset.class_names))
+    L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
+    classes = {"num_classes": len(dataset.class_names)}
+    own_net = build(cfg.task.net, "task.net", **accepted(cfg.task.net, classes))
+    task: Task = build(cfg.task, "task", net=own_net, **accepted(cfg.task, classes))
     # A seed of its own: the sampler's initial weights must not depend on the task net's size.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
     # For samplers that select points by the task net's features.
     net = {"net": task.net}
     own = accepted(cfg.sampler, net)
     sampler = build(cfg.sampler, "sampler", **own) if cfg.learn != "task" else None
-    points = points_per_cloud(task, dataset)
+    cloud = Batch(dataset.test.points[:1], dataset.test.labels[:1])
+    # Pairs may have fewer points than the clouds they are drawn from.
+    points = task.make_batch(cloud, lambda: [torch.Generator()]).points.shape[1]
     sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, points, training=cfg.learn != "nothing")
     baselines: dict[str, Sampler] = {}
     if sampler is not None and sampler.learned:
@@ -167,9 +172,7 @@ def make_experiment(
     elif sampler is not None and sampler.flexible:
         sampler = build(cfg.sampler, "sampler", m=max(sizes), **own)
     _check_cloud_size(cfg, sampler, baselines, points)
-    make_optimizer, make_schedule = optimizer_makers(cfg.optimizer)
-    if cfg.learn != "nothing":
-        _try_optimizer(make_optimizer, make_schedule)
+    make_optimizer, make_schedule = _optimizer_makers(cfg)
     full_clouds = None
     if train is not None and not augmentation(cfg).active:
         full_clouds = FullClouds(train, cfg.batch_size, Path(cfg.cache).expanduser())
@@ -271,29 +274,12 @@ def sizes_to_test(
     return tuple(wanted)
 
 
-def points_per_cloud(task: Task, dataset: CloudDataset) -> int:
-    """Return the number of points that a sampler gets of every cloud.
-
-    Raises:
-        UserError: the data have too few points for the task.
-    """
-    clouds = Batch(dataset.test.points[:1], dataset.test.labels[:1])
-    batch = task.make_batch(clouds, lambda: [torch.Generator()])
-    return batch.points.shape[1]
-
-
 def _recipe(cfg: DictConfig, sampler: Sampler | None) -> Recipe:
     """Return the recipe in force; the task net's training has a record of its own."""
     recipe: Recipe = build(cfg.recipe, "recipe")
     if sampler is None:
         return Recipe(task_points=recipe.task_points)
     return replace(recipe, task_points=None) if sampler.learned else Recipe()
-
-
-def _make_task(cfg: DictConfig, num_classes: int) -> Task:
-    L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
-    net = build(cfg.task.net, "task.net", **accepted(cfg.task.net, {"num_classes": num_classes}))
-    return build(cfg.task, "task", net=net, **accepted(cfg.task, {"num_classes": num_classes}))
 
 
 def _make_baselines(cfg: DictConfig, m: int, net: dict[str, Any]) -> dict[str, Sampler]:
@@ -318,20 +304,17 @@ def _check_cloud_size(
             baseline.check_cloud_size(n)
 
 
-def _try_optimizer(make_optimizer: Any, make_schedule: Any) -> None:
-    """Make an optimizer of nothing, so that its mistakes end a run before a net is pretrained."""
-    optimizer = make_optimizer([torch.nn.Parameter(torch.zeros(1))])
-    if make_schedule:
-        make_schedule(optimizer, total_steps=2)
-
-
-def optimizer_makers(node: DictConfig) -> tuple[Any, Any]:
-    """Return what makes an optimizer of parameters, and a schedule of an optimizer, or None."""
-    settings: Any = OmegaConf.to_container(node, resolve=True)
+def _optimizer_makers(cfg: DictConfig) -> tuple[Any, Any]:
+    """Return functions that make the optimizer of parameters and its schedule, if there is one."""
+    settings: Any = OmegaConf.to_container(cfg.optimizer, resolve=True)
     schedule = settings.pop("schedule", None)
     makers = {"optimizer": settings, "optimizer.schedule": schedule}
     make_optimizer, make_schedule = (
         one and build(OmegaConf.create({**one, "_partial_": True}), where)
         for where, one in makers.items()
     )
+    if cfg.learn != "nothing":  # an optimizer of nothing, so that its mistakes end the run here
+        optimizer = make_optimizer([torch.nn.Parameter(torch.zeros(1))])
+        if make_schedule:
+            make_schedule(optimizer, total_steps=2)
     return make_optimizer, make_schedule

@@ -35,9 +35,8 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, train: Train) -> Path |
         None for ``weights=null`` (the net stays as initialised), for a resumed run (its checkpoint
         contains the task net), and for an evaluated run.
     """
-    if cfg.weights in (None, OF_RUN) or cfg.ckpt_path is not None:
-        return None
-    if cfg.weights == "auto" and cfg.learn == "task":
+    from_scratch = cfg.weights == "auto" and cfg.learn == "task"
+    if cfg.weights in (None, OF_RUN) or cfg.ckpt_path is not None or from_scratch:
         return None
     if cfg.weights != "auto":
         return weights.of_task_net(cfg.weights)
