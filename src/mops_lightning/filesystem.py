@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, what a kill or a damage leaves, and unpacking."""
+"""Files that are written whole or not at all, what a kill leaves, and unpacking."""
 
 import os
 import sys

@@ -15,7 +15,6 @@ from mops_lightning.records.metric_info import foreign_metrics
 from mops_lightning.records.readout_names import parse
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.divergence import Diverged, with_checkpoint
-from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.recipe.warm_start import warm_start as warm_start_sampler
 from mops_lightning.training.run.build import Parts, augmentation
@@ -50,12 +49,12 @@ def fit(parts: Parts, record: RunRecord) -> None:
     Raises:
         UserError: too little data, or training that diverged.
     """
-    recipe = parts.experiment.recipe
-    if recipe != Recipe():
-        named = {"name": parts.cfg.names.recipe, **asdict(recipe)}
-        only_task = {"task_points": recipe.task_points}
-        record.recipe = only_task if parts.experiment.sampler is None else named
     cfg, trainer, experiment = parts.cfg, parts.trainer, parts.experiment
+    recipe = experiment.recipe
+    if recipe != Recipe():
+        named = {"name": cfg.names.recipe, **asdict(recipe)}
+        only_task = {"task_points": recipe.task_points}
+        record.recipe = only_task if experiment.sampler is None else named
     resumed = parts.resumed.path if parts.resumed else None
     task, clouds = experiment.task, len(parts.train.labels)
     if clouds < 2 * trainer.world_size:
@@ -77,13 +76,13 @@ def fit(parts: Parts, record: RunRecord) -> None:
     validation = parts.score_loader(parts.held_out) if len(parts.held_out.labels) else None
     try:
         with _interruptible(), _monitoring():
-            trainer.fit(parts.experiment, loader, validation, ckpt_path=resumed)
-        if name := weights.first_nonfinite(parts.experiment.state_dict()):
+            trainer.fit(experiment, loader, validation, ckpt_path=resumed)
+        if name := weights.first_nonfinite(experiment.state_dict()):
             raise Diverged(f"training diverged: {name} is not finite.")
     except Diverged as error:
         raise with_checkpoint(error, _last_checkpoint(parts)) from None
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        if resumed is None or parts.experiment.started or isinstance(error, UserError):
+        if resumed is None or experiment.started or isinstance(error, UserError):
             raise
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise weights.Damaged(f"ckpt_path: cannot resume from {resumed}: {reason}.") from error
@@ -108,20 +107,16 @@ def test(parts: Parts, record: RunRecord) -> None:
     with _interruptible():
         trainer.test(experiment, parts.score_loader(parts.dataset.test), verbose=False)
     record.metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
-    log_hparams(trainer, record.config, _scores_at_own_size(record.metrics, experiment))
+    parsed = {name: parse(name) for name in record.metrics}
+    scores = {  # of every readout, at the run's own size
+        name: record.metrics[name]
+        for name, key in parsed.items()
+        if key and key.metric == experiment.task.score and key.m in (None, experiment.m)
+    }
+    log_hparams(trainer, record.config, scores)
     if experiment.learn in ("sampler", "nothing") and parts.has_task_weights:
         # A resumed run has its task net from the checkpoint, not from a weights file.
         record.task_weights_sha256 = weights.digest(experiment.task.state_dict())
-
-
-def _scores_at_own_size(metrics: dict[str, float], experiment: Experiment) -> dict[str, float]:
-    """Select the task's score of every readout, at the run's own size."""
-    chosen = {}
-    for name, value in metrics.items():
-        parts = parse(name)
-        if parts and parts.metric == experiment.task.score and parts.m in (None, experiment.m):
-            chosen[name] = value
-    return chosen
 
 
 @contextmanager
