@@ -131,8 +131,7 @@ def _by_column(table: Table) -> Grid:
     cells, columns, costs = table.cells(["row"]), table.columns(), _costs(table)
     rows: list[list] = []
     for name in table.rows():
-        shown = [cells.loc[name].get(column) for column in columns]
-        own = ["" if one is None or one != one else one for one in shown]
+        own = cells.loc[name, columns]
         rows.append([name, *own, *([costs.get(name, "")] if costs else [])])
         sampler = samplers.get(name, name.partition(" from ")[0])
         theirs = published.get("rows", {}).get(sampler, {}) if layout.column == "m" else {}
@@ -161,7 +160,7 @@ def _by_net(table: Table) -> Grid:
     labels, records = net_labels(table.group.records), table.group.records
     columns = sorted(cells.columns, key=lambda label: ("of the training" not in label, label))
     rows: list[list] = [
-        [str(m), name, *("" if one != one else one for one in cells.loc[(m, name), columns])]
+        [str(m), name, *cells.loc[(m, name), columns]]
         for m, name in sorted(cells.index, key=lambda one: (-one[0], sort_key(one[1])))
     ]
     full = _full_metric(table)
@@ -183,10 +182,9 @@ def _plane(table: Table, name: str) -> Grid:
     """Return the grid of a sampler: rows are one setting's values, columns the other's."""
     names, (down, across) = _names(table), table.group.layout.planes[name]
     cells = table.cells(["row", "down"]).loc[name].sort_index().sort_index(axis=1)
-    cells = cells.dropna(axis=1, how="all")
+    cells = cells.loc[:, (cells != "").any()]
     rows: list[list] = [
-        [f"{left:g}", *("" if one != one else one for one in line)]
-        for left, line in zip(cells.index, cells.to_numpy(), strict=True)
+        [f"{left:g}", *line] for left, line in zip(cells.index, cells.to_numpy(), strict=True)
     ]
     title = (
         f"Test {table.metric.title} of {name}: {names['task']} on {names['dataset']}, "

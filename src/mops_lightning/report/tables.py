@@ -99,10 +99,10 @@ class Table:
         return self.values[(self.values["row"] == row) & (self.values["readout"] == readout)]
 
     def cells(self, index: Sequence[str]) -> pd.DataFrame:
-        """Return the cells by columns of ``values``, such as ``row``, and by ``column``."""
+        """Return the cells by columns of ``values`` and by ``column``; empty texts for none."""
         keys = [*index, "column"]
         cells = self.values.groupby(keys, sort=False)[list(self.values)].apply(self._cell)
-        return cells.unstack("column")
+        return cells.unstack("column", fill_value="")
 
     def _cell(self, values: pd.DataFrame) -> Cell:
         by_readout = {one.readout: one for one in values.itertuples()}
@@ -178,9 +178,8 @@ def make_table(group: Group, metric: str, net: str) -> Table:
     values = values[values["own"] | (values["learn"] != "joint")]
     values["readout"] = values["readout"].where(values["readout"].isin(READOUTS), INDEX_READOUT)
     place = ["row", "m", "column", "down"]
-    own = set(values.loc[values["own"], place].itertuples(index=False, name=None))
-    taken = [one in own for one in values[place].itertuples(index=False, name=None)]
-    values = values[values["own"] | ~pd.Series(taken, index=values.index)]
+    tested = values.groupby(place, dropna=False)["own"].transform("any")
+    values = values[values["own"] | ~tested]
     started = values["run"].map(lambda run: records[run].started)
     values = values.assign(started=started).sort_values("started", kind="stable")
     later = values["run"] != values.groupby([*place, "seed"])["run"].transform("last")
