@@ -66,7 +66,7 @@ def assignment(
 ) -> Tensor:
     """Return the assignment whose mean distance is the earth mover's distance.
 
-    Arguments and errors are those of ``earth_movers_distance``.
+    Arguments and errors as in ``earth_movers_distance``.
 
     Returns:
         ``(B, N)`` int64 rows of ``others``, a permutation for every cloud.

@@ -86,7 +86,7 @@ def farthest_point_fill(points: Tensor, indices: Tensor, counts: Tensor) -> Tens
 
 @torch.no_grad()
 def _farthest(points: Tensor, distances: Tensor, steps: int) -> Tensor:
-    """Choose farthest points; arguments and result are those of ``compiled.farthest``."""
+    """Choose farthest points; arguments and result as in ``compiled.farthest``."""
     rows = compiled.farthest(points, steps, distances)
     return farthest_in_steps(points, distances, steps) if rows is None else rows
 

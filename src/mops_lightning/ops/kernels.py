@@ -1,7 +1,7 @@
 """Farthest and nearest points in loops that numba compiles; ``ops.compiled`` calls them.
 
 Squares are summed by fused multiply-add, which rounds once, as torch does on processors with
-AVX2: the rows are those of the torch forms, bit for bit.
+AVX2: the rows are identical to the torch forms' rows.
 
 Points are sorted into a tree of boxes, and far boxes are skipped, as in QuickFPS (Han et al., IEEE
 TCAD 2023). The distance to a box is never above the distance to a point in it, because both are
@@ -284,7 +284,7 @@ def farthest(planes, distances, steps, channels, leaf):
 
 @jit
 def _choose_child(nodes, peaks, left, rows, node):
-    """Take over the farthest point among those of the children."""
+    """Take over the farthest of the children's points."""
     first = nodes[4 * node + 2]
     best = peaks[first]
     for k in range(first + 1, first + nodes[4 * node + 3]):

@@ -10,7 +10,7 @@ SHORTLIST = 16
 
 
 class SubmodularSampler(TaskNetSampler):
-    """Choose points whose max-pooled features are nearly those of the full cloud, without training.
+    """Choose points whose max-pooled features are close to the full cloud's, without training.
 
     With f_ic the feature c of point i, points are chosen greedily so that Σ_c max_i f_ic over the
     chosen points grows most (``facility_location``). Once the

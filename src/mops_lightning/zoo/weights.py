@@ -188,7 +188,7 @@ def check_shapes(
 ) -> None:
     """Reject tensors whose names or shapes are not a module's.
 
-    Arguments and errors are those of ``fit_state``.
+    Arguments and errors as in ``fit_state``.
     """
     expected = module.state_dict()
     wrong = [f"{name} is missing" for name in expected if name not in state]

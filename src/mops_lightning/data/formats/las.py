@@ -26,7 +26,7 @@ VLR, EVLR = 54, 60
 """Bytes of the header of a variable length record, and of an extended one."""
 
 POINTS_PER_BYTE = 1024
-"""Most points that a byte of compressed data stands for."""
+"""Largest number of points per byte of compressed data."""
 
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 """Separately compressed parts of the items of point formats 6 to 10; extra bytes have one each."""
