@@ -6,10 +6,11 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
+from mops_lightning.config.annotations import misfit
 from mops_lightning.config.build import signature
 from mops_lightning.config.compose import compose
 from mops_lightning.config.hydra_conf import conf_dir
-from mops_lightning.config.validate import check, misfit
+from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 
 SPECIALISED = ("task_settings", "dataset_task")

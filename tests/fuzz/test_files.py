@@ -53,7 +53,7 @@ def test_fuzzed_file_is_read_or_refused(kind, made, processes, tmp_path):
 
     counts: Counter[str] = Counter()
     bad = []
-    for number, result in processes.run(try_file, jobs()):
+    for number, result in processes.map(try_file, jobs()):
         content = kept.pop(number)
         said = str(result) if isinstance(result, Died) else result
         counts[said if len(said) < 10 else "bad"] += 1

@@ -114,7 +114,7 @@ def test_page_planes_have_table_and_plot(tmp_path, opened):
     put_planes(tmp_path)
     main([str(tmp_path)])
     page, errors, _ = opened(f"file://{tmp_path}/report.html")
-    assert cells(page, 1)[1] == ["1.0", "1.5 / 2", "1.9 / 2"]
+    assert cells(page, 1)[1] == ["1", "1.5 / 2", "1.9 / 2"]
     assert page.locator("img").evaluate("image => image.naturalWidth") > 300
     assert page.locator("#view").count() == 0, "no run has saved clouds"
     assert errors == []

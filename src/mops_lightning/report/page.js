@@ -5,7 +5,7 @@ for (const head of document.querySelectorAll("th")) {
     const down = head.getAttribute("aria-sort") === "ascending";
     const key = row => {
       const first = row.cells[column].firstChild;
-      const text = first && first.nodeType === Node.TEXT_NODE ? first.textContent : "";  // not the paper's
+      const text = first && first.nodeName !== "SMALL" ? first.textContent : "";  // not the paper's
       const number = parseFloat(text);
       return column === 0 ? text : Number.isNaN(number) ? -Infinity : number;
     };

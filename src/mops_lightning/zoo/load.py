@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 import mops_lightning
-from mops_lightning.config.validate import misfit
+from mops_lightning.config.annotations import misfit
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.zoo import names, weights
