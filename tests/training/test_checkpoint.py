@@ -11,6 +11,7 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from torch import nn
+from torch.optim import Adam
 
 from mops_lightning.config.settings import Learn
 from mops_lightning.data.loader import Augmentation, CloudLoader
@@ -19,6 +20,7 @@ from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.checkpoint import read_plain
 from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.muon import MuonAdam
 from mops_lightning.training.recipe.moving_average import MovingAverage
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.run.callbacks import StopBetweenSteps, last_checkpoint
@@ -111,7 +113,7 @@ def attempt(setting: Setting, path: Path, *callbacks: Callback) -> Any:
         Classification(SmallNet(), 3),
         None if learn == "task" else sampler,
         learn,
-        make_optimizer=partial(torch.optim.Adam, lr=1e-2),
+        make_optimizer=partial(MuonAdam, smallest=3, lr=1e-2) if fast else partial(Adam, lr=1e-2),
         make_schedule=one_cycle,
         recipe=recipe if fast else None,
     )
