@@ -75,7 +75,8 @@ def test_wheel_contains_package_and_configs_only(wheel: Path) -> None:
     configs = files_below(ROOT / "conf", "mops_lightning/conf")
     assert "mops_lightning/conf/config.yaml" in configs
     assert {"mops_lightning/report/paper.json", "mops_lightning/py.typed"} <= names
-    assert names == configs | files_below(ROOT / "src/mops_lightning", "mops_lightning")
+    packages = ("mops_lightning", "hydra_plugins")
+    assert names == configs.union(*(files_below(ROOT / "src" / name, name) for name in packages))
 
 
 def test_wheel_has_console_script_and_licence(wheel: Path) -> None:
