@@ -81,7 +81,7 @@ def _model(name: str, device: str) -> Sampler:
         UserError: there is no such method or model.
     """
     known = {*names.UNTRAINED, *names.available()}
-    if not (name.startswith(names.HUB) or name in known or Path(name).expanduser().exists()):
+    if not (name in known or Path(name).expanduser().exists()):
         raise UserError(f"method: unknown {name!r}.{did_you_mean(name, known)}")
     path = weights.of_run(names.resolve(name))
     return _loaded(path, path.stat().st_mtime_ns, device)

@@ -23,7 +23,7 @@ HINT = "Give a sampler, or the weights of a run with learn=sampler or learn=join
 
 @cache
 def samplers() -> list[type[Sampler]]:
-    """Return the samplers that files may name: those of the public API."""
+    """Return the samplers that files may name: all of the public API."""
     public = [getattr(mops_lightning, name) for name in mops_lightning.__all__]
     classes = [value for value in public if isinstance(value, type) and issubclass(value, Sampler)]
     return [cls for cls in classes if cls is not Sampler]
@@ -36,8 +36,8 @@ def load(path: str | Path, cls: type[Sampler] | None = None) -> Sampler:
     package, or ``cls``, are built. Torch's random state is left as it is.
 
     Args:
-        path: a model's name (``mops-lightning models`` lists them), a weights file, the folder of
-            a run, or ``hf://OWNER/REPO/FILE.safetensors@sha256:HASH``.
+        path: a model's name (``mops-lightning models`` lists them), a weights file or the folder
+            of a run.
         cls: the sampler's class, if it is not one of this package.
 
     Returns:
@@ -57,8 +57,7 @@ def load(path: str | Path, cls: type[Sampler] | None = None) -> Sampler:
     """
     if not isinstance(path, str | Path):
         raise UserError(f"path must be a string or a Path, got {path!r}.")
-    path = names.resolve(path)
-    path = weights.of_run(path) if path.is_dir() else path
+    path = weights.of_run(names.resolve(path))
     content = weights.read(path)
     config = content["config"]
     if config.get("learn") == "task":
@@ -91,11 +90,6 @@ def _build(cls: type[Sampler], node: Any, state: dict[str, Tensor], path: Path) 
     arguments = {name: value for name, value in node.items() if name != "_target_"}
     parameters = signature(cls).parameters
     for name, value in arguments.items():
-        if not _is_plain(value):
-            raise UserError(
-                f"{path}: sampler.{name} must be a number, a string, a list of them or null, got "
-                f"{type(value).__name__}."
-            )
         wanted = misfit(value, parameters[name].annotation) if name in parameters else None
         if wanted:
             raise UserError(f"{path}: sampler.{name} must be {wanted}, got {value!r:.99}.")
@@ -138,9 +132,3 @@ def _at_most(number: int) -> Iterator[None]:
         yield
     finally:
         hook.remove()
-
-
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, list):
-        return all(item is not None and _is_plain(item) for item in value)
-    return value is None or isinstance(value, bool | int | float | str)

@@ -1,7 +1,7 @@
 """The weights format: safetensors, with plain data as JSON in the header.
 
-The header of a run's weights file has the configuration and metrics of the run; that of a model has
-a card. Headers are read without torch and without the tensors.
+The header of a run's weights file has the configuration and metrics of the run; the header of a
+model has a card. Headers are read without torch and without the tensors.
 """
 
 import hashlib
@@ -27,7 +27,8 @@ LONGEST = 1 << 22
 """Most bytes of a header."""
 
 SHA256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
-NAME = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9_-]+(\.[a-z0-9_-]+)+$", max_length=100)]
+NAME_PATTERN = r"^[a-z0-9_-]+(\.[a-z0-9_-]+)+$"
+NAME = Annotated[str, msgspec.Meta(pattern=NAME_PATTERN, max_length=100)]
 
 
 class Figures(msgspec.Struct, forbid_unknown_fields=True):
@@ -149,7 +150,7 @@ def read_header(path: Path) -> dict[str, Any]:
 
 
 def read_card(path: Path) -> dict[str, Any]:
-    """Read the card of a model; errors are those of ``read_header``.
+    """Read the card of a model; errors as in ``read_header``.
 
     Raises:
         UserError: it is a run's weights file.

@@ -1,11 +1,10 @@
-"""Models by name or address: where they are, and what a user's name, file or address means."""
+"""Models by name: where they are, and the file that a name or path means."""
 
-import hashlib
 import os
 import re
 from pathlib import Path
 
-from mops_lightning.errors import UserError, did_you_mean, one_line
+from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.zoo import model_file
 
 UNTRAINED = {
@@ -19,15 +18,10 @@ SHIPPED = Path(__file__).parent / "models"
 """The models that the package contains."""
 VARIABLE = "MOPS_MODELS"
 """Environment variable: folders with models of the user's own."""
-NAME = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)+")
 FILES = (".pt", ".ckpt", ".safetensors", ".json")
 """Suffixes of files; a name does not end in one."""
 PIN = "@sha256:"
 """Between a name and the sha256 that its tensors must have."""
-HUB = "hf://"
-ADDRESS = re.compile(
-    r"hf://(?P<repo>[\w.-]+/[\w.-]+)/(?P<file>[\w./-]+\.safetensors)@sha256:(?P<sha256>[0-9a-f]{64})"
-)
 
 
 def folders() -> list[Path]:
@@ -47,7 +41,8 @@ def available() -> dict[str, Path]:
 
 def is_name(text: str) -> bool:
     """Return whether a model can be called this."""
-    return bool(NAME.fullmatch(text)) and not text.endswith(FILES) and len(text) <= 100
+    matches = bool(re.fullmatch(model_file.NAME_PATTERN, text))
+    return matches and not text.endswith(FILES) and len(text) <= 100
 
 
 def pinned(name: str, sha256: str) -> str:
@@ -75,10 +70,10 @@ def find_model(reference: str) -> Path | None:
 
 
 def resolve(reference: str | Path) -> Path:
-    """Return the path that a user means: an existing file or folder, a model or an address.
+    """Return the path that a user means: an existing file or folder, or a model.
 
     Args:
-        reference: a path, the name of a model, or ``hf://OWNER/REPO/FILE@sha256:HASH``.
+        reference: a path, or the name of a model.
 
     Returns:
         A path. It may not exist if it contains a folder or ends like a file.
@@ -87,8 +82,6 @@ def resolve(reference: str | Path) -> Path:
         UserError: there is no file and no model of this name; the nearest names are listed.
     """
     text = str(reference)
-    if text.startswith(HUB):
-        return fetch(text)
     path = Path(text).expanduser()
     if path.exists():
         return path
@@ -98,37 +91,3 @@ def resolve(reference: str | Path) -> Path:
     if path.name != text or text.endswith(FILES):
         return path
     raise UserError(f"no file or model {text!r}.{did_you_mean(text, available())}")
-
-
-def fetch(address: str) -> Path:
-    """Return a file of the Hugging Face Hub, downloaded if it is not in the cache.
-
-    Args:
-        address: ``hf://OWNER/REPO/FILE.safetensors@sha256:HASH``, with the sha256 of the file.
-
-    Raises:
-        UserError: the address has another form, huggingface_hub is not installed, the file cannot
-            be downloaded, or has another hash.
-    """
-    match = ADDRESS.fullmatch(address)
-    if match is None:
-        raise UserError(
-            f"{address}: the address of a model must be "
-            "hf://OWNER/REPO/FILE.safetensors@sha256:HASH. The publisher names the hash "
-            "(sha256sum FILE)."
-        )
-    try:
-        from huggingface_hub import hf_hub_download
-    except ModuleNotFoundError:
-        raise UserError(
-            f"{address} needs huggingface_hub: pip install 'mops-lightning[hub]'."
-        ) from None
-    try:
-        path = Path(hf_hub_download(match["repo"], match["file"]))
-    except Exception as error:  # errors of several HTTP libraries
-        raise UserError(f"{address} cannot be downloaded: {one_line(error)}") from None
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    if digest != match["sha256"]:
-        raise UserError(f"{address}: the downloaded file has another sha256, {digest}.")
-    return path

@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.records.metric_info import metric_info
@@ -12,7 +10,6 @@ from mops_lightning.records.readout_names import ROWS, MetricName, parse
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.zoo import model_file, names, weights
 
-PRECISIONS = ("float32", "float16", "bfloat16")
 WIDE = 4096
 """Weight matrices with this number of entries may be stored in 16 bits."""
 
@@ -59,9 +56,9 @@ def add(
         raise UserError(f"{run}: not a completed run that kept its weights. Give another RUN.")
     content = weights.read(weights.of_run(run))
     state = content["state"]
+    wide = {name for name, value in state.items() if value.ndim == 2 and value.numel() >= WIDE}
     if half:
-        wide = {name for name, value in state.items() if value.ndim == 2 and value.numel() >= WIDE}
-        state = {name: value.half() if name in wide else value for name, value in state.items()}
+        state |= {name: state[name].half() for name in wide}
     files = {"weights": name}
     if record.config["learn"] == "sampler":
         used = _task_net(task_net, record)
@@ -71,9 +68,9 @@ def add(
         "name": name,
         "transform": "unit_sphere",
         "licence": licence,
-        "precision": _precision(state),
+        "precision": "float16" if half and wide else "float32",
         "notes": notes,
-        "classes": _classes(content["classes"], record),
+        "classes": content["classes"],
         "figures": figures(record),
         "record": {**record.plain(), "files": files},
     }
@@ -124,16 +121,3 @@ def _task_net(name: str | None, record: RunRecord) -> str | None:
         if sha256 in used:
             return names.pinned(model, sha256)
     return None
-
-
-def _classes(own: list[str], record: RunRecord) -> list[str]:
-    """Return the classes of a classifier's outputs, as its file or its record says."""
-    config = record.config
-    if own or config["learn"] != "task" or config["names"]["task"] != "classification":
-        return list(own)
-    return list(record.class_names or [])
-
-
-def _precision(state: dict[str, Tensor]) -> str:
-    used = {str(value.dtype).removeprefix("torch.") for value in state.values()}
-    return next(name for name in reversed(PRECISIONS) if name in used)

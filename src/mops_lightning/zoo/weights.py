@@ -111,7 +111,7 @@ def of_run(run: Path, kind: str = "weights") -> Path:
 
     Args:
         run: the run's folder, or a model file. The record of the run names a file relative to its
-            folder, or a model.
+            folder, or a model. Any other path is the file with the weights.
         kind: ``weights``, of what was trained, or ``task_weights``, of the task net.
 
     Returns:
@@ -122,9 +122,9 @@ def of_run(run: Path, kind: str = "weights") -> Path:
         UserError: the folder contains a ``result.json`` that is not a run record, or the model that
             it names now has other weights.
     """
+    if kind == "weights" and not run.is_dir():
+        return run
     if run.is_file():
-        if kind == "weights":
-            return run
         files, run = model_file.read_card(run)["record"]["files"], run.parent
     else:
         has_record = (run / run_record.FILE).is_file()
@@ -135,7 +135,7 @@ def of_run(run: Path, kind: str = "weights") -> Path:
 
 
 def of_task_net(reference: str | Path) -> Path:
-    """Return the file of a task net: that of a run's folder; any other path is the file.
+    """Return the file with the weights of a task net. A path that is no folder is the file.
 
     Args:
         reference: what ``names.resolve`` takes, or the folder of a run that trained a task net,

@@ -41,8 +41,7 @@ def warm_start(
 
 def _from_file(name: str, sampler: nn.Module) -> tuple[dict[str, Any], str]:
     try:
-        path = names.resolve(name)
-        content = weights.read(weights.of_run(path) if path.is_dir() else path)
+        content = weights.read(weights.of_run(names.resolve(name)))
     except UserError as error:
         raise UserError(f"recipe.warm_start: {error}") from None
     if content["config"].get("learn") == "task":
@@ -68,11 +67,11 @@ def _from_file(name: str, sampler: nn.Module) -> tuple[dict[str, Any], str]:
 
 @torch.no_grad()
 def copy_pointwise_layers(source: nn.Module, target: nn.Module, points: Tensor) -> int:
-    """Copy the first layers of one net's first ``PointMLP`` to that of another.
+    """Copy the first layers of one net's first ``PointMLP`` to another net's first ``PointMLP``.
 
     Layers are copied up to the first whose shapes differ, each with its BatchNorm and running
-    statistics. Where only the target has BatchNorm, its statistics are those of ``points``, and
-    its scale and shift undo the normalization and add the source's bias, so that both layers
+    statistics. Where only the target has BatchNorm, its statistics are computed from ``points``,
+    and its scale and shift undo the normalization and add the source's bias, so that both layers
     compute the same in evaluation.
 
     Args:
@@ -108,7 +107,7 @@ def copy_pointwise_layers(source: nn.Module, target: nn.Module, points: Tensor) 
 
 @torch.no_grad()
 def copy_tensors(source: dict[str, Tensor], target: nn.Module) -> list[str]:
-    """Copy tensors of one net to those of another that have the same name.
+    """Copy tensors of one net to another net's tensors of the same name.
 
     Where only the number of rows differs, as between samplers of two sizes, the rows that both
     have are copied. Tensors that differ in more are left.
