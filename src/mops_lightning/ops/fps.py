@@ -1,7 +1,7 @@
 """Farthest point sampling (Eldar et al., IEEE TIP 1997), from a start point or a given subset."""
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops import compiled
@@ -9,12 +9,7 @@ from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.points import distance_dtype, gather_points, to_planes
 
 
-def farthest_point_sample(
-    points: Tensor,
-    m: int,
-    start: int | Tensor | None = None,
-    generator: Generator | None = None,
-) -> Tensor:
+def farthest_point_sample(points: Tensor, m: int, start: int | Tensor = 0) -> Tensor:
     """Choose m points, each as far as possible from the points chosen before it.
 
     Eldar et al., "The Farthest Point Strategy for Progressive Image Sampling", IEEE TIP 1997.
@@ -23,7 +18,6 @@ def farthest_point_sample(
         points: ``(B, N, C)``.
         m: number of points to choose, 1 ≤ m ≤ N.
         start: index of the first point, one for all clouds or ``(B,)``.
-        generator: draws the first points if ``start`` is None; without either it is point 0.
 
     Returns:
         ``(B, m)`` distinct int64 indices in the order of choice, the lowest index in case of ties;
@@ -44,9 +38,6 @@ def farthest_point_sample(
     clouds, n = points.shape[:2]
     if not 1 <= m <= n:
         raise UserError(f"m must be between 1 and the number of points N={n}, got {m}.")
-    if start is None and generator is not None:
-        start = torch.randint(n, (clouds,), generator=generator, device=generator.device)
-    start = 0 if start is None else start
     outside = (start < 0) | (start >= n)
     if outside if isinstance(outside, bool) else bool(outside.any()):
         raise UserError(f"start must be between 0 and N-1={n - 1}, got {start}.")

@@ -91,7 +91,7 @@ def farthest_rows(points: Tensor, m: int, seed: int = 0, start: int | str | None
     """
     order = seeded_order(points, seed)
     ordered = gather_points(points.detach(), order)
-    first = None
+    first: int | Tensor = 0
     if start == FARTHEST:
         # The mean of ordered points has the same rounding error for every order of the input.
         first = (ordered - ordered.mean(1, keepdim=True)).square().sum(2).argmax(1)
