@@ -79,7 +79,7 @@ class SampleOutput(NamedTuple):
     soft_projected: Tensor | None = None
 
     def first(self, m: int) -> "SampleOutput":
-        """Return the first ``m`` points, without the losses, which are those of all points."""
+        """Return the first ``m`` points, without the losses, which cover all points."""
         if m == self.points.shape[1]:
             return self._replace(losses={})
         return SampleOutput(

@@ -73,8 +73,8 @@ def frobenius_chamfer_loss(
 ) -> dict[str, Tensor]:
     """Return SampleNet's registration loss: ‖R̂Rᵀ − I‖²_F and a chamfer distance.
 
-    As in SampleNet's code, the chamfer distance is that of the points that the task net receives:
-    the sampled ones, or all points while the task net is trained alone.
+    As in SampleNet's code, the chamfer distance is computed on the points that the task net
+    receives: the sampled ones, or all points while the task net is trained alone.
 
     Args:
         predicted: the predicted motion between centred clouds.

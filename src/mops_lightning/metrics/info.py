@@ -1,16 +1,16 @@
-"""What tables and reports know about a metric; imports no torch, so that ``--help`` stays quick."""
+"""Names, units and order of metrics in tables; imports no torch, so that ``--help`` stays quick."""
 
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, fields
 from typing import Any, Self
 
 DEFAULT_ORDER = 10
-"""Place in the closing table of metrics that declare none: after those that do."""
+"""Place in the closing table of metrics that declare none: after all that declare one."""
 
 
 @dataclass(frozen=True)
 class MetricInfo:
-    """How a metric is named, formatted and ordered. Metric classes declare it; see ``of``.
+    """Name, format and order of a metric. Metric classes declare them; see ``of``.
 
     Attributes:
         name: the last part of its log key, such as ``accuracy``.
@@ -22,7 +22,7 @@ class MetricInfo:
         summary_order: position in the table that ends a run, lowest first, ties by name. None:
             in the record only.
         full_cloud_metric: name of the metric shown for full clouds instead, for errors that are
-            normalized by those of full clouds and therefore 1 there.
+            normalized by the error of the full cloud and therefore 1 there.
     """
 
     name: str

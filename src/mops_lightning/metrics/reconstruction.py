@@ -55,7 +55,7 @@ class MeanEMD(MeanDistance):
 
 
 class NormalizedError(TableMetric):
-    """Normalized reconstruction error: a distance divided by that of the full cloud's result.
+    """Normalized reconstruction error: a distance divided by the full cloud's distance.
 
     NRE(Q, P) = D(P, F(Q)) / D(P, F(P)), paper section "Reconstruction of small-scale point clouds".
     1 means that the sampled points serve the net as well as all points.
@@ -81,7 +81,7 @@ class NormalizedError(TableMetric):
             self.add_state(state, default=torch.tensor(0.0).double(), dist_reduce_fx="sum")
 
     def update(self, distances: Distances, reference: Distances) -> None:
-        """Add a batch of distances and those of the full clouds' reconstructions."""
+        """Add distances of a batch, and the distances of the full clouds' reconstructions."""
         sampled = getattr(distances, self.kind).detach().double()
         full = getattr(reference, self.kind).detach().double()
         # 0/0, an exact reconstruction from sampled points too, counts as 1.

@@ -20,8 +20,8 @@ class EdgeConv(nn.Module):
     """The edge convolution of DGCNN with one linear layer.
 
     The published form is y_i = max_j relu(BN(A·x_i + B·(x_j − x_i))) over the k nearest points j
-    in the space of x. As the layer is linear, the maximum over j is that of B·x_j; here BatchNorm
-    follows the maximum, so that no tensor of all edges is normalized.
+    in the space of x. As the layer is linear, only B·x_j depends on j. Here BatchNorm follows the
+    maximum, so that no tensor of all edges is normalized.
 
     Args:
         channels_in: channels of x.

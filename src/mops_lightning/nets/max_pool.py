@@ -21,7 +21,7 @@ class PointMaxPool(nn.Module):
     takes its place. The wide product is therefore needed only to find the winning point of every
     channel. The mean and variance of the product, for BatchNorm, follow from the mean and
     covariance of the narrower input: mean(Wx) = W·mean(x), var(Wx) = diag(W·cov(x)·Wᵀ). Values and
-    gradients are those of the plain layers; gradients flow through the winning points only.
+    gradients equal the plain layers'; gradients flow through the winning points only.
 
     Args:
         channels_in: channels of the input.
@@ -97,7 +97,7 @@ class _MaxOverPoints(Function):
 
     One point per cloud and channel wins. Both gradients are therefore sums of few weighted rows,
     which ``embedding_bag`` adds without a (B, C, D) tensor: the gradient of the weight sums over
-    the winners of a channel, that of the features over the channels that a point wins.
+    the winners of a channel, the gradient of the features over the channels that a point wins.
     """
 
     @staticmethod

@@ -87,7 +87,7 @@ class PCRNet(nn.Module):
     def point_features(self, points: Tensor) -> Tensor:
         """Return the features ``(B, N, C)`` of one cloud whose maxima over points the head takes.
 
-        With several iterations, those of the source hold for the first one.
+        With several iterations, the features of the source hold for the first iteration only.
         """
         return self.pool.values(self.features(points))
 

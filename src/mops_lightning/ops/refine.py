@@ -34,7 +34,7 @@ def refine(
         passes: largest number of passes.
 
     Returns:
-        ``(B, M)`` int64, distinct; no objective is larger than that of ``indices``.
+        ``(B, M)`` int64, distinct; no objective is larger than for ``indices``.
     """
     indices = indices.clone()
     if indices.shape[1] == features.shape[1]:

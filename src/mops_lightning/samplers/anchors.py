@@ -31,7 +31,7 @@ class FPSAnchors(nn.Module):
 
     The first point is the one farthest from the mean; a random order of the points, which depends
     on the cloud only, breaks ties (see ``ordering``). So the anchors turn and move with the cloud,
-    and the first m of them are those of size m.
+    and the first m of them are the anchors for size m.
 
     Args:
         m: largest number of points.

@@ -25,7 +25,7 @@ class Sampler(nn.Module):
 
     Maps ``(B, N, 3)`` points to a ``SampleOutput`` with ``(B, M, 3)`` points. A subclass implements
     ``sample(points, m)``. A learned sampler also implements ``losses``, a flexible one
-    ``training_sizes``, and one with a training schedule of its own ``anneal``.
+    ``training_sizes``, and a sampler with a training schedule ``anneal``.
 
     Args:
         m: number of points to return; for a flexible sampler, the largest number.
@@ -58,10 +58,10 @@ class Sampler(nn.Module):
     """Whether clouds can be sampled in chunks (``stream_sample``), by ``fused``."""
 
     spreads: bool = True
-    """Whether sampled points keep apart from each other, as all but random ones do."""
+    """Whether the method spreads the points evenly; only random sampling does not."""
 
     size_reduction: Literal["mean", "sum"] = "mean"
-    """How the losses at several ``training_sizes`` are reduced to one."""
+    """Reduction of the losses at several ``training_sizes`` to one."""
 
     def __init__(self, m: int) -> None:
         super().__init__()
@@ -171,7 +171,7 @@ class Sampler(nn.Module):
         return {m: largest.first(m)._replace(losses=losses.get(m, {})) for m in sizes}
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
-        """Sample checked input; arguments and result are those of ``forward``."""
+        """Sample checked input; arguments and result as in ``forward``."""
         raise NotImplementedError
 
     def losses(

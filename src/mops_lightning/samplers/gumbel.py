@@ -27,7 +27,7 @@ class GumbelSampler(Sampler):
 
     Differences from the publication: there, the layer is inside a classifier, samples the features
     of its attention blocks, and is trained with it; here, it selects input points for a task net,
-    by features of its own: pointwise layers, and an MLP of the local and the global feature.
+    by its own features: pointwise layers, and an MLP of the local and the global feature.
 
     Args:
         m: number of points to choose.

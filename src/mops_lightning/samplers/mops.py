@@ -33,7 +33,7 @@ class MOPSNet(Sampler):
         m: number of points to generate.
         alpha: weight α of the subset loss (Eq. 11).
         tau_min: temperature at the end of training and in evaluation; training starts at 1.
-        feature_channels: sizes of the pointwise layers; the last is that of the local and the
+        feature_channels: sizes of the pointwise layers; the last is the size of the local and the
             global feature.
         rho_channels: sizes of the hidden layers of ρ.
         threshold: in evaluation, entries of S below it count as zero, as ``SamplingMatrix.sparse``

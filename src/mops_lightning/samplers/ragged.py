@@ -30,7 +30,7 @@ def select_points(
     """Move clouds into the unit sphere, select points, and map them back.
 
     Args:
-        select: see ``Select``. The other arguments and the result are those of
+        select: see ``Select``. The other arguments and the result are as in
             ``Sampler.downsample``.
         points: see there.
         m: see there.

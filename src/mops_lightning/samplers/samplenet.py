@@ -45,7 +45,7 @@ class SampleNet(SNet):
     Lang, Manor and Avidan, "SampleNet: Differentiable Point Cloud Sampling", CVPR 2020.
 
     In training, the task net receives the projected points. In evaluation nothing is projected: the
-    generated points are those of S-Net, matched and completed as usual.
+    generated points are S-Net's, matched and completed as usual.
 
     Args:
         m: number of points to generate.

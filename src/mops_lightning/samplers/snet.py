@@ -89,8 +89,8 @@ class Progressive(Sampler):
     """Mixin for progressive training, in which every power of two is a training size.
 
     This is ProgressiveNet of the S-Net paper: the first m points are the sample of size m, for any
-    m up to the largest. The mixin precedes the net in the bases of a class. Arguments and errors
-    are those of ``ProgressiveSNet``, with ``settings`` of the net.
+    m up to the largest. The mixin precedes the net in the bases of a class. Arguments and errors as
+    in ``ProgressiveSNet``, with ``settings`` of the net.
     """
 
     flexible = True

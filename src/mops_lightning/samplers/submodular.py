@@ -13,8 +13,8 @@ class SubmodularSampler(TaskNetSampler):
     """Choose points whose max-pooled features are close to the full cloud's, without training.
 
     With f_ic the feature c of point i, points are chosen greedily so that Σ_c max_i f_ic over the
-    chosen points grows most (``facility_location``). Once the
-    maxima are those of the full cloud, farthest points follow. Flexible and nested.
+    chosen points grows most (``facility_location``). Once the maxima equal the full cloud's,
+    farthest points follow. Flexible and nested.
 
     Args:
         m: largest number of points to return.
@@ -83,7 +83,7 @@ def _best(features: Tensor, covered: Tensor, bounds: Tensor, active: Tensor) -> 
     Args:
         features: ``(B, N, C)``.
         covered: ``(B, C)`` the maxima over the chosen points.
-        bounds: ``(B, N)`` upper bounds of the gains; those of evaluated points become their gains.
+        bounds: ``(B, N)`` upper bounds of the gains; for evaluated points replaced by the gains.
         active: ``(A,)`` the clouds to look at.
 
     Returns:

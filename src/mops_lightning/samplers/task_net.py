@@ -43,7 +43,7 @@ class TaskNetSampler(Sampler):
         if net is None:
             raise UserError(
                 f"net must be the task net: {name} selects points by the net's features and has "
-                f"no weights of its own. In Python: {name}(m, net=task.net)."
+                f"no weights. In Python: {name}(m, net=task.net)."
             )
         if not isinstance(net, PointFeatureNet):
             raise UserError(
