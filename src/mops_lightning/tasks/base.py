@@ -121,7 +121,7 @@ class Task(nn.Module):
         """Return new metrics of the predictions and targets of ``scores``.
 
         Args:
-            training: of those of ``step`` instead.
+            training: return the metrics of ``step`` instead.
         """
         raise NotImplementedError
 

@@ -113,7 +113,7 @@ class Reconstruction(Task):
         columns = {}
         for name, chosen in samples.items():
             if chosen.shape == clouds.shape:
-                continue  # all points have a column of their own
+                continue  # all points have their own column
             built = self.net(chosen, n)
             ratios = (chamfer_distance(built, clouds) / reference).tolist()
             columns[name] = ReconstructionResult(chosen, built, ratios)

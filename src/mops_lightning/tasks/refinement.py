@@ -1,4 +1,4 @@
-"""The refined readout: samples improved by asking the frozen task net."""
+"""The refined readout: samples improved by local search with the frozen task net."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -18,7 +18,7 @@ BATCH_POINTS = 32768
 
 
 class Refinement:
-    """Exchanges points of samples so that the task net predicts nearly what it does for all points.
+    """Exchanges points of samples until the task net predicts nearly the same as for all points.
 
     It needs no labels, but runs the task net on the full cloud: scores of refined samples are a
     bound for what m input points can give this net. See ``ops.refine`` for the search. Where a

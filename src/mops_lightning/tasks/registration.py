@@ -30,8 +30,8 @@ Loss = Callable[[Motion, Motion, Tensor, Tensor], dict[str, Tensor]]
 class Registration(Task):
     """Estimates the rigid motion between two clouds from sampled points of both.
 
-    Each cloud's centroid is subtracted before sampling; the predicted and scored translation is
-    that of the original clouds.
+    Each cloud's centroid is subtracted before sampling; the predicted and scored translation
+    applies to the original clouds.
 
     Args:
         net: maps sources ``(B, M, 3)`` and targets ``(B, M, 3)`` to a ``Motion``.

@@ -15,13 +15,13 @@ from mops_lightning.zoo import weights
 
 CHECKPOINT = "last.ckpt"
 CHECKPOINT_KEY = "mops_lightning"
-"""Where a checkpoint keeps the identity of its run."""
+"""Key of the run's identity in a checkpoint."""
 
 LENGTH = "trainer.max_epochs"
 """The planned length of a run."""
 
 PARTS = {CHECKPOINT_KEY: dict, "state_dict": dict, "optimizer_states": list, "loops": dict}
-"""What resuming needs of a checkpoint, with its types."""
+"""Parts of a checkpoint that resuming needs, with their types."""
 
 
 def checkpoint_identity(config: dict[str, Any], fingerprint: str) -> dict[str, str]:

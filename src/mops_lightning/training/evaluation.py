@@ -183,7 +183,7 @@ def _check_given(arguments: list[str], trained: TrainedRun) -> None:
         UserError: there is one.
     """
     used = trained.record.config["names"]
-    # weights=auto may train a task net, with settings of its own.
+    # weights=auto may train a task net, which has its own settings.
     inert = OF_SAMPLER if "weights=auto" in arguments else OF_TRAINING
     for argument in arguments:
         path = overrides.path(argument)

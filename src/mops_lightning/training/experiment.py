@@ -46,7 +46,7 @@ class Experiment(L.LightningModule):
         sizes: how many points are tested, from one pass over the data; None: ``m`` alone. With
             several, the metrics are named ``test/m32/generated/accuracy`` and so on.
         recipe: how the sampler is trained beyond its own losses; None: by these alone.
-        task_lr_scale: with ``learn="joint"`` the task net's learning rate over that of the sampler.
+        task_lr_scale: with ``learn="joint"``, the task net's learning rate over the sampler's.
         refine: passes of the refined readout in tests; 0: without this readout.
         full_clouds: training clouds whose predictions the distillation computes once.
         m: the size that is validated and gives the run's score; None: the sampler's.
@@ -202,7 +202,7 @@ class Experiment(L.LightningModule):
         """
         sizes = (0,) if self.sampler is None else self.sampler.training_sizes()
         rank = self.global_rank
-        if rank:  # processes draw the same sizes, but random numbers of their own
+        if rank:  # processes draw the same sizes, but different random numbers
             torch.manual_seed(derive_seed(self.seed, self.current_epoch, batch_idx, rank))
         with restrict_autocast_to_pointwise(self.device.type):
             available = batch.points.shape[1]

@@ -10,7 +10,7 @@ from mops_lightning.types import SampleOutput, TaskOutput
 
 
 class Scores(nn.Module):
-    """One collection of metrics for each readout at each size, and those of the sampled sets.
+    """Metrics of the task for each readout at each size, and metrics of the sampled sets.
 
     Every update returns the metrics that it changed, under the names they are logged by, without
     the stage: ``m32/generated/accuracy``, or ``generated/accuracy`` where one size is tested.

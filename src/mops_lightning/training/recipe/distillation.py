@@ -1,4 +1,4 @@
-"""Losses that compare what the frozen task net makes of a sample and of the whole cloud."""
+"""Losses that compare the frozen task net's outputs for a sample and for the whole cloud."""
 
 import hashlib
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from mops_lightning.zoo import weights
 
 
 class Targets(NamedTuple):
-    """What the frozen task net makes of all points; None for what is not compared."""
+    """Outputs of the frozen task net for all points; None for outputs that are not compared."""
 
     prediction: Any
     features: Tensor | None

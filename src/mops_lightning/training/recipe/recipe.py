@@ -1,4 +1,4 @@
-"""How a sampler is trained beyond the losses of its publication."""
+"""Additions to the published training of a sampler."""
 
 import math
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ STRAIGHT_THROUGH_SETS = ("matched", "completed")
 
 @dataclass(frozen=True)
 class Recipe:
-    """What makes training cheaper or better; the defaults change nothing.
+    """Settings that make training cheaper or better; the defaults change nothing.
 
     Shares are of the training steps of the whole run, from 0 to 1.
 

@@ -156,7 +156,7 @@ def make_experiment(
     classes = {"num_classes": len(dataset.class_names)}
     own_net = build(cfg.task.net, "task.net", **accepted(cfg.task.net, classes))
     task: Task = build(cfg.task, "task", net=own_net, **accepted(cfg.task, classes))
-    # A seed of its own: the sampler's initial weights must not depend on the task net's size.
+    # Another seed: the sampler's initial weights must not depend on the task net's size.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
     # For samplers that select points by the task net's features.
     net = {"net": task.net}
@@ -275,7 +275,7 @@ def sizes_to_test(
 
 
 def _recipe(cfg: DictConfig, sampler: Sampler | None) -> Recipe:
-    """Return the recipe in force; the task net's training has a record of its own."""
+    """Return the recipe in force; the task net's training has its own record."""
     recipe: Recipe = build(cfg.recipe, "recipe")
     if sampler is None:
         return Recipe(task_points=recipe.task_points)

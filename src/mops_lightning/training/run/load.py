@@ -17,7 +17,7 @@ from mops_lightning.zoo import weights
 
 
 def load(parts: Parts, record: RunRecord, task_weights: Path | None) -> None:
-    """Load the weights of the task net, and those of an evaluated run.
+    """Load the weights of the task net and of an evaluated run.
 
     Raises:
         UserError: they do not fit.
@@ -76,7 +76,7 @@ def load_trained(
 
 
 def check_classes(names: list[str] | None, dataset: CloudDataset, what: str) -> None:
-    """Reject a net whose class numbers differ from those of the data.
+    """Reject a net whose class numbers differ from the data's.
 
     Args:
         names: the classes that the net was trained on; None if unknown.

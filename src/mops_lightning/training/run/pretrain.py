@@ -99,8 +99,8 @@ def publish(parts: Parts) -> None:
     """Copy a task net that was trained with ``learn=task`` into the cache, unless one is there.
 
     Not from a run that was resumed with another number of epochs, whose learning rates differed,
-    not from one that started from given weights, and not from several devices, each of which has
-    BatchNorm statistics of its own share.
+    not from one that started from given weights, and not from several devices: the BatchNorm
+    statistics of each cover its share of the data only.
     """
     cfg = parts.cfg
     if cfg.learn != "task" or not parts.trains or parts.trainer.world_size > 1:

@@ -63,7 +63,7 @@ def run(
 
 
 def _train_task_net(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
-    """Train a task net by the same stages, with a record of its own."""
+    """Train a task net by the same stages, with its own record."""
     with recorded(cfg, folder, []) as record:
         train_and_test(build_parts(cfg, folder, dataset, record), record, None)
 
@@ -93,7 +93,7 @@ def checked(
     """Check the settings of a run, unless that was done before its folder was claimed.
 
     Returns:
-        The settings, of an evaluation with those of the trained run, and the trained run.
+        The settings, which an evaluation takes from the trained run, and the trained run.
 
     Raises:
         UserError: a mistake in the settings.

@@ -28,7 +28,7 @@ OUTPUTS = {
     "clouds": f"pictures/{CLOUDS}",
     "tensorboard": "tensorboard",
 }
-"""What callbacks and loggers may have written."""
+"""Files and folders that callbacks and loggers may have written."""
 
 
 def warm_start(parts: Parts, record: RunRecord) -> None:

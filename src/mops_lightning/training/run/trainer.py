@@ -43,7 +43,7 @@ HARMLESS = (
 LOG_EVERY = 10
 """Steps between two points of a curve."""
 LOGGER_FOLDERS = {"TensorBoardLogger": "tensorboard", "CSVLogger": "csv"}
-"""Where a logger writes below the run's folder."""
+"""Subfolder of the run's folder that a logger writes to."""
 
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX = -1, -2, -4
 """Options of mallopt(3)."""
@@ -86,7 +86,7 @@ def make_trainer(
 
     Raises:
         UserError: a setting of the trainer, a callback or the logger is wrong, or this machine
-            cannot do what they ask for.
+            cannot do what they specify.
     """
     _silence_lightning()
     keep_freed_memory()
@@ -178,7 +178,7 @@ def log_hparams(trainer: L.Trainer, config: dict[str, Any], metrics: dict[str, f
     flat["max_epochs"] = config["trainer"]["max_epochs"]
     if isinstance(trainer.logger, TensorBoardLogger):
         trainer.logger.log_hyperparams(flat, {f"hparams/{k}": v for k, v in metrics.items()})
-        # Lightning closed it after the test; this opened it again, with a thread of its own.
+        # Lightning closed it after the test; logging opened it again and started a thread.
         trainer.logger.finalize("success")
     elif trainer.logger is not None:
         trainer.logger.log_hyperparams(flat)
