@@ -15,7 +15,7 @@ if sys.platform != "win32":
     import fcntl
 
 TEMPORARY = ".mops_lightning-"
-"""What names of temporary files start with."""
+"""Prefix of the names of temporary files."""
 
 MEMORY, MEMORY_PER_BYTE = 2 << 30, 200
 """Bytes that the content of a file may take, and more per byte of the file."""

@@ -16,7 +16,7 @@ def main(arguments: list[str], prog: str) -> None:
     """Write the file and print how far its points are from the sampler's.
 
     Args:
-        arguments: those of the command line.
+        arguments: of the command line.
         prog: what the user typed to start this command.
     """
     parser = argparse.ArgumentParser(

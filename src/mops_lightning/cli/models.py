@@ -11,7 +11,7 @@ from mops_lightning.zoo import model_file, names
 
 DESCRIPTION = f"""List trained models, show the card of one, or publish a run as one.
 
-  models                list all models: those of this package and those in ${names.VARIABLE}
+  models                list all models: of this package and of ${names.VARIABLE}
   models NAME           show a card
   models add RUN NAME   write the net that RUN trained to a folder, as NAME.safetensors
 
@@ -23,7 +23,7 @@ def main(arguments: list[str], prog: str) -> None:
     """Do what the arguments say.
 
     Args:
-        arguments: those of the command line.
+        arguments: of the command line.
         prog: what the user typed to start this command.
     """
     parser = argparse.ArgumentParser(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 NAME = "mops_lightning"
-"""What error messages start with."""
+"""Prefix of error messages."""
 
 
 def main() -> None:
@@ -114,7 +114,7 @@ def _check_combination(read: argparse.Namespace) -> None:
 def _job(cfg: "DictConfig") -> float | None:
     """Run one job and return its score, which an optimising sweeper reads.
 
-    The user's mistakes end the program here, because Hydra adds lines of its own to an error.
+    The user's mistakes end the program here, because Hydra adds lines to an error.
 
     Raises:
         KeyboardInterrupt: the user has stopped the job.

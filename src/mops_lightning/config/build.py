@@ -17,7 +17,7 @@ logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
 
 
 REJECTIONS = (ValueError, TypeError, OverflowError, ZeroDivisionError)
-"""What constructors of other libraries raise at settings that they do not take."""
+"""Errors that constructors of other libraries raise for invalid settings."""
 
 
 def build(node: Any, where: str = "", **extra: Any) -> Any:
@@ -133,7 +133,7 @@ def settings_named(node: DictConfig, where: str, *given: str) -> Iterator[None]:
 
 
 def accepted(node: DictConfig, offered: dict[str, Any]) -> dict[str, Any]:
-    """Return those of the offered arguments that a node's constructor takes."""
+    """Return the offered arguments that a node's constructor takes."""
     parameters = signature(str(node["_target_"]), "")
     return {name: value for name, value in offered.items() if name in parameters}
 

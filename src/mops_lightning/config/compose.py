@@ -23,7 +23,7 @@ OTHERWISE = {
     "baselines": " or leave single baselines out with baselines.NAME=null",
     "experiment": " or leave it out",
 }
-"""How to do without a choice, by group."""
+"""Hint for omitting a choice, by group."""
 
 
 def compose(overrides: list[str] | None = None) -> DictConfig:

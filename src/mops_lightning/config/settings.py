@@ -16,14 +16,14 @@ from hydra.core.config_store import ConfigStore
 
 Learn = Literal["task", "sampler", "joint", "nothing"]
 LEARN = get_args(Learn)
-"""What a run may train."""
+"""The choices of ``learn``."""
 WITH_SAMPLER = ("sampler", "joint", "nothing")
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 """Allowed values of ``trainer.precision``; Lightning has more."""
 
 
 class Affects(Flag):
-    """What a setting changes.
+    """The effect of a setting.
 
     ``TRAINING`` is what is learned: such a setting belongs to the identity of a resumed run and to
     the key of a cached task net. ``SCORES`` is what is measured on the test clouds. Settings that
@@ -220,14 +220,14 @@ class RunSettings:
         Affects.SCORES,
         limits=whole(0),
         learn=WITH_SAMPLER,
-        compare=False,  # its results have rows of their own
+        compare=False,  # the readout has its own rows in reports
     )
     pictures: int = setting(
         4, "number of test clouds in the pictures; 0 for none", Affects.NOTHING, limits=whole(0)
     )
     out: str = setting(
         "outputs",
-        "folder for runs; every run makes a folder of its own below it",
+        "folder for runs; every run makes its own folder in it",
         Affects.NOTHING,
     )
     cache: str = setting(
@@ -256,7 +256,7 @@ class RunSettings:
         learn=WITH_SAMPLER,
         compare=False,
     )
-    # Baselines have rows of their own.
+    # Baselines have their own rows in reports.
     baselines: Any = group(Affects.SCORES, learn=WITH_SAMPLER, compare=False)
     names: Any = setting(
         None, "the chosen groups' names; derived, not to be set", Affects.SCORES, compare=False

@@ -18,7 +18,7 @@ OPTIMIZERS = ("optimizer", "pretrain")
 """Nodes whose ``schedule`` is not an argument of the optimizer."""
 
 TABLES = ("epochs", "augment")
-"""Settings that have settings of their own but are no groups of choices."""
+"""Settings that contain settings but are not groups of choices."""
 
 
 def check(cfg: DictConfig) -> None:

@@ -66,7 +66,7 @@ def read_split_list(
 def split_by_time(
     names: Sequence[PurePosixPath], test_share: float, gap: int, test_frames: str
 ) -> list[str]:
-    """Split every sequence of frames; the arguments are those of ``cloud_folder.cloud_folder``.
+    """Split every sequence of frames; arguments as in ``cloud_folder.cloud_folder``.
 
     Returns:
         A split per file: ``train``, ``test``, or an empty one for files in the gap.

@@ -60,7 +60,7 @@ class Nearest(NamedTuple):
     table: Table
 
     def merge(self, other: "Nearest") -> "Nearest":
-        """Keep the nearer points; of equally near ones those of the earlier range."""
+        """Keep the nearer points; in case of ties, the points of the earlier range."""
         nearer = other.distance < self.distance
         columns = {
             name: np.where(nearer, other.table.columns[name], column)

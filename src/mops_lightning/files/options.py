@@ -9,7 +9,7 @@ from mops_lightning.zoo.names import UNTRAINED
 
 @dataclass(frozen=True)
 class Options:
-    """How every file is downsampled.
+    """Options of downsampling a file.
 
     Attributes:
         m: number of points to keep; None: as many as the weights were trained for.

@@ -20,7 +20,7 @@ BATCH = 32768
 """Points of the tiles that are sampled together."""
 
 EXTRA = 1.25
-"""How many times the points to keep are sampled; the final thinning removes the rest."""
+"""Ratio of sampled points to points to keep; the final thinning removes the rest."""
 
 NEIGHBOURS = 8
 """Nearest sampled points that the thinning compares a point with."""

@@ -1,4 +1,4 @@
-"""Where a run took place: versions, machine and commit."""
+"""The environment of a run: versions, machine and commit."""
 
 import platform
 import subprocess

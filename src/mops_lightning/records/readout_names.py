@@ -7,9 +7,9 @@ GENERATED_READOUTS = ("generated", "matched", "completed")
 INDEX_READOUT = "sampled"
 """The only readout of samplers that choose input points."""
 REFINED = "refined"
-"""The completed or sampled points, improved by asking the task net."""
+"""The completed or sampled points, improved by local search with the task net."""
 FULL = "full"
-"""The cloud before sampling: an upper bound for the task net."""
+"""The cloud before sampling, as a reference."""
 SOFT_PROJECTED = "soft_projected"
 """Input of SampleNet's task net in training; logged under ``train/`` only, never a result."""
 

@@ -1,4 +1,4 @@
-"""What a run prints at its end: a table of its test results and the paths of its files."""
+"""The end of a run's output: a table of its test results and the paths of its files."""
 
 from pathlib import Path
 from typing import Any
@@ -70,7 +70,7 @@ def results_table(record: RunRecord) -> tuple[str, Table]:
         rows[FULL] = dict.fromkeys(columns, next(iter(rows[FULL].values())))
         what = info.title
     else:
-        # Metrics of the task; those of the sampled set exist for no full cloud.
+        # Metrics of the task only: a full cloud has no metrics of the sampled set.
         infos = in_summary_order(metric_info(name, [record]) for name in rows.get(FULL, {}))
         columns = {info.name: (info.title, info) for info in infos}
         what = "all points" if config.get("learn") == "task" else f"m={config['m']}"

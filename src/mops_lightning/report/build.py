@@ -89,7 +89,7 @@ def build(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Rep
 
 
 def _joining(parts: list[Group]) -> list[str]:
-    """Return lines about tables of their own."""
+    """Return lines about separate tables."""
     if len(parts) == 1:
         return []
     return [

@@ -25,7 +25,7 @@ def main(arguments: list[str] | None = None, prog: str = "mops-lightning report"
     """Write the tables, the plots and the page into the folder.
 
     Args:
-        arguments: those of the command line; None: ``sys.argv``.
+        arguments: of the command line; None: ``sys.argv``.
         prog: what the user typed to start this command.
     """
     with one_line_endings(prog):

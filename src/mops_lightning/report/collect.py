@@ -97,7 +97,7 @@ def recipe(record: RunRecord) -> dict[str, Any]:
 
 
 def sampler_row(record: RunRecord) -> str:
-    """Return the name of a record's sampler, with what makes it a row of its own.
+    """Return the name of a record's sampler, with the settings that make it a separate row.
 
     That is ``anchored`` for a MOPS-Net with anchors, and its recipe unless it is the paper's.
     """

@@ -87,7 +87,7 @@ def _points(record: RunRecord) -> int | None:
 
 
 def _metrics(found: list[RunRecord], requested: Sequence[str]) -> list[MetricInfo]:
-    """Return the metrics of full clouds: those requested, or those of the closing table."""
+    """Return the metrics of full clouds: the requested ones, or all of the closing table."""
     names = {name for record in found for name in record.metrics}
     known = {name.rsplit("/", 1)[1] for name in names if name.startswith(f"test/{FULL}/")}
     for name in requested:

@@ -155,7 +155,7 @@ def make_table(group: Group, metric: str, net: str) -> Table:
     Args:
         group: the records.
         metric: name of the metric.
-        net: the task net of the table; results under other nets get rows of their own.
+        net: the task net of the table; results under other nets get separate rows.
 
     Raises:
         UserError: no record has the metric.

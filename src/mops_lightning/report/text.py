@@ -19,7 +19,7 @@ class Grid:
 
     Attributes:
         title: a caption.
-        head: names of the columns, starting with that of the row labels.
+        head: names of the columns; the first column holds the row labels.
         rows: their cells.
         below: lines under the table.
     """

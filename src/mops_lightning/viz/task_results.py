@@ -105,7 +105,7 @@ def reconstruction_grid(
     figure = new_figure(2.4 * columns, 2.4 * rows, "tight")
 
     def cell(row: int, column: int, title: str, label: str) -> Axes3D:
-        # Titles of later clouds would repeat those of the first row.
+        # Titles of later clouds would repeat the titles of the first row.
         shown = title if row % 2 == 1 or row == 0 else ""
         return cloud_axes(figure, rows, columns, row, column, shown, label)
 

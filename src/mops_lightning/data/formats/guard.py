@@ -1,7 +1,7 @@
 """Reading damaged files: errors that name the file, and limits in time and memory.
 
-A damaged or crafted file can make a parser run for hours or ask for any amount of memory. Where
-files are read in processes of their own, the system ends a process that exceeds a limit.
+A damaged or crafted file can make a parser run for hours or allocate any amount of memory. Where
+files are read in separate processes, the system ends a process that exceeds a limit.
 """
 
 import signal

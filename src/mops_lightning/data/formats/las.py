@@ -20,7 +20,7 @@ COPC = "copc"
 """The user of the records that index the points of a COPC file."""
 
 SMALLEST = 227
-"""Bytes of the shortest header, that of LAS 1.0 to 1.2."""
+"""Bytes of the shortest header (LAS 1.0 to 1.2)."""
 
 VLR, EVLR = 54, 60
 """Bytes of the header of a variable length record, and of an extended one."""
@@ -99,7 +99,7 @@ def write(path: Path, table: Table) -> None:
 
 
 def _header(laspy: Any, table: Table) -> Any:
-    """Return a header like that of the file that was read.
+    """Return a header like the one of the file that was read.
 
     Without the index of COPC files, which does not fit other points, and without arrays of numbers,
     which the table has as columns.

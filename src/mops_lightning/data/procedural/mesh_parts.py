@@ -1,6 +1,6 @@
 """Parts of procedural shapes: boxes, cushions, tubes, surfaces of revolution and legs.
 
-Axes are those of the shapes: x to the side, y up, z to the front. Lengths have no unit; clouds are
+Axes as for the shapes: x to the side, y up, z to the front. Lengths have no unit; clouds are
 normalised afterwards. All parts are ``trimesh.Trimesh``.
 """
 
@@ -34,7 +34,7 @@ def box(x: Span, y: Span, z: Span) -> Trimesh:
 def cushion(x: Span, y: Span, z: Span, radius: float) -> Trimesh:
     """Return the box with three spans, slightly domed sides and rounded edges.
 
-    ``radius`` is that of the edges, at most half a side.
+    ``radius`` is the radius of the edges, at most half a side.
     """
     ball, faces = _ball()
     low, high = np.array((x, y, z)).T
@@ -97,7 +97,7 @@ def tube(
     normal = np.asarray(across, dtype=np.float64)
     normal = np.broadcast_to(normal / np.linalg.norm(normal), centres.shape)
     turn = 2 * np.pi * (np.arange(sections) + 0.5) / sections
-    # The radius is that of the inscribed circle, so that bars with few corners are not thinner.
+    # Radius of the inscribed circle, so that bars with few corners are not thinner.
     reach = (np.broadcast_to(radii, len(centres)) / np.cos(np.pi / sections))[:, None, None]
     first, second = normal[:, None] * flatten, np.cross(along, normal)[:, None]
     rings = np.cos(turn)[None, :, None] * first + np.sin(turn)[None, :, None] * second
