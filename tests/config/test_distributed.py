@@ -8,48 +8,8 @@ from safetensors.torch import load_file
 
 from mops_lightning.config.compose import compose
 from mops_lightning.config.distributed import check_shares, check_start
-from mops_lightning.data.clouds import Clouds
-from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
 from tests.support.command_line import SMALL_PCRNET, TINY, call, call_anew
-
-
-def clouds(number):
-    points = torch.rand(number, 5, 3, generator=torch.Generator().manual_seed(number))
-    return Clouds(points, torch.arange(number))
-
-
-def loaders(number, processes, batch_size=8, **extra):
-    return [
-        CloudLoader(clouds(number), batch_size, part=(rank, processes), **extra)
-        for rank in range(processes)
-    ]
-
-
-@pytest.mark.parametrize("number", [16, 29])
-def test_loader_shares_of_training_batch_form_whole_batch(number):
-    settings = {"shuffle": True, "drop_last": True, "augment": Augmentation(True, 0.1)}
-    (alone,) = loaders(number, 1, **settings)
-    for whole, *shares in zip(alone, *loaders(number, 2, **settings), strict=True):
-        assert len({len(share.points) for share in shares}) == 1
-        assert torch.equal(torch.cat([share.points for share in shares]), whole.points)
-        assert torch.equal(torch.cat([share.labels for share in shares]), whole.labels)
-
-
-def test_loader_indivisible_batch_drops_last_clouds():
-    first, second = (list(loader) for loader in loaders(7, 2, shuffle=True))
-    assert [len(batch.points) for batch in (*first, *second)] == [3, 3]
-
-
-@pytest.mark.parametrize("processes", [1, 2, 3, 4])
-def test_loader_test_split_scores_each_cloud_once(processes):
-    for number in range(processes, 60):
-        shares = [list(loader) for loader in loaders(number, processes)]
-        assert {len(share) for share in shares} == {-(-number // 8)}
-        sizes = [len(batch.points) for share in shares for batch in share]
-        assert min(sizes) > 0
-        labels = torch.cat([batch.labels for share in shares for batch in share])
-        assert torch.equal(labels.sort().values, torch.arange(number))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,4 @@
 import math
-from itertools import chain
 
 import pytest
 import torch
@@ -102,26 +101,6 @@ def test_augmentation_negative_jitter_raises():
         Augmentation(jitter=-1.0)
 
 
-@pytest.mark.parametrize("shuffle", [False, True])
-def test_loader_processes_share_every_cloud_once(shuffle):
-    whole = CloudLoader(clouds(12), 6, shuffle, seed=5)
-    parts = [CloudLoader(clouds(12), 6, shuffle, seed=5, part=(rank, 3)) for rank in range(3)]
-    shares = [labels(part) for part in parts]
-    assert [[len(batch) for batch in share] for share in shares] == [[2, 2]] * 3
-    if shuffle:  # each batch is shared
-        together = [list(chain(*batches)) for batches in zip(*shares, strict=True)]
-        assert together == labels(whole)
-    else:  # the split is shared
-        assert list(chain(*chain(*shares))) == list(range(12))
-
-
-def test_loader_uneven_shares_without_shuffle_differ_by_one_cloud():
-    shares = [labels(CloudLoader(clouds(11), 4, part=(rank, 3))) for rank in range(3)]
-    assert [sum(len(batch) for batch in share) for share in shares] == [4, 4, 3]
-    assert [len(share) for share in shares] == [3, 3, 3]
-    assert list(chain(*chain(*shares))) == list(range(11))
-
-
 def test_loader_position_counts_batches_and_epochs():
     loader = CloudLoader(clouds(), 4, shuffle=True)
     positions = [
@@ -162,3 +141,36 @@ def test_loader_task_draws_by_cloud_and_in_training_by_epoch(shuffle):
     assert drawn(loader(seed=6)) != epochs[0]
     if not shuffle:
         assert loader().batch_of(torch.tensor([7, 2])) == [(row, epochs[0][row]) for row in (7, 2)]
+
+
+def loaders(number, processes, batch_size=8, **extra):
+    return [
+        CloudLoader(clouds(number), batch_size, part=(rank, processes), **extra)
+        for rank in range(processes)
+    ]
+
+
+@pytest.mark.parametrize("number", [16, 29])
+def test_loader_shares_of_training_batch_form_whole_batch(number):
+    settings = {"shuffle": True, "drop_last": True, "augment": Augmentation(True, 0.1)}
+    (alone,) = loaders(number, 1, **settings)
+    for whole, *shares in zip(alone, *loaders(number, 2, **settings), strict=True):
+        assert len({len(share.points) for share in shares}) == 1
+        assert torch.equal(torch.cat([share.points for share in shares]), whole.points)
+        assert torch.equal(torch.cat([share.labels for share in shares]), whole.labels)
+
+
+def test_loader_indivisible_batch_drops_last_clouds():
+    first, second = (list(loader) for loader in loaders(7, 2, shuffle=True))
+    assert [len(batch.points) for batch in (*first, *second)] == [3, 3]
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3, 4])
+def test_loader_test_split_scores_each_cloud_once(processes):
+    for number in range(processes, 60):
+        shares = [list(loader) for loader in loaders(number, processes)]
+        assert {len(share) for share in shares} == {-(-number // 8)}
+        sizes = [len(batch.points) for share in shares for batch in share]
+        assert min(sizes) > 0
+        labels = torch.cat([batch.labels for share in shares for batch in share])
+        assert torch.equal(labels.sort().values, torch.arange(number))

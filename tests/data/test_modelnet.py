@@ -3,7 +3,7 @@ import os
 import shutil
 import threading
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -67,12 +67,6 @@ def test_modelnet_reads_all_shapes_in_order(layout: Path) -> None:
         assert clouds.points.is_contiguous()
 
 
-def test_modelnet_uses_first_points(layout: Path) -> None:
-    whole, part = modelnet40(layout, n_points=STORED), modelnet40(layout, n_points=5)
-    assert torch.equal(part.train.points, whole.train.points[:, :5])
-    assert torch.equal(part.test.points, whole.test.points[:, :5])
-
-
 def test_modelnet_accepts_parent_folder(layout: Path) -> None:
     above, itself = modelnet40(layout.parent, n_points=4), modelnet40(str(layout), n_points=4)
     assert torch.equal(above.train.points, itself.train.points)
@@ -120,13 +114,6 @@ def test_modelnet_fingerprint_depends_on_content(layout: Path, tmp_path: Path) -
     assert len(others | {first}) == 6
 
 
-def test_modelnet_invalid_n_points_raises(layout: Path) -> None:
-    with pytest.raises(UserError, match=r"^n_points must be at most 12, .*train0\.h5, got 13"):
-        modelnet40(layout, n_points=13)
-    with pytest.raises(UserError, match="n_points must be at least 1, got 0"):
-        modelnet40(layout, n_points=0)
-
-
 def test_modelnet_missing_folder_raises(tmp_path: Path) -> None:
     with pytest.raises(UserError) as caught:
         modelnet40(tmp_path / "none")
@@ -137,13 +124,6 @@ def test_modelnet_missing_folder_raises(tmp_path: Path) -> None:
         "dataset.download=true",
     ):
         assert words in str(caught.value)
-
-
-@pytest.mark.parametrize("damage", [os.unlink, lambda path: os.truncate(path, 0)])
-def test_modelnet_damaged_file_raises(layout: Path, damage: Callable[[Path], Any]) -> None:
-    damage(layout / "ply_data_train2.h5")
-    with pytest.raises(UserError, match=r"ply_data_train2\.h5 is (missing|broken)"):
-        modelnet40(layout, n_points=4)
 
 
 def test_modelnet_missing_lists_raise(layout: Path) -> None:

@@ -261,11 +261,6 @@ def test_shapes_invalid_argument_raises(name: str, value: object) -> None:
         shapes(**{**SMALL, name: value})
 
 
-def test_shapes_unknown_class_raises() -> None:
-    with pytest.raises(UserError, match="Did you mean 'stool'"):
-        shapes(classes=["stol"])
-
-
 def test_shapes_unwritable_cache_raises(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for cache in (tmp_path / "file", tmp_path / "file" / "below"):

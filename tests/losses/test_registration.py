@@ -63,8 +63,10 @@ def test_registration_loss_terms_of_a_shift():
         Motion(quaternions(1), torch.ones(50, 3)),
     )
     cloud = torch.zeros(50, 4, 3).double()
-    shift = quaternion_loss(other, true, cloud, cloud)["translation"]
-    torch.testing.assert_close(shift, torch.tensor(3.0).sqrt())
+    terms = quaternion_loss(other, true, cloud, cloud)
+    assert list(terms) == ["quaternion", "translation"]
+    torch.testing.assert_close(terms["translation"], torch.tensor(3.0).sqrt())
     other = other._replace(translation=other.translation.double())
-    chamfer = frobenius_chamfer_loss(other, true, cloud, cloud)["chamfer"]
-    torch.testing.assert_close(chamfer, torch.tensor(6.0).double())
+    terms = frobenius_chamfer_loss(other, true, cloud, cloud)
+    assert list(terms) == ["frobenius", "chamfer"]
+    torch.testing.assert_close(terms["chamfer"], torch.tensor(6.0).double())

@@ -50,13 +50,6 @@ def test_simplification_loss_equals_double_loop(coverage, per_point, rng):
     assert float(simplification_loss(points, samples)) == pytest.approx(default, rel=1e-5)
 
 
-def test_simplification_loss_gradcheck(rng):
-    points = torch.randn(2, 9, 3, generator=rng, dtype=torch.float64)
-    samples = torch.randn(2, 4, 3, generator=rng, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda q: simplification_loss(points, q, 0.5, 0.1), (samples,))
-    assert simplification_loss(points, points) == 0
-
-
 @pytest.mark.parametrize(
     ("losses", "loss", "weights"),
     [

@@ -49,14 +49,6 @@ def test_decoder_pieces_share_weights(rng):
         torch.testing.assert_close(out[:, :, piece], alone, atol=1e-5, rtol=1e-4)
 
 
-def test_mfoldingnet_size_by_pieces():
-    width = 2048
-    whole = sum(p.numel() for p in MFoldingNet(pieces=1).parameters())
-    for pieces in (4, 8, 16, 32, 64, 128):
-        cut = sum(p.numel() for p in MFoldingNet(pieces=pieces).parameters())
-        assert whole - cut == 2 * width * (128 - 128 // pieces)
-
-
 @pytest.mark.parametrize(
     ("codeword", "published", "tolerance"),
     [

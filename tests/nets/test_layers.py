@@ -28,7 +28,3 @@ def test_point_features_global_is_maximum_of_local(rng):
 def test_check_channels_invalid_raises(channels, min_layers, message):
     with pytest.raises(UserError, match=message):
         check_channels("widths", channels, min_layers)
-
-
-def test_point_features_without_attributes_has_no_further_state():
-    assert all(name.startswith("mlp.") for name in PointFeatures((8, 6)).state_dict())

@@ -1,5 +1,3 @@
-import copy
-
 import pytest
 import torch
 from torch.nn import functional as F
@@ -53,14 +51,6 @@ def test_max_pool_equals_plain_layers(points, training, norm, rng):
         torch.testing.assert_close(got, want)
     for (name, got), want in zip(fast.named_buffers(), plain.buffers(), strict=True):
         torch.testing.assert_close(got, want, msg=name)
-
-
-@pytest.mark.parametrize("norm", [True, False])
-def test_max_pool_gradcheck(norm, rng):
-    net = copy.deepcopy(pools(3, 5, norm)[0])
-    size = (2, PLAIN_MAX_POINTS + 3, 3)
-    features = torch.randn(size, dtype=torch.float64, generator=rng, requires_grad=True)
-    assert torch.autograd.gradcheck(net, (features,))
 
 
 def test_max_pool_frozen_passes_gradients_to_input(rng):

@@ -46,16 +46,6 @@ def test_pcrnet_motion_follows_from_maxima_of_point_features(rng):
         net(iterations=2).from_pooled_pair(*pooled)
 
 
-def test_pcrnet_iterations_compose_motions(rng):
-    source, target = torch.randn(2, 4, 60, 3, generator=rng)
-    one, three = net(), net(iterations=3)
-    three.load_state_dict(one.state_dict())
-    total = one(source, target)
-    for _ in range(2):
-        total = one(total.apply(source), target).after(total)
-    torch.testing.assert_close(three(source, target), total, atol=1e-5, rtol=1e-5)
-
-
 def homogeneous(motion):
     """The 4×4 matrices of motions, by SciPy."""
     matrices = np.tile(np.eye(4), (len(motion.quaternion), 1, 1))

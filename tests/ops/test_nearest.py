@@ -34,12 +34,6 @@ def test_nearest_gradients_equal_double_loop(rng):
     torch.testing.assert_close(gradients(nearest), gradients(plain_nearest))
 
 
-def test_nearest_gradcheck(rng):
-    queries, points = torch.randn(2, 2, 4, 3, dtype=torch.float64, generator=rng)
-    leaves = (queries.requires_grad_(), points.requires_grad_())
-    assert torch.autograd.gradcheck(lambda q, p: nearest(q, p)[0], leaves)
-
-
 @pytest.mark.parametrize("block", [1, 100, 1000, 1500])
 def test_nearest_block_size_changes_nothing(block, rng, monkeypatch):
     queries = torch.randn(3, 11, 3, generator=rng)

@@ -40,11 +40,6 @@ def test_normalize_of_coincident_points_is_zero():
     assert torch.isfinite(gradient).all()
 
 
-def test_normalize_gradcheck(rng):
-    points = torch.randn(2, 6, 3, dtype=torch.float64, generator=rng, requires_grad=True)
-    assert torch.autograd.gradcheck(normalize_unit_sphere, (points,))
-
-
 @pytest.mark.usefixtures("argextreme_path")
 @pytest.mark.parametrize("largest", [True, False])
 def test_argextreme_of_ties_is_lowest_position(largest, rng):

@@ -14,16 +14,6 @@ def small(m_max=16, **settings):
     return FMOPSNet(m_max, feature_channels=(8, 6), rho_channels=(12, 10), **settings)
 
 
-def test_fmops_samples_are_nested(rng):
-    points = torch.randn(3, 40, 3, generator=rng)
-    net = small().eval()
-    whole = net(points)
-    for m in (1, 5, 16):
-        part = net(points, m)
-        torch.testing.assert_close(part.points, whole.points[:, :m])
-        torch.testing.assert_close(part.matrix.dense(), whole.matrix.dense()[..., :m])
-
-
 def test_fmops_equals_mops_with_sliced_weights(rng):
     points = torch.randn(3, 40, 3, generator=rng)
     flexible = small()

@@ -35,18 +35,6 @@ def test_fps_sampler_farthest_start_moves_with_the_cloud(rng):
     assert torch.equal(order[sampler(points[:, order] @ turn + 1).indices], chosen)
 
 
-def test_fps_sampler_seed_varies_start(rng):
-    points = torch.randn(1, 50, 3, generator=rng)
-    starts = {int(FPSSampler(1, seed)(points).indices) for seed in range(60)}
-    assert len(starts) > 25  # 35 are expected of 60 uniform draws
-
-
-def test_fps_sampler_is_nested(rng):
-    points = torch.randn(2, 30, 3, generator=rng)
-    sampler = FPSSampler(20)
-    assert torch.equal(sampler(points, 5).indices, sampler(points).indices[:, :5])
-
-
 def test_fps_sampler_start_out_of_range_raises():
     with pytest.raises(UserError, match=r"^start must be at least 0"):
         FPSSampler(4, start=-1)

@@ -49,12 +49,6 @@ def test_random_shared_point_is_chosen_independently(rng):
     assert abs(share - 5 / 20) < 0.03
 
 
-def test_random_is_nested(rng):
-    points = torch.randn(2, 30, 3, generator=rng)
-    sampler = RandomSampler(20)
-    assert torch.equal(sampler(points, 5).indices, sampler(points).indices[:, :5])
-
-
 def test_random_copies_are_chosen_independently(rng):
     """100 draws from 200 points with two copies each give about 88 distinct points."""
     points = torch.randn(20, 200, 3, generator=rng).repeat(1, 2, 1)

@@ -72,19 +72,6 @@ def test_samplenet_projection_loss_is_beta_times_sigma(rng):
     torch.testing.assert_close(losses["projection"], torch.tensor(0.5 * 0.6**2))
 
 
-@pytest.mark.parametrize("k", [1, 20])
-def test_samplenet_projects_on_one_to_all_points(k, rng):
-    points = torch.randn(2, 20, 3, generator=rng)
-    output = SampleNet(6, k=k).train()(points)
-    torch.testing.assert_close(
-        output.soft_projected, soft_projection(output.points, points, k, 1.0)
-    )
-
-
-def test_samplenet_default_k_is_that_of_publication():
-    assert SampleNet(6).k == 7
-
-
 def test_samplenet_gamma_replaces_alpha():
     assert SampleNet(6, alpha=30.0).alpha == 30
     assert SampleNet(6, alpha=30.0, gamma=5e-5).alpha == 5e-5

@@ -97,11 +97,6 @@ def test_facility_location_equals_plain_greedy(points, channels, rng):
     assert counts.min() < points - 1 or channels > 3
 
 
-def test_facility_location_is_nested(rng):
-    features = torch.rand(2, 50, 30, generator=rng)
-    assert torch.equal(facility_location(features, 4)[0], facility_location(features, 9)[0][:, :4])
-
-
 def test_facility_location_of_one_point():
     with torch.device("meta"):  # the default device is not used
         chosen, counts = facility_location(torch.ones(2, 1, 6, device="cpu"), 1)

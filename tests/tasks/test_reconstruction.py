@@ -12,7 +12,7 @@ from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.reconstruction import Reconstruction
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.types import Batch
-from tests.support.training import changed, quiet_trainer, small_dataset, state
+from tests.support.training import quiet_trainer, small_dataset
 
 
 def task(**extra):
@@ -72,6 +72,17 @@ def test_normalized_errors_sample_match_plain_formula(rng):
     torch.testing.assert_close(values["emd"], exact)
 
 
+def test_scores_are_exact_up_to_a_number_of_points(rng):
+    given = batch(rng, number=1, points=300)
+    net = AutoEncoder(300, 8, (8, 8), (16,)).eval()
+    exact, approximate = (
+        scored(Reconstruction(net, exact_up_to=limit), given, given.points).predictions.emd
+        for limit in (300, 299)
+    )
+    torch.testing.assert_close(exact, earth_movers_distance(net(given.points), given.points))
+    assert approximate > exact + 1e-5
+
+
 def test_scores_of_several_samples_equal_each_alone(rng):
     module, given = task().eval(), batch(rng)
     samples = {m: FPSSampler(m)(given.points).points for m in (4, 9)}
@@ -81,37 +92,9 @@ def test_scores_of_several_samples_equal_each_alone(rng):
             assert str(found) == str(expected)
 
 
-def trained(learn, sampler, **extra):
-    torch.manual_seed(1)
-    module = Experiment(
-        task(),
-        sampler,
-        learn=learn,
-        make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
-        **extra,
-    )
-    before = state(module)
-    data = small_dataset()
-    quiet_trainer(1).fit(
-        module, CloudLoader(data.train, 6, shuffle=True, drop_last=True), CloudLoader(data.test, 6)
-    )
-    return module, changed(before, module)
-
-
-def sampler():
-    return MOPSNet(8, feature_channels=(8, 8), rho_channels=(16, 8))
-
-
-def test_fit_changes_only_what_learns():
-    assert {name.split(".")[0] for name in trained("sampler", sampler())[1]} == {"sampler"}
-    assert {name.split(".")[0] for name in trained("joint", sampler())[1]} == {"sampler", "task"}
-    module, names = trained("task", None)
-    assert {name.split(".")[0] for name in names} == {"task"}
-    assert module.score_name == "test/full/chamfer"
-
-
 def test_test_scores_every_readout():
-    module, _ = trained("sampler", sampler(), baselines={"fps": FPSSampler(8)})
+    sampler = MOPSNet(8, feature_channels=(8, 8), rho_channels=(16, 8))
+    module = Experiment(task(), sampler, baselines={"fps": FPSSampler(8)})
     run = quiet_trainer(1)
     run.test(module, CloudLoader(small_dataset().test, 4), verbose=False)
     for readout in ("generated", "matched", "completed", "fps", "full"):
@@ -119,6 +102,7 @@ def test_test_scores_every_readout():
             assert run.callback_metrics[f"test/{readout}/{name}"] > 0
     assert run.callback_metrics["test/full/nre_cd"] == 1
     assert module.score_name == "test/generated/nre_cd"
+    assert Experiment(task(), learn="task").score_name == "test/full/chamfer"
 
 
 def test_scored_other_cloud_size_needs_flexible_net(rng):

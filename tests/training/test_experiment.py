@@ -1,5 +1,3 @@
-from inspect import Parameter, signature
-
 import pytest
 import torch
 
@@ -72,13 +70,6 @@ def test_fit_learn_joint_changes_both():
     assert {"task.net.pool.linear.weight", "task.net.pool.norm.running_var"} <= names
 
 
-def test_fit_learn_task_changes_every_layer():
-    module = experiment("task", sampler=None)
-    before = state(module)
-    names = changed(before, fit(module))
-    assert {f"task.{name}" for name, _ in module.task.named_parameters()} <= names
-
-
 def test_train_frozen_parts_stay_in_evaluation_mode():
     module = experiment("sampler").train()
     assert not any(m.training for m in module.task.modules())
@@ -123,17 +114,6 @@ def test_test_accuracy_equals_plain_loop():
     assert len({hits / len(data.test.labels), full / len(data.test.labels), mean}) == 3
 
 
-def test_test_index_sampler_has_one_readout():
-    data = small_dataset()
-    run = quiet_trainer(2)
-    module = experiment(sampler=RandomSampler(8))
-    assert not module.trainable
-    run.test(module, CloudLoader(data.test, 4), verbose=False)
-    assert run.callback_metrics["test/matched/unique_points"] == 8
-    assert "test/generated/accuracy" not in run.callback_metrics
-    assert "test/sampled/accuracy" in run.callback_metrics
-
-
 def test_test_refine_adds_readout():
     data = small_dataset()
     run = quiet_trainer(2)
@@ -146,12 +126,6 @@ def test_test_refine_adds_readout():
 def test_fit_same_seed_gives_same_weights():
     first, second = (fit(experiment("joint")).state_dict() for _ in range(2))
     assert all(torch.equal(first[name], second[name]) for name in first)
-
-
-def test_experiment_has_documented_defaults():
-    arguments = signature(Experiment.__init__).parameters.values()
-    found = {a.name: a.default for a in arguments if a.default not in (Parameter.empty, None)}
-    assert found == {"learn": "sampler", "seed": 0, "task_lr_scale": 1.0, "refine": 0}
 
 
 def test_experiment_without_optimizer_only_tests():

@@ -11,11 +11,15 @@ from lightning.pytorch.callbacks import Callback
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.metrics.base import collection
 from mops_lightning.ops.nearest import k_nearest
+from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.readout import match
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.recipe.distillation import FullClouds
+from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.schedules import exponential
 from tests.support.losses import simplification_loss, subset_loss
 from tests.support.recording import (
@@ -45,14 +49,15 @@ def noting(kind, *arguments, **settings):
     return made
 
 
-def fitted(sampler, epochs=1, learn="sampler", **extra):
+def fitted(sampler, epochs=1, task=None, recipe=None, full_clouds=None, **extra):
     """Train with a rate of 0, so that all steps see the same weights, and validate each epoch."""
     data = numbered_clouds()
     module = Experiment(
-        RecordingTask(Fingerprint()),
+        task or RecordingTask(Fingerprint()),
         sampler,
-        learn,
         make_optimizer=lambda parameters: torch.optim.SGD(parameters, lr=0.0),
+        recipe=recipe,
+        full_clouds=full_clouds,
     )
     trainer = quiet_trainer(epochs, **extra)
     train = CloudLoader(data.train, 4, shuffle=True, drop_last=True)
@@ -138,6 +143,60 @@ def test_losses_over_sizes_are_summed_or_averaged(how, make, name, loss, calls):
     readout = "soft_projected" if isinstance(sampler, SampleNet) else "generated"
     prints = torch.stack([module.task.net(call.points).detach() for call in calls]).mean()
     assert logged[f"train/{readout}/fingerprint"] == pytest.approx(float(prints), abs=1e-4)
+
+
+def test_straight_through_losses_are_means_over_generated_and_matched_points(calls):
+    recipe = Recipe(straight_through=0.0)
+    module, logged = fitted(
+        noting(MOPSNet, 8, **MOPS), recipe=recipe, limit_train_batches=1, limit_val_batches=0
+    )
+    generated, matched = (call.points for call in calls)
+    clouds = calls[0].clouds
+    torch.testing.assert_close(matched, gather_points(clouds, match(generated, clouds)))
+    losses = [float(module.task.net(points).square().mean()) for points in (generated, matched)]
+    assert logged["train/loss/task"] == pytest.approx(sum(losses) / 2, rel=1e-4)
+    assert abs(losses[0] - losses[1]) > 0.1
+    scored = float(module.task.net(generated).mean())
+    assert logged["train/generated/fingerprint"] == pytest.approx(scored, abs=1e-4)
+
+
+class FingerprintOfMaxima(Fingerprint):
+    def point_features(self, points):
+        return points.relu()
+
+
+class ComparedTask(RecordingTask):
+    def predict(self, batch, points):
+        return self.net(points)
+
+    def disagreement(self, found, reference):
+        return (found - reference).square()
+
+    def step(self, batch, points):
+        result = super().step(batch, points)
+        return result._replace(output=result.predictions)
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_distillation_targets_are_whole_clouds_and_features_of_seen_points(kept, calls, tmp_path):
+    sampler = noting(MOPSNet, 8, **MOPS)
+    module, logged = fitted(
+        sampler,
+        task=ComparedTask(FingerprintOfMaxima()),
+        recipe=Recipe(train_points=20, distillation=3.0, feature_distillation=0.5),
+        full_clouds=FullClouds(numbered_clouds().train, 6, tmp_path) if kept else None,
+        limit_train_batches=1,
+        limit_val_batches=0,
+    )
+    ((_, seen, output),) = sampler.samples
+    (call,) = calls
+    assert (seen.shape[1], call.clouds.shape[1]) == (20, 40)
+    with torch.no_grad():
+        apart = (module.task.net(output.points) - module.task.net(call.clouds)).square().mean()
+        found, wanted = (points.relu().amax(1) for points in (output.points, seen))
+    relative = ((found - wanted).square().sum(1) / wanted.square().sum(1)).mean()
+    assert logged["train/loss/distillation"] == pytest.approx(3 * float(apart), rel=1e-4)
+    assert logged["train/loss/feature_distillation"] == pytest.approx(float(relative) / 2, rel=1e-4)
 
 
 class InTests(MeanFingerprint):
