@@ -11,6 +11,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
+from omegaconf import OmegaConf
 
 GRIDS = "hydra.sweeper.grids"
 
@@ -20,7 +21,7 @@ class GridSweeperConf(BasicSweeperConf):
     """The sweeper's settings: BasicSweeper's, and the grids."""
 
     _target_: str = "hydra_plugins.grid_sweeper.GridSweeper"
-    _convert_: str = "all"
+    _recursive_: bool = False  # what was escaped (\${...}) is for the cells
     grids: Any = None
 
 
@@ -28,18 +29,20 @@ ConfigStore.instance().store(group="hydra/sweeper", name="grid", node=GridSweepe
 
 
 class GridSweeper(BasicSweeper):
-    """Runs grids one after the other; the cells of a grid are the product of its values.
+    r"""Runs grids one after the other; the cells of a grid are the product of its values.
 
     Args:
         max_batch_size: largest number of cells that the launcher gets at once.
         params: overrides for all grids, as for ``BasicSweeper``.
         grids: list of mappings from an override to a value, or to several values with commas
-            between them. A grid wins over ``params``, the command line over both.
+            between them. A grid wins over ``params``, the command line over both. An escaped
+            interpolation, ``\${seed}``, is resolved in the cell.
     """
 
     def __init__(self, max_batch_size: int | None, params: Any = None, grids: Any = None) -> None:
         super().__init__(max_batch_size, params)
-        self.grids = grids
+        self.params = _plain(self.params)
+        self.grids = _plain(grids)
 
     def _parse_config(self) -> list[str]:
         return []  # ``params`` are added to each grid, so that a grid wins over them
@@ -62,14 +65,15 @@ class GridSweeper(BasicSweeper):
         for number, grid in enumerate(self.grids):
             if not isinstance(grid, dict):
                 raise HydraException(f"{GRIDS}[{number}] must be a mapping, got {grid!r}.")
-            own = _parsed({**self.params, **grid}, f"{GRIDS}[{number}]")
+            own = parsed({**self.params, **grid}, f"{GRIDS}[{number}]")
             batches += super().split_arguments([*own, *overrides], max_batch_size)
         for batch in batches[1:]:  # Hydra checks a batch when it starts
             self.validate_batch_is_legal(batch)
         return batches
 
 
-def _parsed(settings: dict[str, Any], place: str) -> list[Override]:
+def parsed(settings: dict[str, Any], place: str) -> list[Override]:
+    """Return the overrides of a grid; ``place`` names it in errors."""
     parser = OverridesParser.create()
     parsed = []
     for key, value in settings.items():
@@ -82,3 +86,7 @@ def _parsed(settings: dict[str, Any], place: str) -> list[Override]:
                 "commas between them."
             ) from None
     return parsed
+
+
+def _plain(node: Any) -> Any:
+    return OmegaConf.to_container(node, resolve=False) if OmegaConf.is_config(node) else node

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from mops_lightning.records import run_record
+from mops_lightning.training.checkpoint import read_plain
 from mops_lightning.training.experiment import Experiment
 from tests.support.command_line import TINY, call, runs
 from tests.support.forked import start_fork
@@ -52,9 +53,11 @@ def test_run_stopped_mid_epoch_resumes_to_same_weights(unbroken, number, left):
     status, _, err = call(again, folder)
     assert status == 0, err
     (resumed,) = (path.parent for path in (folder / out).rglob("result.json") if path.parent != run)
-    assert run_record.read(resumed).resumed_from == str(
-        (run / "checkpoints" / "last.ckpt").relative_to(folder)
-    )
+    checkpoint = run / "checkpoints" / "last.ckpt"
+    record = run_record.read(resumed)
+    assert record.resumed_from == str(checkpoint.relative_to(folder))
+    before = read_plain(checkpoint, "a checkpoint")["callbacks"]["CPUTime"]["seconds"]
+    assert 0 < before < record.seconds["fit_cpu"]
     got = final_state(resumed)
     assert got.keys() == want.keys()
     different = [name for name in want if not torch.equal(got[name], want[name])]

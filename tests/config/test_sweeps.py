@@ -5,9 +5,11 @@ from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
+from hydra_plugins.grid_sweeper import parsed
 from mops_lightning.config.hydra_conf import conf_dir
 from mops_lightning.config.validate import check
 from mops_lightning.records.run_record import dotted
@@ -33,7 +35,8 @@ def test_sweep_cells_are_valid_and_named_by_swept_settings(name):
     quick = name.startswith("quick/")
     cfg = composed(name)
     raw: Any = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)
-    for key in cfg.hydra.sweeper.params:
+    swept = [key for key, values in cfg.hydra.sweeper.params.items() if "," in str(values)]
+    for key in swept:
         known_as = "names.sampler" if key == "sampler" else key
         assert f"${{{known_as}}}" in raw["subdir"], "two cells would share a folder"
     assert "${" not in f"{cfg.hydra.sweep.dir}/{cfg.hydra.sweep.subdir}"
@@ -48,7 +51,7 @@ def test_sweep_cells_are_valid_and_named_by_swept_settings(name):
 
 def test_sweeps_all_have_quick_form():
     full = {name for name in SWEEPS if "/" not in name}
-    assert {f"quick/{name}" for name in full - {"noise"}} == set(SWEEPS) - full
+    assert {f"quick/{name}" for name in full - {"noise", "modelnet40"}} == set(SWEEPS) - full
 
 
 @pytest.mark.parametrize("name", SWEEPS)
@@ -63,6 +66,17 @@ def test_sweep_neighbours_differ_in_what_is_swept(name):
         followers = {f"sampler.{key}"} if key in ("m", "seed") else set()
         followers |= {f"dataset.{key}"} if key == "seed" else set()
         assert not {path for path in different - followers if not path.startswith(allowed)}
+
+
+def test_planned_cells_have_folders_of_their_own():
+    sweeper: Any = OmegaConf.to_container(composed("modelnet40").hydra.sweeper)
+    cells = []
+    for grid in sweeper["grids"]:
+        overrides = parsed({**sweeper["params"], **grid}, "grids")
+        cells += BasicSweeper.split_arguments(overrides, None)[0]
+    folders = [composed("modelnet40", cell).hydra.sweep.subdir for cell in cells]
+    assert len(folders) == 49
+    assert len(set(folders)) == len(folders)
 
 
 def settings_of(cfg):

@@ -109,7 +109,7 @@ class RunRecord:
         score: its value.
         metric_info: label, unit, direction of metrics that are not this package's.
         validation: metrics of the held-out clouds after the last epoch.
-        seconds: wall time by stage.
+        seconds: wall time by stage; ``fit_cpu``: CPU time of the training, all attempts together.
         seed: of the run.
         started: UTC, ISO 8601.
         versions: of Python and the packages that matter.

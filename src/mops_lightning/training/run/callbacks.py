@@ -2,6 +2,7 @@
 
 import signal
 import sys
+import time
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -81,6 +82,39 @@ class StopBetweenSteps(Checkpoint):
         for number, handler in self._before.items():
             signal.signal(number, handler)
         self._before.clear()
+
+
+class CPUTime(Callback):
+    """Counts the CPU seconds of the training, with those of the attempts before a resumed one.
+
+    Wall time says little on a machine that does something else as well.
+    """
+
+    def __init__(self) -> None:
+        self.before = 0.0
+        self.start: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        """CPU seconds of this process and its threads, at the end those of the training."""
+        since = 0.0 if self.start is None else time.process_time() - self.start
+        return self.before + since
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Start counting."""
+        self.start = time.process_time()
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Stop counting."""
+        self.before, self.start = self.seconds, None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a checkpoint keeps."""
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue from a checkpoint."""
+        self.before = float(state_dict["seconds"])
 
 
 class EpochLines(Callback):

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import nn
@@ -18,6 +19,7 @@ from mops_lightning.training.divergence import Diverged, with_checkpoint
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.recipe.warm_start import warm_start as warm_start_sampler
 from mops_lightning.training.run.build import Parts, augmentation
+from mops_lightning.training.run.callbacks import CPUTime
 from mops_lightning.training.run.trainer import log_hparams
 from mops_lightning.viz.snapshots import CLOUDS
 from mops_lightning.zoo import weights
@@ -86,6 +88,9 @@ def fit(parts: Parts, record: RunRecord) -> None:
             raise
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise weights.Damaged(f"ckpt_path: cannot resume from {resumed}: {reason}.") from error
+    callbacks: Any = trainer.callbacks  # type: ignore[attr-defined]
+    clock = next(one for one in callbacks if isinstance(one, CPUTime))
+    record.seconds["fit_cpu"] = round(clock.seconds, 3)
     record.validation = {
         name: float(value)
         for name, value in trainer.callback_metrics.items()

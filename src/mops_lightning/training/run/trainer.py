@@ -25,7 +25,7 @@ from mops_lightning.records.run_record import dotted
 from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.moving_average import MovingAverage
-from mops_lightning.training.run.callbacks import StopBetweenSteps, build_callbacks
+from mops_lightning.training.run.callbacks import CPUTime, StopBetweenSteps, build_callbacks
 
 HARMLESS = (
     ".*does not have many workers.*",  # the data are in memory; workers would only copy them
@@ -103,6 +103,7 @@ def make_trainer(
         *([MovingAverage(span)] if span else []),  # before the callbacks that save
         *build_callbacks(cfg.callbacks, offered, logged=bool(logger)),
         StopBetweenSteps(folder / "checkpoints" / CHECKPOINT),
+        CPUTime(),
     ]
     trainer: L.Trainer = build(
         cfg.trainer,
