@@ -229,6 +229,16 @@ def test_training_logs_means_over_clouds_of_uneven_batches():
     assert "loss" not in trainer.logged_metrics
 
 
+def test_random_numbers_of_a_step_depend_on_epoch_and_step(calls):
+    for _ in range(2):
+        fitted(noting(FMOPSNet, 16, size_sampling="uniform", **MOPS), 2, limit_val_batches=0)
+    sizes = [call.points.shape[1] for call in calls]
+    first, second, *again = (sizes[start : start + 4] for start in range(0, 16, 4))
+    assert again == [first, second]
+    assert first != second
+    assert len(set(first)) > 1
+
+
 class Rates(Callback):
     """Notes the learning rate of every step."""
 

@@ -7,6 +7,7 @@ import torch
 
 from mops_lightning.config.compose import compose
 from mops_lightning.training.run.run import run
+from mops_lightning.zoo.load import load
 from tests.support.command_line import TINY_ANY_DATA
 from tests.support.recording import FIRST_TEST_CLOUD, numbered_clouds
 
@@ -70,6 +71,19 @@ def test_run_phases_see_disjoint_complete_clouds(learn, changes, readouts, teste
     expected = range(FIRST_TEST_CLOUD, FIRST_TEST_CLOUD + TEST)
     assert Counter(numbers(test)) == dict.fromkeys(expected, tested)
     assert_only_these_changed(changes, calls, held_out[0])
+
+
+def test_run_with_moving_average_tests_and_saves_the_average(calls, tmp_path):
+    overrides = [*SETTINGS, "recipe.ema_span=0.5", f"cache={tmp_path}/cache"]
+    run(compose(overrides), tmp_path / "run", overrides)
+    sampler, name = load(tmp_path / "run"), "queries.weight"
+    kept = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
+    average, last = (kept[key][f"sampler.{name}"] for key in ("state_dict", "current_model_state"))
+    assert torch.equal(sampler.state_dict()[name], average)
+    assert not torch.allclose(average, last)
+    tested = next(call for call in calls if min(call.labels) >= FIRST_TEST_CLOUD)
+    with torch.no_grad():
+        torch.testing.assert_close(sampler(tested.clouds).points, tested.points)
 
 
 def assert_only_these_changed(changes, calls, held_out):
