@@ -93,15 +93,6 @@ def test_help_lists_subcommands_groups_and_keys(tmp_path):
     assert out.index("report ") < out.index("downsample ") < out.index("sampler:")
 
 
-def test_help_lists_groups_that_users_choose_from(tmp_path):
-    status, out, err = call(["--help"], tmp_path)
-    assert (status, err) == (0, "")
-    lines = out.splitlines()
-    assert any(line.startswith("task/net: ") and "pcrnet" in line for line in lines)
-    assert any(line.startswith("sampler: ") and "fmops" in line for line in lines)
-    assert not any(line.startswith(("sampler/", "dataset_task", "task_settings")) for line in lines)
-
-
 @pytest.mark.parametrize("arguments", [["--help"], ["report", "--help"], ["downsample", "--help"]])
 def test_help_imports_no_torch(arguments):
     code = f"""

@@ -224,12 +224,6 @@ def test_flexible_sampler_is_tested_at_all_sizes_and_evaluated(main_job):
     name = "test/m16/completed/accuracy"
     assert after.metrics[name] == before.metrics[name]
     assert "test/m3/matched/accuracy" in after.metrics
-    status, _, err = call(
-        [f"evaluate={run}", "sampler.tau_min=0.5", "hydra.run.dir=refused"], folder
-    )
-    assert status == 2
-    assert err.count("\n") == 1
-    assert "sampler.tau_min must be 0.1" in err
 
 
 def test_weights_of_another_net_are_rejected(main_job):
@@ -278,10 +272,3 @@ def test_flags_first_mistake_raises(given, said):
     with pytest.raises(UserError) as caught:
         flags_first(given.split())
     assert said in str(caught.value)
-
-
-def test_flag_between_settings_is_read(tmp_path):
-    status, out, _ = call(["m=8", "--cfg", "job", "sampler=fps"], tmp_path)
-    assert status == 0
-    assert "\nm: 8\n" in f"\n{out}"
-    assert "FPSSampler" in out

@@ -20,6 +20,8 @@ def test_choose_classes_keeps_order_of_dataset(classes, chosen):
     [
         ("chair", r"^classes must be a list of names, such as \[chair\], got 'chair'"),
         (["chiar"], r"^classes: unknown class 'chiar'.*chair"),
+        ([3], r"^classes must be a list of names"),
+        (7, r"^classes must be a list of names"),
     ],
 )
 def test_choose_classes_invalid_raises(classes, message):

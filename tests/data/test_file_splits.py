@@ -143,12 +143,6 @@ def test_by_number_sorts_digits_that_are_no_numbers():
 FRAMES = paths(*(f"crane/{i}.ply" for i in range(12)), *(f"samba/{i}.ply" for i in range(10)))
 
 
-def test_split_by_time_leaves_out_gap():
-    splits = split_by_time(FRAMES, 0.25, 2, "last")
-    assert splits[:12] == ["train"] * 7 + [""] * 2 + ["test"] * 3
-    assert splits[12:] == ["train"] * 6 + [""] * 2 + ["test"] * 2
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

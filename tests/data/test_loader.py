@@ -62,14 +62,6 @@ def test_loader_interrupted_iteration_starts_again():
     assert len(labels(loader)) == 3
 
 
-def test_augmentation_rotates_about_up_axis(rng):
-    points = clouds().points
-    rotated = Augmentation(rotate_up=True)(points, rng)
-    torch.testing.assert_close(rotated[..., 1], points[..., 1])
-    torch.testing.assert_close(torch.cdist(rotated, rotated), torch.cdist(points, points))
-    assert not torch.allclose(rotated, points)
-
-
 def test_augmentation_jitter_is_clipped(rng):
     points = torch.zeros(8, 5000, 3)
     noise = Augmentation(jitter=0.01, jitter_clip=0.02)(points, rng)

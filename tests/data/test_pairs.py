@@ -1,13 +1,10 @@
 import pytest
 import torch
 
-from mops_lightning.data.loader import CloudLoader
 from mops_lightning.data.pairs import Pairs, pair_batch
 from mops_lightning.errors import UserError
 from mops_lightning.ops.rigid import Motion
 from mops_lightning.seeding import generator
-from mops_lightning.types import Batch
-from tests.support.training import small_dataset
 
 
 def generators(number, key=0):
@@ -64,33 +61,6 @@ def test_pairs_resample_draws_different_points(rng):
         theirs = rows_of(target[i], moved(batch, points)[i])
         assert len(mine) == len(theirs) == 20
         assert mine != theirs
-
-
-def test_pairs_change_by_epoch_in_training_only():
-    data = small_dataset().train
-    pairs = Pairs()
-
-    def make(batch, generators):
-        assert isinstance(batch, Batch)
-        return pairs(batch.points, generators())
-
-    training = CloudLoader(data, 5, shuffle=True, make_batch=make, seed=1)
-    epochs = []
-    for epoch in range(2):
-        training.set_epoch(epoch)
-        epochs.append(torch.cat([batch.quaternion for batch in training]))
-    assert len({tuple(row.tolist()) for row in torch.cat(epochs)}) == 2 * len(data.labels)
-    again = CloudLoader(data, 5, shuffle=True, make_batch=make, seed=1)
-    assert torch.equal(torch.cat([batch.quaternion for batch in again]), epochs[0])
-
-    scored = CloudLoader(data, 5, make_batch=make)
-    first = torch.cat([batch.quaternion for batch in scored])
-    scored.set_epoch(7)
-    assert torch.equal(torch.cat([batch.quaternion for batch in scored]), first)
-    # Independent of the batch size:
-    other = CloudLoader(data, 7, make_batch=make)
-    assert torch.equal(torch.cat([batch.quaternion for batch in other]), first)
-    assert torch.equal(scored.batch_of(torch.tensor([3, 9])).quaternion, first[[3, 9]])
 
 
 def test_pairs_resample_below_one_raises():

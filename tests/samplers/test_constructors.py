@@ -5,47 +5,26 @@ from typing import Any
 
 import pytest
 import torch
+from hydra.utils import get_class
 
+from mops_lightning.config.compose import compose
+from mops_lightning.config.hydra_conf import conf_dir
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.critical_points import CriticalSampler
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.gumbel import GumbelSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.poisson import PoissonSampler
-from mops_lightning.samplers.random import RandomSampler
-from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
+from mops_lightning.samplers.samplenet import SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
-from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.samplers.voxel import VoxelSampler
+from mops_lightning.zoo.load import samplers
 
-FEATURES: dict[str, Any] = {"feature_channels": (64, 64, 64, 128, 128)}
-MOPS: dict[str, Any] = {
-    **{"alpha": 30.0, "tau_min": 0.1, "threshold": 0.0},
-    **{"rho_channels": (512, 256, 128), "anchors": None, **FEATURES},
-    "anchor_width": 0.5,
-    "overlap": 0.0,
-}
-SNET: dict[str, Any] = {
-    **{"alpha": 30.0, "coverage": 1.0, "coverage_per_point": 0.0, **FEATURES},
-    **{"head_channels": (256, 256, 256), "head_norm": True, "output_norm": True},
-}
-DEFAULTS: dict[type[Sampler], dict[str, Any]] = {
-    RandomSampler: {"seed": 0},
-    FPSSampler: {"seed": 0, "start": None},
-    VoxelSampler: {},
-    PoissonSampler: {"seed": 0},
-    SubmodularSampler: {"net": None, "seed": 0},
-    CriticalSampler: {"net": None, "seed": 0},
-    GumbelSampler: {"tau_min": 0.1, **FEATURES},
-    MOPSNet: MOPS,
-    FMOPSNet: {"m_max": 512, "size_sampling": "nested", "num_sizes": 4, "min_size": 1},
-    SNet: SNET,
-    SampleNet: {"k": 7, "beta": 1.0, "gamma": None, "sigma_min": 0.0},
-    ProgressiveSNet: {"m_max": 1024, "min_size": 2, "size_reduction": "sum"},
-    ProgressiveSampleNet: {"m_max": 1024, "min_size": 2, "size_reduction": "sum"},
-}
-"""Of the constructors, as published or documented."""
+FILES = [
+    path for path in sorted(conf_dir().joinpath("sampler").glob("*.yaml")) if path.stem != "own"
+]
+OTHERS = {"net", "size_sampling", "coverage", "coverage_per_point"}
+"""Arguments of which some sampler's file sets another value than the default."""
 LIMITS: list[tuple[type[Sampler], dict[str, Any]]] = [
     (FPSSampler, {"start": 0}),
     (FPSSampler, {"start": 59}),
@@ -62,14 +41,20 @@ NOT_FLEXIBLE = (GumbelSampler, MOPSNet, SNet, SampleNet)
 FLEXIBLE_NOT_NESTED = (VoxelSampler, PoissonSampler)
 
 
-@pytest.mark.parametrize("sampler", DEFAULTS)
-def test_constructor_has_documented_defaults(sampler):
-    arguments = signature(sampler.__init__).parameters.values()
-    found = {a.name: a.default for a in arguments if a.default is not Parameter.empty}
-    assert found == DEFAULTS[sampler]
+@pytest.mark.parametrize("name", [path.stem for path in FILES if path.stem != "own"])
+def test_constructor_has_the_defaults_of_its_file(name):
+    node = compose([f"sampler={name}", "recipe=paper"]).sampler
+    defaults: dict[str, Any] = {}
+    for cls in reversed(get_class(node._target_).__mro__):
+        if issubclass(cls, Sampler):
+            arguments = signature(cls.__init__).parameters.values()
+            defaults |= {a.name: a.default for a in arguments if a.default is not Parameter.empty}
+    for argument in defaults.keys() - OTHERS:
+        default = defaults[argument]
+        assert node[argument] == (list(default) if isinstance(default, tuple) else default)
 
 
-@pytest.mark.parametrize("sampler", DEFAULTS)
+@pytest.mark.parametrize("sampler", samplers())
 def test_sampler_declares_sizes(sampler):
     assert sampler.flexible == (sampler not in NOT_FLEXIBLE)
     assert sampler.nested == (sampler not in (*NOT_FLEXIBLE, *FLEXIBLE_NOT_NESTED))
