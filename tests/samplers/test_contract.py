@@ -291,3 +291,39 @@ def test_gradients_are_correct(make, rng):
         gradients = torch.autograd.grad(total, [sampler.get_parameter(name) for name in names])
         assert all(torch.isfinite(g).all() for g in gradients)
         assert any((g != 0).any() for g in gradients)
+
+
+GRAPHS = ["mops", "fmops", "snet", "samplenet", "snet-progressive", "samplenet-progressive"]
+
+
+# torch's own tracing of an autograd function
+@pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
+@pytest.mark.parametrize("name", GRAPHS)
+@pytest.mark.parametrize("training", [True, False])
+def test_compiles_to_one_graph(name, training, clouds):
+    torch.compiler.reset()
+    sampler = SAMPLERS[name](M).train(training)
+    with torch.no_grad():
+        want = sampler(clouds)
+        got = torch.compile(sampler, backend="eager", fullgraph=True)(clouds)
+    torch.testing.assert_close(got.points, want.points)
+    torch.testing.assert_close(got.losses, want.losses)
+
+
+class Generated(torch.nn.Module):
+    def __init__(self, sampler):
+        super().__init__()
+        self.sampler = sampler
+
+    def forward(self, points):
+        return self.sampler(points).points
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_exported_program_generates_the_same_points(name, clouds, tmp_path):
+    sampler = SAMPLERS[name](M).eval()
+    path = tmp_path / "sampler.pt2"
+    with torch.no_grad():
+        torch.export.save(torch.export.export(Generated(sampler), (clouds,)), path)
+        got = torch.export.load(path).module()(clouds)
+        torch.testing.assert_close(got, sampler(clouds).points)

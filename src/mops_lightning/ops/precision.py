@@ -28,11 +28,16 @@ def full_precision(device: str) -> torch.autocast:
 def restrict_autocast_to_pointwise(device: str) -> Iterator[None]:
     """Disable autocast except in ``pointwise_autocast``, which keeps its dtype.
 
-    Calls may be nested; the inner ones change nothing.
+    Calls may be nested; the inner ones change nothing. In a graph of ``torch.compile`` or
+    ``torch.export``, which cannot read context variables, all layers keep full precision.
 
     Args:
         device: device type, such as ``cuda``.
     """
+    if torch.compiler.is_compiling():
+        with full_precision(device) if torch.is_autocast_enabled(device) else nullcontext():
+            yield
+        return
     mixed = torch.is_autocast_enabled(device)
     token = _POINTWISE.set(torch.get_autocast_dtype(device) if mixed else _POINTWISE.get())
     try:
@@ -44,7 +49,7 @@ def restrict_autocast_to_pointwise(device: str) -> Iterator[None]:
 
 def pointwise_autocast_dtype() -> torch.dtype | None:
     """Return the dtype of ``pointwise_autocast``, or None without mixed precision."""
-    return _POINTWISE.get()
+    return None if torch.compiler.is_compiling() else _POINTWISE.get()
 
 
 def pointwise_autocast(device: str) -> AbstractContextManager[Any]:
@@ -53,5 +58,5 @@ def pointwise_autocast(device: str) -> AbstractContextManager[Any]:
     Args:
         device: device type, such as ``cuda``.
     """
-    dtype = _POINTWISE.get()
+    dtype = pointwise_autocast_dtype()
     return nullcontext() if dtype is None else torch.autocast(device, dtype=dtype)

@@ -140,7 +140,8 @@ class Sampler(nn.Module):
 
     def _checked(self, points: Tensor, m: int) -> SampleOutput:
         """Check the points and sample them, without losses."""
-        finite = not (self.training and points.is_cuda)
+        # A graph cannot branch on values, and on a GPU the check waits for the device.
+        finite = not (torch.compiler.is_compiling() or (self.training and points.is_cuda))
         check_points(points, at_least=m, finite=finite)
         dtype = next((p.dtype for p in self.parameters()), points.dtype)
         if not torch.is_autocast_enabled(points.device.type):
@@ -242,8 +243,8 @@ def check_points(points: Tensor, at_least: int = 1, finite: bool = True) -> None
     Args:
         points: must be ``(B, N, 3)``, floating point and finite.
         at_least: smallest N allowed.
-        finite: whether to check for NaN and infinity. On a GPU this check waits for the device;
-            training there relies on the check in data loading.
+        finite: whether to check for NaN and infinity. Training on a GPU relies on the check in
+            data loading.
 
     Raises:
         UserError: the argument is invalid.

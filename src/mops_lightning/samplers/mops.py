@@ -136,6 +136,7 @@ class MOPSNet(Sampler):
     def _keys(self, points: Tensor) -> Tensor:
         """Return the inputs of the last layer of ρ ``(B, N, C)``."""
         plain = self.training or torch.is_grad_enabled()
+        plain |= torch.compiler.is_compiling()  # a graph has the weights as they are
         if not plain and pointwise_autocast_dtype() is None:
             return self._fused_keys(points)
         local, global_ = self.features(points)

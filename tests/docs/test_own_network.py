@@ -1,0 +1,78 @@
+"""The examples of docs/own_network.md, run as written."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import cross_entropy
+
+from mops_lightning import MOPSNet
+
+PAGE = (Path(__file__).parents[2] / "docs" / "own_network.md").read_text()
+SCRIPTS = dict(re.findall(r"```python\n# (\w+\.py)\n(.*?)```", PAGE, flags=re.S))
+
+MY_NET = """\
+import torch
+from torch import nn
+
+class Net(nn.Module):
+    def forward(self, points):  # how far the points are spread along x, against y
+        spread = points.std(dim=1)
+        return 20 * (spread[:, :2] - spread[:, :2].mean(1, keepdim=True))
+
+net = Net()
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A user's folder: long boxes along x or y, and a net that tells them apart."""
+    random = np.random.default_rng(0)
+    labels = np.arange(64) % 2
+    points = random.random((64, 64, 3), dtype=np.float32) - 0.5
+    points[labels == 0, :, 1] *= 0.5
+    points[labels == 1, :, 0] *= 0.5
+    np.savez(tmp_path / "clouds.npz", points=points, labels=labels)
+    (tmp_path / "my_net.py").write_text(MY_NET)
+    for name, text in SCRIPTS.items():
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def run(script, folder):
+    done = subprocess.run([sys.executable, script], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_example_has_at_most_30_lines(name):
+    assert len(SCRIPTS[name].strip().splitlines()) <= 30
+
+
+def test_plain_loop_trains_a_sampler_for_the_net(folder):
+    run("plain_loop.py", folder)
+    data = np.load(folder / "clouds.npz")
+    points, labels = torch.from_numpy(data["points"]), torch.from_numpy(data["labels"])
+    own: dict[str, Any] = {}
+    exec(MY_NET, own)
+    torch.manual_seed(0)
+    losses = []
+    for trained in (False, True):
+        sampler = MOPSNet(m=16)
+        if trained:
+            sampler.load_state_dict(torch.load(folder / "sampler.pt", weights_only=True))
+        sample = sampler.eval()(points).points
+        losses.append(float(cross_entropy(own["net"](sample.detach()), labels)))
+    assert losses[1] < losses[0] / 5
+
+
+def test_lightning_scores_every_readout(folder):
+    out = run("by_lightning.py", folder)
+    for readout in ("generated", "matched", "completed", "fps", "full"):
+        assert f"test/{readout}/accuracy" in out
