@@ -25,7 +25,7 @@ def test_key_and_path_of_an_argument(argument, key, path):
 @pytest.mark.parametrize("text", ["a/b=0.1", "~/runs", "it's (1), a \\ run", "plain/path", "a b"])
 def test_value_is_read_as_typed(text):
     for argument in (f"out={text}", f"out={overrides.quote(text)}"):
-        override = overrides.parse(argument)
+        override = overrides.parse_override(argument)
         assert override is not None
         assert override.value() == text
         assert compose([overrides.readable(argument)]).out == text

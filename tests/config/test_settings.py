@@ -13,7 +13,7 @@ from mops_lightning.config.compose import compose
 from mops_lightning.config.settings import Affects, RunSettings, number, setting
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
-from mops_lightning.report.build import build
+from mops_lightning.report.build import build_report
 from mops_lightning.training.checkpoint import checkpoint_identity
 from mops_lightning.training.evaluation import TrainedRun, as_trained, command_line
 from mops_lightning.training.run.pretrain import cache_folder
@@ -93,7 +93,7 @@ def test_made_up_setting_that_affects_results_makes_columns_of_a_report(affects,
     for haste in (1.0, 2.0):
         put_cell(tmp_path, f"a{haste}", "mops", {"generated": haste}, haste=haste, m=8)
     columns = ["m=8"] if affects is Affects.NOTHING else ["haste=1.0", "haste=2.0"]
-    head = build(tmp_path).grids[0].head
+    head = build_report(tmp_path).grids[0].head
     assert head[: len(columns) + 1] == ["sampled by", *columns]
 
 

@@ -10,7 +10,7 @@ import torch
 from scipy.optimize import linear_sum_assignment
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.emd import assignment, earth_movers_distance
+from mops_lightning.ops.emd import earth_movers_distance, solve_assignments
 
 
 def plain_emd(points, others):
@@ -60,9 +60,9 @@ def test_assignment_is_permutation(block, rng):
     points, others = clouds(rng, 3, 61)
     points[1] = 0.5
     others[2] = points[2]
-    rows = assignment(points, others, block)
+    rows = solve_assignments(points, others, block)
     assert torch.equal(rows.sort(1).values, torch.arange(61).expand(3, -1))
-    assert torch.equal(assignment(points, others, block), rows)
+    assert torch.equal(solve_assignments(points, others, block), rows)
     if block is None:
         assert earth_movers_distance(points, others)[2] == 0
 
@@ -107,11 +107,11 @@ def test_workers_same_assignment_and_exit_with_parent(tmp_path, rng):
         "if __name__ == '__main__':\n"
         "    import torch\n"
         "    from mops_lightning.ops import workers\n"
-        "    from mops_lightning.ops.emd import assignment\n"
+        "    from mops_lightning.ops.emd import solve_assignments\n"
         "    points, others = torch.load(sys.argv[1])\n"
         "    for block in (None, 64):\n"
-        "        shared = assignment(points, others, block, 1, workers=2)\n"
-        "        assert torch.equal(shared, assignment(points, others, block, 1))\n"
+        "        shared = solve_assignments(points, others, block, 1, workers=2)\n"
+        "        assert torch.equal(shared, solve_assignments(points, others, block, 1))\n"
         "    print(*workers.pool(2)._processes, flush=True)\n"
         "    input()\n"
     )

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mops_lightning.records import run_record
-from mops_lightning.report.build import build
+from mops_lightning.report.build import build_report
 from mops_lightning.report.cli import main
 from mops_lightning.report.page import page as page_text
 from mops_lightning.viz.figures import new_figure, save_figure
@@ -134,4 +134,6 @@ def test_page_runs_its_own_scripts_only(reported):
 def test_page_embeds_png_where_svg_is_missing(tmp_path):
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
     picture = save_figure(new_figure(1, 1), tmp_path / "curves.png")
-    assert 'src="data:image/png;base64,iVBOR' in page_text(build(tmp_path), tmp_path, [picture])
+    assert 'src="data:image/png;base64,iVBOR' in page_text(
+        build_report(tmp_path), tmp_path, [picture]
+    )

@@ -3,7 +3,7 @@ from typing import Any
 import pytest
 from matplotlib.colors import LogNorm, Normalize
 
-from mops_lightning.report.build import build
+from mops_lightning.report.build import build_report
 from mops_lightning.report.plots import plots
 from tests.support.reports import put, put_cell
 
@@ -16,7 +16,7 @@ def test_heat_maps_wide_range_has_logarithmic_colours(far, kind, tmp_path):
             values = {"generated": far if corner else 1.0 + across, "matched": 2.0}
             settings = dict(zip(keys, (down, across), strict=True))
             put_cell(tmp_path, f"{sampler}{down}{across}", sampler, values, of=settings)
-    figure = plots(build(tmp_path))["nre_cd_planes"]
+    figure = plots(build_report(tmp_path))["nre_cd_planes"]
     images = [image for axis in figure.axes for image in axis.images]
     assert {type(image.norm) for image in images} == {kind}
     assert len({(image.norm.vmin, image.norm.vmax) for image in images}) == 1, "one scale"
@@ -28,7 +28,7 @@ def test_curves_show_values_by_size(tmp_path):
     for m in (8, 32):
         put(tmp_path, "fps", m, {"test/sampled/accuracy": m / 100})
         put(tmp_path, "mops", m, {"test/generated/accuracy": m / 50, "test/matched/accuracy": 0.5})
-    (figure,) = plots(build(tmp_path)).values()
+    (figure,) = plots(build_report(tmp_path)).values()
     panels: list[list[Any]] = [list(axes.containers) for axes in figure.axes]
     first, second, third = panels
     fps, mops = first

@@ -18,7 +18,7 @@ from mops_lightning.samplers.poisson import PoissonSampler
 from mops_lightning.samplers.samplenet import SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.samplers.voxel import VoxelSampler
-from mops_lightning.zoo.load import samplers
+from mops_lightning.zoo.load import package_samplers
 
 FILES = [
     path for path in sorted(conf_dir().joinpath("sampler").glob("*.yaml")) if path.stem != "own"
@@ -54,7 +54,7 @@ def test_constructor_has_the_defaults_of_its_file(name):
         assert node[argument] == (list(default) if isinstance(default, tuple) else default)
 
 
-@pytest.mark.parametrize("sampler", samplers())
+@pytest.mark.parametrize("sampler", package_samplers())
 def test_sampler_declares_sizes(sampler):
     assert sampler.flexible == (sampler not in NOT_FLEXIBLE)
     assert sampler.nested == (sampler not in (*NOT_FLEXIBLE, *FLEXIBLE_NOT_NESTED))

@@ -3,13 +3,13 @@
 import re
 
 from mops_lightning.records import run_record
-from mops_lightning.report.build import build
+from mops_lightning.report.build import build_report
 from mops_lightning.report.text import markdown
 from tests.support.records import record
 
 
 def table(folder, *metrics, mixed=False):
-    report = build(folder, metrics, mixed)
+    report = build_report(folder, metrics, mixed)
     return markdown(report.grids, report.remarks)
 
 

@@ -6,7 +6,7 @@ import torch
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.training.readouts import readout_names, readouts
+from mops_lightning.training.readouts import names_of_readouts, readouts
 
 SMALL: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
 
@@ -30,4 +30,4 @@ def test_readouts_refine_starts_from_distinct_rows(sampler, rng):
 
 
 def test_readout_names_without_sampler_is_full():
-    assert readout_names(None) == ("full",)
+    assert names_of_readouts(None) == ("full",)

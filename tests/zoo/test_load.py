@@ -9,7 +9,7 @@ from mops_lightning import SampleOutput, Sampler, load
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
-from mops_lightning.zoo.load import samplers
+from mops_lightning.zoo.load import package_samplers
 from tests.support.models import write_run
 
 ROOT = Path(__file__).parents[2]
@@ -110,7 +110,7 @@ def test_load_model_by_name_or_unknown_name():
 
 
 def test_samplers_of_conf_can_all_be_loaded():
-    known = {f"{cls.__module__}.{cls.__qualname__}" for cls in samplers()}
+    known = {f"{cls.__module__}.{cls.__qualname__}" for cls in package_samplers()}
     for path in (ROOT / "conf" / "sampler").glob("*.yaml"):
         if path.stem != "own":  # names no class
             node: Any = OmegaConf.load(path)

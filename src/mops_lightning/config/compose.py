@@ -12,7 +12,7 @@ from mops_lightning.config import settings
 from mops_lightning.config.build import signature
 from mops_lightning.config.hydra_conf import composed, conf_dir
 from mops_lightning.config.overrides import key as key_of
-from mops_lightning.config.overrides import parse, with_own_classes
+from mops_lightning.config.overrides import parse_override, with_own_classes
 from mops_lightning.config.validate import refusal
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.records.run_record import dotted
@@ -53,7 +53,7 @@ def refuse_plain_groups(arguments: Sequence[str]) -> None:
     """
     groups = _groups()
     for argument in arguments:
-        override = parse(argument)
+        override = parse_override(argument)
         name = key_of(argument)
         if override is None or override.is_delete() or name not in groups:
             continue

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from hydra.core.override_parser.types import Override
 
 
-def parse(argument: str) -> "Override | None":
+def parse_override(argument: str) -> "Override | None":
     """Read one argument of the command line.
 
     A value that is none to Hydra, such as a path with ``=`` in it, is taken as the text it is.
@@ -29,7 +29,7 @@ def readable(argument: str) -> str:
 
 def key(argument: str) -> str:
     """Return the key that an override is about, such as ``task/net``; empty for anything else."""
-    override = parse(argument)
+    override = parse_override(argument)
     if override is None:
         return ""
     package = f"@{override.package}" if override.package is not None else ""

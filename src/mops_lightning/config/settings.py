@@ -324,7 +324,7 @@ def _of(schema: type, path: str) -> Setting:
     return found
 
 
-def limited() -> dict[str, Limits]:
+def limits_by_setting() -> dict[str, Limits]:
     """Return the limits of all settings that have some, by dotted name."""
     found = {name: of(name).limits for name in (*declared(), *INSIDE)}
     return {name: limits for name, limits in found.items() if limits is not None}

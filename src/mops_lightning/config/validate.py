@@ -101,7 +101,7 @@ def _check_numbers(value: Any, path: str) -> None:
 
 def _check_limits(config: dict[str, Any]) -> None:
     values = dotted(config)
-    for path, limits in settings.limited().items():
+    for path, limits in settings.limits_by_setting().items():
         value = values.get(path, MISSING)
         counts = settings.of(path).counts(config["learn"])
         if value != MISSING and counts and not limits.fits(value):

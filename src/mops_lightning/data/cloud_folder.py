@@ -127,7 +127,7 @@ def cloud_folder(
     listed = None
     if split_file:
         listed = read_split_list(folder, Path(split_file).expanduser(), suffixes)
-    names = sorted(listed) if listed else files(folder, suffixes)
+    names = sorted(listed) if listed else list_files(folder, suffixes)
     chosen = choose_classes(classes, sorted(set(map(class_of, names))))
     names = [name for name in names if class_of(name) in chosen]
     if listed is not None:
@@ -152,7 +152,7 @@ def cloud_folder(
     return CloudDataset(chosen, clouds["train"], clouds["test"], digest.hexdigest(), notes)
 
 
-def files(folder: Path, suffixes: Sequence[str]) -> list[PurePosixPath]:
+def list_files(folder: Path, suffixes: Sequence[str]) -> list[PurePosixPath]:
     """Return the relative paths of the files with these suffixes below a folder, sorted."""
     names = sorted(
         PurePosixPath(path.relative_to(folder).as_posix())

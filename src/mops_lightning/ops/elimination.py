@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.ops.fps import farthest_point_sample
-from mops_lightning.ops.kernels import cached, jit
+from mops_lightning.ops.kernels import jit, jit_cached
 from mops_lightning.ops.points import gather_points
 
 FINEST = 2**20
@@ -137,7 +137,7 @@ def _before(keys, order, point, other):
     return keys[point] > keys[other] or (keys[point] == keys[other] and order[point] < order[other])
 
 
-@cached
+@jit_cached
 def _remove_crowded(planes, order, starts, numbers, cell_of, around, m, reach, scale):
     """Remove the most crowded point until m remain.
 

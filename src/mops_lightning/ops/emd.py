@@ -53,11 +53,11 @@ def earth_movers_distance(
         >>> earth_movers_distance(points, points.flip(1))
         tensor([0., 0.])
     """
-    rows = assignment(points, others, block, rounds, workers)
+    rows = solve_assignments(points, others, block, rounds, workers)
     return torch.linalg.vector_norm(points - gather_points(others, rows), dim=2).mean(1)
 
 
-def assignment(
+def solve_assignments(
     points: Tensor,
     others: Tensor,
     block: int | None = None,

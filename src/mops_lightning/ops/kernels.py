@@ -26,7 +26,7 @@ jit: Any = partial(njit, nogil=True, error_model="numpy")
 intrinsic: Any = extending.intrinsic
 
 
-def cached(function: Any) -> Any:
+def jit_cached(function: Any) -> Any:
     """Compile, and keep the compiled form in a file next to this one or in the user's cache."""
     try:
         return jit(function, cache=True)
@@ -222,7 +222,7 @@ def _place(bits, wanted):
     return start
 
 
-@cached
+@jit_cached
 def farthest(planes, distances, steps, channels, leaf):
     """Repeatedly choose the point with the largest distance and update the distances.
 
@@ -294,7 +294,7 @@ def _choose_child(nodes, peaks, left, rows, node):
     peaks[node] = best
 
 
-@cached
+@jit_cached
 def nearest(planes, queries, scratch, channels, leaf):
     """Find the nearest point for every query.
 

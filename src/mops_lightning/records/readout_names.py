@@ -36,7 +36,7 @@ def size_prefix(m: int | None) -> str:
     return "" if m is None else f"m{m}/"
 
 
-def parse(name: str, stage: str = "test") -> MetricName | None:
+def parse_metric_name(name: str, stage: str = "test") -> MetricName | None:
     """Split a name such as ``test/m32/generated/accuracy`` or ``test/generated/accuracy``.
 
     Returns:

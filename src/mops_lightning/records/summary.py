@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mops_lightning.records.metric_info import in_summary_order, metric_info
-from mops_lightning.records.readout_names import FULL, REFINED, ROWS, parse
+from mops_lightning.records.readout_names import FULL, REFINED, ROWS, parse_metric_name
 from mops_lightning.records.run_record import FILE, RunRecord
 
 Rows = dict[str, dict[str, float | None]]
@@ -25,7 +25,7 @@ def readout_rows(metrics: dict[str, float | None], score: str | None = None) -> 
         ``{"generated": {"accuracy": 0.8}}``, or ``{"generated": {"m=32": 0.8}}`` if several sizes
         are tested. Baselines come first, full clouds last; the latter hold for every size.
     """
-    parts = {name: parse(name) for name in metrics}
+    parts = {name: parse_metric_name(name) for name in metrics}
     several = any(part and part.m for part in parts.values())
     rows: Rows = {}
     for name, part in parts.items():
@@ -61,7 +61,7 @@ def closing_lines(folder: Path, record: RunRecord, console: Console | None = Non
 def results_table(record: RunRecord) -> tuple[str, Table]:
     """Return a title and the test results of every readout, by metric or by size."""
     config = record.config
-    names, score = config["names"], parse(record.score_name)
+    names, score = config["names"], parse_metric_name(record.score_name)
     by_size = score.metric if score and score.m else None
     rows = readout_rows(record.metrics, by_size)
     if by_size:

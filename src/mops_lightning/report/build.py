@@ -8,7 +8,7 @@ import pandas as pd
 
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import metric_info
-from mops_lightning.records.readout_names import FULL, parse
+from mops_lightning.records.readout_names import FULL, parse_metric_name
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report import paper
 from mops_lightning.report.collect import (
@@ -53,7 +53,7 @@ class Report:
     tables: list[Table] = field(default_factory=list)
 
 
-def build(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Report:
+def build_report(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Report:
     """Make the tables of all completed records below ``folder``, one for each group and metric.
 
     Args:
@@ -126,7 +126,7 @@ def _grids(table: Table) -> list[Grid]:
 def _by_column(table: Table) -> Grid:
     names, layout = _names(table), table.group.layout
     joint = trained_with(table.group.records[0]) == "joint"
-    published = paper.table(names["task"], names["dataset"], table.metric.name, joint)
+    published = paper.published(names["task"], names["dataset"], table.metric.name, joint)
     samplers = {sampler_row(one): one.config["names"]["sampler"] for one in table.group.records}
     cells, columns, costs = table.cells(["row"]), table.columns(), _costs(table)
     rows: list[list] = []
@@ -232,7 +232,7 @@ def _full_lines(table: Table) -> list[str]:
     """Return a line for each task net with its value on full clouds."""
     names, records, metric = _names(table), table.group.records, _full_metric(table)
     joint = trained_with(records[0]) == "joint"
-    theirs = paper.table(names["task"], names["dataset"], metric.name, joint)
+    theirs = paper.published(names["task"], names["dataset"], metric.name, joint)
     label = f"{metric.title} " if table.metric.full_cloud_metric else ""
     lines = []
     for record in sorted(records, key=lambda one: (sampler_row(one), -one.config["m"])):
@@ -242,7 +242,7 @@ def _full_lines(table: Table) -> list[str]:
         net = record.config["names"]["net"]
         after = ""
         if trained_with(record) == "joint":
-            several = any(parts.m for parts in map(parse, record.metrics) if parts)
+            several = any(parts.m for parts in map(parse_metric_name, record.metrics) if parts)
             size = "" if several else f", m={record.config['m']}"
             after = f" after joint training with {sampler_row(record)}{size}"
         published = net == table.net and "full" in theirs

@@ -6,7 +6,7 @@ from pathlib import Path
 from mops_lightning.errors import one_line_endings
 from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.records import run_record
-from mops_lightning.report.build import Report, build
+from mops_lightning.report.build import Report, build_report
 from mops_lightning.report.tables import long_form
 from mops_lightning.report.text import latex, markdown
 
@@ -30,7 +30,7 @@ def main(arguments: list[str] | None = None, prog: str = "mops-lightning report"
     """
     with one_line_endings(prog):
         chosen = make_parser(prog).parse_args(arguments)
-        report = build(chosen.folder, chosen.metric, chosen.mixed)
+        report = build_report(chosen.folder, chosen.metric, chosen.mixed)
         written = write(report, chosen.folder)
         if chosen.records:
             run_record.write_many(chosen.records, report.found.done)

@@ -6,7 +6,7 @@ from typing import Any
 
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-from mops_lightning.records.readout_names import parse
+from mops_lightning.records.readout_names import parse_metric_name
 from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
 from mops_lightning.records.summary import sampler_name
 
@@ -91,7 +91,7 @@ def trained_with(record: RunRecord) -> str:
     return "joint" if learn == "joint" else "sampler alone"
 
 
-def recipe(record: RunRecord) -> dict[str, Any]:
+def recorded_recipe(record: RunRecord) -> dict[str, Any]:
     """Return the recipe that a record's sampler was trained by, with its name; {}: the paper's."""
     return record.recipe or (record.evaluated and record.evaluated.recipe) or {}
 
@@ -101,7 +101,7 @@ def sampler_row(record: RunRecord) -> str:
 
     That is ``anchored`` for a MOPS-Net with anchors, and its recipe unless it is the paper's.
     """
-    parts = [sampler_name(record.config), recipe(record).get("name")]
+    parts = [sampler_name(record.config), recorded_recipe(record).get("name")]
     return " ".join(filter(None, parts))
 
 
@@ -119,5 +119,5 @@ def seed(record: RunRecord) -> int:
 
 def score(found: list[RunRecord]) -> str:
     """Return the name of the records' main metric; empty if none names it."""
-    names = (parts.metric for record in found if (parts := parse(record.score_name)))
+    names = (parts.metric for record in found if (parts := parse_metric_name(record.score_name)))
     return next(names, "")

@@ -9,7 +9,7 @@ import pandas as pd
 
 from mops_lightning.config.shared_settings import table_settings
 from mops_lightning.records.run_record import RunRecord, dotted
-from mops_lightning.report.collect import epochs, recipe, sampler_row, seed, trained_with
+from mops_lightning.report.collect import epochs, recorded_recipe, sampler_row, seed, trained_with
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def varying(found: list[RunRecord]) -> list[str]:
 def considered(record: RunRecord) -> dict[str, Any]:
     """Return the settings that are compared, with dotted keys, and the epochs trained."""
     learn = record.evaluated.learn if record.evaluated else record.config["learn"]
-    settings = {**table_settings(record.config, learn), **dotted(recipe(record), "recipe")}
+    settings = {**table_settings(record.config, learn), **dotted(recorded_recipe(record), "recipe")}
     return {**settings, "trainer.max_epochs": epochs(record)}
 
 

@@ -106,5 +106,5 @@ def _paper(record: RunRecord) -> str:
         values = paper.net(names["net"], _net(record).get("pieces"), points)
     if values:
         return " / ".join(f"{value:g}" for value in values)
-    published = paper.table(names["task"], names["dataset"], score([record])).get("full")
+    published = paper.published(names["task"], names["dataset"], score([record])).get("full")
     return "" if published is None else f"{published:.2f}"

@@ -7,12 +7,12 @@ from typing import Any
 
 
 @cache
-def tables() -> dict[str, dict[str, Any]]:
+def published_tables() -> dict[str, dict[str, Any]]:
     """Return all tables by name, each with its source; see ``paper.json``."""
     return json.loads(files("mops_lightning.report").joinpath("paper.json").read_text())
 
 
-def table(task: str, dataset: str, metric: str, joint: bool = False) -> dict[str, Any]:
+def published(task: str, dataset: str, metric: str, joint: bool = False) -> dict[str, Any]:
     """Return the paper's table for a task, dataset and metric; empty if it has none.
 
     Returns:
@@ -20,7 +20,7 @@ def table(task: str, dataset: str, metric: str, joint: bool = False) -> dict[str
         ``full``, if the paper gives it: the value on all points.
     """
     wanted = (task, dataset, metric, joint)
-    for one in tables().values():
+    for one in published_tables().values():
         if (one["task"], one.get("dataset"), one.get("metric"), one.get("joint", False)) == wanted:
             return one
     return {}
@@ -35,4 +35,4 @@ def net(name: str, pieces: int | None, n_points: int | None) -> list[float] | No
         n_points: points of the clouds.
     """
     key = str(pieces) if name in ("foldingnet", "mfoldingnet") else name
-    return tables()["frameworks"]["nets"].get(key, {}).get(str(n_points))
+    return published_tables()["frameworks"]["nets"].get(key, {}).get(str(n_points))

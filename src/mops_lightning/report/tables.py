@@ -15,7 +15,7 @@ from mops_lightning.records.readout_names import (
     GENERATED_READOUTS,
     INDEX_READOUT,
     REFINED,
-    parse,
+    parse_metric_name,
 )
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import baseline_name
@@ -139,7 +139,7 @@ def long_form(found: list[RunRecord], net: str, keys: Sequence[str] = ()) -> pd.
             "device": record.device,
         }
         for name, figure in record.metrics.items():
-            parts = parse(name)
+            parts = parse_metric_name(name)
             if parts is not None and figure is not None:
                 tested = {"m": parts.m or record.config["m"], "readout": parts.readout}
                 rows.append({**facts, **tested, "metric": parts.metric, "value": figure})

@@ -109,7 +109,7 @@ class TrainedRun:
             if ("/" in key or "@" in key) and _is_repeated(overrides.path(argument)):
                 chosen.append(overrides.readable(argument))
         for argument in chosen:
-            override = overrides.parse(argument)
+            override = overrides.parse_override(argument)
             if override is None or not NAME.fullmatch(str(override.value())):
                 raise self.not_accepted(argument)
         return chosen
@@ -163,7 +163,7 @@ def command_line(arguments: list[str]) -> list[str]:
 
 def _run_named(argument: str) -> str | None:
     """Return the run that ``evaluate=RUN`` names."""
-    override = overrides.parse(argument)
+    override = overrides.parse_override(argument)
     if override is None or override.is_delete():
         return None
     if override.is_sweep_override():

@@ -24,7 +24,7 @@ from mops_lightning.tasks.base import Task
 from mops_lightning.tasks.refinement import Refinement
 from mops_lightning.training.checkpoint import CHECKPOINT_KEY
 from mops_lightning.training.divergence import check_checkpoint, check_loss
-from mops_lightning.training.readouts import readout_names, readouts
+from mops_lightning.training.readouts import names_of_readouts, readouts
 from mops_lightning.training.recipe.distillation import Distillation, FullClouds, Targets
 from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through
 from mops_lightning.training.scores import Scores
@@ -94,7 +94,7 @@ class Experiment(L.LightningModule):
         self.m: int = m or (self.sampler.m if self.sampler is not None else 0)
         self.sizes = tuple(sizes or (self.m,))
         self.prefixes = {m: size_prefix(m) if len(self.sizes) > 1 else "" for m in self.sizes}
-        self.main_readout, *others = readout_names(self.sampler)
+        self.main_readout, *others = names_of_readouts(self.sampler)
         score = task.full_score or task.score if self.sampler is None else task.score
         self.score_name = f"test/{self.prefixes.get(self.m, '')}{self.main_readout}/{score}"
         self.refinement = Refinement(task, refine) if refine and self.sampler is not None else None

@@ -11,7 +11,7 @@ from mops_lightning.samplers.base import Sampler
 from mops_lightning.types import SampleOutput
 
 
-def readout_names(sampler: Sampler | None) -> tuple[str, ...]:
+def names_of_readouts(sampler: Sampler | None) -> tuple[str, ...]:
     """Return the names of a sampler's readouts; without a sampler only the full cloud is scored."""
     if sampler is None:
         return (FULL,)
@@ -40,7 +40,7 @@ def readouts(
     """
     samples: dict[int, dict[str, Tensor]] = {}
     rows: dict[int, Tensor] = {}
-    names = readout_names(sampler)
+    names = names_of_readouts(sampler)
     generates = sampler is not None and sampler.generates
     # Points are matched one by one, so matching the largest nested set matches all smaller ones.
     nested = generates and sampler is not None and sampler.nested

@@ -37,11 +37,11 @@ class PlainMOPSNet(nn.Module):
         super().__init__()
         norm = sampler.rho_first[0]
         assert isinstance(norm, nn.BatchNorm1d)
-        self.features = fused_layers(sampler.features.mlp.layers)
+        self.features = plain_layers(sampler.features.mlp.layers)
         self.rho_local = fuse_linear_bn_eval(sampler.rho_local, norm)
         self.rho_global = fuse_linear_bn_eval(sampler.rho_global, norm)
         self.rho_global.register_parameter("bias", None)  # the shift applies to the sum once
-        self.rho = fused_layers(sampler.rho)
+        self.rho = plain_layers(sampler.rho)
         self.register_buffer("queries", sampler.queries.weight.detach()[:m] / sampler.tau_min)
 
     def forward(self, points: Tensor) -> Tensor:
@@ -58,8 +58,8 @@ class PlainSNet(nn.Module):
     def __init__(self, sampler: SNet, m: int) -> None:
         super().__init__()
         last = [sampler.pool.linear, *([sampler.pool.norm] if sampler.pool.norm else [])]
-        self.features = fused_layers([*sampler.features.layers, *last])
-        self.head = fused_layers(sampler.head)
+        self.features = plain_layers([*sampler.features.layers, *last])
+        self.head = plain_layers(sampler.head)
         self.m = m
 
     def forward(self, points: Tensor) -> Tensor:
@@ -68,7 +68,7 @@ class PlainSNet(nn.Module):
         return self.head(pooled).unflatten(1, (-1, 3))[:, : self.m]
 
 
-def fused_layers(layers: Iterable[nn.Module]) -> nn.Sequential:
+def plain_layers(layers: Iterable[nn.Module]) -> nn.Sequential:
     """Return linear layers and ReLUs, with BatchNorm fused into the linear layer before it."""
     plain: list[nn.Module] = []
     for layer in layers:

@@ -22,7 +22,7 @@ HINT = "Give a sampler, or the weights of a run with learn=sampler or learn=join
 
 
 @cache
-def samplers() -> list[type[Sampler]]:
+def package_samplers() -> list[type[Sampler]]:
     """Return the samplers that files may name: all of the public API."""
     public = [getattr(mops_lightning, name) for name in mops_lightning.__all__]
     classes = [value for value in public if isinstance(value, type) and issubclass(value, Sampler)]
@@ -69,7 +69,7 @@ def load(path: str | Path, cls: type[Sampler] | None = None) -> Sampler:
 def _known_class(node: Any, path: Path) -> type[Sampler]:
     """Return the class that a file names, if it is one of ours."""
     target = node.get("_target_") if isinstance(node, dict) else None
-    for cls in samplers():
+    for cls in package_samplers():
         if target == f"{cls.__module__}.{cls.__qualname__}":
             return cls
     raise UserError(

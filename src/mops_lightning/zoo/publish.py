@@ -6,7 +6,7 @@ from typing import Any
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.records.metric_info import metric_info
-from mops_lightning.records.readout_names import ROWS, MetricName, parse
+from mops_lightning.records.readout_names import ROWS, MetricName, parse_metric_name
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.zoo import model_file, names, weights
 
@@ -71,18 +71,18 @@ def add(
         "precision": "float16" if half and wide else "float32",
         "notes": notes,
         "classes": content["classes"],
-        "figures": figures(record),
+        "figures": card_figures(record),
         "record": {**record.plain(), "files": files},
     }
     model_file.write(path, card, state)
     return path
 
 
-def figures(record: RunRecord) -> dict[str, Any]:
+def card_figures(record: RunRecord) -> dict[str, Any]:
     """Return a record's score by readout, at the run's own size, for a card."""
     scores = {key: value for key, value in record.metrics.items() if value is not None}
     named = record.score_name
-    parts = {key: part for key in scores if (part := parse(key))}
+    parts = {key: part for key in scores if (part := parse_metric_name(key))}
     if named not in parts:
         raise UserError("the record of the run has no test score. Give a run that was tested.")
     main = parts[named]

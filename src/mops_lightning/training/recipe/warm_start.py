@@ -16,7 +16,7 @@ CLOUDS = 64
 Block = tuple[nn.Linear, nn.BatchNorm1d | None]
 
 
-def warm_start(
+def warm_start_sampler(
     source: bool | str, sampler: nn.Module, net: nn.Module, clouds: Tensor
 ) -> tuple[dict[str, Any], str]:
     """Copy layers or tensors to a sampler, as ``recipe.warm_start`` says.

@@ -16,7 +16,7 @@ from mops_lightning.training.run.build import Parts
 from mops_lightning.zoo import weights
 
 
-def load(parts: Parts, record: RunRecord, task_weights: Path | None) -> None:
+def load_weights(parts: Parts, record: RunRecord, task_weights: Path | None) -> None:
     """Load the weights of the task net and of an evaluated run.
 
     Raises:

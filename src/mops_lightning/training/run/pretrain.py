@@ -95,7 +95,7 @@ def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
     return Path(cfg.cache).expanduser() / "weights" / name
 
 
-def publish(parts: Parts) -> None:
+def add_to_cache(parts: Parts) -> None:
     """Copy a task net that was trained with ``learn=task`` into the cache, unless one is there.
 
     Not from a run that was resumed with another number of epochs, whose learning rates differed,

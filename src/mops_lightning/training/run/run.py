@@ -20,7 +20,7 @@ from mops_lightning.records.summary import closing_lines
 from mops_lightning.training.evaluation import TrainedRun, as_trained
 from mops_lightning.training.run import pretrain, stages
 from mops_lightning.training.run.build import Parts, build_parts
-from mops_lightning.training.run.load import load
+from mops_lightning.training.run.load import load_weights
 
 STARTED = ".started"
 """Empty file in the folder of a run that has begun."""
@@ -56,7 +56,7 @@ def run(
             with record.timed("pretrain"):
                 task_weights = pretrain.task_weights(cfg, dataset, _train_task_net)
         train_and_test(parts, record, task_weights)
-        pretrain.publish(parts)
+        pretrain.add_to_cache(parts)
     if leads:
         closing_lines(folder, record)
     return record
@@ -76,7 +76,7 @@ def train_and_test(parts: Parts, record: RunRecord, task_weights: Path | None) -
         record: is filled.
         task_weights: a file for the task net; None leaves it as initialised.
     """
-    load(parts, record, task_weights)
+    load_weights(parts, record, task_weights)
     if parts.trains:
         stages.warm_start(parts, record)
         with record.timed("fit"):

@@ -13,11 +13,11 @@ from torch import nn
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records.metric_info import foreign_metrics
-from mops_lightning.records.readout_names import parse
+from mops_lightning.records.readout_names import parse_metric_name
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.divergence import Diverged, with_checkpoint
 from mops_lightning.training.recipe.recipe import Recipe
-from mops_lightning.training.recipe.warm_start import warm_start as warm_start_sampler
+from mops_lightning.training.recipe.warm_start import warm_start_sampler
 from mops_lightning.training.run.build import Parts, augmentation
 from mops_lightning.training.run.callbacks import CPUTime
 from mops_lightning.training.run.trainer import log_hparams
@@ -112,7 +112,7 @@ def test(parts: Parts, record: RunRecord) -> None:
     with _interruptible():
         trainer.test(experiment, parts.score_loader(parts.dataset.test), verbose=False)
     record.metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
-    parsed = {name: parse(name) for name in record.metrics}
+    parsed = {name: parse_metric_name(name) for name in record.metrics}
     scores = {  # of every readout, at the run's own size
         name: record.metrics[name]
         for name, key in parsed.items()
