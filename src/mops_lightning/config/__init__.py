@@ -1,1 +1,1 @@
-"""Settings: composing, validating and building what they describe."""
+"""Settings: composing and validating them, and building the objects that they describe."""

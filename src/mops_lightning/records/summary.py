@@ -91,7 +91,7 @@ def results_table(record: RunRecord) -> tuple[str, Table]:
 
 
 def sampler_name(config: dict[str, Any]) -> str:
-    """Return the name of a run's sampler, with what it starts from.
+    """Return the name of a run's sampler, and for FPS the start point if it is set.
 
     A MOPS-Net with anchors is ``mops anchored``, FPS from the farthest point ``fps from farthest``.
     """
@@ -101,7 +101,7 @@ def sampler_name(config: dict[str, Any]) -> str:
 
 
 def baseline_name(config: dict[str, Any], name: str) -> str:
-    """Return the name of a run's baseline, with what it starts from."""
+    """Return the name of a run's baseline, and for FPS the start point if it is set."""
     return name + _start((config.get("baselines") or {}).get(name) or {})
 
 

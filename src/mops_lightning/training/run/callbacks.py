@@ -15,7 +15,7 @@ from mops_lightning.config.build import accepted, build
 from mops_lightning.errors import Interrupted, UserError
 
 STANDARD = ("learning_rate", "checkpoint", "progress", "pictures")
-"""Names in ``conf/callbacks/default.yaml``. None of them changes what is learned."""
+"""Names in ``conf/callbacks/default.yaml``. None of them changes the training."""
 
 
 class StopBetweenSteps(Checkpoint):
@@ -166,7 +166,7 @@ def progress(score: str) -> Callback:
 
 
 def added(nodes: DictConfig) -> dict[str, Any]:
-    """Return the callbacks that a user added, which may change what is learned, as plain data."""
+    """Return the callbacks that a user added, as plain data: they may change the training."""
     plain: Any = OmegaConf.to_container(nodes, resolve=True)
     return {name: node for name, node in plain.items() if name not in STANDARD and node}
 

@@ -1,4 +1,4 @@
-"""The first stage of a run whose parts are built: weights from files, and what they must fit."""
+"""The first stage of a run whose parts are built: weights from files, which must fit."""
 
 from pathlib import Path
 from typing import Any

@@ -160,7 +160,7 @@ def _check_scores(parts: Parts, metrics: dict[str, float]) -> None:
 
 
 def save(parts: Parts, record: RunRecord) -> None:
-    """Fill in what the run wrote and scored, and save what it trained."""
+    """Record the files and scores of the run, and save the trained weights."""
     cfg, experiment = parts.cfg, parts.experiment
     task, sampler = experiment.task, experiment.sampler
     for kind, name in OUTPUTS.items():

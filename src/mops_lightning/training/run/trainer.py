@@ -1,4 +1,4 @@
-"""Building Lightning's trainer, and what is asked of it besides training."""
+"""Building Lightning's trainer, and its setup beyond training."""
 
 import ctypes
 import io
@@ -38,7 +38,7 @@ HARMLESS = (
     ".*GPU available but not used.*",  # trainer=cpu is a choice
     ".*AMP with fp16 is not supported on CPU.*",  # make_trainer raises an error
 )
-"""Warnings about what is intended."""
+"""Warnings about intended behaviour."""
 
 LOG_EVERY = 10
 """Steps between two points of a curve."""
