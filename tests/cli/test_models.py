@@ -1,4 +1,6 @@
 import json
+import os
+import resource
 
 import pytest
 
@@ -75,6 +77,29 @@ def test_models_shows_a_foreign_card_escaped_and_on_its_lines(tmp_path, monkeypa
         assert "\\x1b[31m" in out
         assert "\\x1b]0,title\\x07 \\ud800" in out
     assert "one two" in out
+
+
+def test_models_add_on_a_full_disk_is_one_line(tmp_path):
+    write_run(tmp_path / "run")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        status, out, err = call("add", tmp_path / "run", "fmops.mine", "--folder", tmp_path / "new")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert f"{tmp_path}/new/fmops.mine.safetensors: File too large. Free some space" in err
+    assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_models_leaves_out_a_named_pipe_and_refuses_it_by_path(tmp_path, monkeypatch):
+    pipe = tmp_path / "fmops.pipe.safetensors"
+    os.mkfifo(pipe)
+    monkeypatch.setenv(names.VARIABLE, str(tmp_path))
+    assert "fmops.pipe" not in call()[1]
+    status, out, err = call(pipe)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert f"no file {pipe}" in err
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,7 @@ EXTRA = {
 }
 CALLER: dict[str, set[str]] = {
     # Arguments that code gives, not YAML: see training.run.build and training.run.trainer.
+    "MuonAdam": {"params"},
     "PointNetVanilla": {"num_classes"},
     "PointNetTransform": {"num_classes"},
     "DGCNN": {"num_classes"},

@@ -104,7 +104,7 @@ def test_read_other_headers_are_refused(saved, changes):
 def test_read_quantised_tensors_are_refused(saved, dtype):
     net, path = saved
     rewrite(path, {"head.0.weight": net.state_dict()["head.0.weight"].to(dtype)})
-    with pytest.raises(weights.Damaged, match=r"head\.0\.weight is quantised to 8 bits") as refused:
+    with pytest.raises(weights.Damaged, match=r"head\.0\.weight is quantised") as refused:
         weights.read(path)
     assert "\n" not in str(refused.value)
 

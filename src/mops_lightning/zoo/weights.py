@@ -99,8 +99,7 @@ def check_state(state: Any, path: str | Path) -> None:
     for name, value in state.items():
         if value.element_size() == 1 and value.dtype != torch.bool:
             raise Damaged(
-                f"{path}: {name} is quantised to 8 bits ({value.dtype}). Give weights in 16 or 32 "
-                "bits."
+                f"{path}: {name} is quantised ({value.dtype}). Give weights in 16 or 32 bits."
             )
     if name := first_nonfinite(state):
         raise damaged(path, f"{name} is not finite, because the training diverged")
