@@ -23,13 +23,6 @@ def clouds():
     return [50 + 10 * torch.rand(number, 3, generator=rng) for number in (20, 40, 20)]
 
 
-def padded(clouds):
-    points = torch.full((len(clouds), 40, 3), 1e6)
-    for row, cloud in zip(points, clouds, strict=True):
-        row[: len(cloud)] = cloud
-    return points, torch.tensor([len(cloud) for cloud in clouds])
-
-
 def one_by_one(net, clouds, **arguments):
     return [net.downsample(cloud, **arguments) for cloud in clouds]
 
@@ -63,31 +56,26 @@ def test_shift_and_scale_change_nothing(net, clouds):
 
 
 @pytest.mark.parametrize("readout", ["generated", "completed"])
-def test_lengths_and_batch_give_what_single_clouds_give(net, clouds, readout):
+def test_batch_gives_the_same_as_single_clouds(net, clouds, readout):
     single = one_by_one(net, clouds, readout=readout)
-    points, indices = net.downsample(padded(clouds)[0], None, readout, padded(clouds)[1])
     batch = torch.arange(3).repeat_interleave(torch.tensor([20, 40, 20]))
     flat, flat_indices = net.downsample(torch.cat(clouds), None, readout, batch=batch)
-    for i, (expected, rows) in enumerate(single):
-        assert torch.allclose(points[i], expected)
+    for i, (expected, _) in enumerate(single):
         assert torch.allclose(flat[8 * i : 8 * i + 8], expected)
-        assert rows is None or torch.equal(indices[i], rows)
     if readout == "generated":
-        assert (indices, flat_indices) == (None, None)
+        assert flat_indices is None
     else:
         assert torch.equal(torch.cat(clouds)[flat_indices], flat)
 
 
 def test_small_clouds_are_returned_whole(net, clouds):
     sampler = FPSSampler(30)
-    points, indices = sampler.downsample(padded(clouds)[0], lengths=[20, 40, 20])
-    assert torch.equal(points[0, :20], clouds[0])
-    assert indices[0].tolist() == [*range(20), *[-1] * 10]
-    assert not points[0, 20:].any()
-    assert len(indices[1].unique()) == 30
     batch = torch.arange(3).repeat_interleave(torch.tensor([20, 40, 20]))
-    _, rows = sampler.downsample(torch.cat(clouds), batch=batch)
+    points, rows = sampler.downsample(torch.cat(clouds), batch=batch)
     assert batch[rows].bincount().tolist() == [20, 30, 20]
+    assert torch.equal(points[:20], clouds[0])
+    assert rows[:20].tolist() == list(range(20))
+    assert len(rows.unique()) == 70
 
 
 def test_arrays_in_arrays_out(net, clouds):
@@ -112,10 +100,7 @@ def test_arrays_of_any_byte_order_and_read_only_arrays(net, clouds):
 
 
 @pytest.mark.parametrize("dtype", ["uint16", "uint32", "uint64", "int32"])
-def test_lengths_and_batch_of_any_whole_numbers(net, clouds, dtype):
-    points, lengths = padded(clouds)
-    found = net.downsample(points, lengths=lengths.numpy().astype(dtype))
-    assert torch.equal(found[1], net.downsample(points, lengths=lengths)[1])
+def test_batch_of_any_whole_numbers(net, clouds, dtype):
     batch = np.repeat(np.arange(2), 10)
     found = net.downsample(clouds[0], batch=batch.astype(dtype))
     assert torch.equal(found[1], net.downsample(clouds[0], batch=batch)[1])
@@ -146,12 +131,8 @@ MISTAKES: dict[str, tuple[tuple[Any, ...], dict[str, Any], str]] = {
     "m": ((POINTS, 9), {}, "m must be 8"),
     "m text": ((POINTS, "9"), {}, "m must be a whole number"),
     "readout": ((POINTS, 8, "matchd"), {}, "Did you mean 'matched'"),
-    "both": ((POINTS,), {"lengths": [9, 9], "batch": [0]}, "exclude each other"),
-    "lengths size": ((POINTS,), {"lengths": [20]}, r"shape \(B=2,\), got .* \(1,\)"),
-    "lengths type": ((POINTS,), {"lengths": torch.ones(2)}, "lengths must be whole numbers"),
-    "lengths list": ((POINTS,), {"lengths": [[1], [2, 3]]}, "lengths must be whole numbers, got"),
-    "lengths range": ((POINTS,), {"lengths": [20, 21]}, r"from 1 to N=20, got \[20, 21\]"),
-    "lengths and one": ((POINTS[0],), {"lengths": [20]}, "with lengths"),
+    "batch type": ((POINTS[0],), {"batch": torch.ones(20)}, "batch must be whole numbers"),
+    "batch list": ((POINTS[0],), {"batch": [[1], [2, 3]]}, "batch must be whole numbers, got"),
     "batch and many": ((POINTS,), {"batch": [0] * 20}, "with batch"),
     "batch size": ((POINTS[0],), {"batch": [0]}, r"shape \(P=20,\)"),
     "batch order": ((POINTS[0],), {"batch": [1, *[0] * 19]}, "ascending"),

@@ -91,7 +91,6 @@ class Sampler(nn.Module):
         points: Any,
         m: int | None = None,
         readout: str = "completed",
-        lengths: Any = None,
         batch: Any = None,
     ) -> tuple[Any, Any]:
         """Sample clouds in their own unit: normalised as in training, sampled, mapped back.
@@ -101,17 +100,14 @@ class Sampler(nn.Module):
             m: number of points to return of each cloud; None means ``self.m``.
             readout: of generated points: ``generated``, ``matched`` (the nearest input points,
                 perhaps repeated) or ``completed`` (m different input points).
-            lengths: ``(B,)`` numbers of points, where clouds of several sizes are padded to
-                ``(B, N, 3)``.
             batch: ``(P,)`` the cloud of every point, ascending from 0, where clouds of several
                 sizes are one after the other.
 
         Returns:
             The points, and their indices in the input, or None for generated points; tensors or
             arrays like the input. For ``(N, 3)`` points ``(m, 3)`` and ``(m,)``, for ``(B, N, 3)``
-            ``(B, m, 3)`` and ``(B, m)``, with ``batch`` both of all clouds one after the other.
-            With ``lengths`` or ``batch``, a cloud with fewer than m points is returned whole; with
-            ``lengths`` it is padded with zeros, and its indices with −1.
+            ``(B, m, 3)`` and ``(B, m)``, with ``batch`` both of all clouds one after the other; a
+            cloud with fewer than m points is then returned whole.
 
         Raises:
             UserError: an argument is invalid, or the sampler is in training mode.
@@ -136,7 +132,7 @@ class Sampler(nn.Module):
                 return output.points, output.indices
             return select(clouds, output.points.to(clouds.device), readout)
 
-        return select_points(sample, points, m, lengths, batch)
+        return select_points(sample, points, m, batch)
 
     def _checked(self, points: Tensor, m: int) -> SampleOutput:
         """Check the points and sample them, without losses."""

@@ -20,13 +20,7 @@ Sample = tuple[Tensor, Tensor | None]
 and ``(m,)`` of one cloud, ``(B, m, 3)`` and ``(B, m)`` of a batch."""
 
 
-def select_points(
-    select: Select,
-    points: Any,
-    m: int,
-    lengths: Any = None,
-    batch: Any = None,
-) -> tuple[Any, Any]:
+def select_points(select: Select, points: Any, m: int, batch: Any = None) -> tuple[Any, Any]:
     """Move clouds into the unit sphere, select points, and map them back.
 
     Args:
@@ -34,7 +28,6 @@ def select_points(
             ``Sampler.downsample``.
         points: see there.
         m: see there.
-        lengths: see there.
         batch: see there.
 
     Raises:
@@ -43,14 +36,9 @@ def select_points(
     tensor = _tensor("points", points)
     if not tensor.is_floating_point():
         raise UserError(f"points must be floating point, got {tensor.dtype}. Try points.float().")
-    if lengths is not None and batch is not None:
-        raise UserError("lengths and batch exclude each other. Give lengths for (B, N, 3) points.")
     if batch is not None:
         _check_shape(tensor, 2, "(P, 3) with batch")
         result = _flat(select, tensor, m, _tensor("batch", batch))
-    elif lengths is not None:
-        _check_shape(tensor, 3, "(B, N, 3) with lengths")
-        result = _padded(select, tensor, m, _tensor("lengths", lengths))
     elif tensor.ndim == 2:
         _check_shape(tensor, 2, "(N, 3) or (B, N, 3)")
         chosen, rows = _selected(select, tensor[None], m)
@@ -86,29 +74,14 @@ def _check_shape(points: Tensor, ndim: int, wanted: str) -> None:
         raise UserError(f"points must have shape {wanted}, got {tuple(points.shape)}.")
 
 
-def _padded(select: Select, points: Tensor, m: int, lengths: Tensor) -> Sample:
-    """Select from padded clouds; the result is padded with zeros, its rows with −1."""
-    number = points.shape[1]
-    lengths = _integers("lengths", lengths, len(points), f"B={len(points)}")
-    if len(lengths) and (int(lengths.min()) < 1 or int(lengths.max()) > number):
-        raise UserError(f"lengths must be from 1 to N={number}, got {lengths.tolist()}.")
-    clouds = [cloud[:length] for cloud, length in zip(points, lengths.tolist(), strict=True)]
-    samples = _each(select, clouds, m)
-    chosen = points.new_zeros(len(clouds), m, points.shape[2])
-    rows = torch.full((len(clouds), m), -1, dtype=torch.int64, device=points.device)
-    generated = False
-    for cloud, (sampled, sampled_rows) in enumerate(samples):
-        chosen[cloud, : len(sampled)] = sampled
-        if sampled_rows is None:
-            generated = True
-        else:
-            rows[cloud, : len(sampled_rows)] = sampled_rows
-    return chosen, None if generated else rows
-
-
 def _flat(select: Select, points: Tensor, m: int, batch: Tensor) -> Sample:
     """Select from clouds one after the other; rows count through all clouds."""
-    batch = _integers("batch", batch, len(points), f"P={len(points)}")
+    if batch.ndim != 1 or len(batch) != len(points) or batch.is_floating_point():
+        raise UserError(
+            f"batch must be whole numbers of shape (P={len(points)},), got {batch.dtype} of shape "
+            f"{tuple(batch.shape)}."
+        )
+    batch = batch.long()  # torch computes with few of the unsigned types
     if len(batch) and (int(batch.min()) < 0 or bool((batch[1:] < batch[:-1]).any())):
         raise UserError("batch must be ascending and at least 0. Sort the points by cloud.")
     counts = batch.bincount().tolist()
@@ -120,16 +93,6 @@ def _flat(select: Select, points: Tensor, m: int, batch: Tensor) -> Sample:
     parts = zip(samples, starts, strict=True)
     rows = [rows + start for (_, rows), start in parts if rows is not None]
     return chosen, torch.cat(rows) if len(rows) == len(samples) else None
-
-
-def _integers(name: str, values: Tensor, size: int, wanted: str) -> Tensor:
-    """Return whole numbers as int64; torch computes with few of the unsigned types."""
-    if values.ndim != 1 or len(values) != size or values.is_floating_point():
-        raise UserError(
-            f"{name} must be whole numbers of shape ({wanted},), got {values.dtype} of shape "
-            f"{tuple(values.shape)}."
-        )
-    return values.long()
 
 
 def _each(select: Select, clouds: list[Tensor], m: int) -> list[Sample]:

@@ -18,7 +18,6 @@ def downsample(
     m: int,
     method: str | Path = "fps",
     readout: str = "completed",
-    lengths: Any = None,
     batch: Any = None,
     start: int | str | None = None,
     seed: int | None = None,
@@ -35,8 +34,6 @@ def downsample(
             name of a model. A model suits the task net and the shapes that it was trained for.
         readout: of a model: ``generated``, ``matched`` or ``completed``; see
             ``Sampler.downsample``.
-        lengths: ``(B,)`` numbers of points, where clouds of several sizes are padded to
-            ``(B, N, 3)``, as in PyTorch3D.
         batch: ``(P,)`` the cloud of every point, ascending from 0, as in PyTorch Geometric.
         start: with ``fps``, the row of the first point in every cloud, or ``"farthest"`` for the
             point farthest from the mean.
@@ -63,7 +60,7 @@ def downsample(
         sampler = untrained(str(method), m, seed or 0, **arguments)
     else:
         sampler = _model(str(method), str(getattr(points, "device", "cpu")))
-    return sampler.downsample(points, m, readout, lengths, batch)
+    return sampler.downsample(points, m, readout, batch)
 
 
 def untrained(method: str, m: int, seed: int = 0, **arguments: Any) -> Sampler:
