@@ -81,7 +81,7 @@ def _locked_temporary(folder: Path, prefix: str, suffix: str) -> tuple[Path, int
 
 
 def is_temporary(path: Path) -> bool:
-    """Return whether a file is a temporary one of ``atomic_write``, which is no input."""
+    """Return whether a file is a temporary one of ``atomic_write``, and so not an input."""
     return path.name.startswith(TEMPORARY)
 
 

@@ -44,10 +44,10 @@ def main(arguments: list[str], prog: str) -> None:
 
 
 def _refuse_unused(chosen: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Refuse options that the words make no use of.
+    """Refuse options that the subcommand does not use.
 
     Raises:
-        UserError: there is one.
+        UserError: an option is not used.
     """
     values = {name: value for name, value in vars(chosen).items() if name != "words"}
     given = {name for name, value in values.items() if value != parser.get_default(name)}
@@ -101,7 +101,7 @@ def _add(chosen: argparse.Namespace, run: Path, name: str) -> list[str]:
         f"Records name it {names.pinned(name, card['sha256'])}.",
     ]
     if record["config"]["learn"] != "task" and "task_weights" not in record["files"]:
-        lines.append(f"Its task net is no model: evaluate={name} also needs weights=FILE.")
+        lines.append(f"Its task net is not a model: evaluate={name} also needs weights=FILE.")
     found = names.available().get(name)
     if found is None or not found.samefile(path):
         lines.append(f"To find it by name, set {names.VARIABLE}={folder}.")

@@ -20,7 +20,7 @@ INPUTS = {
     "evaluate": (),
     "dataset.root": (),
 }
-"""Settings that name what must exist, with values that are no paths."""
+"""Settings that name an existing file or folder, with values that are not paths."""
 OUTPUTS = ("out", "cache", "dataset.cache")
 MISSING = {
     "ckpt_path": "no checkpoint {}. Give a run's folder, a .ckpt file, or last.",

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 def parse_override(argument: str) -> "Override | None":
     """Read one argument of the command line.
 
-    A value that is none to Hydra, such as a path with ``=`` in it, is taken as the text it is.
+    A value that Hydra cannot parse, such as a path with ``=`` in it, is taken as text.
 
     Returns:
-        None for an option and for what is no override at all.
+        None for an option and for text that is not an override.
     """
     return None if argument.startswith("-") else _parsed(argument) or _parsed(_quoted(argument))
 

@@ -63,7 +63,7 @@ def choose_classes(classes: Sequence[str] | None, known: Sequence[str]) -> tuple
     """Return the classes to load, in the order of ``known``; None or empty means all.
 
     Raises:
-        UserError: a class is unknown, or ``classes`` is no list of names.
+        UserError: a class is unknown, or ``classes`` is not a list of names.
     """
     if not classes:
         return tuple(known)

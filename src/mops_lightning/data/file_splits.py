@@ -194,7 +194,7 @@ def neighbouring_tiles(boxes: Sequence[Box]) -> list[list[int]]:
         boxes: F boxes ``(2, 3)``.
 
     Returns:
-        F ascending lists of positions; empty for files that are no tiles.
+        F ascending lists of positions; empty for files that are not tiles.
     """
     low, high = np.stack(boxes, 1)
     touching, is_tile = [], np.ones(len(boxes), bool)

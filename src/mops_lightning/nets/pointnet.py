@@ -45,7 +45,7 @@ class PointNetVanilla(nn.Module):
         return self.head(self.pool(self.features(points)))
 
     def point_features(self, points: Tensor) -> Tensor:
-        """Return the features ``(B, N, 1024)`` of which the net takes the maximum over points."""
+        """Return the features ``(B, N, 1024)`` before the maximum over points."""
         return self.pool.values(self.features(points))
 
     def from_pooled(self, pooled: Tensor) -> Tensor:

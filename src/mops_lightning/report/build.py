@@ -252,7 +252,7 @@ def _full_lines(table: Table) -> list[str]:
 
 
 def _full_metric(table: Table) -> MetricInfo:
-    """Return the metric of full clouds: errors that are normalized by theirs are 1 there."""
+    """Return the metric of full clouds, whose errors normalized by the full cloud are always 1."""
     name = table.metric.full_cloud_metric or table.metric.name
     return metric_info(name, table.group.records)
 

@@ -73,7 +73,7 @@ def _records(folder: Path) -> list[tuple[Path, RunRecord | str]]:
 
 
 def _lines(path: Path) -> list[str]:
-    """Return the lines of a regular file; other files and bytes that are no text give none."""
+    """Return the lines of a regular file; other files give none."""
     return path.read_text(errors="replace").splitlines() if path.is_file() else []
 
 

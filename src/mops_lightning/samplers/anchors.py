@@ -41,7 +41,7 @@ class FPSAnchors(nn.Module):
 
     def __init__(self, m: int, channels: int, width: float) -> None:
         super().__init__()
-        # Not named as the plain net's weight, of which a warm start would otherwise take copies.
+        # Another name than in the plain net, so that a warm start does not copy its weight.
         self.slots = nn.Parameter(torch.zeros(m, channels))
         self.relation = nn.Parameter(torch.zeros(channels, channels))
         # On a surface the spacing of k points decreases as √(1/k).

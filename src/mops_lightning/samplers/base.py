@@ -213,7 +213,7 @@ class Sampler(nn.Module):
         """Check that the sampler returns samples of size m.
 
         Raises:
-            UserError: it does not.
+            UserError: it does not return m points.
         """
         size: object = m  # mypy would take the check for needless
         if not isinstance(size, Integral):
@@ -229,7 +229,7 @@ class Sampler(nn.Module):
         """Check that the sampler's settings allow clouds of ``n`` points.
 
         Raises:
-            UserError: they do not.
+            UserError: they do not allow it.
         """
 
 

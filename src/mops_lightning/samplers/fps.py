@@ -62,7 +62,7 @@ class FPSSampler(Sampler):
         """Check that ``start`` is the index of one of ``n`` points.
 
         Raises:
-            UserError: it is not.
+            UserError: it is not an index.
         """
         if isinstance(self.start, int) and self.start >= n:
             raise UserError(

@@ -29,7 +29,7 @@ def check_loss(total: Tensor, step: int, strategy: Strategy) -> None:
         strategy: Lightning's; reaches the other processes.
 
     Raises:
-        Diverged: it is not.
+        Diverged: it is not finite.
     """
     loss = total.detach()
     bad = not bool(torch.isfinite(loss))

@@ -177,10 +177,10 @@ def _run_named(argument: str) -> str | None:
 
 
 def _check_given(arguments: list[str], trained: TrainedRun) -> None:
-    """Refuse the user's settings that a test of this run cannot have, or that do not change it.
+    """Refuse settings of the user that do not apply to a test of this run.
 
     Raises:
-        UserError: there is one.
+        UserError: a setting does not apply.
     """
     used = trained.record.config["names"]
     # weights=auto may train a task net, which has its own settings.
@@ -247,10 +247,10 @@ def as_trained(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -> Di
 
 
 def _check_sampler(old: dict[str, Any], new: dict[str, Any], name: str) -> None:
-    """Refuse another setting of the sampler's training than the run's.
+    """Refuse settings of the sampler's training that differ from the run's.
 
     Raises:
-        UserError: there is one.
+        UserError: a setting differs.
     """
     for key in sorted({*old, *new}):
         used, chosen = old.get(key), new.get(key)

@@ -158,8 +158,8 @@ def read_card(path: Path) -> dict[str, Any]:
     header = read_header(path)
     if header["schema"] != MODEL:
         raise UserError(
-            f"{path} holds the weights of a run and is no model. `mops-lightning models add` makes "
-            "a model of it."
+            f"{path} holds the weights of a run and is not a model. `mops-lightning models add` "
+            "makes a model of it."
         )
     return header
 

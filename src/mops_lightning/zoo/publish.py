@@ -101,7 +101,7 @@ def card_figures(record: RunRecord) -> dict[str, Any]:
 
 
 def _task_net(name: str | None, record: RunRecord) -> str | None:
-    """Return a reference to the model of a sampler's task net, or None if it is no model."""
+    """Return a reference to the model of a sampler's task net, or None if it is not a model."""
     if name is not None:
         path = names.find_model(name)
         if path is None:

@@ -134,7 +134,7 @@ def of_run(run: Path, kind: str = "weights") -> Path:
 
 
 def of_task_net(reference: str | Path) -> Path:
-    """Return the file with the weights of a task net. A path that is no folder is the file.
+    """Return the file with the weights of a task net. A path that is not a folder is the file.
 
     Args:
         reference: what ``names.resolve`` takes, or the folder of a run that trained a task net,

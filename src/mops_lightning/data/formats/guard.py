@@ -97,7 +97,7 @@ def naming_file(path: Path) -> Iterator[None]:
         raise BadCloudError(
             f"{path} is broken or too large for the memory: {one_line(error)}."
         ) from None
-    except BaseException as error:  # a panic in lazrs is no Exception
+    except BaseException as error:  # a panic in lazrs is not an Exception
         raise BadCloudError(f"{path} is broken: {one_line(error)}.") from None
 
 

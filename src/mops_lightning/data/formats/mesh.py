@@ -114,7 +114,7 @@ def _announced_faces(data: bytes, kind: str) -> int:
 
 
 def _check_glb(data: bytes) -> None:
-    """Reject a scene that would take much more memory than its file, or whose parts are no tree."""
+    """Reject a scene that needs much more memory than its file, or whose parts are not a tree."""
     tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
     limit = VALUES_PER_BYTE * len(data)
     counts = [accessor["count"] for accessor in tree.get("accessors", [])]

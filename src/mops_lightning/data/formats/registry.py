@@ -30,7 +30,7 @@ CHUNKED: dict[str, Callable[[Path], CloudFile]] = {
     ".npy": arrays.locate_npy, ".bin": arrays.locate_kitti, ".ply": ply.locate,
     ".las": las.locate, ".laz": las.locate,
 }  # fmt: skip
-"""Formats of which any range of rows can be read alone."""
+"""Formats whose rows can be read in any range."""
 
 READABLE = tuple(dict.fromkeys((*READERS, *MESHES)))
 
@@ -78,7 +78,7 @@ def write(path: Path, table: Table) -> None:
 
 
 def open_cloud_file(path: Path) -> CloudFile:
-    """Open a file of which any range of rows can be read alone.
+    """Open a file whose rows can be read in any range.
 
     Raises:
         BadCloudError: the file is missing, broken, or of a format that is read as a whole only.

@@ -49,7 +49,7 @@ class Table:
 
 @dataclass(frozen=True)
 class CloudFile:
-    """A file of which any range of rows can be read alone, so that it need not fit in memory.
+    """A file whose rows can be read in any range, so that it need not fit in memory.
 
     Attributes:
         path: the file.

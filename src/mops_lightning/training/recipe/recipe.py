@@ -28,7 +28,7 @@ class Recipe:
         train_points: points of a cloud that a training step sees, drawn in every step, and at
             least twice the sampled ones; None: all. Validation and test always see all.
         task_points: the same for the task net, trained alone, also before a sampler's training.
-        all_points_from: share from which on training steps see all points; None: never.
+        all_points_from: share after which training steps see all points; None: never.
         warm_start: whether the sampler's first layers start as copies of the task net's; or the
             weights file of a trained sampler, of any size, to start from.
         distillation: weight of the disagreement between the frozen task net's predictions on the
@@ -36,7 +36,7 @@ class Recipe:
         feature_distillation: weight of the distance between the frozen task net's max-pooled
             features of the sample and of the points that the step sees.
             Only with ``learn="sampler"`` and a net with ``point_features``.
-        straight_through: share from which on the task net also sees points of the cloud, whose
+        straight_through: share after which the task net also sees points of the cloud, whose
             gradients go to the generated ones; None: never.
         ema_span: time constant of an exponential moving average of the weights, as a share; the
             average is validated, tested and saved. None: the last weights are.

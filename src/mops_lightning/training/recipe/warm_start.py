@@ -31,7 +31,7 @@ def warm_start_sampler(
         The numbers for the record, and a sentence about them.
 
     Raises:
-        UserError: ``source`` names a file that is no sampler's or that fits nowhere.
+        UserError: ``source`` names a file that is not a sampler's, or no tensor fits.
     """
     if isinstance(source, str):
         return _from_file(source, sampler)
