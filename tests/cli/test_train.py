@@ -98,6 +98,8 @@ def test_sweep_with_failed_cell_completes_the_rest(main_job):
     assert status == 1
     assert "sweep/cells/1 failed: m must be at most the 64 points of a cloud, got m=65" in out
     assert "3 cells: 2 completed, 1 failed; in sweep/cells" in out
+    assert "files in sweep/cells/: table.md, table.tex, table.csv, report.html" in out
+    assert "m must be at most" in (folder / "sweep" / "cells" / "table.md").read_text()
     assert "Traceback" not in out + err
     found = [json.loads(path.read_text()) for path in (folder / "sweep").rglob("result.json")]
     states = {record["config"]["m"]: record["status"] for record in found}

@@ -190,7 +190,11 @@ def _state(cell: Path) -> str:
 
 
 class SweepSummary(Callback):
-    """Prints the states of a sweep's cells at its end; the exit status is 1 if any failed."""
+    """Counts the cells at the end of a sweep and reports them; the exit status is 1 if any failed.
+
+    The report is that of the whole folder, so that earlier starts and the other processes of the
+    same sweep count too.
+    """
 
     def on_multirun_start(self, config: DictConfig, **extra: Any) -> None:
         """Mark the start, on the clock of the folder's file system."""
@@ -202,7 +206,9 @@ class SweepSummary(Callback):
             end("mops_lightning", f"out: cannot write to {folder}: {error.strerror}.", USER_ERROR)
 
     def on_multirun_end(self, config: DictConfig, **extra: Any) -> None:
-        """Count the cells of this start by state."""
+        """Count the cells of this start by state, and write the report."""
+        from mops_lightning.report import cli as report
+
         folder = Path(os.path.relpath(config.hydra.sweep.dir))
         begun = (folder / BEGUN).stat().st_mtime_ns
         states: Counter[str] = Counter()
@@ -213,7 +219,8 @@ class SweepSummary(Callback):
                 states[_state(cell)] += 1
         counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
         print(f"{sum(states.values())} cells: {counts}; in {folder}")
-        print(f"Table: python -m mops_lightning report {folder}")
+        if states["completed"]:
+            report.main([str(folder)], "python -m mops_lightning report")
         if set(states) - {"completed", ELSEWHERE} or not states:
             print(f"To repeat the rest: the same command with hydra.sweep.dir={folder}")
             raise SystemExit(1)
