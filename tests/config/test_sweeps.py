@@ -15,11 +15,9 @@ from mops_lightning.config.validate import check
 from mops_lightning.records.run_record import dotted
 
 ROOT = Path(__file__).parents[2] / "sweeps"
-SWEEPS = sorted(
-    str(path.relative_to(ROOT).with_suffix(""))
-    for path in ROOT.rglob("*.yaml")
-    if path.stem != "minutes"
-)
+SWEEPS = sorted(path.stem for path in ROOT.glob("*.yaml"))
+ON_SHAPES = ("ablation",)
+"""Sweeps that use the procedural shapes without the overlay."""
 
 
 def composed(name, overrides=()):
@@ -30,53 +28,80 @@ def composed(name, overrides=()):
     return cfg
 
 
-@pytest.mark.parametrize("name", SWEEPS)
-def test_sweep_cells_are_valid_and_named_by_swept_settings(name):
-    quick = name.startswith("quick/")
-    cfg = composed(name)
-    raw: Any = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)
-    swept = [key for key, values in cfg.hydra.sweeper.params.items() if "," in str(values)]
-    for key in swept:
-        known_as = "names.sampler" if key == "sampler" else key
-        assert f"${{{known_as}}}" in raw["subdir"], "two cells would share a folder"
-    assert "${" not in f"{cfg.hydra.sweep.dir}/{cfg.hydra.sweep.subdir}"
-    assert cfg.hydra.mode.name == "MULTIRUN"
-    assert ("/sweeps/quick/" in cfg.hydra.sweep.dir) == quick
-    assert (cfg.names.dataset == "shapes") == quick or name == "noise"
-    assert not quick or cfg.trainer.max_epochs <= 4
+def grids(cfg):
+    """Return the overrides of every grid of a sweep."""
+    sweeper: Any = OmegaConf.to_container(cfg.hydra.sweeper, resolve=False)
+    several = sweeper.get("grids", [{}])
+    return [parsed({**(sweeper["params"] or {}), **grid}, "grids") for grid in several]
+
+
+def checked(cfg):
     if OmegaConf.is_missing(cfg.dataset, "root"):
         cfg.dataset.root = "the user's"
     check(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"]))
 
 
-def test_sweeps_all_have_quick_form():
-    full = {name for name in SWEEPS if "/" not in name}
-    assert {f"quick/{name}" for name in full - {"noise", "modelnet40"}} == set(SWEEPS) - full
+@pytest.mark.parametrize("name", SWEEPS)
+def test_sweep_cells_are_valid_and_named_by_swept_settings(name):
+    cfg = composed(name)
+    raw: Any = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)
+    for swept in (one for grid in grids(cfg) for one in grid if one.is_sweep_override()):
+        key = swept.get_key_element()
+        known_as = "names.sampler" if key == "sampler" else key
+        assert known_as in raw["subdir"] or "run_label" in raw["subdir"]
+    assert "${" not in f"{cfg.hydra.sweep.dir}/{cfg.hydra.sweep.subdir}"
+    assert cfg.hydra.mode.name == "MULTIRUN"
+    assert (cfg.names.dataset == "shapes") == (name in (*ON_SHAPES, "noise"))
+    checked(cfg)
+
+
+@pytest.mark.parametrize("name", sorted({*SWEEPS} - {*ON_SHAPES, "noise"}))
+def test_quick_overlay_runs_any_sweep_on_shapes(name):
+    full = composed(name)
+    quick = composed(name, ["+quick=shapes", "dataset=shapes"])
+    assert quick.hydra.sweep.dir.endswith(f"/sweeps/quick/{name}")
+    assert (quick.names.dataset, quick.names.recipe) == ("shapes", "fast")
+    assert quick.dataset.n_points == 512
+    assert quick.trainer.max_epochs < full.trainer.max_epochs
+    for choice in ("task", "net", "sampler"):
+        assert quick.names[choice] == full.names[choice]
+    assert quick.hydra.sweeper == full.hydra.sweeper
+    assert quick.hydra.sweep.subdir == full.hydra.sweep.subdir
+    checked(quick)
 
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_sweep_neighbours_differ_in_what_is_swept(name):
-    params: Any = OmegaConf.to_container(composed(name).hydra.sweeper.params)
-    swept = {key: values.split(",") for key, values in params.items() if "," in str(values)}
-    for key, (first, second, *_) in swept.items():
-        one, other = (settings_of(composed(name, [f"{key}={value}"])) for value in (first, second))
-        different = {path for path in {**one, **other} if one.get(path) != other.get(path)}
-        # A sampler may have an optimizer of its own.
-        allowed = ("sampler.", "optimizer.", "names.sampler") if key == "sampler" else (key,)
-        followers = {f"sampler.{key}"} if key in ("m", "seed") else set()
-        followers |= {f"dataset.{key}"} if key == "seed" else set()
-        assert not {path for path in different - followers if not path.startswith(allowed)}
+    for grid in grids(composed(name)):
+        values = {one.get_key_element(): texts(one) for one in grid}
+        first = {key: several[0] for key, several in values.items()}
+        for key in (key for key, several in values.items() if len(several) > 1):
+            one, other = (
+                settings_of(composed(name, [f"{k}={v}" for k, v in {**first, key: value}.items()]))
+                for value in values[key][:2]
+            )
+            different = {path for path in {**one, **other} if one.get(path) != other.get(path)}
+            # A sampler may have an optimizer of its own.
+            allowed = ("sampler.", "optimizer.", "names.sampler") if key == "sampler" else (key,)
+            followers = {f"sampler.{key}"} if key in ("m", "seed") else set()
+            followers |= {f"dataset.{key}"} if key == "seed" else set()
+            assert not {path for path in different - followers if not path.startswith(allowed)}
 
 
-def test_planned_cells_have_folders_of_their_own():
-    sweeper: Any = OmegaConf.to_container(composed("modelnet40").hydra.sweeper)
-    cells = []
-    for grid in sweeper["grids"]:
-        overrides = parsed({**sweeper["params"], **grid}, "grids")
-        cells += BasicSweeper.split_arguments(overrides, None)[0]
-    folders = [composed("modelnet40", cell).hydra.sweep.subdir for cell in cells]
-    assert len(folders) == 49
+@pytest.mark.parametrize(("name", "number"), [("modelnet40", 49), ("ablation", 18)])
+def test_cells_of_several_grids_have_folders_of_their_own(name, number):
+    several = grids(composed(name))
+    cells = [cell for grid in several for cell in BasicSweeper.split_arguments(grid, None)[0]]
+    folders = [composed(name, cell).hydra.sweep.subdir for cell in cells]
+    assert len(folders) == number
     assert len(set(folders)) == len(folders)
+
+
+def texts(override):
+    """Return the values of an override as they are written."""
+    if override.is_sweep_override():
+        return list(override.sweep_string_iterator())
+    return [override.get_value_element_as_str()]
 
 
 def settings_of(cfg):
