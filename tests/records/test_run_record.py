@@ -46,17 +46,19 @@ def test_read_no_record_raises(tmp_path):
     (tmp_path / "result.json").write_text('{"schema": ')
     with pytest.raises(UserError, match="not a run record"):
         run_record.read(tmp_path)
-    shorter = {**record().plain()}
-    del shorter["error"]
-    for plain in (shorter, {**record().plain(), "foreign": 3}):
-        (tmp_path / "result.json").write_text(json.dumps(plain))
-        with pytest.raises(UserError, match="not a run record: unknown or missing"):
-            run_record.read(tmp_path)
+    (tmp_path / "result.json").write_text(json.dumps({**record().plain(), "foreign": 3}))
+    with pytest.raises(UserError, match="not a run record: unknown: foreign"):
+        run_record.read(tmp_path)
 
 
 @pytest.mark.parametrize(
     "text",
-    ['{"schema": ' + "1" * 5000 + "}", "[" * 2000 + "]" * 2000, "[" * 60 + "]" * 60, '"\x1b[31m"'],
+    [
+        '{"schema": ' + "1" * 5000 + "}",
+        "[" * 2000 + "]" * 2000,
+        "[" * 60 + "]" * 60,
+        '"\x1b[31m"',
+    ],
     ids=["digits", "levels", "depth", "escape"],
 )
 def test_read_hostile_file_ends_in_one_printable_line(tmp_path, text):

@@ -3,6 +3,7 @@ import os
 
 import pytest
 
+from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.report.collect import collect
 from tests.support.records import CONFIG
@@ -16,7 +17,20 @@ def test_collect_counts_but_hides_unfinished_runs(tmp_path):
     put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.8}, status="interrupted")
     text = table(tmp_path)
     assert "80.00" not in text
-    assert "1 of 2 runs is not completed" in text
+    assert "1 of 2 runs has no full result" in text
+
+
+def test_collect_lists_partial_tests_apart(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    (tmp_path / "more").mkdir()
+    part = ["tested on 1 of 4 batches"]
+    put(tmp_path / "more", "fps", 32, {"test/sampled/accuracy": 0.9}, seed=1, partial=part)
+    text = table(tmp_path)
+    assert rows(text)[1] == ["fps", "30.00"]
+    assert "1 of 2 runs has no full result" in text
+    assert f"- {tmp_path}/more/fps-32-pointnet: completed: tested on 1 of 4 batches" in text
+    with pytest.raises(UserError, match=r"none of its 1 runs has a full result: .*1 of 4 batches"):
+        table(tmp_path / "more")
 
 
 def test_collect_lists_failed_cells_with_reason(tmp_path):
@@ -25,7 +39,7 @@ def test_collect_lists_failed_cells_with_reason(tmp_path):
     (tmp_path / "failed" / ".failed").write_text("m must be at most 64\n")
     put_cell(tmp_path / "done", ".attempts/1", "mops", {"generated": 9.0})
     text = table(tmp_path)
-    assert "1 of 2 runs is not completed:" in text
+    assert "1 of 2 runs has no full result:" in text
     assert f"- {tmp_path}/failed: m must be at most 64" in text
     assert "9" not in rows(text)[1][1]
 
@@ -51,6 +65,12 @@ def test_collect_lists_unreadable_record(tmp_path):
         ({"config": 3}, "not a run record: Expected &#96;object&#96;, got &#96;int&#96;"),
         ({"metrics": {"test/sampled/accuracy": "x"}}, "not a run record"),
         ({"metrics": {"test/sampled/accuracy": 10**400}}, "not a run record: Number out of range"),
+        (
+            {"config": {**CONFIG, "sampler": {"alpha": 10**400}}},
+            "not a run record: Number out of range",
+        ),
+        ({"config": {**CONFIG, "baselines": {"fps": 1.5}}}, "not a run record: Expected"),
+        ({"config": {**CONFIG, "dataset": {"n_points": {}}}}, "not a run record: Expected"),
         ({"metric_info": {"accuracy": {"scale": "x"}}}, "not a run record"),
         ({"evaluated": {"seed": "x"}}, "not a run record"),
     ],
@@ -62,7 +82,7 @@ def test_collect_lists_record_without_what_tables_need(tmp_path, change, said):
     path = tmp_path / "random-32-pointnet" / "result.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     text = table(tmp_path)
-    assert "1 of 2 runs is not completed" in text
+    assert "1 of 2 runs has no full result" in text
     assert said in text
     assert "fps" in text
 
@@ -78,7 +98,7 @@ def test_collect_reads_records_of_many_runs_from_one_file(tmp_path):
     with (tmp_path / "runs.jsonl").open("a") as file:
         file.write("broken\n")
     text = table(tmp_path)
-    assert "1 of 3 runs is not completed" in text
+    assert "1 of 3 runs has no full result" in text
     assert "line 3: not a run record" in text
     assert rows(text) == rows(before)
 
@@ -86,7 +106,7 @@ def test_collect_reads_records_of_many_runs_from_one_file(tmp_path):
 def test_collect_named_pipe_is_skipped(tmp_path):
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
     (tmp_path / "pipe").mkdir()
-    for name in ("result.json", "runs.jsonl"):
+    for name in ("result.json", "runs.jsonl", ".failed"):
         os.mkfifo(tmp_path / "pipe" / name)
     assert "result.json: not a regular file" in table(tmp_path)
 
@@ -98,4 +118,4 @@ def test_collect_lists_bytes_that_are_no_text(tmp_path):
         (tmp_path / name / "result.json").write_bytes(content)
     (tmp_path / "folder" / "result.json").mkdir(parents=True)
     text = table(tmp_path)
-    assert "3 of 4 runs are not completed" in text
+    assert "3 of 4 runs have no full result" in text

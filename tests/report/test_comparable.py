@@ -142,7 +142,7 @@ def test_mixed_sizes_and_settings_give_columns_by_size(tmp_path):
     put_cell(tmp_path, "a", "mops", {"generated": 1.0}, test_noise_std=0.0, m=32)
     put_cell(tmp_path, "b", "mops", {"generated": 2.0}, test_noise_std=0.1, m=8)
     assert rows(table(tmp_path, mixed=True))[:2] == [
-        ["sampled by", "m=32", "m=8", "training"],
+        ["sampled by", "m=32", "m=8", "training (wall)"],
         ["mops", "1", "2", "1 s"],
     ]
 

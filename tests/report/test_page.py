@@ -9,10 +9,7 @@ import pytest
 import torch
 
 from mops_lightning.records import run_record
-from mops_lightning.report.build import build_report
 from mops_lightning.report.cli import main
-from mops_lightning.report.page import page as page_text
-from mops_lightning.viz.figures import new_figure, save_figure
 from mops_lightning.viz.snapshots import save_clouds
 from tests.support.reports import put, put_planes
 
@@ -129,11 +126,3 @@ def test_page_runs_its_own_scripts_only(reported):
     assert digests == set(re.findall("'sha256-([^']*)'", policy))
     assert len(digests) == 2
     assert '<meta name="viewport"' in text
-
-
-def test_page_embeds_png_where_svg_is_missing(tmp_path):
-    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
-    picture = save_figure(new_figure(1, 1), tmp_path / "curves.png")
-    assert 'src="data:image/png;base64,iVBOR' in page_text(
-        build_report(tmp_path), tmp_path, [picture]
-    )

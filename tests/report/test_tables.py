@@ -1,3 +1,6 @@
+import json
+import shutil
+
 import pytest
 
 from mops_lightning.errors import UserError
@@ -64,7 +67,44 @@ def test_training_is_summed_over_sizes_per_seed(tmp_path):
         put_cell(tmp_path, f"{number}", "mops", {"generated": 1.0}, m=m, seed=seed, cost=1000.0)
     put_cell(tmp_path, "snet", "snet", {"generated": 2.0}, cost=700.4)
     found = rows(table(tmp_path))
-    assert [row[-1] for row in found] == ["training", "700 s", "2,000 s"]
+    assert [row[-1] for row in found] == ["training (wall)", "700 s", "2,000 s"]
+
+
+def test_training_is_cpu_time_if_every_run_has_it(tmp_path):
+    for name, seconds in (("mops", 300.0), ("snet", 500.0)):
+        path = put_cell(tmp_path, name, name, {"generated": 1.0})
+        took = {"total": 99.0, "fit": 90.0, "fit_cpu": seconds}
+        path.write_text(json.dumps({**json.loads(path.read_text()), "seconds": took}))
+    found = rows(table(tmp_path))
+    assert [row[-1] for row in found] == ["training (CPU)", "500 s", "300 s"]
+
+
+def test_values_within_two_deviations_of_the_best_are_level(tmp_path):
+    """The deviations of the best and of the value are 0.1; 0.15 away is level, 0.5 is not."""
+    for seed, shift in enumerate((-0.1, 0.0, 0.1)):
+        for name, value in (("mops", 1.0), ("fmops", 1.15), ("snet", 1.5), ("samplenet", 1.6)):
+            values = {"generated": value + shift}
+            put_cell(tmp_path, f"{name}{seed}", name, values, seed=seed)
+    text = table(tmp_path)
+    for marked in ("**1 ± 0.10**", "**1.15 ± 0.10**", "<u>1.5 ± 0.10</u>", "| 1.6 ± 0.10"):
+        assert marked in text
+    assert "those level with it, less than two standard deviations over seeds away" in text
+    for path in tmp_path.glob("*[12]"):
+        shutil.rmtree(path)
+    text = table(tmp_path)
+    assert "**0.9**" in text
+    assert "<u>1.05</u>" in text
+    assert "level" not in text
+
+
+def test_equal_cells_are_named(tmp_path):
+    for alpha in (1, 10, 100):
+        values = {"generated": 1.037, "matched": 1.035}
+        put_cell(tmp_path, f"a{alpha}", "mops", values, of={"alpha": alpha})
+        put_cell(tmp_path, f"b{alpha}", "snet", {"generated": float(alpha)}, of={"alpha": alpha})
+    text = table(tmp_path)
+    assert "All 3 cells of mops are equal: the settings that differ changed nothing." in text
+    assert "cells of snet" not in text
 
 
 def test_cells_unknown_metric_is_refused(tmp_path):

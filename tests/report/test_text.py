@@ -1,7 +1,9 @@
 import re
 
+from mops_lightning.report.build import build_report
 from mops_lightning.report.tables import Cell, Part
 from mops_lightning.report.text import PAPER, Grid, latex, markdown
+from tests.support.reports import put, put_pairs
 
 
 def test_markdown_escapes_names():
@@ -50,6 +52,29 @@ def test_latex_is_ascii_with_balanced_groups_whatever_names_are():
     body = re.sub(r"(?m)^%.*$|\\\\|\\[{}]", "", text)
     assert body.count("{") == body.count("}")
     assert not re.search(r"\\\\\n\[", text), "an optional argument"
+
+
+def test_latex_tables_are_well_formed(tmp_path):
+    """Environments nest, rows have as many cells as columns, and no letter is special."""
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3, "test/full/accuracy": 0.9})
+    put(tmp_path, "mops", 8, {"test/generated/accuracy": 0.8, "test/matched/accuracy": 0.7})
+    put_pairs(tmp_path, "a_b&c #1", 32, 12.0)
+    report = build_report(tmp_path)
+    text = latex(report.grids, report.remarks)
+    opened: list[str] = []
+    width = 0
+    for line in re.sub(r"(?m)^%.*\n", "", text).splitlines():
+        if begun := re.match(r"\\begin\{(\w+)\}(?:\{(l?r*)\})?$", line):
+            opened.append(begun[1])
+            width = len(begun[2] or "")
+        elif ended := re.match(r"\\end\{(\w+)\}$", line):
+            assert opened.pop() == ended[1]
+        elif opened == ["table", "tabular"] and line.endswith(r"\\"):
+            assert len(re.findall(r"(?<!\\)&", line)) == width - 1
+        plain = re.sub(r"\\[&%_#${}]|\$[^$]*\$", "", line)
+        assert not re.search(r"[%_#$^~]", plain), line
+    assert opened == []
+    assert text.count(r"\begin{tabular}") == 2
 
 
 def test_markdown_of_hostile_names_is_printable():

@@ -3,13 +3,14 @@
 import json
 import math
 import os
+import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypedDict
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import msgspec
 
@@ -45,6 +46,12 @@ class TaskSettings(TypedDict, total=False):
     net: dict[str, Any] | None
 
 
+class DatasetSettings(TypedDict, total=False):
+    """Settings of a data set."""
+
+    n_points: int | None
+
+
 class TrainerSettings(TypedDict):
     """Settings of a trainer."""
 
@@ -58,9 +65,10 @@ class Configuration(TypedDict):
     learn: str
     m: int
     task: TaskSettings
-    dataset: dict[str, Any]
+    dataset: DatasetSettings
     sampler: dict[str, Any]
     trainer: TrainerSettings
+    baselines: NotRequired[dict[str, dict[str, Any] | None] | None]
 
 
 class Git(TypedDict):
@@ -110,6 +118,7 @@ class RunRecord:
         metric_info: label, unit, direction of metrics that are not this package's.
         validation: metrics of the held-out clouds after the last epoch.
         seconds: wall time by stage; ``fit_cpu``: CPU time of the training, all attempts together.
+        partial: what the run left out, such as "tested on 1 of 4 batches"; empty for a full run.
         seed: of the run.
         started: UTC, ISO 8601.
         versions: of Python and the packages that matter.
@@ -146,6 +155,7 @@ class RunRecord:
     metric_info: dict[str, dict[str, Any]] = field(default_factory=dict)
     validation: dict[str, float | None] = field(default_factory=dict)
     seconds: dict[str, Annotated[float, msgspec.Meta(ge=0)]] = field(default_factory=dict)
+    partial: list[str] = field(default_factory=list)
     seed: Annotated[int, msgspec.Meta(ge=0)]
     started: str
     versions: dict[str, str]
@@ -198,9 +208,8 @@ def from_plain(plain: Any) -> RunRecord:
         ValueError: it does not fit the types of ``RunRecord`` and the settings that tables read.
     """
     record = msgspec.convert(plain, RunRecord)
-    known = {one.name for one in fields(RunRecord)}
-    if different := known ^ (plain.keys() | {"folder"}):  # models have no folder
-        raise ValueError(f"unknown or missing: {', '.join(sorted(different))}")
+    if unknown := plain.keys() - {one.name for one in fields(RunRecord)}:
+        raise ValueError(f"unknown: {', '.join(sorted(unknown))}")
     msgspec.convert(record.config, Configuration)
     msgspec.convert(record.metrics, dict[str, float | None])
     for name, values in record.metric_info.items():
@@ -261,20 +270,22 @@ def from_json(text: str, place: str) -> RunRecord:
     """
     try:
         plain = json.loads(text)
-        _check_depth(plain, MAX_DEPTH)
+        _check_extent(plain, MAX_DEPTH)
         return from_plain(plain)
     except (ValueError, RecursionError) as error:
         reason = printable(str(error).splitlines()[0][:200])
         raise UserError(f"{place}: not a run record: {reason}") from None
 
 
-def _check_depth(plain: Any, deepest: int) -> None:
-    """Check that lists and dictionaries are not nested too deeply."""
+def _check_extent(plain: Any, deepest: int) -> None:
+    """Check that nothing is nested too deeply, and that a float can hold every number."""
     if deepest < 0:
         raise ValueError(f"nested more than {MAX_DEPTH} levels deep")
+    if isinstance(plain, int) and abs(plain) > sys.float_info.max:
+        raise ValueError("Number out of range")
     if isinstance(plain, dict | list):
         for item in plain.values() if isinstance(plain, dict) else plain:
-            _check_depth(item, deepest - 1)
+            _check_extent(item, deepest - 1)
 
 
 def dotted(tree: Any, prefix: str = "") -> dict[str, Any]:

@@ -10,32 +10,6 @@ from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL, REFINED, ROWS, parse_metric_name
 from mops_lightning.records.run_record import FILE, RunRecord
 
-Rows = dict[str, dict[str, float | None]]
-"""Readout → metric, or m=SIZE if several sizes are tested → value."""
-
-
-def readout_rows(metrics: dict[str, float | None], score: str | None = None) -> Rows:
-    """Group a record's flat test metrics by readout.
-
-    Args:
-        metrics: such as ``{"test/generated/accuracy": 0.8}``.
-        score: the metric to show if several sizes are tested; None: the only one.
-
-    Returns:
-        ``{"generated": {"accuracy": 0.8}}``, or ``{"generated": {"m=32": 0.8}}`` if several sizes
-        are tested. Baselines come first, full clouds last; the latter hold for every size.
-    """
-    parts = {name: parse_metric_name(name) for name in metrics}
-    several = any(part and part.m for part in parts.values())
-    rows: Rows = {}
-    for name, part in parts.items():
-        if part is None or (several and score not in (None, part.metric)):
-            continue
-        column = part.metric if not several else f"m={part.m}" if part.m else FULL
-        rows.setdefault(part.readout, {})[column] = metrics[name]
-    order = {name: position for position, name in enumerate(ROWS)}
-    return dict(sorted(rows.items(), key=lambda item: order.get(item[0], -1)))
-
 
 def closing_lines(folder: Path, record: RunRecord, console: Console | None = None) -> None:
     """Print the table of test results and the output paths.
@@ -59,11 +33,20 @@ def closing_lines(folder: Path, record: RunRecord, console: Console | None = Non
 
 
 def results_table(record: RunRecord) -> tuple[str, Table]:
-    """Return a title and the test results of every readout, by metric or by size."""
+    """Return a title and the test results of every readout, by metric or by size.
+
+    Baselines come first, full clouds last; the latter hold for every size.
+    """
     config = record.config
     names, score = config["names"], parse_metric_name(record.score_name)
     by_size = score.metric if score and score.m else None
-    rows = readout_rows(record.metrics, by_size)
+    rows: dict[str, dict[str, float | None]] = {}
+    for name, value in record.metrics.items():
+        parts = parse_metric_name(name)
+        if parts and by_size in (None, parts.metric):
+            column = f"m={parts.m}" if by_size else parts.metric
+            rows.setdefault(parts.readout, {})[column] = value
+    rows = dict(sorted(rows.items(), key=lambda row: ROWS.index(row[0]) if row[0] in ROWS else -1))
     if by_size:
         info = metric_info(by_size, [record])
         columns = {size: (size, info) for size in next(iter(rows.values()))}

@@ -1,13 +1,12 @@
 """From records to tables: by size, by another setting, as a plane of two, by net, or of nets."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
-from mops_lightning.metrics.info import MetricInfo
-from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import FULL, parse_metric_name
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report import paper
@@ -19,18 +18,15 @@ from mops_lightning.report.collect import (
     score,
     seed,
     trained_with,
+    training_time,
 )
-from mops_lightning.report.comparable import (
-    Group,
-    commit,
-    groups,
-    net_groups,
-    value,
-    weightless,
-)
+from mops_lightning.report.comparable import Group, commit, groups, net_groups, weightless
 from mops_lightning.report.nets import nets_grid
-from mops_lightning.report.tables import Table, make_table, net_labels, sort_key
+from mops_lightning.report.tables import Table, make_table, sort_key
 from mops_lightning.report.text import PAPER, Grid
+
+SETS = "generated / matched / completed sets, or one figure for samplers that choose input points."
+"""The content of a cell, for titles."""
 
 MAX_NAMED = 8
 """Most runs listed by name that were made in the same way."""
@@ -48,9 +44,9 @@ class Report:
     """
 
     found: Found
+    tables: list[Table]
     grids: list[Grid]
     remarks: list[str]
-    tables: list[Table] = field(default_factory=list)
 
 
 def build_report(folder: Path, metrics: Iterable[str] = (), mixed: bool = False) -> Report:
@@ -65,43 +61,38 @@ def build_report(folder: Path, metrics: Iterable[str] = (), mixed: bool = False)
         UserError: there is no record, or no record has a metric.
     """
     found = collect(folder)
-    last = _without_result(found)
     chosen = list(metrics)
     scored = [record for record in found.done if record.config["learn"] != "task"]
-    if not scored:
-        parts = net_groups(found.done, mixed)
-        grids = [nets_grid(part, chosen) for part in parts]
-        return Report(found, grids, [*_provenance(found.done, ""), *_joining(parts), *last])
-    parts = groups(scored, mixed)
+    parts = groups(scored, mixed) if scored else net_groups(found.done, mixed)
     tables = [
         make_table(part, metric, _net(part))
         for part in parts
         for metric in chosen or [score(part.records)]
+        if scored
     ]
     grids = [grid for table in tables for grid in _grids(table)]
-    tasks = {record.config["names"]["task"] for record in scored}
+    if not scored:
+        grids = [nets_grid(part, chosen) for part in parts]
+    tasks = {record.config["names"]["task"] for record in scored or found.done}
     same = [record for record in found.done if record.config["names"]["task"] in tasks]
+    nets = {table.net for table in tables}
     hidden = sorted({folder for table in tables for folder in table.hidden})
-    lines = [f"- {one}: not shown; a later run has the same row, column and seed" for one in hidden]
-    net = tables[0].net if len({table.net for table in tables}) == 1 else ""
-    made = _provenance(same, net)
-    return Report(found, grids, [*made, *lines, *_joining(parts), *last], tables)
-
-
-def _joining(parts: list[Group]) -> list[str]:
-    """Return lines about separate tables."""
-    if len(parts) == 1:
-        return []
-    return [
-        "",
-        f"{len(parts)} groups of runs are not comparable and have tables of their own. --mixed "
-        "joins groups that differ in commit or settings only.",
+    remarks = [
+        *_provenance(same, nets.pop() if len(nets) == 1 else ""),
+        *(f"- {one}: not shown; a later run has the same row, column and seed" for one in hidden),
     ]
+    if len(parts) > 1:
+        remarks += [
+            "",
+            f"{len(parts)} groups of runs are not comparable and have tables of their own. "
+            "--mixed joins groups that differ in commit or settings only.",
+        ]
+    return Report(found, tables, grids, [*remarks, *_without_result(found)])
 
 
 def _net(group: Group) -> str:
     """Return the task net of a group's table; empty for a table by net."""
-    if group.layout.column == "net":
+    if group.column == "net":
         return ""
     trained = [record for record in group.records if not weightless(record)] or group.records
     return trained[0].config["names"]["net"]
@@ -109,133 +100,141 @@ def _net(group: Group) -> str:
 
 def _grids(table: Table) -> list[Grid]:
     """Return the texts of a table, with the values of full clouds."""
-    layout = table.group.layout
-    if layout.planes:
-        grids = [_plane(table, name) for name in sorted(layout.planes, key=sort_key)]
+    if table.group.planes:
+        grids = [_plane(table, name) for name in sorted(table.group.planes, key=sort_key)]
         grids[-1].below += _full_lines(table)
-    elif layout.column == "net":
-        grids = [_by_net(table)]
     else:
-        grids = [_by_column(table)]
-    about = f" ({table.group.about})" if table.group.about else ""
-    for grid in grids:
-        grid.title += about
+        grids = [_by_net(table) if table.group.column == "net" else _by_column(table)]
+    grids[-1].below += [*_level_line(table), *_unchanged_lines(table)]
+    if table.group.about:
+        for grid in grids:
+            grid.title += f" ({table.group.about})"
     return grids
 
 
+def _level_line(table: Table) -> list[str]:
+    """Return a line that says what bold means, if a value is bold and not the best."""
+    if not table.values["level"].any():
+        return []
+    return [
+        "Bold: the best value, and those level with it, less than two standard deviations over "
+        "seeds away."
+    ]
+
+
+def _unchanged_lines(table: Table) -> list[str]:
+    """Return a line for each sampler whose cells are equal, though its settings differ."""
+    lines = []
+    for name in table.rows() if table.group.settings else ():
+        values = table.values[table.values["row"] == name]
+        shown = values["mean"].map(table.metric.format).groupby(values["readout"])
+        if shown.nunique().max() == 1 and shown.count().min() > 1:
+            lines.append(
+                f"All {shown.count().max()} cells of {name} are equal: the settings that differ "
+                "changed nothing."
+            )
+    return lines
+
+
 def _by_column(table: Table) -> Grid:
-    names, layout = _names(table), table.group.layout
-    joint = trained_with(table.group.records[0]) == "joint"
-    published = paper.published(names["task"], names["dataset"], table.metric.name, joint)
+    """Return the scores of all samplers by size or by another setting, beside the paper's."""
+    names, by_size = table.names, table.group.column == "m"
+    published = _published(table) if by_size else {}
     samplers = {sampler_row(one): one.config["names"]["sampler"] for one in table.group.records}
     cells, columns, costs = table.cells(["row"]), table.columns(), _costs(table)
     rows: list[list] = []
+    below: list[str] = []
     for name in table.rows():
-        own = cells.loc[name, columns]
-        rows.append([name, *own, *([costs.get(name, "")] if costs else [])])
+        rows.append([name, *cells.loc[name, columns], *([costs.get(name, "")] if costs else [])])
         sampler = samplers.get(name, name.partition(" from ")[0])
-        theirs = published.get("rows", {}).get(sampler, {}) if layout.column == "m" else {}
-        if any(str(column) in theirs for column in columns):
-            values = [theirs.get(str(column), []) for column in columns]
+        theirs = published.get("rows", {}).get(sampler, {})
+        values = [theirs.get(str(column), []) for column in columns]
+        if any(values):
             texts = [" / ".join(f"{one:.2f}" for one in cell) for cell in values]
             rows.append([PAPER, *texts, *([""] if costs else [])])
-    below = [published["note"]] if "note" in published and any(r[0] == PAPER for r in rows) else []
-    size = "" if layout.column == "m" else f", m={names['m']},"
-    title = (
-        f"Test {table.metric.title}: {names['task']} on {names['dataset']}{size} "
-        f"under {table.net}; generated / matched / completed sets, or one figure for "
-        "samplers that choose input points."
-    )
-    head = ["sampled by", *(f"{layout.column}={one}" for one in columns)]
-    if layout.column == "m":
+            below = [published["note"]] if "note" in published else []
+    if by_size:
         below += _full_lines(table)
     else:
-        rows.append(_full_row(table))
-    return Grid(title, head + ["training"] * bool(costs), rows, below)
+        full = table.full[table.full["metric"] == table.metric.name]
+        texts = full.groupby("column")["value"].last().map(table.metric.format).to_dict()
+        rows.append(["all points", *(texts.get(column, "") for column in columns)])
+    size = "" if by_size else f", m={table.sizes},"
+    title = (
+        f"Test {table.metric.title}: {names['task']} on {names['dataset']}{size} "
+        f"under {table.net}; {SETS}"
+    )
+    head = ["sampled by", *(f"{table.group.column}={one}" for one in columns)]
+    if costs:
+        head.append(training_time(table.group.records)[0])
+    return Grid(title, head, rows, below)
 
 
 def _by_net(table: Table) -> Grid:
     """Return the scores of the same samples under several nets: size and sampler by net."""
-    names, cells = _names(table), table.cells(["m", "row"])
-    labels, records = net_labels(table.group.records), table.group.records
+    names, cells = table.names, table.cells(["m", "row"])
     columns = sorted(cells.columns, key=lambda label: ("of the training" not in label, label))
     rows: list[list] = [
         [str(m), name, *cells.loc[(m, name), columns]]
         for m, name in sorted(cells.index, key=lambda one: (-one[0], sort_key(one[1])))
     ]
-    full = _full_metric(table)
-    label = f"all points ({full.title})" if table.metric.full_cloud_metric else "all points"
-    figures = [record.metrics.get(f"test/{FULL}/{full.name}") for record in records]
+    metric = table.full_metric
+    label = f"all points ({metric.title})" if table.metric.full_cloud_metric else "all points"
+    full = table.full[table.full["metric"] == metric.name]
     # Figures differ by seed where data depend on it; equal ones are of the same data.
-    tested = pd.DataFrame({"net": labels, "figure": figures}).dropna().drop_duplicates()
-    by_net = tested.groupby("net")["figure"].mean().map(full.format)
-    means = [by_net.get(name, "") for name in columns]
+    tested = full.drop_duplicates(["net", "value"]).groupby("net")["value"]
+    means = tested.mean().map(metric.format).to_dict()
     title = (
         f"Test {table.metric.title} of the same samples under several task nets: {names['task']} "
-        f"on {names['dataset']}; generated / matched / completed sets, or one figure for samplers "
-        "that choose input points."
+        f"on {names['dataset']}; {SETS}"
     )
-    return Grid(title, ["m", "sampled by", *columns], [*rows, ["", label, *means]])
+    rows.append(["", label, *(means.get(name, "") for name in columns)])
+    return Grid(title, ["m", "sampled by", *columns], rows)
 
 
 def _plane(table: Table, name: str) -> Grid:
-    """Return the grid of a sampler: rows are one setting's values, columns the other's."""
-    names, (down, across) = _names(table), table.group.layout.planes[name]
+    """Return the grid of a sampler: rows are one setting's values, columns the other's.
+
+    Below it is the range of its values by readout, a measure of sensitivity.
+    """
+    names, (down, across) = table.names, table.group.planes[name]
     cells = table.cells(["row", "down"]).loc[name].sort_index().sort_index(axis=1)
     cells = cells.loc[:, (cells != "").any()]
-    rows: list[list] = [
-        [f"{left:g}", *line] for left, line in zip(cells.index, cells.to_numpy(), strict=True)
-    ]
-    title = (
-        f"Test {table.metric.title} of {name}: {names['task']} on {names['dataset']}, "
-        f"m={names['m']}, under {table.net}; generated / matched / completed sets."
-    )
-    corner = f"{down.split('.')[-1]} \\ {across.split('.')[-1]}"
-    head = [corner, *(f"{one:g}" for one in cells.columns)]
-    return Grid(title, head, rows, [_spread(table, name)])
-
-
-def _spread(table: Table, name: str) -> str:
-    """Return the range of a heat map's values by readout: a measure of sensitivity."""
-    parts = []
+    rows = [[f"{left:g}", *line] for left, line in zip(cells.index, cells.to_numpy(), strict=True)]
+    spreads = []
     for readout in table.readouts(name):
         means = table.of(name, readout)["mean"]
         low, high = means.min(), means.max()
         times = f" (factor {high / low:.3g})" if low > 0 else ""
-        parts.append(f"{readout} {table.metric.format(low)} to {table.metric.format(high)}{times}")
-    return f"Spread over the plane of {name}: {', '.join(parts)}."
+        ends = f"{table.metric.format(low)} to {table.metric.format(high)}"
+        spreads.append(f"{readout} {ends}{times}")
+    title = (
+        f"Test {table.metric.title} of {name}: {names['task']} on {names['dataset']}, "
+        f"m={table.sizes}, under {table.net}; generated / matched / completed sets."
+    )
+    corner = f"{down.split('.')[-1]} \\ {across.split('.')[-1]}"
+    head = [corner, *(f"{one:g}" for one in cells.columns)]
+    return Grid(title, head, rows, [f"Spread over the plane of {name}: {', '.join(spreads)}."])
 
 
 def _costs(table: Table) -> dict[str, str]:
     """Return the seconds of training of every row by size, over all its runs, per seed."""
-    rows = [
-        {"row": sampler_row(one), "seed": one.seed, "fit": one.seconds["fit"]}
-        for one in table.group.records
-        if "fit" in one.seconds
-    ]
-    if table.group.layout.column != "m" or not rows:
+    if table.group.column != "m":
         return {}
-    by_row = pd.DataFrame(rows).groupby("row")
-    costs = by_row["fit"].sum() / by_row["seed"].nunique()
+    rows = [(sampler_row(one), one.seed) for one in table.group.records]
+    runs = pd.DataFrame(rows, columns=["row", "seed"])
+    runs["seconds"] = training_time(table.group.records)[1]
+    by_row = runs.dropna().groupby("row")
+    costs = by_row["seconds"].sum() / by_row["seed"].nunique()
     return costs.map("{:,.0f} s".format).to_dict()
-
-
-def _full_row(table: Table) -> list[str]:
-    """Return the task net's values on full clouds, by the setting of the columns."""
-    key, name = table.group.layout.column, f"test/{FULL}/{table.metric.name}"
-    figures = [(value(one, key), one.metrics.get(name)) for one in table.group.records]
-    texts = {column: table.metric.format(one) for column, one in figures if one is not None}
-    return ["all points", *(texts.get(column, "") for column in table.columns())]
 
 
 def _full_lines(table: Table) -> list[str]:
     """Return a line for each task net with its value on full clouds."""
-    names, records, metric = _names(table), table.group.records, _full_metric(table)
-    joint = trained_with(records[0]) == "joint"
-    theirs = paper.published(names["task"], names["dataset"], metric.name, joint)
+    metric, theirs = table.full_metric, _published(table, full_clouds=True)
     label = f"{metric.title} " if table.metric.full_cloud_metric else ""
     lines = []
-    for record in sorted(records, key=lambda one: (sampler_row(one), -one.config["m"])):
+    for record in sorted(table.group.records, key=lambda one: (sampler_row(one), -one.config["m"])):
         figure = record.metrics.get(f"test/{FULL}/{metric.name}")
         if figure is None:
             continue
@@ -251,17 +250,11 @@ def _full_lines(table: Table) -> list[str]:
     return list(dict.fromkeys(lines))
 
 
-def _full_metric(table: Table) -> MetricInfo:
-    """Return the metric of full clouds, whose errors normalized by the full cloud are always 1."""
-    name = table.metric.full_cloud_metric or table.metric.name
-    return metric_info(name, table.group.records)
-
-
-def _names(table: Table) -> dict[str, str]:
-    """Return what the records share: names of task and dataset; and their sizes."""
-    names = table.group.records[0].config["names"]
-    sizes = "/".join(str(m) for m in sorted({one.config["m"] for one in table.group.records}))
-    return {"task": names["task"], "dataset": names["dataset"], "m": sizes}
+def _published(table: Table, full_clouds: bool = False) -> dict[str, Any]:
+    """Return the paper's table; empty if it has none."""
+    metric = table.full_metric if full_clouds else table.metric
+    joint = trained_with(table.group.records[0]) == "joint"
+    return paper.published(table.names["task"], table.names["dataset"], metric.name, joint)
 
 
 def _provenance(found: list[RunRecord], net: str) -> list[str]:
@@ -308,10 +301,10 @@ def _way(record: RunRecord) -> str:
 
 
 def _without_result(found: Found) -> list[str]:
-    """Return a line for each run that is not completed, and their number."""
+    """Return a line for each run without a full result, and their number."""
     if not found.undone:
         return []
     lines = [f"- {folder}: {why}" for folder, why in found.undone.items()]
-    verb = "is" if len(lines) == 1 else "are"
+    verb = "has" if len(lines) == 1 else "have"
     number = len(found.done) + len(lines)
-    return ["", f"{len(lines)} of {number} runs {verb} not completed:", "", *lines]
+    return ["", f"{len(lines)} of {number} runs {verb} no full result:", "", *lines]

@@ -7,7 +7,7 @@ from mops_lightning.errors import one_line_endings
 from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.records import run_record
 from mops_lightning.report.build import Report, build_report
-from mops_lightning.report.tables import long_form
+from mops_lightning.report.tables import NOT_IN_CSV, long_form
 from mops_lightning.report.text import latex, markdown
 
 PAGE = "report.html"
@@ -64,14 +64,12 @@ def write(report: Report, folder: Path) -> list[str]:
     """Write all files of a report into its folder and return their names."""
     from mops_lightning.report.page import page
     from mops_lightning.report.plots import plots
-    from mops_lightning.viz.figures import save_figure, save_svg
+    from mops_lightning.viz.figures import save_figure
 
     remove_temporary(folder, below=False)
-    layouts = [table.group.layout for table in report.tables]
-    keys = {one.column for one in layouts} - {"m", "net", ""}
-    keys |= {key for one in layouts for pair in one.planes.values() for key in pair}
+    keys = {key for table in report.tables for key in table.group.settings}
     net = report.tables[0].net if report.tables else ""
-    long = long_form(report.found.done, net, sorted(keys)).drop(columns="run")
+    long = long_form(report.found.done, net, sorted(keys)).drop(columns=[*NOT_IN_CSV])
     texts = {
         "table.md": markdown(report.grids, report.remarks),
         "table.tex": latex(report.grids, report.remarks),
@@ -80,13 +78,11 @@ def write(report: Report, folder: Path) -> list[str]:
     for name, text in texts.items():
         with atomic_write(folder / name) as temporary:
             temporary.write_text(text)
-    drawn, shown = [], []
-    for name, figure in plots(report).items():
-        png = save_figure(figure, folder / f"{name}.png", dpi=150)
-        svg = png.with_suffix(".svg")
-        small = save_svg(figure, svg)
-        drawn += [png.name, svg.name] if small else [png.name]
-        shown.append(svg if small else png)
+    drawn = [
+        save_figure(figure, folder / f"{name}{suffix}", dpi=150)
+        for name, figure in plots(report).items()
+        for suffix in (".png", ".svg")
+    ]
     with atomic_write(folder / PAGE) as temporary:
-        temporary.write_text(page(report, folder, shown))
-    return [*texts, PAGE, *drawn]
+        temporary.write_text(page(report, folder, drawn[1::2]))
+    return [*texts, PAGE, *(path.name for path in drawn)]

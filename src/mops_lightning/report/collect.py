@@ -17,7 +17,7 @@ class Found:
 
     Attributes:
         done: records of completed runs, sorted by folder.
-        undone: folder → why it has no result.
+        undone: folder → why it has no result, or one of a part of the test only.
     """
 
     done: list[RunRecord]
@@ -28,19 +28,20 @@ def collect(folder: Path) -> Found:
     """Read all records below ``folder``, except earlier attempts of a sweep's cells.
 
     Raises:
-        UserError: there is no record, or none of a completed run.
+        UserError: there is no record, or none with a full result.
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: folder not found. Give the folder of a run or a sweep.")
     done: list[RunRecord] = []
     undone: dict[str, str] = {}
     for place, record in _records(folder):
-        if isinstance(record, RunRecord) and record.status == "completed":
-            done.append(replace(record, folder=str(place)))
-        elif isinstance(record, RunRecord):
-            undone[str(place)] = record.status + (f": {record.error}" if record.error else "")
-        else:
+        if isinstance(record, str):
             undone[str(place)] = record
+        elif record.status == "completed" and not record.partial:
+            done.append(replace(record, folder=str(place)))
+        else:
+            reasons = " and ".join(record.partial) or record.error
+            undone[str(place)] = record.status + (f": {reasons}" if reasons else "")
     if not done and not undone:
         raise UserError(
             f"{folder}: no {run_record.FILE} or {run_record.MANY} found. Give the folder of a run "
@@ -48,7 +49,7 @@ def collect(folder: Path) -> Found:
         )
     if not done:
         listed = "; ".join(f"{run} ({why})" for run, why in list(undone.items())[:3])
-        raise UserError(f"{folder}: none of its {len(undone)} runs is completed: {listed}.")
+        raise UserError(f"{folder}: none of its {len(undone)} runs has a full result: {listed}.")
     return Found(done, undone)
 
 
@@ -79,10 +80,7 @@ def _lines(path: Path) -> list[str]:
 
 def _failure(run: Path) -> str:
     """Return why the last start of a sweep's cell failed; empty if nothing says so."""
-    try:
-        return (run / FAILED).read_text(errors="replace").strip()
-    except OSError:
-        return ""
+    return "\n".join(_lines(run / FAILED)).strip()
 
 
 def trained_with(record: RunRecord) -> str:
@@ -103,6 +101,17 @@ def sampler_row(record: RunRecord) -> str:
     """
     parts = [sampler_name(record.config), recorded_recipe(record).get("name")]
     return " ".join(filter(None, parts))
+
+
+def training_time(found: list[RunRecord]) -> tuple[str, list[float | None]]:
+    """Return the head of a column, and the seconds that every run was trained; None: not at all.
+
+    They are CPU time if all runs have recorded it, otherwise wall time.
+    """
+    trained = [record for record in found if "fit" in record.seconds]
+    if trained and all("fit_cpu" in record.seconds for record in trained):
+        return "training (CPU)", [record.seconds.get("fit_cpu") for record in found]
+    return "training (wall)", [record.seconds.get("fit") for record in found]
 
 
 def epochs(record: RunRecord) -> int | None:

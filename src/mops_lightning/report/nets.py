@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import pandas as pd
+from pandas.api.types import is_numeric_dtype
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics.info import MetricInfo
@@ -11,7 +12,7 @@ from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report import paper
-from mops_lightning.report.collect import score, seed
+from mops_lightning.report.collect import score, seed, training_time
 from mops_lightning.report.comparable import Group
 from mops_lightning.report.tables import over_seeds
 from mops_lightning.report.text import PAPER, Grid
@@ -35,18 +36,18 @@ def nets_grid(group: Group, metrics: Sequence[str] = ()) -> Grid:
         UserError: no record has a metric.
     """
     found = sorted(group.records, key=lambda record: record.started)
-    names = found[0].config["names"]
-    settings = pd.DataFrame([_net(record) for record in found])
-    settings = settings.drop(columns=[*HIDDEN], errors="ignore")
+    names, infos = found[0].config["names"], _metrics(found, metrics)
+    settings = pd.DataFrame(map(_net, found)).drop(columns=[*HIDDEN], errors="ignore")
     keys = [key for key in sorted(settings) if settings[key].dropna().map(str).nunique() > 1]
-    infos = _metrics(found, metrics)
-    rows: dict[tuple[Any, ...], dict[int, RunRecord]] = {}
-    for record in found:
-        label = [(value is not None, value or 0) for value in map(_net(record).get, keys)]
-        place = (_points(record) or 0, *label, record.config["names"]["net"])
-        rows.setdefault(place, {})[seed(record)] = record
-    lines = [_row(list(rows[place].values()), keys, infos) for place in sorted(rows, key=_order)]
-    head = ["net", *keys, "points", *(info.title for info in infos), "MB", "training", PAPER]
+    runs = settings[keys].apply(_sortable).assign(points=[_points(one) for one in found])
+    runs = runs.assign(net=[one.config["names"]["net"] for one in found], record=found)
+    place = ["points", *keys, "net"]
+    runs["seed"] = [seed(one) for one in found]
+    last = runs.groupby([*place, "seed"], sort=False, dropna=False).tail(1)
+    nets = last.sort_values(place, na_position="first").groupby(place, sort=False, dropna=False)
+    lines = [_row([*records], keys, infos) for _, records in nets["record"]]
+    titles = (info.title for info in infos)
+    head = ["net", *keys, "points", *titles, "MB", training_time(found)[0], PAPER]
     table = pd.DataFrame(lines, columns=head)
     # Not every table has costs and figures of the paper.
     table = table.drop(columns=[name for name in head[-2:] if not any(table[name])])
@@ -55,10 +56,9 @@ def nets_grid(group: Group, metrics: Sequence[str] = ()) -> Grid:
     return Grid(title, list(table), table.to_numpy().tolist())
 
 
-def _order(place: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return a key that sorts places whose settings may be of several types."""
-    points, *label, name = place
-    return points, *((given, isinstance(one, str), one) for given, one in label), name
+def _sortable(values: pd.Series) -> pd.Series:
+    """Return numbers as they are, and other values as texts."""
+    return values if is_numeric_dtype(values) else values.map(str, na_action="ignore")
 
 
 def _row(records: list[RunRecord], keys: list[str], metrics: list[MetricInfo]) -> list[str]:
@@ -73,7 +73,7 @@ def _row(records: list[RunRecord], keys: list[str], metrics: list[MetricInfo]) -
         text = over_seeds(metric, values.mean(), std) if count else ""
         texts.append(text + (f" (n={count})" if count > 1 else ""))
     size = first.parameters.get("task")
-    cost = pd.Series([one.seconds.get("fit") for one in records], dtype=float).mean()
+    cost = pd.Series(training_time(records)[1], dtype=float).mean()
     texts.append("" if size is None else f"{4e-6 * size:.1f}")
     return [*texts, "" if pd.isna(cost) else f"{cost:,.0f} s", _paper(first)]
 

@@ -20,7 +20,6 @@ MAX_RUNS = 24
 """Most runs whose clouds are in a page; more make it too large to open."""
 
 PLOTLY = "package_data/plotly.min.js"
-IMAGE_TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
 
 VIEW = """<h2>Sampled clouds</h2>
 <p><label>{choice} <select id="run"></select></label>
@@ -35,7 +34,7 @@ def page(report: Report, folder: Path, plots: Sequence[Path]) -> str:
     Args:
         report: its content.
         folder: the folder of the report; its name is the title.
-        plots: SVG or PNG files.
+        plots: SVG files.
     """
     clouds, damaged = _clouds(report, folder)
     return render(
@@ -66,7 +65,7 @@ def render(
             ``(K, n, 3)`` and ``colours`` by readout, y up; a click shows ``hidden`` readouts.
         remarks: lines at the end.
         remarks_title: their heading.
-        plots: SVG or PNG files.
+        plots: SVG files.
         choice: what a group of clouds is called.
     """
     own = files("mops_lightning.report")
@@ -131,8 +130,7 @@ def _table(grid: Grid) -> str:
 
 def _image(path: Path) -> str:
     data = base64.b64encode(path.read_bytes()).decode()
-    source = f"data:{IMAGE_TYPES[path.suffix]};base64,{data}"
-    return f'<img alt="{html.escape(path.stem)}" src="{source}">'
+    return f'<img alt="{html.escape(path.stem)}" src="data:image/svg+xml;base64,{data}">'
 
 
 def _clouds(report: Report, folder: Path) -> tuple[list[dict[str, Any]], list[str]]:

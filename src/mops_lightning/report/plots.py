@@ -26,10 +26,10 @@ def plots(report: Report) -> dict[str, Figure]:
     """Return the figures of a report by file name without suffix."""
     figures: dict[str, Figure] = {}
     for table in report.tables:
-        name, layout = table.metric.name, table.group.layout
-        if layout.planes:
+        name, group = table.metric.name, table.group
+        if group.planes:
             figures[_free(f"{name}_planes", figures)] = heat_maps(table)
-        elif layout.column != "net" and len(table.columns()) > 1:
+        elif group.column != "net" and len(table.columns()) > 1:
             figures[_free(f"{name}_curves", figures)] = curves(table)
     return figures
 
@@ -67,7 +67,7 @@ def curves(table: Table) -> Figure:
                 capsize=2,
             )
         axis.set_title(readout)
-        axis.set_xlabel(table.group.layout.column)
+        axis.set_xlabel(table.group.column)
         axis.set_xticks(range(len(columns)), [f"{column:g}" for column in columns])
         axis.grid(alpha=0.3)
     panels[0].set_ylabel(table.metric.title)
@@ -77,7 +77,7 @@ def curves(table: Table) -> Figure:
 
 def heat_maps(table: Table) -> Figure:
     """Draw the planes of all samplers, a row each and a column per readout, on one colour scale."""
-    planes, scale = table.group.layout.planes, table.metric.scale
+    planes, scale = table.group.planes, table.metric.scale
     names = sorted(planes, key=sort_key)
     means = table.values["mean"] * scale
     norm = _colour_scale(means.min(), means.max())

@@ -1,10 +1,11 @@
 """The long form of records, and tables of one metric from it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from mops_lightning.errors import UserError, did_you_mean
@@ -17,7 +18,7 @@ from mops_lightning.records.readout_names import (
     REFINED,
     parse_metric_name,
 )
-from mops_lightning.records.run_record import RunRecord
+from mops_lightning.records.run_record import Names, RunRecord
 from mops_lightning.records.summary import baseline_name
 from mops_lightning.report.collect import epochs, sampler_row, seed, trained_with
 from mops_lightning.report.comparable import Group, value
@@ -33,6 +34,10 @@ ORDER = (
     *("snet_progressive", "samplenet", "samplenet_progressive", "mops", "fmops"),
 )
 """Samplers in the order of the paper's tables; others follow by name."""
+
+
+NOT_IN_CSV = ("row", "size", "started")
+"""Further columns of the long form: the row of a value, the run's own size, and its start."""
 
 
 class Part(NamedTuple):
@@ -72,6 +77,7 @@ class Table:
         net: the task net of the table; other nets are named in rows.
         values: one row for every cell and readout: ``row``, ``m``, ``column``, and for heat maps
             ``down``; ``readout``, ``mean`` and ``std`` over seeds, and their ``count``.
+        full: the long form of all metrics on full clouds, with ``column``.
         hidden: folders of runs that are not shown, because a later run has the same place.
     """
 
@@ -79,11 +85,28 @@ class Table:
     group: Group
     net: str
     values: pd.DataFrame
-    hidden: list[str] = field(default_factory=list)
+    full: pd.DataFrame
+    hidden: list[str]
+
+    @property
+    def names(self) -> Names:
+        """The names that the records share: of task and dataset."""
+        return self.group.records[0].config["names"]
+
+    @property
+    def sizes(self) -> str:
+        """The sizes of the runs."""
+        return "/".join(map(str, sorted({one.config["m"] for one in self.group.records})))
+
+    @property
+    def full_metric(self) -> MetricInfo:
+        """The metric of full clouds: errors that are normalized by theirs are 1 there."""
+        name = self.metric.full_cloud_metric or self.metric.name
+        return metric_info(name, self.group.records)
 
     def columns(self) -> list[Any]:
         """Return all columns: sizes from the largest, other values from the smallest."""
-        return sorted(self.values["column"].unique(), reverse=self.group.layout.column == "m")
+        return sorted(self.values["column"].unique(), reverse=self.group.column == "m")
 
     def rows(self) -> list[str]:
         """Return all rows in the paper's order, rows of other nets last."""
@@ -116,7 +139,7 @@ class Table:
 
 
 def long_form(found: list[RunRecord], net: str, keys: Sequence[str] = ()) -> pd.DataFrame:
-    """Return one row for every test value of every record.
+    """Return one row for every test value of every record: the columns of ``table.csv``, and more.
 
     Args:
         found: completed records.
@@ -124,28 +147,29 @@ def long_form(found: list[RunRecord], net: str, keys: Sequence[str] = ()) -> pd.
         keys: settings that get a column, dotted.
     """
     rows = []
-    labels = net_labels(found)
-    for number, record in enumerate(found):
+    for record, label in zip(found, net_labels(found), strict=True):
         facts = {
-            "run": number,
             "folder": record.folder,
             "sampler": row_name(record, net),
             "learn": trained_with(record),
             "seed": seed(record),
             "epochs": epochs(record) or 0,
             **{key: value(record, key) for key in keys},
-            "net": labels[number],
+            "net": label,
             "commit": record.git["commit"],
             "device": record.device,
+            "size": record.config["m"],
+            "started": record.started,
         }
         for name, figure in record.metrics.items():
             parts = parse_metric_name(name)
             if parts is not None and figure is not None:
-                tested = {"m": parts.m or record.config["m"], "readout": parts.readout}
-                rows.append({**facts, **tested, "metric": parts.metric, "value": figure})
-    facts_first = ["run", "folder", "sampler", "learn", "seed", "epochs"]
-    tested_next = ["m", "readout", "metric", "value"]
-    columns = [*facts_first, *tested_next, *keys, "net", "commit", "device"]
+                m = record.config["m"] if parts.m is None else parts.m
+                tested = {"m": m, "readout": parts.readout, "metric": parts.metric}
+                row = _row(record, parts.readout, net)
+                rows.append({**facts, **tested, "value": figure, "row": row})
+    first = ["folder", "sampler", "learn", "seed", "epochs", "m", "readout", "metric", "value"]
+    columns = [*first, *keys, "net", "commit", "device", *NOT_IN_CSV]
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -160,78 +184,70 @@ def make_table(group: Group, metric: str, net: str) -> Table:
     Raises:
         UserError: no record has the metric.
     """
-    records, layout = group.records, group.layout
-    long = long_form(records, net)
+    long = long_form(group.records, net, group.settings)
+    long["down"], long["column"] = 0.0, 0.0 if group.planes else long[group.column]
+    for name, pair in group.planes.items():
+        own = long["sampler"] == name
+        long.loc[own, ["down", "column"]] = long.loc[own, pair].to_numpy(float)
     values = long[(long["metric"] == metric) & (long["readout"] != FULL)].copy()
     if values.empty:
         known = set(long["metric"])
         raise UserError(f"--metric: no run has {metric!r}.{did_you_mean(metric, known)}")
     values["own"] = values["readout"].isin([*READOUTS, REFINED])
-    values["row"] = [_row(records[one.run], one, net) for one in values.itertuples()]
-    _add_columns(values, group)
-    if layout.column not in ("m", "net"):  # the run's own size only
-        sizes = values["run"].map(lambda run: records[run].config["m"])
-        values = values[values["m"] == sizes]
-    if layout.planes:
+    if group.settings:  # the run's own size only
+        values = values[values["m"] == values["size"]]
+    if group.planes:
         values = values[values["own"] & (values["readout"] != REFINED)]
     # Joint training gives each run its own task net, under which its baselines ran too.
     values = values[values["own"] | (values["learn"] != "joint")]
     values["readout"] = values["readout"].where(values["readout"].isin(READOUTS), INDEX_READOUT)
     place = ["row", "m", "column", "down"]
     tested = values.groupby(place, dropna=False)["own"].transform("any")
-    values = values[values["own"] | ~tested]
-    started = values["run"].map(lambda run: records[run].started)
-    values = values.assign(started=started).sort_values("started", kind="stable")
-    later = values["run"] != values.groupby([*place, "seed"])["run"].transform("last")
+    values = values[values["own"] | ~tested].sort_values("started", kind="stable")
+    later = values["folder"] != values.groupby([*place, "seed"])["folder"].transform("last")
     hidden = sorted(set(values.loc[later & values["own"], "folder"]))
     over = values[~later].groupby([*place, "readout"], sort=False)["value"]
     table = over.agg(mean="mean", std="std", count_="count").reset_index()
-    return Table(metric_info(metric, records), group, net, _ranked(table, metric, records), hidden)
+    info = metric_info(metric, group.records)
+    return Table(info, group, net, _ranked(table, info), long[long["readout"] == FULL], hidden)
 
 
-def _add_columns(values: pd.DataFrame, group: Group) -> None:
-    """Add the columns that give the places of a table."""
-    records, layout = group.records, group.layout
-    values["down"] = 0.0
-    if layout.column in ("m", "net"):
-        values["column"] = values[layout.column]
-        return
-    if not layout.planes:
-        values["column"] = values["run"].map(lambda run: value(records[run], layout.column))
-        return
-    keys = values["run"].map(lambda run: layout.planes[sampler_row(records[run])])
-    for name, position in (("down", 0), ("column", 1)):
-        pairs = zip(values["run"], keys, strict=True)
-        values[name] = [value(records[run], pair[position]) for run, pair in pairs]
+def _ranked(table: pd.DataFrame, metric: MetricInfo) -> pd.DataFrame:
+    """Add the rank of each value among the rows of its column, and whether it is level.
 
-
-def _ranked(table: pd.DataFrame, name: str, records: list[RunRecord]) -> pd.DataFrame:
-    """Add the rank of each value among the rows of its column.
-
-    Points chosen from the input compete with completed sets. Equal texts have equal ranks.
+    Points chosen from the input compete with completed sets. Equal texts have equal ranks. A value
+    is level with the best, and has its rank, if it is less than two standard deviations away: the
+    larger of the two deviations over seeds.
     """
-    metric = metric_info(name, records)
-    table["rank"] = 0
+    table["rank"], table["level"] = 0, False
     if metric.higher_is_better is None:
         return table
     rivals = table["readout"].replace(INDEX_READOUT, GENERATED_READOUTS[-1])
     shown = pd.to_numeric(table["mean"].map(metric.format))
     shown = shown.where(~table["row"].str.endswith(WITH_NET))
-    places = shown.groupby([rivals, table["m"], table["column"], table["down"]])
-    ranks = places.rank("dense", ascending=not metric.higher_is_better)
-    several = places.transform("count") > 1
-    table["rank"] = ranks.where(several & (ranks <= 2), 0).fillna(0).astype(int)
+    places = [rivals, table["m"], table["column"], table["down"]]
+    top = "max" if metric.higher_is_better else "min"
+    best = shown.groupby(places).transform(top)
+    deviation = metric.scale * table["std"].fillna(0.0)
+    of_best = deviation.where(shown == best).groupby(places).transform("max")
+    near = (shown - best).abs() < 2 * np.maximum(deviation, of_best)
+    second = shown.where((shown != best) & ~near).groupby(places).transform(top)
+    several = shown.groupby(places).transform("count") > 1
+    table["level"] = several & near & (shown != best)
+    table.loc[several & (shown == second), "rank"] = 2
+    table.loc[several & ((shown == best) | near), "rank"] = 1
     return table
 
 
-def _row(record: RunRecord, one: Any, net: str) -> str:
+def _row(record: RunRecord, readout: str, net: str) -> str:
     """Return the row of a value: a sampler, a baseline of its run, or refined samples."""
-    if one.readout == REFINED:
-        return f"{one.sampler}{WITH_NET}"
-    if one.readout in READOUTS:
-        return one.sampler
-    prefix = row_name(record, net).removesuffix(sampler_row(record))  # such as "icp on "
-    return prefix + baseline_name(record.config, one.readout)
+    own = row_name(record, net)
+    if readout == REFINED:
+        return f"{own}{WITH_NET}"
+    if readout in (*READOUTS, FULL):
+        return own
+    prefix = own.removesuffix(sampler_row(record))  # such as "icp on "
+    return prefix + baseline_name(record.config, readout)
 
 
 def row_name(record: RunRecord, net: str) -> str:

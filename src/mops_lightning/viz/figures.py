@@ -11,9 +11,6 @@ from PIL import Image
 
 from mops_lightning.filesystem import atomic_write
 
-MAX_PNG_BYTES = 300_000
-MAX_SVG_BYTES = 150_000
-
 
 def new_figure(width: float, height: float, layout: Any = "constrained") -> Figure:
     """Return an empty figure of a size in inches."""
@@ -44,51 +41,23 @@ def cloud_axes(
 
 
 def save_figure(figure: Figure, path: Path, dpi: float = 110) -> Path:
-    """Write a figure as PNG of at most ``MAX_PNG_BYTES``, completely or not at all.
+    """Write a figure as PNG or SVG, completely or not at all.
 
-    Figures above the limit get a palette of 256 colours and, if that is not enough, a lower
-    resolution.
+    A PNG gets a palette of 256 colours, which makes it several times smaller.
 
     Args:
         figure: what to write.
-        path: the file.
-        dpi: resolution of figures below the limit.
-    """
-    data = _png(figure, dpi)
-    if len(data) > MAX_PNG_BYTES:
-        data = _with_palette(data)
-    while len(data) > MAX_PNG_BYTES:
-        dpi *= 0.8
-        data = _with_palette(_png(figure, dpi))
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(data)
-    return path
-
-
-def save_svg(figure: Figure, path: Path) -> bool:
-    """Write a figure as SVG unless that exceeds ``MAX_SVG_BYTES``; then delete an earlier file.
-
-    Returns:
-        Whether the file was written.
+        path: the file; its suffix gives the format.
+        dpi: resolution of a PNG, and of the images in an SVG.
     """
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg", dpi=150, metadata={"Date": None})
-    if buffer.tell() > MAX_SVG_BYTES:
-        path.unlink(missing_ok=True)
-        return False
+    if path.suffix == ".svg":
+        figure.savefig(buffer, format="svg", dpi=dpi, metadata={"Date": None})
+    else:
+        figure.savefig(buffer, format="png", dpi=dpi)
+        image = Image.open(buffer).convert("RGB")
+        buffer = io.BytesIO()
+        image.quantize(256, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
     with atomic_write(path) as temporary:
         temporary.write_bytes(buffer.getvalue())
-    return True
-
-
-def _png(figure: Figure, dpi: float) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
-    return buffer.getvalue()
-
-
-def _with_palette(png: bytes) -> bytes:
-    buffer = io.BytesIO()
-    image = Image.open(io.BytesIO(png)).convert("RGB")
-    image.quantize(256, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
-    return buffer.getvalue()
+    return path
