@@ -25,12 +25,12 @@ gc.set_threshold(50_000, 20, 50)
 
 
 SLOW_FILES = (
-    *("training/test_tensorboard", "docs/test_notebooks", "cli/test_train", "cli/test_launchers"),
-    *("config/test_distributed", "samplers/test_memory", "files/test_engine"),
-    *("training/test_checkpoint", "training/test_pretrain", "cli/test_resume", "docs/test_site"),
-    *("report/test_page", "fuzz/test_command_lines", "test_wheel", "training/test_precision"),
-    *("training/test_evaluate", "zoo/test_export", "training/test_warm_start"),
-    *("cli/test_sweep", "files/test_batch", "zoo/test_models"),
+    *("training/run/test_tensorboard", "docs/test_notebooks", "cli/test_train"),
+    *("cli/test_launchers", "config/test_distributed", "samplers/test_memory"),
+    *("files/test_engine", "training/test_checkpoint", "training/run/test_pretrain"),
+    *("cli/test_resume", "docs/test_site", "report/test_page", "fuzz/test_command_lines"),
+    *("test_wheel", "training/test_precision", "training/run/test_load", "zoo/test_export"),
+    *("training/recipe/test_warm_start", "cli/test_sweep", "files/test_batch", "zoo/test_models"),
 )
 """Files of few tests that take long. They begin first, or one process would end alone with one."""
 

@@ -100,13 +100,6 @@ def test_installed_copy_is_imported(installed: Path, tmp_path: Path) -> None:
     assert Path(lines[1]) == installed.resolve() / "mops_lightning" / "conf"
 
 
-def test_help_of_installed_copy_lists_datasets(installed: Path, tmp_path: Path) -> None:
-    text = python("-m", "mops_lightning", "--help", cwd=tmp_path, path=installed)
-    datasets = sorted(file.stem for file in (ROOT / "conf/dataset").glob("*.yaml"))
-    assert f"dataset: {', '.join(datasets)}" in text
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_run_of_installed_copy_leaves_a_record(installed: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "empty"
     elsewhere.mkdir()

@@ -3,11 +3,11 @@ import torch
 
 from mops_lightning import load
 from mops_lightning.cli.export import main
-from tests.support import commands
+from tests.support.captured import captured
 
 
 def call(*arguments):
-    return commands.call(main, "mops-lightning export", *arguments)
+    return captured(main, arguments, "mops-lightning export")
 
 
 def test_export_of_a_model_writes_a_file_that_runs(tmp_path):

@@ -6,12 +6,12 @@ import pytest
 
 from mops_lightning.cli.models import main
 from mops_lightning.zoo import model_file, names
-from tests.support import commands
+from tests.support.captured import captured
 from tests.support.models import rewrite, write_run
 
 
 def call(*arguments):
-    return commands.call(main, "mops-lightning models", *arguments)
+    return captured(main, arguments, "mops-lightning models")
 
 
 def test_models_lists_name_task_sizes_figures_licence_and_size():

@@ -211,21 +211,14 @@ def test_folder_of_meshes_trains(tmp_path):
     assert run_record.read(run).dataset_facts["train_files"] == 18
 
 
-def test_flexible_sampler_is_tested_at_all_sizes_and_evaluated(main_job):
+def test_flexible_sampler_is_tested_at_all_sizes(main_job):
     folder, *_ = main_job
     status, out, err = call([*TINY, "sampler=fmops", "sampler.m_max=32"], folder)
     assert status == 0, err
     for word in ("m=8", "m=16", "m=32", "fmops completed", "all points"):
         assert word in out
     run = next(path for path in runs(folder) if path.parent.name == "fmops-m32")
-    before = run_record.read(run)
-    status, out, err = call([f"evaluate={run}", "sizes=[3,16]", "pictures=0"], folder)
-    assert status == 0, err
-    again = next(path for path in runs(folder) if path.parent.name == "fmops-evaluated")
-    after = run_record.read(again)
-    name = "test/m16/completed/accuracy"
-    assert after.metrics[name] == before.metrics[name]
-    assert "test/m3/matched/accuracy" in after.metrics
+    assert "test/m16/completed/accuracy" in run_record.read(run).metrics
 
 
 def test_weights_of_another_net_are_rejected(main_job):

@@ -92,12 +92,3 @@ def test_search_finds_a_setting(address, opened):
     page.locator("input.md-search__input").press_sequentially("test_noise_std")
     page.locator(".md-search-result__item").first.wait_for(state="attached", timeout=60_000)
     assert errors == []
-
-
-def test_dark_mode_is_one_click(address, opened):
-    page, _, _ = opened(f"{address}/index.html")
-    colour = "getComputedStyle(document.body).backgroundColor"
-    light = page.evaluate(colour)
-    page.locator("label[title='Dark mode']").click()
-    page.wait_for_function(f"{colour} != '{light}'", timeout=10_000)
-    assert page.locator("label[title='Light mode']").is_visible()

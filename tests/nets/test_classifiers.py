@@ -1,4 +1,4 @@
-"""What every classifier guarantees. A new net adds one line to NETS."""
+"""What is specific to classifiers; see test_contract for what all nets guarantee."""
 
 from typing import Any
 
@@ -7,40 +7,7 @@ import torch
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.dgcnn import DGCNN, max_of_rows
-from mops_lightning.nets.pointnet import PointNetTransform, PointNetVanilla, TransformNet
-from tests.support.mixed import check_close_in_mixed_precision
-
-NETS = {"pointnet": PointNetVanilla, "pointnet_transform": PointNetTransform, "dgcnn": DGCNN}
-
-
-@pytest.mark.parametrize("name", NETS)
-def test_logits_are_independent_of_order_and_batch(name, rng):
-    torch.manual_seed(0)
-    net = NETS[name](5).eval()
-    points = torch.randn(3, 60, 3, generator=rng)
-    logits = net(points)
-    assert logits.shape == (3, 5)
-    order = torch.randperm(60, generator=rng)
-    torch.testing.assert_close(net(points[:, order]), logits, atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(net(points[1:2]), logits[1:2], atol=1e-5, rtol=1e-4)
-    assert net(points[:, :1]).shape == (3, 5)
-
-
-@pytest.mark.parametrize("name", NETS)
-def test_all_parameters_have_gradients(name, rng):
-    torch.manual_seed(0)
-    net = NETS[name](5)
-    for module in net.modules():
-        if isinstance(module, TransformNet):  # its last weights are zero, which stops gradients
-            torch.nn.init.normal_(list(module.head.parameters())[-2], std=0.01)
-    net(torch.randn(4, 60, 3, generator=rng)).square().sum().backward()
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in net.parameters())
-
-
-@pytest.mark.parametrize("name", NETS)
-def test_mixed_precision_is_close_with_finite_gradients(name, rng):
-    torch.manual_seed(0)
-    check_close_in_mixed_precision(NETS[name](5).eval(), torch.randn(8, 60, 3, generator=rng))
+from mops_lightning.nets.pointnet import TransformNet
 
 
 def test_transform_net_starts_at_identity(rng):

@@ -24,14 +24,6 @@ def test_random_places_are_uniform(rng):
         assert chi_square_p(counts, 4000 * 10 / 50, 10 / 50) > 1e-3
 
 
-def test_random_points_are_uniform_over_seeds(rng):
-    points = torch.randn(1, 50, 3, generator=rng)
-    counts: Counter[int] = Counter()
-    for seed in range(1000):
-        counts.update(RandomSampler(10, seed)(points).indices[0].tolist())
-    assert chi_square_p(counts.values(), 1000 * 10 / 50, 10 / 50) > 1e-3
-
-
 def test_random_pairs_are_uniform(rng):
     points = torch.randint(0, 3, (1, 5, 3), generator=rng) / 4  # few bits to hash
     points[..., 0] += torch.arange(5)

@@ -5,13 +5,13 @@ import io
 from typing import Any
 
 
-def captured(main, arguments):
+def captured(main, arguments, *more):
     """Exit status and what it printed."""
     out, err = io.StringIO(), io.StringIO()
     status: Any = 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            main([str(argument) for argument in arguments])
+            main([str(argument) for argument in arguments], *more)
         except SystemExit as stop:
             status = stop.code
     return status, out.getvalue(), err.getvalue()

@@ -77,20 +77,6 @@ def test_train_frozen_parts_stay_in_evaluation_mode():
     assert not any(p.requires_grad for p in module.task.parameters())
 
 
-def test_test_scores_every_readout_and_set():
-    data = small_dataset()
-    run = quiet_trainer(2)
-    run.test(experiment(), CloudLoader(data.test, 4), verbose=False)
-    metrics = run.callback_metrics
-    for readout in ("generated", "matched", "completed", "random", "fps", "full"):
-        assert 0 <= metrics[f"test/{readout}/accuracy"] <= 1
-        assert f"test/{readout}/mean_class_accuracy" in metrics
-    assert 1 <= metrics["test/matched/unique_points"] <= 8
-    assert metrics["test/generated/subset_distance"] >= 0
-    assert 0 <= metrics["test/matrix/nonzero_percent"] <= 100
-    assert metrics["test/matrix/orthogonality_error"] >= 0
-
-
 def test_test_accuracy_equals_plain_loop():
     data = small_dataset()
     module = experiment(task_net=SpreadNet()).eval()

@@ -38,8 +38,8 @@ class SeenBy(MOPSNet):
         return super().sample(points, m)
 
 
-def trained(recipe: Recipe, epochs: int = 2, table: Any = None, **more: Any) -> Experiment:
-    """Train on 24 clouds in batches of 6, with a table of the task net's predictions if given."""
+def trained(recipe: Recipe, epochs: int = 2, **more: Any) -> Experiment:
+    """Train on 24 clouds in batches of 6."""
     torch.manual_seed(0)
     module = Experiment(
         Classification(PointNetVanilla(3), 3),
@@ -47,18 +47,10 @@ def trained(recipe: Recipe, epochs: int = 2, table: Any = None, **more: Any) -> 
         make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
         recipe=recipe,
     )
-    assert module.distillation is not None
-    module.distillation.table = table
     data = small_dataset(points=POINTS)
     trainer = quiet_trainer(epochs, **more)
     trainer.fit(module, CloudLoader(data.train, 6, shuffle=True), CloudLoader(data.test, 6))
     return module
-
-
-def logged(recipe: Recipe) -> dict[str, float]:
-    """Return the last logged training losses."""
-    metrics = trained(recipe, epochs=1).trainer.callback_metrics
-    return {name: float(value) for name, value in metrics.items() if name.startswith("train/loss")}
 
 
 def test_recipe_paper_and_fast_are_valid_and_differ():
@@ -216,27 +208,6 @@ def test_straight_through_completed_set_gives_gradients_to_its_matched_points():
         for place, row in enumerate(kept):
             gradients[cloud, rows[cloud].tolist().index(row)] = weight[cloud, place]
     torch.testing.assert_close(generated.grad, gradients)
-
-
-@pytest.mark.parametrize("name", ["distillation", "feature_distillation"])
-def test_distillation_is_logged_with_its_weight_and_only_then(name):
-    key = f"train/loss/{name}"
-    assert key not in logged(Recipe())
-    given: list[dict[str, Any]] = [{name: 1e-6}, {name: 2e-6}]
-    light, heavy = (logged(Recipe(**one))[key] for one in given)
-    assert light > 0
-    assert heavy == pytest.approx(2 * light, rel=1e-3)
-
-
-def test_distillation_with_kept_predictions_trains_the_same():
-    recipe = Recipe(distillation=3.0)
-    computed = trained(recipe)
-    with torch.no_grad():
-        table = computed.task.eval().predict(None, small_dataset(points=POINTS).train.points)
-    kept, wrong = trained(recipe, table=table), trained(recipe, table=table.flip(0))
-    weights = [module.state_dict()["sampler.queries.weight"] for module in (computed, kept, wrong)]
-    torch.testing.assert_close(weights[0], weights[1])
-    assert not torch.allclose(weights[0], weights[2])
 
 
 def test_straight_through_changes_the_training_from_its_share_on():

@@ -72,13 +72,6 @@ def test_evaluate_older_record_without_newer_setting(trained, tmp_path):
         evaluated(older, tmp_path / "other", "sampler.min_size=2")
 
 
-def test_evaluate_record_of_other_defaults(trained, tmp_path):
-    sampler = {**trained[1].config["sampler"], "tau_min": 1.0, "num_sizes": 2}
-    again = evaluated(changed_record(trained, tmp_path / "run", sampler), tmp_path)
-    assert again.config["sampler"] == sampler
-    assert again.metrics != trained[1].metrics
-
-
 def test_evaluate_record_with_settings_of_its_recipe_and_of_no_file(trained, tmp_path):
     sampler = {**trained[1].config["sampler"], "size_sampling": "uniform", "threshold": 0.0}
     sampler["feature_channels"] = [64, 64, 64, 128, 128]

@@ -6,7 +6,6 @@ from importlib.util import find_spec
 import pytest
 
 from mops_lightning.config.compose import compose
-from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.training.run.run import run
 from tests.support.command_line import TINY
@@ -49,8 +48,3 @@ def test_logger_missing_package_raises(name, tmp_path):
         pytest.skip(f"{name} is installed")
     with pytest.raises(UserError, match=f"needs a package that is not installed: .*{name}"):
         logged(tmp_path, f"logger={name}")
-
-
-@pytest.mark.parametrize("name", ["csv", "mlflow", "none", "tensorboard", "wandb"])
-def test_logger_settings_fit_constructors(name):
-    check(compose([f"logger={name}"]))
