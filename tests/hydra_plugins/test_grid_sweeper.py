@@ -53,7 +53,7 @@ def test_grids_run_one_after_the_other_and_win_over_params(tmp_path):
 
 
 def test_grids_command_line_applies_to_every_grid(tmp_path):
-    status, cells, out, err = start(tmp_path, "m=2,4", "hydra/launcher=joblib")
+    status, cells, out, err = start(tmp_path, "m=2,4")
     assert status == 0, out + err
     assert cells == ["random-m2", "random-m4", "fps-m2", "fps-m4"]
 
