@@ -16,7 +16,7 @@ from mops_lightning.errors import UserError
 
 cloud_folder = partial(module.cloud_folder, test_frames=None, crop="nearest", crops=32)
 
-FORMATS = (".ply", ".pcd", ".bin", ".npy", ".npz", ".xyz", ".txt", ".obj")
+FORMATS = (".ply", ".pcd", ".bin", ".npy", ".npz", ".xyz", ".txt")
 
 
 def write(path, seed=0, number=300):
@@ -37,11 +37,11 @@ def folder(tmp_path):
 def test_cloud_folder_reads_every_format_without_labels(folder):
     data = cloud_folder(folder, n_points=64, crops=3)
     assert data.class_names == ("cloud",)
-    assert data.train.points.shape == (21, 64, 3)
+    assert data.train.points.shape == (18, 64, 3)
     assert data.test.points.shape == (6, 64, 3)
-    assert (data.notes["train_files"], data.notes["test_files"]) == (7, 2)
+    assert (data.notes["train_files"], data.notes["test_files"]) == (6, 2)
     assert torch.isfinite(data.train.points).all()
-    assert data.train.points.norm(dim=2).amax(1).allclose(torch.ones(21))
+    assert data.train.points.norm(dim=2).amax(1).allclose(torch.ones(18))
     assert data.train.points.mean(1).abs().max() < 1e-5
 
 
@@ -73,12 +73,6 @@ def test_cloud_folder_folders_are_classes_and_splits(tmp_path):
     assert cloud_folder(tmp_path, n_points=32, classes=["car"]).class_names == ("car",)
 
 
-def test_cloud_folder_split_file(folder):
-    (folder / "split.csv").write_text("path,split\nscan_0.ply,test\nscan_1.pcd,train\n")
-    data = cloud_folder(folder, n_points=64, crops=2, split_file="split.csv")
-    assert (len(data.train.points), len(data.test.points)) == (2, 2)
-
-
 def test_cloud_folder_broken_file_is_named(folder):
     (folder / "notes.txt").write_text("scanned on Monday\n")
     with pytest.raises(UserError, match=r"notes\.txt"):
@@ -87,18 +81,6 @@ def test_cloud_folder_broken_file_is_named(folder):
     write(folder / "small.ply", number=10)
     with pytest.raises(UserError, match=r"small\.ply has 10 points.*or remove the file"):
         cloud_folder(folder, n_points=64)
-
-
-def test_cloud_folder_tiles_that_touch_a_test_tile_are_left_out(tmp_path, capsys):
-    for i in range(10):
-        points = np.random.default_rng(i).random((300, 3)) + np.array([i, 0, 0])
-        WRITERS[".npy"](tmp_path / f"tile_{i}.npy", Table(points))
-    data = cloud_folder(tmp_path, n_points=64, crops=1)
-    assert data.notes["test_files"] == 2
-    assert data.notes["left_out_files"] == 8 - data.notes["train_files"] > 0
-    assert "left out because they touch a test file" in capsys.readouterr().err
-    objects = cloud_folder(tmp_path, n_points=64, crops=1, crop="whole")
-    assert objects.notes == {"train_files": 8, "test_files": 2, "left_out_files": 0}
 
 
 def test_cloud_folder_class_in_one_split_is_reported(mesh_layout, capsys):
@@ -113,7 +95,7 @@ def test_cloud_folder_surface_reads_modelnet_layout(mesh_layout, capsys):
     assert data.class_names == ("ball", "box")
     assert data.train.labels.tolist() == [0, 1, 1]
     assert data.test.labels.tolist() == [0, 1]
-    assert data.notes == {"train_files": 3, "test_files": 2, "left_out_files": 0}
+    assert data.notes == {"train_files": 3, "test_files": 2}
     for clouds in (data.train, data.test):
         assert clouds.points.shape == (len(clouds.labels), 200, 3)
         assert (clouds.points.dtype, clouds.labels.dtype) == (torch.float32, torch.int64)

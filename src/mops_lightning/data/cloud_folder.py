@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,9 +18,7 @@ from torch import Tensor
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, make_dataset
 from mops_lightning.data.file_splits import (
     SPLITS,
-    Box,
     class_of,
-    read_split_list,
     split_by_folder,
     split_by_share,
     split_by_time,
@@ -41,25 +39,10 @@ DRAWS = 50
 """Crops that are drawn before a file is rejected because all points of a crop coincide."""
 
 
-class Source(NamedTuple):
-    """A file that was read.
-
-    Attributes:
-        clouds: ``(K, n_points, 3)`` in the unit sphere.
-        box: the bounding box in the file's own unit; None for a mesh.
-        digest: sha256 of a mesh's file; empty for other files.
-    """
-
-    clouds: Tensor
-    box: Box | None = None
-    digest: str = ""
-
-
 def cloud_folder(
     root: str | Path,
     n_points: int = 1024,
     classes: Sequence[str] | None = None,
-    split_file: str | Path | None = None,
     test_share: float = 0.2,
     gap: int = 0,
     seed: int = 0,
@@ -72,23 +55,13 @@ def cloud_folder(
 ) -> CloudDataset:
     """Read the clouds or meshes in a folder and its subfolders, one per file.
 
-    A file is in one split only. The split comes from ``split_file``; else from ``test_frames``;
-    else from folders named ``train`` and ``test``; else a random share of the files of every class
-    is the test split. With ``crop=nearest``, training files that touch a test file of the same
-    scene are left out then.
-
-    A list has one line per file, with a path relative to ``root``; other files are ignored. The
-    first line is optional. Empty lines and lines that start with ``#`` are ignored::
-
-        path,split
-        chair/chair_0001.off,train
-        chair/old/seat.obj,test
+    A file is in one split only. The split comes from ``test_frames``; else from folders named
+    ``train`` and ``test``; else a random share of the files of every class is the test split.
 
     Args:
         root: the folder. The first folder of a path is the class, if there is one.
         n_points: number of points per cloud.
         classes: names to keep; None or empty means all.
-        split_file: path of a list, relative to the working directory or to ``root``.
         test_share: share of test files in a class, between 0 and 1.
         gap: number of frames between training and test frames that are not used, because
             neighbouring frames are almost identical.
@@ -104,8 +77,8 @@ def cloud_folder(
 
     Returns:
         Float32 clouds ``(S, n_points, 3)`` in the unit sphere, with the centroid at the origin, and
-        classes in alphabetical order. ``notes`` has the number of files per split and of files left
-        out. The fingerprint depends on the content of the files and the arguments, not on ``root``.
+        classes in alphabetical order. ``notes`` has the number of files per split. The fingerprint
+        depends on the content of the files and the arguments, not on ``root``.
 
     Raises:
         UserError: an argument or a file is invalid, or a split is empty.
@@ -124,31 +97,31 @@ def cloud_folder(
     if not folder.is_dir():
         raise UserError(f"root: {folder} is not a folder.")
     suffixes = MESHES if crop == "surface" else READABLE
-    listed = None
-    if split_file:
-        listed = read_split_list(folder, Path(split_file).expanduser(), suffixes)
-    names = sorted(listed) if listed else list_files(folder, suffixes)
+    names = list_files(folder, suffixes)
     chosen = choose_classes(classes, sorted(set(map(class_of, names))))
     names = [name for name in names if class_of(name) in chosen]
-    if listed is not None:
-        splits: list[str] | None = [listed[name] for name in names]
-    elif test_frames is not None:
+    if test_frames is not None:
         splits = split_by_time(names, test_share, gap, test_frames)
         names = [name for name, split in zip(names, splits, strict=True) if split]
         splits = [split for split in splits if split]
     else:
-        splits = split_by_folder(names)
-    sources = _read_files(folder, names, n_points, crop, crops, seed, cache)
-    if splits is None:
-        boxes = [source.box for source in sources if source.box is not None]
-        splits = split_by_share(names, boxes if crop == "nearest" else None, test_share, seed)
-    clouds = _splits(folder, names, sources, splits, chosen)
+        splits = split_by_folder(names) or split_by_share(names, test_share, seed)
     notes = _notes(folder, names, splits, chosen)
+    crops_of, digests = _read_files(folder, names, n_points, crop, crops, seed, cache)
+    clouds = {}
+    for split in SPLITS:
+        rows = [row for row, of_file in enumerate(splits) if of_file == split]
+        labels = torch.tensor([chosen.index(class_of(names[row])) for row in rows])
+        clouds[split] = Clouds(
+            torch.cat([crops_of[row] for row in rows]),
+            labels.repeat_interleave(crops),
+            torch.tensor(rows).repeat_interleave(crops) if crops > 1 else None,
+        )
     if crop != "surface":
         return replace(make_dataset("clouds", clouds, chosen, None, folder), notes=notes)
     digest = hashlib.sha256(repr(("meshes", VERSION, n_points, seed, chosen)).encode())
-    for path, split, source in zip(names, splits, sources, strict=True):
-        digest.update(repr((split, str(path), source.digest)).encode())
+    for path, split, of_file in zip(names, splits, digests, strict=True):
+        digest.update(repr((split, str(path), of_file)).encode())
     return CloudDataset(chosen, clouds["train"], clouds["test"], digest.hexdigest(), notes)
 
 
@@ -175,25 +148,29 @@ def _read_files(
     crops: int,
     seed: int,
     cache: str | Path | None,
-) -> list[Source]:
-    """Sample the surfaces of meshes, or draw crops of clouds."""
+) -> tuple[list[Tensor], list[str]]:
+    """Sample the surfaces of meshes, or draw crops of clouds.
+
+    Returns:
+        The clouds of every file, ``(crops, n_points, 3)``, and the sha256 of every mesh's file.
+    """
     kept = Path(cache).expanduser() if cache else None
     if kept is not None:
         remove_temporary(kept, below=False)
     console = Console(stderr=True)
-    sources = []
+    clouds, digests = [], []
     for name in track(names, "Reading files", console=console, disable=not console.is_terminal):
         path = folder / name
         if crop == "surface":
             digest, cloud = sample_surface(path, n_points, seed, kept)
-            sources.append(Source(cloud[None], digest=digest))
+            clouds.append(cloud[None])
+            digests.append(digest)
             continue
         rng = np.random.default_rng(derive_seed(seed, zlib.crc32(str(name).encode())))
         points = read(path, max(10_000, 8 * n_points), seed).finite().points
         drawn = torch.from_numpy(random_crops(points, n_points, crops, crop, rng, path))
-        box: Box = np.stack([points.min(0), points.max(0)])
-        sources.append(Source(normalize_unit_sphere(drawn), box))
-    return sources
+        clouds.append(normalize_unit_sphere(drawn))
+    return clouds, digests
 
 
 def random_crops(
@@ -234,45 +211,30 @@ def random_crops(
     return crops
 
 
-def _splits(
-    folder: Path,
-    names: list[PurePosixPath],
-    sources: list[Source],
-    splits: list[str],
-    classes: tuple[str, ...],
-) -> dict[str, Clouds]:
-    """Return the clouds of both splits."""
-    clouds: dict[str, Clouds] = {}
-    for split in SPLITS:
-        rows = [i for i, of_file in enumerate(splits) if of_file == split]
-        if not rows:
-            raise UserError(f"root: {folder} has no {split} file of {', '.join(classes)}.")
-        each = len(sources[0].clouds)
-        labels = torch.tensor([classes.index(class_of(names[i])) for i in rows])
-        clouds[split] = Clouds(
-            torch.cat([sources[i].clouds for i in rows]),
-            labels.repeat_interleave(each),
-            torch.tensor(rows).repeat_interleave(each) if each > 1 else None,
-        )
-    return clouds
-
-
 def _notes(
     folder: Path, names: list[PurePosixPath], splits: list[str], classes: tuple[str, ...]
 ) -> dict[str, Any]:
-    """Return facts for the run record; print what a user may not expect."""
-    left_out = splits.count("")
-    notes: dict[str, Any] = {f"{split}_files": splits.count(split) for split in SPLITS}
-    notes["left_out_files"] = left_out
-    warnings = []
-    if left_out:
-        warnings.append(f"{left_out} training files left out because they touch a test file.")
-    found = {(class_of(name), split) for name, split in zip(names, splits, strict=True)}
+    """Return facts for the run record; print which classes are missing in a split.
+
+    Raises:
+        UserError: a split has no file.
+    """
+    notes: dict[str, Any] = {}
     for split, consequence in zip(SPLITS, ("never learned", "never scored"), strict=True):
-        missing = [name for name in classes if (name, split) not in found]
+        found = {
+            class_of(name) for name, of_file in zip(names, splits, strict=True) if of_file == split
+        }
+        missing = [name for name in classes if name not in found]
+        if not found:
+            raise UserError(
+                f"root: {folder} has no {split} file of {', '.join(classes)}: give at least two "
+                "files, because a file is in one split only."
+            )
+        notes[f"{split}_files"] = splits.count(split)
         if missing:
             notes[f"classes_without_{split}_files"] = missing
-            warnings.append(f"no {split} file of {', '.join(missing)}: {consequence}.")
-    for warning in warnings:
-        print(f"{folder}: {warning}", file=sys.stderr)
+            print(
+                f"{folder}: no {split} file of {', '.join(missing)}: {consequence}.",
+                file=sys.stderr,
+            )
     return notes
