@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, make_dataset
-from mops_lightning.data.formats.guard import naming_file
+from mops_lightning.data.formats.guard import reading
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import memory
 
@@ -68,10 +68,8 @@ def read_lines(path: Path) -> list[str]:
     Raises:
         UserError: the file cannot be read.
     """
-    try:
+    with reading(path):
         lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"root: cannot read {path}: {error}.") from error
     return [line.strip() for line in lines if line.strip()]
 
 
@@ -90,7 +88,7 @@ def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:
         raise UserError(f"n_points must be at least 1, got {n_points}.")
     if not path.is_file():
         raise UserError(f"root: {path} is missing. Complete the folder, or use another root.")
-    with naming_file(path), h5py.File(path, "r") as file:
+    with reading(path), h5py.File(path, "r") as file:
         data, label = _dataset(path, file, "data"), _dataset(path, file, "label")
         if (
             data.ndim != 3

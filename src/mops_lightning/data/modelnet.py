@@ -1,9 +1,9 @@
 """ModelNet40 in its public HDF5 format, ``modelnet40_ply_hdf5_2048``."""
 
 import re
+import shutil
 import sys
 import tempfile
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +14,6 @@ from filelock import FileLock
 from mops_lightning.data.clouds import CloudDataset, Clouds, make_dataset
 from mops_lightning.data.hdf5 import read_clouds, read_lines, read_names
 from mops_lightning.errors import UserError, one_line
-from mops_lightning.filesystem import memory
 
 FOLDER = "modelnet40_ply_hdf5_2048"
 MIRRORS = (
@@ -25,7 +24,7 @@ ARCHIVE_HASH = "md5:c9ab8e6dfb16f67afdab25e155c79e59"
 TIMEOUT = 60.0
 """Seconds without a byte after which a mirror is given up."""
 
-LOOKED_FOR = "shape_names.txt, train_files.txt, test_files.txt and ply_data_{train,test}*.h5"
+LOOKED_FOR = "shape_names.txt, train_files.txt, test_files.txt and the files that they list"
 
 
 def modelnet40(
@@ -76,11 +75,8 @@ def modelnet40(
 
 
 def _find(root: Path) -> Path | None:
-    for folder in (root, root / FOLDER):
-        names = [folder / name for name in ("shape_names.txt", "train_files.txt")]
-        if any(name.is_file() for name in names) or any(folder.glob("ply_data_train*.h5")):
-            return folder
-    return None
+    folders = (root, root / FOLDER)
+    return next((folder for folder in folders if (folder / "train_files.txt").is_file()), None)
 
 
 def _download(root: Path) -> Path:
@@ -119,24 +115,14 @@ def _fetch(folder: Path) -> Path:
 def _unpack(archive: Path, folder: Path) -> None:
     """Unpack the archive's top folder as ``folder``, completely or not at all."""
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as name:
-        with zipfile.ZipFile(archive) as packed:
-            size = sum(member.file_size for member in packed.infolist())
-            if size > memory(archive):
-                raise UserError(f"{archive} unpacks to {size:,} bytes, far more than its own.")
-            packed.extractall(name)
+        shutil.unpack_archive(archive, name)
         (Path(name) / FOLDER).replace(folder)
 
 
 def _files(folder: Path, split: str) -> list[Path]:
-    """Return the files of a split; lists contain paths of other machines, so only names count."""
-    listing = folder / f"{split}_files.txt"
-    if listing.is_file():
-        files = [folder / re.split(r"[/\\]", line)[-1] for line in read_lines(listing)]
-    else:
-        files = sorted(
-            folder.glob(f"ply_data_{split}*.h5"),
-            key=lambda f: (int(re.sub(r"\D", "", f.stem) or 0), f.name),
-        )
+    """Return the files of a split; the list contains paths of other machines: only names count."""
+    lines = read_lines(folder / f"{split}_files.txt")
+    files = [folder / re.split(r"[/\\]", line)[-1] for line in lines]
     if not files:
-        raise UserError(f"root: no ply_data_{split}*.h5 in {folder}.")
+        raise UserError(f"root: {folder / f'{split}_files.txt'} lists no files.")
     return files
