@@ -24,7 +24,8 @@ from mops_lightning.data.procedural.airplane import airplane
 from mops_lightning.data.procedural.furniture import bed, desk, lamp, shelf, table
 from mops_lightning.data.procedural.seats import chair, sofa, stool
 from mops_lightning.data.procedural.vessels import bottle, bowl, bucket, cup, goblet, teapot, vase
-from mops_lightning.data.surfaces import cached, unit_sphere
+from mops_lightning.data.surfaces import cached
+from mops_lightning.data.unit_sphere import UnitSphere
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import remove_temporary
 
@@ -144,4 +145,5 @@ def _cloud(name: str, n_points: int, seed: int, split: int, i: int) -> NDArray[n
     cos, sin = np.cos(angle), np.sin(angle)
     number = int(spread.generate_state(1, np.uint64)[0])
     cloud = np.asarray(trimesh.sample.sample_surface(mesh, n_points, seed=number)[0])
-    return unit_sphere(cloud @ ((cos, 0, -sin), (0, 1, 0), (sin, 0, cos)))
+    cloud = cloud @ ((cos, 0, -sin), (0, 1, 0), (sin, 0, cos))
+    return UnitSphere.around(cloud).normalise(cloud).numpy()

@@ -18,39 +18,13 @@ from torch import Tensor
 from mops_lightning.data.formats.guard import check_coordinates, check_size
 from mops_lightning.data.formats.registry import open_cloud_file
 from mops_lightning.data.formats.table import CloudFile, Table
+from mops_lightning.data.unit_sphere import UnitSphere, largest_distance
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fused import FusedMOPSNet
-
-
-class UnitSphere(NamedTuple):
-    """A cloud's centre ``(3,)`` and the largest distance of a point from it."""
-
-    centre: NDArray[np.float64]
-    radius: float
-
-    @classmethod
-    def around(cls, points: NDArray[np.float64]) -> "UnitSphere":
-        """Measure a cloud ``(n, 3)``."""
-        centre = points.sum(0) / len(points)
-        return cls(centre, largest_distance(points, centre) or 1.0)
-
-    def normalise(self, points: NDArray[np.float64]) -> Tensor:
-        """Return points ``(n, 3)`` of the cloud in the unit sphere, float32."""
-        return torch.from_numpy(((points - self.centre) / self.radius).astype(np.float32))
-
-    def restore(self, points: Tensor) -> NDArray[np.float64]:
-        """Return points ``(n, 3)`` of the unit sphere in the file's own unit."""
-        restored: NDArray[np.float64] = points.double().numpy() * self.radius + self.centre
-        return restored
-
-
-def largest_distance(points: NDArray[np.float64], centre: NDArray[np.float64]) -> float:
-    """Return the largest distance of points ``(n, 3)`` from ``centre`` ``(3,)``."""
-    return float(np.linalg.norm(points - centre, axis=1).max(initial=0.0))
 
 
 class Nearest(NamedTuple):

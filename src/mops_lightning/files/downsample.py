@@ -11,8 +11,9 @@ from torch import Tensor
 from mops_lightning.data.formats.guard import check_coordinates, check_size
 from mops_lightning.data.formats.registry import read, write
 from mops_lightning.data.formats.table import Table
+from mops_lightning.data.unit_sphere import UnitSphere
 from mops_lightning.errors import UserError
-from mops_lightning.files.chunks import Outcome, UnitSphere, sample_by_chunks
+from mops_lightning.files.chunks import Outcome, sample_by_chunks
 from mops_lightning.files.engine import Engine, LocalEngine
 from mops_lightning.files.options import Options
 from mops_lightning.files.tiles import sample_by_tiles

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from mops_lightning.data.unit_sphere import UnitSphere
 from mops_lightning.errors import UserError
 from mops_lightning.ops.readout import select
 from mops_lightning.samplers.base import Sampler
@@ -64,8 +65,9 @@ def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler) -> Rows
         step = max(BATCH // n, 1)
         for first in range(0, len(places) if number else 0, step):
             batch = places[first : first + step]
-            stacked = np.stack([points[tiles[place]] for place in batch])
-            rows = sample_tiles(sampler, _normalised(stacked), number).numpy()
+            clouds = [points[tiles[place]] for place in batch]
+            stacked = torch.stack([UnitSphere.around(one).normalise(one) for one in clouds])
+            rows = sample_tiles(sampler, stacked, number).numpy()
             for place, chosen in zip(batch, rows, strict=True):
                 selected[place] = tiles[place][chosen]
     kept = np.concatenate(selected)
@@ -107,13 +109,6 @@ def shares(m: int, sizes: list[int]) -> Rows:
     """
     ends = np.cumsum([0, *sizes], dtype=np.int64)
     return np.diff(m * ends // ends[-1])
-
-
-def _normalised(tiles: Points) -> Tensor:
-    """Return tiles ``(B, n, 3)`` in the unit sphere, as in training."""
-    centred = tiles - tiles.mean(1, keepdims=True)
-    radius = np.linalg.norm(centred, axis=2).max(1)[:, None, None]
-    return torch.from_numpy((centred / np.where(radius > 0, radius, 1.0)).astype(np.float32))
 
 
 @torch.no_grad()
