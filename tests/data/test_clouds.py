@@ -1,7 +1,13 @@
 import pytest
 import torch
 
-from mops_lightning.data.clouds import Clouds, choose_classes, noisy
+from mops_lightning.data.clouds import (
+    CloudDataset,
+    Clouds,
+    choose_classes,
+    noisy,
+    scale_warning,
+)
 from mops_lightning.errors import UserError
 
 KNOWN = ("chair", "lamp", "table")
@@ -49,3 +55,12 @@ def test_noisy_depends_on_position_and_scales(rng):
     torch.testing.assert_close(10 * small, large, atol=1e-5, rtol=1e-4)
     assert not torch.equal(small[0], small[1])
     assert torch.equal(noisy(split_of(points), 0.0).points, points)
+
+
+@pytest.mark.parametrize(("scale", "warned"), [(1, False), (0.01, True), (100, True)])
+def test_scale_warning_names_the_radius(scale, warned, rng):
+    points = torch.nn.functional.normalize(torch.randn(5, 30, 3, generator=rng), dim=2)
+    clouds = split_of(points * scale)
+    warning = scale_warning(CloudDataset(("a",), clouds, clouds, ""))
+    assert (warning is not None) == warned
+    assert not warned or f"about {scale:g} from the origin" in str(warning)

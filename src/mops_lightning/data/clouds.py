@@ -137,3 +137,14 @@ def noisy(clouds: Clouds, noise: float) -> Clouds:
         torch.randn(points.shape[1:], generator=generator(NOISE, s)) for s in range(len(points))
     ]
     return clouds._replace(points=points + noise * torch.stack(drawn))
+
+
+def scale_warning(dataset: CloudDataset) -> str | None:
+    """Return one line about training clouds far from the unit sphere, else None."""
+    radius = dataset.train.points.norm(dim=2).amax(1).median().item()
+    if 0.5 <= radius <= 2:
+        return None
+    return (
+        f"dataset: the farthest points of the clouds are about {radius:.3g} from the origin, but "
+        "nets and samplers are made for the unit sphere. Centre and scale the clouds first."
+    )

@@ -1,5 +1,6 @@
 """One run: load the data, pretrain the task net if needed, fit, test, save."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from mops_lightning.config import distributed
 from mops_lightning.config.build import build
 from mops_lightning.config.validate import check
-from mops_lightning.data.clouds import CloudDataset, noisy
+from mops_lightning.data.clouds import CloudDataset, noisy, scale_warning
 from mops_lightning.errors import Interrupted, UserError, closed_outputs
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
@@ -172,6 +173,8 @@ def _load_data(cfg: DictConfig) -> CloudDataset:
             f"dataset: {cfg.dataset.get('_target_')} must return a CloudDataset, got "
             f"{type(dataset).__name__}."
         )
+    if warning := scale_warning(dataset):
+        print(warning, file=sys.stderr)
     test = noisy(dataset.test, cfg.test_noise_std)
     if not torch.isfinite(test.points).all():
         raise UserError(
