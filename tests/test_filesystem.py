@@ -1,3 +1,4 @@
+import os
 import resource
 import zipfile
 
@@ -68,6 +69,23 @@ def test_load_npz_small_file_of_large_arrays_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(filesystem, "MEMORY", 1000)
     with pytest.raises(UserError, match=r"a\.npz is broken: .* bytes announced"):
         load_npz(tmp_path / "a.npz")
+
+
+def test_load_npz_of_a_pipe_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "a.npz")
+    with pytest.raises(UserError, match=r"a\.npz is broken: FileNotFoundError"):
+        load_npz(tmp_path / "a.npz")
+
+
+def test_atomic_write_keeps_a_pipe_and_a_link_to_a_device(tmp_path):
+    os.mkfifo(tmp_path / "pipe.ply")
+    (tmp_path / "null.ply").symlink_to("/dev/null")
+    for path in (tmp_path / "pipe.ply", tmp_path / "null.ply"):
+        with pytest.raises(OSError, match="not a file") as error, atomic_write(path):
+            pass
+        assert file_error(error.value) == f"{path}: is a folder, a pipe or a device, not a file."
+        assert not path.is_file()
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_load_npz_pickled_objects_are_refused(tmp_path):

@@ -1,5 +1,6 @@
 """Files that are written whole or not at all, what a kill leaves, and unpacking."""
 
+import errno
 import os
 import sys
 import tempfile
@@ -34,8 +35,13 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
     Yields:
         The temporary path, in the same folder and with the same suffix.
+
+    Raises:
+        OSError: the file cannot be written, or ``path`` is a folder, a pipe or a device.
     """
     path = Path(path)
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EEXIST, "is a folder, a pipe or a device, not a file", str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     # A part of the name only: with all of a long one the temporary name would be too long.
     prefix = f"{TEMPORARY}{path.stem[:32]}-"
@@ -119,6 +125,8 @@ def load_npz(path: Path) -> dict[str, Any]:
     import numpy as np
 
     try:
+        if not path.is_file():  # a pipe may never end
+            raise FileNotFoundError("no such file")
         with zipfile.ZipFile(path) as packed:
             announced = sum(info.file_size for info in packed.infolist())
         if announced > memory(path):
