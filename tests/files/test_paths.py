@@ -30,7 +30,7 @@ def inputs(tmp_path, monkeypatch):
     ],
 )
 def test_outputs_follow_inputs(source, target, expected, inputs):
-    found = file_pairs(Path(source), Path(target), False)
+    found = file_pairs(Path(source), Path(target))
     assert [str(path) for _, path in found] == expected
 
 
@@ -40,7 +40,6 @@ def test_outputs_follow_inputs(source, target, expected, inputs):
         ("b.npy", "b.npy", "OUT must differ from IN"),
         ("b.npy", "b.npy/below.ply", "b.npy is a file, not a folder"),
         ("b.npy", "out.stl", "OUT must end in"),
-        ("b.npy", "out.obj", ".obj holds coordinates only"),
         ("nowhere", "out", "nowhere: no such file or folder"),
         ("in", "b.npy", "OUT must be a folder"),
         ("empty", "out", "empty contains no file"),
@@ -51,7 +50,7 @@ def test_impossible_output_is_rejected(source, target, message, inputs):
     Path("empty").mkdir()
     Path("in/c.ply").touch()
     with pytest.raises(UserError, match=message):
-        file_pairs(Path(source), Path(target), True)
+        file_pairs(Path(source), Path(target))
 
 
 @pytest.mark.parametrize(
@@ -71,5 +70,5 @@ def test_outputs_links_and_temporary_files_are_no_inputs(inputs):
     Path("in/loop.npy").symlink_to("loop.npy")
     Path("in/circle").symlink_to("../in")
     Path(f"in/{TEMPORARY}a-x.npy").touch()
-    found = file_pairs(Path("in"), Path("out"), False)
+    found = file_pairs(Path("in"), Path("out"))
     assert [str(path) for path, _ in found] == ["in/a.npy", "in/c.stl", "in/deep/b.ply"]

@@ -31,7 +31,7 @@ def seeds(folder):
     made = {
         kind: (suffix, [_written(folder, suffix, table) for table in tables])
         for kind, suffix in (("ply", ".ply"), ("pcd", ".pcd"), ("bin", ".bin"), ("npy", ".npy"),
-                             ("npz", ".npz"), ("xyz", ".xyz"), ("obj cloud", ".obj"))
+                             ("npz", ".npz"), ("xyz", ".xyz"))
     }  # fmt: skip
     rows = np.zeros(40, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("label", "i4")])
     made["npy"][1].append(_saved(lambda file: np.save(file, rows)))

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.data.formats.guard import reading
-from mops_lightning.data.formats.mesh import parse_mesh
+from mops_lightning.data.formats.mesh import sample_mesh
+from mops_lightning.data.unit_sphere import UnitSphere
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write, load_npz
 
@@ -44,20 +45,11 @@ def sample_surface(
     kept = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.npz" if cache else None
 
     def sample() -> list[NDArray[np.float32]]:
-        from trimesh.sample import sample_surface
-
-        mesh = parse_mesh(data, path)
         random = np.random.default_rng([seed, int(digest[:16], 16)])
-        return [unit_sphere(np.asarray(sample_surface(mesh, n_points, seed=random)[0]))]
+        points, _ = sample_mesh(path, data, n_points, random)
+        return [UnitSphere.around(points).normalise(points).numpy()]
 
     return digest, torch.from_numpy(cached(kept, [(n_points, 3)], sample)[0])
-
-
-def unit_sphere(points: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Centre ``(N, 3)`` points at the origin and scale the largest norm to 1."""
-    points = points - points.mean(axis=0)
-    radius = np.linalg.norm(points, axis=1).max()
-    return (points / radius if radius > 0 else points).astype(np.float32)
 
 
 def cached(

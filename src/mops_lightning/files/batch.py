@@ -4,23 +4,24 @@ Worker processes import this module, so it imports torch only when there is a fi
 """
 
 import os
-import signal
 import sys
 import time
 from collections import Counter
 from collections.abc import Generator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.progress import track
 
-from mops_lightning.data.formats import guard
 from mops_lightning.errors import UserError, one_line, printable
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.files.paths import FilePair
-from mops_lightning.files.processes import Died, processes
+from mops_lightning.ops.workers import start_worker
 
 if TYPE_CHECKING:
     from mops_lightning.files.chunks import Outcome
@@ -124,29 +125,30 @@ def process_folder(
 def _results(
     pairs: list[FilePair], options: Options, workers: int, engine: Engine | None
 ) -> Generator["tuple[FilePair, Outcome | UserError]", None, None]:
-    """Yield pairs of files and results, in the order of completion.
-
-    Several files are read in other processes, so that one bad file cannot stop the rest; with
-    ``--cluster`` the cluster's processes read them.
-    """
-    if engine is not None or len(pairs) < 2:
+    """Yield pairs of files and results, in the order of completion."""
+    workers = min(workers, len(pairs))
+    if engine is not None or workers < 2:
         yield from ((pair, attempt(*pair, options, engine=engine)) for pair in pairs)
         return
-    shared = workers if workers > 1 else None
-    calls = ((*pair, options, shared) for pair in pairs)
-    for place, result in processes(min(workers, len(pairs))).map(attempt, calls):
-        yield pairs[place], _death(pairs[place][0], result) if isinstance(result, Died) else result
+    # Spawned, because forking after torch has started threads can deadlock.
+    with ProcessPoolExecutor(workers, get_context("spawn"), start_worker) as executor:
+        pair_of = {executor.submit(attempt, *pair, options, workers): pair for pair in pairs}
+        try:
+            for future in as_completed(pair_of):
+                pair = pair_of[future]
+                try:
+                    yield pair, future.result()
+                except BrokenProcessPool:
+                    yield pair, _death(pair[0])
+        except BaseException:  # interrupted
+            for process in active_children():
+                process.terminate()
+            raise
 
 
-def _death(source: Path, died: Died) -> UserError:
-    """Return the error of a file whose process died."""
-    if died.signal == getattr(signal, "SIGALRM", -1):
-        return UserError(
-            f"{source} is broken or very slow to read: it took more than "
-            f"{guard.seconds(source):.0f} s. Downsample it alone, without a limit."
-        )
-    how = f" (signal {died.signal})" if died.signal else ""
+def _death(source: Path) -> UserError:
+    """Return the error of a file that was not done because a process died."""
     return UserError(
-        f"{source} is broken or needs too much memory: its process died{how}. Downsample it alone, "
-        "or run the same command again with fewer --workers."
+        f"{source}: its process died, perhaps for lack of memory. Run the same command again with "
+        "fewer --workers."
     )

@@ -16,7 +16,7 @@ from mops_lightning.zoo.names import UNTRAINED
 DESCRIPTION = """Downsample clouds and meshes from files.
 
 IN is a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt .off .obj .stl .glb) or a folder of them,
-OUT a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt .obj) or a folder. Clouds are normalised to
+OUT a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt) or a folder. Clouds are normalised to
 the unit sphere, as in training, sampled by a trained sampler (--weights) or an untrained method
 (--method), and mapped back. Meshes are first sampled on their surface."""
 
@@ -89,7 +89,7 @@ def _run(chosen: argparse.Namespace) -> int:
     load_sampler(options)  # reports its mistakes before any file is read
     if chosen.cluster:  # workers may have a different working directory
         chosen.source = chosen.source.absolute()
-    pairs = file_pairs(chosen.source, chosen.target, chosen.keep_attributes)
+    pairs = file_pairs(chosen.source, chosen.target)
     is_folder = chosen.source.is_dir()
     if not is_folder and pairs[0][1].exists() and not chosen.overwrite:
         raise UserError(f"{pairs[0][1]} exists. Give another OUT, or --overwrite.")

@@ -12,7 +12,7 @@ FilePair = tuple[Path, Path]
 """An input file and its output file."""
 
 
-def file_pairs(source: Path, target: Path, keep_attributes: bool) -> list[FilePair]:
+def file_pairs(source: Path, target: Path) -> list[FilePair]:
     """Return the input files and their output files.
 
     An output file in a folder has the format of its input, or .ply where that cannot be written.
@@ -20,33 +20,32 @@ def file_pairs(source: Path, target: Path, keep_attributes: bool) -> list[FilePa
     Args:
         source: a file or a folder.
         target: a file or a folder; a folder if ``source`` is one.
-        keep_attributes: the output format must hold attributes.
 
     Raises:
         UserError: an input is missing, or an output is ambiguous or cannot be written.
     """
     if not source.exists():
         raise UserError(f"{source}: no such file or folder.")
-    if keep_attributes and target.suffix.lower() == ".obj":
-        raise UserError("--keep-attributes: .obj holds coordinates only. Use .ply, .pcd or .npz.")
     if realpath(target) == realpath(source):
         raise UserError(f"OUT must differ from IN, got {source} for both.")
     if blocking := next((p for p in target.parents if p.exists() and not p.is_dir()), None):
         raise UserError(f"OUT: {blocking} is a file, not a folder. Give another OUT.")
-
-    def suffix(path: Path) -> str:
-        own = path.suffix.lower()
-        loses_attributes = own == ".obj" and keep_attributes
-        return own if own in WRITERS and not loses_attributes else ".ply"
-
     if source.is_dir():
-        goals = {path: path.relative_to(source) for path in _inputs(source, target)}
-        return _distinct([(p, target / g.with_suffix(suffix(p))) for p, g in goals.items()])
+        inputs = _inputs(source, target)
+        return _distinct(
+            [(path, _output(path, target / path.relative_to(source))) for path in inputs]
+        )
     if target.is_dir():
-        target = target / f"{source.stem}{suffix(source)}"
+        target = _output(source, target / source.name)
     if target.suffix.lower() not in WRITERS:
         raise UserError(f"OUT must end in one of {', '.join(WRITERS)}, got {target}.")
     return [(source, target)]
+
+
+def _output(source: Path, path: Path) -> Path:
+    """Return ``path`` with the suffix of ``source``, or .ply where that cannot be written."""
+    own = source.suffix.lower()
+    return path.with_suffix(own if own in WRITERS else ".ply")
 
 
 def _inputs(source: Path, target: Path) -> list[Path]:

@@ -1,5 +1,6 @@
 """What holds for every format: what is written is read again, and bad files are named."""
 
+import os
 from typing import Any
 
 import laspy
@@ -39,7 +40,7 @@ def test_points_and_columns_round_trip(table, suffix, tmp_path):
         np.testing.assert_allclose(again.columns[name], column, rtol=1e-6)
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".bin", ".obj", ".las", ".laz"])
+@pytest.mark.parametrize("suffix", [".npy", ".bin", ".las", ".laz"])
 def test_points_round_trip(table, suffix, tmp_path):
     again = read(written(table, suffix, tmp_path), 100, 0)
     np.testing.assert_allclose(again.points, table.points, atol=1e-6)
@@ -87,7 +88,7 @@ def test_awkward_columns_keep_numbers(suffix, tmp_path):
 
 def test_coordinates_beyond_float32_keep_digits(tmp_path):
     points = np.random.default_rng(0).random((20, 3)) + 1e9
-    for suffix in (".pcd", ".obj", ".xyz"):
+    for suffix in (".pcd", ".xyz"):
         again = read(written(Table(points), suffix, tmp_path), 9, 0)
         np.testing.assert_allclose(again.points, points, rtol=0, atol=1e-6)
     with pytest.raises(UserError, match="holds float32"):
@@ -147,6 +148,9 @@ HEAD = (
         ("a.pcd", HEAD.encode() + b"DATA binary\n123", "a.pcd is broken"),
         ("a.pcd", HEAD.encode() + b"DATA binary_compressed\n\x03\0\0\0\x80\x02\0\0123", "broken"),
         ("a.ply", b"ply\nformat", "a.ply is broken"),
+        ("a.ply", ASCII.replace("vertex 2", "vertex 0").encode(), "a.ply holds no points"),
+        ("a.pcd", HEAD.replace("POINTS 40", "POINTS 0").encode() + b"DATA ascii\n", "no points"),
+        ("a.txt", b"1000\n1 2 3\n4 5 6\n", "announces 1000 points, but has 2"),
         ("a.las", b"LASF", "a.las is broken"),
         ("a.off", b"OFF\n1 0 0\n0 0 0\n", "no faces"),
         ("a.jpg", b"", "must end in .ply"),
@@ -156,6 +160,14 @@ def test_bad_file_is_named(name, content, said, tmp_path):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(UserError, match=said):
         read(tmp_path / name, 10, 0)
+
+
+def test_pipe_and_endless_device_are_no_files(tmp_path):
+    os.mkfifo(tmp_path / "a.ply")
+    (tmp_path / "a.bin").symlink_to("/dev/zero")
+    for name in ("a.ply", "a.bin"):
+        with pytest.raises(UserError, match=rf"{name}: not a file"):
+            read(tmp_path / name, 9, 0)
 
 
 @pytest.mark.parametrize("suffix", WRITERS)

@@ -1,10 +1,5 @@
-"""Reading damaged files: errors that name the file, and limits in time and memory.
+"""Errors of files that hold no usable cloud: each names its file."""
 
-A damaged or crafted file can make a parser run for hours or allocate any amount of memory. Where
-files are read in separate processes, the system ends a process that exceeds a limit.
-"""
-
-import signal
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,15 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mops_lightning.errors import UserError, one_line
-from mops_lightning.filesystem import memory
-
-try:
-    import resource
-except ModuleNotFoundError:  # Windows
-    resource = None  # type: ignore[assignment]
-
-SECONDS, BYTES_PER_SECOND = 60.0, 200_000
-"""A file may take this long, and longer if it is large."""
 
 LARGEST = 1e150
 """Largest coordinate."""
@@ -30,54 +16,6 @@ LARGEST = 1e150
 
 class BadCloudError(UserError):
     """A file that holds no usable cloud or mesh."""
-
-
-class _State:
-    limits_are_on = False
-
-
-def turn_on_limits() -> None:
-    """Apply the limits in this process from now on; the system ends it when one is exceeded."""
-    _State.limits_are_on = resource is not None
-    if _State.limits_are_on:
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
-
-
-def seconds(path: Path) -> float:
-    """Return the time limit of a file."""
-    return SECONDS + path.stat().st_size / BYTES_PER_SECOND
-
-
-@contextmanager
-def limited(path: Path) -> Iterator[None]:
-    """Read ``path`` within the limits, if they are turned on in this process.
-
-    Raises:
-        MemoryError: more memory is needed than the file may take.
-    """
-    if not _State.limits_are_on:
-        yield
-        return
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    most = _data_bytes() + memory(path)
-    if before[1] == resource.RLIM_INFINITY or most < before[1]:
-        resource.setrlimit(resource.RLIMIT_DATA, (most, before[1]))
-    # The system's timer also ends a parser that never returns to Python.
-    signal.setitimer(signal.ITIMER_REAL, seconds(path))
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        resource.setrlimit(resource.RLIMIT_DATA, before)
-
-
-def _data_bytes() -> int:
-    """Return the memory that counts for RLIMIT_DATA; 0 on systems that do not tell."""
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmData"))
-    except (OSError, StopIteration, ValueError):
-        return 0
 
 
 @contextmanager
@@ -103,14 +41,14 @@ def naming_file(path: Path) -> Iterator[None]:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Read ``path`` within the limits; any error names the file.
+    """Read ``path``; any error names the file.
 
     Raises:
-        BadCloudError: the file is missing or broken.
+        BadCloudError: the file is missing or broken, or is a pipe or a device, which may never end.
     """
     if not path.is_file():
-        raise BadCloudError(f"{path}: no such file.")
-    with limited(path), naming_file(path):
+        raise BadCloudError(f"{path}: {'not a file' if path.exists() else 'no such file'}.")
+    with naming_file(path):
         yield
 
 

@@ -1,14 +1,15 @@
 """Mesh files: OFF, OBJ, PLY, STL and GLB, parsed by trimesh."""
 
-import json
 import re
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mops_lightning.data.formats.guard import BadCloudError, naming_file
+from mops_lightning.data.formats.isolated import isolated
 from mops_lightning.data.formats.ply import plain_header
 
 if TYPE_CHECKING:
@@ -22,8 +23,35 @@ FLAT = 1e-12
 MAX_MATERIALS = 1000
 """In an OBJ file with more, materials are ignored: trimesh's time grows with their square."""
 
-VALUES_PER_BYTE = 100
-"""Most values that a GLB scene may have per byte of its file, by repeating meshes."""
+
+def sample_mesh(
+    path: Path, data: bytes, number: int, seed: int | np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Sample points on the surface of a mesh, uniform by area.
+
+    Args:
+        path: path of the file, for its suffix and for errors.
+        data: content of the file.
+        number: number of points.
+        seed: of the draw.
+
+    Returns:
+        The points ``(number, 3)``, and the normals of their faces ``(number, 3)``.
+
+    Raises:
+        BadCloudError: the file is not a valid mesh with a surface.
+    """
+    return isolated(_sample, path, data, number, seed)
+
+
+def _sample(
+    path: Path, data: bytes, number: int, seed: int | np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    from trimesh.sample import sample_surface
+
+    mesh = parse_mesh(data, path)
+    points, faces = sample_surface(mesh, number, seed=seed)
+    return np.asarray(points, np.float64), np.asarray(mesh.face_normals)[faces].astype(np.float32)
 
 
 def parse_mesh(data: bytes, path: Path) -> "Trimesh":
@@ -90,8 +118,6 @@ def _load(data: bytes, kind: str) -> "Trimesh":
         data = re.sub(rb"(?m)^[ ]*usemtl.*$", b"", data)
     if kind == ".ply":
         data = plain_header(data)
-    if kind == ".glb":
-        _check_glb(data)
     # Materials do not affect the surface, and their files may be missing.
     extra: dict[str, Any] = {"skip_materials": True} if kind != ".off" else {}
     scene: Any = trimesh.load(
@@ -111,33 +137,3 @@ def _announced_faces(data: bytes, kind: str) -> int:
     else:
         return 0
     return int(counts[1]) if counts else 0
-
-
-def _check_glb(data: bytes) -> None:
-    """Reject a scene that needs much more memory than its file, or whose parts are not a tree."""
-    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    limit = VALUES_PER_BYTE * len(data)
-    counts = [accessor["count"] for accessor in tree.get("accessors", [])]
-    if sum(counts) > limit:
-        raise ValueError(f"{sum(counts)} values announced in {len(data)} bytes")
-    sizes = [_glb_values(mesh, counts) for mesh in tree.get("meshes", [])]
-    nodes: list[dict[str, Any]] = tree.get("nodes", [])
-    total = sum(sizes) + sum(sizes[node["mesh"]] for node in nodes if "mesh" in node)
-    if total > limit:
-        raise ValueError(f"{total} values announced in {len(data)} bytes")
-    children = [child for node in nodes for child in node.get("children", [])]
-    if len(set(children)) < len(children):
-        raise ValueError("a part of the scene has two parents")
-    roots = set(range(len(nodes))) - set(children)
-    if nodes and not roots:
-        raise ValueError("the parts of the scene form a circle")
-
-
-def _glb_values(mesh: dict[str, Any], counts: list[int]) -> int:
-    """Return the number of values of a mesh's accessors."""
-    used = [
-        place
-        for part in mesh["primitives"]
-        for place in (*part["attributes"].values(), part.get("indices"))
-    ]
-    return sum(counts[place] for place in used if place is not None)

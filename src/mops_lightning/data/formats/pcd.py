@@ -7,6 +7,7 @@ import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 
+from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.table import (
     Column,
     Table,
@@ -26,6 +27,8 @@ def read(path: Path) -> Table:
     names = header["FIELDS"]
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
     number = int(header.get("POINTS", [header["WIDTH"][0]])[0])
+    if number < 1:
+        raise BadCloudError(f"{path} holds no points.")
     kinds = zip(header["TYPE"], header["SIZE"], counts, strict=True)
     layout = np.dtype(
         [

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.data.formats.isolated import isolated
 from mops_lightning.data.formats.table import (
     CloudFile,
     Column,
@@ -61,8 +62,12 @@ def read(path: Path) -> Table | None:
     """Read the vertices with all their properties; None for a mesh, which has faces as well.
 
     Raises:
-        BadCloudError: the file ends before its last vertex.
+        BadCloudError: the file is broken or ends before its last vertex.
     """
+    return isolated(_parse, path)
+
+
+def _parse(path: Path) -> Table | None:
     from trimesh.exchange.ply import load_ply
 
     with np.errstate(all="ignore"):
@@ -71,6 +76,8 @@ def read(path: Path) -> Table | None:
     if "faces" in found and len(found["faces"]):
         return None
     vertex = found["metadata"]["_ply_raw"]["vertex"]
+    if not vertex["length"]:
+        raise BadCloudError(f"{path} holds no points.")
     columns = _columns(vertex["data"])
     number, declared = len(next(iter(columns.values()))), vertex["length"]
     if number < declared:

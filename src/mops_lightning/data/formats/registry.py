@@ -3,12 +3,10 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from mops_lightning.data.formats import arrays, las, pcd, ply, text
 from mops_lightning.data.formats.guard import BadCloudError, reading
 from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
-from mops_lightning.data.formats.mesh import parse_mesh
+from mops_lightning.data.formats.mesh import sample_mesh
 from mops_lightning.data.formats.table import CloudFile, Table
 from mops_lightning.errors import one_line
 from mops_lightning.filesystem import atomic_write
@@ -16,14 +14,14 @@ from mops_lightning.filesystem import atomic_write
 READERS: dict[str, Callable[[Path], Table | None]] = {
     ".ply": ply.read, ".pcd": pcd.read, ".las": las.read, ".laz": las.read,
     ".bin": arrays.read_kitti, ".npy": arrays.read_npy, ".npz": arrays.read_npz,
-    ".xyz": text.read, ".txt": text.read, ".obj": text.read_obj,
+    ".xyz": text.read, ".txt": text.read,
 }  # fmt: skip
 """Readers of clouds; they return None for a mesh."""
 
 WRITERS: dict[str, Callable[[Path, Table], None]] = {
     ".ply": ply.write, ".pcd": pcd.write, ".las": las.write, ".laz": las.write,
     ".bin": arrays.write_kitti, ".npy": arrays.write_npy, ".npz": arrays.write_npz,
-    ".xyz": text.write, ".txt": text.write, ".obj": text.write_obj,
+    ".xyz": text.write, ".txt": text.write,
 }  # fmt: skip
 
 CHUNKED: dict[str, Callable[[Path], CloudFile]] = {
@@ -53,13 +51,8 @@ def read(path: Path, surface: int, seed: int) -> Table:
         table = READERS[suffix](path) if suffix in READERS else None
         if table is not None:
             return table
-        mesh = parse_mesh(path.read_bytes(), path)
-    from trimesh.sample import sample_surface  # a third of a second, which clouds do not need
-
-    points, faces = sample_surface(mesh, surface, seed=seed)
-    normals = np.asarray(mesh.face_normals)[faces].T
-    columns = dict(zip(("nx", "ny", "nz"), normals.astype(np.float32), strict=True))
-    return Table(np.asarray(points, np.float64), columns)
+        points, normals = sample_mesh(path, path.read_bytes(), surface, seed)
+    return Table(points, dict(zip(("nx", "ny", "nz"), normals.T, strict=True)))
 
 
 def write(path: Path, table: Table) -> None:

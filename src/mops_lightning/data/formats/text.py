@@ -1,4 +1,4 @@
-"""Text files: .xyz and .txt with one point per line, and Wavefront OBJ files without faces."""
+"""Text files: .xyz and .txt with one point per line."""
 
 import re
 from pathlib import Path
@@ -9,7 +9,6 @@ from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.table import (
     Column,
     Table,
-    compact_coordinates,
     from_array,
     from_columns,
     to_columns,
@@ -57,27 +56,6 @@ def write(path: Path, table: Table) -> None:
     header = "" if unnamed else " ".join(columns)
     formats = [_number_format(column) for column in columns.values()]
     np.savetxt(path, to_rows(columns), fmt=formats, header=header, comments="# ")
-
-
-def read_obj(path: Path) -> Table | None:
-    """Read the vertices of an OBJ file; None for a mesh, which has faces as well.
-
-    Raises:
-        BadCloudError: there are no vertices.
-    """
-    data = path.read_bytes()
-    if re.search(rb"^f\s", data, re.M):
-        return None
-    words = [line.split()[1:4] for line in data.splitlines() if line[:2] in (b"v ", b"v\t")]
-    if not words:
-        raise BadCloudError(f"{path} holds no vertices.")
-    return Table(np.array(words, np.float64))
-
-
-def write_obj(path: Path, table: Table) -> None:
-    """Write the vertices alone."""
-    points = compact_coordinates(table)
-    np.savetxt(path, points, fmt=f"v {' '.join([_number_format(points)] * 3)}")
 
 
 def _number_format(column: Column) -> str:
