@@ -38,6 +38,13 @@ def test_build_several_metrics_give_several_tables(tmp_path):
     assert "pointnet on all points: emd 0.06." in text
 
 
+def test_build_metric_of_one_task_gives_tables_of_this_task(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    put_pairs(tmp_path, "fps", 32, 12.0)
+    assert rows(table(tmp_path, "accuracy"))[1] == ["fps", "30.00"]
+    assert table(tmp_path, "accuracy").count("| sampled by |") == 1
+
+
 def test_build_registration_shows_degrees_and_icp_last(tmp_path):
     put_pairs(tmp_path, "fps", 32, 12.345)
     put_pairs(tmp_path, "fps", 32, 20.0, net="icp")

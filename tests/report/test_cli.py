@@ -44,6 +44,14 @@ def test_report_prints_written_table(tmp_path, capsys):
     assert text in capsys.readouterr().out
 
 
+def test_report_of_names_that_are_no_text_is_written(tmp_path):
+    odd = {"device": "\ud800", "recipe": {"name": ["fast"]}}
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3}, **odd)
+    main([str(tmp_path)])
+    assert "\\ud800" in (tmp_path / "table.csv").read_text()
+    assert "\\ud800" in (tmp_path / "report.html").read_text()
+
+
 def test_report_writes_all_files(tmp_path, capsys):
     put_planes(tmp_path)
     main([str(tmp_path)])

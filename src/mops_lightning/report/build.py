@@ -17,6 +17,7 @@ from mops_lightning.report.collect import (
     sampler_row,
     score,
     seed,
+    tested_metrics,
     trained_with,
     training_time,
 )
@@ -64,11 +65,13 @@ def build_report(folder: Path, metrics: Iterable[str] = (), mixed: bool = False)
     chosen = list(metrics)
     scored = [record for record in found.done if record.config["learn"] != "task"]
     parts = groups(scored, mixed) if scored else net_groups(found.done, mixed)
+    measured = tested_metrics(scored)
     tables = [
         make_table(part, metric, _net(part))
         for part in parts
         for metric in chosen or [score(part.records)]
-        if scored
+        # A metric of one task only has tables for it; make_table refuses an unknown one.
+        if scored and (metric not in measured or metric in tested_metrics(part.records))
     ]
     grids = [grid for table in tables for grid in _grids(table)]
     if not scored:

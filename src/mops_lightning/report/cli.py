@@ -12,6 +12,9 @@ from mops_lightning.report.text import latex, markdown
 
 PAGE = "report.html"
 
+ESCAPED = "backslashreplace"
+"""How files show the bytes of names that are no text, which Python reads as lone surrogates."""
+
 DESCRIPTION = """Write tables, plots and an HTML page of all run records below a folder.
 
 Reads result.json and runs.jsonl files only. As in the paper's tables, columns are sizes, and a cell
@@ -77,12 +80,12 @@ def write(report: Report, folder: Path) -> list[str]:
     }
     for name, text in texts.items():
         with atomic_write(folder / name) as temporary:
-            temporary.write_text(text)
+            temporary.write_text(text, errors=ESCAPED)
     drawn = [
         save_figure(figure, folder / f"{name}{suffix}", dpi=150)
         for name, figure in plots(report).items()
         for suffix in (".png", ".svg")
     ]
     with atomic_write(folder / PAGE) as temporary:
-        temporary.write_text(page(report, folder, drawn[1::2]))
+        temporary.write_text(page(report, folder, drawn[1::2]), errors=ESCAPED)
     return [*texts, PAGE, *(path.name for path in drawn)]

@@ -6,7 +6,7 @@ from typing import Any
 
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-from mops_lightning.records.readout_names import parse_metric_name
+from mops_lightning.records.readout_names import FULL, parse_metric_name
 from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
 from mops_lightning.records.summary import sampler_name
 
@@ -100,7 +100,7 @@ def sampler_row(record: RunRecord) -> str:
     That is ``anchored`` for a MOPS-Net with anchors, and its recipe unless it is the paper's.
     """
     parts = [sampler_name(record.config), recorded_recipe(record).get("name")]
-    return " ".join(filter(None, parts))
+    return " ".join(str(part) for part in parts if part)
 
 
 def training_time(found: list[RunRecord]) -> tuple[str, list[float | None]]:
@@ -124,6 +124,12 @@ def epochs(record: RunRecord) -> int | None:
 def seed(record: RunRecord) -> int:
     """Return the seed of a run, or of the run that it evaluates."""
     return record.evaluated.seed if record.evaluated else record.seed
+
+
+def tested_metrics(found: list[RunRecord]) -> set[str]:
+    """Return the names of the metrics that a sampled set of a record was tested by."""
+    parts = (parse_metric_name(name) for record in found for name in record.metrics)
+    return {one.metric for one in parts if one and one.readout != FULL}
 
 
 def score(found: list[RunRecord]) -> str:
