@@ -15,7 +15,7 @@ from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.attention import attend
 from mops_lightning.ops.elimination import eliminate
-from mops_lightning.ops.fps import farthest_point_sample
+from mops_lightning.ops.fps import farthest_point_sample, fps
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.samplers.base import stream_sample
@@ -224,6 +224,20 @@ def farthest(peak: dict[str, float], rounds: int) -> list[Row]:
     return rows
 
 
+def flat_farthest(peak: dict[str, float], rounds: int) -> list[Row]:
+    """The replacement of torch_geometric.nn.fps, and fpsample."""
+    rows: list[Row] = []
+    for number, m in ((50_000, 4096), (100_000, 50_000), (1_000_000, 1000)):
+        points = cloud(number)[0]
+        own = partial(fps, points, ratio=(m - 0.5) / number, random_start=False)
+        assert torch.equal(own(), farthest_point_sample(points[None], m)[0])
+        others = libraries.farthest(points, m)
+        buckets = {name: call for name, call in others.items() if "buckets" in name}
+        calls: Calls = {"mops_lightning.fps": own, **buckets}
+        rows += _rows("function", calls, {"N": number, "m": m}, rounds, peak)
+    return rows
+
+
 def completed(peak: dict[str, float], rounds: int) -> list[Row]:
     """Matched and completed sets of 40,960 points."""
     points = cloud(40960)
@@ -308,6 +322,7 @@ ALL: dict[str, Callable[[dict[str, float], int], list[Row]]] = {
     "large": large,
     "modules": modules,
     "farthest": farthest,
+    "flat_farthest": flat_farthest,
     "completed": completed,
     "poisson": poisson,
     "neighbours": neighbours,

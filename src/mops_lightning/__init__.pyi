@@ -2,6 +2,7 @@
 
 from .ops.emd import earth_movers_distance as earth_movers_distance
 from .ops.fps import farthest_point_sample as farthest_point_sample
+from .ops.fps import fps as fps
 from .ops.nearest import chamfer_distance as chamfer_distance
 from .ops.nearest import nearest as nearest
 from .ops.readout import complete as complete

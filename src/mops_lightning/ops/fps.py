@@ -6,7 +6,7 @@ from torch import Tensor
 from mops_lightning.errors import UserError
 from mops_lightning.ops import compiled
 from mops_lightning.ops.nearest import nearest
-from mops_lightning.ops.points import distance_dtype, gather_points, to_planes
+from mops_lightning.ops.points import cloud_sizes, distance_dtype, gather_points, to_planes
 
 
 def farthest_point_sample(points: Tensor, m: int, start: int | Tensor = 0) -> Tensor:
@@ -98,3 +98,66 @@ def farthest_in_steps(points: Tensor, distances: Tensor, steps: int) -> Tensor:
             total.addcmul_(other, other)
         torch.minimum(distances, total, out=distances)
     return torch.cat(chosen, 1)
+
+
+def fps(
+    x: Tensor,
+    batch: Tensor | None = None,
+    ratio: float = 0.5,
+    random_start: bool = True,
+    batch_size: int | None = None,
+) -> Tensor:
+    """Choose farthest points of flat clouds: a replacement for ``torch_geometric.nn.fps``.
+
+    Signature and result are those of torch_cluster's ``fps``. Random starts are drawn by torch, so
+    that ``torch.manual_seed`` repeats them. Where a cloud has fewer different points than are
+    chosen, copies are chosen instead of the same row again.
+
+    Args:
+        x: ``(P, C)`` points of all clouds, or ``(P,)`` numbers.
+        batch: ``(P,)`` the cloud of every point, ascending from 0; None: one cloud.
+        ratio: share of the points to choose, 0 < ratio ≤ 1: ⌈ratio · n⌉ of a cloud's n points.
+        random_start: start from a random point of every cloud instead of its first point.
+        batch_size: number of clouds; None: as many as ``batch`` has.
+
+    Returns:
+        Rows of ``x``, int64, cloud by cloud, in the order of choice. With ``(B, N, C)`` points as
+        ``x.flatten(0, 1)`` and ⌈ratio · N⌉ = M they are ``(B, M)``, flattened.
+
+    Raises:
+        UserError: an argument has a wrong shape or value.
+
+    Examples:
+        >>> import torch
+        >>> from mops_lightning import fps
+        >>> square = torch.tensor([[-1.0, -1], [-1, 1], [1, -1], [1, 1]])
+        >>> fps(square, torch.tensor([0, 0, 0, 0]), ratio=0.5, random_start=False)
+        tensor([0, 3])
+    """
+    if x.ndim == 0 or len(x) == 0:
+        raise UserError(f"x must have shape (P, C) with P ≥ 1, got {tuple(x.shape)}.")
+    counts = torch.tensor([len(x)]) if batch is None else cloud_sizes(len(x), batch)
+    if batch_size is not None and batch_size < len(counts):
+        raise UserError(f"batch_size must be at least {len(counts)}, got {batch_size}.")
+    points = x.detach().reshape(len(x), -1)
+    if not 0 < ratio <= 1:
+        raise UserError(f"ratio must be above 0 and at most 1, got {ratio}.")
+    share = torch.tensor(ratio, dtype=points.dtype).cpu()  # torch_cluster rounds as here
+    sizes = (counts.float() * share).ceil().long()
+    starts = torch.zeros_like(counts)
+    if random_start:
+        starts = torch.randint(2**62, counts.shape) % counts.clamp_min(1)
+    begins = counts.cumsum(0) - counts
+    if len(counts.unique()) == 1:
+        clouds = points.reshape(len(counts), int(counts[0]), -1)
+        rows = farthest_point_sample(clouds, int(sizes[0]), starts.to(x.device))
+        return (rows + begins[:, None].to(x.device)).flatten()
+    numbers = zip(*(part.tolist() for part in (sizes, starts, begins)), strict=True)
+    parts = zip(points.split(counts.tolist()), numbers, strict=True)
+    return torch.cat(
+        [
+            farthest_point_sample(cloud[None], m, start)[0] + begin
+            for cloud, (m, start, begin) in parts
+            if m
+        ]
+    )

@@ -1,14 +1,57 @@
-"""Gathering, normalisation, memory layout and extremes of batched point clouds."""
+"""Input, gathering, normalisation, memory layout and extremes of batched point clouds."""
 
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
+
+from mops_lightning.errors import UserError
 
 GROUP = 32
 """Number of consecutive values that ``blocked_argextreme`` reduces together."""
 
 PLAIN_MAX_VALUES = 8192
 """Up to this number of values, torch's own argmax and argmin are faster."""
+
+
+def as_tensor(name: str, value: Any) -> Tensor:
+    """Return a tensor of an argument: a tensor, an array, or a list of whole numbers."""
+    if isinstance(value, np.ndarray):
+        native = value.astype(value.dtype.newbyteorder("="), copy=False)  # files may be big-endian
+        try:
+            # torch takes neither negative strides nor memory that must not be written to.
+            return torch.from_numpy(np.require(native, requirements=("C", "W")))
+        except TypeError:
+            raise UserError(f"{name} must hold numbers, got dtype {value.dtype}.") from None
+    if isinstance(value, list | tuple) and name != "points":
+        try:
+            return torch.tensor(value)
+        except (RuntimeError, TypeError, ValueError):
+            raise UserError(f"{name} must be whole numbers, got {value!r:.99}.") from None
+    if not isinstance(value, Tensor):
+        raise UserError(f"{name} must be a tensor or an array, got {type(value).__name__}.")
+    return value
+
+
+def cloud_sizes(number: int, batch: Tensor, name: str = "batch") -> Tensor:
+    """Return the number of points ``(B,)`` of every cloud, on the CPU.
+
+    Args:
+        number: P, of points.
+        batch: ``(P,)`` the cloud of every point, ascending from 0, as in PyTorch Geometric.
+        name: of the argument, for errors.
+    """
+    if batch.ndim != 1 or len(batch) != number or batch.is_floating_point():
+        raise UserError(
+            f"{name} must be whole numbers of shape (P={number},), got {batch.dtype} of shape "
+            f"{tuple(batch.shape)}."
+        )
+    batch = batch.long()  # torch computes with few of the unsigned types
+    if len(batch) and (int(batch.min()) < 0 or bool((batch[1:] < batch[:-1]).any())):
+        raise UserError(f"{name} must be ascending and at least 0. Sort the points by cloud.")
+    return batch.bincount().cpu()
 
 
 def gather_points(points: Tensor, indices: Tensor) -> Tensor:

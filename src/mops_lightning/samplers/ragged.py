@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.points import as_tensor, cloud_sizes, gather_points
 
 Select = Callable[[Tensor, int], tuple[Tensor, Tensor | None]]
 """``select(points, m)`` maps ``(B, N, 3)`` float32 in the unit sphere to points ``(B, m, 3)`` and
@@ -33,12 +33,12 @@ def select_points(select: Select, points: Any, m: int, batch: Any = None) -> tup
     Raises:
         UserError: an argument has a wrong type, shape or value.
     """
-    tensor = _tensor("points", points)
+    tensor = as_tensor("points", points)
     if not tensor.is_floating_point():
         raise UserError(f"points must be floating point, got {tensor.dtype}. Try points.float().")
     if batch is not None:
         _check_shape(tensor, 2, "(P, 3) with batch")
-        result = _flat(select, tensor, m, _tensor("batch", batch))
+        result = _flat(select, tensor, m, as_tensor("batch", batch))
     elif tensor.ndim == 2:
         _check_shape(tensor, 2, "(N, 3) or (B, N, 3)")
         chosen, rows = _selected(select, tensor[None], m)
@@ -51,24 +51,6 @@ def select_points(select: Select, points: Any, m: int, batch: Any = None) -> tup
     return result[0].numpy(), None if result[1] is None else result[1].numpy()
 
 
-def _tensor(name: str, value: Any) -> Tensor:
-    if isinstance(value, np.ndarray):
-        native = value.astype(value.dtype.newbyteorder("="), copy=False)  # files may be big-endian
-        try:
-            # torch takes neither negative strides nor memory that must not be written to.
-            return torch.from_numpy(np.require(native, requirements=("C", "W")))
-        except TypeError:
-            raise UserError(f"{name} must hold numbers, got dtype {value.dtype}.") from None
-    if isinstance(value, list | tuple) and name != "points":
-        try:
-            return torch.tensor(value)
-        except (RuntimeError, TypeError, ValueError):
-            raise UserError(f"{name} must be whole numbers, got {value!r:.99}.") from None
-    if not isinstance(value, Tensor):
-        raise UserError(f"{name} must be a tensor or an array, got {type(value).__name__}.")
-    return value
-
-
 def _check_shape(points: Tensor, ndim: int, wanted: str) -> None:
     if points.ndim != ndim or points.shape[-1] != 3:
         raise UserError(f"points must have shape {wanted}, got {tuple(points.shape)}.")
@@ -76,15 +58,7 @@ def _check_shape(points: Tensor, ndim: int, wanted: str) -> None:
 
 def _flat(select: Select, points: Tensor, m: int, batch: Tensor) -> Sample:
     """Select from clouds one after the other; rows count through all clouds."""
-    if batch.ndim != 1 or len(batch) != len(points) or batch.is_floating_point():
-        raise UserError(
-            f"batch must be whole numbers of shape (P={len(points)},), got {batch.dtype} of shape "
-            f"{tuple(batch.shape)}."
-        )
-    batch = batch.long()  # torch computes with few of the unsigned types
-    if len(batch) and (int(batch.min()) < 0 or bool((batch[1:] < batch[:-1]).any())):
-        raise UserError("batch must be ascending and at least 0. Sort the points by cloud.")
-    counts = batch.bincount().tolist()
+    counts = cloud_sizes(len(points), batch).tolist()
     if 0 in counts:
         raise UserError(f"batch: cloud {counts.index(0)} has no points. Number clouds from 0.")
     samples = _each(select, list(points.split(counts)), m)
