@@ -9,6 +9,7 @@ from mops_lightning.data.formats.table import Table
 from mops_lightning.files.compare_cli import main
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
+from mops_lightning.zoo.names import UNTRAINED
 from tests.support.captured import captured
 
 
@@ -38,8 +39,8 @@ def test_compare_writes_table_and_page(folder, tmp_path):
     assert "two.pcd: 90 of 700 points" in out
     with (tmp_path / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * 2 * 5
-    assert {row["method"] for row in rows} == {"random", "voxel", "fps", "poisson", "trained"}
+    assert len(rows) == 2 * 2 * 6
+    assert {row["method"] for row in rows} == {*UNTRAINED, "trained"}
     largest = {row["method"]: float(row["hausdorff"]) for row in rows}
     assert largest["fps"] < largest["random"]
     assert all(float(row[name]) > 0 for row in rows for name in ("chamfer", "density", "seconds"))

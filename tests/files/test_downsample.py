@@ -7,7 +7,7 @@ from mops_lightning.data.formats.registry import read
 from tests.support.downsample import call
 
 
-@pytest.mark.parametrize("method", ["fps", "random", "voxel", "poisson"])
+@pytest.mark.parametrize("method", ["fps", "random", "voxel", "poisson", "serial"])
 def test_untrained_method_keeps_rows_of_the_file(method, folder, tmp_path):
     source, target = folder / "in" / "a.ply", tmp_path / "out.npz"
     status, out, err = call(source, target, "--method", method, "--m", 20, "--keep-attributes")

@@ -10,7 +10,7 @@ from tests.support.downsample import call
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--m", 5], "give --method fps|random|voxel|poisson, or --weights MODEL"),
+        (["--m", 5], "give --method fps|random|voxel|poisson|serial, or --weights MODEL"),
         (["--m", 5, "--method", "fps", "--weights", "w.pt"], "--weights or --method fps, not both"),
         (["--method", "fps"], "--m must be"),
         (["--m", 0, "--method", "fps"], "--m must be"),

@@ -24,7 +24,7 @@ LINES = int(os.environ.get("MOPS_FUZZ", "2"))
 GROUPS = {
     "sampler": (
         *("mops", "fmops", "snet", "snet_progressive", "samplenet", "samplenet_progressive"),
-        *("fps", "random", "voxel", "poisson"),
+        *("fps", "random", "voxel", "poisson", "serial"),
     ),
     "task": ("classification", "registration", "reconstruction"),
     "task/net": ("pointnet", "pcrnet", "icp", "autoencoder", "foldingnet", "atlasnet"),

@@ -16,6 +16,7 @@ from mops_lightning.samplers.gumbel import GumbelSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.poisson import PoissonSampler
 from mops_lightning.samplers.samplenet import SampleNet
+from mops_lightning.samplers.serial import SerialSampler
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.zoo.load import package_samplers
@@ -38,7 +39,7 @@ LIMITS: list[tuple[type[Sampler], dict[str, Any]]] = [
 ]
 """The smallest and largest allowed arguments."""
 NOT_FLEXIBLE = (GumbelSampler, MOPSNet, SNet, SampleNet)
-FLEXIBLE_NOT_NESTED = (VoxelSampler, PoissonSampler)
+FLEXIBLE_NOT_NESTED = (VoxelSampler, PoissonSampler, SerialSampler)
 
 
 @pytest.mark.parametrize("name", [path.stem for path in FILES if path.stem != "own"])

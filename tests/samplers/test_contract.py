@@ -17,6 +17,7 @@ from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.poisson import PoissonSampler
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
+from mops_lightning.samplers.serial import SerialSampler
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.samplers.voxel import VoxelSampler
@@ -38,6 +39,7 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "fps": lambda m, **kw: FPSSampler(m, **kw),
     "voxel": lambda m: VoxelSampler(m),
     "poisson": lambda m, **kw: PoissonSampler(m, **kw),
+    "serial": lambda m: SerialSampler(m),
     "submodular": lambda m, **kw: SubmodularSampler(m, PointNetVanilla(3), **kw),
     "critical": lambda m, **kw: CriticalSampler(m, PointNetVanilla(3), **kw),
     "gumbel": lambda m: GumbelSampler(m, feature_channels=(8, 6)),

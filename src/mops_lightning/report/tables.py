@@ -30,7 +30,7 @@ READOUTS = (INDEX_READOUT, *GENERATED_READOUTS)
 """Readouts of a cell, in its order."""
 
 ORDER = (
-    *("random", "voxel", "fps", "poisson", "critical", "submodular", "gumbel", "snet"),
+    *("random", "serial", "voxel", "fps", "poisson", "critical", "submodular", "gumbel", "snet"),
     *("snet_progressive", "samplenet", "samplenet_progressive", "mops", "fmops"),
 )
 """Samplers in the order of the paper's tables; others follow by name."""

@@ -58,7 +58,7 @@ class Sampler(nn.Module):
     """Whether clouds can be sampled in chunks (``stream_sample``), by ``fused``."""
 
     spreads: bool = True
-    """Whether the method spreads the points evenly; only random sampling does not."""
+    """Whether the method spreads the points evenly; random and serial sampling do not."""
 
     size_reduction: Literal["mean", "sum"] = "mean"
     """Reduction of the losses at several ``training_sizes`` to one."""

@@ -30,8 +30,9 @@ def downsample(
         points: ``(N, 3)``, ``(B, N, 3)``, or ``(P, 3)`` with ``batch``; a tensor or an array,
             floating point, in any unit.
         m: number of points to return of each cloud.
-        method: ``random``, ``voxel``, ``fps`` or ``poisson``, or what ``load`` takes, such as the
-            name of a model. A model suits the task net and the shapes that it was trained for.
+        method: ``random``, ``serial``, ``voxel``, ``fps`` or ``poisson``, or what ``load`` takes,
+            such as the name of a model. A model suits the task net and the shapes that it was
+            trained for.
         readout: of a model: ``generated``, ``matched`` or ``completed``; see
             ``Sampler.downsample``.
         batch: ``(P,)`` the cloud of every point, ascending from 0, as in PyTorch Geometric.
@@ -64,8 +65,8 @@ def downsample(
 
 
 def untrained(method: str, m: int, seed: int = 0, **arguments: Any) -> Sampler:
-    """Return the sampler of one of the ``UNTRAINED`` methods; ``voxel`` has no seed."""
-    if method != "voxel":
+    """Return the sampler of one of the ``UNTRAINED`` methods; some have no seed."""
+    if method not in ("voxel", "serial"):
         arguments["seed"] = seed
     make: type[Sampler] = getattr(mops_lightning, names.UNTRAINED[method])
     return make(m, **arguments)

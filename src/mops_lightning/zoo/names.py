@@ -12,6 +12,7 @@ UNTRAINED = {
     "random": "RandomSampler",
     "voxel": "VoxelSampler",
     "poisson": "PoissonSampler",
+    "serial": "SerialSampler",
 }
 """Samplers without weights, public names of the package, by the name of the method."""
 SHIPPED = Path(__file__).parent / "models"
