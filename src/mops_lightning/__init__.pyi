@@ -5,6 +5,8 @@ from .ops.fps import farthest_point_sample as farthest_point_sample
 from .ops.fps import fps as fps
 from .ops.nearest import chamfer_distance as chamfer_distance
 from .ops.nearest import nearest as nearest
+from .ops.propagation import propagate as propagate
+from .ops.propagation import propagation_map as propagation_map
 from .ops.readout import complete as complete
 from .ops.readout import match as match
 from .ops.sampling_matrix import SamplingMatrix as SamplingMatrix

@@ -41,7 +41,8 @@ def test_version_is_that_of_the_package(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("typed", "near"), [("reprot", "'report' or 'export'"), ("down-sample", "'downsample'")]
+    ("typed", "near"),
+    [("reprot", "'report' or 'export' or 'propagate'"), ("down-sample", "'downsample'")],
 )
 def test_unknown_subcommand_names_the_nearest(typed, near, tmp_path):
     status, out, err = call([typed, "results"], tmp_path)

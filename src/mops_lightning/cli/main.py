@@ -14,6 +14,7 @@ from mops_lightning.errors import USER_ERROR, did_you_mean, end, quiet_on_closed
 COMMANDS = {
     "report": "mops_lightning.report.cli",
     "downsample": "mops_lightning.files.downsample_cli",
+    "propagate": "mops_lightning.files.propagate_cli",
     "compare": "mops_lightning.files.compare_cli",
     "models": "mops_lightning.cli.models",
     "export": "mops_lightning.cli.export",

@@ -16,6 +16,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.files.chunks import Outcome, sample_by_chunks
 from mops_lightning.files.engine import Engine, LocalEngine
 from mops_lightning.files.options import Options
+from mops_lightning.files.propagate import write_map
 from mops_lightning.files.tiles import sample_by_tiles
 from mops_lightning.ops.readout import select
 from mops_lightning.samplers.base import Sampler, stream_sample
@@ -79,17 +80,19 @@ def downsample_file(
     sampler = load_sampler(options)
     m = options.m or sampler.m
     if options.chunk is None:
-        table, outcome = _sample_whole(source, sampler, m, options)
+        points, table, outcome = _sample_whole(source, sampler, m, options)
+        if options.map is not None:
+            write_map(options.map, points, table.points, options.map_k)
     else:
         table, outcome = sample_by_chunks(source, sampler, m, options, engine or LocalEngine())
-    write(target, table)
+    write(target, table)  # last, so that a file that exists is complete
     return outcome
 
 
 def _sample_whole(
     source: Path, sampler: Sampler, m: int, options: Options
-) -> tuple[Table, Outcome]:
-    """Sample a file that is read as a whole."""
+) -> tuple[NDArray[np.float64], Table, Outcome]:
+    """Sample a file that is read as a whole; also return all of its points."""
     table = read(source, options.surface or max(SURFACE, 8 * m), options.seed)
     finite = table.finite()
     number = len(finite.points)
@@ -100,7 +103,7 @@ def _sample_whole(
     else:
         kept = finite.take(rows)
         kept = kept if options.keep_attributes else kept.without_attributes()
-    return kept, Outcome(m, number, len(table.points) - number)
+    return table.points, kept, Outcome(m, number, len(table.points) - number)
 
 
 def sample_cloud(

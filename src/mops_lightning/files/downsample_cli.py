@@ -4,6 +4,7 @@ import argparse
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields
+from os.path import realpath
 from pathlib import Path
 
 from mops_lightning.errors import UserError, one_line_endings
@@ -74,6 +75,14 @@ def make_parser(prog: str) -> argparse.ArgumentParser:
         metavar="ADDRESS",
         help="distribute the chunks of every file over the workers of this Dask scheduler",
     )
+    add(
+        "--map",
+        type=Path,
+        metavar="FILE.npz",
+        help="write for every point of IN the row of its nearest point of OUT, to carry labels "
+        "back by mops_lightning.propagate",
+    )
+    add("--map-k", type=int, default=1, help="rows per point in --map, with weights 1/d^2")
     add("--seed", type=int, default=0, help="seed of random choices")
     add("--overwrite", action="store_true", help="replace existing files")
     return parser
@@ -93,6 +102,8 @@ def _run(chosen: argparse.Namespace) -> int:
     is_folder = chosen.source.is_dir()
     if not is_folder and pairs[0][1].exists() and not chosen.overwrite:
         raise UserError(f"{pairs[0][1]} exists. Give another OUT, or --overwrite.")
+    if chosen.map is not None:
+        _check_map(chosen, is_folder, pairs[0])
     # Of a run that was killed.
     remove_temporary(chosen.target if is_folder else pairs[0][1].parent, below=is_folder)
     with _engine(chosen) as engine:
@@ -102,6 +113,16 @@ def _run(chosen: argparse.Namespace) -> int:
         workers, overwrite = chosen.workers, chosen.overwrite
         failed = process_folder(pairs, options, chosen.target, workers, overwrite, engine)
         return 1 if failed else 0
+
+
+def _check_map(chosen: argparse.Namespace, is_folder: bool, files: tuple[Path, Path]) -> None:
+    """Reject a map of several files, and one that would replace another file."""
+    if is_folder:
+        raise UserError(f"--map is the map of one file, but IN is the folder {chosen.source}.")
+    if realpath(chosen.map) in map(realpath, files):
+        raise UserError(f"--map must differ from IN and OUT, got {chosen.map}.")
+    if chosen.map.exists() and not chosen.overwrite:
+        raise UserError(f"{chosen.map} exists. Give another --map, or --overwrite.")
 
 
 def _options(chosen: argparse.Namespace) -> Options:

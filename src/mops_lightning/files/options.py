@@ -1,6 +1,7 @@
 """Options of ``downsample``, checked."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from mops_lightning.errors import UserError
 from mops_lightning.records.readout_names import GENERATED_READOUTS
@@ -21,6 +22,8 @@ class Options:
         seed: of random choices.
         chunk: number of points to read at a time; None: the whole file.
         tile: most points of a tile; None: no tiles.
+        map: file to write for ``mops_lightning.propagate``; None: no file.
+        map_k: number of sampled points per point in this file.
 
     Raises:
         UserError: a value is out of range, or options exclude each other.
@@ -35,6 +38,8 @@ class Options:
     seed: int = 0
     chunk: int | None = None
     tile: int | None = None
+    map: Path | None = None
+    map_k: int = 1
 
     def __post_init__(self) -> None:
         """Reject values out of range and options that exclude each other."""
@@ -57,6 +62,10 @@ class Options:
                 "--keep-attributes: generated points are new and have no attributes. Use "
                 "--readout completed or matched."
             )
+        if self.map is not None and self.map.suffix.lower() != ".npz":
+            raise UserError(f"--map must end in .npz, got {self.map}.")
+        if self.map_k < 1 or (self.m is not None and self.map_k > self.m):
+            raise UserError(f"--map-k must be from 1 to --m, got {self.map_k}.")
         self._check_parts()
 
     def _check_parts(self) -> None:
@@ -67,6 +76,10 @@ class Options:
             raise UserError("--tile needs --m, the number of points to keep of all tiles together.")
         if self.tile is not None and self.readout != "completed":
             raise UserError(f"--tile keeps different input points: no --readout {self.readout}.")
+        if self.chunk is not None and self.map is not None:
+            raise UserError(
+                "--map needs the whole cloud in memory: use mops-lightning propagate after --chunk."
+            )
         if self.chunk is not None and self.chunk < 1:
             raise UserError(f"--chunk must be at least 1, got {self.chunk}.")
         needs_all = self.method or self.tile is not None or self.readout == "completed"

@@ -10,7 +10,14 @@ import numpy as np
 
 from mops_lightning.data.formats.guard import BadCloudError, ends_early
 from mops_lightning.data.formats.isolated import isolated
-from mops_lightning.data.formats.table import CloudFile, Column, Table, split_array, unique_names
+from mops_lightning.data.formats.table import (
+    CloudFile,
+    Column,
+    Table,
+    TableParts,
+    split_array,
+    unique_names,
+)
 from mops_lightning.errors import UserError
 
 COPC = "copc"
@@ -87,22 +94,43 @@ def _table(cloud: Any, header: Any) -> Table:
 
 def write(path: Path, table: Table) -> None:
     """Write a LAS or LAZ file like the one that was read, or one of plain coordinates."""
+    write_parts(path, TableParts.whole(table))
+
+
+def write_parts(path: Path, table: TableParts) -> None:
+    """Write a LAS or LAZ file part by part."""
     laspy = _laspy(path)
-    cloud = laspy.LasData(_header(laspy, table))
-    cloud.x, cloud.y, cloud.z = table.points.T
-    known = set(cloud.point_format.dimension_names)
+    header = _header(laspy, table)
+    dimensions = _add_dimensions(laspy, header, Table(table.corners, table.columns))
+    form = {"header": header, "do_compress": path.suffix.lower() == ".laz", "closefd": False}
+    # Opened here, because laspy leaves its file open when the disk is full.
+    with path.open("wb+") as stream, laspy.open(stream, mode="w", **form) as file:
+        for part in table.parts:
+            points = laspy.ScaleAwarePointRecord.zeros(len(part.points), header=header)
+            points.x, points.y, points.z = part.points.T
+            for name, column in unique_names(part).items():
+                points[dimensions[name]] = column
+            file.write_points(points)
+        if header.evlrs:
+            file.write_evlrs(header.evlrs)
+
+
+def _add_dimensions(laspy: Any, header: Any, table: Table) -> dict[str, str]:
+    """Add what a header lacks for a table, and return the dimension of every column."""
+    known = set(header.point_format.dimension_names)
+    dimensions = {}
     for name, column in unique_names(table).items():
-        if name in known and _stored_exactly(cloud, name, column):
+        if name in known and _holds(laspy, header, name, column):
+            dimensions[name] = name
             continue
         kind = np.dtype("u1") if column.dtype.kind == "b" else column.dtype.newbyteorder("=")
         kind = np.dtype("f4") if kind == np.dtype("f2") else kind
-        own = (f"{name}_" if name in known else name)[:32]
-        cloud.add_extra_dim(laspy.ExtraBytesParams(name=own, type=kind))
-        cloud[own] = column.astype(kind)
-    cloud.write(path)
+        dimensions[name] = (f"{name}_" if name in known else name)[:32]
+        header.add_extra_dim(laspy.ExtraBytesParams(name=dimensions[name], type=kind))
+    return dimensions
 
 
-def _header(laspy: Any, table: Table) -> Any:
+def _header(laspy: Any, table: TableParts) -> Any:
     """Return a header like the one of the file that was read.
 
     Without the index of COPC files, which does not fit other points, and without arrays of numbers,
@@ -110,8 +138,8 @@ def _header(laspy: Any, table: Table) -> Any:
     """
     if table.header is None:
         header = laspy.LasHeader(point_format=3, version="1.2")
-        extent = float(np.ptp(table.points, axis=0).max())
-        header.offsets = table.points.min(0)
+        extent = float(np.ptp(table.corners, axis=0).max())
+        header.offsets = table.corners[0]
         header.scales = np.full(3, max(extent, 1e-9) / 2**30)
         return header
     source = table.header
@@ -126,13 +154,12 @@ def _header(laspy: Any, table: Table) -> Any:
     return header
 
 
-def _stored_exactly(cloud: Any, name: str, column: Column) -> bool:
-    """Store a column in a dimension of LAS, if the dimension's type holds its numbers."""
+def _holds(laspy: Any, header: Any, name: str, column: Column) -> bool:
+    """Return whether the type of a dimension of LAS holds the numbers of a column exactly."""
+    points = laspy.ScaleAwarePointRecord.zeros(len(column), header=header)
     with suppress(OverflowError, TypeError, ValueError), np.errstate(all="ignore"):
-        cloud[name] = column
-        if np.array_equal(np.asarray(cloud[name]), column):
-            return True
-    cloud[name] = np.zeros(len(column), np.uint8)
+        points[name] = column
+        return np.array_equal(np.asarray(points[name]), column)
     return False
 
 

@@ -13,10 +13,11 @@ from mops_lightning.data.formats.table import (
     CloudFile,
     Column,
     Table,
+    TableParts,
     binary_file,
     from_columns,
-    to_columns,
     to_rows,
+    unique_names,
 )
 
 KINDS = {
@@ -97,11 +98,22 @@ def _columns(data: Any) -> dict[str, Column]:
 
 def write(path: Path, table: Table) -> None:
     """Write binary PLY: float coordinates, or double where float would lose digits."""
-    columns = to_columns(table)
-    rows = to_rows({name: column.astype(_ply_kind(column)) for name, column in columns.items()})
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    lines += [f"property {TYPES[rows.dtype[name].str[1:]]} {name}" for name in columns]
-    path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + rows.tobytes())
+    write_parts(path, TableParts.whole(table))
+
+
+def write_parts(path: Path, table: TableParts) -> None:
+    """Write binary PLY part by part."""
+    examples = unique_names(Table(table.corners, table.columns))
+    kinds = dict.fromkeys("xyz", table.coordinates.newbyteorder("<").str)
+    kinds |= {name: _ply_kind(column) for name, column in examples.items()}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {table.number}"]
+    lines += [f"property {TYPES[kind[1:]]} {name}" for name, kind in kinds.items()]
+    with path.open("wb") as file:
+        file.write("\n".join([*lines, "end_header\n"]).encode())
+        for part in table.parts:
+            columns = dict(zip("xyz", part.points.T, strict=True)) | unique_names(part)
+            rows = {name: column.astype(kinds[name]) for name, column in columns.items()}
+            file.write(to_rows(rows).tobytes())
 
 
 def _ply_kind(column: Column) -> str:

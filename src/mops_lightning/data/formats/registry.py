@@ -7,7 +7,7 @@ from mops_lightning.data.formats import arrays, las, pcd, ply, text
 from mops_lightning.data.formats.guard import BadCloudError, reading
 from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
 from mops_lightning.data.formats.mesh import sample_mesh
-from mops_lightning.data.formats.table import CloudFile, Table
+from mops_lightning.data.formats.table import CloudFile, Table, TableParts
 from mops_lightning.errors import one_line
 from mops_lightning.filesystem import atomic_write
 
@@ -23,6 +23,11 @@ WRITERS: dict[str, Callable[[Path, Table], None]] = {
     ".bin": arrays.write_kitti, ".npy": arrays.write_npy, ".npz": arrays.write_npz,
     ".xyz": text.write, ".txt": text.write,
 }  # fmt: skip
+
+PART_WRITERS: dict[str, Callable[[Path, TableParts], None]] = {
+    ".ply": ply.write_parts, ".las": las.write_parts, ".laz": las.write_parts,
+}  # fmt: skip
+"""Formats that are written part by part."""
 
 CHUNKED: dict[str, Callable[[Path], CloudFile]] = {
     ".npy": arrays.locate_npy, ".bin": arrays.locate_kitti, ".ply": ply.locate,
@@ -55,7 +60,7 @@ def read(path: Path, surface: int, seed: int) -> Table:
     return Table(points, dict(zip(("nx", "ny", "nz"), normals.T, strict=True)))
 
 
-def write(path: Path, table: Table) -> None:
+def write(path: Path, table: Table | TableParts) -> None:
     """Write a file that ends in one of ``WRITERS``, completely or not at all.
 
     Raises:
@@ -63,7 +68,10 @@ def write(path: Path, table: Table) -> None:
     """
     try:
         with atomic_write(path) as temporary:
-            WRITERS[path.suffix.lower()](temporary, table)
+            if isinstance(table, TableParts):
+                PART_WRITERS[path.suffix.lower()](temporary, table)
+            else:
+                WRITERS[path.suffix.lower()](temporary, table)
     except OSError as error:
         raise BadCloudError(
             f"OUT: cannot write {path} ({one_line(error)}). Free space, or give another OUT."

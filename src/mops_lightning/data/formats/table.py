@@ -1,6 +1,6 @@
 """A cloud as its file has it: coordinates and columns of attributes, whole or in ranges of rows."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -79,6 +79,34 @@ class CloudFile:
             if len(table.points) < len(rows):
                 raise ends_early(self.path, rows.start + len(table.points))
             return table.finite()
+
+
+@dataclass(frozen=True)
+class TableParts:
+    """A table that is written part by part, so that it need not fit in memory.
+
+    Attributes:
+        parts: the table's rows, part by part; all parts have the same columns.
+        number: how many points all parts have.
+        corners: ``(2, 3)`` lowest and highest coordinates.
+        coordinates: the type of the coordinates in formats that offer float32 and float64.
+        columns: numbers of every column that show its type and range, ``(any,)`` each.
+        header: see ``Table``.
+    """
+
+    parts: Iterable[Table]
+    number: int
+    corners: NDArray[np.float64]
+    coordinates: np.dtype[Any]
+    columns: Mapping[str, Column]
+    header: Any = None
+
+    @classmethod
+    def whole(cls, table: Table) -> "TableParts":
+        """Return a table as its only part."""
+        corners = np.stack([table.points.min(0), table.points.max(0)])
+        kind = compact_coordinates(table).dtype
+        return cls([table], len(table.points), corners, kind, table.columns, table.header)
 
 
 def binary_file(path: Path, number: int, kind: np.dtype[Any], offset: int = 0) -> CloudFile:

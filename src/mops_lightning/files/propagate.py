@@ -1,0 +1,147 @@
+"""The way back in files: the map of a downsampled file, and columns of a sample for all points."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mops_lightning.data.formats.guard import BadCloudError, check_coordinates, reading
+from mops_lightning.data.formats.registry import READERS, open_cloud_file, write
+from mops_lightning.data.formats.table import Column, Table, TableParts
+from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.files.engine import with_progress
+from mops_lightning.filesystem import atomic_write
+from mops_lightning.ops.propagation import propagate, propagation_map
+
+PART = 500_000
+"""Number of points that are read at a time."""
+
+Points = NDArray[np.float64]
+
+
+def write_map(path: Path, points: Points, sampled: Points, k: int) -> None:
+    """Write a map that ``mops_lightning.propagate`` reads.
+
+    Args:
+        path: the .npz file.
+        points: ``(N, 3)``; points that are not finite get row −1.
+        sampled: ``(m, 3)``.
+        k: number of sampled points per point, at most m.
+    """
+    finite = np.isfinite(points).all(1)
+    found = propagation_map(points[finite], sampled, k)
+    arrays: dict[str, Any] = {"rows": np.full((len(points), k), -1, np.int32), "m": len(sampled)}
+    arrays["rows"][finite] = found.rows.numpy()
+    if k > 1:  # the weight of one point is 1
+        arrays["weights"] = np.zeros((len(points), k), np.float32)
+        arrays["weights"][finite] = found.weights.numpy()
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+
+
+def propagate_file(
+    small: Path, big: Path, target: Path, fields: list[str], k: int = 1, mean: bool = False
+) -> int:
+    """Carry columns of a sample to all points of a file.
+
+    Files of a format in ``registry.CHUNKED`` are read part by part.
+
+    Args:
+        small: the sample, which has the columns.
+        big: all points.
+        target: the file to write, of a format in ``registry.PART_WRITERS``: all finite points of
+            ``big`` with its columns and these.
+        fields: names of the columns.
+        k: number of sampled points per point; see ``mops_lightning.propagate``.
+        mean: average whole numbers, too.
+
+    Returns:
+        The number of points written.
+
+    Raises:
+        UserError: a file is broken, or the sample lacks a column.
+    """
+    sample = _read(small).finite()
+    missing = next((name for name in fields if name not in sample.columns), None)
+    if missing is not None:
+        hint = did_you_mean(missing, sample.columns)
+        raise UserError(f"--field: {small} has no column {missing!r}.{hint}")
+    if not 1 <= k <= len(sample.points):
+        raise UserError(
+            f"--k must be from 1 to the {len(sample.points)} points of {small}, got {k}."
+        )
+    carried = {name: sample.columns[name] for name in fields}
+
+    def carry(table: Table) -> Table:
+        found = propagation_map(table.points, sample.points, k)
+        columns = {name: propagate(values, found, mean) for name, values in carried.items()}
+        return Table(table.points, {**table.columns, **columns}, table.header)
+
+    tables = _tables(big)
+    form = _measure(big, tables("measuring"))
+    parts = (carry(table) for table in tables("propagating"))
+    write(target, replace(form, parts=parts, columns={**form.columns, **carried}))
+    return form.number
+
+
+def _read(path: Path) -> Table:
+    """Read a cloud; a mesh has no points that could be matched."""
+    if path.suffix.lower() not in READERS:
+        raise BadCloudError(f"{path} must end in {', '.join(READERS)}.")
+    with reading(path):
+        table = READERS[path.suffix.lower()](path)
+    if table is None or not len(table.finite().points):
+        raise BadCloudError(f"{path} must be a cloud of at least one point.")
+    return table
+
+
+def _tables(path: Path) -> Callable[[str], Iterable[Table]]:
+    """Return a function of a title that reads a file's finite points, in parts if possible."""
+    try:
+        file = open_cloud_file(path)
+    except BadCloudError:  # for example ascii PLY; a broken file fails again here
+        whole = _read(path).finite()
+        return lambda title: [whole]
+    ranges = file.row_ranges(PART)
+
+    def read(title: str) -> Iterator[Table]:
+        for rows in with_progress(ranges, title, len(ranges)):
+            table = file.read(rows)
+            if len(table.points):
+                yield replace(table, header=file.header)
+
+    return read
+
+
+def _measure(path: Path, tables: Iterable[Table]) -> TableParts:
+    """Return the form of a table that is written in parts, without its parts.
+
+    Raises:
+        BadCloudError: there are no points.
+    """
+    number, lost, low, high = 0, 0.0, np.full(3, np.inf), np.full(3, -np.inf)
+    first: Table | None = None
+    columns: dict[str, Column] = {}
+    for table in tables:
+        if first is None:
+            first, columns = table, dict(table.columns)
+        for name, column in table.columns.items():
+            columns[name] = np.concatenate([columns[name], _extremes(column)])
+        check_coordinates(path, table.points)
+        number += len(table.points)
+        low, high = np.minimum(low, table.points.min(0)), np.maximum(high, table.points.max(0))
+        lost = max(lost, float(np.abs(table.points.astype(np.float32) - table.points).max()))
+    if first is None:
+        raise BadCloudError(f"{path} holds no points.")
+    single = lost <= 1e-6 * float((high - low).max())
+    kind = np.dtype(np.float32 if single else np.float64)
+    return TableParts([], number, np.stack([low, high]), kind, columns, first.header)
+
+
+def _extremes(column: Column) -> Column:
+    """Return the lowest and the highest number, and the one farthest from a whole number."""
+    fraction = np.abs(column - np.rint(column))
+    return column[[column.argmin(), column.argmax(), fraction.argmax()]]

@@ -1,0 +1,237 @@
+"""From the sampled points back to all points: labels, colours, scores and features.
+
+A map names the nearest sampled points of every point. Floats are averaged with inverse-distance
+weights, as in PointNet++ (Qi et al., NeurIPS 2017); whole numbers are never averaged unless the
+caller asks for it, so that a label stays a label.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from mops_lightning.errors import UserError
+from mops_lightning.filesystem import load_npz
+from mops_lightning.ops.nearest import k_nearest, nearest
+from mops_lightning.ops.points import as_tensor, cloud_sizes
+
+
+class PropagationMap(NamedTuple):
+    """The nearest sampled points of every point.
+
+    Attributes:
+        rows: ``(N, k)`` or ``(B, N, k)`` int64, rows of the sampled points, the nearest first; −1
+            for points of a file without finite coordinates.
+        weights: of the rows, floating point; their sum is 1.
+        m: number of sampled points, of every cloud where rows are ``(B, N, k)``.
+    """
+
+    rows: Tensor
+    weights: Tensor
+    m: int
+
+
+def propagation_map(
+    points: Any, sampled: Any, k: int = 1, batch: Any = None, sampled_batch: Any = None
+) -> PropagationMap:
+    """Find the k nearest sampled points of every point, and their weights.
+
+    The weights are proportional to 1/d², d the distance; a point at distance 0 gets all of it.
+
+    Args:
+        points: ``(N, C)``, ``(B, N, C)``, or ``(P, C)`` with ``batch``; a tensor or an array.
+        sampled: their sample ``(m, C)``, ``(B, m, C)``, or ``(Q, C)`` with ``sampled_batch``.
+        k: number of sampled points, at most as many as each cloud has.
+        batch: ``(P,)`` the cloud of every point, ascending from 0, as in PyTorch Geometric.
+        sampled_batch: ``(Q,)`` the cloud of every sampled point.
+
+    Returns:
+        Rows of ``sampled``; with ``batch`` they count through all clouds.
+
+    Raises:
+        UserError: an argument has a wrong shape or value.
+
+    Examples:
+        >>> import torch
+        >>> from mops_lightning import propagation_map
+        >>> line = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
+        >>> propagation_map(line, line[[0, 2]]).rows  # one cloud; of (B, N, 3) they are (B, N, k)
+        tensor([[0],
+                [0],
+                [1]])
+    """
+    points, sampled = as_tensor("points", points), as_tensor("sampled", sampled)
+    if (batch is None) != (sampled_batch is None):
+        raise UserError("batch and sampled_batch belong together: give both or none.")
+    ndim = 2 if batch is not None or points.ndim == 2 else 3
+    for name, tensor in (("points", points), ("sampled", sampled)):
+        if tensor.ndim != ndim or not tensor.is_floating_point():
+            raise UserError(
+                f"{name} must be floating point of {ndim} dimensions, got {tensor.dtype} of shape "
+                f"{tuple(tensor.shape)}."
+            )
+    if batch is not None:
+        sizes = cloud_sizes(len(points), as_tensor("batch", batch)).tolist()
+        labels = as_tensor("sampled_batch", sampled_batch)
+        numbers = cloud_sizes(len(sampled), labels, "sampled_batch").tolist()
+        clouds, samples = points.split(sizes), sampled.split(numbers)
+    elif ndim == 2:
+        clouds, samples = (points,), (sampled,)
+    else:
+        clouds, samples = points.unbind(), sampled.unbind()
+    if len(clouds) != len(samples) or not clouds:
+        raise UserError(
+            f"points and sampled must have as many clouds, got {len(clouds)} and {len(samples)}."
+        )
+    found = [_search(cloud, sample, k) for cloud, sample in zip(clouds, samples, strict=True)]
+    rows, weights = zip(*found, strict=True)
+    if ndim == 3:
+        return PropagationMap(torch.stack(rows), torch.stack(weights), sampled.shape[1])
+    begins = np.cumsum([0, *map(len, samples)])[:-1].tolist()
+    shifted = [part + begin for part, begin in zip(rows, begins, strict=True)]
+    return PropagationMap(torch.cat(shifted), torch.cat(weights), len(sampled))
+
+
+@torch.no_grad()
+def _search(points: Tensor, sampled: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Return the k nearest rows ``(N, k)`` of one cloud, and their weights."""
+    if points.shape[1] != sampled.shape[1]:
+        raise UserError(
+            f"points and sampled must have the same number of coordinates, got {points.shape[1]} "
+            f"and {sampled.shape[1]}."
+        )
+    if not 1 <= k <= len(sampled):
+        raise UserError(
+            f"k must be from 1 to the number of sampled points, {len(sampled)}, got {k}."
+        )
+    if not (bool(torch.isfinite(points).all()) and bool(torch.isfinite(sampled).all())):
+        raise UserError("points and sampled must be finite, got NaN or infinity.")
+    dtype = torch.promote_types(points.dtype, sampled.dtype)
+    points, sampled = points.to(dtype), sampled.to(dtype)
+    if k == 1:
+        rows = nearest(points[None], sampled[None])[1][0, :, None]
+        return rows, torch.ones_like(rows, dtype=torch.promote_types(dtype, torch.float32))
+    if points.is_cpu:
+        tree: Any = cKDTree(sampled.double().numpy())
+        distances, rows = map(torch.from_numpy, tree.query(points.double().numpy(), k=k))
+        squared = distances.square()
+    else:
+        squared, rows = (part[0] for part in k_nearest(points[None], sampled[None], k))
+    # Relative to the nearest point, because 1/d² may be infinite.
+    inverse = torch.where(squared[:, :1] > 0, squared[:, :1] / squared, (squared == 0).to(squared))
+    weights = inverse / inverse.sum(1, keepdim=True)
+    return rows, weights.to(torch.promote_types(dtype, torch.float32))
+
+
+def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> Any:
+    """Carry values of the sampled points to all points.
+
+    With one sampled point per point, values are copied. With several, floats are averaged by the
+    weights, and of whole numbers the one with the largest sum of weights is taken.
+
+    Args:
+        values: ``(m, ...)``, or ``(B, m, ...)`` for maps of ``(B, N, k)``: one row per sampled
+            point, in the order of the sample; a tensor or an array.
+        map: from ``propagation_map``, or the file that ``downsample --map`` writes.
+        mean: average whole numbers too, such as colours, and round them.
+        fill: value of the points of a file without finite coordinates.
+
+    Returns:
+        ``(N, ...)`` or ``(B, N, ...)``, of the type and dtype of ``values``, on their device.
+        Gradients flow to floating-point values.
+
+    Raises:
+        UserError: map and values do not fit, or ``fill`` is missing.
+
+    Examples:
+        >>> import torch
+        >>> from mops_lightning import propagate, propagation_map
+        >>> line = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
+        >>> propagate(torch.tensor([7, 8]), propagation_map(line, line[[0, 2]]))
+        tensor([7, 7, 8])
+    """
+    if not isinstance(map, PropagationMap):
+        map = read_map(Path(map))
+    numbers = as_tensor("values", values)
+    rows, leading = _rows(map, numbers).to(numbers.device), map.rows.ndim - 1
+    missing = rows[:, 0] < 0
+    if fill is None and bool(missing.any()):
+        raise UserError(
+            f"map: {int(missing.sum())} points have no finite coordinates. Give their value, such "
+            "as fill=0."
+        )
+    rows, table = rows.clamp_min(0), numbers.reshape(-1, *numbers.shape[leading:])
+    weights = map.weights.to(numbers.device).reshape(rows.shape)
+    if rows.shape[1] == 1:
+        result = table[rows[:, 0]]
+    else:
+        averaged = mean or numbers.is_floating_point()
+        result = (_mean if averaged else _vote)(table, rows, weights)
+    if bool(missing.any()):
+        result[missing] = fill
+    result = result.reshape(*map.rows.shape[:-1], *numbers.shape[leading:])
+    return result if isinstance(values, Tensor) else result.numpy()
+
+
+def _rows(map: PropagationMap, values: Tensor) -> Tensor:
+    """Return the rows ``(T, k)`` of values whose clouds are one after the other; check both."""
+    leading, clouds = map.rows.ndim - 1, map.rows.shape[:-2]
+    if tuple(values.shape[:leading]) != (*clouds, map.m):
+        raise UserError(
+            f"values must have one row for each of {map.m} sampled points, shape "
+            f"{(*clouds, map.m)}, got {tuple(values.shape)}."
+        )
+    rows = map.rows.long()
+    if rows.numel() and not (int(rows.min()) >= -1 and int(rows.max()) < map.m):
+        raise UserError(
+            f"map: rows must be from -1 to {map.m - 1}, got {int(rows.min())} to {int(rows.max())}."
+        )
+    if clouds:
+        rows = rows + map.m * torch.arange(clouds[0], device=rows.device)[:, None, None]
+    return rows.reshape(-1, rows.shape[-1])
+
+
+def _mean(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """Return weighted means, of the table's dtype."""
+    exact = table if table.is_floating_point() else table.double()
+    weights = weights.to(torch.promote_types(exact.dtype, torch.float32))
+    weights = weights.reshape(*weights.shape, *[1] * (table.ndim - 1))
+    total = exact[rows[:, 0]] * weights[:, 0]
+    for i in range(1, rows.shape[1]):
+        total = total + exact[rows[:, i]] * weights[:, i]
+    return (total if table.is_floating_point() else total.round()).to(table.dtype)
+
+
+def _vote(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """Return, column by column, the value with the largest sum of weights; of equals the nearer."""
+    codes = table.long().reshape(len(table), -1)[rows]  # (T, k, columns)
+    votes = [
+        ((codes == codes[:, i, None]) * weights[..., None]).sum(1) for i in range(rows.shape[1])
+    ]
+    winner = torch.stack(votes, 1).argmax(1, keepdim=True)
+    return codes.gather(1, winner).to(table.dtype).reshape(-1, *table.shape[1:])
+
+
+def read_map(path: Path) -> PropagationMap:
+    """Read the file that ``downsample --map`` writes.
+
+    Raises:
+        UserError: the file is missing, broken, or not a map.
+    """
+    if not path.is_file():
+        raise UserError(f"map: no file {path}. Write it by downsample --map {path}.")
+    arrays = load_npz(path)
+    rows, m = arrays.get("rows"), arrays.get("m")
+    kinds = {array.dtype.kind for array in (rows, m) if array is not None}
+    if rows is None or m is None or kinds != {"i"} or rows.ndim != 2 or not rows.shape[1]:
+        raise UserError(
+            f"{path} is no map: it must hold whole numbers, rows (N, k) and m, got "
+            f"{', '.join(arrays) or 'no arrays'}. Write it by downsample --map."
+        )
+    weights = arrays.get("weights", np.ones(rows.shape, np.float32))
+    if weights.shape != rows.shape or not (np.isfinite(weights).all() and (weights >= 0).all()):
+        raise UserError(f"{path}: weights must be finite, at least 0, and of shape {rows.shape}.")
+    return PropagationMap(torch.from_numpy(rows), torch.from_numpy(weights), int(m))

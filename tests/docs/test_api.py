@@ -1,0 +1,34 @@
+"""The examples of docs/api.md for all points and for PyTorch Geometric, run as written."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+PAGE = (Path(__file__).parents[2] / "docs" / "api.md").read_text()
+
+
+def example(title):
+    """Return the first Python block below a title."""
+    text = re.search(rf"#+ {title}\n.*?```python\n(.*?)```", PAGE, flags=re.S)
+    assert text is not None
+    return text[1]
+
+
+def test_labels_come_back_to_all_points():
+    names: dict[str, Any] = {}
+    exec(example("Back to all points"), names)
+    labels, points = names["labels"], names["points"]
+    assert (labels.shape, labels.dtype) == ((4096,), torch.bool)
+    assert ((points[:, 0] > 0.5) == labels).float().mean() > 0.9
+
+
+def test_pointnet2_layer_runs_with_one_import_replaced():
+    pytest.importorskip("torch_geometric", reason="torch_geometric is in the extra test")
+    names: dict[str, Any] = {}
+    exec(example("Farthest points"), names)
+    assert names["x"].shape == (768, 64)
+    assert names["batch"].bincount().tolist() == [256] * 3
+    names["x"].sum().backward()

@@ -1,0 +1,197 @@
+"""The map of a downsampled file, and the subcommand ``propagate``."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import mops_lightning
+from mops_lightning.data.formats.registry import WRITERS, read
+from mops_lightning.data.formats.table import Table
+from mops_lightning.files import propagate as module
+from mops_lightning.files.propagate_cli import main
+from tests.support.captured import captured
+from tests.support.downsample import call as downsample
+
+
+def call(*arguments):
+    return captured(main, arguments)
+
+
+def contents(path):
+    return read(path, 9, 0)
+
+
+@pytest.fixture(autouse=True)
+def small_parts(monkeypatch):
+    monkeypatch.setattr(module, "PART", 60)
+
+
+@pytest.fixture
+def scan(tmp_path):
+    """500 points far from the origin, of which 20 are not finite, in a file."""
+    points = np.random.default_rng(1).normal([400_000, 5_000_000, 0], 1, (500, 3))
+    points[100:120] = np.nan
+    columns = {"intensity": np.arange(500, dtype=np.uint16)}
+    WRITERS[".ply"](tmp_path / "big.ply", Table(points, columns))
+    return tmp_path / "big.ply"
+
+
+def nearest(points, sampled):
+    return np.linalg.norm(points[:, None] - sampled, axis=2).argmin(1)
+
+
+def test_map_leads_from_sample_to_all_points(scan, tmp_path):
+    map_, small = tmp_path / "map.npz", tmp_path / "small.ply"
+    arguments = ["--m", 30, "--method", "fps", "--map", map_, "--keep-attributes"]
+    status, _, err = downsample(scan, small, *arguments)
+    assert (status, err) == (0, "")
+    points, sample = contents(scan).points, contents(small)
+    labels = np.arange(30) + 2**60
+    carried = mops_lightning.propagate(labels, map_, fill=-1)
+    assert len(carried) == 500
+    finite = np.isfinite(points).all(1)
+    np.testing.assert_array_equal(carried[~finite], -1)
+    expected = labels[nearest(points[finite], sample.points)]
+    np.testing.assert_array_equal(carried[finite], expected)
+    assert (np.load(map_)["rows"][sample.columns["intensity"], 0] >= 0).all()
+
+
+def test_map_with_several_rows_averages_scores(scan, tmp_path):
+    map_, small = tmp_path / "new" / "map.npz", tmp_path / "small.npz"
+    arguments = ["--m", 30, "--method", "random", "--map", map_, "--map-k", 4]
+    assert downsample(scan, small, *arguments)[0] == 0
+    points = contents(scan).finite().points
+    sampled = contents(small).points
+    distances = np.linalg.norm(points[:, None] - sampled, axis=2)
+    rows = distances.argsort(1)[:, :4]
+    inverse = np.maximum(np.take_along_axis(distances, rows, 1), 1e-12) ** -2
+    scores = np.random.default_rng(2).random(30)
+    expected = (scores[rows] * inverse).sum(1) / inverse.sum(1)
+    carried = mops_lightning.propagate(scores, map_, fill=np.nan)
+    np.testing.assert_allclose(carried[np.isfinite(carried)], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--map", "map.txt"], "--map must end in .npz, got map.txt"),
+        (["--map", "big.ply.npz", "--map-k", 0], "--map-k must be from 1 to --m, got 0"),
+        (["--map", "map.npz", "--map-k", 9], "--map-k must be from 1 to --m, got 9"),
+        (["--map", "old.npz"], "old.npz exists. Give another --map, or --overwrite"),
+        (["--map", "map.npz", "--chunk", 60], "--map needs the whole cloud in memory: use"),
+        (["--map", "small.npz"], "--map must differ from IN and OUT"),
+    ],
+)
+def test_wrong_map_of_downsample_gets_one_line(arguments, said, scan, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "old.npz").touch()
+    status, out, err = downsample("big.ply", "small.npz", "--m", 8, "--method", "fps", *arguments)
+    assert (status, out, len(err.splitlines())) == (2, "", 1)
+    assert said in err
+    status, _, err = downsample(tmp_path, "out", "--m", 8, "--method", "fps", "--map", "map.npz")
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert "--map is the map of one file" in err
+
+
+@pytest.mark.parametrize("source", [".ply", ".las", ".laz", ".npy", ".npz", ".xyz"])
+@pytest.mark.parametrize("target", [".ply", ".las", ".laz"])
+def test_labels_reach_all_points(source, target, tmp_path):
+    random = np.random.default_rng(1)
+    points = random.normal(size=(200, 3)).astype(np.float32).astype(float)
+    big, small, out = tmp_path / f"big{source}", tmp_path / "small.npz", tmp_path / f"out{target}"
+    WRITERS[source](big, Table(points, {"intensity": np.arange(200, dtype=np.uint16)}))
+    labels = np.arange(20) + 2**30
+    classes = np.array([3] * 10 + [200] * 10, np.uint8)  # a LAS class of old files is below 32
+    columns: dict[str, Any] = {"label": labels, "classification": classes}
+    columns["score"] = random.random(20)
+    WRITERS[".npz"](small, Table(points[:20], columns))
+    fields = [word for name in columns for word in ("--field", name)]
+    status, said, err = call(small, big, out, *fields)
+    assert (status, err) == (0, "")
+    assert "label, classification, score of 200 points" in said
+    made = contents(out)
+    np.testing.assert_allclose(made.points, points, atol=1e-6)
+    rows = nearest(contents(big).points, points[:20])
+    np.testing.assert_array_equal(made.columns["label"], labels[rows])
+    np.testing.assert_array_equal(made.columns["score"], columns["score"][rows])
+    # LAS keeps numbers that its own column cannot hold in a column beside it.
+    name = "classification_" if "classification_" in made.columns else "classification"
+    np.testing.assert_array_equal(made.columns[name], classes[rows])
+    if source not in (".npy",):
+        np.testing.assert_array_equal(made.columns["intensity"], np.arange(200))
+
+
+def test_points_without_coordinates_are_left_out_and_columns_kept(scan, tmp_path):
+    sample = contents(scan).take(np.arange(0, 90, 3))
+    WRITERS[".ply"](tmp_path / "small.ply", Table(sample.points, {"label": np.arange(30)}))
+    status, out, err = call(tmp_path / "small.ply", scan, "--field", "label")
+    assert (status, err) == (0, "")
+    made = contents(tmp_path / "big_propagated.ply")
+    whole = contents(scan).finite()
+    np.testing.assert_array_equal(made.points, whole.points)
+    np.testing.assert_array_equal(made.columns["intensity"], whole.columns["intensity"])
+    np.testing.assert_array_equal(made.columns["label"], nearest(whole.points, sample.points))
+
+
+@pytest.mark.parametrize("target", [".ply", ".las"])
+def test_later_parts_may_have_larger_and_broken_numbers(target, tmp_path):
+    points = np.random.default_rng(1).random((180, 3))
+    large = np.arange(180) + 2**31 - 70  # int32 holds those of the first part
+    rows = np.zeros(180, [*((axis, "f8") for axis in "xyz"), ("large", "i8"), ("intensity", "f8")])
+    rows["x"], rows["y"], rows["z"] = points.T
+    rows["large"], rows["intensity"] = large, np.where(np.arange(180) > 100, 0.5, 3)
+    np.save(tmp_path / "big.npy", rows)
+    WRITERS[".npz"](tmp_path / "small.npz", Table(points[:5], {"label": np.arange(5)}))
+    files = [tmp_path / "small.npz", tmp_path / "big.npy", tmp_path / f"out{target}"]
+    assert call(*files, "--field", "label")[0] == 0
+    made = contents(files[2]).columns
+    np.testing.assert_array_equal(made["large"], large)
+    name = "intensity_" if target == ".las" else "intensity"
+    np.testing.assert_array_equal(made[name], rows["intensity"])
+
+
+def test_colours_are_averaged_and_labels_vote(tmp_path):
+    line = np.arange(5.0)[:, None] * [1, 0, 0]
+    WRITERS[".npz"](tmp_path / "big.npz", Table(line, {}))
+    columns = {"label": np.array([5, 9, 9]), "red": np.array([0, 100, 100], np.uint8)}
+    WRITERS[".npz"](tmp_path / "small.npz", Table(line[[0, 2, 4]], columns))
+    files = [tmp_path / "small.npz", tmp_path / "big.npz"]
+    assert call(*files, tmp_path / "a.ply", "--field", "label", "--k", 3)[0] == 0
+    assert contents(tmp_path / "a.ply").columns["label"].tolist() == [5, 9, 9, 9, 9]
+    assert call(*files, tmp_path / "b.ply", "--field", "red", "--k", 2, "--mean")[0] == 0
+    assert contents(tmp_path / "b.ply").columns["red"].tolist() == [0, 50, 100, 100, 100]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["small.npz", "big.npz", "--field", "lable"], "no column 'lable'. Did you mean 'label'?"),
+        (["small.npz", "big.npz", "--field", "label", "--k", 4], "--k must be from 1 to the 3"),
+        (
+            ["small.npz", "big.npz", "out.obj", "--field", "label"],
+            "OUT must end in .ply, .las, .laz, got out.obj",
+        ),
+        (["small.npz", "mesh.ply", "mesh.ply", "--field", "label"], "OUT must differ"),
+        (["small.npz", "big.npz", "old.ply", "--field", "label"], "old.ply exists"),
+        (["small.npz", "nowhere.ply", "--field", "label"], "nowhere.ply: no such file"),
+        (["nowhere.ply", "big.npz", "--field", "label"], "nowhere.ply: no such file"),
+        (["small.npz", "empty.npz", "--field", "label"], "must be a cloud of at least one point"),
+        (["small.npz", "mesh.ply", "--field", "label"], "must be a cloud of at least one point"),
+        (["small.npz", "mesh.off", "out.ply", "--field", "label"], "mesh.off must end in .ply"),
+    ],
+)
+def test_mistake_ends_in_one_line(arguments, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    line = np.arange(5.0)[:, None] * [1, 0, 0]
+    WRITERS[".npz"](tmp_path / "big.npz", Table(line, {}))
+    WRITERS[".npz"](tmp_path / "small.npz", Table(line[:3], {"label": np.arange(3)}))
+    (tmp_path / "old.ply").touch()
+    WRITERS[".npz"](tmp_path / "empty.npz", Table(line[:0], {}))
+    trimesh.creation.box().export(tmp_path / "mesh.ply")
+    before = sorted(tmp_path.iterdir())
+    status, out, err = call(*arguments)
+    assert (status, out, len(err.splitlines())) == (2, "", 1), err
+    assert said in err
+    assert sorted(tmp_path.iterdir()) == before
