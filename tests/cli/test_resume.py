@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mops_lightning.records import run_record
-from mops_lightning.training.checkpoint import read_plain
+from mops_lightning.training.checkpoint import read_sealed
 from mops_lightning.training.experiment import Experiment
 from tests.support.command_line import TINY, call, runs
 from tests.support.forked import start_fork
@@ -56,7 +56,7 @@ def test_run_stopped_mid_epoch_resumes_to_same_weights(unbroken, number, left):
     checkpoint = run / "checkpoints" / "last.ckpt"
     record = run_record.read(resumed)
     assert record.resumed_from == str(checkpoint.relative_to(folder))
-    before = read_plain(checkpoint, "a checkpoint")["callbacks"]["CPUTime"]["seconds"]
+    before = read_sealed(checkpoint)["callbacks"]["CPUTime"]["seconds"]
     assert 0 < before < record.seconds["fit_cpu"]
     got = final_state(resumed)
     assert got.keys() == want.keys()

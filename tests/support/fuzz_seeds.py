@@ -13,7 +13,7 @@ from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
 from mops_lightning.records import run_record
 from mops_lightning.samplers.fmops import FMOPSNet
-from mops_lightning.training.checkpoint import CHECKPOINT_KEY
+from mops_lightning.training.checkpoint import CHECKPOINT_KEY, sealed
 from mops_lightning.viz.snapshots import save_clouds
 from mops_lightning.zoo import weights
 from tests.support.records import record
@@ -52,7 +52,7 @@ def seeds(folder):
     made["hdf5"] = (".h5", [_hdf5(folder / "a.h5", options) for options in ({}, packed)])
     made["names"] = (".txt", [b"chair\ntable\nlamp\n"])
     made["weights"] = (".safetensors", [_weights(folder / "a.safetensors")])
-    made["checkpoint"] = (".ckpt", [_saved(lambda file: torch.save(CHECKPOINT, file))])
+    made["checkpoint"] = (".ckpt", [sealed(_saved(lambda file: torch.save(CHECKPOINT, file)))])
     run_record.write(folder, record(files={"weights": "weights.safetensors"}))
     made["record"] = (".json", [(folder / run_record.FILE).read_bytes()])
     save_clouds(

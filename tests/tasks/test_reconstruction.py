@@ -9,6 +9,7 @@ from mops_lightning.ops.emd import earth_movers_distance
 from mops_lightning.ops.nearest import chamfer_distance
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.tasks.base import figures_of
 from mops_lightning.tasks.reconstruction import Reconstruction
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.types import Batch
@@ -119,7 +120,7 @@ def test_figures_show_samples_and_reconstructions(rng):
     given = batch(rng, number=2)
     chosen = FPSSampler(8)(given.points).points
     samples = {"sampled": chosen, "full": given.points}
-    axes = module.figures(given, samples, ["long", "tall"])["reconstructions"].axes
+    axes = figures_of(module, given, samples, ["long", "tall"])["reconstructions"].axes
     assert [one.get_title() for one in axes[:4]] == [
         "input",
         "from all points",

@@ -15,6 +15,7 @@ from mops_lightning.ops.nearest import chamfer_distance
 from mops_lightning.ops.rigid import Motion, identity_motion, quaternion_conjugate
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.tasks.base import figures_of
 from mops_lightning.tasks.registration import Registration
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.run.pictures import cloud_titles
@@ -180,7 +181,7 @@ def test_figures_show_every_readout_and_its_error(rng):
     data = CloudLoader(small_dataset().test, 4, make_batch=(module := task()).make_batch)
     batch = data.batch_of(torch.tensor([0, 1]))
     samples = {"sampled": FPSSampler(8)(batch.points).points, "full": batch.points}
-    figures = module.figures(batch, samples, ["long", "tall"])
+    figures = figures_of(module, batch, samples, ["long", "tall"])
     axes = figures["pairs"].axes
     assert len(axes) == 6
     assert [one.get_title() for one in axes[:3]] == ["before (centred)", "by sampled", "by full"]

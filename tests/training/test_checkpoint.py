@@ -1,5 +1,6 @@
 """A run that is stopped and resumed, also several times, gets the weights of an unbroken one."""
 
+import io
 import pickle
 import signal
 from functools import cache, partial
@@ -18,12 +19,13 @@ from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.classification import Classification
-from mops_lightning.training.checkpoint import read_plain
+from mops_lightning.training.checkpoint import read_sealed, sealed
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.muon import MuonAdam
 from mops_lightning.training.recipe.moving_average import MovingAverage
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.run.callbacks import StopBetweenSteps, last_checkpoint
+from mops_lightning.training.run.trainer import AtomicCheckpointIO
 from mops_lightning.training.schedules import one_cycle
 from tests.support.training import quiet_trainer, small_dataset
 
@@ -190,12 +192,25 @@ class Touch:
 
 
 @pytest.mark.parametrize("plain", [True, False])
-def test_read_plain_runs_no_pickled_code(plain, tmp_path):
-    content = {"state": Touch(tmp_path / "ran")}
-    if plain:
-        (tmp_path / "a.ckpt").write_bytes(pickle.dumps(content))
-    else:
-        torch.save(content, tmp_path / "a.ckpt")
-    with pytest.raises(UserError, match="expected a checkpoint"):
-        read_plain(tmp_path / "a.ckpt", "a checkpoint")
+def test_read_sealed_runs_no_pickled_code(plain, tmp_path):
+    content, path, buffer = {"state": Touch(tmp_path / "ran")}, tmp_path / "a.ckpt", io.BytesIO()
+    torch.save(content, buffer)
+    path.write_bytes(sealed(pickle.dumps(content) if plain else buffer.getvalue()))
+    with pytest.raises(UserError, match="expected a checkpoint of plain data"):
+        read_sealed(path)
     assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("change", ["byte", "cut", "saved again", "empty"])
+def test_read_sealed_of_a_changed_checkpoint_raises(change, tmp_path):
+    path = tmp_path / "last.ckpt"
+    AtomicCheckpointIO().save_checkpoint({"epoch": 3, "weight": torch.ones(50)}, path)
+    assert read_sealed(path)["epoch"] == 3
+    written = bytearray(path.read_bytes())
+    if change == "saved again":
+        torch.save({**torch.load(path), "epoch": 2}, path)
+    else:
+        written[written.index(torch.ones(50).numpy().tobytes())] ^= 1
+        path.write_bytes({"byte": written, "cut": written[:-1], "empty": b""}[change])
+    with pytest.raises(UserError, match=r"last\.ckpt is damaged .*expected a checkpoint as"):
+        read_sealed(path)

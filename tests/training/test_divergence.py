@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 import torch
 from lightning.pytorch.strategies import SingleDeviceStrategy
@@ -6,7 +8,7 @@ from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.checkpoint import CHECKPOINT
-from mops_lightning.training.divergence import Diverged, check_checkpoint, check_loss
+from mops_lightning.training.divergence import Diverged, check_finite
 from mops_lightning.training.run.run import run
 from mops_lightning.zoo import weights
 from tests.support.command_line import TINY
@@ -15,23 +17,15 @@ STRATEGY = SingleDeviceStrategy()
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_check_loss_not_finite_raises(value):
-    check_loss(torch.tensor(3.0), 1, STRATEGY)
-    with pytest.raises(Diverged, match=f"loss is {value} after 7 steps"):
-        check_loss(torch.tensor(value), 7, STRATEGY)
-
-
-@pytest.mark.parametrize("part", ["state_dict", "optimizer_states"])
-def test_check_checkpoint_not_finite_raises(part):
-    good = {
-        "state_dict": {"w": torch.ones(2), "n": torch.tensor(1)},
-        "optimizer_states": [{"state": {0: {"exp_avg": torch.ones(2)}}, "param_groups": [{}]}],
-        "callbacks": {"best": torch.tensor(float("inf"))},
+def test_check_finite_names_the_first_value_that_is_not(value):
+    good: dict[str, Any] = {
+        "weights": {"w": torch.ones(2), "n": torch.tensor(1)},
+        "optimizer": [{"state": {0: {"exp_avg": torch.ones(2)}}, "param_groups": [{}]}],
     }
-    check_checkpoint(good, STRATEGY)
-    bad = {**good, part: [{"state": {0: {"exp_avg": torch.tensor([1.0, float("nan")])}}}]}
-    with pytest.raises(Diverged, match=rf"{part}\.0\.state\.0\.exp_avg is not finite"):
-        check_checkpoint(bad, STRATEGY)
+    check_finite(good, 7, STRATEGY)
+    good["optimizer"][0]["state"][0]["exp_avg"][1] = value
+    with pytest.raises(Diverged, match=r"optimizer\.0\.state\.0\.exp_avg is not finite at step 7"):
+        check_finite(good, 7, STRATEGY)
 
 
 @pytest.fixture(scope="module")

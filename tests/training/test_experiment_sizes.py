@@ -102,9 +102,9 @@ def test_sizes_to_test_returns_ascending_sizes(sizes, m, sampler, expected):
     ("sizes", "m", "sampler", "named"),
     [
         ([8], 32, MOPSNet(32), r"returns 32 points.*got sizes=\[8\]"),
-        ([101], 32, FMOPSNet(100), r"at most sampler.m_max=100, .* got \[101\]"),
-        ([201], 32, FPSSampler(32), "from 1 to the 200 points"),
-        ("auto", 101, FMOPSNet(100), "m must be at most sampler.m_max=100, got m=101"),
+        ([101], 32, FMOPSNet(100), "sizes must be at most sampler.m_max=100, got 101"),
+        ([201], 32, FPSSampler(32), "sizes must be at most the 200 points of a cloud, got 201"),
+        ("auto", 101, FMOPSNet(100), "m must be at most sampler.m_max=100, got 101"),
         ("auto", 32, FMOPSNet(512), "sampler.m_max must be at most the 200 points .* got 512"),
     ],
 )

@@ -8,7 +8,7 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from mops_lightning.data.loader import CloudLoader
+from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.metrics.base import collection
 from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.ops.points import gather_points
@@ -18,7 +18,6 @@ from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.recipe.distillation import FullClouds
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.schedules import exponential
 from tests.support.losses import simplification_loss, subset_loss
@@ -49,7 +48,7 @@ def noting(kind, *arguments, **settings):
     return made
 
 
-def fitted(sampler, epochs=1, task=None, recipe=None, full_clouds=None, **extra):
+def fitted(sampler, epochs=1, task=None, recipe=None, augment=None, **extra):
     """Train with a rate of 0, so that all steps see the same weights, and validate each epoch."""
     data = numbered_clouds()
     module = Experiment(
@@ -57,10 +56,9 @@ def fitted(sampler, epochs=1, task=None, recipe=None, full_clouds=None, **extra)
         sampler,
         make_optimizer=lambda parameters: torch.optim.SGD(parameters, lr=0.0),
         recipe=recipe,
-        full_clouds=full_clouds,
     )
     trainer = quiet_trainer(epochs, **extra)
-    train = CloudLoader(data.train, 4, shuffle=True, drop_last=True)
+    train = CloudLoader(data.train, 4, shuffle=True, augment=augment, drop_last=True)
     trainer.fit(module, train, CloudLoader(data.test, 10))
     return module, {name: float(value) for name, value in trainer.callback_metrics.items()}
 
@@ -177,20 +175,22 @@ class ComparedTask(RecordingTask):
         return result._replace(output=result.predictions)
 
 
-@pytest.mark.parametrize("kept", [False, True])
-def test_distillation_targets_are_whole_clouds_and_features_of_seen_points(kept, calls, tmp_path):
+# Predictions for clouds that do not change are computed once; with noise, for the noisy clouds.
+@pytest.mark.parametrize("augment", [None, Augmentation(jitter=0.1, jitter_clip=0.3)])
+def test_distillation_targets_are_whole_clouds_and_features_of_seen_points(augment, calls):
     sampler = noting(MOPSNet, 8, **MOPS)
     module, logged = fitted(
         sampler,
         task=ComparedTask(FingerprintOfMaxima()),
         recipe=Recipe(train_points=20, distillation=3.0, feature_distillation=0.5),
-        full_clouds=FullClouds(numbered_clouds().train, 6, tmp_path) if kept else None,
+        augment=augment,
         limit_train_batches=1,
         limit_val_batches=0,
     )
     ((_, seen, output),) = sampler.samples
     (call,) = calls
     assert (seen.shape[1], call.clouds.shape[1]) == (20, 40)
+    assert (module.distillation.table is None) == (augment is not None)
     with torch.no_grad():
         apart = (module.task.net(output.points) - module.task.net(call.clouds)).square().mean()
         found, wanted = (points.relu().amax(1) for points in (output.points, seen))

@@ -52,7 +52,7 @@ def figures(name):
     cfg = as_trained(compose(chosen), trained, chosen)
     data = dataset(cfg.names.task, card["record"]["class_names"])
     experiment = make_experiment(cfg, data, {}).eval()
-    load_trained(trained, cfg, experiment, data)
+    load_trained(trained, True, experiment, data)
     task, sampler = experiment.task, experiment.sampler
     score = task.full_score or task.score if m is None else task.score
     metric = task.metrics()[score]

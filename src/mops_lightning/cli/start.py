@@ -6,7 +6,7 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from mops_lightning.config import distributed
@@ -44,7 +44,11 @@ class RunStart(Callback):
         cfg = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
         try:
             folder = Path(config.hydra.run.dir)
-            checked(cfg, list(config.hydra.overrides.task))
+            settings = checked(cfg, list(config.hydra.overrides.task))
+            if cfg.evaluate:  # the job gets the settings of the trained run
+                with open_dict(config):
+                    for name in settings:
+                        config[name] = settings[name]
             check_paths(cfg)
             distributed.check_start(cfg, config.hydra.overrides.hydra)
             if not distributed.is_worker_rank(cfg):

@@ -74,6 +74,7 @@ def one_of(*choices: str, others: tuple[Any, ...] = ()) -> Limits:
 
 
 NOT_NEGATIVE = number("of at least 0", lambda x: x >= 0)
+ABOVE_ZERO = number("above 0", lambda x: x > 0)
 
 
 @dataclass(frozen=True)
@@ -194,7 +195,7 @@ class RunSettings:
         1.0,
         "with learn=joint, the task net's learning rate as a share of the sampler's",
         Affects.TRAINING,
-        limits=number("above 0", lambda x: x > 0),
+        limits=ABOVE_ZERO,
         learn=("joint",),
     )
     batch_size: int = setting(
@@ -294,6 +295,16 @@ INSIDE: dict[str, dict[str, Any]] = {
     "epochs.sampler": {"limits": whole(0)},
     "epochs.joint": {"limits": whole(0)},
     "trainer.max_epochs": {"limits": whole(0)},
+    # A run that is shortened in these ways tests or trains nothing that anybody wants to know.
+    "trainer.fast_dev_run": {"limits": Limits("false; try epochs.sampler=1", lambda x: not x)},
+    "trainer.overfit_batches": {"limits": Limits("0; give fewer clouds", lambda x: not x)},
+    "trainer.max_steps": {
+        "limits": Limits(
+            "-1 or a whole number of at least 1", lambda x: x == -1 or whole(1).fits(x)
+        )
+    },
+    "trainer.limit_train_batches": {"limits": ABOVE_ZERO},
+    "trainer.limit_test_batches": {"limits": ABOVE_ZERO},
     "trainer.precision": {"limits": one_of(*PRECISIONS, others=("32", 32, None))},
     "trainer._target_": _NOTHING,
     "trainer.accelerator": _NOTHING,

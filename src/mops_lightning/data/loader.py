@@ -60,8 +60,8 @@ class Augmentation:
 FIXED, DRAWN = 11, 12
 """Random streams of tasks: the same in every epoch, or new in every epoch."""
 
-MakeBatch = Callable[[Batch, Callable[[], list[Generator]]], Any]
-"""Function that converts a batch for a task, given one random generator per cloud."""
+MakeBatch = Callable[[Tensor, list[Generator]], Any]
+"""Function that converts clouds for a task, given one random generator per cloud."""
 
 
 class CloudLoader:
@@ -75,7 +75,7 @@ class CloudLoader:
         batch_size: clouds per batch.
         shuffle: whether every epoch has a new order; otherwise the order of the split.
         augment: augmentation, or None.
-        make_batch: the task's conversion of a batch, see ``tasks.base.Task.make_batch``. Without
+        make_batch: the task's conversion of clouds, see ``tasks.base.Task.make_batch``. Without
             ``shuffle`` its random numbers are the same in every epoch.
         drop_last: whether to drop an incomplete last batch, because BatchNorm cannot train on a
             single cloud; the only batch is never dropped.
@@ -111,6 +111,11 @@ class CloudLoader:
 
     def __len__(self) -> int:
         return self.batches
+
+    @property
+    def keeps_clouds(self) -> bool:
+        """Whether the clouds are the same in every epoch, neither augmented nor converted."""
+        return self.make_batch is None and not (self.augment and self.augment.active)
 
     def set_epoch(self, epoch: int) -> None:
         """Start ``epoch`` from its first batch, unless it is the current epoch."""
@@ -162,8 +167,7 @@ class CloudLoader:
         return self._made(self.clouds.points[rows], rows, 0)
 
     def _made(self, points: Tensor, rows: Tensor, epoch: int) -> Any:
-        batch = Batch(points, self.clouds.labels[rows], rows)
         if self.make_batch is None:
-            return batch
+            return Batch(points, self.clouds.labels[rows], rows)
         stream = (DRAWN, self.seed, epoch) if self.shuffle else (FIXED, self.seed)
-        return self.make_batch(batch, lambda: [generator(*stream, row) for row in rows.tolist()])
+        return self.make_batch(points, [generator(*stream, row) for row in rows.tolist()])

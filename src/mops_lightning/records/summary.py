@@ -25,8 +25,9 @@ def closing_lines(folder: Path, record: RunRecord, console: Console | None = Non
     console.print(table)
     files = ", ".join([FILE, *sorted(record.files.values())])
     seconds = record.seconds["total"]
+    partial = f", but {' and '.join(record.partial)}" if record.partial else ""
     console.print(
-        f"{record.status} in {seconds:.0f} s; files in {folder}/: {files}",
+        f"{record.status} in {seconds:.0f} s{partial}; files in {folder}/: {files}",
         soft_wrap=True,
         highlight=False,
     )

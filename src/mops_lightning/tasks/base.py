@@ -1,6 +1,7 @@
 """The contract that every task keeps."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import singledispatch
 from inspect import signature
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -8,11 +9,10 @@ from torch import Generator, Tensor, nn
 from torchmetrics import MetricCollection
 
 from mops_lightning.errors import UserError
-from mops_lightning.types import Batch, TaskOutput
+from mops_lightning.types import TaskOutput
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
 
 K = TypeVar("K")
 
@@ -21,7 +21,7 @@ class Task(nn.Module):
     """Base of all tasks: owns the task net, its losses and its metrics.
 
     A task implements ``step`` and ``metrics``, and, for distillation and the refined readout,
-    ``predict`` and ``disagreement``. ``make_batch``, ``scores`` and ``figures`` have defaults.
+    ``predict`` and ``disagreement``. ``scores`` calls ``step`` by default.
 
     Args:
         net: the task net; its call signature is task-specific, see ``net_takes``.
@@ -39,8 +39,9 @@ class Task(nn.Module):
     requires_same_classes: bool = False
     """Whether the net's outputs are the classes of the data it was trained on."""
 
-    clouds_are_batches: bool = True
-    """Whether ``make_batch`` leaves clouds as they are, so that their predictions can be kept."""
+    make_batch: Callable[[Tensor, list[Generator]], Any] | None = None
+    """Converts clouds ``(B, N, 3)``, given one random generator per cloud, to the batch that
+    ``step`` takes; None: ``step`` takes a ``Batch``."""
 
     net_takes: tuple[str, ...] = ("points",)
     """Names of the arguments of the net's ``forward``."""
@@ -65,21 +66,11 @@ class Task(nn.Module):
             )
         self.net = net
 
-    def make_batch(self, batch: Batch, generators: Callable[[], list[Generator]]) -> Any:
-        """Turn the loader's batch into the one that ``step`` takes; the same by default.
-
-        Args:
-            batch: clouds and labels.
-            generators: makes one random number generator per cloud, so that what is drawn for a
-                cloud does not depend on the rest of its batch.
-        """
-        return batch
-
     def predict(self, batch: Any, points: Tensor) -> Any:
         """Return the net's output for sampled points, as ``disagreement`` compares it.
 
         Args:
-            batch: from ``make_batch``.
+            batch: a ``Batch``, or from ``make_batch``.
             points: as for ``step``.
         """
         raise NotImplementedError
@@ -97,7 +88,7 @@ class Task(nn.Module):
         """Run the net on sampled points, for training.
 
         Args:
-            batch: from ``make_batch``.
+            batch: as for ``predict``.
             points: ``(B', M, 3)`` sampled from ``batch.points``, in the same order.
 
         Returns:
@@ -109,7 +100,7 @@ class Task(nn.Module):
         """Run the net on several samples of one batch, for scores; by default ``step`` on each.
 
         Args:
-            batch: from ``make_batch``.
+            batch: as for ``predict``.
             samples: points by name, each as for ``step``.
 
         Returns:
@@ -125,14 +116,17 @@ class Task(nn.Module):
         """
         raise NotImplementedError
 
-    def figures(
-        self, batch: Any, samples: Mapping[str, Tensor], titles: Sequence[str]
-    ) -> "dict[str, Figure]":
-        """Draw the task's results for a few clouds, by name; nothing by default.
 
-        Args:
-            batch: as for ``step``.
-            samples: sampled points ``(B', M, 3)`` by readout.
-            titles: one per cloud of the dataset.
-        """
-        return {}
+@singledispatch
+def figures_of(
+    task: Task, batch: Any, samples: Mapping[str, Tensor], titles: Sequence[str]
+) -> "dict[str, Figure]":
+    """Draw a task's results for a few clouds, by name; nothing unless a task registers a function.
+
+    Args:
+        task: in evaluation mode.
+        batch: as for ``Task.step``.
+        samples: sampled points by readout, each as for ``Task.step``.
+        titles: one per cloud of the dataset.
+    """
+    return {}

@@ -22,7 +22,7 @@ from mops_lightning.metrics.reconstruction import (
 )
 from mops_lightning.ops.emd import earth_movers_distance
 from mops_lightning.ops.nearest import chamfer_distance
-from mops_lightning.tasks.base import K, Task
+from mops_lightning.tasks.base import K, Task, figures_of
 from mops_lightning.types import Batch, TaskOutput
 
 if TYPE_CHECKING:
@@ -95,30 +95,6 @@ class Reconstruction(Task):
         emd = _emd(built, clouds, None if exact else SCORED_BLOCK, SCORED_ROUNDS)
         return Distances(chamfer_distance(built, clouds), emd)
 
-    def figures(
-        self, batch: Batch, samples: Mapping[str, Tensor], titles: Sequence[str]
-    ) -> "dict[str, Figure]":
-        """Draw input, sampled points and reconstructions side by side.
-
-        Args:
-            batch: the clouds to draw.
-            samples: sampled points ``(B, M, 3)`` by readout.
-            titles: one per cloud.
-        """
-        from mops_lightning.viz.task_results import ReconstructionResult, reconstruction_grid
-
-        clouds, n = batch.points, batch.points.shape[1]
-        full = self.net(clouds, n)
-        reference = chamfer_distance(full, clouds)
-        columns = {}
-        for name, chosen in samples.items():
-            if chosen.shape == clouds.shape:
-                continue  # all points have their own column
-            built = self.net(chosen, n)
-            ratios = (chamfer_distance(built, clouds) / reference).tolist()
-            columns[name] = ReconstructionResult(chosen, built, ratios)
-        return {"reconstructions": reconstruction_grid(clouds, full, columns, titles)}
-
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return mean distances and, except in training, which has no reference, NRE."""
         metrics: list[TableMetric] = [MeanChamfer(), MeanEMD()]
@@ -135,3 +111,23 @@ class Reconstruction(Task):
 def _emd(built: Tensor, points: Tensor, block: int | None, rounds: int) -> Tensor:
     """Return earth mover's distances ``(B,)``, computed by one process per thread of torch."""
     return earth_movers_distance(built, points, block, rounds, torch.get_num_threads())
+
+
+@figures_of.register(Reconstruction)
+def _(
+    task: Reconstruction, batch: Batch, samples: Mapping[str, Tensor], titles: Sequence[str]
+) -> "dict[str, Figure]":
+    """Draw input, sampled points and reconstructions side by side."""
+    from mops_lightning.viz.task_results import ReconstructionResult, reconstruction_grid
+
+    clouds = batch.points
+    full = task.predict(batch, clouds)
+    reference = chamfer_distance(full, clouds)
+    columns = {}
+    for name, chosen in samples.items():
+        if chosen.shape == clouds.shape:
+            continue  # all points have a column of their own
+        built = task.predict(batch, chosen)
+        ratios = (chamfer_distance(built, clouds) / reference).tolist()
+        columns[name] = ReconstructionResult(chosen, built, ratios)
+    return {"reconstructions": reconstruction_grid(clouds, full, columns, titles)}

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 from torchmetrics import MetricCollection
 
 from mops_lightning.data.pairs import Pairs
@@ -18,8 +18,8 @@ from mops_lightning.metrics.registration import (
     TranslationError,
 )
 from mops_lightning.ops.rigid import Motion, identity_motion, quaternion_to_matrix
-from mops_lightning.tasks.base import Task
-from mops_lightning.types import Batch, PairBatch, TaskOutput
+from mops_lightning.tasks.base import Task, figures_of
+from mops_lightning.types import PairBatch, TaskOutput
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,7 +45,6 @@ class Registration(Task):
 
     score = RotationError.name
     net_takes = ("source", "target")
-    clouds_are_batches = False
     clouds_per_prediction = 2
     maps_pooled = "from_pooled_pair"
 
@@ -58,12 +57,8 @@ class Registration(Task):
                 raise UserError(f"{name} cannot be None. Leave it at its default.")
         assert pairs is not None
         assert loss is not None
-        self.pairs = pairs
+        self.make_batch = pairs
         self.loss = loss
-
-    def make_batch(self, batch: Batch, generators: Callable[[], list[Generator]]) -> PairBatch:
-        """Make a pair of every cloud; see ``Pairs``."""
-        return self.pairs(batch.points, generators())
 
     def predict(self, batch: PairBatch, points: Tensor) -> Motion:
         """Return the motions between the centred clouds from ``(2B, M, 3)`` points of both."""
@@ -111,28 +106,24 @@ class Registration(Task):
             TranslationError(),
         )
 
-    def figures(
-        self, batch: PairBatch, samples: Mapping[str, Tensor], titles: Sequence[str]
-    ) -> "dict[str, Figure]":
-        """Draw the pairs before and after alignment, one column for each readout.
 
-        Args:
-            batch: the pairs to draw.
-            samples: sampled points ``(2B, M, 3)`` by readout.
-            titles: one per pair.
-        """
-        from mops_lightning.viz.task_results import RegistrationResult, pair_grid
+@figures_of.register(Registration)
+def _(
+    task: Registration, batch: PairBatch, samples: Mapping[str, Tensor], titles: Sequence[str]
+) -> "dict[str, Figure]":
+    """Draw the pairs before and after alignment, one column for each readout."""
+    from mops_lightning.viz.task_results import RegistrationResult, pair_grid
 
-        source, target = batch.points.chunk(2)
-        columns = {}
-        for name, points in samples.items():
-            result = self.step(batch, points)
-            motion: Motion = result.output
-            of_source, of_target = points.chunk(2)
-            errors = RotationError.of(result.predictions, result.targets)
-            columns[name] = RegistrationResult(
-                motion.apply(source), motion.apply(of_source), of_target, errors.tolist()
-            )
-        true = Motion(batch.quaternion, batch.translation)
-        before = RotationError.of(identity_motion(source), true).tolist()
-        return {"pairs": pair_grid(source, target, before, columns, titles)}
+    source, target = batch.points.chunk(2)
+    columns = {}
+    for name, points in samples.items():
+        result = task.step(batch, points)
+        motion: Motion = result.output
+        of_source, of_target = points.chunk(2)
+        errors = RotationError.of(result.predictions, result.targets)
+        columns[name] = RegistrationResult(
+            motion.apply(source), motion.apply(of_source), of_target, errors.tolist()
+        )
+    true = Motion(batch.quaternion, batch.translation)
+    before = RotationError.of(identity_motion(source), true).tolist()
+    return {"pairs": pair_grid(source, target, before, columns, titles)}

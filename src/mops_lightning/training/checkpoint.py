@@ -1,5 +1,7 @@
 """Finding the checkpoint to resume from, and checking that it belongs to this run."""
 
+import hashlib
+import io
 import json
 from contextlib import suppress
 from dataclasses import dataclass
@@ -7,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 
 from mops_lightning.config.shared_settings import training_settings
 from mops_lightning.errors import UserError
@@ -20,8 +21,7 @@ CHECKPOINT_KEY = "mops_lightning"
 LENGTH = "trainer.max_epochs"
 """The planned length of a run."""
 
-PARTS = {CHECKPOINT_KEY: dict, "state_dict": dict, "optimizer_states": list, "loops": dict}
-"""Parts of a checkpoint that resuming needs, with their types."""
+SEAL_BYTES = hashlib.sha256().digest_size
 
 
 def checkpoint_identity(config: dict[str, Any], fingerprint: str) -> dict[str, str]:
@@ -62,48 +62,35 @@ class Checkpoint:
 
     @classmethod
     def read(cls, path: Path) -> "Checkpoint":
-        """Read a checkpoint and check that it contains all that resuming needs.
+        """Read what identifies a checkpoint.
 
         Raises:
-            UserError: the file cannot be opened.
-            Damaged: it is damaged, not finite, or not a checkpoint of this program.
+            UserError: the file cannot be opened, or is no checkpoint as it was written.
         """
-        content = read_plain(path, "a checkpoint")
-        try:
-            written_by = content[CHECKPOINT_KEY]
-            planned = int(json.loads(written_by[LENGTH]))
-            done = int(content["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"])
-            complete = min(planned, done) >= 0 and all(
-                isinstance(content[key], kind) for key, kind in PARTS.items()
-            )
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
-            complete = False
-        if not complete:
-            raise weights.Damaged(f"{path} is not a checkpoint of this program.")
-        weights.check_state(content["state_dict"], path)
-        return cls(path, written_by, planned, done)
+        content = read_sealed(path)
+        written_by = content[CHECKPOINT_KEY]
+        done = content["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"]
+        return cls(path, written_by, int(json.loads(written_by[LENGTH])), int(done))
 
 
-def find_checkpoint(cfg: DictConfig, identity: dict[str, str]) -> Checkpoint | None:
-    """Return the checkpoint that ``ckpt_path`` means; None where training starts at the beginning.
+def find_checkpoint(name: str, out: Path, identity: dict[str, str]) -> Checkpoint:
+    """Return the checkpoint that ``ckpt_path`` means.
 
     Args:
-        cfg: ``ckpt_path`` may be ``last`` (the newest run below ``out`` with these settings), a
-            run's folder or a file.
+        name: ``last`` (the newest run below ``out`` with these settings), a run's folder or a file.
+        out: folder for runs.
         identity: this run's; see ``checkpoint_identity``.
 
     Raises:
         UserError: there is no such checkpoint, it belongs to other settings, or it has more epochs
             than ``trainer.max_epochs``.
     """
-    if cfg.ckpt_path is None:
-        return None
-    newest = cfg.ckpt_path == "last"
-    checkpoint = _newest(Path(cfg.out), identity) if newest else _named(cfg.ckpt_path, identity)
-    if cfg.trainer.max_epochs < checkpoint.done:
+    checkpoint = _newest(out, identity) if name == "last" else _named(name, identity)
+    epochs = int(json.loads(identity[LENGTH]))
+    if epochs < checkpoint.done:
         raise UserError(
             f"trainer.max_epochs must be at least {checkpoint.done}, the epochs of "
-            f"{checkpoint.path}, got {cfg.trainer.max_epochs}."
+            f"{checkpoint.path}, got {epochs}."
         )
     return checkpoint
 
@@ -137,9 +124,8 @@ def _named(name: str, identity: dict[str, str]) -> Checkpoint:
 
 def _newest(out: Path, identity: dict[str, str]) -> Checkpoint:
     """Return the newest checkpoint of these settings below ``out``."""
-    paths = sorted(
-        out.glob(f"**/checkpoints/{CHECKPOINT}"), key=lambda p: p.stat().st_mtime, reverse=True
-    )
+    found = [path for path in out.glob(f"**/checkpoints/{CHECKPOINT}") if path.is_file()]
+    paths = sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)
     for path in paths:
         with suppress(weights.Damaged):
             checkpoint = Checkpoint.read(path)
@@ -156,20 +142,29 @@ def _different(old: dict[str, str], new: dict[str, str]) -> list[str]:
     return [name for name in names if old.get(name) != new.get(name)]
 
 
-def read_plain(path: Path, what: str) -> Any:
-    """Read a file of plain tensors and plain data; pickled code is refused, not executed.
+def sealed(content: bytes) -> bytes:
+    """Return the bytes of a checkpoint and, behind them, their sha256; ``torch.load`` skips it."""
+    return content + hashlib.sha256(content).digest()
 
-    Args:
-        path: the file.
-        what: kind of file that was expected, for the error.
+
+def read_sealed(path: Path) -> Any:
+    """Read a checkpoint, which must not have changed since it was written.
+
+    A changed counter or tensor would be resumed to another training, silently. Pickled code is
+    refused, not executed.
 
     Raises:
         UserError: the file cannot be opened.
-        Damaged: it is damaged, or contains more than plain data.
+        Damaged: it is not a checkpoint, or was changed.
     """
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except PermissionError:
-        raise UserError(f"{path} may not be read. Check its permissions.") from None
+        written = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}.") from None
+    content, seal = written[:-SEAL_BYTES], written[-SEAL_BYTES:]
+    if hashlib.sha256(content).digest() != seal:
+        raise weights.damaged(path, "expected a checkpoint as this program wrote it")
+    try:
+        return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except Exception:  # torch's messages advise to execute the file's code
-        raise weights.damaged(path, f"expected {what}") from None
+        raise weights.damaged(path, "expected a checkpoint of plain data") from None

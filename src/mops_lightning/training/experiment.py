@@ -23,12 +23,15 @@ from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
 from mops_lightning.tasks.refinement import Refinement
 from mops_lightning.training.checkpoint import CHECKPOINT_KEY
-from mops_lightning.training.divergence import check_checkpoint, check_loss
+from mops_lightning.training.divergence import SAVED, check_finite
 from mops_lightning.training.readouts import names_of_readouts, readouts
-from mops_lightning.training.recipe.distillation import Distillation, FullClouds, Targets
+from mops_lightning.training.recipe.distillation import Distillation, Targets
 from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through
 from mops_lightning.training.scores import Scores
 from mops_lightning.types import Batch, SampleOutput
+
+TEST = "test/"
+"""Prefix of the test metrics, which the run logs together after the test, not as curves."""
 
 
 class Experiment(L.LightningModule):
@@ -48,7 +51,6 @@ class Experiment(L.LightningModule):
         recipe: how the sampler is trained beyond its own losses; None: by these alone.
         task_lr_scale: with ``learn="joint"``, the task net's learning rate over the sampler's.
         refine: passes of the refined readout in tests; 0: without this readout.
-        full_clouds: training clouds whose predictions the distillation computes once.
         m: the size that is validated and gives the run's score; None: the sampler's.
 
     Raises:
@@ -70,7 +72,6 @@ class Experiment(L.LightningModule):
         task_lr_scale: float = 1.0,
         recipe: Recipe | None = None,
         refine: int = 0,
-        full_clouds: FullClouds | None = None,
     ) -> None:
         super().__init__()
         _check_learn(learn, task, sampler)
@@ -84,11 +85,8 @@ class Experiment(L.LightningModule):
         self.identity = identity
         self.task_lr_scale = task_lr_scale
         self.recipe = recipe or Recipe()
-        self.distillation: Distillation | None = None
-        if learn == "sampler":
-            self.distillation = Distillation(task, self.recipe, full_clouds)
+        self.distillation = Distillation(task, self.recipe) if learn == "sampler" else None
         self.total_steps = 1
-        self.started = False  # whether a checkpoint, if any, was restored
         for module in self._frozen():
             module.requires_grad_(False)
         self.m: int = m or (self.sampler.m if self.sampler is not None else 0)
@@ -147,8 +145,9 @@ class Experiment(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the run's identity; refuse a state that is not finite."""
-        check_checkpoint(checkpoint, self.trainer.strategy)
+        """Add the run's identity; refuse a state that would replace the last finite one."""
+        saved = {name: checkpoint.get(name) for name in SAVED}
+        check_finite(saved, self.global_step, self.trainer.strategy)
         checkpoint[CHECKPOINT_KEY] = self.identity or {}
 
     def on_train_start(self) -> None:
@@ -159,13 +158,12 @@ class Experiment(L.LightningModule):
         last step of an epoch and before its end, it counts this epoch as completed and does not
         begin the next one: every later checkpoint would be one epoch behind.
         """
-        self.started = True
         epochs: Any = self.trainer.fit_loop.epoch_progress.current
         if epochs.processed == epochs.ready:
             self.trainer.fit_loop.reset_restart_stage()
-        if self.distillation is not None:
-            self.distillation.start(self.device)
         loader: Any = self.trainer.train_dataloader
+        if self.distillation is not None:
+            self.distillation.start(loader, self.device)
         if hasattr(loader, "load_state_dict"):
             begun = self.trainer.fit_loop.epoch_loop.batch_progress.current.ready
             position = begun if begun < len(loader) else 0
@@ -198,7 +196,7 @@ class Experiment(L.LightningModule):
         """Return the task loss plus the sampler's losses, over all sizes of this step.
 
         Raises:
-            Diverged: the loss is NaN or infinite.
+            Diverged: a loss is NaN or infinite.
         """
         sizes = (0,) if self.sampler is None else self.sampler.training_sizes()
         rank = self.global_rank
@@ -218,7 +216,7 @@ class Experiment(L.LightningModule):
             share = 1 / len(sizes) if mean else 1.0
             losses = {name: torch.stack(values).sum() * share for name, values in terms.items()}
             total = torch.stack(list(losses.values())).sum()
-        check_loss(total, self.global_step, self.trainer.strategy)
+        check_finite({"the loss": total}, self.global_step, self.trainer.strategy)
         soft = outputs[sizes[0]].soft_projected
         readout = self.main_readout if soft is None else SOFT_PROJECTED
         self._log_training({**losses, "total": total}, readout, len(batch.points))
@@ -283,8 +281,8 @@ class Experiment(L.LightningModule):
             sets = {prefix: samples[m] for m, prefix in self.prefixes.items()}
             # The same for all sizes; without a sampler, the full clouds are in it already.
             sets[""] = {**sets.get("", {}), FULL: batch.points}
-            self._score("test/", batch, sets)
-            self._score_sets("test/", self.prefixes, batch.points, outputs)
+            self._score(TEST, batch, sets)
+            self._score_sets(TEST, self.prefixes, batch.points, outputs)
 
     def _score(self, stage: str, batch: Batch, sets: Mapping[str, Mapping[str, Tensor]]) -> None:
         """Update and log the task's metrics of readouts, and the loss of the main one.
@@ -294,7 +292,7 @@ class Experiment(L.LightningModule):
             batch: the clouds.
             sets: points by readout, by prefix of a size.
         """
-        clouds = len(batch.points)
+        clouds, logger = len(batch.points), _logger_of(stage)
         samples = {
             (prefix, readout): points
             for prefix, by_readout in sets.items()
@@ -302,13 +300,13 @@ class Experiment(L.LightningModule):
         }
         for (prefix, readout), result in self.task.scores(batch, samples).items():
             for name, metric in self.scores.update_readout(f"{prefix}{readout}", result).items():
-                self.log(f"{stage}{name}", metric, batch_size=clouds)
+                self.log(f"{stage}{name}", metric, batch_size=clouds, logger=logger)
             if readout != self.main_readout:
                 continue
             for name, value in result.losses.items():
                 key = f"{stage}{prefix}loss/{name}"
                 mean, place = self.scores.update_loss(key, value, clouds), f"scores.losses.{key}"
-                self.log(key, mean, batch_size=clouds, metric_attribute=place)
+                self.log(key, mean, batch_size=clouds, metric_attribute=place, logger=logger)
 
     def _score_sets(
         self,
@@ -322,7 +320,12 @@ class Experiment(L.LightningModule):
             return
         updated = self.scores.update_sets(points, outputs, self.sampler.nested, prefixes)
         for name, metric in updated.items():
-            self.log(f"{stage}{name}", metric, batch_size=len(points))
+            self.log(f"{stage}{name}", metric, batch_size=len(points), logger=_logger_of(stage))
+
+
+def _logger_of(stage: str) -> bool | None:
+    """Return whether metrics go to the logger; None: if there is one."""
+    return False if stage == TEST else None
 
 
 def _check_learn(learn: Learn, task: Task, sampler: Sampler | None) -> None:

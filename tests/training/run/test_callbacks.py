@@ -5,12 +5,7 @@ from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
-from mops_lightning.training.run.callbacks import (
-    STANDARD,
-    EpochLines,
-    added,
-    build_callbacks,
-)
+from mops_lightning.training.run.callbacks import STANDARD, EpochLines, build_callbacks
 from tests.support.command_line import TINY, call, runs
 
 STOPPING = [
@@ -29,7 +24,6 @@ def build_from(overrides, tmp_path):
 
 def test_standard_names_are_those_of_the_yaml():
     assert set(compose().callbacks) == set(STANDARD)
-    assert added(compose().callbacks) == {}
 
 
 def test_without_logger_and_pictures_two_are_built(tmp_path):
@@ -46,7 +40,6 @@ def test_added_callback_is_built_with_its_settings(tmp_path):
     made = build_from(STOPPING, tmp_path)
     assert isinstance(made[-1], EarlyStopping)
     assert made[-1].monitor == "train/mean_loss"
-    assert list(added(compose(STOPPING).callbacks)) == ["early"]
 
 
 @pytest.mark.parametrize("target", ["torch.nn.ReLU", None])

@@ -39,6 +39,18 @@ def test_evaluate_without_changes_repeats_metrics(trained, tmp_path):
     assert not (tmp_path / "new" / "weights.safetensors").exists()
 
 
+def test_evaluate_on_the_command_line_has_the_settings_of_the_run_and_the_user(trained, tmp_path):
+    folder, record = trained
+    status, _, err = call([f"evaluate={folder}", "seed=5", "pictures=0", "logger=none"], tmp_path)
+    assert (status, err) == (0, "")
+    (made,) = runs(tmp_path)
+    again = run_record.read(made)
+    assert again.config["batch_size"] == record.config["batch_size"] == 4
+    assert (again.config["seed"], again.config["sampler"]) == (5, record.config["sampler"])
+    assert again.evaluated is not None
+    assert again.evaluated.run == str(folder)
+
+
 def test_evaluate_follows_weights_path_of_record(trained, tmp_path):
     folder, record = trained
     (tmp_path / "kept").mkdir()
@@ -211,10 +223,10 @@ def test_evaluate_task_net_on_other_data(tmp_path):
         evaluated(folder, tmp_path / "b", "learn=nothing")
 
 
-def test_evaluate_autoencoder_more_points_names_cause(tmp_path):
+def test_evaluate_autoencoder_more_points_raises(tmp_path):
     overrides = [*TINY, "task=reconstruction", "sampler=mops", f"cache={tmp_path}/cache"]
     made = run(compose(overrides), tmp_path / "made", overrides)
-    with pytest.raises(UserError, match=r"task.net.n_points is 90 here and was 64"):
+    with pytest.raises(UserError, match=r"another net's weights: .* instead of"):
         evaluated((tmp_path / "made", made), tmp_path, "dataset.n_points=90")
 
 

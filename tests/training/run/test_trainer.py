@@ -1,9 +1,11 @@
 import sys
 import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
+from lightning.pytorch.callbacks.progress.progress_bar import get_standard_metrics
 
 from mops_lightning.config.compose import compose
 from mops_lightning.nets.pointnet import PointNetVanilla
@@ -23,6 +25,16 @@ def test_make_trainer_writes_checkpoints_atomically(tmp_path):
     experiment = Experiment(Classification(PointNetVanilla(3), 3), learn="task")
     trainer = make_trainer(compose(TINY), tmp_path, small_dataset(), experiment, clouds=8)
     assert isinstance(trainer.strategy.checkpoint_io, AtomicCheckpointIO)
+
+
+def test_make_trainer_progress_bar_shows_no_version(tmp_path):
+    experiment = Experiment(Classification(PointNetVanilla(3), 3), learn="task")
+    cfg = compose([*(one for one in TINY if not one.startswith("logger")), "logger=tensorboard"])
+    trainer = make_trainer(cfg, tmp_path, small_dataset(), experiment, clouds=8)
+    assert trainer.logger is not None
+    assert trainer.logger.log_dir is not None
+    assert Path(trainer.logger.log_dir) == tmp_path / "tensorboard"
+    assert "v_num" not in get_standard_metrics(trainer)
 
 
 class Unwritable:

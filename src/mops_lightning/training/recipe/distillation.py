@@ -1,22 +1,15 @@
 """Losses that compare the frozen task net's outputs for a sample and for the whole cloud."""
 
-import hashlib
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from mops_lightning.data.clouds import Clouds
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
-from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.tasks.base import Task
-from mops_lightning.training.checkpoint import read_plain
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.types import Batch, PointFeatureNet
-from mops_lightning.zoo import weights
 
 
 class Targets(NamedTuple):
@@ -32,23 +25,27 @@ class Distillation:
     Args:
         task: with the frozen task net.
         recipe: for the weights of the losses.
-        clouds: whose predictions are computed once; None: they are computed in every step.
     """
 
-    def __init__(self, task: Task, recipe: Recipe, clouds: "FullClouds | None" = None) -> None:
+    def __init__(self, task: Task, recipe: Recipe) -> None:
         self.task = task
         self.recipe = recipe
         self.predicts = recipe.distillation > 0
-        self.clouds = clouds if self.predicts and task.clouds_are_batches else None
         self.table: Tensor | None = None
 
-    def start(self, device: torch.device) -> None:
-        """Read or compute the predictions for all points of every training cloud.
+    def start(self, loader: Any, device: torch.device) -> None:
+        """Compute the predictions for all points of every training cloud, if they stay the same.
 
-        Not earlier, because a resumed run has its task net from the checkpoint.
+        They do unless clouds are augmented or converted to pairs; then each step computes those of
+        its batch. Not earlier, because a resumed run has its task net from the checkpoint.
+
+        Args:
+            loader: of the training clouds.
+            device: where to compute.
         """
-        if self.clouds is not None:
-            self.table = full_predictions(self.task, self.clouds, device)
+        fixed = isinstance(loader, CloudLoader) and loader.keeps_clouds
+        if self.predicts and fixed:
+            self.table = full_predictions(self.task, loader, device)
 
     @torch.no_grad()
     def targets(self, batch: Batch, seen: Tensor) -> Targets:
@@ -67,7 +64,6 @@ class Distillation:
     def _prediction(self, batch: Batch) -> Any:
         if self.table is None or batch.rows is None:
             return self.task.predict(batch, batch.points)
-        self.table = self.table.to(batch.rows.device)
         return self.table[batch.rows]
 
     def losses(self, points: Tensor, output: Any, targets: Targets) -> dict[str, Tensor]:
@@ -108,56 +104,20 @@ def feature_distance(features: Tensor, reference: Tensor) -> Tensor:
     return (apart / reference.square().sum(1).clamp_min(1e-12)).mean()
 
 
-@dataclass(frozen=True)
-class FullClouds:
-    """The training clouds, without augmentation, whose predictions are kept in a file.
-
-    Attributes:
-        clouds: in the order of their rows in a batch.
-        batch_size: clouds per batch.
-        cache: folder for the file.
-    """
-
-    clouds: Clouds
-    batch_size: int
-    cache: Path
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "FullClouds":
-        """Return itself: the moving average copies the experiment, but needs no clouds."""
-        return self
-
-
-def full_predictions(task: Task, full: FullClouds, device: torch.device) -> Tensor:
-    """Return the predictions of a task whose batches are the clouds themselves.
-
-    They are kept in a file, which is named by the weights and the clouds.
+@torch.no_grad()
+def full_predictions(task: Task, loader: CloudLoader, device: torch.device) -> Tensor:
+    """Return the predictions for all points of a loader's clouds.
 
     Args:
-        task: in evaluation mode; its net is moved to ``device``.
-        full: the clouds.
+        task: in evaluation mode, on ``device``.
+        loader: of clouds that it does not change.
         device: where to compute.
 
     Returns:
-        One row per cloud, on the CPU; see ``Task.predict``.
+        One row per cloud, in the order of ``Batch.rows``; see ``Task.predict``.
     """
-    named = hashlib.sha256(weights.digest(task.state_dict()).encode())
-    named.update(full.clouds.points.numpy().tobytes())
-    path = full.cache / "predictions" / f"{named.hexdigest()[:16]}.pt"
-    if path.is_file():
-        kept: Tensor = read_plain(path, "predictions")
-        return kept
-    predictions = _predict(task, full, device)
-    remove_temporary(path.parent, below=False)
-    with atomic_write(path) as temporary:
-        torch.save(predictions, temporary)
-    return predictions
-
-
-@torch.no_grad()
-def _predict(task: Task, full: FullClouds, device: torch.device) -> Tensor:
-    task.to(device)
     parts = []
-    for batch in CloudLoader(full.clouds, full.batch_size):
+    for batch in CloudLoader(loader.clouds, loader.batch_size):
         points = batch.points.to(device)
-        parts.append(task.predict(batch._replace(points=points), points).cpu())
+        parts.append(task.predict(batch._replace(points=points), points))
     return torch.cat(parts)

@@ -32,7 +32,8 @@ class Recipe:
         warm_start: whether the sampler's first layers start as copies of the task net's; or the
             weights file of a trained sampler, of any size, to start from.
         distillation: weight of the disagreement between the frozen task net's predictions on the
-            sample and on all points; see ``Task.disagreement``. Only with ``learn="sampler"``.
+            sample and on all points, after augmentation; see ``Task.disagreement``. Only with
+            ``learn="sampler"``.
         feature_distillation: weight of the distance between the frozen task net's max-pooled
             features of the sample and of the points that the step sees.
             Only with ``learn="sampler"`` and a net with ``point_features``.

@@ -32,13 +32,16 @@ from mops_lightning.records.run_record import RunRecord
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed, generator
 from mops_lightning.tasks.base import Task
-from mops_lightning.training.checkpoint import Checkpoint, checkpoint_identity, find_checkpoint
+from mops_lightning.training.checkpoint import (
+    CHECKPOINT,
+    Checkpoint,
+    checkpoint_identity,
+    find_checkpoint,
+)
 from mops_lightning.training.evaluation import OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.recipe.distillation import FullClouds
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.run.trainer import device_name, make_trainer
-from mops_lightning.types import Batch
 
 STANDARD = (8, 16, 32, 64, 128, 256, 512)
 """The sizes of the paper's tables."""
@@ -86,6 +89,14 @@ class Parts:
         return any(True for _ in self.experiment.task.parameters())
 
     @property
+    def last_checkpoint(self) -> Path | None:
+        """The newest checkpoint of this run, or the one that it was resumed from."""
+        own = self.folder / "checkpoints" / CHECKPOINT
+        if own.is_file():
+            return own
+        return self.resumed.path if self.resumed else None
+
+    @property
     def part(self) -> tuple[int, int]:
         """Rank of this process and number of processes."""
         return self.trainer.global_rank, self.trainer.world_size
@@ -109,7 +120,9 @@ def build_parts(
         UserError: settings that do not fit each other, the data or the checkpoint to resume.
     """
     identity = checkpoint_identity(record.config, dataset.fingerprint)
-    resumed = find_checkpoint(cfg, identity)
+    resumed = None
+    if cfg.ckpt_path is not None:
+        resumed = find_checkpoint(cfg.ckpt_path, Path(cfg.out), identity)
     record.dataset_fingerprint = dataset.fingerprint
     record.train_clouds, record.test_clouds = len(dataset.train.labels), len(dataset.test.labels)
     record.class_names = list(dataset.class_names)
@@ -117,7 +130,7 @@ def build_parts(
     record.resumed_from = None if resumed is None else str(resumed.path)
     record.lengthened = resumed is not None and cfg.trainer.max_epochs > resumed.planned
     train, held_out = split(dataset.train, cfg.val_fraction, cfg.seed)
-    experiment = make_experiment(cfg, dataset, identity, train)
+    experiment = make_experiment(cfg, dataset, identity)
     trainer = make_trainer(cfg, folder, dataset, experiment, len(train.labels))
     parts = Parts(cfg, folder, dataset, train, held_out, experiment, trainer, resumed, trained)
     distributed.check_shares(
@@ -138,16 +151,13 @@ def build_parts(
     return parts
 
 
-def make_experiment(
-    cfg: DictConfig, dataset: CloudDataset, identity: dict[str, str], train: Clouds | None = None
-) -> Experiment:
+def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, str]) -> Experiment:
     """Build task, sampler and baselines.
 
     Args:
         cfg: a composed configuration.
         dataset: says how many classes and points there are.
         identity: see ``checkpoint_identity``.
-        train: the clouds to train on, whose predictions may be computed once.
 
     Raises:
         UserError: a setting that its part or the data do not allow.
@@ -162,9 +172,9 @@ def make_experiment(
     net = {"net": task.net}
     own = accepted(cfg.sampler, net)
     sampler = build(cfg.sampler, "sampler", **own) if cfg.learn != "task" else None
-    cloud = Batch(dataset.test.points[:1], dataset.test.labels[:1])
     # Pairs may have fewer points than the clouds they are drawn from.
-    points = task.make_batch(cloud, lambda: [torch.Generator()]).points.shape[1]
+    one = CloudLoader(dataset.test, 1, make_batch=task.make_batch).batch_of(torch.tensor([0]))
+    points = one.points.shape[1]
     sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, points, training=cfg.learn != "nothing")
     baselines: dict[str, Sampler] = {}
     if sampler is not None and sampler.learned:
@@ -173,9 +183,6 @@ def make_experiment(
         sampler = build(cfg.sampler, "sampler", m=max(sizes), **own)
     _check_cloud_size(cfg, sampler, baselines, points)
     make_optimizer, make_schedule = _optimizer_makers(cfg)
-    full_clouds = None
-    if train is not None and not augmentation(cfg).active:
-        full_clouds = FullClouds(train, cfg.batch_size, Path(cfg.cache).expanduser())
     return Experiment(
         task,
         sampler,
@@ -189,8 +196,7 @@ def make_experiment(
         m=cfg.m,
         task_lr_scale=cfg.task_lr_scale,
         refine=cfg.refine,
-        recipe=_recipe(cfg, sampler),
-        full_clouds=full_clouds,
+        recipe=_in_force(build(cfg.recipe, "recipe"), sampler),
     )
 
 
@@ -238,45 +244,36 @@ def sizes_to_test(
     """
     if sampler is None:
         return ()
-    if m > n_points:
+    listed = [] if sizes == AUTO else list(map(int, sizes))
+    wanted = tuple(sorted({m, *listed}))
+    if not sampler.flexible and wanted != (m,):
         raise UserError(
-            f"m must be at most the {n_points} points of a cloud, got m={m}. {MORE_POINTS}"
+            f"sizes: this sampler returns {m} points only, got sizes={listed}. "
+            "Train one that returns any number, such as sampler=fmops, or run with -m m=8,16,32."
         )
-    if sampler.learned and m > sampler.m:
-        raise UserError(
-            f"m must be at most sampler.m_max={sampler.m}, got m={m}. "
-            f"Lower m, or train with sampler.m_max={m}."
-        )
-    if sampler.learned and training and sampler.m > n_points:
-        raise UserError(
-            f"sampler.m_max must be at most the {n_points} points of a cloud, got {sampler.m}. "
-            f"{MORE_POINTS}"
-        )
+    largest = {"m": m, "sizes": wanted[-1]}
+    if sampler.learned and training:
+        largest["sampler.m_max"] = sampler.m
+    for name, size in largest.items():
+        if size > n_points:
+            raise UserError(
+                f"{name} must be at most the {n_points} points of a cloud, got {size}. "
+                f"{MORE_POINTS}"
+            )
+        if sampler.learned and size > sampler.m:
+            raise UserError(
+                f"{name} must be at most sampler.m_max={sampler.m}, got {size}. "
+                f"Lower it, or train with sampler.m_max={size}."
+            )
     if sizes == AUTO:
         most = min(sampler.m, n_points)
         more = STANDARD if sampler.flexible and sampler.learned else ()
         return tuple(sorted({m, *(size for size in more if size <= most)}))
-    wanted = sorted({m, *map(int, sizes)})
-    if not sampler.flexible and wanted != [m]:
-        raise UserError(
-            f"sizes: this sampler returns {m} points only, got sizes={list(sizes)}. "
-            "Train one that returns any number, such as sampler=fmops, or run with -m m=8,16,32."
-        )
-    if wanted[0] < 1 or wanted[-1] > n_points:
-        raise UserError(
-            f"sizes must be from 1 to the {n_points} points of a cloud, got {list(sizes)}."
-        )
-    if sampler.learned and wanted[-1] > sampler.m:
-        raise UserError(
-            f"sizes must be at most sampler.m_max={sampler.m}, the largest size of this net, "
-            f"got {list(sizes)}."
-        )
-    return tuple(wanted)
+    return wanted
 
 
-def _recipe(cfg: DictConfig, sampler: Sampler | None) -> Recipe:
-    """Return the recipe in force; the task net's training has its own record."""
-    recipe: Recipe = build(cfg.recipe, "recipe")
+def _in_force(recipe: Recipe, sampler: Sampler | None) -> Recipe:
+    """Return the part of a recipe that counts; the task net's training has its own record."""
     if sampler is None:
         return Recipe(task_points=recipe.task_points)
     return replace(recipe, task_points=None) if sampler.learned else Recipe()

@@ -9,7 +9,7 @@ from typing import Any
 
 import lightning as L
 from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, RichProgressBar
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from mops_lightning.config.build import accepted, build
 from mops_lightning.errors import Interrupted, UserError
@@ -163,12 +163,6 @@ def progress(score: str) -> Callback:
         score: see ``EpochLines``.
     """
     return RichProgressBar(leave=False) if sys.stdout.isatty() else EpochLines(score)
-
-
-def added(nodes: DictConfig) -> dict[str, Any]:
-    """Return the callbacks that a user added, as plain data: they may change the training."""
-    plain: Any = OmegaConf.to_container(nodes, resolve=True)
-    return {name: node for name, node in plain.items() if name not in STANDARD and node}
 
 
 def build_callbacks(nodes: DictConfig, offered: dict[str, Any], logged: bool) -> list[Callback]:

@@ -1,15 +1,13 @@
 """The first stage of a run whose parts are built: weights from files, which must fit."""
 
 from pathlib import Path
-from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import Evaluated, RunRecord
-from mops_lightning.training.checkpoint import CHECKPOINT, read_plain
+from mops_lightning.training.checkpoint import CHECKPOINT, read_sealed
 from mops_lightning.training.evaluation import KEY, OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.run.build import Parts
@@ -32,13 +30,20 @@ def load_weights(parts: Parts, record: RunRecord, task_weights: Path | None) -> 
         if task.requires_same_classes and content.get("classes"):
             check_classes(content["classes"], parts.dataset, f"weights: {task_weights}")
     if parts.trained is not None:
-        record.evaluated = load_trained(parts.trained, parts.cfg, parts.experiment, parts.dataset)
+        of_run = parts.cfg.weights == OF_RUN
+        record.evaluated = load_trained(parts.trained, of_run, parts.experiment, parts.dataset)
 
 
 def load_trained(
-    trained: TrainedRun, cfg: DictConfig, experiment: Experiment, dataset: CloudDataset
+    trained: TrainedRun, task_net: bool, experiment: Experiment, dataset: CloudDataset
 ) -> Evaluated:
     """Load the nets of a trained run into an experiment.
+
+    Args:
+        trained: the run.
+        task_net: whether the run's task net is loaded, if it has weights.
+        experiment: to fill.
+        dataset: that is tested.
 
     Returns:
         The run and how it was trained, for the record.
@@ -47,9 +52,8 @@ def load_trained(
         UserError: settings, classes or files do not match the run.
     """
     record, name = trained.record, trained.name
-    with_net = cfg.weights == OF_RUN and any(True for _ in experiment.task.parameters())
     own_data = record.dataset_fingerprint == dataset.fingerprint
-    if experiment.task.requires_same_classes and cfg.weights == OF_RUN and not own_data:
+    if experiment.task.requires_same_classes and task_net and not own_data:
         check_classes(record.class_names, dataset, f"{KEY}: {name}")
     part = "task net" if trained.trained_task_net else "sampler"
     module = experiment.task if trained.trained_task_net else experiment.sampler
@@ -58,11 +62,12 @@ def load_trained(
         content = weights.load_into(module, weights.of_run(trained.place))
     except UserError as error:
         raise UserError(f"{KEY}: the {part} of {name} cannot be loaded: {error}") from None
-    if with_net and not trained.trained_task_net:
+    has_weights = any(True for _ in experiment.task.parameters())
+    if task_net and has_weights and not trained.trained_task_net:
         try:
             _load_task(experiment.task, trained)
         except UserError as error:
-            raise UserError(f"{KEY}: {error}{_changed_net(cfg, record.config)}") from None
+            raise UserError(f"{KEY}: {error}") from None
     return Evaluated(
         run=name,
         commit=record.git["commit"],
@@ -115,22 +120,10 @@ def _load_task(task: torch.nn.Module, trained: TrainedRun) -> None:
         raise UserError(
             f"{path}, which contains the run's task net, does not exist. Give weights=FILE."
         )
-    state = read_plain(path, "a checkpoint")["state_dict"]
+    state = read_sealed(path)["state_dict"]
     own = {
         key.removeprefix("task."): value for key, value in state.items() if key.startswith("task.")
     }
     if weights.digest(own) != trained.record.task_weights_sha256:
         raise UserError(f"{path} does not belong to the run in its folder. Give weights=FILE.")
     weights.fit_state(task, own, path)
-
-
-def _changed_net(cfg: DictConfig, config: dict[str, Any]) -> str:
-    """Return the settings of the task net in which an evaluation differs from its run."""
-    new: Any = OmegaConf.to_container(cfg.task.net, resolve=True)
-    old = config["task"].get("net") or {}
-    changed = [
-        f"task.net.{key} is {new.get(key)} here and was {old.get(key)}"
-        for key in {**old, **new}
-        if new.get(key) != old.get(key)
-    ]
-    return f" Cause: {', '.join(changed)}." if changed else ""

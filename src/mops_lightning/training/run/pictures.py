@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.readout_names import FULL
-from mops_lightning.tasks.base import Task
+from mops_lightning.tasks.base import Task, figures_of
 from mops_lightning.training.readouts import readouts
 from mops_lightning.viz.clouds import (
     COLOURS,
@@ -31,7 +31,9 @@ from mops_lightning.viz.snapshots import CLOUDS, save_clouds
 DENSE_PIXELS = 2**20
 """Most entries of S that are drawn: 1,024 points by 1,024 columns."""
 MESHES = 2
-"""Clouds in TensorBoard's mesh tab. With four, Chromium stopped drawing the first of 12 views."""
+"""Clouds in TensorBoard's mesh tab."""
+MESH_SPACING = 2.2
+"""Between the centres of clouds in the mesh tab; clouds are in the unit sphere."""
 
 
 class CloudVisualization(Callback):
@@ -104,10 +106,10 @@ class CloudVisualization(Callback):
         baselines = () if scores is None else module.baselines.items()
         methods = {name: baseline(points, m).points for name, baseline in baselines}
         if sampler is None:
-            return module.task.figures(batch, {**methods, FULL: points}, self.titles), {}
+            return figures_of(module.task, batch, {**methods, FULL: points}, self.titles), {}
         output = sampler(points, m)
         samples = readouts(points, {m: output}, sampler)[m]
-        figures = module.task.figures(batch, {**methods, **samples}, self.titles)
+        figures = figures_of(module.task, batch, {**methods, **samples}, self.titles)
         titles = cloud_titles(module.task, self.titles)
         if scores is not None:
             main = {**methods, module.main_readout: samples[module.main_readout]}
@@ -154,18 +156,24 @@ def _add_meshes(
     titles: Sequence[str],
     step: int,
 ) -> None:
-    """Show ``MESHES`` clouds with each readout, to be turned with the mouse."""
-    for name, chosen in samples.items():
-        for number, title in enumerate(titles[:MESHES]):
-            shown = (points[number], chosen[number])
-            colours = [
-                torch.tensor(colour, dtype=torch.uint8).expand(len(part), 3)
-                for colour, part in zip((INPUT_COLOUR, COLOURS[name]), shown, strict=True)
-            ]
-            board.experiment.add_mesh(
-                f"{name}/{number}_{title}",
-                vertices=torch.cat(shown).cpu()[None],
-                colors=torch.cat(colours)[None],
-                config_dict={"material": {"cls": "PointsMaterial", "size": 0.03}},
-                global_step=step,
-            )
+    """Show clouds as rows and readouts as columns in one view, to be turned with the mouse.
+
+    Browsers draw about 16 views on a page, so that each run has one.
+    """
+    if not samples:
+        return
+    titles = titles[:MESHES]
+    vertices, colours = [], []
+    for row in range(len(titles)):
+        for column, (name, chosen) in enumerate(samples.items()):
+            place = MESH_SPACING * torch.tensor([column, -row, 0.0])
+            for colour, part in ((INPUT_COLOUR, points[row]), (COLOURS[name], chosen[row])):
+                vertices.append(part.cpu() + place)
+                colours.append(torch.tensor(colour, dtype=torch.uint8).expand(len(part), 3))
+    board.experiment.add_mesh(
+        f"clouds/{'_'.join(titles)}",
+        vertices=torch.cat(vertices)[None],
+        colors=torch.cat(colours)[None],
+        config_dict={"material": {"cls": "PointsMaterial", "size": 0.03}},
+        global_step=step,
+    )

@@ -18,7 +18,7 @@ from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.training.checkpoint import CHECKPOINT, checkpoint_identity
 from mops_lightning.training.evaluation import OF_RUN
 from mops_lightning.training.run.build import Parts
-from mops_lightning.training.run.callbacks import added
+from mops_lightning.training.run.callbacks import STANDARD
 from mops_lightning.zoo import weights
 from mops_lightning.zoo.weights import FILE
 
@@ -77,7 +77,7 @@ def task_config(cfg: DictConfig) -> DictConfig:
             own.trainer.max_epochs = cfg.epochs.task
             own.optimizer = cfg.pretrain
             own.weights = "auto"
-            for name in added(cfg.callbacks):  # such as early stopping on a readout's score
+            for name in set(cfg.callbacks) - set(STANDARD):  # such as early stopping on a score
                 del own.callbacks[name]
         own.learn = "task"
         own.trainer.devices, own.trainer.strategy = 1, "auto"

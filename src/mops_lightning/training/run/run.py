@@ -18,6 +18,7 @@ from mops_lightning.errors import Interrupted, UserError, closed_outputs
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import closing_lines
+from mops_lightning.training.divergence import Diverged
 from mops_lightning.training.evaluation import TrainedRun, as_trained
 from mops_lightning.training.run import pretrain, stages
 from mops_lightning.training.run.build import Parts, build_parts
@@ -36,7 +37,7 @@ def run(
         cfg: a composed configuration.
         folder: the run's folder; must not hold a result yet.
         overrides: what the user changed, for the record.
-        claimed: whether ``claim`` was called for the folder.
+        claimed: whether the settings are ``checked`` and the folder is claimed (``claim``).
 
     Returns:
         The record, as written.
@@ -44,10 +45,12 @@ def run(
     Raises:
         UserError: a mistake in settings or files.
     """
-    cfg, trained = checked(cfg, overrides, claimed)
+    trained = TrainedRun.read(cfg.evaluate) if cfg.evaluate else None
     leads = not distributed.is_worker_rank(cfg)
-    if leads and not claimed:
-        claim(folder)
+    if not claimed:
+        cfg = checked(cfg, overrides or [])
+        if leads:
+            claim(folder)
     with recorded(cfg, folder, overrides or []) as record:
         with record.timed("data"):
             dataset = _load_data(cfg)
@@ -78,33 +81,34 @@ def train_and_test(parts: Parts, record: RunRecord, task_weights: Path | None) -
         task_weights: a file for the task net; None leaves it as initialised.
     """
     load_weights(parts, record, task_weights)
-    if parts.trains:
-        stages.warm_start(parts, record)
-        with record.timed("fit"):
-            stages.fit(parts, record)
-    with record.timed("test"):
-        stages.test(parts, record)
-    if parts.trainer.is_global_zero:
-        stages.save(parts, record)
+    try:
+        if parts.trains:
+            stages.warm_start(parts, record)
+            with record.timed("fit"):
+                stages.fit(parts, record)
+        with record.timed("test"):
+            stages.test(parts, record)
+        if parts.trainer.is_global_zero:
+            stages.save(parts, record)
+    except Diverged as error:
+        last = parts.last_checkpoint
+        kept = f" The last finite checkpoint is {last}." if last else ""
+        raise UserError(
+            f"{error} No weights were saved.{kept} Try a lower learning rate (optimizer.lr) or "
+            "other weights of the losses."
+        ) from None
 
 
-def checked(
-    cfg: DictConfig, overrides: list[str] | None, claimed: bool = False
-) -> tuple[DictConfig, TrainedRun | None]:
-    """Check the settings of a run, unless that was done before its folder was claimed.
-
-    Returns:
-        The settings, which an evaluation takes from the trained run, and the trained run.
+def checked(cfg: DictConfig, overrides: list[str]) -> DictConfig:
+    """Return the checked settings of a run, which an evaluation takes from the trained run.
 
     Raises:
         UserError: a mistake in the settings.
     """
-    trained = TrainedRun.read(cfg.evaluate) if cfg.evaluate else None
-    if trained is not None and overrides is not None:
-        return as_trained(cfg, trained, overrides), trained
-    if not claimed:
-        check(cfg)
-    return cfg, trained
+    if cfg.evaluate:
+        return as_trained(cfg, TrainedRun.read(cfg.evaluate), overrides)
+    check(cfg)
+    return cfg
 
 
 @contextmanager
@@ -151,17 +155,14 @@ def claim(folder: Path) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"out: cannot write to {folder}: {error.strerror}.") from None
-    try:
         # Two runs that start in the same second get the same folder; the second one stops here.
         (folder / STARTED).touch(exist_ok=False)
-    except FileExistsError:
-        raise UserError(
-            f"{folder} already contains a run; runs are never overwritten. Start again for a "
-            "new folder, and leave hydra.run.dir out or give another one."
-        ) from None
     except OSError as error:
+        if (folder / STARTED).is_file():
+            raise UserError(
+                f"{folder} already contains a run; runs are never overwritten. Start again for a "
+                "new folder, and leave hydra.run.dir out or give another one."
+            ) from None
         raise UserError(f"out: cannot write to {folder}: {error.strerror}.") from None
 
 

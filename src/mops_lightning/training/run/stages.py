@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import lightning as L
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import nn
 
@@ -15,12 +16,12 @@ from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records.metric_info import foreign_metrics
 from mops_lightning.records.readout_names import parse_metric_name
 from mops_lightning.records.run_record import RunRecord
-from mops_lightning.training.divergence import Diverged, with_checkpoint
+from mops_lightning.training.divergence import Diverged, check_finite
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.recipe.warm_start import warm_start_sampler
 from mops_lightning.training.run.build import Parts, augmentation
 from mops_lightning.training.run.callbacks import CPUTime
-from mops_lightning.training.run.trainer import log_hparams
+from mops_lightning.training.run.trainer import log_test
 from mops_lightning.viz.snapshots import CLOUDS
 from mops_lightning.zoo import weights
 
@@ -76,21 +77,13 @@ def fit(parts: Parts, record: RunRecord) -> None:
         part=parts.part,
     )
     validation = parts.score_loader(parts.held_out) if len(parts.held_out.labels) else None
-    try:
-        with _interruptible(), _monitoring():
-            trainer.fit(experiment, loader, validation, ckpt_path=resumed)
-        if name := weights.first_nonfinite(experiment.state_dict()):
-            raise Diverged(f"training diverged: {name} is not finite.")
-    except Diverged as error:
-        raise with_checkpoint(error, _last_checkpoint(parts)) from None
-    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        if resumed is None or experiment.started or isinstance(error, UserError):
-            raise
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise weights.Damaged(f"ckpt_path: cannot resume from {resumed}: {reason}.") from error
+    with _errors_of_lightning():
+        trainer.fit(experiment, loader, validation, ckpt_path=resumed)
+    check_finite(dict(experiment.state_dict()), trainer.global_step, trainer.strategy)
     callbacks: Any = trainer.callbacks  # type: ignore[attr-defined]
     clock = next(one for one in callbacks if isinstance(one, CPUTime))
     record.seconds["fit_cpu"] = round(clock.seconds, 3)
+    _note_shortened(trainer, len(loader), record)
     record.validation = {
         name: float(value)
         for name, value in trainer.callback_metrics.items()
@@ -98,19 +91,27 @@ def fit(parts: Parts, record: RunRecord) -> None:
     }
 
 
-def _last_checkpoint(parts: Parts) -> Path | None:
-    """Return the newest checkpoint of this run, or the one that it was resumed from."""
-    own = parts.folder / OUTPUTS["checkpoint"]
-    if own.is_file():
-        return own
-    return parts.resumed.path if parts.resumed else None
+def _note_shortened(trainer: L.Trainer, batches: int, record: RunRecord) -> None:
+    """Note a training on part of the batches, or of fewer steps than planned.
+
+    Early stopping is a plan of its own.
+    """
+    if (seen := int(trainer.num_training_batches)) < batches:
+        record.partial.append(f"trained on {seen} of {batches} batches of an epoch")
+    steps, of_epoch = trainer.global_step, math.ceil(seen / trainer.accumulate_grad_batches)
+    planned = of_epoch * (trainer.max_epochs or 0)
+    if steps < planned and trainer.early_stopping_callback is None:
+        record.partial.append(f"trained for {steps} of {planned} steps")
 
 
 def test(parts: Parts, record: RunRecord) -> None:
     """Score all test clouds."""
     experiment, trainer = parts.experiment, parts.trainer
-    with _interruptible():
-        trainer.test(experiment, parts.score_loader(parts.dataset.test), verbose=False)
+    loader = parts.score_loader(parts.dataset.test)
+    with _errors_of_lightning():
+        trainer.test(experiment, loader, verbose=False)
+    if (tested := trainer.num_test_batches[0]) < len(loader):
+        record.partial.append(f"tested on {tested} of {len(loader)} batches")
     record.metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
     parsed = {name: parse_metric_name(name) for name in record.metrics}
     scores = {  # of every readout, at the run's own size
@@ -118,26 +119,19 @@ def test(parts: Parts, record: RunRecord) -> None:
         for name, key in parsed.items()
         if key and key.metric == experiment.task.score and key.m in (None, experiment.m)
     }
-    log_hparams(trainer, record.config, scores)
+    log_test(trainer, record.config, record.metrics, scores)
     if experiment.learn in ("sampler", "nothing") and parts.has_task_weights:
         # A resumed run has its task net from the checkpoint, not from a weights file.
         record.task_weights_sha256 = weights.digest(experiment.task.state_dict())
 
 
 @contextmanager
-def _interruptible() -> Iterator[None]:
-    """Raise ``Interrupted`` where Lightning turns Ctrl-C into ``SystemExit``."""
+def _errors_of_lightning() -> Iterator[None]:
+    """Raise ``Interrupted`` for Ctrl-C, ``UserError`` for callbacks that monitor no metric."""
     try:
         yield
     except SystemExit:
         raise Interrupted("Resume with the same command and ckpt_path=last.") from None
-
-
-@contextmanager
-def _monitoring() -> Iterator[None]:
-    """Raise ``UserError`` where a callback of Lightning's monitors a metric that is not there."""
-    try:
-        yield
     except (RuntimeError, MisconfigurationException) as error:
         text = str(error)
         if not (text.startswith("Early stopping conditioned on metric") or "monitor=" in text):
@@ -147,16 +141,12 @@ def _monitoring() -> Iterator[None]:
 
 def _check_scores(parts: Parts, metrics: dict[str, float]) -> None:
     """Refuse a test whose score or losses are not finite, though the weights are."""
-    score = parts.experiment.score_name
-    judged = [name for name in metrics if name == score or name.split("/")[-2] == "loss"]
-    bad = [name for name in judged if not math.isfinite(metrics[name])]
-    if not bad:
-        return
-    text = f"{bad[0]} is {metrics[bad[0]]}"
-    if not parts.trains:
-        raise UserError(f"{text}. Check the data and the weights.")
-    error = UserError(f"training diverged: {text}.")
-    raise with_checkpoint(error, _last_checkpoint(parts))
+    for name, value in metrics.items():
+        judged = name == parts.experiment.score_name or name.split("/")[-2] == "loss"
+        if judged and not math.isfinite(value):
+            if parts.trains:
+                raise Diverged(f"training diverged: {name} is {value}.")
+            raise UserError(f"{name} is {value}. Check the data and the weights.")
 
 
 def save(parts: Parts, record: RunRecord) -> None:

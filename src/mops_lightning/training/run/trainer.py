@@ -22,7 +22,7 @@ from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.records.run_record import dotted
-from mops_lightning.training.checkpoint import CHECKPOINT
+from mops_lightning.training.checkpoint import CHECKPOINT, sealed
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.moving_average import MovingAverage
 from mops_lightning.training.run.callbacks import CPUTime, StopBetweenSteps, build_callbacks
@@ -44,6 +44,8 @@ LOG_EVERY = 10
 """Steps between two points of a curve."""
 LOGGER_FOLDERS = {"TensorBoardLogger": "tensorboard", "CSVLogger": "csv"}
 """Subfolder of the run's folder that a logger writes to."""
+FIRST_HPARAMS = ("sampler.alpha", "sampler.tau_min")
+"""Settings that come first in TensorBoard's hparams."""
 
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX = -1, -2, -4
 """Options of mallopt(3)."""
@@ -69,7 +71,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         buffer = io.BytesIO()  # torch.save hides the OSError of a full disk
         torch.save(checkpoint, buffer)
         with atomic_write(path) as temporary:
-            temporary.write_bytes(buffer.getbuffer())
+            temporary.write_bytes(sealed(buffer.getvalue()))
 
 
 def make_trainer(
@@ -145,7 +147,7 @@ def _logger(node: DictConfig, folder: Path) -> Any:
     """Build the logger, which writes into the run's folder itself unless it has a name."""
     own = accepted(node, {"name": ""})
     if below := LOGGER_FOLDERS.get(node["_target_"].rpartition(".")[2]):
-        own["version"] = below
+        own |= {"name": below, "version": ""}  # the progress bar would show a version
     unset = {name: value for name, value in own.items() if name not in node}
     return build(node, "logger", save_dir=str(folder), **unset)
 
@@ -165,24 +167,38 @@ def device_name(trainer: L.Trainer) -> str:
     return torch.cuda.get_device_name(root) if root.type == "cuda" else root.type
 
 
-def log_hparams(trainer: L.Trainer, config: dict[str, Any], metrics: dict[str, float]) -> None:
-    """Log the settings that distinguish runs, together with test metrics.
+def log_test(
+    trainer: L.Trainer, config: dict[str, Any], metrics: dict[str, float], scores: dict[str, float]
+) -> None:
+    """Log the test: metrics, and the settings that distinguish runs with the main scores.
+
+    TensorBoard shows the metrics as one table of text. As curves of one point each they would bury
+    the curves of the training.
 
     Args:
         trainer: its logger gets them, if it has one.
         config: the settings as plain data.
-        metrics: by name; only TensorBoard takes them.
+        metrics: by name.
+        scores: those for TensorBoard's hparams.
     """
+    board = trainer.logger
+    if board is None:
+        return
     keys = ("names", "sampler", "optimizer", "augment", "m", "learn", "seed", "batch_size")
     leaves = dotted({key: config[key] for key in keys})
-    flat = {key: value for key, value in leaves.items() if key.rsplit(".", 1)[-1][:1] != "_"}
+    first = {key: leaves[key] for key in FIRST_HPARAMS if key in leaves}
+    flat = {k: v for k, v in {**first, **leaves}.items() if k.rsplit(".", 1)[-1][:1] != "_"}
     flat["max_epochs"] = config["trainer"]["max_epochs"]
-    if isinstance(trainer.logger, TensorBoardLogger):
-        trainer.logger.log_hyperparams(flat, {f"hparams/{k}": v for k, v in metrics.items()})
-        # Lightning closed it after the test; logging opened it again and started a thread.
-        trainer.logger.finalize("success")
-    elif trainer.logger is not None:
-        trainer.logger.log_hyperparams(flat)
+    if isinstance(board, TensorBoardLogger):
+        rows = [f"| {name} | {value:.6g} |" for name, value in sorted(metrics.items())]
+        table = "\n".join(["| metric | value |", "|---|--:|", *rows])
+        board.experiment.add_text("test", table, trainer.global_step)
+        board.log_hyperparams(flat, {f"hparams/{k}": v for k, v in scores.items()})
+    else:
+        board.log_metrics(metrics, trainer.global_step)
+        board.log_hyperparams(flat)
+    # Lightning closed it after the test; logging opened it again.
+    board.finalize("success")
 
 
 def keep_freed_memory() -> bool:
