@@ -1,5 +1,6 @@
-"""TensorBoard, opened in a browser."""
+"""TensorBoard, by its server and in a browser."""
 
+import json
 import socket
 import subprocess
 import sys
@@ -13,23 +14,30 @@ from mops_lightning.config.compose import compose
 from mops_lightning.training.run.run import run
 from tests.support.command_line import TINY
 
+RUNS = (
+    ["sampler=fps"],  # has neither alpha nor tau_min, and is the first that TensorBoard reads
+    ["sampler=mops", "sampler.alpha=10", "sampler.tau_min=0.1"],
+    ["sampler=mops", "sampler.alpha=30", "sampler.tau_min=0.2"],
+)
+
 
 @pytest.fixture(scope="module")
 def board(tmp_path_factory):
-    """The address of a TensorBoard that shows two small runs."""
+    """The address of a TensorBoard that shows the small runs of a sweep."""
     folder = tmp_path_factory.mktemp("board")
     logged = [one for one in TINY if not one.startswith(("pictures", "logger"))]
-    overrides = [*logged, "sampler=mops", "weights=null", "pictures=3", "trainer.max_epochs=2"]
+    overrides = [*logged, "weights=null", "pictures=3", "trainer.max_epochs=2"]
     overrides += ["val_fraction=0.2", f"cache={folder}/cache"]
-    for seed in range(2):
-        mine = [*overrides, f"seed={seed}"]
-        run(compose(mine), folder / f"run{seed}", mine)
+    for number, own in enumerate(RUNS):
+        mine = [*overrides, *own]
+        run(compose(mine), folder / f"run{number}", mine)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     command = [sys.executable, "-m", "tensorboard.main", "--logdir", folder, "--port", str(port)]
+    command += ["--load_fast=false", "--reload_interval=0", "--reload_task=blocking"]  # all at once
     address = f"http://127.0.0.1:{port}"
-    with subprocess.Popen([*command, "--load_fast=false"], stderr=subprocess.DEVNULL) as server:
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as server:
         deadline = time.monotonic() + 60
         while True:
             try:
@@ -40,6 +48,18 @@ def board(tmp_path_factory):
                 time.sleep(0.2)
         yield address
         server.terminate()
+
+
+def test_hparams_compare_all_runs_and_begin_with_what_differs(board):
+    with urllib.request.urlopen(f"{board}/data/plugin/hparams/experiment?request={{}}") as answer:
+        experiment = json.load(answer)
+    settings = experiment["hparamInfos"]
+    differing = [one["name"] for one in settings if one["differs"]]
+    assert differing == ["names.sampler", "sampler.alpha", "sampler.tau_min"]
+    assert [one["name"] for one in settings[:3]] == differing
+    assert "sampler.threshold" in [one["name"] for one in settings]
+    shown = [one["name"]["tag"] for one in experiment["metricInfos"][:5]]  # the first five columns
+    assert "hparams/test/generated/accuracy" in shown
 
 
 def test_tensorboard_shows_curves_settings_images_meshes(board, opened):
@@ -57,7 +77,7 @@ def test_tensorboard_shows_curves_settings_images_meshes(board, opened):
     see("#images", "matrix")
     page, errors, requests = see("#mesh", "run1/tensorboard", "canvas")
     meshes = page.locator("canvas")
-    meshes.nth(1).wait_for(state="attached", timeout=30_000)  # one view for each run
+    meshes.nth(len(RUNS) - 1).wait_for(state="attached", timeout=30_000)  # a view of each run
     context = "(canvas.getContext('webgl2') || canvas.getContext('webgl'))"
     lost = meshes.evaluate_all(f"all => all.filter(canvas => {context}.isContextLost()).length")
     assert lost == 0, "the browser stopped drawing some"

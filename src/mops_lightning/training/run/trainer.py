@@ -15,6 +15,7 @@ from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig
 from torch import Tensor
+from torch.utils.tensorboard.summary import hparams
 
 from mops_lightning.config.build import accepted, build
 from mops_lightning.data.clouds import CloudDataset
@@ -44,8 +45,6 @@ LOG_EVERY = 10
 """Steps between two points of a curve."""
 LOGGER_FOLDERS = {"TensorBoardLogger": "tensorboard", "CSVLogger": "csv"}
 """Subfolder of the run's folder that a logger writes to."""
-FIRST_HPARAMS = ("sampler.alpha", "sampler.tau_min")
-"""Settings that come first in TensorBoard's hparams."""
 
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX = -1, -2, -4
 """Options of mallopt(3)."""
@@ -186,19 +185,34 @@ def log_test(
         return
     keys = ("names", "sampler", "optimizer", "augment", "m", "learn", "seed", "batch_size")
     leaves = dotted({key: config[key] for key in keys})
-    first = {key: leaves[key] for key in FIRST_HPARAMS if key in leaves}
-    flat = {k: v for k, v in {**first, **leaves}.items() if k.rsplit(".", 1)[-1][:1] != "_"}
+    flat = {k: v for k, v in leaves.items() if k.rsplit(".", 1)[-1][:1] != "_"}
     flat["max_epochs"] = config["trainer"]["max_epochs"]
     if isinstance(board, TensorBoardLogger):
         rows = [f"| {name} | {value:.6g} |" for name, value in sorted(metrics.items())]
         table = "\n".join(["| metric | value |", "|---|--:|", *rows])
         board.experiment.add_text("test", table, trainer.global_step)
-        board.log_hyperparams(flat, {f"hparams/{k}": v for k, v in scores.items()})
+        _log_hparams(board, flat, {f"hparams/{k}": v for k, v in scores.items()})
     else:
         board.log_metrics(metrics, trainer.global_step)
         board.log_hyperparams(flat)
     # Lightning closed it after the test; logging opened it again.
     board.finalize("success")
+
+
+def _log_hparams(
+    board: TensorBoardLogger, settings: dict[str, Any], scores: dict[str, float]
+) -> None:
+    """Log the start and the end of a session of TensorBoard's hparams.
+
+    Lightning also logs a summary of the experiment, with this run's settings alone. TensorBoard
+    takes the first that it finds for all runs. Without one it compares the runs itself and shows
+    the settings that differ first.
+    """
+    board.log_metrics(scores)
+    plain = {k: v if isinstance(v, int | float | str) else str(v) for k, v in settings.items()}
+    _, *session = hparams(plain, scores)
+    for summary in session:
+        board.experiment.file_writer.add_summary(summary)
 
 
 def keep_freed_memory() -> bool:
