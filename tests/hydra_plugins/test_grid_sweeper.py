@@ -92,3 +92,11 @@ def test_grids_values_may_be_null_lists_and_numbers(tmp_path):
     assert status == 0, out + err
     config = record(tmp_path, "random-m4")["config"]
     assert (config["sizes"], config["weights"]) == ([4, 6], None)
+
+
+def test_sweep_may_report_runs_of_different_settings_in_one_table(tmp_path):
+    grids = "hydra.sweeper.grids=[{sampler:mops,m:4},{sampler:mops,m:8,optimizer.lr:0.01}]"
+    _, _, out, _ = start(tmp_path, grids)
+    assert "2 groups of runs are not comparable" in out
+    _, _, out, _ = start(tmp_path, grids, "hydra.callbacks.summary.mixed=true")
+    assert "| m=8 | m=4 |" in out

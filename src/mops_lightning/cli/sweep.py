@@ -194,7 +194,14 @@ class SweepSummary(Callback):
 
     The report is that of the whole folder, so that earlier starts and the other processes of the
     same sweep count too.
+
+    Args:
+        mixed: whether the report joins runs that differ in settings which the sweep does not vary
+            for comparison, such as epochs chosen for each size.
     """
+
+    def __init__(self, mixed: bool = False) -> None:
+        self.mixed = mixed
 
     def on_multirun_start(self, config: DictConfig, **extra: Any) -> None:
         """Mark the start, on the clock of the folder's file system."""
@@ -220,7 +227,8 @@ class SweepSummary(Callback):
         counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
         print(f"{sum(states.values())} cells: {counts}; in {folder}")
         if states["completed"]:
-            report.main([str(folder)], "python -m mops_lightning report")
+            options = ["--mixed"] if self.mixed else []
+            report.main([str(folder), *options], "python -m mops_lightning report")
         if set(states) - {"completed", ELSEWHERE} or not states:
             print(f"To repeat the rest: the same command with hydra.sweep.dir={folder}")
             raise SystemExit(1)
