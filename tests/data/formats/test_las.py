@@ -10,7 +10,7 @@ from mops_lightning.data.formats.registry import WRITERS, open_cloud_file, read
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 
-NUMBER, EVLRS, LONG_NUMBER = 107, 243, 247
+RECORDS, NUMBER, EVLRS, LONG_NUMBER = 100, 107, 243, 247
 """Places of counts in the header."""
 
 
@@ -98,7 +98,9 @@ def written(path, form, number=300):
     [
         ("a.las", 3, NUMBER, "<I", 301, "ends after 300 points"),
         ("a.las", 6, LONG_NUMBER, "<Q", 2**63, "cannot hold 9,223,372,036,854,775,808 points"),
-        ("a.las", 6, EVLRS, "<I", 2**32 - 1, "is broken"),
+        ("a.las", 3, RECORDS, "<I", 2**31, "cannot hold 2,147,483,648 records"),
+        ("a.laz", 6, RECORDS, "<I", 2**31, "cannot hold 2,147,483,648 records"),
+        ("a.las", 6, EVLRS, "<I", 2**32 - 1, "cannot hold 4,294,967,295 records"),
         ("a.laz", 3, NUMBER, "<I", 2**32 - 1, "cannot hold 4,294,967,295 points"),
     ],
 )

@@ -26,6 +26,9 @@ COPC = "copc"
 POINTS_PER_BYTE = 1024
 """Largest number of points per byte of a file, which may be compressed."""
 
+RECORD, EXTENDED_RECORD = 54, 60
+"""Least numbers of bytes of the records before and after the points."""
+
 
 def read(path: Path) -> Table:
     """Read all points with all their dimensions; coordinates are scaled and shifted.
@@ -47,6 +50,7 @@ def locate(path: Path) -> CloudFile:
 
 
 def _parse_header(path: Path) -> Any:
+    _check_records(path)
     with _laspy(path).open(path) as file:
         header, size = file.header, path.stat().st_size
     if header.point_count > POINTS_PER_BYTE * size:
@@ -54,6 +58,19 @@ def _parse_header(path: Path) -> Any:
             f"{path} is broken: {size:,} bytes cannot hold {header.point_count:,} points."
         )
     return header
+
+
+def _check_records(path: Path) -> None:
+    """Reject more records than the file can hold: laspy would read as many, for minutes."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(247)
+    records = int.from_bytes(head[100:104], "little")
+    extended = int.from_bytes(head[243:247], "little") if head[25:26] >= b"\x04" else 0
+    if RECORD * records + EXTENDED_RECORD * extended > size:
+        raise BadCloudError(
+            f"{path} is broken: {size:,} bytes cannot hold {records + extended:,} records."
+        )
 
 
 def _parse(path: Path) -> Table:
