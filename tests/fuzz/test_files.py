@@ -18,11 +18,11 @@ from mops_lightning.errors import UserError
 from mops_lightning.zoo import model_file
 from tests.support import mutations
 from tests.support.fuzz_readers import outcome
-from tests.support.fuzz_seeds import changed_content, json_bytes, seeds
+from tests.support.fuzz_seeds import changed_content, changed_glb, json_bytes, seeds
 
 FILES = int(os.environ.get("MOPS_FUZZ", "12"))
 KINDS = (
-    "bin", "checkpoint", "glb", "hdf5", "las", "laz", "names", "npy", "npz", "obj",
+    "bin", "checkpoint", "glb", "glb content", "hdf5", "las", "laz", "names", "npy", "npz", "obj",
     "off", "pcd", "pcd ascii", "pcd compressed", "pictured clouds", "ply",
     "ply ascii", "ply mesh", "record", "record content", "stl", "weights",
     "weights content", "xyz",
@@ -75,6 +75,9 @@ def fuzzed(kind, made, number):
             header["__metadata__"][model_file.KEY] = json_bytes(plain).decode()
         content = json_bytes(header)
         return len(content).to_bytes(8, "little") + content + packed[end:]
+    if kind == "glb content":
+        scenes = made["glb"][1]
+        return changed_glb(random, scenes[random.integers(len(scenes))])
     if kind == "record content":
         return json_bytes(changed_content(random, json.loads(made["record"][1][0])))
     others = made[kind][1]

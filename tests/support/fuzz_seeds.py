@@ -16,6 +16,7 @@ from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.training.checkpoint import CHECKPOINT_KEY, sealed
 from mops_lightning.viz.snapshots import save_clouds
 from mops_lightning.zoo import weights
+from tests.support.mutations import flip_bits
 from tests.support.records import record
 
 BOX = trimesh.creation.box((1.0, 2.0, 3.0))
@@ -154,6 +155,27 @@ def _places(content):
         yield content, key
         if isinstance(content[key], dict | list) and content[key]:
             yield from _places(content[key])
+
+
+def changed_glb(random, content):
+    """Change the scene or the buffer of a GLB file, whose lengths stay right.
+
+    Other changes rarely get past its JSON.
+    """
+    start = 20 + int.from_bytes(content[12:16], "little")
+    scene, buffer = json.loads(content[20:start]), content[start + 8 :]
+    if random.random() < 0.5:
+        scene = changed_content(random, scene)
+    else:
+        buffer = flip_bits(random, bytearray(buffer), [])
+    text = json_bytes(scene)
+    text += b" " * (-len(text) % 4)
+    parts = [
+        len(part).to_bytes(4, "little") + kind + bytes(part)
+        for kind, part in ((b"JSON", text), (b"BIN\0", buffer))
+    ]
+    length = 12 + sum(map(len, parts))
+    return content[:8] + length.to_bytes(4, "little") + b"".join(parts)
 
 
 def json_bytes(content):
