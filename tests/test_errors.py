@@ -1,4 +1,6 @@
-from mops_lightning.errors import did_you_mean, printable
+import pytest
+
+from mops_lightning.errors import UserError, did_you_mean, one_line_endings, printable
 
 
 def test_did_you_mean_suggests_the_closest_names():
@@ -10,3 +12,23 @@ def test_did_you_mean_suggests_the_closest_names():
 
 def test_printable_escapes_control_characters():
     assert printable("a\x1b]0;b\x07 é\n\udcff") == "a\\x1b]0;b\\x07 é\n\\udcff"
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (UserError("no"), "tool: no\n"),
+        (RuntimeError("Could not determine home directory."), "no user has this name"),
+        (MemoryError(), "tool: out of memory"),
+        (FileNotFoundError(2, "No such file", "a"), "tool: a: No such file.\n"),
+    ],
+)
+def test_one_line_endings_of_mistakes(error, said, capsys):
+    with pytest.raises(SystemExit, match="2"), one_line_endings("tool"):
+        raise error
+    assert said in capsys.readouterr().err
+
+
+def test_one_line_endings_passes_faults_of_the_program_on():
+    with pytest.raises(RuntimeError, match="fault"), one_line_endings("tool"):
+        raise RuntimeError("fault")

@@ -72,12 +72,30 @@ def file_error(error: OSError) -> str:
     return f"{name}{error.strerror or error}.{hint if full else ''}"
 
 
-def memory_error(error: BaseException) -> str | None:
-    """Return one line if an error says that there is not enough memory; None for other errors."""
+def line_about(error: BaseException) -> str | None:
+    """Return one line about an error that the user can mend; None for a fault of the program."""
+    if isinstance(error, UserError):
+        return str(error)
+    if isinstance(error, OSError):
+        return file_error(error)
     text = " ".join(str(error).split())
     if isinstance(error, MemoryError) or re.search(r"(can't|not enough|out of) .*memory", text):
         return f"out of memory: {text[-200:]} Try a smaller batch_size, or smaller clouds."
+    if isinstance(error, RuntimeError) and "determine home directory" in text:  # Python's words
+        return "a path begins with ~NAME, but no user has this name. For a file, write ./~NAME."
     return None
+
+
+def end_in_one_line(name: str, error: Exception) -> NoReturn:
+    """Print one line about an error that the user can mend, and exit; raise any other error.
+
+    Raises:
+        SystemExit: the user can mend it.
+    """
+    line = line_about(error)
+    if line is None or isinstance(error, BrokenPipeError):
+        raise error
+    end(name, line, USER_ERROR)
 
 
 def end(name: str, message: str, status: int) -> NoReturn:
@@ -105,12 +123,8 @@ def one_line_endings(prog: str, interrupted: str = "interrupted.") -> Iterator[N
     with quiet_on_closed_pipe():
         try:
             yield
-        except UserError as error:
-            end(name, str(error), USER_ERROR)
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            end(name, file_error(error), USER_ERROR)
+        except Exception as error:
+            end_in_one_line(name, error)
         except KeyboardInterrupt:
             end(name, interrupted, INTERRUPTED)
 

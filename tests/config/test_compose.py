@@ -2,7 +2,7 @@
 
 import pytest
 
-from mops_lightning.config.compose import refuse_plain_groups
+from mops_lightning.config.compose import check_overrides
 from mops_lightning.errors import UserError
 from tests.support.command_line import TINY, TINY_WITH_PICTURES, call
 
@@ -27,6 +27,9 @@ from tests.support.command_line import TINY, TINY_WITH_PICTURES, call
         (["baselines=null"], "baselines=null: choose one"),
         (["sampler=3"], "sampler=3: choose one with sampler=NAME"),
         (["~m"], "m cannot be removed."),
+        (["=8"], "'=8' has no key"),
+        (["--shell-completion"], "--shell-completion: add install=bash"),
+        (["--shell-completion", "install=sh"], "--shell-completion: add install=bash"),
         (["weights=nowhere.pt", *TINY_WITH_PICTURES], "weights: no file nowhere.pt"),
     ],
 )
@@ -71,6 +74,21 @@ def test_callback_with_an_unknown_metric_ends_in_one_line(name, tmp_path):
     assert len(err.strip().splitlines()) == 1
 
 
+def test_yaml_in_another_encoding_ends_in_one_line(tmp_path):
+    (tmp_path / "sampler").mkdir()
+    (tmp_path / "sampler" / "mine.yaml").write_bytes("a: é".encode("latin-1"))
+    status, _, err = call(["--config-dir", str(tmp_path), "sampler=mine"], tmp_path)
+    assert (status, err.count("\n")) == (2, 1)
+    assert "a file is not in UTF-8" in err
+
+
+def test_current_folder_that_is_an_interpolation_ends_in_one_line(tmp_path):
+    (tmp_path / "${m}").mkdir()
+    status, _, err = call(TINY, tmp_path / "${m}")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "path of the current folder contains ${" in err
+
+
 def test_broken_yaml_ends_in_one_line(tmp_path):
     (tmp_path / "sampler").mkdir()
     (tmp_path / "sampler" / "mine.yaml").write_text("a: [1\nb: 2\n")
@@ -84,15 +102,19 @@ def test_broken_yaml_ends_in_one_line(tmp_path):
     ("override", "said"),
     [
         ("sampler=fps,null", "sampler=fps,null: choose one"),
+        ("sampler=[]", r"sampler=\[\]: choose one"),
+        ("sampler={}", "sampler={}: choose one"),
+        ("=8", "'=8' has no key. Settings are KEY=VALUE"),
         ("optimizer=[nan]", r"optimizer=\[nan\]: choose one"),
         ("optimizer=[one_cycle,null]", "choose one with optimizer=NAME"),
     ],
 )
-def test_refuse_plain_groups_no_choice_raises(override, said):
+def test_check_overrides_mistake_raises(override, said):
     with pytest.raises(UserError, match=said):
-        refuse_plain_groups([override])
+        check_overrides([override])
 
 
-def test_refuse_plain_groups_takes_names_and_lists():
-    refuse_plain_groups(["out='5'", "weights=null", "ckpt_path=last,null", "sampler=fps,mops"])
-    refuse_plain_groups(["optimizer=[one_cycle]", "optimizer=['one_cycle']"])
+def test_check_overrides_takes_names_and_lists():
+    check_overrides(["out='5'", "weights=null", "ckpt_path=last,null", "sampler=fps,mops"])
+    check_overrides(["baselines={}"])
+    check_overrides(["optimizer=[one_cycle]", "optimizer=['one_cycle']"])

@@ -28,6 +28,8 @@ from tests.support.downsample import call
         (["--m", 5, "--method", "fps", "--workers", 0], "--workers must be"),
         (["--m", 5, "--method", "fps", "--readout", "matched"], "--readout needs --weights"),
         (["--m", 5, "--method", "fps", "--surface", -5], "--surface must be"),
+        (["--m", 5, "--method", "fps", "--seed", 2**64], "--seed must be from 0"),
+        (["--m", 5, "--method", "fps", "--seed", -1], "--seed must be from 0"),
     ],
 )
 def test_mistake_ends_in_one_line(arguments, said, folder, tmp_path, monkeypatch):

@@ -23,6 +23,13 @@ def test_exponential_spans_first_to_last_rate():
     assert seen[50] == pytest.approx((5e-4 * 1e-5) ** 0.5)
 
 
+@pytest.mark.parametrize("name", ["warmup", "start_factor", "end_factor"])
+@pytest.mark.parametrize("share", [-0.1, 2.0])
+def test_one_cycle_of_no_share_raises(name, share):
+    with pytest.raises(UserError, match=f"^{name} must be between 0 and 1, got {share}"):
+        rates(one_cycle, 5, **{name: share})
+
+
 def test_one_cycle_equals_torch():
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
     reference = torch.optim.lr_scheduler.OneCycleLR(
@@ -46,3 +53,9 @@ def test_step_decay_stops_at_floor():
 def test_exponential_zero_end_lr_raises():
     with pytest.raises(UserError, match=r"end_lr.*positive.*0"):
         rates(exponential, 3, end_lr=0.0)
+
+
+@pytest.mark.parametrize(("name", "value"), [("every", 0), ("factor", 0.0), ("factor", 2.0)])
+def test_step_decay_out_of_range_raises(name, value):
+    with pytest.raises(UserError, match=f"^{name} must be"):
+        rates(step_decay, 5, **{"every": 2, "factor": 0.5, "floor_lr": 0.0, name: value})

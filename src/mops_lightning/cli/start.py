@@ -1,6 +1,7 @@
 """Checks before Hydra writes anything into the folder of a single run."""
 
 import sys
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,9 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from mops_lightning.config import distributed
+from mops_lightning.config import distributed, overrides, settings
 from mops_lightning.config.compose import explain
-from mops_lightning.errors import USER_ERROR, UserError, end, file_error, memory_error
+from mops_lightning.errors import USER_ERROR, UserError, end, end_in_one_line, line_about, one_line
 from mops_lightning.zoo import names
 
 INPUTS = {
@@ -27,6 +28,8 @@ MISSING = {
     "weights": "no file {}. Give a weights file, a run, a model, or weights=auto.",
 }
 """Errors of inputs that nothing else checks before a run begins."""
+LIGHTNING = ("trainer.", "logger.", "callbacks.")
+"""Settings that are arguments of Lightning's classes."""
 
 
 class RunStart(Callback):
@@ -44,19 +47,69 @@ class RunStart(Callback):
         cfg = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
         try:
             folder = Path(config.hydra.run.dir)
-            settings = checked(cfg, list(config.hydra.overrides.task))
+            given = list(config.hydra.overrides.task)
+            complete = checked(cfg, given)
             if cfg.evaluate:  # the job gets the settings of the trained run
                 with open_dict(config):
-                    for name in settings:
-                        config[name] = settings[name]
+                    for name in complete:
+                        config[name] = complete[name]
+            else:
+                check_effect(cfg, given)
             check_paths(cfg)
             distributed.check_start(cfg, config.hydra.overrides.hydra)
             if not distributed.is_worker_rank(cfg):
                 claim(folder)
-        except (UserError, OmegaConfBaseException) as error:
+        except OmegaConfBaseException as error:
             end("mops_lightning", explain(error, sys.argv[1:]), USER_ERROR)
-        except OSError as error:
-            end("mops_lightning", file_error(error), USER_ERROR)
+        except Exception as error:
+            end_in_one_line("mops_lightning", error)
+
+
+def check_effect(cfg: DictConfig, given: list[str]) -> None:
+    """Refuse a single run's settings of a recipe that nothing follows; a sweep's cells may differ.
+
+    Args:
+        cfg: the run's settings.
+        given: the overrides that it was composed from.
+
+    Raises:
+        UserError: there is one.
+    """
+    from hydra.utils import get_object
+
+    from mops_lightning.samplers.base import Sampler  # imports torch
+
+    learn, where = cfg.learn, f"learn={cfg.learn}"
+    cls = get_object(cfg.sampler._target_)
+    if learn == "sampler" and getattr(cls, "losses", None) is Sampler.losses:
+        learn, where = "nothing", f"sampler={cfg.names.sampler}, which is not trained"
+    for argument in given:
+        path = overrides.path(argument)
+        if path.startswith("recipe.") and not settings.of(path).counts(learn):
+            raise UserError(f"{argument}: has no effect with {where}. Leave it out.")
+
+
+def line_about_run(error: Exception, given: list[str]) -> str | None:
+    """Return one line about an error of a run that the user can mend; None for any other.
+
+    Lightning refuses some of its settings only when it uses them, by errors of any kind.
+
+    Args:
+        error: as it was raised.
+        given: the overrides.
+    """
+    line = line_about(error)
+    frames = list(traceback.walk_tb(error.__traceback__))
+    if line is None and frames[-1][0].f_globals.get("__name__", "").startswith("lightning."):
+        paths = {argument: overrides.path(argument) for argument in given}
+        suspects = [
+            argument
+            for argument, path in paths.items()
+            if path.startswith(LIGHTNING) and path not in settings.INSIDE
+        ]
+        if suspects:
+            return f"{' '.join(suspects)}: not usable in this run: {one_line(error)}"
+    return line
 
 
 def check_paths(cfg: DictConfig) -> None:
@@ -79,7 +132,7 @@ def check_paths(cfg: DictConfig) -> None:
         except (OSError, RuntimeError, ValueError) as error:
             # Python: no such user, a null byte.
             reason = error.strerror if isinstance(error, OSError) else str(error)
-            raise UserError(f"{name}: {_short(value)}: {reason}.") from None
+            raise UserError(f"{name}: {_short(value)}: {str(reason).rstrip('.')}.") from None
 
 
 def _check_missing(name: str, value: str) -> None:
@@ -94,10 +147,3 @@ def _check_missing(name: str, value: str) -> None:
 
 def _short(text: str) -> str:
     return text if len(text) <= 100 else f"{text[:60]} ... ({len(text)} characters)"
-
-
-def line_about(error: BaseException) -> str | None:
-    """Return one line about an error that the user can mend; None for a fault of the program."""
-    if isinstance(error, UserError):
-        return str(error)
-    return file_error(error) if isinstance(error, OSError) else memory_error(error)

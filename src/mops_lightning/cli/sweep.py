@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from mops_lightning.cli.start import line_about
+from mops_lightning.cli.start import line_about_run
 from mops_lightning.config import settings
 from mops_lightning.config.settings import Affects
 from mops_lightning.errors import USER_ERROR, Interrupted, UserError, end, one_line
@@ -84,7 +84,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
     except Timeout:
         log.warning(f"{folder}: skipped, because another process runs this cell")
     except Exception as error:
-        text = line_about(error)
+        text = line_about_run(error, overrides)
         if text is None:
             log.exception(f"{folder} failed")
         else:

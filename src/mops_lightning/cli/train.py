@@ -2,7 +2,9 @@
 
 import argparse
 import os
+import re
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mops_lightning.config.hydra_conf import conf_dir
@@ -14,13 +16,15 @@ from mops_lightning.errors import (
     UserError,
     did_you_mean,
     end,
-    file_error,
+    end_in_one_line,
     quiet_on_closed_pipe,
 )
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
+COMPLETION = re.compile(r"((un)?install|query)=(bash|zsh|fish)")
+"""The setting that ``--shell-completion`` needs."""
 NAME = "mops_lightning"
 """Prefix of error messages."""
 
@@ -39,14 +43,18 @@ def _run() -> None:
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError  # type: ignore[import-untyped]
 
-    from mops_lightning.config.compose import explain, refuse_plain_groups
+    from mops_lightning.config.compose import check_overrides, explain
 
     show_traceback = bool(os.environ.get("HYDRA_FULL_ERROR"))
     # Makes Hydra raise instead of printing its own shortened traceback.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
+        if "${" in str(Path.cwd()):
+            raise UserError(
+                "the path of the current folder contains ${, which Hydra resolves. Use another."
+            )
         sys.argv[1:] = flags_first(sys.argv[1:])
-        refuse_plain_groups(sys.argv[1:])
+        check_overrides(sys.argv[1:])
         if any(key(argument) == "evaluate" for argument in sys.argv[1:]):
             from mops_lightning.training.evaluation import command_line
 
@@ -54,14 +62,13 @@ def _run() -> None:
         sys.argv[1:] = with_own_classes([readable(argument) for argument in sys.argv[1:]])
         app = hydra.main(config_path=str(conf_dir()), config_name="config", version_base="1.3")
         app(_job)()
-    except (UserError, HydraException, OmegaConfBaseException, YAMLError) as error:
+    except Exception as error:
         if show_traceback:
             raise
-        end(NAME, explain(error, sys.argv[1:]), USER_ERROR)
-    except OSError as error:
-        if show_traceback or isinstance(error, BrokenPipeError):
-            raise
-        end(NAME, file_error(error), USER_ERROR)
+        of_hydra = HydraException | OmegaConfBaseException | YAMLError | UnicodeDecodeError
+        if isinstance(error, of_hydra):
+            end(NAME, explain(error, sys.argv[1:]), USER_ERROR)
+        end_in_one_line(NAME, error)
 
 
 def flags_first(arguments: list[str]) -> list[str]:
@@ -104,6 +111,8 @@ def _check_combination(read: argparse.Namespace) -> None:
         raise UserError(f"{' and '.join(chosen)}: give one of them. `--cfg job` shows one run.")
     if read.resolve and not (read.cfg or read.help):
         raise UserError("--resolve belongs to --cfg: write --cfg job --resolve.")
+    if read.shell_completion and not COMPLETION.fullmatch(" ".join(read.overrides)):
+        raise UserError("--shell-completion: add install=bash, or zsh or fish, or uninstall=bash.")
     if read.experimental_rerun:
         raise UserError(
             "--experimental-rerun is not available, because the pickle that it reads can run code. "
@@ -119,12 +128,10 @@ def _job(cfg: "DictConfig") -> float | None:
     Raises:
         KeyboardInterrupt: the user has stopped the job.
     """
-    from pathlib import Path
-
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
-    from mops_lightning.cli.start import line_about
+    from mops_lightning.cli.start import line_about_run
     from mops_lightning.cli.sweep import run_cell
     from mops_lightning.config import distributed
     from mops_lightning.training.run.run import run
@@ -149,7 +156,7 @@ def _job(cfg: "DictConfig") -> float | None:
             text = again.format(os.path.relpath(hydra_cfg.sweep.dir)) if swept else str(stop)
             raise KeyboardInterrupt(text) from None
         except Exception as error:
-            line = line_about(error)
+            line = line_about_run(error, overrides)
             if line is None:
                 raise
             end(NAME, line, USER_ERROR)

@@ -38,30 +38,32 @@ def compose(overrides: list[str] | None = None) -> DictConfig:
     from hydra.errors import HydraException
 
     given = with_own_classes(overrides or [])
-    refuse_plain_groups(given)
+    check_overrides(given)
     try:
         return composed(given)
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+    except (HydraException, OmegaConfBaseException, YAMLError, UnicodeDecodeError) as error:
         raise UserError(explain(error, given)) from None
 
 
-def refuse_plain_groups(arguments: Sequence[str]) -> None:
-    """Refuse ``logger=null`` and the like, at which Hydra raises an error without the key.
+def check_overrides(arguments: Sequence[str]) -> None:
+    """Refuse ``logger=null`` and the like: Hydra's error has no key, or there is none.
 
     Raises:
-        UserError: a group of choices is set to something else than a name.
+        UserError: there is no key, or a group of choices is set to something else than a name.
     """
     groups = _groups()
     for argument in arguments:
         override = parse_override(argument)
         name = key_of(argument)
+        if override is not None and not name:
+            raise UserError(f"{argument!r} has no key. Settings are KEY=VALUE.")
         if override is None or override.is_delete() or name not in groups:
             continue
         value: Any = override.value()
         values = [value]
         if override.is_sweep_override():
             values = value.list if override.is_choice_sweep() else []
-        if not all(map(_is_choice, values)):
+        if not (all(map(_is_choice, values)) or (name == "baselines" and value == {})):
             raise UserError(f"{argument}: choose one with {name}=NAME{OTHERWISE.get(name, '')}.")
 
 
@@ -70,8 +72,8 @@ def _is_choice(value: Any) -> bool:
     from hydra.core.override_parser.types import QuotedString
 
     if isinstance(value, list):
-        return all(isinstance(one, str | QuotedString) for one in value)
-    return isinstance(value, str | dict | QuotedString)
+        return bool(value) and all(isinstance(one, str | QuotedString) for one in value)
+    return isinstance(value, str | QuotedString) or (isinstance(value, dict) and bool(value))
 
 
 def explain(error: BaseException, arguments: Sequence[str]) -> str:
@@ -83,6 +85,8 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
     """
     from hydra.errors import MissingConfigException
 
+    if isinstance(error, UnicodeDecodeError):
+        return f"a file is not in UTF-8: {error}."
     if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
         mark = error.problem_mark
         return f"{mark.name}, line {mark.line + 1}: not valid YAML: {error.problem}."
@@ -98,8 +102,6 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
             return f"{group}={choice}: no such choice.{did_you_mean(choice, cause.options or ())}"
         texts.append(str(cause).strip())
         cause = cause.__cause__
-    if isinstance(error, UserError):
-        return texts[0]
     for text in texts:
         if "Could not override '" in text:
             key = text.split("Could not override '")[1].split("'")[0]

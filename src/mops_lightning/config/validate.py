@@ -17,8 +17,14 @@ from mops_lightning.records.run_record import dotted
 OPTIMIZERS = ("optimizer", "pretrain")
 """Nodes whose ``schedule`` is not an argument of the optimizer."""
 
-TABLES = ("epochs", "augment")
+TABLES = ("epochs", "augment", "pretrain")
 """Settings that contain settings but are not groups of choices."""
+
+OBJECTS = ("task", "task.net", "dataset", "sampler", "recipe", "trainer", "logger")
+"""Nodes that must not describe a function to call later."""
+
+AUGMENTATION = "mops_lightning.data.loader.Augmentation"
+"""The class behind each part of ``augment``."""
 
 
 def check(cfg: DictConfig) -> None:
@@ -47,6 +53,13 @@ def check(cfg: DictConfig) -> None:
     _check_limits(plain)
     _check_numbers(plain, "")
     _check_evaluation(plain)
+    for key in plain["epochs"]:
+        if key not in settings.LEARN:
+            raise UserError(f"epochs.{key}: no such setting.{did_you_mean(key, settings.LEARN)}")
+    for key, node in plain["augment"].items():
+        if key not in ("task", "sampler") or not isinstance(node, dict):
+            raise UserError(f"augment has settings of task and sampler, got {key}: {node!r}.")
+        _check_node({**node, "_target_": AUGMENTATION}, f"augment.{key}")
     for name, setting in declared.items():
         if setting.counts(plain["learn"]):
             _check_node(plain.get(name), name)
@@ -103,8 +116,7 @@ def _check_limits(config: dict[str, Any]) -> None:
     values = dotted(config)
     for path, limits in settings.limits_by_setting().items():
         value = values.get(path, MISSING)
-        counts = settings.of(path).counts(config["learn"])
-        if value != MISSING and counts and not limits.fits(value):
+        if value != MISSING and not limits.fits(value):
             raise refusal(path, value)
 
 
@@ -127,12 +139,16 @@ def _check_node(node: Any, where: str) -> None:
         return
     if node.get("_target_") == MISSING:
         raise UserError(f"{where}._target_ must be set: give {where}._target_=MODULE.CLASS.")
+    if node.get("_partial_") and where in OBJECTS:
+        raise UserError(f"{where}._partial_ must be left out: {where} is an object.")
     if node.get("_target_") is not None:
         parameters = signature(str(node["_target_"]), where)
         takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
         for key in node:
             name = str(key)
             if name == "schedule" and where in OPTIMIZERS:
+                if not isinstance(node[key], dict | None):
+                    raise UserError(f"{where}.schedule must be settings, got {node[key]!r}.")
                 continue  # built separately
             if not name.startswith("_") and name not in parameters and not takes_any:
                 raise UserError(

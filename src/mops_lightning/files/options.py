@@ -53,6 +53,8 @@ class Options:
             raise UserError(f"--m must be a whole number of at least 1, got {self.m}.")
         if self.surface is not None and self.surface < 1:
             raise UserError(f"--surface must be at least 1, got {self.surface}.")
+        if not 0 <= self.seed < 2**63:
+            raise UserError(f"--seed must be from 0 to 2**63 - 1, got {self.seed}.")
         if self.readout not in GENERATED_READOUTS:
             raise UserError(
                 f"--readout must be one of {', '.join(GENERATED_READOUTS)}, got {self.readout}."

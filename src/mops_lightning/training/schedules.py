@@ -26,7 +26,14 @@ def one_cycle(
         warmup: fraction of the run in which the rate increases.
         start_factor: first rate over peak.
         end_factor: last rate over peak.
+
+    Raises:
+        UserError: one of these is not between 0 and 1.
     """
+    shares = {"warmup": warmup, "start_factor": start_factor, "end_factor": end_factor}
+    for name, share in shares.items():
+        if not 0 <= share <= 1:
+            raise UserError(f"{name} must be between 0 and 1, got {share}.")
     last = max(total_steps - 1, 1)
     peak = warmup * total_steps - 1
 
@@ -71,6 +78,13 @@ def step_decay(
         every: steps between two decays.
         factor: of one decay.
         floor_lr: smallest rate.
+
+    Raises:
+        UserError: ``every`` or ``factor`` is out of range.
     """
+    if every < 1:
+        raise UserError(f"every must be at least 1, got {every}.")
+    if not 0 < factor <= 1:
+        raise UserError(f"factor must be above 0 and at most 1, got {factor}.")
     first = optimizer.param_groups[0]["lr"]
     return LambdaLR(optimizer, lambda step: max(factor ** (step // every), floor_lr / first))
