@@ -68,11 +68,9 @@ def check_overrides(arguments: Sequence[str]) -> None:
 
 
 def _is_choice(value: Any) -> bool:
-    """Return whether Hydra takes a value as a choice of a group: a name, or a list of names."""
+    """Return whether a value is a choice of a group: a name, or settings of a single object."""
     from hydra.core.override_parser.types import QuotedString
 
-    if isinstance(value, list):
-        return bool(value) and all(isinstance(one, str | QuotedString) for one in value)
     return isinstance(value, str | QuotedString) or (isinstance(value, dict) and bool(value))
 
 

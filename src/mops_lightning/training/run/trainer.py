@@ -13,6 +13,7 @@ import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig
 from torch import Tensor
 from torch.utils.tensorboard.summary import hparams
@@ -199,6 +200,7 @@ def log_test(
     board.finalize("success")
 
 
+@rank_zero_only
 def _log_hparams(
     board: TensorBoardLogger, settings: dict[str, Any], scores: dict[str, float]
 ) -> None:
