@@ -75,17 +75,17 @@ class GridSweeper(BasicSweeper):
 def parsed(settings: dict[str, Any], place: str) -> list[Override]:
     """Return the overrides of a grid; ``place`` names it in errors."""
     parser = OverridesParser.create()
-    parsed = []
+    overrides = []
     for key, value in settings.items():
         text = "null" if value is None else str(value)
         try:
-            parsed.append(parser.parse_override(f"{key}={text}"))
+            overrides.append(parser.parse_override(f"{key}={text}"))
         except HydraException:
             raise HydraException(
                 f"{place}: cannot read {key}={text}. Give one value, or several with "
                 "commas between them."
             ) from None
-    return parsed
+    return overrides
 
 
 def _plain(node: Any) -> Any:

@@ -75,6 +75,9 @@ def check_effect(cfg: DictConfig, given: list[str]) -> None:
     Raises:
         UserError: there is one.
     """
+    of_recipe = [one for one in given if overrides.path(one).startswith("recipe.")]
+    if not of_recipe:
+        return
     from hydra.utils import get_object
 
     from mops_lightning.samplers.base import Sampler  # imports torch
@@ -83,9 +86,8 @@ def check_effect(cfg: DictConfig, given: list[str]) -> None:
     cls = get_object(cfg.sampler._target_)
     if learn == "sampler" and getattr(cls, "losses", None) is Sampler.losses:
         learn, where = "nothing", f"sampler={cfg.names.sampler}, which is not trained"
-    for argument in given:
-        path = overrides.path(argument)
-        if path.startswith("recipe.") and not settings.of(path).counts(learn):
+    for argument in of_recipe:
+        if not settings.of(overrides.path(argument)).counts(learn):
             raise UserError(f"{argument}: has no effect with {where}. Leave it out.")
 
 
