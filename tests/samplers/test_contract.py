@@ -1,58 +1,15 @@
-"""What every sampler guarantees. A new sampler adds one line to SAMPLERS."""
-
-from collections.abc import Callable
-from typing import Any
+"""What every sampler guarantees; ``tests/support/samplers.py`` lists them."""
 
 import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.critical_points import CriticalSampler
-from mops_lightning.samplers.fmops import FMOPSNet
-from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.gumbel import GumbelSampler
 from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.poisson import PoissonSampler
-from mops_lightning.samplers.random import RandomSampler
-from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
-from mops_lightning.samplers.serial import SerialSampler
-from mops_lightning.samplers.snet import ProgressiveSNet, SNet
-from mops_lightning.samplers.submodular import SubmodularSampler
-from mops_lightning.samplers.voxel import VoxelSampler
+from mops_lightning.samplers.snet import SNet
+from tests.support.samplers import SAMPLERS
 
-SMALL: dict[str, Any] = {"feature_channels": (8, 6), "head_channels": (12, 10)}
-MOPS_LAYERS: dict[str, Any] = {"feature_channels": (8, 6), "rho_channels": (12, 10)}
-
-
-def moved(sampler: MOPSNet) -> MOPSNet:
-    """Give a sampler with anchors weights that differ from those of its start."""
-    for weights in sampler.queries.parameters():
-        values = torch.arange(weights.numel()).sin() / 2
-        weights.data = values.reshape(weights.shape)
-    return sampler
-
-
-SAMPLERS: dict[str, Callable[..., Sampler]] = {
-    "random": lambda m, **kw: RandomSampler(m, **kw),
-    "fps": lambda m, **kw: FPSSampler(m, **kw),
-    "voxel": lambda m: VoxelSampler(m),
-    "poisson": lambda m, **kw: PoissonSampler(m, **kw),
-    "serial": lambda m: SerialSampler(m),
-    "submodular": lambda m, **kw: SubmodularSampler(m, PointNetVanilla(3), **kw),
-    "critical": lambda m, **kw: CriticalSampler(m, PointNetVanilla(3), **kw),
-    "gumbel": lambda m: GumbelSampler(m, feature_channels=(8, 6)),
-    "mops": lambda m: MOPSNet(m, **MOPS_LAYERS),
-    "fmops": lambda m: FMOPSNet(m, **MOPS_LAYERS),
-    "mops-anchors": lambda m: moved(MOPSNet(m, anchors="fps", **MOPS_LAYERS)),
-    "fmops-anchors": lambda m: moved(FMOPSNet(m, anchors="fps", **MOPS_LAYERS)),
-    "snet": lambda m: SNet(m, **SMALL),
-    "snet-without-norm": lambda m: SNet(m, head_norm=False, output_norm=False, **SMALL),
-    "samplenet": lambda m: SampleNet(m, k=3, **SMALL),
-    "snet-progressive": lambda m: ProgressiveSNet(m, **SMALL),
-    "samplenet-progressive": lambda m: ProgressiveSampleNet(m, k=3, **SMALL),
-}
 SEEDED = ["random", "fps", "poisson"]
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 B, N, M = 3, 60, 8
@@ -91,8 +48,9 @@ def test_input_of_wrong_type_raises(make, clouds):
     if make().learned:
         with pytest.raises(UserError, match=r"must be torch\.float32 like the sampler's weights"):
             make()(clouds.half())
-    with pytest.raises(UserError, match="m must be a whole number"):
-        make(m=8.0)
+    for m in (8.0, 0):
+        with pytest.raises(UserError, match=f"m must be a whole number of at least 1, got {m}"):
+            make(m=m)
     with pytest.raises(UserError, match="whole number, got 8"):
         make()(clouds, 8.0)
 
@@ -163,11 +121,6 @@ def test_result_does_not_depend_on_default_device(make, clouds):
 def test_size_out_of_range_raises(make, clouds, m):
     with pytest.raises(UserError, match=f"m must be .*{M}.* got {m}"):
         make()(clouds, m)
-
-
-def test_constructor_without_points_raises(make):
-    with pytest.raises(UserError, match="m must be a whole number of at least 1, got 0"):
-        make(m=0)
 
 
 def test_size_above_number_of_points_raises(make, clouds):

@@ -77,11 +77,6 @@ def test_nested_training_sizes_split_the_range_from_min_size():
         assert 8 <= small_size <= 64 <= large_size <= 512
 
 
-def test_training_sizes_depend_on_seed():
-    assert drawn(20) == drawn(20)
-    assert len(set(drawn(20))) > 15
-
-
 def test_training_sizes_of_tiny_net_are_valid():
     assert set(small(1).training_sizes()) == {1}
     assert {size for _ in range(99) for size in small(3, num_sizes=1).training_sizes()} <= {1, 2, 3}

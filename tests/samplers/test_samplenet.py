@@ -89,16 +89,6 @@ def test_samplenet_sigma_has_lower_bound(sigma_min, t, sigma):
     assert math.isclose(net.sigma.item(), sigma, rel_tol=1e-5)
 
 
-def test_progressive_samplenet_is_nested(rng):
-    net = ProgressiveSampleNet(8, k=3).train()
-    points = torch.randn(4, 30, 3, generator=rng)
-    whole = net(points)
-    for m, output in net.sample_sizes(points, (2, 4, 8)).items():
-        torch.testing.assert_close(output.points, whole.points[:, :m])
-        torch.testing.assert_close(output.soft_projected, whole.soft_projected[:, :m])
-        assert set(output.losses) == {"simplification", "projection"}
-
-
 @pytest.mark.parametrize("reduction", ["sum", "mean"])
 def test_progressive_samplenet_adds_projection_once(reduction, rng):
     net = ProgressiveSampleNet(16, k=3, beta=0.5, size_reduction=reduction).train()

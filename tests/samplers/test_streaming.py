@@ -17,19 +17,6 @@ def test_stream_sample_equals_whole_cloud(trained, size, rng):
     torch.testing.assert_close(streamed, whole[0], rtol=0, atol=1e-5)
 
 
-def test_parts_merge_in_any_order(trained, rng):
-    points = torch.randn(1000, 3, generator=rng)
-    parts = points.split([1, 400, 99, 500])
-    net = trained.fused()
-    global_ = torch.stack([net.global_part(part) for part in parts]).amax(0)
-    sums = [net.sum_part(part, global_, 24) for part in parts]
-    forwards = sums[0].merge(sums[1]).merge(sums[2]).merge(sums[3]).result()
-    by_pairs = sums[3].merge(sums[1]).merge(sums[0].merge(sums[2])).result()
-    torch.testing.assert_close(forwards, by_pairs, rtol=0, atol=1e-6)
-    with torch.no_grad():
-        torch.testing.assert_close(forwards, trained(points[None]).points[0], rtol=0, atol=1e-5)
-
-
 def test_stream_sample_is_nested(rng):
     torch.manual_seed(1)
     sampler = FMOPSNet(24).eval()

@@ -12,20 +12,14 @@ from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.samplers.fmops import FMOPSNet
-from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
-from mops_lightning.samplers.snet import ProgressiveSNet, SNet
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.tasks.reconstruction import Reconstruction
 from mops_lightning.tasks.registration import Registration
 from mops_lightning.training.experiment import Experiment
+from tests.support.samplers import SAMPLERS
 from tests.support.training import changed, quiet_trainer, small_dataset, state
 
 POINTS, LARGEST = 72, 64
-MOPS: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
-SNET: dict[str, Any] = {"feature_channels": (8, 16), "head_channels": (16,)}
 
 TASKS = {
     "classification": lambda: Classification(PointNetVanilla(3), 3),
@@ -36,15 +30,7 @@ TASKS = {
     ),
 }
 # Sizes on both sides of 32 points, where the pooling layer changes its algorithm, in one step.
-SAMPLERS = {
-    "mops": lambda: MOPSNet(LARGEST, **MOPS),
-    "fmops": lambda: FMOPSNet(LARGEST, **MOPS),
-    "snet": lambda: SNet(LARGEST, **SNET),
-    "samplenet": lambda: SampleNet(LARGEST, k=4, **SNET),
-    "snet_progressive": lambda: ProgressiveSNet(LARGEST, min_size=8, **SNET),
-    "samplenet_progressive": lambda: ProgressiveSampleNet(LARGEST, min_size=8, k=4, **SNET),
-    "fps": lambda: FPSSampler(LARGEST),
-}
+LEARNED = ("mops", "fmops", "snet", "samplenet", "snet-progressive", "samplenet-progressive")
 
 
 def trained_parts(task: str, sampler: str | None, learn: Any) -> set[str]:
@@ -52,7 +38,7 @@ def trained_parts(task: str, sampler: str | None, learn: Any) -> set[str]:
     torch.manual_seed(0)
     module = Experiment(
         TASKS[task](),
-        None if sampler is None else SAMPLERS[sampler](),
+        None if sampler is None else SAMPLERS[sampler](LARGEST),
         learn=learn,
         make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
     )
@@ -65,8 +51,8 @@ def trained_parts(task: str, sampler: str | None, learn: Any) -> set[str]:
 
 
 LEARNS = {
-    **{(name, "sampler"): {"sampler"} for name in SAMPLERS if name != "fps"},
-    **{(name, "joint"): {"sampler", "task"} for name in SAMPLERS if name != "fps"},
+    **{(name, "sampler"): {"sampler"} for name in LEARNED},
+    **{(name, "joint"): {"sampler", "task"} for name in LEARNED},
     ("fps", "joint"): {"task"},
 }
 

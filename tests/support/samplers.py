@@ -1,0 +1,53 @@
+"""A small sampler of every kind. A new sampler adds one line to SAMPLERS."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.critical_points import CriticalSampler
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.samplers.gumbel import GumbelSampler
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.poisson import PoissonSampler
+from mops_lightning.samplers.random import RandomSampler
+from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
+from mops_lightning.samplers.serial import SerialSampler
+from mops_lightning.samplers.snet import ProgressiveSNet, SNet
+from mops_lightning.samplers.submodular import SubmodularSampler
+from mops_lightning.samplers.voxel import VoxelSampler
+
+SMALL: dict[str, Any] = {"feature_channels": (8, 6), "head_channels": (12, 10)}
+MOPS_LAYERS: dict[str, Any] = {"feature_channels": (8, 6), "rho_channels": (12, 10)}
+
+
+def moved(sampler: MOPSNet) -> MOPSNet:
+    """Give a sampler with anchors weights that differ from those of its start."""
+    for weights in sampler.queries.parameters():
+        values = torch.arange(weights.numel()).sin() / 2
+        weights.data = values.reshape(weights.shape)
+    return sampler
+
+
+SAMPLERS: dict[str, Callable[..., Sampler]] = {
+    "random": lambda m, **kw: RandomSampler(m, **kw),
+    "fps": lambda m, **kw: FPSSampler(m, **kw),
+    "voxel": lambda m: VoxelSampler(m),
+    "poisson": lambda m, **kw: PoissonSampler(m, **kw),
+    "serial": lambda m: SerialSampler(m),
+    "submodular": lambda m, **kw: SubmodularSampler(m, PointNetVanilla(3), **kw),
+    "critical": lambda m, **kw: CriticalSampler(m, PointNetVanilla(3), **kw),
+    "gumbel": lambda m: GumbelSampler(m, feature_channels=(8, 6)),
+    "mops": lambda m: MOPSNet(m, **MOPS_LAYERS),
+    "fmops": lambda m: FMOPSNet(m, **MOPS_LAYERS),
+    "mops-anchors": lambda m: moved(MOPSNet(m, anchors="fps", **MOPS_LAYERS)),
+    "fmops-anchors": lambda m: moved(FMOPSNet(m, anchors="fps", **MOPS_LAYERS)),
+    "snet": lambda m: SNet(m, **SMALL),
+    "snet-without-norm": lambda m: SNet(m, head_norm=False, output_norm=False, **SMALL),
+    "samplenet": lambda m: SampleNet(m, k=3, **SMALL),
+    "snet-progressive": lambda m: ProgressiveSNet(m, **SMALL),
+    "samplenet-progressive": lambda m: ProgressiveSampleNet(m, k=3, **SMALL),
+}
