@@ -6,7 +6,6 @@ pytest.importorskip("torch_geometric", reason="torch_geometric is not installed"
 from torch_geometric.data import Batch, Data
 from torch_geometric.transforms import BaseTransform, Compose
 
-from mops_lightning import downsample
 from mops_lightning.errors import UserError
 from mops_lightning.transforms import Downsample
 
@@ -34,12 +33,6 @@ def test_batch_is_downsampled_cloud_by_cloud(clouds):
     assert small.batch.tolist() == [0] * 10 + [1] * 10
     for one, item in zip(small.to_data_list(), clouds, strict=True):
         assert torch.equal(one.pos, item.pos[one.row])
-
-
-def test_batch_vector_gives_the_same_rows(clouds):
-    batch = Batch.from_data_list(clouds)
-    _, rows = downsample(batch.pos, 10, "fps", batch=batch.batch)
-    assert torch.equal(batch.row[rows], Downsample(10, method="fps")(batch).row)
 
 
 def test_generated_points_have_no_attributes(cloud):

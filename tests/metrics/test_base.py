@@ -1,3 +1,5 @@
+import json
+
 import pytest
 import torch
 from torchmetrics.classification import MulticlassAccuracy
@@ -17,40 +19,46 @@ METRICS = [
 ]
 
 
-# What tables and records contain: name, title, 0.5 as text, whether higher is better, place in the
-# closing table, name for full clouds.
+# What tables and records contain: name, title, 0.012345678 as text, whether higher is better, place
+# in the closing table, name for full clouds.
 SHOWN = """
-accuracy: accuracy (%), 50.00, True, 1, None
-mean_class_accuracy: mean class accuracy (%), 50.00, True, 2, None
-chamfer: chamfer, 0.5, False, 3, None
-emd: emd, 0.5, False, 4, None
-nre_cd: nre cd, 0.5, False, 1, chamfer
-nre_emd: nre emd, 0.5, False, 2, emd
-nre_cd_of_means: nre cd of means, 0.5, False, None, chamfer
-nre_emd_of_means: nre emd of means, 0.5, False, None, emd
-rotation_error_deg: rotation error (°), 0.50, False, 1, None
-rotation_error_p90_deg: rotation error p90 (°), 0.50, False, 2, None
-rotation_error_doubled_deg: rotation error doubled (°), 0.50, False, None, None
-rotation_recall_5deg: rotation recall 5deg (%), 50.00, True, 3, None
-rotation_recall_10deg: rotation recall 10deg (%), 50.00, True, 4, None
-translation_error: translation error, 0.5, False, 5, None
-subset_distance: subset distance, 0.5, False, None, None
-unique_points: unique points, 0.5, True, None, None
-nonzero_percent: non-zero entries of S (%), 0.50, False, None, None
-orthogonality_error: orthogonality error, 0.5, False, None, None
+accuracy: accuracy (%), 1.23, True, 1, None
+mean_class_accuracy: mean class accuracy (%), 1.23, True, 2, None
+chamfer: chamfer, 0.01235, False, 3, None
+emd: emd, 0.01235, False, 4, None
+nre_cd: nre cd, 0.01235, False, 1, chamfer
+nre_emd: nre emd, 0.01235, False, 2, emd
+nre_cd_of_means: nre cd of means, 0.01235, False, None, chamfer
+nre_emd_of_means: nre emd of means, 0.01235, False, None, emd
+rotation_error_deg: rotation error (°), 0.01, False, 1, None
+rotation_error_p90_deg: rotation error p90 (°), 0.01, False, 2, None
+rotation_error_doubled_deg: rotation error doubled (°), 0.01, False, None, None
+rotation_recall_5deg: rotation recall 5deg (%), 1.23, True, 3, None
+rotation_recall_10deg: rotation recall 10deg (%), 1.23, True, 4, None
+translation_error: translation error, 0.01235, False, 5, None
+subset_distance: subset distance, 0.01235, False, None, None
+unique_points: unique points, 0.01235, True, None, None
+nonzero_percent: non-zero entries of S (%), 0.01, False, None, None
+orthogonality_error: orthogonality error, 0.01235, False, None, None
 """
 
 
 def shown(metric):
     info = MetricInfo.of(metric.name, metric)
     return (
-        f"{info.name}: {info.title}, {info.format(0.5)}, {info.higher_is_better}, "
+        f"{info.name}: {info.title}, {info.format(0.012345678)}, {info.higher_is_better}, "
         f"{info.summary_order}, {info.full_cloud_metric}"
     )
 
 
 def test_metrics_declare_what_tables_show():
     assert [shown(metric) for metric in METRICS] == SHOWN.strip().splitlines()
+
+
+def test_info_survives_json():
+    info = MetricInfo("a", "b", "c", 2.0, True, None, "d")
+    assert MetricInfo.from_dict("a", json.loads(json.dumps(info.as_dict()))) == info
+    assert MetricInfo("a").as_dict() == {}
 
 
 @pytest.mark.parametrize("metric", METRICS)

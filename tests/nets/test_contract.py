@@ -67,10 +67,10 @@ def test_number_of_points_is_variable(name, n, rng):
     torch.testing.assert_close(net(points), net(points, n))
 
 
-@pytest.mark.parametrize("name", NETS)
+@pytest.mark.parametrize("name", [*NETS, "pointnet"])
 def test_result_follows_from_maxima_of_point_features(name, rng):
     torch.manual_seed(0)
-    net: Any = NETS[name](50).eval()
+    net: Any = ALL[name](50).eval()
     points = torch.randn(2, 40, 3, generator=rng)
     features = net.point_features(points)
     assert features.min() >= 0

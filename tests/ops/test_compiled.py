@@ -1,5 +1,7 @@
 """The compiled loops give the same rows as the torch forms, which GPUs use."""
 
+from functools import partial
+
 import pytest
 import torch
 
@@ -92,31 +94,23 @@ def test_fill_by_farthest_points_equals_torch_form(kind, rng, both):
     assert torch.equal(fast, plain)
 
 
-@pytest.mark.parametrize("channels", [1, 2, 4])
-def test_farthest_other_dimensions_equals_torch_form(channels, rng, both):
-    points = torch.rand(1, 600, channels, generator=rng)
-    fast, plain = both(farthest_point_sample, points, 300)
-    assert torch.equal(fast, plain)
+def with_value(value):
+    return torch.rand(1, 600, 3).index_put((torch.tensor(0), torch.tensor(7)), torch.tensor(value))
 
 
-@pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
-def test_farthest_non_finite_equals_torch_form(wrong, rng, both):
-    points = torch.rand(1, 600, 3, generator=rng)
-    points[0, 7, 0] = wrong
-    fast, plain = both(farthest_point_sample, points, 300)
-    assert torch.equal(fast, plain)
+ODD = {
+    **{f"{number} channels": partial(torch.rand, 1, 600, number) for number in (1, 2, 4)},
+    "NaN": lambda: with_value(torch.nan),
+    "infinite": lambda: with_value(torch.inf),
+    "half precision": lambda: torch.rand(1, 600, 3).half(),
+    "not contiguous": lambda: torch.rand(3, 600, 2).transpose(0, 2)[:, ::2],
+}
 
 
-def test_farthest_half_precision_equals_torch_form(rng, both):
-    points = torch.rand(1, 600, 3, generator=rng).half()
-    fast, plain = both(farthest_point_sample, points, 300)
-    assert torch.equal(fast, plain)
-
-
-def test_farthest_non_contiguous_equals_torch_form(rng, both):
-    points = torch.rand(3, 600, 2, generator=rng).transpose(0, 2)[:, ::2]
-    start = torch.tensor([5, 0])
-    fast, plain = both(farthest_point_sample, points, 200, start=start)
+@pytest.mark.parametrize("kind", ODD)
+def test_farthest_of_odd_points_equals_torch_form(kind, both):
+    points = ODD[kind]()
+    fast, plain = both(farthest_point_sample, points, 200, start=torch.arange(len(points)))
     assert torch.equal(fast, plain)
 
 

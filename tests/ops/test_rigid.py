@@ -4,7 +4,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mops_lightning.ops.rigid import (
-    Motion,
     identity_motion,
     quaternion_conjugate,
     quaternion_from_euler,
@@ -99,11 +98,3 @@ def test_random_motion_covers_its_range():
     still = torch.tensor([1.0, 0.0, 0.0, 0.0])
     mean = torch.rad2deg(rotation_angle(drawn.quaternion, still.expand(2000, 4))).mean()
     assert 41.5 < mean < 44
-
-
-def test_random_motion_depends_on_own_generator_only():
-    both = random_motion(45.0, 1.0, [generator(1), generator(2)])
-    alone = random_motion(45.0, 1.0, [generator(2)])
-    assert torch.equal(both.quaternion[1:], alone.quaternion)
-    assert torch.equal(both.translation[1:], alone.translation)
-    assert isinstance(both, Motion)

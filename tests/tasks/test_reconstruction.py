@@ -1,7 +1,6 @@
 import pytest
 import torch
 
-from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
@@ -13,7 +12,6 @@ from mops_lightning.tasks.base import figures_of
 from mops_lightning.tasks.reconstruction import Reconstruction
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.types import Batch
-from tests.support.training import quiet_trainer, small_dataset
 
 
 def task(**extra):
@@ -93,16 +91,9 @@ def test_scores_of_several_samples_equal_each_alone(rng):
             assert str(found) == str(expected)
 
 
-def test_test_scores_every_readout():
+def test_score_name_is_that_of_generated_points_or_of_full_clouds():
     sampler = MOPSNet(8, feature_channels=(8, 8), rho_channels=(16, 8))
-    module = Experiment(task(), sampler, baselines={"fps": FPSSampler(8)})
-    run = quiet_trainer(1)
-    run.test(module, CloudLoader(small_dataset().test, 4), verbose=False)
-    for readout in ("generated", "matched", "completed", "fps", "full"):
-        for name in module.task.metrics():
-            assert run.callback_metrics[f"test/{readout}/{name}"] > 0
-    assert run.callback_metrics["test/full/nre_cd"] == 1
-    assert module.score_name == "test/generated/nre_cd"
+    assert Experiment(task(), sampler).score_name == "test/generated/nre_cd"
     assert Experiment(task(), learn="task").score_name == "test/full/chamfer"
 
 

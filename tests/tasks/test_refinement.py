@@ -58,27 +58,7 @@ def test_refinement_brings_prediction_nearer(name, rng, monkeypatch):
             assert torch.where(was > 0, apart < was, apart == 0).all()
 
 
-def test_refinement_of_pairs_refines_sources_for_whole_targets(rng):
-    """The sources do not depend on the targets' samples; the targets do on the sources'."""
-    torch.manual_seed(0)
-    task = TASKS["registration"]().double().eval()
-    batch = batch_of("registration", torch.randn(6, 50, 3, generator=rng).double())
-    rows = FPSSampler(5)(batch.points).indices
-    refined = Refinement(task, 3)(batch, {5: rows})[5]
-    other = rows.clone()
-    other[3:] = rows[3:].flip(1)
-    other[3:, 0] = torch.tensor([next(i for i in range(50) if i not in row) for row in rows[3:]])
-    again = Refinement(task, 3)(batch, {5: other})[5]
-    assert torch.equal(refined[:3], again[:3])
-    net, (source, target) = task.net, batch.points.chunk(2)
-    chosen = gather_points(source, refined[:3])
-    whole, half = net(source, target), net(chosen, target)
-    apart = task.disagreement(half, whole)
-    before = task.disagreement(net(gather_points(source, rows[:3]), target), whole)
-    assert (apart < before).all()
-
-
-def test_refinement_of_pairs_refines_targets_for_refined_sources(rng):
+def test_refinement_of_pairs_refines_sources_for_whole_targets_then_targets_for_them(rng):
     torch.manual_seed(0)
     task: Any = TASKS["registration"]().double().eval()
     batch = batch_of("registration", torch.randn(6, 50, 3, generator=rng).double())
@@ -87,16 +67,21 @@ def test_refinement_of_pairs_refines_targets_for_refined_sources(rng):
     source, target = (task.net.point_features(points) for points in batch.points.chunk(2))
     whole = task.predict(batch, batch.points)
 
-    def refined_for(pooled):
+    def refined_for(features, start, of_pair):
         def apart(candidates, cloud):
-            found = refinement.predict_pooled(task, batch, torch.cat([pooled[cloud], candidates]))
+            found = refinement.predict_pooled(task, batch, torch.cat(of_pair(candidates, cloud)))
             return task.disagreement(found, Motion(*(part[cloud] for part in whole)))
 
-        return refine(target, rows[3:], apart, 3)
+        return refine(features, start, apart, 3)
+
+    def targets_for(pooled):
+        return refined_for(target, rows[3:], lambda found, cloud: [pooled[cloud], found])
 
     with torch.no_grad():
-        assert torch.equal(refined[3:], refined_for(gather_points(source, refined[:3]).amax(1)))
-        assert not torch.equal(refined[3:], refined_for(source.amax(1)))
+        sources = refined_for(source, rows[:3], lambda found, cloud: [found, target.amax(1)[cloud]])
+        assert torch.equal(refined[:3], sources)
+        assert torch.equal(refined[3:], targets_for(gather_points(source, sources).amax(1)))
+        assert not torch.equal(refined[3:], targets_for(source.amax(1)))
 
 
 def test_refinement_of_unsuitable_task_or_net_raises():

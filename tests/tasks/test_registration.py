@@ -12,7 +12,7 @@ from mops_lightning.metrics.registration import RotationError
 from mops_lightning.nets.icp import ICP
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.ops.nearest import chamfer_distance
-from mops_lightning.ops.rigid import Motion, identity_motion, quaternion_conjugate
+from mops_lightning.ops.rigid import Motion, identity_motion
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.base import figures_of
@@ -37,11 +37,6 @@ class Kabsch(torch.nn.Module):
         return Motion(torch.from_numpy(scalar_last).roll(1, 1).float(), shift[:, 0])
 
 
-def inverse(motion):
-    back = Motion(quaternion_conjugate(motion.quaternion), torch.zeros_like(motion.translation))
-    return back._replace(translation=-back.apply(motion.translation[:, None])[:, 0])
-
-
 def small_net():
     torch.manual_seed(0)
     return PCRNet(feature_channels=(16, 32), head_channels=(32, 16))
@@ -57,6 +52,7 @@ def test_step_exact_net_recovers_motions(rng):
     batch = pair_batch(source, true.apply(source), true)
     for loss in (quaternion_loss, frobenius_chamfer_loss):
         result = task(Kabsch(), loss).step(batch, batch.points)
+        assert torch.equal(result.targets.translation, true.translation)
         assert RotationError.of(result.predictions, true).max() < 1e-2
         torch.testing.assert_close(
             result.predictions.translation, true.translation, atol=1e-4, rtol=0
@@ -82,65 +78,7 @@ def test_step_loss_takes_sampled_points(rng):
     torch.testing.assert_close(result.losses["chamfer"], expected)
 
 
-def test_step_shifted_cloud_shifts_translation(rng):
-    source, target = torch.randn(2, 5, 40, 3, generator=rng)
-    module = task().eval()
-    true = motion(1)
-    shift = torch.tensor([1.0, -2.0, 3.0])
-
-    def answer(a, b):
-        batch = pair_batch(a, b, true)
-        return module.step(batch, batch.points).predictions
-
-    plain = answer(source, target)
-    by_target = answer(source, target + shift)
-    torch.testing.assert_close(by_target.quaternion, plain.quaternion, atol=1e-5, rtol=0)
-    torch.testing.assert_close(by_target.translation, plain.translation + shift, atol=1e-4, rtol=0)
-    # q = R·p + t = R·(p + s) + (t − R·s)
-    by_source = answer(source + shift, target)
-    still = plain.apply(source)
-    torch.testing.assert_close(by_source.apply(source + shift), still, atol=1e-4, rtol=0)
-
-
-def test_step_both_clouds_moved_conjugates_motion(rng):
-    source = torch.randn(5, 40, 3, generator=rng)
-    true, both = motion(1), motion(2)
-    target = true.apply(source)
-    module = task(Kabsch())
-    batch = pair_batch(both.apply(source), both.apply(target), true)
-    found = module.step(batch, batch.points).predictions
-    expected = both.after(true).after(inverse(both))
-    assert RotationError.of(found, expected).max() < 1e-2
-    torch.testing.assert_close(found.translation, expected.translation, atol=1e-4, rtol=0)
-
-
-def test_step_targets_are_motions_before_centring(rng):
-    source = torch.randn(5, 40, 3, generator=rng)
-    true = motion(1)
-    batch = pair_batch(source, true.apply(source), true)
-    result = task(Kabsch()).step(batch, batch.points)
-    torch.testing.assert_close(result.targets.translation, true.translation)
-
-
 MOPS: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
-
-
-def test_test_scores_every_readout_by_every_metric():
-    sampler = MOPSNet(8, **MOPS)
-    module = Experiment(task(resample=40), sampler, baselines={"fps": FPSSampler(8)})
-    run = quiet_trainer(1)
-    loader = CloudLoader(small_dataset().test, 4, make_batch=module.task.make_batch)
-    run.test(module, loader, verbose=False)
-    for readout in ("generated", "matched", "completed", "fps", "full"):
-        values = {
-            name: run.callback_metrics[f"test/{readout}/{name}"] for name in module.task.metrics()
-        }
-        assert 0 <= values["rotation_error_deg"] <= 180
-        assert values["rotation_error_doubled_deg"] == 2 * values["rotation_error_deg"]
-        assert values["rotation_error_p90_deg"] >= 0
-        assert values["rotation_recall_5deg"] <= values["rotation_recall_10deg"] <= 1
-        assert values["translation_error"] >= 0
-    assert module.score_name == "test/generated/rotation_error_deg"
 
 
 class RecordingSampler(FPSSampler):

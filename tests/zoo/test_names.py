@@ -26,12 +26,6 @@ def test_available_lists_own_folders_and_package(own):
     assert found["pointnet.modelnet40"].parent == names.SHIPPED
 
 
-def test_available_leaves_out_named_pipes_and_folders(own):
-    os.mkfifo(own / "fmops.pipe.safetensors")
-    (own / "fmops.folder.safetensors").mkdir()
-    assert not {"fmops.pipe", "fmops.folder"} & set(names.available())
-
-
 def test_own_model_comes_before_one_of_the_package(own):
     (own / "pointnet.modelnet40.safetensors").touch()
     assert names.find_model("pointnet.modelnet40") == own / "pointnet.modelnet40.safetensors"

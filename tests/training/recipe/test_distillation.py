@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.training.recipe.distillation import feature_distance, pooled_features
 
 
@@ -12,11 +11,6 @@ def test_feature_distance_is_relative_to_the_reference():
     found = torch.tensor([[1.0, 2.0], [0.0, 3.0]])
     reference = torch.tensor([[3.0, 4.0], [0.0, 3.0]])
     assert feature_distance(found, reference) == pytest.approx((8 / 25 + 0) / 2)
-
-
-def test_pooled_features_are_maxima_over_points():
-    net, points = PointNetVanilla(3).eval(), torch.randn(2, 7, 3)
-    torch.testing.assert_close(net.from_pooled(pooled_features(net, points)), net(points))
 
 
 def test_feature_distillation_of_net_without_point_features_raises():
