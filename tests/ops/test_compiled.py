@@ -1,5 +1,6 @@
 """The compiled loops give the same rows as the torch forms, which GPUs use."""
 
+from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -98,7 +99,7 @@ def with_value(value):
     return torch.rand(1, 600, 3).index_put((torch.tensor(0), torch.tensor(7)), torch.tensor(value))
 
 
-ODD = {
+ODD: dict[str, Callable[[], torch.Tensor]] = {
     **{f"{number} channels": partial(torch.rand, 1, 600, number) for number in (1, 2, 4)},
     "NaN": lambda: with_value(torch.nan),
     "infinite": lambda: with_value(torch.inf),
