@@ -1,3 +1,7 @@
+import json
+
+import pytest
+
 from tests.support.records import evaluated
 from tests.support.reports import put, put_cell, put_pairs, rows, table
 
@@ -17,6 +21,16 @@ def test_build_shows_records_and_paper(tmp_path):
         ["*the paper's*", "84.28 / 79.01 / 79.74", "52.39 / 32.62 / 32.62"],
     ]
     assert "pointnet on all points: 90.00 (the paper: 87.10)." in table(tmp_path)
+
+
+@pytest.mark.parametrize("changed", [{"test_noise_std": 0.1}, {"test_corruption": "shear-3"}])
+def test_build_changed_test_clouds_show_no_paper(tmp_path, changed):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3, "test/full/accuracy": 0.9})
+    assert "paper" in table(tmp_path)
+    path = tmp_path / "fps-32-pointnet" / "result.json"
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps({**record, "config": {**record["config"], **changed}}))
+    assert "paper" not in table(tmp_path)
 
 
 def test_build_other_dataset_shows_no_paper(tmp_path):

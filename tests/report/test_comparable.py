@@ -108,6 +108,26 @@ def test_runs_of_differing_settings_have_tables_of_their_own(tmp_path):
     assert len(titles(table(tmp_path, mixed=True))) == 1
 
 
+def test_corruptions_give_columns_or_many_of_them_rows(tmp_path):
+    specs = [None, "shear-1", "shear-2"]
+    for i, spec in enumerate(specs):
+        put_cell(tmp_path, f"a{i}", "mops", {"generated": 1 + i, "full": 0.5}, test_corruption=spec)
+        put_cell(tmp_path, f"b{i}", "fps", {"sampled": 5.0}, test_corruption=spec)
+    heads = [f"test_corruption={one}" for one in ("none", "shear-1", "shear-2")]
+    assert rows(table(tmp_path)) == [
+        ["sampled by", *heads],
+        ["fps", "5", "5", "5"],
+        ["mops", "1", "2", "3"],
+        ["all points", "0.5", "0.5", "0.5"],
+    ]
+    for i in range(3, 9):
+        put_cell(tmp_path, f"a{i}", "mops", {"generated": 1 + i}, test_corruption=f"shear-{i}")
+    down = rows(table(tmp_path))
+    assert down[0] == ["test_corruption", "fps", "mops", "all points"]
+    assert down[1] == ["none", "5", "1", "0.5"]
+    assert down[-1] == ["shear-8", "", "9", ""]
+
+
 @pytest.mark.parametrize("mixed", [False, True])
 def test_setting_that_only_one_run_has_is_no_column(tmp_path, mixed):
     put_cell(tmp_path, "a", "mops", {"generated": 1.0}, optimizer={"weight_decay": 0.1})

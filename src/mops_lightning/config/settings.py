@@ -215,6 +215,12 @@ class RunSettings:
         Affects.SCORES,
         limits=NOT_NEGATIVE,
     )
+    test_corruption: str | None = setting(
+        None,
+        "corruption of test clouds and its severity, such as shear-3 (docs/data.md); null: none",
+        Affects.SCORES,
+        nullable=True,
+    )
     refine: int = setting(
         0,
         "passes of local search with the task net (readout refined; slow); 0: off",

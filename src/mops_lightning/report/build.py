@@ -29,6 +29,12 @@ from mops_lightning.report.text import PAPER, Grid
 SETS = "generated / matched / completed sets, or one figure for samplers that choose input points."
 """The content of a cell, for titles."""
 
+CHANGED = ("test_noise_std", "test_corruption")
+"""Settings that change the test clouds, to which the paper's values do not apply."""
+
+MAX_COLUMNS = 8
+"""Most values of a setting that a table shows side by side; more are below each other."""
+
 MAX_NAMED = 8
 """Most runs listed by name that were made in the same way."""
 
@@ -170,6 +176,9 @@ def _by_column(table: Table) -> Grid:
     head = ["sampled by", *(f"{table.group.column}={one}" for one in columns)]
     if costs:
         head.append(training_time(table.group.records)[0])
+    if not by_size and len(columns) > MAX_COLUMNS:
+        head = [table.group.column, *(row[0] for row in rows)]
+        rows = [list(line) for line in zip(columns, *(row[1:] for row in rows), strict=True)]
     return Grid(title, head, rows, below)
 
 
@@ -254,7 +263,9 @@ def _full_lines(table: Table) -> list[str]:
 
 
 def _published(table: Table, full_clouds: bool = False) -> dict[str, Any]:
-    """Return the paper's table; empty if it has none."""
+    """Return the paper's table; empty if it has none, and for test clouds that were changed."""
+    if any(one.config.get(key) for one in table.group.records for key in CHANGED):
+        return {}
     metric = table.full_metric if full_clouds else table.metric
     joint = trained_with(table.group.records[0]) == "joint"
     return paper.published(table.names["task"], table.names["dataset"], metric.name, joint)

@@ -11,7 +11,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from mops_lightning.records.readout_names import GENERATED_READOUTS, INDEX_READOUT
-from mops_lightning.report.build import Report
+from mops_lightning.report.build import MAX_COLUMNS, Report
 from mops_lightning.report.tables import Table, sort_key
 from mops_lightning.viz.figures import new_figure
 
@@ -68,7 +68,11 @@ def curves(table: Table) -> Figure:
             )
         axis.set_title(readout)
         axis.set_xlabel(table.group.column)
-        axis.set_xticks(range(len(columns)), [f"{column:g}" for column in columns])
+        axis.set_xticks(
+            range(len(columns)), [one if isinstance(one, str) else f"{one:g}" for one in columns]
+        )
+    if len(columns) > MAX_COLUMNS:
+        axis.tick_params(axis="x", rotation=90, labelsize=5)
         axis.grid(alpha=0.3)
     panels[0].set_ylabel(table.metric.title)
     panels[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))

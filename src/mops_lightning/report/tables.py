@@ -185,7 +185,7 @@ def make_table(group: Group, metric: str, net: str) -> Table:
         UserError: no record has the metric.
     """
     long = long_form(group.records, net, group.settings)
-    long["down"], long["column"] = 0.0, 0.0 if group.planes else long[group.column]
+    long["down"], long["column"] = 0.0, 0.0 if group.planes else long[group.column].fillna("none")
     for name, pair in group.planes.items():
         own = long["sampler"] == name
         long.loc[own, ["down", "column"]] = long.loc[own, pair].to_numpy(float)

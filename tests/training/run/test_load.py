@@ -137,6 +137,14 @@ def test_evaluate_noise_changes_test_clouds_only(trained, tmp_path):
         assert getattr(noisy, name) == getattr(record, name)
 
 
+def test_evaluate_on_corrupted_clouds(trained, tmp_path):
+    _, record = trained
+    thinned = evaluated(trained, tmp_path, "test_corruption=drop_global-5")
+    key = "test/m8/generated/subset_distance"
+    assert thinned.metrics[key] > record.metrics[key]  # a quarter of the points lies farther away
+    assert thinned.dataset_fingerprint == record.dataset_fingerprint
+
+
 def test_evaluate_threshold_changes_generated_points(trained, tmp_path):
     _, record = trained
     sparse = evaluated(trained, tmp_path, "sampler.threshold=0.02")

@@ -14,6 +14,7 @@ from mops_lightning.config import distributed
 from mops_lightning.config.build import build
 from mops_lightning.config.validate import check
 from mops_lightning.data.clouds import CloudDataset, noisy, scale_warning
+from mops_lightning.data.corruptions import corrupt
 from mops_lightning.errors import Interrupted, UserError, closed_outputs
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
@@ -167,7 +168,7 @@ def claim(folder: Path) -> None:
 
 
 def _load_data(cfg: DictConfig) -> CloudDataset:
-    """Load both splits and add noise to the test clouds."""
+    """Load both splits and corrupt the test clouds."""
     dataset = build(cfg.dataset, "dataset")
     if not isinstance(dataset, CloudDataset):
         raise UserError(
@@ -176,7 +177,7 @@ def _load_data(cfg: DictConfig) -> CloudDataset:
         )
     if warning := scale_warning(dataset):
         print(warning, file=sys.stderr)
-    test = noisy(dataset.test, cfg.test_noise_std)
+    test = noisy(corrupt(dataset.test, cfg.test_corruption), cfg.test_noise_std)
     if not torch.isfinite(test.points).all():
         raise UserError(
             f"test_noise_std={cfg.test_noise_std} makes coordinates infinite. Lower it."
