@@ -68,6 +68,8 @@ def rng() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
+PATIENCE = 120_000
+"""Milliseconds that a browser may take on a busy machine, where its own limit is 30,000."""
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
@@ -82,7 +84,8 @@ def browser() -> Iterator[Any]:
     with sync_playwright() as playwright:
         # WebGL without a graphics card.
         flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        yield playwright.chromium.launch(executable_path=program, args=flags)
+        launch = playwright.chromium.launch
+        yield launch(executable_path=program, args=flags, timeout=PATIENCE)
 
 
 @pytest.fixture
@@ -100,6 +103,7 @@ def opened_once(browser: Any) -> Iterator[Any]:
 def opening(browser: Any) -> Iterator[Any]:
     """Yield the function of ``opened``."""
     page = browser.new_page()
+    page.set_default_timeout(PATIENCE)
     errors: list[str] = []
     requests: list[str] = []
 

@@ -1,5 +1,4 @@
 import os
-import resource
 import zipfile
 
 import numpy as np
@@ -13,6 +12,7 @@ from mops_lightning.filesystem import (
     load_npz,
     remove_temporary,
 )
+from tests.support.full_disk import full_disk
 
 
 def test_atomic_write_replaces_the_old_file(tmp_path):
@@ -104,13 +104,12 @@ def test_load_npz_member_that_is_no_array_is_refused(tmp_path):
 def test_atomic_write_on_full_disk_names_the_file(tmp_path):
     path = tmp_path / "file.txt"
     path.write_text("old")
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
-    try:
-        with pytest.raises(OSError, match="too large") as error, atomic_write(path) as temporary:
-            temporary.write_bytes(b"x" * 2000)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with (
+        full_disk(1000),
+        pytest.raises(OSError, match="too large") as error,
+        atomic_write(path) as temporary,
+    ):
+        temporary.write_bytes(b"x" * 2000)
     assert file_error(error.value).startswith(f"{path}: File too large. Free some space")
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]

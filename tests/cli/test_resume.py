@@ -94,12 +94,3 @@ def test_stopped_run_resumed_by_same_command_tests_same_weights(tmp_path, monkey
     )
     assert got.status == "completed"
     assert got.metrics == want.metrics
-
-
-def test_checkpoint_of_other_settings_is_rejected(unbroken):
-    folder, _ = unbroken
-    (run,) = runs(folder)
-    arguments = [*LONGER, "m=4", f"ckpt_path={run.relative_to(folder)}", "out=wrong"]
-    status, out, err = call(arguments, folder)
-    assert status == 2
-    assert "other settings (sampler" in err

@@ -2,8 +2,6 @@
 
 import json
 
-import h5py
-import numpy as np
 import pytest
 
 from mops_lightning.cli.train import flags_first
@@ -155,33 +153,6 @@ def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
     assert "learn=sampler: ICP has no weights" in err
 
 
-def test_cfg_job_prints_config(tmp_path):
-    status, out, err = call(["--cfg", "job", "m=64"], tmp_path)
-    assert (status, err) == (0, "")
-    assert "m: 64" in out
-
-
-def test_failed_run_writes_record_with_error(tmp_path):
-    root = tmp_path / "broken"
-    root.mkdir()
-    (root / "shape_names.txt").write_text("a\nb\n")
-    for split in ("train", "test"):
-        (root / f"{split}_files.txt").write_text(f"ply_data_{split}0.h5\n")
-        with h5py.File(root / f"ply_data_{split}0.h5", "w") as file:
-            file["data"] = np.zeros((4, 32, 3), np.float32)
-            file["label"] = np.zeros((4, 1), np.uint8)
-    path = root / "ply_data_test0.h5"
-    path.write_bytes(path.read_bytes()[:700])
-    settings = ["dataset=modelnet40", "dataset.root=broken", "dataset.n_points=32", "m=4"]
-    status, out, err = call(settings, tmp_path)
-    assert status == 2
-    assert "ply_data_test0.h5" in err
-    (run,) = runs(tmp_path)
-    record = run_record.read(run)
-    assert record.status == "failed"
-    assert "ply_data_test0.h5" in str(record.error)
-
-
 def test_real_modelnet40_trains(real_data, tmp_path):
     root = (real_data / "modelnet40_hdf5_1024").resolve()
     if not root.is_dir():
@@ -219,20 +190,6 @@ def test_flexible_sampler_is_tested_at_all_sizes(main_job):
         assert word in out
     run = next(path for path in runs(folder) if path.parent.name == "fmops-m32")
     assert "test/m16/completed/accuracy" in run_record.read(run).metrics
-
-
-def test_weights_of_another_net_are_rejected(main_job):
-    folder, run, *_ = main_job
-    other = next((folder / "cache" / "weights").rglob("weights.safetensors"))
-    settings = [
-        *TINY,
-        f"weights={other}",
-        "dataset.classes=[chair,table]",
-        "out=other",
-    ]
-    status, out, err = call(settings, folder)
-    assert status == 2
-    assert "holds another net's weights" in err
 
 
 @pytest.mark.parametrize(

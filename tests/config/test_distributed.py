@@ -9,7 +9,7 @@ from safetensors.torch import load_file
 from mops_lightning.config.compose import compose
 from mops_lightning.config.distributed import check_shares, check_start
 from mops_lightning.errors import UserError
-from tests.support.command_line import SMALL_PCRNET, TINY, call, call_anew
+from tests.support.command_line import SMALL_PCRNET, TINY, call, call_anew, refused
 
 
 @pytest.mark.parametrize(
@@ -81,6 +81,5 @@ def test_two_processes_equal_one_and_rank_zero_writes(tmp_path):
 
 
 def test_sweep_on_several_devices_raises(tmp_path):
-    status, _, err = call(["-m", *TINY, "trainer.devices=2", "m=4,8"], tmp_path)
-    assert status == 2
-    assert "hydra/launcher=joblib" in err
+    said = refused(["-m", *TINY, "trainer.devices=2", "m=4,8"], tmp_path)
+    assert "hydra/launcher=joblib" in said

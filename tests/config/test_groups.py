@@ -17,8 +17,9 @@ TASKS = ("classification", "registration", "reconstruction")
 
 
 def test_default_run_is_described_in_120_lines(tmp_path):
-    status, out, err = call(["--cfg", "job"], tmp_path)
+    status, out, err = call(["--cfg", "job", "m=64"], tmp_path)
     assert (status, err) == (0, "")
+    assert "m: 64" in out.splitlines()
     assert len(out.splitlines()) <= 120
 
 
@@ -30,6 +31,7 @@ def test_help_shows_every_key_and_choice(tmp_path):
     for group in ("sampler", "task/net", "dataset", "recipe", "experiment"):
         names = sorted(path.stem for path in conf_dir().joinpath(group).glob("*.yaml"))
         assert f"\n{group}: {', '.join(names)}\n" in out
+    assert out.index("report ") < out.index("downsample ") < out.index("sampler:")
     hidden = ("sampler/", "dataset_task", "task_settings")
     assert not any(line.startswith(hidden) for line in out.splitlines())
 

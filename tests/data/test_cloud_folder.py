@@ -107,13 +107,13 @@ def test_cloud_folder_surface_reads_modelnet_layout(mesh_layout, capsys):
 
 def test_cloud_folder_splits_every_class_by_share(tmp_path):
     """ShapeNetCore's layout: SYNSET/*.ply, objects that overlap each other."""
-    for synset, number in (("02691156", 20), ("03001627", 5)):
+    for synset, number in (("02691156", 20), ("03001627", 5), ("alone", 1)):
         for i in range(number):
             write(tmp_path / synset / f"{i:032x}.ply", seed=i, number=60)
     settings: dict[str, Any] = {"n_points": 50, "crop": "whole", "crops": 1, "test_share": 0.15}
     data = cloud_folder(tmp_path, **settings)
-    assert data.class_names == ("02691156", "03001627")
-    assert data.train.points.shape == (17 + 4, 50, 3)
+    assert data.class_names == ("02691156", "03001627", "alone")
+    assert data.train.points.shape == (17 + 4 + 1, 50, 3)
     assert data.test.labels.tolist() == [0] * 3 + [1]
     assert data.train.sources is None
     again, other = (cloud_folder(tmp_path, **settings, seed=seed) for seed in (0, 1))

@@ -6,7 +6,6 @@ from mops_lightning.data.file_splits import (
     by_number,
     class_of,
     split_by_folder,
-    split_by_share,
     split_by_time,
 )
 from mops_lightning.errors import UserError
@@ -26,15 +25,6 @@ def test_split_by_folder_first_or_second_folder():
 def test_split_by_folder_file_outside_raises():
     with pytest.raises(UserError, match=r"chair/b\.ply is neither in train/ nor in test/"):
         split_by_folder(paths("train/a.ply", "chair/b.ply"))
-
-
-def test_split_by_share_every_class_and_seed():
-    names = paths(*(f"{one}/{i}.ply" for one in ("a", "b") for i in range(10)), "c/alone.ply")
-    splits = split_by_share(names, 0.3, 0)
-    tests = [name for name, split in zip(names, splits, strict=True) if split == "test"]
-    assert [name.parts[0] for name in tests] == ["a"] * 3 + ["b"] * 3
-    assert splits == split_by_share(names, 0.3, 0)
-    assert splits != split_by_share(names, 0.3, 1)
 
 
 def test_by_number_sorts_digits_that_are_no_numbers():

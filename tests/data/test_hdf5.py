@@ -11,6 +11,7 @@ import torch
 
 from mops_lightning.data.hdf5 import hdf5, read_clouds
 from mops_lightning.errors import UserError
+from tests.support.hdf5 import write_file
 
 
 @pytest.fixture
@@ -19,7 +20,7 @@ def folder(tmp_path):
     for split, number in (("train", 6), ("test", 4)):
         with h5py.File(tmp_path / f"{split}.h5", "w") as file:
             file["data"] = rng.normal(size=(number, 50, 3)).astype(np.float32)
-            file["label"] = (np.arange(number) % 2).astype(np.uint8)[:, None]
+            file["label"] = (np.arange(number) % 2).astype(np.uint8)  # ModelNet40's are (S, 1)
             file["name"] = np.array([b"x"] * number)
     return tmp_path
 
@@ -114,12 +115,6 @@ def test_hdf5_real_data(real_data):
     assert data.train.points.shape == (626, 10_000, 3)
     assert data.test.points.shape == (100, 10_000, 3)
     assert data.test.points.norm(dim=2).max() < 1.001
-
-
-def write_file(path: Path, **datasets: Any) -> None:
-    with h5py.File(path, "w") as file:
-        for key, value in datasets.items():
-            file.create_dataset(key, data=value)
 
 
 def set_item(path: Path, key: str, place: Any, value: float) -> None:

@@ -194,12 +194,6 @@ def test_shapes_cache_is_written_and_read(tmp_path: Path) -> None:
     assert torch.equal(again.train.labels, fresh.train.labels)
 
 
-def test_shapes_cache_file_depends_on_arguments(tmp_path: Path) -> None:
-    for seed in (0, 1):
-        assert same(shapes(**SMALL, seed=seed, cache=tmp_path), shapes(**SMALL, seed=seed))
-    assert len(list(tmp_path.iterdir())) == 2
-
-
 def test_shapes_damaged_cache_is_replaced(tmp_path: Path) -> None:
     fresh = shapes(**SMALL, cache=tmp_path)
     (path,) = tmp_path.iterdir()

@@ -15,3 +15,10 @@ def captured(main, arguments, *more):
         except SystemExit as stop:
             status = stop.code
     return status, out.getvalue(), err.getvalue()
+
+
+def refused(main, arguments, *more):
+    """The line in which a command with a mistake ends."""
+    status, out, err = captured(main, arguments, *more)
+    assert (status, out, err.count("\n")) == (2, "", 1), err
+    return err

@@ -13,6 +13,8 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 
 from mops_lightning.cli.main import main
+from mops_lightning.config.compose import compose
+from mops_lightning.training.run.run import run
 
 TINY_ANY_DATA = [
     "trainer=cpu",
@@ -87,9 +89,23 @@ def call(arguments, folder):
     return status, out.getvalue(), err.getvalue()
 
 
+def refused(arguments, folder):
+    """The line in which a command line with a mistake ends."""
+    status, out, err = call(arguments, folder)
+    assert (status, err.count("\n")) == (2, 1), out + err
+    assert err.startswith("mops_lightning: ")
+    return err
+
+
 def runs(folder):
     """Return the folders of all runs below ``outputs``."""
     return sorted(path.parent for path in (folder / "outputs").rglob("result.json"))
+
+
+def job(folder, *overrides):
+    """Run the smallest job with further settings, and a cache beside its folder; its record."""
+    chosen = [*TINY, f"cache={folder.parent}/cache", *overrides]
+    return run(compose(chosen), folder, chosen)
 
 
 def variables(folder):

@@ -4,14 +4,12 @@ import pytest
 import torch
 from lightning.pytorch.strategies import SingleDeviceStrategy
 
-from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.divergence import Diverged, check_finite
-from mops_lightning.training.run.run import run
 from mops_lightning.zoo import weights
-from tests.support.command_line import TINY
+from tests.support.command_line import job
 
 STRATEGY = SingleDeviceStrategy()
 
@@ -32,16 +30,9 @@ def test_check_finite_names_the_first_value_that_is_not(value):
 def diverged(tmp_path_factory):
     """A run whose rate explodes after its first epoch, and its error."""
     folder = tmp_path_factory.mktemp("diverged")
-    overrides = [
-        *TINY,
-        f"cache={folder}/cache",
-        "weights=null",
-        "trainer.max_epochs=3",
-        "optimizer=exponential",
-        "optimizer.schedule.end_lr=1e30",
-    ]
+    rising = ["optimizer=exponential", "optimizer.schedule.end_lr=1e30"]
     with pytest.raises(UserError) as error:
-        run(compose(overrides), folder / "run", overrides)
+        job(folder / "run", "weights=null", "trainer.max_epochs=3", *rising)
     return folder / "run", str(error.value)
 
 
@@ -58,16 +49,8 @@ def test_run_diverged_keeps_last_finite_checkpoint(diverged):
 
 
 def test_run_diverged_in_last_step_fails(tmp_path):
-    overrides = [
-        *TINY,
-        f"cache={tmp_path}/cache",
-        "weights=null",
-        "optimizer.lr=1e30",
-        "dataset.train_per_class=2",
-        "batch_size=6",
-        "val_fraction=0",
-        "callbacks.checkpoint=null",
-    ]
+    one_step = ["dataset.train_per_class=2", "batch_size=6", "val_fraction=0"]
+    settings = ["weights=null", "optimizer.lr=1e30", "callbacks.checkpoint=null"]
     with pytest.raises(UserError, match=r"training diverged: .*Try a lower"):
-        run(compose(overrides), tmp_path / "run", overrides)
+        job(tmp_path / "run", *one_step, *settings)
     assert run_record.read(tmp_path / "run").status == "failed"

@@ -4,9 +4,7 @@ import json
 
 import pytest
 
-from mops_lightning.config.compose import compose
-from mops_lightning.training.run.run import run
-from tests.support.command_line import TINY_WITH_PICTURES, call
+from tests.support.command_line import TINY, call, job, refused
 
 NETS = {
     "classification": ("pointnet",),
@@ -18,18 +16,10 @@ NETS = {
 @pytest.mark.parametrize("task", NETS)
 def test_train_mixed_precision_is_close(task, tmp_path):
     for net in NETS[task]:
-        common = [
-            *TINY_WITH_PICTURES,
-            f"task={task}",
-            f"task/net={net}",
-            "pictures=0",
-            "logger=none",
-        ]
-        common += ["learn=joint", "weights=null", f"cache={tmp_path}/cache"]
+        common = [f"task={task}", f"task/net={net}", "learn=joint", "weights=null"]
         found = {}
         for precision in ("32-true", "bf16-mixed"):
-            chosen = [*common, f"trainer.precision={precision}"]
-            record = run(compose(chosen), tmp_path / net / precision, chosen)
+            record = job(tmp_path / net / precision, *common, f"trainer.precision={precision}")
             found[precision] = record.metrics["test/generated/subset_distance"]
             assert record.status == "completed"
         assert found["bf16-mixed"] == pytest.approx(found["32-true"], rel=0.2)
@@ -37,9 +27,7 @@ def test_train_mixed_precision_is_close(task, tmp_path):
 
 
 def test_evaluate_precision_does_not_change_metrics(tmp_path):
-    overrides = [*TINY_WITH_PICTURES, "pictures=0", "logger=none", f"cache={tmp_path}/cache"]
-    status, _, err = call([*overrides, "hydra.run.dir=run"], tmp_path)
-    assert status == 0, err
+    job(tmp_path / "run")
     for name, precision in (("single", "32-true"), ("half", "bf16-mixed")):
         arguments = ["evaluate=run", f"trainer.precision={precision}", f"hydra.run.dir={name}"]
         status, _, err = call(arguments, tmp_path)
@@ -49,6 +37,5 @@ def test_evaluate_precision_does_not_change_metrics(tmp_path):
 
 
 def test_precision_gpu_only_on_cpu_raises(tmp_path):
-    status, _, err = call([*TINY_WITH_PICTURES, "trainer.precision=16-mixed"], tmp_path)
-    assert status != 0
-    assert "trainer.precision=bf16-mixed" in err
+    said = refused([*TINY, "trainer.precision=16-mixed"], tmp_path)
+    assert "trainer.precision=bf16-mixed" in said

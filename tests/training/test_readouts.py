@@ -1,19 +1,15 @@
-from typing import Any
-
 import pytest
 import torch
 
 from mops_lightning.ops.points import gather_points
-from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.training.readouts import names_of_readouts, readouts
+from tests.support.samplers import SAMPLERS
 
-SMALL: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
 
-
-@pytest.mark.parametrize("sampler", [FPSSampler(8), MOPSNet(8, **SMALL)])
+@pytest.mark.parametrize("name", ["fps", "mops"])
 @torch.no_grad()
-def test_readouts_refine_starts_from_distinct_rows(sampler, rng):
+def test_readouts_refine_starts_from_distinct_rows(name, rng):
+    sampler = SAMPLERS[name](8)
     points = torch.randn(3, 60, 3, generator=rng)
     started = {}
 

@@ -14,15 +14,6 @@ def run(tmp_path):
     return tmp_path / "run"
 
 
-def test_added_model_gives_the_same_points(tmp_path, monkeypatch):
-    net = write_run(tmp_path / "run")
-    publish.add(tmp_path / "run", "fmops.mine", tmp_path / "models")
-    monkeypatch.setenv(names.VARIABLE, str(tmp_path / "models"))
-    points = torch.rand(2, 40, 3)
-    with torch.no_grad():
-        assert torch.equal(load("fmops.mine")(points, 5).points, net(points, 5).points)
-
-
 def test_card_is_written_from_the_record(run, tmp_path):
     card = model_file.read_card(publish.add(run, "fmops.mine", tmp_path, licence="CC0"))
     figures = {"metric": "accuracy (%)", "m": 8, "points": 64, "values": {"generated": "50.00"}}

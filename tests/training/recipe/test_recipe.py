@@ -10,13 +10,11 @@ from mops_lightning.config.compose import compose
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.data.pairs import Pairs
 from mops_lightning.errors import UserError
-from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.readout import complete
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.classification import Classification
-from mops_lightning.tasks.reconstruction import Reconstruction
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.moving_average import MovingAverage
 from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through
@@ -140,17 +138,6 @@ def test_training_sees_drawn_points_then_all_and_validation_always_all():
     assert isinstance(module.sampler, SeenBy)
     assert module.sampler.seen[True] == [20] * 4 + [POINTS] * 4
     assert set(module.sampler.seen[False]) == {POINTS}
-
-
-def test_reconstruction_from_drawn_points_is_of_the_whole_cloud():
-    task = Reconstruction(AutoEncoder(POINTS, 8, (8,), (8,)))
-    data = small_dataset(points=POINTS)
-    sampler = SeenBy()
-    module = Experiment(
-        task, sampler, make_optimizer=torch.optim.Adam, recipe=Recipe(train_points=20)
-    )
-    quiet_trainer(1).fit(module, CloudLoader(data.train, 6), CloudLoader(data.test, 6))
-    assert set(sampler.seen[True]) == {20}
 
 
 def test_points_at_is_at_least_twice_the_sample():

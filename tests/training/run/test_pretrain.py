@@ -9,15 +9,13 @@ from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.training.run.pretrain import cache_folder
-from mops_lightning.training.run.run import run
 from mops_lightning.zoo import weights
-from tests.support.command_line import SMALL_PCRNET, TINY, call
+from tests.support.command_line import SMALL_PCRNET, TINY, call, job
 from tests.support.forked import start_fork
 
 
 def train(folder, *arguments):
-    overrides = [*TINY, f"cache={folder}/cache", *arguments]
-    return run(compose(overrides), folder / f"run{len(list(folder.iterdir()))}", overrides)
+    return job(folder / f"run{len(list(folder.iterdir()))}", *arguments)
 
 
 def files(folder, pattern):
@@ -37,6 +35,13 @@ def test_task_net_from_file_is_not_published(tmp_path):
     own, again = (weights.read(path)["state"] for path in paths)
     assert all(torch.equal(own[name], again[name]) for name in own)  # at a rate of 0 nothing moves
     assert len(files(tmp_path, "cache/weights/*/weights.safetensors")) == 1
+
+
+def test_task_net_is_pretrained_by_its_own_optimizer(tmp_path):
+    by_run = train(tmp_path, *SMALL_PCRNET, "sampler=fps", "pretrain.lr=0")
+    train(tmp_path, *SMALL_PCRNET, "learn=task", "optimizer.lr=0")
+    (alone,) = files(tmp_path, "run*/weights.safetensors")
+    assert by_run.task_weights_sha256 == alone["sha256"]
 
 
 def test_weights_file_for_net_without_weights_raises(tmp_path):

@@ -5,9 +5,9 @@ from mops_lightning.config.compose import compose
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.checkpoint import CHECKPOINT
-from mops_lightning.training.run.run import recorded, run
+from mops_lightning.training.run.run import recorded
 from mops_lightning.training.run.trainer import AtomicCheckpointIO
-from tests.support.command_line import TINY
+from tests.support.command_line import job
 
 
 def test_recorded_running_then_completed(tmp_path):
@@ -36,21 +36,13 @@ def test_recorded_exception_is_written_and_raised(raised, status, error, tmp_pat
     assert (found.status, found.error) == (status, error)
 
 
-SMALL = [*TINY, "sampler.feature_channels=[8,8]", "sampler.rho_channels=[16,8]", "weights=null"]
-
-
-def job(folder, *arguments):
-    overrides = [*SMALL, f"cache={folder.parent}/cache", *arguments]
-    return run(compose(overrides), folder, overrides)
-
-
 def test_run_on_part_of_the_batches_says_so(tmp_path, capsys):
     limits = ["+trainer.limit_train_batches=1", "+trainer.limit_test_batches=1"]
-    record = job(tmp_path / "run", *limits)
+    record = job(tmp_path / "run", "weights=null", *limits)
     parts = ["trained on 1 of 2 batches of an epoch", "tested on 1 of 3 batches"]
     assert record.partial == run_record.read(tmp_path / "run").partial == parts
     assert f" s, but {' and '.join(parts)}; files in " in capsys.readouterr().out
-    record = job(tmp_path / "steps", "+trainer.max_steps=1", "trainer.max_epochs=3")
+    record = job(tmp_path / "steps", "weights=null", "+trainer.max_steps=1", "trainer.max_epochs=3")
     assert record.partial == ["trained for 1 of 6 steps"]
 
 
@@ -70,13 +62,13 @@ def test_run_that_trains_or_tests_nothing_is_refused(argument, named, tmp_path):
 
 
 def test_completed_run_resumed_is_completed_with_the_cpu_time_of_all_parts(tmp_path):
-    first = job(tmp_path / "first")
+    first = job(tmp_path / "first", "weights=null")
     assert first.partial == []
     path = tmp_path / "first" / "checkpoints" / CHECKPOINT
     content = torch.load(path, weights_only=True)
     content["callbacks"]["CPUTime"]["seconds"] += 1000
     AtomicCheckpointIO().save_checkpoint(content, path)
-    again = job(tmp_path / "again", f"ckpt_path={path}")
+    again = job(tmp_path / "again", "weights=null", f"ckpt_path={path}")
     assert (again.status, again.partial) == ("completed", [])
     assert again.metrics == first.metrics
     assert again.seconds["fit_cpu"] > 1000

@@ -68,7 +68,7 @@ def test_tensorboard_shows_curves_settings_images_meshes(board, opened):
         page.goto(f"{board}/{address}")
         for one in what:
             found = page.locator(one) if one == "canvas" else page.get_by_text(one)
-            found.first.wait_for(state="attached", timeout=30_000)
+            found.first.wait_for(state="attached")
         return page, errors, requests
 
     see("?tagFilter=mean_loss#timeseries", "mean_loss", "canvas")
@@ -77,7 +77,7 @@ def test_tensorboard_shows_curves_settings_images_meshes(board, opened):
     see("#images", "matrix")
     page, errors, requests = see("#mesh", "run1/tensorboard", "canvas")
     meshes = page.locator("canvas")
-    meshes.nth(len(RUNS) - 1).wait_for(state="attached", timeout=30_000)  # a view of each run
+    meshes.nth(len(RUNS) - 1).wait_for(state="attached")  # a view of each run
     context = "(canvas.getContext('webgl2') || canvas.getContext('webgl'))"
     lost = meshes.evaluate_all(f"all => all.filter(canvas => {context}.isContextLost()).length")
     assert lost == 0, "the browser stopped drawing some"
