@@ -93,19 +93,6 @@ def test_augmentation_negative_jitter_raises():
         Augmentation(jitter=-1.0)
 
 
-def test_loader_position_counts_batches_and_epochs():
-    loader = CloudLoader(clouds(), 4, shuffle=True)
-    positions = [
-        (state["epoch"], state["position"]) for _ in loader for state in [loader.state_dict()]
-    ]
-    assert positions == [(0, 1), (0, 2), (1, 0)]
-    loader.set_epoch(3)
-    assert loader.state_dict() == {"epoch": 3, "position": 0}
-    loader.load_state_dict({"epoch": 3, "position": 2})
-    loader.set_epoch(3)
-    assert len(labels(loader)) == 1
-
-
 def drawn(loader):
     """The number that the task draws for each cloud, by label."""
     return {label: number for batch in loader for label, number in batch}

@@ -3,10 +3,7 @@ import os
 import shutil
 import threading
 from collections.abc import Iterator
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -16,6 +13,8 @@ import torch
 from mops_lightning.data import modelnet
 from mops_lightning.data.modelnet import FOLDER, modelnet40
 from mops_lightning.errors import UserError
+from tests.support.hdf5 import write_file
+from tests.support.served import served
 
 NAMES = ("airplane", "night_stand", "chair")  # not in alphabetical order
 FILES = {"train": (0, 1, 2, 10), "test": (0, 1)}
@@ -26,12 +25,6 @@ def cloud(split: str, file: int, row: int) -> np.ndarray:
     """Return points that identify where they are stored."""
     random = np.random.default_rng([len(split), file, row])
     return random.uniform(-1, 1, (STORED, 3)).astype(np.float32)
-
-
-def write_file(path: Path, **datasets: Any) -> None:
-    with h5py.File(path, "w") as file:
-        for key, value in datasets.items():
-            file.create_dataset(key, data=value)
 
 
 def write_layout(folder: Path) -> Path:
@@ -69,20 +62,6 @@ def test_modelnet_accepts_parent_folder(layout: Path) -> None:
     above, itself = modelnet40(layout.parent, n_points=4), modelnet40(str(layout), n_points=4)
     assert torch.equal(above.train.points, itself.train.points)
     assert above.fingerprint == itself.fingerprint
-
-
-def test_modelnet_selects_classes(layout: Path) -> None:
-    whole = modelnet40(layout, n_points=4)
-    dataset = modelnet40(layout, n_points=4, classes=["chair", "night_stand"])
-    assert dataset.class_names == ("night_stand", "chair")
-    assert dataset.test.labels.tolist() == [0, 1, 0] * 2
-    assert torch.equal(dataset.test.points, whole.test.points[whole.test.labels > 0])
-
-
-def test_modelnet_accepts_flat_labels(layout: Path) -> None:
-    path = layout / "ply_data_test1.h5"
-    write_file(path, data=np.zeros((2, STORED, 3)), label=np.array([2, 0], dtype=np.int32))
-    assert modelnet40(layout, n_points=4).test.labels.tolist()[-2:] == [2, 0]
 
 
 def test_modelnet_fingerprint_depends_on_content(layout: Path, tmp_path: Path) -> None:
@@ -134,40 +113,15 @@ def test_modelnet_class_without_shapes_raises(layout: Path) -> None:
 
 
 @pytest.fixture
-def shelf(tmp_path: Path) -> Iterator[tuple[str, list[str], Path]]:
-    """A web server for a folder: its address, the requests and the folder."""
-    folder = tmp_path / "shelf"
-    folder.mkdir()
-    asked: list[str] = []
-
-    class Handler(SimpleHTTPRequestHandler):
-        def do_GET(self) -> None:
-            asked.append(self.path)
-            super().do_GET()
-
-        def log_message(self, *args: object) -> None: ...
-
-    serve = partial(Handler, directory=str(folder))
-    with ThreadingHTTPServer(("127.0.0.1", 0), serve) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_port}", asked, folder
-        finally:
-            server.shutdown()
-            thread.join()
-
-
-@pytest.fixture
-def mirror(
-    layout: Path, shelf: tuple[str, list[str], Path], monkeypatch: pytest.MonkeyPatch
-) -> Path:
-    """The archive on the second of two mirrors, with the expected hash."""
-    address, _, folder = shelf
-    archive = Path(shutil.make_archive(str(folder / "set"), "zip", layout.parent, FOLDER))
-    monkeypatch.setattr(modelnet, "MIRRORS", (f"{address}/gone.zip", f"{address}/set.zip"))
+def mirror(layout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """The archive on the second of two mirrors, with the expected hash; what is requested."""
+    archive = Path(
+        shutil.make_archive(str(tmp_path / "shelf" / "set"), "zip", layout.parent, FOLDER)
+    )
     monkeypatch.setattr(modelnet, "ARCHIVE_HASH", md5(archive))
-    return archive
+    with served(archive.parent) as (address, requested):
+        monkeypatch.setattr(modelnet, "MIRRORS", (f"{address}/gone.zip", f"{address}/set.zip"))
+        yield requested
 
 
 def md5(path: Path) -> str:
@@ -176,7 +130,7 @@ def md5(path: Path) -> str:
 
 @pytest.mark.parametrize("name", ["data", f"data/{FOLDER}"])
 def test_modelnet_downloads_once(
-    layout: Path, mirror: Path, shelf: tuple[str, list[str], Path], tmp_path: Path, name: str
+    layout: Path, mirror: list[str], tmp_path: Path, name: str
 ) -> None:
     root = tmp_path / "new" / name
     found: list[str] = []
@@ -191,19 +145,17 @@ def test_modelnet_downloads_once(
         thread.join()
     load()
     assert found == [modelnet40(layout, n_points=4).fingerprint] * 4
-    assert shelf[1] == ["/gone.zip", "/set.zip"]
+    assert mirror == ["/gone.zip", "/set.zip"]
     assert not list((tmp_path / "new").rglob("*.zip*"))
 
 
-def test_modelnet_existing_files_are_not_downloaded(
-    layout: Path, mirror: Path, shelf: tuple[str, list[str], Path]
-) -> None:
+def test_modelnet_existing_files_are_not_downloaded(layout: Path, mirror: list[str]) -> None:
     modelnet40(layout, n_points=4, download=True)
-    assert shelf[1] == []
+    assert mirror == []
 
 
 def test_modelnet_wrong_hash_raises(
-    mirror: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    mirror: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(modelnet, "ARCHIVE_HASH", "md5:" + "0" * 32)
     with pytest.raises(UserError, match=r"gone\.zip: .*404.*set\.zip: .*hash.*save the file as"):
@@ -211,7 +163,7 @@ def test_modelnet_wrong_hash_raises(
     assert not list((tmp_path / "new").rglob("*.zip"))
 
 
-def test_modelnet_unwritable_root_raises(mirror: Path, tmp_path: Path) -> None:
+def test_modelnet_unwritable_root_raises(mirror: list[str], tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=r"Cannot download ModelNet40 into"):
         modelnet40(tmp_path / "file" / "data", download=True)

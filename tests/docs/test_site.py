@@ -3,15 +3,12 @@
 import re
 import subprocess
 import sys
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
-from typing import Any
 
 import pytest
 
 import mops_lightning
+from tests.support.served import served
 
 ROOT = Path(__file__).parents[2]
 
@@ -62,16 +59,8 @@ def test_links_lead_to_files_and_anchors_of_the_site(site):
 @pytest.fixture(scope="module")
 def address(site):
     """Serve the site: browsers refuse the search index of pages from the disk."""
-    handler = partial(Quiet, directory=str(site))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, *args: Any) -> None:
-        """Print nothing."""
+    with served(site) as (address, _):
+        yield address
 
 
 @pytest.mark.parametrize("name", ["index", "gallery", "reference", "notebooks/quickstart"])
@@ -90,5 +79,5 @@ def test_search_finds_a_setting(address, opened):
     page, errors, _ = opened(f"{address}/index.html")
     page.wait_for_load_state("networkidle")
     page.locator("input.md-search__input").press_sequentially("test_noise_std")
-    page.locator(".md-search-result__item").first.wait_for(state="attached", timeout=60_000)
+    page.locator(".md-search-result__item").first.wait_for(state="attached")
     assert errors == []

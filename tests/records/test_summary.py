@@ -4,14 +4,11 @@ from pathlib import Path
 from rich.console import Console
 
 from mops_lightning.records.summary import closing_lines
-from tests.support.records import record
-
-NAMES = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": "mops"}
+from tests.support.records import NAMES, record
 
 
 def printed(metrics, score, infos=None, **config):
     console = Console(width=80, record=True, file=StringIO())
-    config = {"m": 32, "learn": "sampler", "names": NAMES, **config}
     facts = {"score_name": score, "metric_info": infos or {}}
     closing_lines(Path("run"), record(config=config, metrics=metrics, **facts), console)
     return console.export_text()

@@ -17,9 +17,7 @@ def put(folder, sampler, m, metrics, task="classification", net="pointnet", **ch
     names = {"task": task, "net": net, "dataset": "modelnet40", "sampler": sampler}
     config = {
         "m": m,
-        "learn": "sampler",
         "names": names,
-        "trainer": {"max_epochs": 3},
         "task": changes.pop("settings", {}),
         "sampler": changes.pop("of", {}),
     }
@@ -42,16 +40,9 @@ def rows(text):
 
 def put_cell(folder, name, sampler, values, seed=0, cost=0.5, **settings):
     """A run of a sweep, whose settings beside the size are given dotted."""
+    names = {"task": "reconstruction", "net": "autoencoder", "dataset": "shapes"}
     config = {
-        "m": settings.pop("m", 32),
-        "learn": "sampler",
-        "names": {
-            "task": "reconstruction",
-            "net": "autoencoder",
-            "dataset": "shapes",
-            "sampler": sampler,
-        },
-        "trainer": {"max_epochs": 3},
+        "names": {**names, "sampler": sampler},
         "task": {"exact_up_to": 2048},
         "sampler": {"m": 32, **settings.pop("of", {})},
         **settings,
@@ -100,9 +91,7 @@ def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):
     metrics = {f"test/full/{metric}": value for metric, value in metrics.items()}
     config = {
         "learn": "task",
-        "m": 32,
         "names": {"task": task, "net": net, "dataset": "modelnet40", "sampler": "mops"},
-        "trainer": {"max_epochs": 3},
         "task": {"net": {"_target_": net, "n_points": points, **settings}},
         "dataset": {"n_points": points},
     }

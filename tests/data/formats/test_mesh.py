@@ -11,15 +11,9 @@ import trimesh
 from mops_lightning.data.formats import isolated
 from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.mesh import MAX_MATERIALS, parse_mesh, sample_mesh
+from tests.support.meshes import BALL, BOX, write_mesh
 
-BOX = trimesh.creation.box((1.0, 2.0, 3.0))
-BALL = trimesh.creation.icosphere(subdivisions=1)
 SQUARE = "OFF\n4 2 0\n0 0 5\n3 0 5\n3 3 5\n0 3 5\n3 0 1 2\n3 0 2 3\n"
-
-
-def write(path: Path, mesh: Any, **options: Any) -> Path:
-    mesh.export(path, **options)
-    return path
 
 
 @pytest.mark.parametrize("suffix", ["off", "obj", "ply", "stl", "glb", "ascii.ply", "ascii.stl"])
@@ -29,7 +23,7 @@ def test_parse_formats_give_same_surface(tmp_path: Path, suffix: str) -> None:
         options = {"encoding": "ascii"}
     elif suffix == "ascii.stl":
         options = {"file_type": "stl_ascii"}
-    path = write(tmp_path / f"mesh.{suffix}", BOX, **options)
+    path = write_mesh(tmp_path / f"mesh.{suffix}", BOX, **options)
     mesh = parse_mesh(path.read_bytes(), path)
     np.testing.assert_allclose(mesh.bounds, BOX.bounds)
     np.testing.assert_allclose(mesh.area, BOX.area)
@@ -62,7 +56,7 @@ def test_parse_scene_applies_transforms(tmp_path: Path) -> None:
     scene = trimesh.Scene(BOX)
     turn = trimesh.transformations.rotation_matrix(np.pi / 2, (0, 0, 1), (5, 0, 0))
     scene.add_geometry(BOX, transform=turn)
-    path = write(tmp_path / "scene.glb", scene)
+    path = write_mesh(tmp_path / "scene.glb", scene)
     mesh = parse_mesh(path.read_bytes(), path)
     np.testing.assert_allclose(mesh.area, 2 * BOX.area)
     np.testing.assert_allclose(mesh.bounds, scene.bounds)
@@ -76,7 +70,7 @@ def test_parse_latin1_comment(tmp_path: Path, suffix: str) -> None:
         text = trimesh.exchange.stl.export_stl_ascii(BOX).encode()
         data = text.replace(b"solid", "solid Körper".encode("latin-1"), 1)
     else:
-        data = comment + write(tmp_path / f"m.{suffix}", BOX).read_bytes()
+        data = comment + write_mesh(tmp_path / f"m.{suffix}", BOX).read_bytes()
     assert parse_mesh(data, Path(f"m.{suffix}")).area == pytest.approx(BOX.area)
 
 
