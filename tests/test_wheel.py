@@ -90,16 +90,6 @@ def test_wheel_has_console_script_and_licence(wheel: Path) -> None:
     assert licence == (ROOT / "LICENSE").read_bytes()
 
 
-def test_installed_copy_is_imported(installed: Path, tmp_path: Path) -> None:
-    code = (
-        "import mops_lightning, mops_lightning.config.hydra_conf as c;"
-        "print(mops_lightning.__file__); print(c.conf_dir())"
-    )
-    lines = python("-c", code, cwd=tmp_path, path=installed).split("\n")
-    assert Path(lines[0]) == installed / "mops_lightning" / "__init__.py"
-    assert Path(lines[1]) == installed.resolve() / "mops_lightning" / "conf"
-
-
 def test_run_of_installed_copy_leaves_a_record(installed: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "empty"
     elsewhere.mkdir()

@@ -32,10 +32,17 @@ def test_write_nan_becomes_null(tmp_path):
         {"config": {"names": "mops"}},
         {"config": {"names": {"task": "classification", "net": "pointnet", "dataset": "shapes"}}},
         {"config": {"sampler": "mops"}},
+        {"config": {"baselines": {"fps": 1.5}}},
+        {"config": {"dataset": {"n_points": {}}}},
+        {"config": {"m": "x"}},
+        {"metrics": {"a": "x"}},
+        {"metrics": {"a": 10**400}},
+        {"metric_info": {"accuracy": {"scale": "x"}}},
+        {"evaluated": {"seed": "x"}},
     ],
 )
 def test_write_of_wrong_type_raises_and_writes_nothing(tmp_path, changes):
-    with pytest.raises(ValueError, match=r"Expected|Invalid|missing"):
+    with pytest.raises(ValueError, match=r"Expected|Invalid|missing|range"):
         run_record.write(tmp_path, record(**changes))
     assert not list(tmp_path.iterdir())
 
@@ -57,12 +64,15 @@ def test_read_no_record_raises(tmp_path):
         '{"schema": ' + "1" * 5000 + "}",
         "[" * 2000 + "]" * 2000,
         "[" * 60 + "]" * 60,
+        '{"config": 1' + "0" * 400 + "}",
         '"\x1b[31m"',
+        "\xff\xfe",
+        "[" * 100_000,
     ],
-    ids=["digits", "levels", "depth", "escape"],
+    ids=["digits", "levels", "depth", "range", "escape", "bytes", "deep"],
 )
 def test_read_hostile_file_ends_in_one_printable_line(tmp_path, text):
-    (tmp_path / "result.json").write_text(text)
+    (tmp_path / "result.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(UserError, match="not a run record") as error:
         run_record.read(tmp_path)
     assert str(error.value).isprintable()

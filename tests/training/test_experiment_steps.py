@@ -16,7 +16,7 @@ from mops_lightning.ops.readout import match
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
-from mops_lightning.samplers.snet import ProgressiveSNet, SNet
+from mops_lightning.samplers.snet import ProgressiveSNet
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.schedules import exponential
@@ -95,17 +95,6 @@ def test_task_net_of_samplenet_gets_projected_points_in_training_only(kind, call
     generated, matched, _ = (call.points for call in calls if not call.training)
     assert torch.equal(generated, scored.points)
     assert not torch.equal(generated, matched)
-
-
-@pytest.mark.parametrize("kind", [MOPSNet, SNet])
-def test_task_net_of_generating_sampler_gets_generated_points_in_training(kind, calls):
-    sampler = noting(kind, 8, **(MOPS if kind is MOPSNet else SNET))
-    fitted(sampler)
-    generated = [output.points for training, _, output in sampler.samples if training]
-    steps = [call for call in calls if call.training]
-    assert len(steps) == len(generated) == 4
-    for call, points in zip(steps, generated, strict=True):
-        assert torch.equal(call.points, points)
 
 
 @pytest.mark.parametrize(
