@@ -4,7 +4,9 @@ import pytest
 
 from mops_lightning.data.formats.registry import read
 from mops_lightning.filesystem import TEMPORARY
-from tests.support.downsample import call
+from tests.support.downsample import call, refused
+
+GENERATED = ["--weights", "weights.safetensors", "--readout", "generated"]
 
 
 @pytest.mark.parametrize(
@@ -17,15 +19,18 @@ from tests.support.downsample import call
         (["--m", 41, "--weights", "weights.safetensors"], "trained for up to 40 points, got 41"),
         (["--weights", "task.pt"], "holds a task net"),
         (["--weights", "nowhere.pt"], "--weights: no file nowhere.pt"),
-        (
-            ["--weights", "weights.safetensors", "--keep-attributes", "--readout", "generated"],
-            "no attributes",
-        ),
+        ([*GENERATED, "--keep-attributes"], "no attributes"),
         (["--m", 500, "--method", "fps"], "holds 299 points, fewer than --m 500"),
         (["--m", 5, "--method", "fps", "--chunk", 9], "--chunk needs --weights"),
         (["--weights", "weights.safetensors", "--chunk", 0], "--chunk must be at least 1, got 0"),
         (["--weights", "weights.safetensors", "--chunk", 9], "--readout generated or matched"),
+        (["--m", 9, "--method", "fps", "--tile", 1], "--tile must be at least 2"),
+        (["--weights", "weights.safetensors", "--tile", 64], "--tile needs --m"),
+        (["--m", 9, "--method", "fps", "--tile", 64, "--chunk", 32], "without --tile"),
+        (["--m", 7000, "--method", "fps", "--tile", 64], "fewer than --m 7000"),
         (["--m", 5, "--method", "fps", "--workers", 0], "--workers must be"),
+        ([*GENERATED, "--cluster", "tcp://127.0.0.1:9"], "give --chunk"),
+        ([*GENERATED, "--cluster", "", "--chunk", 500], "got ''"),
         (["--m", 5, "--method", "fps", "--readout", "matched"], "--readout needs --weights"),
         (["--m", 5, "--method", "fps", "--surface", -5], "--surface must be"),
         (["--m", 5, "--method", "fps", "--seed", 2**64], "--seed must be from 0"),
@@ -34,10 +39,7 @@ from tests.support.downsample import call
 )
 def test_mistake_ends_in_one_line(arguments, said, folder, tmp_path, monkeypatch):
     monkeypatch.chdir(folder)
-    status, out, err = call("in/a.ply", tmp_path / "out.ply", *arguments)
-    assert (status, out) == (2, "")
-    assert said in err
-    assert len(err.strip().splitlines()) == 1
+    assert said in refused("in/a.ply", tmp_path / "out.ply", *arguments)
     assert not (tmp_path / "out.ply").exists()
 
 
@@ -45,9 +47,7 @@ def test_existing_output_needs_overwrite(folder, tmp_path):
     source, target = folder / "in" / "a.ply", tmp_path / "out.ply"
     target.write_text("mine")
     settings = ["--method", "random", "--m", 5]
-    status, _, err = call(source, target, *settings)
-    assert status == 2
-    assert f"{target} exists" in err
+    assert f"{target} exists" in refused(source, target, *settings)
     assert target.read_text() == "mine"
     assert call(source, target, *settings, "--overwrite")[0] == 0
     assert len(read(target, 9, 0).points) == 5

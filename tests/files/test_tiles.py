@@ -153,19 +153,3 @@ def test_tile_trained_sampler_of_many_sizes(folder, tmp_path):
     options = ["--weights", folder, "--tile", 64, "--m", 120]
     assert call(folder / "in" / "a.ply", tmp_path / "a.npy", *options)[0] == 0
     assert len(np.unique(np.load(tmp_path / "a.npy"), axis=0)) == 120
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--tile", 1, "--m", 9], "--tile must be at least 2"),
-        (["--tile", 64], "--m"),
-        (["--tile", 64, "--m", 9, "--chunk", 32], "without --tile"),
-        (["--tile", 64, "--m", 7000], "fewer than --m 7000"),
-    ],
-)
-def test_tile_invalid_options_end_in_one_line(options, message, scan, tmp_path):
-    status, out, err = call(scan, tmp_path / "out.npy", "--method", "fps", *options)
-    assert (status, out) == (2, "")
-    assert message in err
-    assert len(err.splitlines()) == 1

@@ -1,8 +1,12 @@
 """The command that downsamples files, in this process."""
 
 from mops_lightning.files.downsample_cli import main
-from tests.support.captured import captured
+from tests.support import captured
 
 
 def call(*arguments):
-    return captured(main, arguments)
+    return captured.captured(main, arguments)
+
+
+def refused(*arguments):
+    return captured.refused(main, arguments)

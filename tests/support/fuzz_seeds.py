@@ -16,10 +16,10 @@ from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.training.checkpoint import CHECKPOINT_KEY, sealed
 from mops_lightning.viz.snapshots import save_clouds
 from mops_lightning.zoo import weights
+from tests.support.meshes import BOX
 from tests.support.mutations import flip_bits
 from tests.support.records import record
 
-BOX = trimesh.creation.box((1.0, 2.0, 3.0))
 SAMPLER = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 8, "sizes": [2, 4]}
 
 
