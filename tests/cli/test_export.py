@@ -6,16 +6,18 @@ from mops_lightning.cli.export import main
 from tests.support.captured import captured, refused
 
 
-def test_export_of_a_model_writes_a_file_that_runs(tmp_path):
+def test_export_of_a_model_writes_a_file_that_runs_at_any_size(tmp_path):
     target = tmp_path / "net.pt2"
     command = "mops-lightning export"
-    status, out, err = captured(main, ["samplenet.modelnet40-m32", target], command)
+    model = "fmops.modelnet40-m512"
+    status, out, err = captured(main, [model, target, "--m", 10], command)
     assert (status, err) == (0, "")
     assert out.startswith(f"{target}: ")
-    points = torch.rand(3, 77, 3)
+    net, sampler = torch.export.load(target).module(), load(model)
     with torch.no_grad():
-        expected = load("samplenet.modelnet40-m32")(points).points
-        assert torch.allclose(torch.export.load(target).module()(points), expected, atol=1e-5)
+        for shape in ((1, 12), (4, 100), (2, 257)):
+            points = torch.rand(*shape, 3)
+            assert torch.allclose(net(points), sampler(points, 10).points, atol=1e-5)
 
 
 @pytest.mark.parametrize(

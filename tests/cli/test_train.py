@@ -153,19 +153,6 @@ def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
     assert "learn=sampler: ICP has no weights" in err
 
 
-def test_real_modelnet40_trains(real_data, tmp_path):
-    root = (real_data / "modelnet40_hdf5_1024").resolve()
-    if not root.is_dir():
-        pytest.skip(f"no modelnet40_hdf5_1024 in {real_data}")
-    settings = [*TINY_ANY_DATA, "pictures=2"]
-    data = ["dataset=modelnet40", f"dataset.root={root}", "dataset.classes=[cup,bowl]"]
-    status, out, err = call([*settings, *data, "sampler.alpha=10", "sampler.tau_min=0.2"], tmp_path)
-    assert status == 0, err
-    (run,) = runs(tmp_path)
-    record = run_record.read(run)
-    assert (record.train_clouds, record.test_clouds) == (79 + 64, 20 + 20)
-
-
 def test_folder_of_meshes_trains(tmp_path):
     import trimesh
 
@@ -180,16 +167,6 @@ def test_folder_of_meshes_trains(tmp_path):
     assert status == 0, err
     (run,) = runs(tmp_path)
     assert run_record.read(run).dataset_facts["train_files"] == 18
-
-
-def test_flexible_sampler_is_tested_at_all_sizes(main_job):
-    folder, *_ = main_job
-    status, out, err = call([*TINY, "sampler=fmops", "sampler.m_max=32"], folder)
-    assert status == 0, err
-    for word in ("m=8", "m=16", "m=32", "fmops completed", "all points"):
-        assert word in out
-    run = next(path for path in runs(folder) if path.parent.name == "fmops-m32")
-    assert "test/m16/completed/accuracy" in run_record.read(run).metrics
 
 
 @pytest.mark.parametrize(

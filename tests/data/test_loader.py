@@ -56,6 +56,14 @@ def test_loader_resumes_within_epoch():
     assert all(torch.equal(a, b) for a, b in zip(seen, want, strict=True))
 
 
+def test_loader_augments_anew_in_every_batch_and_epoch():
+    loader = CloudLoader(clouds(), 4, augment=Augmentation(jitter=0.01), seed=1)
+    first, second = (torch.cat([batch.points for batch in loader]) for _ in range(2))
+    assert (first != second).any(2).all()
+    noise = first - clouds().points
+    assert not torch.allclose(noise[:4], noise[4:8], atol=1e-4)
+
+
 def test_loader_interrupted_iteration_starts_again():
     loader = CloudLoader(clouds(), 4)
     next(iter(loader))

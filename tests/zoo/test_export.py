@@ -42,16 +42,6 @@ def test_plain_net_equals_the_sampler(sampler, m):
             assert torch.allclose(net(points), sampler(points, m).points, atol=1e-5)
 
 
-def test_pt2_file_equals_the_model_at_any_size(tmp_path):
-    sampler = load("fmops.modelnet40-m512")
-    assert export(sampler, tmp_path / "net.pt2", m=10) < 1e-5
-    net = torch.export.load(tmp_path / "net.pt2").module()
-    with torch.no_grad():
-        for shape in SIZES:
-            points = clouds(*shape)
-            assert torch.allclose(net(points), sampler(points, 10).points, atol=1e-5)
-
-
 def test_onnx_file_equals_the_model_at_any_size(tmp_path):
     pytest.importorskip("onnxscript", reason="extra onnx")
     onnxruntime = pytest.importorskip("onnxruntime", reason="extra onnx")

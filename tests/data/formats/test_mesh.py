@@ -1,5 +1,4 @@
 import json
-import os
 import struct
 from pathlib import Path
 from typing import Any
@@ -132,13 +131,6 @@ def test_parse_broken_mesh_raises(name: str) -> None:
     data, message = BROKEN[name]
     with pytest.raises(BadCloudError, match=rf"{name}.*({message})"):
         parse_mesh(data, Path(name))
-
-
-@pytest.mark.skipif("MOPS_DATA" not in os.environ, reason="MOPS_DATA names no folder of real data")
-def test_parse_real_obj() -> None:
-    path = Path(os.environ["MOPS_DATA"]) / "scans" / "stanford-bunny.obj"
-    mesh = parse_mesh(path.read_bytes(), path)
-    assert len(mesh.faces) > 10_000
 
 
 @pytest.mark.parametrize("normal", ["nan nan nan", "a b c", "0 1", ""])
