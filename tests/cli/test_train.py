@@ -5,7 +5,6 @@ import json
 import pytest
 
 from mops_lightning.cli.train import flags_first
-from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.zoo import weights
 from tests.support.command_line import (
@@ -182,22 +181,3 @@ def test_folder_of_meshes_trains(tmp_path):
 )
 def test_flags_first_any_order_keeps_all_arguments(given, ordered):
     assert flags_first(given.split()) == ordered.split()
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ("--multirn m=8", "no flag '--multirn'. Did you mean '--multirun'"),
-        ("m=8 --conf x", "no flag '--conf'. Did you mean '--cfg'"),
-        ("m=8 --out=here", "Settings are KEY=VALUE, without dashes."),
-        ("m=8 --cfg", "--cfg/-c: expected one argument."),
-        ("-m m=8,16 --cfg job", "--multirun and --cfg: give one of them."),
-        ("--experimental-rerun config.pickle", "--experimental-rerun is not available"),
-        ("m=8 --resolve", "write --cfg job --resolve."),
-        ("--cfg jobs m=8", "--cfg/-c: invalid choice: 'jobs'"),
-    ],
-)
-def test_flags_first_mistake_raises(given, said):
-    with pytest.raises(UserError) as caught:
-        flags_first(given.split())
-    assert said in str(caught.value)

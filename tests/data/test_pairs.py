@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from mops_lightning.data.pairs import Pairs, pair_batch
+from mops_lightning.data.pairs import Pairs
 from mops_lightning.errors import UserError
 from mops_lightning.ops.rigid import Motion
 from mops_lightning.seeding import generator
@@ -71,10 +71,3 @@ def test_pairs_resample_below_one_raises():
 def test_pairs_resample_above_n_points_raises(rng):
     with pytest.raises(UserError, match=r"^resample must be at most the 50 .*got 51"):
         Pairs(resample=51)(clouds(rng), generators(6))
-
-
-def test_pair_batch_centres_clouds(rng):
-    source, target = clouds(rng), clouds(rng) + 3
-    batch = pair_batch(source, target, Motion(torch.ones(6, 4), torch.ones(6, 3)))
-    torch.testing.assert_close(batch.centroids[6:], target.mean(1))
-    torch.testing.assert_close(torch.cat(restored(batch)), torch.cat([source, target]))

@@ -170,16 +170,6 @@ def test_shapes_bounding_boxes_do_not_identify_classes(dataset: CloudDataset) ->
     assert linear < 0.55
 
 
-def test_shapes_occupancy_identifies_classes(dataset: CloudDataset) -> None:
-    def occupancy(clouds: Clouds, cells: int = 6) -> np.ndarray:
-        at = ((clouds.points + 1) / 2 * cells).long().clamp(0, cells - 1)
-        flat = (at * torch.tensor([cells * cells, cells, 1])).sum(-1)
-        counts = torch.zeros(len(flat), cells**3)
-        return counts.scatter_add_(1, flat, torch.ones(flat.shape)).sqrt().numpy()
-
-    assert _nearest(dataset, occupancy) > 0.75
-
-
 # Cache
 
 

@@ -66,19 +66,3 @@ def test_pip_install_uses_the_constraints(name):
     installs = [step for step in steps if "pip install" in step]
     assert installs
     assert all(" -c constraints.txt " in step for step in installs)
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        ".git/config",
-        ".venv/bin/python",
-        "data/modelnet40_ply_hdf5_2048/ply_data_train0.h5",
-        "outputs/classification/result.json",
-        "results/main_job/runs.jsonl",
-        "src/mops_lightning/__pycache__/cli.cpython-312.pyc",
-        "src/mops_lightning/samplers/__pycache__/base.cpython-312.pyc",
-    ],
-)
-def test_dockerignore_excludes_what_images_do_not_need(path):
-    assert ignored(path)

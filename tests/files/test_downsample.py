@@ -7,10 +7,12 @@ from mops_lightning.data.formats.registry import read
 from tests.support.downsample import call, refused
 
 
-@pytest.mark.parametrize("method", ["fps", "random", "voxel", "poisson", "serial"])
+@pytest.mark.parametrize(
+    "method", [["fps"], ["random"], ["voxel"], ["poisson"], ["serial"], ["fps", "--tile", 64]]
+)
 def test_untrained_method_keeps_rows_of_the_file(method, folder, tmp_path):
     source, target = folder / "in" / "a.ply", tmp_path / "out.npz"
-    status, out, err = call(source, target, "--method", method, "--m", 20, "--keep-attributes")
+    status, out, err = call(source, target, "--method", *method, "--m", 20, "--keep-attributes")
     assert (status, err) == (0, "")
     assert "20 of 299 points (1 more without finite coordinates left out)" in out
     kept, whole = read(target, 9, 0), read(source, 9, 0)

@@ -7,8 +7,6 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from mops_lightning.data.formats.registry import WRITERS, read
-from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from mops_lightning.files.tiles import balanced_tiles, sample_by_tiles, shares, thin
 from mops_lightning.samplers.fmops import FMOPSNet
@@ -33,16 +31,6 @@ def street(number=4000):
 def sampler():
     torch.manual_seed(0)
     return FMOPSNet(64).eval()
-
-
-@pytest.fixture(scope="module")
-def scan(tmp_path_factory):
-    """A cloud of 6,000 points with rows that are not finite."""
-    path = tmp_path_factory.mktemp("scene") / "scan.ply"
-    points = np.random.default_rng(0).normal(size=(6000, 3)) * [30, 10, 1] + [1000, 0, 0]
-    points[100:140] = np.nan
-    WRITERS[".ply"](path, Table(points, {"label": np.arange(6000)}))
-    return path
 
 
 @pytest.mark.parametrize(("number", "size"), [(1000, 128), (1025, 128), (100, 128), (7, 2), (1, 2)])
@@ -135,18 +123,6 @@ def test_sample_by_tiles_all_points_and_too_many(sampler):
     assert len(sample_by_tiles(points, 250, 128, sampler)) == 128
     with pytest.raises(UserError, match=r"2 tiles of up to 250 points .* up to 64 points of each"):
         sample_by_tiles(points, 250, 129, sampler)
-
-
-def test_tile_keeps_rows_with_attributes(scan, tmp_path):
-    target = tmp_path / "out.npz"
-    arguments = ["--method", "fps", "--keep-attributes", "--tile", 512, "--m", 600]
-    status, out, err = call(scan, target, *arguments)
-    assert (status, err) == (0, "")
-    assert "600 of 5,960 points (40 more" in out
-    kept, whole = read(target, 9, 0), read(scan, 9, 0)
-    rows = kept.columns["label"].astype(int)
-    assert len(set(rows)) == 600
-    np.testing.assert_array_equal(kept.points, whole.points[rows])
 
 
 def test_tile_trained_sampler_of_many_sizes(folder, tmp_path):

@@ -14,12 +14,10 @@ import time
 import traceback
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mops_lightning.cli.sweep import run_cell
 from mops_lightning.config.compose import compose
-from mops_lightning.files.downsample_cli import main as downsample
 from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE
@@ -53,26 +51,11 @@ def cell(folder):
     run_cell(compose(overrides), folder / "cell", overrides)
 
 
-def files(folder):
-    """A folder of clouds."""
-    arguments = [f"{folder}/in", f"{folder}/out", "--method=fps", "--m=8"]
-    with contextlib.suppress(SystemExit):
-        downsample(arguments)
+WORK = {"single": single, "cell": cell}
 
 
-def file(folder):
-    """One cloud, in this process."""
-    with contextlib.suppress(SystemExit):
-        downsample([f"{folder}/in/0.npy", f"{folder}/out/0.npy", "--method=fps", "--m=8"])
-
-
-WORK = {"single": single, "cell": cell, "files": files, "file": file}
-
-
-def results(folder, work):
+def results(folder):
     """What must be equal, bit for bit."""
-    if work in ("files", "file"):
-        return {path.name: path.read_bytes() for path in (folder / "out").iterdir()}
     found = {}
     for path in sorted(folder.rglob("weights.safetensors")):
         if ASIDE not in path.parts:
@@ -81,15 +64,6 @@ def results(folder, work):
     records = [run_record.read(path.parent) for path in folder.rglob(run_record.FILE)]
     assert any(record.status == "completed" for record in records)
     return found
-
-
-def prepare(folder, work):
-    folder.mkdir()
-    if work in ("files", "file"):
-        (folder / "in").mkdir()
-        for number in range(3):
-            points = np.random.default_rng(number).random((50, 3), dtype=np.float32)
-            np.save(folder / "in" / f"{number}.npy", points)
 
 
 def attempt(folder, work, at_write=0, after=0.0):
@@ -152,29 +126,29 @@ def unbroken(tmp_path_factory):
     def of(work):
         if work not in found:
             folder = tmp_path_factory.mktemp("unbroken") / work
-            prepare(folder, work)
+            folder.mkdir()
             start = time.monotonic()
             status, writes = attempt(folder, work)
             assert status == 0
-            found[work] = results(folder, work), writes, time.monotonic() - start
+            found[work] = results(folder), writes, time.monotonic() - start
         return found[work]
 
     return of
 
 
 def check(folder, work, want, **kill):
-    prepare(folder, work)
+    folder.mkdir()
     status, _ = attempt(folder, work, **kill)
     assert status in (0, -signal.SIGKILL)
-    if status or work == "files":
+    if status:
         assert attempt(folder, work)[0] == 0
-    assert results(folder, work) == want, kill
+    assert results(folder) == want, kill
     # A single run that was killed has a folder of its own, which no later run uses.
     left = [path for path in folder.rglob(f"{TEMPORARY}*") if work != "single"]
     assert left == [], kill
 
 
-@pytest.mark.parametrize("work", ["single", "cell", "file"])  # files: by another process
+@pytest.mark.parametrize("work", WORK)
 def test_kill_at_write_same_command_gives_same_bits(unbroken, tmp_path, work):
     want, writes, _ = unbroken(work)
     assert want

@@ -96,5 +96,6 @@ def test_begun_record_is_read_as_written(tmp_path):
     run_record.write(tmp_path, started)
     found = run_record.read(tmp_path)
     assert found == started
+    assert {"python", "torch", "lightning", "mops-lightning"} <= set(found.versions)
     assert (found.status, found.seed) == ("running", 3)
     assert found.seconds["fit"] >= 0

@@ -12,7 +12,7 @@ from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.metrics.base import collection
 from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.ops.points import gather_points
-from mops_lightning.ops.readout import match
+from mops_lightning.ops.readout import complete, match
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
@@ -132,19 +132,28 @@ def test_losses_over_sizes_are_summed_or_averaged(how, make, name, loss, calls):
     assert logged[f"train/{readout}/fingerprint"] == pytest.approx(float(prints), abs=1e-4)
 
 
-def test_straight_through_losses_are_means_over_generated_and_matched_points(calls):
-    recipe = Recipe(straight_through=0.0)
+@pytest.mark.parametrize("chosen", ["matched", "completed"])
+def test_straight_through_losses_are_means_over_generated_and_chosen_points(chosen, calls):
+    recipe = Recipe(straight_through=0.0, straight_through_set=chosen)
     module, logged = fitted(
         noting(MOPSNet, 8, **MOPS), recipe=recipe, limit_train_batches=1, limit_val_batches=0
     )
     generated, matched = (call.points for call in calls)
     clouds = calls[0].clouds
-    torch.testing.assert_close(matched, gather_points(clouds, match(generated, clouds)))
+    rows = match(generated, clouds)
+    rows = complete(rows, clouds) if chosen == "completed" else rows
+    torch.testing.assert_close(matched, gather_points(clouds, rows))
     losses = [float(module.task.net(points).square().mean()) for points in (generated, matched)]
     assert logged["train/loss/task"] == pytest.approx(sum(losses) / 2, rel=1e-4)
     assert abs(losses[0] - losses[1]) > 0.1
     scored = float(module.task.net(generated).mean())
     assert logged["train/generated/fingerprint"] == pytest.approx(scored, abs=1e-4)
+
+
+def test_straight_through_begins_at_its_share_of_the_training(calls):
+    recipe = Recipe(straight_through=0.5)
+    fitted(noting(MOPSNet, 8, **MOPS), recipe=recipe, limit_val_batches=0)
+    assert len(calls) == 1 + 1 + 2 + 2  # of 4 steps
 
 
 class FingerprintOfMaxima(Fingerprint):

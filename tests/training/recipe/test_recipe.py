@@ -197,26 +197,6 @@ def test_straight_through_completed_set_gives_gradients_to_its_matched_points():
     torch.testing.assert_close(generated.grad, gradients)
 
 
-def test_straight_through_changes_the_training_from_its_share_on():
-    weights = [
-        trained(Recipe(straight_through=share)).state_dict()["sampler.queries.weight"]
-        for share in (None, 1.0, 0.5)
-    ]
-    last_step_only, half = (not torch.equal(one, weights[0]) for one in weights[1:])
-    assert last_step_only
-    assert half
-    assert not torch.equal(weights[1], weights[2])
-
-
-def test_straight_through_of_completed_sets_is_another_training():
-    sets: list[Any] = ["matched", "completed"]
-    one, other = (
-        trained(Recipe(straight_through=0.0, straight_through_set=name)).state_dict()
-        for name in sets
-    )
-    assert not torch.equal(one["sampler.queries.weight"], other["sampler.queries.weight"])
-
-
 def test_moving_average_ends_with_the_average_of_all_steps():
     steps: list[torch.Tensor] = []
 

@@ -10,8 +10,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.training.run.pretrain import cache_folder
 from mops_lightning.zoo import weights
-from tests.support.command_line import SMALL_PCRNET, TINY, call, job
-from tests.support.forked import start_fork
+from tests.support.command_line import SMALL_PCRNET, TINY, call, job, start
 
 
 def train(folder, *arguments):
@@ -133,7 +132,7 @@ def test_same_task_net_in_two_processes_is_trained_once(tmp_path):
     folder.parent.mkdir(parents=True)
     lock = folder.parent / f"{folder.name}.lock"
     with FileLock(lock):
-        other = start_fork([*overrides, "hydra.run.dir=a"], tmp_path)
+        other = start([*overrides, "hydra.run.dir=a"], tmp_path)
         lines = iter(other.stdout.readline, "")
         assert any("Waiting for another process" in line and str(lock) in line for line in lines)
     status, here, err = call([*overrides, "hydra.run.dir=b"], tmp_path)
