@@ -52,8 +52,8 @@ def test_stopped_run_resumed_by_same_command_gives_same_weights(
         assert "ckpt_path=" in err
         assert run_record.read(tmp_path / "stopped" / str(stop)).status == "interrupted"
         command = [*SHORT, "out=stopped", "ckpt_path=last"]
-    status, _, err = call([*command, f"hydra.run.dir=stopped/{number}"], tmp_path)
-    assert status == 0, err
+    status, out, err = call([*command, f"hydra.run.dir=stopped/{number}"], tmp_path)
+    assert (status, "Warm start" in out) == (0, False), err
     last = run_record.read(tmp_path / "stopped" / str(number))
     assert last.resumed_from == f"stopped/{number - 1}/checkpoints/last.ckpt"
     assert ended(tmp_path / "stopped" / str(number)) == unbroken

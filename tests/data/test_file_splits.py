@@ -6,6 +6,7 @@ from mops_lightning.data.file_splits import (
     by_number,
     class_of,
     split_by_folder,
+    split_by_share,
     split_by_time,
 )
 from mops_lightning.errors import UserError
@@ -25,6 +26,12 @@ def test_split_by_folder_first_or_second_folder():
 def test_split_by_folder_file_outside_raises():
     with pytest.raises(UserError, match=r"chair/b\.ply is neither in train/ nor in test/"):
         split_by_folder(paths("train/a.ply", "chair/b.ply"))
+
+
+def test_split_by_share_depends_on_the_seed():
+    names = paths(*(f"a/{i}.ply" for i in range(10)))
+    first, again, other = (split_by_share(names, 0.3, seed) for seed in (0, 0, 1))
+    assert first == again != other
 
 
 def test_by_number_sorts_digits_that_are_no_numbers():

@@ -4,6 +4,7 @@ import shutil
 import pytest
 
 from mops_lightning.errors import UserError
+from tests.support.records import evaluated
 from tests.support.reports import put, put_cell, rows, table
 
 
@@ -30,6 +31,14 @@ def test_cells_of_several_seeds_show_mean_and_deviation(tmp_path):
     for seed, value in enumerate((1.0, 2.0, 3.0)):
         put_cell(tmp_path, f"{seed}", "mops", {"generated": value, "matched": 1.5}, seed=seed)
     assert rows(table(tmp_path))[1][:2] == ["mops", "2 ± 1.00 / 1.5 ± 0.00 (n=3)"]
+
+
+def test_evaluations_count_by_the_seeds_of_their_runs(tmp_path):
+    for seed in (0, 1):
+        (tmp_path / f"{seed}").mkdir()
+        metrics = {"test/generated/accuracy": 0.5 + seed / 10}
+        put(tmp_path / f"{seed}", "mops", 32, metrics, evaluated=evaluated(seed=seed))
+    assert rows(table(tmp_path))[1][1] == "55.00 ± 7.07 (n=2)"
 
 
 def test_later_of_two_equal_runs_counts(tmp_path):

@@ -63,13 +63,14 @@ def test_ply_chunked_impossible_count_is_broken(tmp_path):
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_ply_line_ends_and_latin_comments_are_read(end, form, tmp_path):
     path = tmp_path / "a.ply"
     lines = ["ply", "comment größe", f"format {form} 1.0", "comment é", "element vertex 2"]
     lines += [f"property float {axis}" for axis in "xyz"]
     points = np.array([[1, 2, 3], [4, 5, 10]], "<f4")  # its last bytes hold a line end
-    body = points.tobytes() if form != "ascii" else f"1 2 3{end}4 5 10{end}".encode()
+    stored = points.astype(">f4") if form == "binary_big_endian" else points
+    body = stored.tobytes() if form != "ascii" else f"1 2 3{end}4 5 10{end}".encode()
     head = end.join([*lines, "end_header", ""])
     path.write_bytes(head.encode("latin-1") + body)
     np.testing.assert_array_equal(read(path, 9, 0).points, points)
