@@ -14,13 +14,13 @@ from twins import PlainMOPS, plain_farthest_point_sample
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.attention import attend
-from mops_lightning.ops.elimination import eliminate
 from mops_lightning.ops.fps import farthest_point_sample, fps
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.samplers.base import stream_sample
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.poisson import eliminate
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.samplenet import SampleNet
 from mops_lightning.samplers.snet import SNet

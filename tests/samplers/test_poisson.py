@@ -1,8 +1,93 @@
+"""The compiled loops, a plain form in torch, and the formula as published; the sampler."""
+
+import pytest
 import torch
 
 from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.poisson import PoissonSampler
+from mops_lightning.samplers.poisson import PoissonSampler, eliminate, spacing_bound
 from mops_lightning.samplers.random import RandomSampler
+from tests.support.clouds import cloud_of
+
+KINDS = ["sphere", "grid", "copies", "one point", "offset", "tiny", "huge", "outlier"]
+
+
+def published(cloud, m, reach):
+    """Sample elimination that sums all weights again before every removal."""
+    kept = list(range(len(cloud)))
+    while len(kept) > m:
+        sums = []
+        for i in kept:
+            distances = [float((cloud[i] - cloud[j]).norm()) for j in kept if j != i]
+            sums.append(sum(max(0.0, 1 - d / reach) ** 8 for d in distances))
+        kept.pop(max(range(len(kept)), key=lambda place: sums[place]))
+    return kept
+
+
+def in_steps(points, m):
+    """Sample elimination with whole weights and the distances to all points in a step."""
+    points = points.double()
+    number = points.shape[1]
+    reach = spacing_bound(points, m).clamp_min(torch.finfo(torch.float64).tiny)
+    scale = 2.0 ** min(50, 62 - number.bit_length())
+
+    def weights(cloud, others, bound):
+        squared = sum((cloud[..., axis] - others[..., axis]) ** 2 for axis in range(3))
+        return ((1 - squared.sqrt() / bound).clamp_min(0).square().square().square() * scale).long()
+
+    kept = []
+    for cloud, bound in zip(points, reach, strict=True):
+        crowding = weights(cloud, cloud[:, None], bound).sum(1)
+        for _ in range(number - m):
+            worst = crowding.argmax()
+            crowding -= weights(cloud, cloud[worst], bound)
+            crowding[worst] = -1
+        kept.append((crowding > 0).nonzero()[:, 0])
+    return torch.stack(kept)
+
+
+@pytest.mark.parametrize("m", [2, 9, 23, 24])  # the last two points are equally crowded
+def test_eliminate_equals_published_formula(m, rng):
+    points = torch.randn(3, 24, 3, generator=rng, dtype=torch.float64)
+    reach = spacing_bound(points, m)
+    clouds = zip(points, reach, strict=True)
+    expected = [published(cloud, m, float(bound)) for cloud, bound in clouds]
+    assert eliminate(points, m).tolist() == expected
+
+
+def test_eliminate_to_one_point_has_reach_of_bounding_box(rng):
+    points = torch.randn(1, 24, 3, generator=rng, dtype=torch.float64)
+    reach = float((points[0].amax(0) - points[0].amin(0)).norm())
+    assert eliminate(points, 1).tolist() == [published(points[0], 1, reach)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (40, 39), (40, 40), (300, 1), (300, 20), (300, 150)])
+def test_eliminate_equals_plain_form(n, m, kind, rng):
+    points = cloud_of(kind, (2, n), torch.float32, rng)
+    assert torch.equal(eliminate(points, m), in_steps(points, m))
+
+
+def test_eliminate_non_contiguous_equals_plain_form(rng):
+    points = torch.rand(3, 400, 2, generator=rng, dtype=torch.float64).transpose(0, 2)[:, ::2]
+    assert torch.equal(eliminate(points, 30), in_steps(points, 30))
+
+
+def test_eliminate_of_many_copies_does_not_overflow():
+    points = torch.zeros(1, 8200, 3)
+    points[0, 0] = 1.0
+    kept = eliminate(points, 8199)
+    assert kept[0, 0] == 0  # the only point that is not crowded
+
+
+@pytest.mark.parametrize("m", [2, 5, 12])
+def test_spacing_bound_is_upper_bound(m, rng):
+    points = torch.randn(20, 30, 3, generator=rng, dtype=torch.float64)
+    bound = spacing_bound(points, m)
+    for _ in range(30):
+        rows = torch.randperm(30, generator=rng)[:m]
+        spacing = torch.cdist(points[:, rows], points[:, rows])
+        spacing.diagonal(dim1=1, dim2=2).fill_(torch.inf)
+        assert (spacing.amin((1, 2)) <= bound[:, 0]).all()
 
 
 def test_poisson_of_points_with_gradients_equals_points_without(rng):

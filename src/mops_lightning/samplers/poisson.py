@@ -1,12 +1,28 @@
-"""Poisson-disk sampling by sample elimination, with exactly m points."""
+"""Poisson-disk sampling by sample elimination, with exactly m points.
 
+Numba compiles the loops, which visit the points of neighbouring cells only. They run on the CPU,
+for clouds on other devices, too.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+
+import itertools
+from heapq import heapify, heappop, heapreplace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.ops.elimination import eliminate
+from mops_lightning.ops.fps import farthest_point_sample
+from mops_lightning.ops.kernels import jit, jit_cached
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import seeded_order
 from mops_lightning.types import SampleOutput
+
+FINEST = 2**20
+"""Maximum number of cells along an axis: three positions fit into an integer of 64 bits."""
 
 
 class PoissonSampler(Sampler):
@@ -52,3 +68,132 @@ class PoissonSampler(Sampler):
         kept = eliminate(gather_points(points.detach(), order), m)
         indices = order.gather(1, kept)
         return SampleOutput(gather_points(points, indices), indices, {})
+
+
+@torch.no_grad()
+def eliminate(points: Tensor, m: int) -> Tensor:
+    """Remove the most crowded point of every cloud until m remain; see ``PoissonSampler``.
+
+    Args:
+        points: ``(B, N, 3)``, finite; the first point is removed in case of ties.
+        m: number of points that remain, 1 ≤ m ≤ N.
+
+    Returns:
+        ``(B, m)`` int64 rows of ``points``, ascending.
+    """
+    number = points.shape[1]
+    points = points.double()
+    reach = spacing_bound(points, m).clamp_min(torch.finfo(points.dtype).tiny)
+    # Sums of integers do not depend on the order of the points.
+    scale = 2.0 ** min(50, 62 - number.bit_length())
+    clouds = zip(points.cpu().numpy(), reach.flatten().tolist(), strict=True)
+    remaining = [_eliminate_by_cells(cloud, m, bound, scale) for cloud, bound in clouds]
+    rows = [torch.from_numpy(np.flatnonzero(remains)) for remains in remaining]
+    return torch.stack(rows).to(points.device)
+
+
+def spacing_bound(points: Tensor, m: int) -> Tensor:
+    """Return an upper bound of the smallest distance among any m points of a cloud.
+
+    Every point is within half of this bound of one of the first m − 1 points of farthest point
+    sampling. Of any m points, two therefore share the same one.
+
+    Args:
+        points: ``(B, N, C)``.
+        m: number of points.
+
+    Returns:
+        ``(B, 1)``.
+    """
+    if m == 1:
+        spans = points.amax(1) - points.amin(1)
+        return torch.linalg.vector_norm(spans, dim=1, keepdim=True)
+    chosen = gather_points(points, farthest_point_sample(points, m))
+    last = torch.linalg.vector_norm(chosen[:, :-1] - chosen[:, -1:], dim=2)
+    return 2 * last.amin(1, keepdim=True)
+
+
+def _eliminate_by_cells(
+    points: NDArray[np.float64], m: int, reach: float, scale: float
+) -> NDArray[np.bool_]:
+    """Return whether each of ``(N, 3)`` points remains, by the compiled loops."""
+    low = points.min(0)
+    extent = float((points.max(0) - low).max())
+    side = max(reach, extent / FINEST) * (1 + 1e-9)
+    position = ((points - low) / side).astype(np.int64) + 1  # so that no neighbour is below 0
+    key = (position[:, 0] * 2 * FINEST + position[:, 1]) * 2 * FINEST + position[:, 2]
+    order = key.argsort(kind="stable")
+    cells, starts, cell_of = np.unique(key[order], return_index=True, return_inverse=True)
+    around = np.empty((len(cells), 27), np.int32)
+    for column, (x, y, z) in enumerate(itertools.product((-1, 0, 1), repeat=3)):
+        wanted = cells + ((x * 2 * FINEST + y) * 2 * FINEST + z)
+        place = np.minimum(np.searchsorted(cells, wanted), len(cells) - 1)
+        around[:, column] = np.where(cells[place] == wanted, place, -1)
+    planes = np.ascontiguousarray(points[order].T)
+    ends = np.append(starts[1:], len(points))
+    remains: NDArray[np.bool_] = _remove_crowded(
+        planes, order, starts, ends, cell_of, around, m, reach, scale
+    )
+    return remains
+
+
+@jit
+def _change(planes, starts, ends, near, point, sign, reach, scale, crowding):
+    """Add a point's weights to the crowding of all points around it, and return their sum."""
+    limit = reach * reach * (1 + 1e-12) + 2.3e-308  # weights beyond are 0, whatever the rounding
+    x, y, z = planes[0, point], planes[1, point], planes[2, point]
+    total = np.int64(0)
+    for cell in near:
+        if cell >= 0:
+            for i in range(starts[cell], ends[cell]):
+                dx, dy, dz = planes[0, i] - x, planes[1, i] - y, planes[2, i] - z
+                squared = dx * dx + dy * dy + dz * dz
+                if squared <= limit:
+                    share = max(1.0 - np.sqrt(squared) / reach, 0.0)
+                    share *= share
+                    share *= share
+                    weight = np.int64(share * share * scale)
+                    crowding[i] += sign * weight
+                    total += weight
+    return total
+
+
+@jit_cached
+def _remove_crowded(planes, order, starts, ends, cell_of, around, m, reach, scale):
+    """Remove the most crowded point until m remain.
+
+    Args:
+        planes: ``(3, N)`` coordinates of points that are sorted by their cell; changed.
+        order: ``(N,)`` their rows; the lowest row is removed in case of ties.
+        starts: ``(K,)`` first point of every cell.
+        ends: ``(K,)`` the point after the last one of every cell.
+        cell_of: ``(N,)`` cell of every point.
+        around: ``(K, 27)`` cells with all points nearer than ``reach``; -1 for none.
+        m: number of points that remain.
+        reach: distance from which weights are 0, positive.
+        scale: factor of the weights before they are truncated to integers.
+
+    Returns:
+        ``(N,)`` whether each row remains.
+    """
+    size = len(order)
+    crowding, remains = np.zeros(size, np.int64), np.ones(size, np.bool_)
+    for i in range(size):
+        # Weights are symmetric, so their sum is the crowding of the point itself.
+        near, zero = around[cell_of[i]], np.int64(0)
+        total = _change(planes, starts, ends, near, i, zero, reach, scale, crowding)
+        crowding[i] = total
+    heap = [(-crowding[i], order[i], i) for i in range(size)]
+    heapify(heap)
+    for _ in range(size - m):
+        key, row, point = heap[0]
+        while -key != crowding[point]:
+            # Crowding only falls: a key is an upper bound, and is corrected when it is the largest.
+            heapreplace(heap, (-crowding[point], row, point))
+            key, row, point = heap[0]
+        heappop(heap)
+        remains[row] = False
+        near = around[cell_of[point]]
+        _change(planes, starts, ends, near, point, np.int64(-1), reach, scale, crowding)
+        planes[0, point] = np.inf  # no later weight reaches it
+    return remains
