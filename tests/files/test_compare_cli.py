@@ -6,7 +6,7 @@ import pytest
 
 from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
-from mops_lightning.files.compare_cli import main
+from mops_lightning.files.cli import compare as main
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
 from mops_lightning.zoo.names import UNTRAINED

@@ -10,7 +10,7 @@ import mops_lightning
 from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
 from mops_lightning.files import propagate as module
-from mops_lightning.files.propagate_cli import main
+from mops_lightning.files.cli import propagate as main
 from tests.support.captured import captured, refused
 from tests.support.downsample import call as downsample
 from tests.support.downsample import refused as not_downsampled

@@ -12,14 +12,14 @@ from pathlib import Path
 from mops_lightning.errors import USER_ERROR, did_you_mean, end, quiet_on_closed_pipe
 
 COMMANDS = {
-    "report": "mops_lightning.report.cli",
-    "downsample": "mops_lightning.files.downsample_cli",
-    "propagate": "mops_lightning.files.propagate_cli",
-    "compare": "mops_lightning.files.compare_cli",
-    "models": "mops_lightning.cli.models",
-    "export": "mops_lightning.cli.export",
+    "report": "mops_lightning.report.cli.main",
+    "downsample": "mops_lightning.files.cli.downsample",
+    "propagate": "mops_lightning.files.cli.propagate",
+    "compare": "mops_lightning.files.cli.compare",
+    "models": "mops_lightning.cli.models.main",
+    "export": "mops_lightning.cli.export.main",
 }
-"""Subcommands and their modules, whose ``main(arguments, prog)`` runs them."""
+"""Subcommands and their functions of ``(arguments, prog)``."""
 
 WORD = re.compile(r"[^-+~=][^=]*")
 """An argument that is neither an option nor an override."""
@@ -33,7 +33,8 @@ def main() -> None:
         if first == "--version":
             print(f"mops_lightning {version('mops-lightning')}")
         elif first in COMMANDS:
-            import_module(COMMANDS[first]).main(arguments[1:], f"{program()} {first}")
+            module, _, function = COMMANDS[first].rpartition(".")
+            getattr(import_module(module), function)(arguments[1:], f"{program()} {first}")
         elif WORD.fullmatch(first):
             hint = did_you_mean(first, COMMANDS)
             end(

@@ -1,0 +1,294 @@
+"""The subcommands ``downsample``, ``propagate`` and ``compare``."""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields
+from os.path import realpath
+from pathlib import Path
+
+from mops_lightning.errors import UserError, did_you_mean, one_line_endings, printable
+from mops_lightning.files.engine import Engine, LocalEngine
+from mops_lightning.files.options import Options
+from mops_lightning.filesystem import remove_temporary
+from mops_lightning.records.readout_names import GENERATED_READOUTS
+from mops_lightning.zoo.names import UNTRAINED
+
+DOWNSAMPLE = """Downsample clouds and meshes from files.
+
+IN is a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt .off .obj .stl .glb) or a folder of them,
+OUT a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt) or a folder. Clouds are normalised to
+the unit sphere, as in training, sampled by a trained sampler (--weights) or an untrained method
+(--method), and mapped back. Meshes are first sampled on their surface."""
+
+PROPAGATE = """Carry labels, colours or scores from a sample to all points of a cloud.
+
+SMALL is the sample with the columns, BIG the whole cloud (.ply .pcd .las .laz .bin .npy .npz .xyz
+.txt). Every point of BIG gets the values of its nearest point of SMALL. A .las, .laz, .npy, .bin or
+binary .ply file may be larger than memory."""
+
+COMPARE = """Compare downsampling methods on your own files.
+
+Each file is sampled to m points by random, voxel, farthest point and Poisson-disk sampling and,
+with --weights, by a trained sampler. A table and a page with the clouds in 3-D show the chamfer and
+Hausdorff distances to the full cloud, how evenly it is represented, and the time."""
+
+WEIGHTS = "a trained sampler: a model's name, a weights file or the folder of a run"
+
+Add = Callable[..., object]
+"""``ArgumentParser.add_argument``."""
+
+
+def parsed(
+    arguments: list[str], prog: str, description: str, declare: Callable[[Add], None]
+) -> argparse.Namespace:
+    """Parse the arguments of a subcommand, which ``declare`` adds to the parser."""
+    parser = argparse.ArgumentParser(
+        prog=prog, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    declare(parser.add_argument)
+    return parser.parse_args(arguments)
+
+
+def downsample(arguments: list[str], prog: str = "mops-lightning downsample") -> None:
+    """Downsample all files; failed files are listed at the end and make the exit status 1.
+
+    Args:
+        arguments: of the command line.
+        prog: what the user typed to start this command.
+    """
+    with one_line_endings(prog, "interrupted. Run the same command to do the rest."):
+        sys.exit(_downsample(parsed(arguments, prog, DOWNSAMPLE, _downsample_arguments)))
+
+
+def _downsample_arguments(add: Add) -> None:
+    add("source", metavar="IN", type=Path, help="a file or a folder")
+    add("target", metavar="OUT", type=Path, help="a file or a folder")
+    add("--m", type=int, help="number of points to keep; default: as the weights were trained for")
+    add("--weights", help=WEIGHTS)
+    add("--method", choices=UNTRAINED, help="an untrained method, instead of --weights")
+    add(
+        "--readout",
+        choices=GENERATED_READOUTS,
+        help="of a trained sampler: the points that it generates, the input points nearest to "
+        "them, or these without duplicates, completed to m by farthest point sampling (default)",
+    )
+    add("--keep-attributes", action="store_true", help="keep colours, normals, intensities, ...")
+    add("--surface", type=int, help="points to sample from a mesh first; default: 10000 or 8m")
+    add(
+        "--workers",
+        type=int,
+        default=1,
+        help="processes that share a folder's files",
+    )
+    add(
+        "--tile",
+        type=int,
+        metavar="POINTS",
+        help="cut large scenes into tiles of up to so many points (a balanced kd-tree), sample "
+        "each as in training, and keep --m points in total",
+    )
+    add("--chunk", type=int, help="points to read at a time, for clouds larger than memory")
+    add(
+        "--cluster",
+        metavar="ADDRESS",
+        help="distribute the chunks of every file over the workers of this Dask scheduler",
+    )
+    add(
+        "--map",
+        type=Path,
+        metavar="FILE.npz",
+        help="write for every point of IN the row of its nearest point of OUT, to carry labels "
+        "back by mops_lightning.propagate",
+    )
+    add("--map-k", type=int, default=1, help="rows per point in --map, with weights 1/d^2")
+    add("--seed", type=int, default=0, help="seed of random choices")
+    add("--overwrite", action="store_true", help="replace existing files")
+
+
+def _downsample(chosen: argparse.Namespace) -> int:
+    """Do what the arguments say and return the exit status."""
+    options = _options(chosen)
+    from mops_lightning.files.batch import process_file, process_folder
+    from mops_lightning.files.downsample import load_sampler
+    from mops_lightning.files.paths import file_pairs
+
+    load_sampler(options)  # reports its mistakes before any file is read
+    if chosen.cluster:  # workers may have a different working directory
+        chosen.source = chosen.source.absolute()
+    pairs = file_pairs(chosen.source, chosen.target)
+    is_folder = chosen.source.is_dir()
+    if not is_folder and pairs[0][1].exists() and not chosen.overwrite:
+        raise UserError(f"{pairs[0][1]} exists. Give another OUT, or --overwrite.")
+    if chosen.map is not None:
+        _check_map(chosen, is_folder, pairs[0])
+    # Of a run that was killed.
+    remove_temporary(chosen.target if is_folder else pairs[0][1].parent, below=is_folder)
+    with _engine(chosen) as engine:
+        if not is_folder:
+            process_file(*pairs[0], options, engine)
+            return 0
+        workers, overwrite = chosen.workers, chosen.overwrite
+        failed = process_folder(pairs, options, chosen.target, workers, overwrite, engine)
+        return 1 if failed else 0
+
+
+def _check_map(chosen: argparse.Namespace, is_folder: bool, files: tuple[Path, Path]) -> None:
+    """Reject a map of several files, and one that would replace another file."""
+    if is_folder:
+        raise UserError(f"--map is the map of one file, but IN is the folder {chosen.source}.")
+    if realpath(chosen.map) in map(realpath, files):
+        raise UserError(f"--map must differ from IN and OUT, got {chosen.map}.")
+    if chosen.map.exists() and not chosen.overwrite:
+        raise UserError(f"{chosen.map} exists. Give another --map, or --overwrite.")
+
+
+def _options(chosen: argparse.Namespace) -> Options:
+    if chosen.readout and chosen.method:
+        raise UserError(f"--readout needs --weights: --method {chosen.method} keeps input points.")
+    if chosen.workers < 1:
+        raise UserError(f"--workers must be at least 1, got {chosen.workers}.")
+    if chosen.cluster == "":
+        raise UserError("--cluster must be the address of a Dask scheduler, got ''.")
+    if chosen.cluster and chosen.chunk is None:
+        raise UserError("--cluster distributes the chunks of a file: give --chunk as well.")
+    values = {field.name: getattr(chosen, field.name) for field in fields(Options)}
+    return Options(**{**values, "readout": chosen.readout or "completed"})
+
+
+def _engine(chosen: argparse.Namespace) -> AbstractContextManager[Engine | None]:
+    """Return the engine; None for a folder without ``--cluster``: its files are shared."""
+    is_file = not chosen.source.is_dir()
+    if not chosen.cluster:
+        return nullcontext(LocalEngine(progress=True) if is_file else None)
+    from mops_lightning.files.engine import dask_engine
+
+    return dask_engine(chosen.cluster, progress=is_file)
+
+
+def propagate(arguments: list[str], prog: str = "mops-lightning propagate") -> None:
+    """Carry columns of one file to another; arguments as for ``downsample``."""
+    with one_line_endings(prog):
+        _propagate(parsed(arguments, prog, PROPAGATE, _propagate_arguments))
+
+
+def _propagate_arguments(add: Add) -> None:
+    add("small", metavar="SMALL", type=Path, help="the sample, with the columns")
+    add("big", metavar="BIG", type=Path, help="all points")
+    add(
+        "target",
+        metavar="OUT",
+        type=Path,
+        nargs="?",
+        help="a .ply, .las or .laz file to write; default: BIG_propagated",
+    )
+    add(
+        "--field",
+        action="append",
+        required=True,
+        metavar="NAME",
+        help="a column of SMALL; may be given several times. It replaces a column of BIG",
+    )
+    add(
+        "--k",
+        type=int,
+        default=1,
+        help="use the k nearest points of SMALL, weighted by 1/d^2: floats are averaged, of whole "
+        "numbers the one with the largest weight is taken; default: 1, which copies",
+    )
+    add("--mean", action="store_true", help="with --k: average whole numbers, such as colours")
+    add("--overwrite", action="store_true", help="replace an existing OUT")
+
+
+def _propagate(chosen: argparse.Namespace) -> None:
+    start = time.perf_counter()
+    from mops_lightning.data.formats.registry import PART_WRITERS
+    from mops_lightning.files.propagate import propagate_file
+
+    big, target = chosen.big, chosen.target
+    if target is None:
+        suffix = big.suffix if big.suffix.lower() in PART_WRITERS else ".ply"
+        target = big.with_name(f"{big.stem}_propagated{suffix}")
+    if target.suffix.lower() not in PART_WRITERS:
+        raise UserError(f"OUT must end in {', '.join(PART_WRITERS)}, got {target}.")
+    if realpath(target) in (realpath(big), realpath(chosen.small)):
+        raise UserError(f"OUT must differ from SMALL and BIG, got {target}.")
+    if target.exists() and not chosen.overwrite:
+        raise UserError(f"{target} exists. Give another OUT, or --overwrite.")
+    remove_temporary(target.parent, below=False)
+    number = propagate_file(chosen.small, big, target, chosen.field, chosen.k, chosen.mean)
+    names, seconds = ", ".join(chosen.field), time.perf_counter() - start
+    print(printable(f"{target}: {names} of {number:,} points, {seconds:.1f} s"))
+
+
+def compare(arguments: list[str], prog: str = "mops-lightning compare") -> None:
+    """Write the table and the page, and print the table; arguments as for ``downsample``."""
+    with one_line_endings(prog):
+        _compare(parsed(arguments, prog, COMPARE, _compare_arguments))
+
+
+def _compare_arguments(add: Add) -> None:
+    add("files", metavar="FILE", type=Path, nargs="+", help="clouds or meshes")
+    add("--m", type=int, nargs="+", required=True, help="numbers of points to keep")
+    add("--weights", help=WEIGHTS)
+    add("--methods", nargs="+", default=list(UNTRAINED), help="untrained methods; default: all")
+    add("--tile", type=int, metavar="POINTS", help="the trained sampler by tiles, as in downsample")
+    add("--out", type=Path, default=Path("compare"), help="folder to write; default: compare")
+    add("--seed", type=int, default=0, help="seed of random choices")
+    add("--overwrite", action="store_true", help="replace an earlier comparison in --out")
+
+
+def _compare(chosen: argparse.Namespace) -> None:
+    if chosen.weights is None and chosen.tile is not None:
+        raise UserError("--tile is for the trained sampler: give --weights.")
+    for name in chosen.methods:
+        if name not in UNTRAINED:
+            raise UserError(f"--methods: unknown {name!r}.{did_you_mean(name, UNTRAINED)}")
+    from mops_lightning.files.compare import (
+        FILES,
+        compare_file,
+        options_by_method,
+        write_comparison,
+    )
+    from mops_lightning.files.downsample import load_sampler
+
+    _check_folder(chosen.out, FILES, chosen.overwrite)
+    by_size = {
+        m: options_by_method(m, chosen.methods, chosen.weights, chosen.tile, chosen.seed)
+        for m in chosen.m
+    }
+    for methods in by_size.values():
+        for options in methods.values():
+            load_sampler(options)  # reports its mistakes before any file is read
+    results = [
+        compare_file(path, m, methods, chosen.seed)
+        for path in chosen.files
+        for m, methods in by_size.items()
+    ]
+    print(write_comparison(results, chosen.out))
+    print(f"files in {chosen.out}/: {', '.join(FILES)}")
+
+
+def _check_folder(folder: Path, written: tuple[str, ...], overwrite: bool) -> None:
+    """Accept a new or empty folder, or with ``overwrite`` an earlier comparison.
+
+    Raises:
+        UserError: the folder contains other files, or an earlier comparison that is kept.
+    """
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise UserError(f"--out must be a folder, got the file {folder}.")
+    names = sorted(path.name for path in folder.iterdir())
+    if other := next((name for name in names if name not in written), None):
+        raise UserError(
+            f"--out: {folder} contains {other}, which is not part of a comparison. Give a new "
+            "folder."
+        )
+    if names and not overwrite:
+        raise UserError(
+            f"--out: {folder} contains an earlier comparison ({', '.join(names)}). Give another "
+            "folder, or --overwrite."
+        )
