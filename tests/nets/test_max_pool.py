@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from mops_lightning.nets.max_pool import PLAIN_MAX_POINTS, PointMaxPool
+from mops_lightning.nets.max_pool import GROUP, PLAIN_MAX_POINTS, PointMaxPool, blocked_argmax
 
 
 class PlainMaxPool(PointMaxPool):
@@ -72,3 +72,9 @@ def test_max_pool_ignores_padding(rng):
         fast.load_state_dict(pool.state_dict())
         features.requires_grad_()
         torch.testing.assert_close(fast(features), pool(features))
+
+
+def test_blocked_argmax_of_ties_is_lowest_position(rng):
+    values = torch.randint(0, 9, (50, 3 * GROUP), generator=rng).float()
+    expected = [row.index(max(row)) for row in values.tolist()]
+    assert blocked_argmax(values).squeeze(1).tolist() == expected

@@ -1,12 +1,6 @@
 import pytest
 
-from mops_lightning.ops import compiled, points
-
-
-@pytest.fixture(params=[0, points.PLAIN_MAX_VALUES], ids=["blocked", "plain"])
-def argextreme_path(request, monkeypatch):
-    """Small inputs through both code paths of ``blocked_argextreme``."""
-    monkeypatch.setattr(points, "PLAIN_MAX_VALUES", request.param)
+from mops_lightning.ops import compiled
 
 
 @pytest.fixture(params=["compiled", "torch"])

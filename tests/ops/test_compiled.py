@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 
-from mops_lightning.ops import compiled, nearest
+from mops_lightning.ops import compiled
 from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample
 from mops_lightning.ops.nearest import nearest as nearest_points
 from tests.support.clouds import cloud_of
@@ -18,7 +18,6 @@ KINDS += ["outlier"]
 @pytest.fixture
 def both(monkeypatch):
     """Return a function that calls another in the compiled and in the torch form."""
-    monkeypatch.setattr(nearest, "COMPILED_MIN_PAIRS", 1)
     monkeypatch.setattr(compiled, "NEAREST_LEAF", 8)
     monkeypatch.setattr(compiled, "FARTHEST_LEAF", 40)  # several levels
 

@@ -10,10 +10,12 @@ from mops_lightning.ops.points import gather_points
 from tests.support.plain import plain_nearest
 
 
-@pytest.mark.usefixtures("argextreme_path")
+@pytest.mark.parametrize("form", ["compiled", "torch"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("n", [5, 32, 75])
-def test_nearest_equals_double_loop(n, dtype, rng):
+def test_nearest_equals_double_loop(n, dtype, form, rng, monkeypatch):
+    if form == "torch":
+        monkeypatch.setattr(compiled, "nearest", lambda *_: None)
     queries = torch.randn(2, 6, 3, dtype=dtype, generator=rng)
     points = torch.randn(2, n, 3, dtype=dtype, generator=rng)
     distances, indices = nearest(queries, points)
@@ -38,24 +40,11 @@ def test_nearest_gradients_equal_double_loop(rng):
 def test_nearest_block_size_changes_nothing(block, rng, monkeypatch):
     queries = torch.randn(3, 11, 3, generator=rng)
     points = torch.randn(3, 40, 3, generator=rng)
+    monkeypatch.setattr(compiled, "nearest", lambda *_: None)
     whole = nearest(queries, points)
     monkeypatch.setitem(search.BLOCK, "cpu", block)
     for part, expected in zip(nearest(queries, points), whole, strict=True):
         assert torch.equal(part, expected)
-
-
-@pytest.mark.parametrize(
-    ("m", "n", "channels", "k", "used"),
-    [
-        *((256, 256, 3, 1, True), (255, 257, 3, 1, False), (2, 2**15, 4, 1, True)),
-        *((2, 2**15, 5, 1, False), (256, 256, 3, 2, False)),
-    ],
-)
-def test_nearest_uses_compiled_form_for_many_pairs(m, n, channels, k, used, rng, monkeypatch):
-    calls = []
-    monkeypatch.setattr(compiled, "nearest", lambda *given: calls.append(given))
-    k_nearest(torch.rand(1, m, channels, generator=rng), torch.rand(1, n, channels), k)
-    assert bool(calls) == used
 
 
 @pytest.mark.parametrize("offset", [0.0, 30.0])
@@ -72,7 +61,6 @@ def test_nearest_far_from_origin_has_no_cancellation(offset, rng):
         torch.testing.assert_close(distances[b].double().sqrt(), exact, rtol=1e-5, atol=0)
 
 
-@pytest.mark.usefixtures("argextreme_path")
 @pytest.mark.parametrize("value", [float("inf"), -float("inf"), float("nan")])
 def test_nearest_of_query_that_is_not_finite_is_a_row(value, rng):
     points = torch.randn(1, 33, 3, generator=rng)

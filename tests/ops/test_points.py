@@ -1,12 +1,7 @@
 import pytest
 import torch
 
-from mops_lightning.ops.points import (
-    GROUP,
-    blocked_argextreme,
-    gather_points,
-    normalize_unit_sphere,
-)
+from mops_lightning.ops.points import gather_points, normalize_unit_sphere
 
 
 def test_gather_points_equals_double_loop(rng):
@@ -38,12 +33,3 @@ def test_normalize_of_coincident_points_is_zero():
     assert (result[0] == 0).all()
     (gradient,) = torch.autograd.grad(result.square().sum(), points)
     assert torch.isfinite(gradient).all()
-
-
-@pytest.mark.usefixtures("argextreme_path")
-@pytest.mark.parametrize("largest", [True, False])
-def test_argextreme_of_ties_is_lowest_position(largest, rng):
-    values = torch.randint(0, 9, (50, 3 * GROUP), generator=rng).float()
-    rows = values.tolist()
-    expected = [row.index(max(row) if largest else min(row)) for row in rows]
-    assert blocked_argextreme(values, largest).squeeze(1).tolist() == expected

@@ -117,11 +117,3 @@ def test_read_not_finite_is_refused(saved, value):
     weights.save(path, net, {}, {})
     with pytest.raises(weights.Damaged, match=r"head\.0\.weight is not finite"):
         weights.load_into(PointNetVanilla(4), path)
-
-
-@pytest.mark.parametrize(
-    "state", [[1, 2], {"a": 1}, {1: torch.ones(1)}, {"a": torch.ones(2).to_sparse()}], ids=str
-)
-def test_check_state_without_tensors_by_name_raises(state, tmp_path):
-    with pytest.raises(weights.Damaged, match="no tensors by name"):
-        weights.check_state(state, tmp_path)

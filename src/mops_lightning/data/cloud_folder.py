@@ -49,7 +49,7 @@ def cloud_folder(
     cache: str | Path | None = None,
     *,
     # No defaults: a record without these is evaluated with the values of its preset.
-    test_frames: Literal["last", "spread"] | None,
+    test_frames: Literal["last"] | None,
     crop: Crop,
     crops: int,
 ) -> CloudDataset:
@@ -68,8 +68,8 @@ def cloud_folder(
         seed: seed of the split and the points.
         cache: folder for sampled surfaces, found by file content, ``n_points`` and ``seed``; None
             disables the cache.
-        test_frames: for sequences, whose frames are in the order of their numbers: ``last`` tests
-            the last frames of every class, ``spread`` frames at equal distances.
+        test_frames: ``last`` for sequences, whose frames are in the order of their numbers: the
+            last frames of every class are the test split.
         crop: ``nearest`` takes the points nearest to a drawn point, as the tiles of ``downsample
             --tile``; ``whole`` random points of the cloud; ``surface`` random points on the
             surface of a mesh, uniform by area.
@@ -87,6 +87,8 @@ def cloud_folder(
     for argument, (value, minimum) in minima.items():
         if value < minimum:
             raise UserError(f"{argument} must be at least {minimum}, got {value}.")
+    if test_frames not in (None, "last"):
+        raise UserError(f"test_frames must be last or null, got {test_frames!r}.")
     if not 0 < test_share < 1:
         raise UserError(f"test_share must be between 0 and 1, got {test_share}.")
     if crop not in CROPS:
@@ -101,7 +103,7 @@ def cloud_folder(
     chosen = choose_classes(classes, sorted(set(map(class_of, names))))
     names = [name for name in names if class_of(name) in chosen]
     if test_frames is not None:
-        splits = split_by_time(names, test_share, gap, test_frames)
+        splits = split_by_time(names, test_share, gap)
         names = [name for name, split in zip(names, splits, strict=True) if split]
         splits = [split for split in splits if split]
     else:

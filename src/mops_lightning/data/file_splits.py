@@ -6,54 +6,37 @@ from pathlib import PurePath, PurePosixPath
 
 import numpy as np
 
-from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.errors import UserError
 from mops_lightning.seeding import derive_seed
 
 SPLITS = ("train", "test")
-TEST_FRAMES = ("last", "spread")
 
 
-def split_by_time(
-    names: Sequence[PurePosixPath], test_share: float, gap: int, test_frames: str
-) -> list[str]:
-    """Split every sequence of frames; arguments as in ``cloud_folder.cloud_folder``.
+def split_by_time(names: Sequence[PurePosixPath], test_share: float, gap: int) -> list[str]:
+    """Test the last frames of every sequence; arguments as in ``cloud_folder.cloud_folder``.
 
     Returns:
         A split per file: ``train``, ``test``, or an empty one for files in the gap.
 
     Raises:
-        UserError: ``test_frames`` is unknown, or ``gap`` leaves a sequence no training frame.
+        UserError: ``gap`` leaves a sequence no training frame.
     """
-    if test_frames not in TEST_FRAMES:
-        hint = did_you_mean(test_frames, TEST_FRAMES)
-        raise UserError(f"test_frames: unknown {test_frames!r}.{hint}")
     splits = [""] * len(names)
     for sequence in sorted({class_of(name) for name in names}):
         members = [i for i, name in enumerate(names) if class_of(name) == sequence]
         members.sort(key=lambda i: (names[i].parent.parts, by_number(names[i])))
-        of_sequence = _split_frames(sequence, len(members), test_share, gap, test_frames)
+        n_test = max(round(len(members) * test_share), 1)
+        before = len(members) - n_test
+        if gap >= before:
+            raise UserError(
+                f"gap must leave training frames, got {gap}: {sequence} has {len(members)} "
+                f"frame(s), {n_test} of them for the test. Use a gap below {before}, or a smaller "
+                "test_share."
+            )
+        of_sequence = ["train"] * (before - gap) + [""] * gap + ["test"] * n_test
         for i, split in zip(members, of_sequence, strict=True):
             splits[i] = split
     return splits
-
-
-def _split_frames(
-    sequence: str, frames: int, test_share: float, gap: int, test_frames: str
-) -> list[str]:
-    """Return the split of every frame of a sequence; frames in the gap have an empty one."""
-    n_test = max(round(frames * test_share), 1)
-    if test_frames == "last":
-        test = list(range(frames - n_test, frames))
-    else:  # the middle frame of each of n_test equal parts
-        test = [(2 * part + 1) * frames // (2 * n_test) for part in range(n_test)]
-    # Distance of every frame from the nearest test frame.
-    apart = [min(abs(frame - other) for other in test) for frame in range(frames)]
-    if gap >= max(apart):
-        raise UserError(
-            f"gap must leave training frames, got {gap}: {sequence} has {frames} frame(s), "
-            f"{n_test} of them for the test. Use a gap below {max(apart)}, or a smaller test_share."
-        )
-    return ["train" if far > gap else "" if far else "test" for far in apart]
 
 
 def by_number(path: PurePath) -> tuple[list[tuple[int, str]], str]:

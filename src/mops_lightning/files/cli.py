@@ -254,7 +254,11 @@ def _compare(chosen: argparse.Namespace) -> None:
     )
     from mops_lightning.files.downsample import load_sampler
 
-    _check_folder(chosen.out, FILES, chosen.overwrite)
+    if chosen.out.exists() and not chosen.out.is_dir():
+        raise UserError(f"--out must be a folder, got the file {chosen.out}.")
+    earlier = [chosen.out / name for name in FILES if (chosen.out / name).exists()]
+    if earlier and not chosen.overwrite:
+        raise UserError(f"--out: {earlier[0]} exists. Give another folder, or --overwrite.")
     by_size = {
         m: options_by_method(m, chosen.methods, chosen.weights, chosen.tile, chosen.seed)
         for m in chosen.m
@@ -269,26 +273,3 @@ def _compare(chosen: argparse.Namespace) -> None:
     ]
     print(write_comparison(results, chosen.out))
     print(f"files in {chosen.out}/: {', '.join(FILES)}")
-
-
-def _check_folder(folder: Path, written: tuple[str, ...], overwrite: bool) -> None:
-    """Accept a new or empty folder, or with ``overwrite`` an earlier comparison.
-
-    Raises:
-        UserError: the folder contains other files, or an earlier comparison that is kept.
-    """
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise UserError(f"--out must be a folder, got the file {folder}.")
-    names = sorted(path.name for path in folder.iterdir())
-    if other := next((name for name in names if name not in written), None):
-        raise UserError(
-            f"--out: {folder} contains {other}, which is not part of a comparison. Give a new "
-            "folder."
-        )
-    if names and not overwrite:
-        raise UserError(
-            f"--out: {folder} contains an earlier comparison ({', '.join(names)}). Give another "
-            "folder, or --overwrite."
-        )

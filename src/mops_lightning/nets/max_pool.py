@@ -8,7 +8,8 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from mops_lightning.ops.points import GROUP, blocked_argextreme
+GROUP = 32
+"""Number of consecutive values that ``blocked_argmax`` reduces together."""
 
 PLAIN_MAX_POINTS = 32
 """Up to this number of points, ``PointMaxPool`` computes the plain layers."""
@@ -113,7 +114,7 @@ class _MaxOverPoints(Function):
             winners = torch.empty(clouds, len(weight), dtype=torch.int64)
             for cloud, values, rows in zip(padded, extremes, winners, strict=True):
                 product = weight @ cloud.mT
-                place = blocked_argextreme(product, largest=True)
+                place = blocked_argmax(product)
                 values.copy_(product.gather(1, place)[:, 0])
                 rows.copy_(place[:, 0])
             # A padding copy can exceed the first point by a rounding error of the product.
@@ -156,3 +157,21 @@ class _MaxOverPoints(Function):
             None if to_features is None else to_features.to(dtype),
             None if to_weight is None else to_weight.to(dtype),
         )
+
+
+def blocked_argmax(values: Tensor) -> Tensor:
+    """Return ``values.argmax(1, keepdim=True)``.
+
+    On a CPU, torch vectorises ``amax`` but not ``argmax``. This function therefore reduces groups
+    of values first and searches for positions only among the groups and in the winning group.
+
+    Args:
+        values: ``(rows, L)``, L a multiple of ``GROUP``.
+
+    Returns:
+        ``(rows, 1)`` int64; the lowest position in case of ties.
+    """
+    groups = values.view(len(values), -1, GROUP)
+    group = groups.amax(2).argmax(1, keepdim=True)
+    winners = groups.gather(1, group[..., None].expand(-1, 1, GROUP))
+    return winners.argmax(2).add_(group, alpha=GROUP)

@@ -14,18 +14,10 @@ from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops import compiled
-from mops_lightning.ops.points import (
-    blocked_argextreme,
-    distance_dtype,
-    gather_points,
-    to_planes,
-)
+from mops_lightning.ops.points import distance_dtype, gather_points, to_planes
 
 BLOCK = {"cpu": 2**19, "other": 2**24}
 """Distances in memory at a time: a CPU keeps these in its cache; 64 MiB on other devices."""
-
-COMPILED_MIN_PAIRS, COMPILED_MAX_CHANNELS = 2**16, 4
-"""Minimum number of pairs per cloud, and maximum number of channels, for compiled code."""
 
 
 def nearest(queries: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -116,20 +108,17 @@ def _check_shapes(queries: Tensor, points: Tensor) -> None:
 
 def _search(queries: Tensor, points: Tensor, k: int) -> Tensor:
     """Return the ``(B, M, k)`` nearest rows."""
-    large = queries.shape[1] * points.shape[1] >= COMPILED_MIN_PAIRS
-    if k == 1 and large and points.shape[2] <= COMPILED_MAX_CHANNELS:
-        rows = compiled.nearest(queries, points)
-        if rows is not None:
-            return rows[..., None]
-    return search_in_blocks(queries, points, k)
+    traced = torch.compiler.is_compiling()  # a graph cannot contain compiled loops
+    rows = compiled.nearest(queries, points) if k == 1 and not traced else None
+    return search_in_blocks(queries, points, k) if rows is None else rows[..., None]
 
 
 def search_in_blocks(queries: Tensor, points: Tensor, k: int) -> Tensor:
     """Find the k nearest rows ``(B, M, k)`` in torch; planes keep every step vectorised."""
     dtype = distance_dtype(points)
     rows = to_planes(queries.to(dtype))[..., None]  # (C, B, M, 1)
-    columns = to_planes(points.to(dtype), padding=torch.inf)[:, :, None]  # (C, B, 1, N)
-    clouds, m, width = queries.shape[0], queries.shape[1], columns.shape[3]
+    columns = to_planes(points.to(dtype))[:, :, None]  # (C, B, 1, N)
+    clouds, m, width = queries.shape[0], queries.shape[1], points.shape[1]
     limit = BLOCK["cpu" if points.device.type == "cpu" else "other"]
     height = max(1, min(m, limit // width))
     depth = max(1, min(clouds, limit // (height * width)))
@@ -146,11 +135,7 @@ def search_in_blocks(queries: Tensor, points: Tensor, k: int) -> Tensor:
                 torch.sub(columns[axis, b : b + depth], part[axis], out=difference)
                 total.addcmul_(difference, difference)
             flat = total.view(-1, width)
-            winners = (
-                blocked_argextreme(flat, largest=False)
-                if k == 1
-                else flat.topk(k, largest=False)[1]
-            )
+            # topk would break ties arbitrarily.
+            winners = flat.argmin(1) if k == 1 else flat.topk(k, largest=False)[1]
             indices[b : b + depth, r : r + height] = winners.view(*shape[:2], k)
-    # Of a query that is not finite, the padding may be the nearest.
-    return indices.clamp_(max=points.shape[1] - 1)
+    return indices

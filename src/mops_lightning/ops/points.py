@@ -1,19 +1,12 @@
-"""Input, gathering, normalisation, memory layout and extremes of batched point clouds."""
+"""Input, gathering, normalisation and memory layout of batched point clouds."""
 
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
-
-GROUP = 32
-"""Number of consecutive values that ``blocked_argextreme`` reduces together."""
-
-PLAIN_MAX_VALUES = 8192
-"""Up to this number of values, torch's own argmax and argmin are faster."""
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
@@ -88,40 +81,6 @@ def distance_dtype(points: Tensor) -> torch.dtype:
     return torch.promote_types(points.dtype, torch.float32)
 
 
-def to_planes(points: Tensor, padding: float | None = None) -> Tensor:
-    """Convert ``(B, N, C)`` to contiguous ``(C, B, N)``, one plane per coordinate.
-
-    Args:
-        points: ``(B, N, C)``.
-        padding: value that pads N to a multiple of ``GROUP``; None adds no padding.
-
-    Returns:
-        ``(C, B, N)``, or ``(C, B, N')`` with padding.
-    """
-    planes = points.permute(2, 0, 1)
-    if padding is not None:
-        planes = F.pad(planes, (0, -points.shape[1] % GROUP), value=padding)
-    return planes.contiguous()
-
-
-def blocked_argextreme(values: Tensor, largest: bool) -> Tensor:
-    """Return ``values.argmax(1, keepdim=True)`` or ``values.argmin(1, keepdim=True)``.
-
-    On a CPU, torch vectorises ``amax`` but not ``argmax``. This function therefore reduces groups
-    of values first and searches for positions only among the groups and in the winning group.
-
-    Args:
-        values: ``(rows, L)``, L a multiple of ``GROUP``.
-        largest: True for the maximum, False for the minimum.
-
-    Returns:
-        ``(rows, 1)`` int64; the lowest position in case of ties.
-    """
-    if values.numel() <= PLAIN_MAX_VALUES:
-        return values.argmax(1, keepdim=True) if largest else values.argmin(1, keepdim=True)
-    groups = values.view(len(values), -1, GROUP)
-    extremes = groups.amax(2) if largest else groups.amin(2)
-    group = extremes.argmax(1, keepdim=True) if largest else extremes.argmin(1, keepdim=True)
-    winners = groups.gather(1, group[..., None].expand(-1, 1, GROUP))
-    offset = winners.argmax(2) if largest else winners.argmin(2)
-    return offset.add_(group, alpha=GROUP)
+def to_planes(points: Tensor) -> Tensor:
+    """Convert ``(B, N, C)`` to contiguous ``(C, B, N)``, one plane per coordinate."""
+    return points.permute(2, 0, 1).contiguous()

@@ -70,7 +70,13 @@ def read(path: str | Path) -> dict[str, Any]:
         raise damaged(path) from None
     if digest(state) != header["sha256"]:
         raise damaged(path, "sha256 differs")
-    check_state(state, path)
+    for name, value in state.items():
+        if value.element_size() == 1 and value.dtype != torch.bool:
+            raise Damaged(
+                f"{path}: {name} is quantised ({value.dtype}). Give weights in 16 or 32 bits."
+            )
+    if name := first_nonfinite(state):
+        raise damaged(path, f"{name} is not finite, because the training diverged")
     trained = header.get("record", header)
     return {
         "config": trained["config"],
@@ -79,30 +85,6 @@ def read(path: str | Path) -> dict[str, Any]:
         "sha256": header["sha256"],
         "state": state,
     }
-
-
-def check_state(state: Any, path: str | Path) -> None:
-    """Reject what is not a ``state_dict`` of finite tensors.
-
-    Args:
-        state: of a file.
-        path: the file, for the error.
-
-    Raises:
-        Damaged: it is not a ``state_dict``, or a tensor is quantised, NaN or infinite.
-    """
-    if not isinstance(state, dict) or not all(
-        isinstance(name, str) and isinstance(value, Tensor) and value.layout == torch.strided
-        for name, value in state.items()
-    ):
-        raise damaged(path, "no tensors by name")
-    for name, value in state.items():
-        if value.element_size() == 1 and value.dtype != torch.bool:
-            raise Damaged(
-                f"{path}: {name} is quantised ({value.dtype}). Give weights in 16 or 32 bits."
-            )
-    if name := first_nonfinite(state):
-        raise damaged(path, f"{name} is not finite, because the training diverged")
 
 
 def of_run(run: Path, kind: str = "weights") -> Path:
