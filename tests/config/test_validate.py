@@ -33,7 +33,6 @@ EXTRA = {
     "experiment=own_scans": ["dataset.root=somewhere"],
     "dataset=mesh_sequence": ["dataset.root=somewhere"],
     "task/loss=quaternion": ["task=registration"],
-    "task/loss=frobenius_chamfer": ["task=registration"],
 }
 FROM_CODE = {
     *("params", "optimizer", "total_steps"),  # of optimizers and schedules

@@ -67,7 +67,7 @@ def test_shapes_points_are_uniform_by_area(monkeypatch: pytest.MonkeyPatch) -> N
     """A thin-walled cylinder, whose floor has a fifth of the area."""
 
     def cylinder(rng: np.random.Generator) -> Trimesh:
-        return join(turned([(0, 0), (1, 0)], 64), turned([(1, 0), (1, 2)], 64))
+        return join([turned([(0, 0), (1, 0)], 64), turned([(1, 0), (1, 2)], 64)])
 
     monkeypatch.setattr(source, "BUILDERS", {"cylinder": cylinder})
     monkeypatch.setattr(source, "STRETCH", (0.0, 0.0, 0.0))

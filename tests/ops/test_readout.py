@@ -71,5 +71,5 @@ def test_complete_wrong_arguments_raise(indices, points, words):
 
 @pytest.mark.parametrize("shape", [(4, 3), (2, 4, 3), (1, 4, 2)])
 def test_match_other_shapes_raise(shape):
-    with pytest.raises(UserError, match=r"generated .* and points .* must agree"):
+    with pytest.raises(UserError, match=r"queries .* and points .* must agree"):
         match(torch.zeros(shape), torch.zeros(1, 5, 3))

@@ -1,10 +1,9 @@
-"""Losses between rigid motions, and the registration losses, as weighted terms by name."""
+"""The paper's registration loss."""
 
 import torch
 from torch import Tensor
 
-from mops_lightning.ops.nearest import chamfer_distance
-from mops_lightning.ops.rigid import Motion, quaternion_to_matrix
+from mops_lightning.ops.rigid import Motion
 
 
 def quaternion_distance(predicted: Tensor, true: Tensor) -> Tensor:
@@ -22,20 +21,6 @@ def quaternion_distance(predicted: Tensor, true: Tensor) -> Tensor:
     """
     sign = torch.where((predicted * true).sum(1, keepdim=True) < 0, -1.0, 1.0)
     return torch.linalg.vector_norm(predicted - sign * true, dim=1).mean()
-
-
-def frobenius_distance(predicted: Tensor, true: Tensor) -> Tensor:
-    """Return ‖R̂Rᵀ − I‖²_F for the rotation matrices of unit quaternions.
-
-    Args:
-        predicted: ``(B, 4)``.
-        true: ``(B, 4)``.
-
-    Returns:
-        A scalar, the mean over the batch.
-    """
-    between = quaternion_to_matrix(predicted) @ quaternion_to_matrix(true).mT
-    return (between - torch.eye(3).to(between)).square().sum((1, 2)).mean()
 
 
 def quaternion_loss(
@@ -62,31 +47,4 @@ def quaternion_loss(
     return {
         "quaternion": quaternion_distance(predicted.quaternion, true.quaternion),
         "translation": shift,
-    }
-
-
-def frobenius_chamfer_loss(
-    predicted: Motion,
-    true: Motion,
-    source: Tensor,
-    target: Tensor,
-) -> dict[str, Tensor]:
-    """Return SampleNet's registration loss: ‖R̂Rᵀ − I‖²_F and a chamfer distance.
-
-    As in SampleNet's code, the chamfer distance is computed on the points that the task net
-    receives: the sampled ones, or all points while the task net is trained alone.
-
-    Args:
-        predicted: the predicted motion between centred clouds.
-        true: the true motion between centred clouds.
-        source: ``(B, M, 3)`` points of the centred source.
-        target: ``(B, M, 3)`` points of the centred target.
-
-    Returns:
-        The terms ``frobenius`` and ``chamfer``, scalars.
-    """
-    chamfer = chamfer_distance(predicted.apply(source), target).mean()
-    return {
-        "frobenius": frobenius_distance(predicted.quaternion, true.quaternion),
-        "chamfer": chamfer,
     }

@@ -38,10 +38,7 @@ class PointMaxPool(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, N, channels_in)`` to ``(B, channels_out)`` in the dtype of the weights."""
         if features.shape[1] <= PLAIN_MAX_POINTS:
-            features = features.to(self.linear.weight)
-            rows = self.linear(features.flatten(0, 1))  # faster than finding the winners
-            rows = rows if self.norm is None else self.norm(rows)
-            return F.relu(rows.unflatten(0, features.shape[:2]).amax(1))
+            return self.values(features).amax(1)  # faster than finding the winners of few points
         if self.norm is None:
             increasing = torch.zeros_like(self.linear.bias, dtype=torch.bool)
             return F.relu(self._extremes(features, increasing) + self.linear.bias)

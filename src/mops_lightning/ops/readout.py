@@ -54,11 +54,6 @@ def match(generated: Tensor, points: Tensor) -> Tensor:
         >>> match(torch.tensor([[[0.9, 0, 0], [1.2, 0, 0]]]), points)
         tensor([[1, 1]])
     """
-    if generated.ndim != 3 or points.ndim != 3 or generated.shape[::2] != points.shape[::2]:
-        raise UserError(
-            "generated (B, M, 3) and points (B, N, 3) must agree in all but the number of points, "
-            f"got {tuple(generated.shape)} and {tuple(points.shape)}."
-        )
     return nearest(generated.detach(), points.detach())[1]
 
 

@@ -88,8 +88,6 @@ def _each(select: Select, clouds: list[Tensor], m: int) -> list[Sample]:
 
 def _selected(select: Select, points: Tensor, m: int) -> Sample:
     """Select from clouds of one size, in their own unit."""
-    if not bool(torch.isfinite(points).all()):
-        raise UserError("points must be finite, got NaN or infinity.")
     if points.shape[0] == 0 or points.shape[1] == 0:
         raise UserError(
             f"points must have at least one cloud and one point, got shape {tuple(points.shape)}."

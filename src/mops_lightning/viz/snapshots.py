@@ -51,12 +51,11 @@ def load_clouds(path: Path) -> tuple[list[str], dict[str, NDArray[np.float32]]]:
         arrays = load_npz(path)
         titles = [str(title) for title in arrays.pop(TITLES)]
         clouds = {INPUT: arrays.pop(INPUT), **arrays}
-    except (UserError, KeyError, TypeError, SystemError) as error:  # numpy's, for odd characters
+        shapes = {cloud.shape[::2] for cloud in clouds.values()}
+        finite = all(np.isfinite(cloud).all() for cloud in clouds.values())
+        if len(clouds) < 2 or not titles or shapes != {(len(titles), 3)} or not finite:
+            raise ValueError("expected finite clouds and samples for each title")
+    # Numpy raises TypeError for other kinds of numbers, SystemError for odd characters.
+    except (KeyError, SystemError, TypeError, ValueError) as error:
         raise UserError(f"{path}: cannot read saved clouds: {error}.") from None
-    for name, cloud in clouds.items():
-        fits = cloud.dtype.kind == "f" and cloud.shape[2:] == (3,) and cloud.shape[1] > 0
-        if not fits or len(cloud) != len(titles) or not np.isfinite(cloud).all():
-            raise UserError(f"{path}: cannot read saved clouds: {name} is damaged.")
-    if len(clouds) < 2 or not titles:
-        raise UserError(f"{path}: cannot read saved clouds: no samples.")
     return titles, clouds

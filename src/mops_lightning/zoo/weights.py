@@ -75,8 +75,8 @@ def read(path: str | Path) -> dict[str, Any]:
             raise Damaged(
                 f"{path}: {name} is quantised ({value.dtype}). Give weights in 16 or 32 bits."
             )
-    if name := first_nonfinite(state):
-        raise damaged(path, f"{name} is not finite, because the training diverged")
+    if wrong := first_nonfinite(state):
+        raise damaged(path, f"{wrong} is not finite, because the training diverged")
     trained = header.get("record", header)
     return {
         "config": trained["config"],

@@ -62,6 +62,6 @@ def test_smooth_interpolates_without_overshoot() -> None:
 
 def test_join_keeps_all_faces() -> None:
     parts = [box((0, 1), (0, 1), (0, 1)), rod((5, 0, 0), (5, 1, 0), 0.1)]
-    mesh = join(parts[0], parts[1:])
+    mesh = join(parts)
     assert mesh.area == pytest.approx(sum(part.area for part in parts))
     assert mesh.bounds[1, 0] > 5

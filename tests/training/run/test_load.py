@@ -231,8 +231,6 @@ def test_evaluate_missing_weights_raises(trained, tmp_path):
 
 
 def test_command_line_other_net_drops_its_settings(tmp_path):
-    own = ["task.net.iterations=2", "sampler=mops", "task/loss=frobenius_chamfer"]
-    job(tmp_path / "run", *SMALL_PCRNET, *own)
-    for other in (["task/net=icp"], ["task/loss=quaternion"]):
-        again = evaluated((tmp_path / "run", None), tmp_path / other[0].replace("/", "-"), *other)
-        assert again.status == "completed"
+    job(tmp_path / "run", *SMALL_PCRNET, "task.net.iterations=2", "sampler=mops")
+    again = evaluated((tmp_path / "run", None), tmp_path / "icp", "task/net=icp")
+    assert again.status == "completed"

@@ -50,7 +50,7 @@ def airplane(rng: Generator) -> Trimesh:
         return join(parts)
     size = radius * rng.uniform(0.4, 0.55)
     if high:  # at the sides of the body, below the high tailplane
-        return join(parts, _engine(rng, radius * 1.35, radius * 0.45, -0.45, size))
+        return join(parts + _engine(rng, radius * 1.35, radius * 0.45, -0.45, size))
     for share in (0.36,) if rng.random() < 0.65 else (0.3, 0.58):
         edge = root_z - sweep * share * span
         parts += _engine(rng, share * span, level - size * 1.3, edge, size)

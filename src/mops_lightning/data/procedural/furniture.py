@@ -59,7 +59,7 @@ def table(rng: Generator) -> Trimesh:
             parts += [box(around(wide - 0.1), apron, around(0.03, z)) for z in around(deep - 0.06)]
             parts += [box(around(0.03, x), apron, around(deep - 0.1)) for x in around(wide - 0.06)]
         if rng.random() < 0.25:
-            parts += rungs(ends, rng.uniform(0.12, 0.25), 0.03, (0, 1, 2, 3))
+            parts += rungs(ends, rng.uniform(0.12, 0.25), 0.03)
     return join(parts)
 
 

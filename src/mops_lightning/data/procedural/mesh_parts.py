@@ -121,10 +121,10 @@ def turned(profile: ArrayLike, sections: int = 32) -> Trimesh:
     )
 
 
-def disc(radius: float, y: Span, sections: int = 32) -> Trimesh:
+def disc(radius: float, y: Span) -> Trimesh:
     """Return a closed upright cylinder about the y axis."""
     low, high = y
-    return turned(((0, low), (radius, low), (radius, high), (0, high)), sections)
+    return turned(((0, low), (radius, low), (radius, high), (0, high)))
 
 
 def smooth(points: ArrayLike, steps: int = 24) -> Array:
@@ -138,15 +138,12 @@ def smooth(points: ArrayLike, steps: int = 24) -> Array:
     return PchipInterpolator(np.arange(len(knots)), knots)(np.linspace(0, len(knots) - 1, steps))
 
 
-def join(*parts: Trimesh | Sequence[Trimesh]) -> Trimesh:
-    """Return one mesh of all parts, which may be given in lists."""
-    flat: list[Trimesh] = []
-    for part in parts:
-        flat += [part] if isinstance(part, Trimesh) else part
+def join(parts: Sequence[Trimesh]) -> Trimesh:
+    """Return one mesh of all parts."""
     # trimesh's concatenate also merges normals and visuals, at a third of the time of the dataset.
-    starts = np.cumsum([0] + [len(part.vertices) for part in flat[:-1]])
-    vertices = np.concatenate([part.vertices for part in flat])
-    faces = np.concatenate([part.faces + start for part, start in zip(flat, starts, strict=True)])
+    starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
     return Trimesh(vertices, faces, process=False)
 
 
@@ -176,10 +173,10 @@ def four_legs(
     return [rod(top, foot, (radius, radius * taper), sections) for top, foot in ends], ends
 
 
-def rungs(ends: Array, level: float, radius: float, sides: tuple[int, ...]) -> list[Trimesh]:
-    """Return a bar to the next leg for each leg in ``sides``.
+def rungs(ends: Array, level: float, radius: float) -> list[Trimesh]:
+    """Return a bar from every leg to the next one.
 
     ``ends`` is from ``four_legs``, ``level`` relative to the height of the legs.
     """
     at = ends[:, 1] + level * (ends[:, 0] - ends[:, 1])
-    return [rod(at[i], at[(i + 1) % len(at)], radius, 8) for i in sides]
+    return [rod(at[i], at[(i + 1) % len(at)], radius, 8) for i in range(len(at))]

@@ -32,7 +32,7 @@ def chair(rng: Generator) -> Trimesh:
         )
         parts += legs
         if rng.random() < 0.4:
-            parts += rungs(ends, rng.uniform(0.25, 0.5), 0.025, (0, 1, 2, 3))
+            parts += rungs(ends, rng.uniform(0.25, 0.5), 0.025)
     parts.append(_chair_back(rng, width, -depth / 2, (seat, seat + rise)))
     if rng.random() < 0.3:
         y, reach = seat + rise * rng.uniform(0.3, 0.6), depth * rng.uniform(0.25, 0.45)
@@ -115,7 +115,7 @@ def stool(rng: Generator) -> Trimesh:
         legs, ends = four_legs(rng, width * inset, depth * inset, y[0], radius, splay)
         parts += legs
     if rng.random() < 0.7:
-        parts += rungs(ends, rng.uniform(0.2, 0.45), 0.025, tuple(range(len(ends))))
+        parts += rungs(ends, rng.uniform(0.2, 0.45), 0.025)
     return join(parts)
 
 
