@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.autoencoder import PointEncoder
+from mops_lightning.nets.autoencoder import PointEncoder, Reconstructor
 from mops_lightning.nets.foldingnet import REACH, square_grid
 from mops_lightning.nets.layers import check_channels, linear_norm_relu
 
@@ -36,7 +36,7 @@ class Patch(nn.Module):
         return self.layers(hidden.flatten(0, 1)).unflatten(0, hidden.shape[:2])
 
 
-class AtlasNet(nn.Module):
+class AtlasNet(Reconstructor):
     """The paper's encoder, and M patches without shared weights.
 
     Patches map random points of a square in training, and a regular grid in evaluation.
@@ -67,19 +67,6 @@ class AtlasNet(nn.Module):
         self.n_points = n_points
         self.encoder = PointEncoder(codeword)
         self.patches = nn.ModuleList(Patch(codeword, patch_channels) for _ in range(pieces))
-
-    def forward(self, points: Tensor, n_points: int | None = None) -> Tensor:
-        """Map ``(B, N, 3)`` points, any N, to ``(B, n, 3)``.
-
-        Args:
-            points: the sampled or the full cloud.
-            n_points: n; None means the attribute ``n_points``.
-        """
-        return self.from_pooled(self.encoder(points), n_points)
-
-    def point_features(self, points: Tensor) -> Tensor:
-        """Return the features ``(B, N, d)`` whose maxima over points are the codeword."""
-        return self.encoder.point_features(points)
 
     def from_pooled(self, pooled: Tensor, n_points: int | None = None) -> Tensor:
         """Map codewords ``(B, d)`` to ``(B, n, 3)``; ``n_points`` as for ``forward``."""

@@ -50,7 +50,36 @@ class PointEncoder(nn.Module):
         return self.pool.values(self.features(points))
 
 
-class AutoEncoder(nn.Module):
+class Reconstructor(nn.Module):
+    """Base of the reconstruction nets: an encoder, and ``from_pooled``, the decoder.
+
+    Attributes:
+        encoder: gives the codeword.
+        n_points: default number of output points.
+    """
+
+    encoder: PointEncoder
+    n_points: int
+
+    def forward(self, points: Tensor, n_points: int | None = None) -> Tensor:
+        """Map ``(B, N, 3)`` points, any N, to ``(B, n, 3)``.
+
+        Args:
+            points: the sampled or the full cloud.
+            n_points: n; None means the attribute ``n_points``.
+        """
+        return self.from_pooled(self.encoder(points), n_points)
+
+    def point_features(self, points: Tensor) -> Tensor:
+        """Return the features ``(B, N, d)`` whose maxima over points are the codeword."""
+        return self.encoder.point_features(points)
+
+    def from_pooled(self, pooled: Tensor, n_points: int | None = None) -> Tensor:
+        """Map codewords ``(B, d)`` to ``(B, n, 3)``; ``n_points`` as for ``forward``."""
+        raise NotImplementedError
+
+
+class AutoEncoder(Reconstructor):
     """Encoder, and a decoder of linear layers with all 3n coordinates as output.
 
     Args:
@@ -82,24 +111,12 @@ class AutoEncoder(nn.Module):
             nn.Linear(decoder_channels[-1], 3 * n_points),
         )
 
-    def forward(self, points: Tensor, n_points: int | None = None) -> Tensor:
-        """Map ``(B, N, 3)`` points, any N, to ``(B, n, 3)``.
-
-        Args:
-            points: the sampled or the full cloud.
-            n_points: n, or None.
+    def from_pooled(self, pooled: Tensor, n_points: int | None = None) -> Tensor:
+        """Map codewords ``(B, d)`` to ``(B, n, 3)``.
 
         Raises:
-            UserError: ``n_points`` is neither None nor n.
+            UserError: ``n_points`` is neither None nor the net's own.
         """
-        return self.from_pooled(self.encoder(points), n_points)
-
-    def point_features(self, points: Tensor) -> Tensor:
-        """Return the features ``(B, N, d)`` whose maxima over points are the codeword."""
-        return self.encoder.point_features(points)
-
-    def from_pooled(self, pooled: Tensor, n_points: int | None = None) -> Tensor:
-        """Map codewords ``(B, d)`` to ``(B, n, 3)``; ``n_points`` and errors as for ``forward``."""
         if n_points not in (None, self.n_points):
             raise UserError(
                 f"n_points must be {self.n_points}, the size this AutoEncoder was made for, got "
