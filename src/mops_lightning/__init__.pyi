@@ -21,7 +21,6 @@ from .samplers.random import RandomSampler as RandomSampler
 from .samplers.samplenet import ProgressiveSampleNet as ProgressiveSampleNet
 from .samplers.samplenet import SampleNet as SampleNet
 from .samplers.serial import SerialSampler as SerialSampler
-from .samplers.snet import ProgressiveSNet as ProgressiveSNet
 from .samplers.snet import SNet as SNet
 from .samplers.submodular import SubmodularSampler as SubmodularSampler
 from .samplers.voxel import VoxelSampler as VoxelSampler

@@ -111,7 +111,7 @@ def test_rival_samplers_have_published_settings():
     assert (cfg.trainer.max_epochs, cfg.val_fraction) == (500, 0)
     assert compose(["sampler=snet", "optimizer=exponential"]).optimizer.lr == 5e-4
     assert compose(["sampler=fmops"]).optimizer.lr == 0.001
-    cfg = compose(["sampler=snet_progressive"])
+    cfg = compose(["sampler=samplenet_progressive"])
     assert (cfg.sampler.m_max, cfg.sampler.min_size, cfg.sampler.size_reduction) == (1024, 2, "sum")
     assert (cfg.sampler.coverage, cfg.sampler.coverage_per_point) == (0.5, pytest.approx(1 / 30))
 

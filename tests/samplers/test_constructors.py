@@ -15,9 +15,9 @@ from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.gumbel import GumbelSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.poisson import PoissonSampler
-from mops_lightning.samplers.samplenet import SampleNet
+from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.samplers.serial import SerialSampler
-from mops_lightning.samplers.snet import ProgressiveSNet, SNet
+from mops_lightning.samplers.snet import SNet
 from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.zoo.load import package_samplers
 
@@ -35,7 +35,7 @@ LIMITS: list[tuple[type[Sampler], dict[str, Any]]] = [
     (SNet, {"alpha": 0.0, "coverage": 0.0, "coverage_per_point": 0.0}),
     (SampleNet, {"k": 1, "beta": 0.0, "gamma": 0.0, "sigma_min": 0.0}),
     (SampleNet, {"k": 60}),
-    (ProgressiveSNet, {"min_size": 1}),
+    (ProgressiveSampleNet, {"min_size": 1}),
 ]
 """The smallest and largest allowed arguments."""
 NOT_FLEXIBLE = (GumbelSampler, MOPSNet, SNet, SampleNet)

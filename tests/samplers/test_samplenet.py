@@ -89,6 +89,26 @@ def test_samplenet_sigma_has_lower_bound(sigma_min, t, sigma):
     assert math.isclose(net.sigma.item(), sigma, rel_tol=1e-5)
 
 
+def test_progressive_training_sizes_are_powers_of_two():
+    sizes = (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
+    assert ProgressiveSampleNet().training_sizes() == sizes
+    assert ProgressiveSampleNet(100, min_size=16).training_sizes() == (16, 32, 64, 100)
+    assert ProgressiveSampleNet(1).training_sizes() == (1,)
+
+
+def test_progressive_samples_are_nested(rng):
+    net = ProgressiveSampleNet(16, coverage=0.5, coverage_per_point=1 / 30).train()
+    points = torch.randn(4, 40, 3, generator=rng)
+    net(points)  # running statistics change with every call, the result does not
+    whole = net(points).points
+    outputs = net.sample_sizes(points, net.training_sizes())
+    assert list(outputs) == [2, 4, 8, 16]
+    for m, output in outputs.items():
+        assert torch.equal(output.points, whole[:, :m])
+        expected = 30 * simplification_loss(points, whole[:, :m], 0.5, 1 / 30)
+        torch.testing.assert_close(output.losses["simplification"], expected)
+
+
 @pytest.mark.parametrize("reduction", ["sum", "mean"])
 def test_progressive_samplenet_adds_projection_once(reduction, rng):
     net = ProgressiveSampleNet(16, k=3, beta=0.5, size_reduction=reduction).train()
@@ -107,3 +127,15 @@ def test_progressive_samplenet_adds_projection_once(reduction, rng):
 def test_samplenet_invalid_argument_raises(arguments):
     with pytest.raises(UserError, match=f"^{next(iter(arguments))} must be .*at least"):
         SampleNet(8, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"min_size": 0}, "^min_size must be at least 1, got 0"),
+        ({"size_reduction": "summ"}, "^size_reduction: unknown 'summ'.*sum"),
+    ],
+)
+def test_progressive_samplenet_invalid_argument_raises(arguments, message):
+    with pytest.raises(UserError, match=message):
+        ProgressiveSampleNet(8, **arguments)

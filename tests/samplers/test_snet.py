@@ -3,7 +3,7 @@ import torch
 from torch import nn
 
 from mops_lightning.errors import UserError
-from mops_lightning.samplers.snet import ProgressiveSNet, SNet
+from mops_lightning.samplers.snet import SNet
 from tests.support.losses import simplification_loss
 
 
@@ -70,25 +70,6 @@ def test_snet_loss_is_weighted_and_in_training_only(rng):
     assert net.eval()(points).losses == {}
 
 
-def test_progressive_training_sizes_are_powers_of_two():
-    assert ProgressiveSNet().training_sizes() == (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
-    assert ProgressiveSNet(100, min_size=16).training_sizes() == (16, 32, 64, 100)
-    assert ProgressiveSNet(1).training_sizes() == (1,)
-
-
-def test_progressive_samples_are_nested(rng):
-    net = ProgressiveSNet(16, coverage=0.5, coverage_per_point=1 / 30).train()
-    points = torch.randn(4, 40, 3, generator=rng)
-    net(points)  # running statistics change with every call, the result does not
-    whole = net(points).points
-    outputs = net.sample_sizes(points, net.training_sizes())
-    assert list(outputs) == [2, 4, 8, 16]
-    for m, output in outputs.items():
-        assert torch.equal(output.points, whole[:, :m])
-        expected = 30 * simplification_loss(points, whole[:, :m], 0.5, 1 / 30)
-        torch.testing.assert_close(output.losses["simplification"], expected)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -97,10 +78,8 @@ def test_progressive_samples_are_nested(rng):
         ({"coverage": -1.0}, "^coverage must be a number of at least 0"),
         ({"feature_channels": (8,)}, "^feature_channels must be sizes of at least 2 layers"),
         ({"head_channels": (0,)}, "^head_channels must be .* each at least 1, got .0."),
-        ({"min_size": 0}, "^min_size must be at least 1, got 0"),
-        ({"size_reduction": "summ"}, "^size_reduction: unknown 'summ'.*sum"),
     ],
 )
 def test_snet_invalid_argument_raises(arguments, message):
     with pytest.raises(UserError, match=message):
-        ProgressiveSNet(8, **arguments)
+        SNet(8, **arguments)

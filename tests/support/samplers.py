@@ -16,7 +16,7 @@ from mops_lightning.samplers.poisson import PoissonSampler
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.samplers.serial import SerialSampler
-from mops_lightning.samplers.snet import ProgressiveSNet, SNet
+from mops_lightning.samplers.snet import SNet
 from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.samplers.voxel import VoxelSampler
 
@@ -48,6 +48,5 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "snet": lambda m: SNet(m, **SMALL),
     "snet-without-norm": lambda m: SNet(m, head_norm=False, output_norm=False, **SMALL),
     "samplenet": lambda m: SampleNet(m, k=3, **SMALL),
-    "snet-progressive": lambda m: ProgressiveSNet(m, **SMALL),
     "samplenet-progressive": lambda m: ProgressiveSampleNet(m, k=3, **SMALL),
 }

@@ -30,7 +30,7 @@ TASKS = {
     ),
 }
 # Sizes on both sides of 32 points, where the pooling layer changes its algorithm, in one step.
-LEARNED = ("mops", "fmops", "snet", "samplenet", "snet-progressive", "samplenet-progressive")
+LEARNED = ("mops", "fmops", "snet", "samplenet", "samplenet-progressive")
 
 
 def trained_parts(task: str, sampler: str | None, learn: Any) -> set[str]:

@@ -2,15 +2,15 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.ops.points import gather_points
-from mops_lightning.samplers.snet import Progressive, SNet
+from mops_lightning.samplers.snet import SNet
 from mops_lightning.types import SampleOutput
 
 
@@ -121,15 +121,18 @@ class SampleNet(SNet):
         return {m: {**terms, **projection} for m, terms in losses.items()}
 
 
-class ProgressiveSampleNet(Progressive, SampleNet):
+class ProgressiveSampleNet(SampleNet):
     """SampleNet with nested samples: the first m points are the sample of size m.
 
-    SampleNetProgressive of Lang, Manor and Avidan, "SampleNet", CVPR 2020.
+    SampleNetProgressive of Lang, Manor and Avidan, "SampleNet", CVPR 2020, after ProgressiveNet of
+    Dovrat, Lang and Avidan, "Learning to Sample", CVPR 2019.
 
     Args:
-        m_max: largest number of points.
-        min_size: smallest training size, see ``ProgressiveSNet``.
-        size_reduction: ``sum`` or ``mean`` of the losses at all sizes.
+        m_max: largest number of points; 1,024 in the publication.
+        min_size: smallest training size, or m_max if that is smaller; training sizes are m_max and
+            the doubles of min_size. In the publication 2 for classification, 16 for reconstruction.
+        size_reduction: ``sum`` (classification) or ``mean`` (reconstruction) of the losses at all
+            sizes.
         **settings: arguments of ``SampleNet``.
 
     Raises:
@@ -141,4 +144,34 @@ class ProgressiveSampleNet(Progressive, SampleNet):
         >>> sampler = ProgressiveSampleNet(m_max=32).eval()
         >>> sampler(torch.rand(2, 64, 3), m=5).points.shape  # (B, N, 3) to (B, m, 3)
         torch.Size([2, 5, 3])
+        >>> sampler.training_sizes()
+        (2, 4, 8, 16, 32)
     """
+
+    flexible = True
+    nested = True
+
+    def __init__(
+        self,
+        m_max: int = 1024,
+        min_size: int = 2,
+        size_reduction: Literal["sum", "mean"] = "sum",
+        **settings: Any,
+    ) -> None:
+        super().__init__(m_max, **settings)
+        if min_size < 1:
+            raise UserError(f"min_size must be at least 1, got {min_size}.")
+        if size_reduction not in ("sum", "mean"):
+            hint = did_you_mean(size_reduction, ("sum", "mean"))
+            raise UserError(f"size_reduction: unknown {size_reduction!r}.{hint}")
+        self.min_size = min_size
+        self.size_reduction = size_reduction
+
+    def training_sizes(self) -> tuple[int, ...]:
+        """Return ``min_size``, its doubles below the largest size, and the largest size."""
+        sizes = {self.m}
+        size = self.min_size
+        while size < self.m:
+            sizes.add(size)
+            size *= 2
+        return tuple(sorted(sizes))

@@ -2,11 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
 
 from torch import Tensor, nn
 
-from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.errors import UserError
 from mops_lightning.losses.subset import simplification_losses
 from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
 from mops_lightning.nets.max_pool import PointMaxPool
@@ -83,67 +82,3 @@ class SNet(Sampler):
         weights = (self.coverage, self.coverage_per_point)
         losses = simplification_losses(points, output.points, sizes, *weights)
         return {m: {"simplification": self.alpha * loss} for m, loss in losses.items()}
-
-
-class Progressive(Sampler):
-    """Mixin for progressive training, in which every power of two is a training size.
-
-    This is ProgressiveNet of the S-Net paper: the first m points are the sample of size m, for any
-    m up to the largest. The mixin precedes the net in the bases of a class. Arguments and errors as
-    in ``ProgressiveSNet``, with ``settings`` of the net.
-    """
-
-    flexible = True
-    nested = True
-
-    def __init__(
-        self,
-        m_max: int = 1024,
-        min_size: int = 2,
-        size_reduction: Literal["sum", "mean"] = "sum",
-        **settings: Any,
-    ) -> None:
-        super().__init__(m_max, **settings)
-        if min_size < 1:
-            raise UserError(f"min_size must be at least 1, got {min_size}.")
-        if size_reduction not in ("sum", "mean"):
-            hint = did_you_mean(size_reduction, ("sum", "mean"))
-            raise UserError(f"size_reduction: unknown {size_reduction!r}.{hint}")
-        self.min_size = min_size
-        self.size_reduction = size_reduction
-
-    def training_sizes(self) -> tuple[int, ...]:
-        """Return ``min_size``, its doubles below the largest size, and the largest size."""
-        sizes = {self.m}
-        size = self.min_size
-        while size < self.m:
-            sizes.add(size)
-            size *= 2
-        return tuple(sorted(sizes))
-
-
-class ProgressiveSNet(Progressive, SNet):
-    """S-Net with nested samples: the first m points are the sample of size m.
-
-    ProgressiveNet of Dovrat, Lang and Avidan, "Learning to Sample", CVPR 2019.
-
-    Args:
-        m_max: largest number of points; 1,024 in the publication.
-        min_size: smallest training size, or m_max if that is smaller; training sizes are m_max and
-            the doubles of min_size. In the publication 2 for classification, 16 for reconstruction.
-        size_reduction: ``sum`` (classification) or ``mean`` (reconstruction) of the losses at all
-            sizes.
-        **settings: arguments of ``SNet``.
-
-    Raises:
-        UserError: an argument is out of range.
-
-    Examples:
-        >>> import torch
-        >>> from mops_lightning import ProgressiveSNet
-        >>> sampler = ProgressiveSNet(m_max=32).eval()
-        >>> sampler(torch.rand(2, 64, 3), m=5).points.shape  # (B, N, 3) to (B, m, 3)
-        torch.Size([2, 5, 3])
-        >>> sampler.training_sizes()
-        (2, 4, 8, 16, 32)
-    """
