@@ -1,6 +1,7 @@
 """The errors that users see, and how a command ends: one line on stderr and an exit status."""
 
 import errno
+import math
 import os
 import re
 import select
@@ -28,6 +29,17 @@ class Interrupted(Exception):
 
     Not a KeyboardInterrupt: Lightning turns that into ``SystemExit(1)`` and hides what happened.
     """
+
+
+def check_at_least(minimum: float, **arguments: float) -> None:
+    """Reject arguments that are smaller than a minimum, infinite or not a number.
+
+    Raises:
+        UserError: it names the argument.
+    """
+    for name, value in arguments.items():
+        if not minimum <= value < math.inf:
+            raise UserError(f"{name} must be at least {minimum}, got {value}.")
 
 
 def did_you_mean(name: str, allowed: Iterable[str]) -> str:

@@ -124,11 +124,11 @@ def test_mops_threshold_drops_small_entries_in_evaluation_only(rng):
         ({"tau_min": 1.5}, "^tau_min must be above 0 and at most 1, got 1.5"),
         ({"feature_channels": ()}, "^feature_channels must be sizes of at least 1 layer,"),
         ({"rho_channels": (8, 0)}, "^rho_channels must be sizes"),
-        ({"overlap": -1.0}, "^overlap must be a number of at least 0, got -1.0"),
-        ({"overlap": float("nan")}, "^overlap must be a number"),
+        ({"overlap": -1.0}, "^overlap must be at least 0, got -1.0"),
+        ({"overlap": float("nan")}, "^overlap must be at least 0, got nan"),
         ({"threshold": 1.0}, "^threshold must be at least 0 and below 1, got 1.0"),
-        ({"alpha": -1.0}, "^alpha must be a number of at least 0, got -1.0"),
-        ({"alpha": float("inf")}, "^alpha must be a number"),
+        ({"alpha": -1.0}, "^alpha must be at least 0, got -1.0"),
+        ({"alpha": float("inf")}, "^alpha must be at least 0, got inf"),
     ],
 )
 def test_mops_invalid_argument_raises(arguments, message):

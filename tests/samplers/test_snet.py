@@ -73,9 +73,9 @@ def test_snet_loss_is_weighted_and_in_training_only(rng):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"alpha": -1.0}, "^alpha must be a number of at least 0, got -1.0"),
-        ({"alpha": float("nan")}, "^alpha must be a number"),
-        ({"coverage": -1.0}, "^coverage must be a number of at least 0"),
+        ({"alpha": -1.0}, "^alpha must be at least 0, got -1.0"),
+        ({"alpha": float("nan")}, "^alpha must be at least 0, got nan"),
+        ({"coverage": -1.0}, "^coverage must be at least 0"),
         ({"feature_channels": (8,)}, "^feature_channels must be sizes of at least 2 layers"),
         ({"head_channels": (0,)}, "^head_channels must be .* each at least 1, got .0."),
     ],

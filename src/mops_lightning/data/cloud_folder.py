@@ -27,7 +27,7 @@ from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
 from mops_lightning.data.formats.registry import READABLE, read
 from mops_lightning.data.surfaces import VERSION, sample_surface
-from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.errors import UserError, check_at_least, did_you_mean
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.ops.points import normalize_unit_sphere
 from mops_lightning.seeding import derive_seed
@@ -83,10 +83,9 @@ def cloud_folder(
     Raises:
         UserError: an argument or a file is invalid, or a split is empty.
     """
-    minima = {"n_points": (n_points, 2), "crops": (crops, 1), "seed": (seed, 0), "gap": (gap, 0)}
-    for argument, (value, minimum) in minima.items():
-        if value < minimum:
-            raise UserError(f"{argument} must be at least {minimum}, got {value}.")
+    check_at_least(2, n_points=n_points)
+    check_at_least(1, crops=crops)
+    check_at_least(0, seed=seed, gap=gap)
     if test_frames not in (None, "last"):
         raise UserError(f"test_frames must be last or null, got {test_frames!r}.")
     if not 0 < test_share < 1:

@@ -9,7 +9,7 @@ import torch
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, make_dataset
 from mops_lightning.data.formats.guard import reading
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.filesystem import memory
 
 NAMES = "shape_names.txt"
@@ -84,8 +84,7 @@ def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:
     Raises:
         UserError: the file is missing, damaged or has other content.
     """
-    if n_points < 1:
-        raise UserError(f"n_points must be at least 1, got {n_points}.")
+    check_at_least(1, n_points=n_points)
     if not path.is_file():
         raise UserError(f"root: {path} is missing. Complete the folder, or use another root.")
     with reading(path), h5py.File(path, "r") as file:

@@ -8,7 +8,7 @@ import torch
 from torch import Generator, Tensor
 
 from mops_lightning.data.clouds import Clouds
-from mops_lightning.errors import UserError
+from mops_lightning.errors import check_at_least
 from mops_lightning.seeding import generator
 from mops_lightning.types import Batch
 
@@ -32,12 +32,7 @@ class Augmentation:
 
     def __post_init__(self) -> None:
         """Check the arguments."""
-        values = (self.jitter, self.jitter_clip)
-        if not all(isinstance(value, int | float) and value >= 0 for value in values):
-            raise UserError(
-                "augment: jitter and jitter_clip must be at least 0, "
-                f"got {self.jitter} and {self.jitter_clip}."
-            )
+        check_at_least(0, jitter=self.jitter, jitter_clip=self.jitter_clip)
 
     @property
     def active(self) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.nets.autoencoder import PointEncoder, Reconstructor
 from mops_lightning.nets.foldingnet import REACH, square_grid
 from mops_lightning.nets.layers import check_channels, linear_norm_relu
@@ -59,8 +59,7 @@ class AtlasNet(Reconstructor):
         patch_channels: Sequence[int] = (1024, 512, 512),
     ) -> None:
         super().__init__()
-        if pieces < 1:
-            raise UserError(f"pieces must be at least 1, got {pieces}.")
+        check_at_least(1, pieces=pieces)
         if n_points < pieces:
             raise UserError(f"n_points must be at least pieces={pieces}, got {n_points}.")
         check_channels("patch_channels", patch_channels)

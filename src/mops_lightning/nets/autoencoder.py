@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.nets.layers import (
     PointMLP,
     check_channels,
@@ -34,8 +34,7 @@ class PointEncoder(nn.Module):
         channels: Sequence[int] = (64, 128, 128, 256),
     ) -> None:
         super().__init__()
-        if codeword < 1:
-            raise UserError(f"codeword must be at least 1, got {codeword}.")
+        check_at_least(1, codeword=codeword)
         check_channels("channels", channels)
         self.codeword = codeword
         self.features = PointMLP([3, *channels])
@@ -100,8 +99,7 @@ class AutoEncoder(Reconstructor):
         decoder_channels: Sequence[int] = (256, 256),
     ) -> None:
         super().__init__()
-        if n_points < 1:
-            raise UserError(f"n_points must be at least 1, got {n_points}.")
+        check_at_least(1, n_points=n_points)
         check_channels("encoder_channels", encoder_channels)
         check_channels("decoder_channels", decoder_channels)
         self.n_points = n_points

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import check_at_least
 from mops_lightning.nets.layers import check_channels
 from mops_lightning.nets.max_pool import PointMaxPool
 from mops_lightning.nets.pointnet import classifier_head
@@ -91,8 +91,7 @@ class DGCNN(nn.Module):
         dropout: float = 0.3,
     ) -> None:
         super().__init__()
-        if k < 1:
-            raise UserError(f"k must be at least 1, got {k}.")
+        check_at_least(1, k=k)
         check_channels("edge_channels", edge_channels)
         sizes = zip([3, *edge_channels[:-1]], edge_channels, strict=True)
         self.edges = nn.ModuleList(EdgeConv(before, after, k) for before, after in sizes)

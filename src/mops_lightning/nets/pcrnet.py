@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
 from mops_lightning.nets.max_pool import PointMaxPool
 from mops_lightning.ops.rigid import Motion, identity_motion
@@ -44,8 +44,7 @@ class PCRNet(nn.Module):
         head_channels: Sequence[int] = (1024, 1024, 512, 512, 256),
     ) -> None:
         super().__init__()
-        if iterations < 1:
-            raise UserError(f"iterations must be at least 1, got {iterations}.")
+        check_at_least(1, iterations=iterations)
         check_channels("feature_channels", feature_channels, 2)
         check_channels("head_channels", head_channels)
         self.iterations = iterations

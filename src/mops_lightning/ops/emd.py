@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.ops.assignment import Rows, approximate_assignment, solve_assignment
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.workers import pool
@@ -76,12 +76,10 @@ def solve_assignments(
             "points and others must both be (B, N, 3) with the same N, got "
             f"{tuple(points.shape)} and {tuple(others.shape)}."
         )
-    if block is not None and block < 2:
-        raise UserError(f"block must be at least 2 points, got {block}.")
-    if rounds < 0:
-        raise UserError(f"rounds must be at least 0, got {rounds}.")
-    if workers < 1:
-        raise UserError(f"workers must be at least 1, got {workers}.")
+    if block is not None:
+        check_at_least(2, block=block)
+    check_at_least(0, rounds=rounds)
+    check_at_least(1, workers=workers)
     p, q = _solvable(points), _solvable(others)
     solve = (
         partial(approximate_assignment, block=block, rounds=rounds) if block else solve_assignment

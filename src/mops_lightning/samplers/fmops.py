@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 import torch
 
-from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.errors import UserError, check_at_least, did_you_mean
 from mops_lightning.samplers.mops import MOPSNet
 
 DISTRIBUTIONS = ("nested", "uniform")
@@ -56,10 +56,7 @@ class FMOPSNet(MOPSNet):
         if size_sampling not in DISTRIBUTIONS:
             hint = did_you_mean(size_sampling, DISTRIBUTIONS)
             raise UserError(f"size_sampling: unknown {size_sampling!r}.{hint}")
-        if num_sizes < 1:
-            raise UserError(f"num_sizes must be at least 1, got {num_sizes}.")
-        if min_size < 1:
-            raise UserError(f"min_size must be at least 1, got {min_size}.")
+        check_at_least(1, num_sizes=num_sizes, min_size=min_size)
         self.size_sampling = size_sampling
         self.num_sizes = num_sizes
         self.min_size = min_size

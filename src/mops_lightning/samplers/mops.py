@@ -1,13 +1,12 @@
 """MOPS-Net, the learned sampler of the paper."""
 
-import math
 from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.losses.subset import overlap_losses, subset_losses
 from mops_lightning.nets.layers import PointFeatures, check_channels, linear_norm_relu
 from mops_lightning.ops.precision import pointwise_autocast, pointwise_autocast_dtype
@@ -77,10 +76,7 @@ class MOPSNet(Sampler):
         super().__init__(m)
         if not 0 < tau_min <= 1:
             raise UserError(f"tau_min must be above 0 and at most 1, got {tau_min}.")
-        if not 0 <= alpha < math.inf:
-            raise UserError(f"alpha must be a number of at least 0, got {alpha}.")
-        if not 0 <= overlap < math.inf:
-            raise UserError(f"overlap must be a number of at least 0, got {overlap}.")
+        check_at_least(0, alpha=alpha, overlap=overlap)
         check_channels("feature_channels", feature_channels)
         check_channels("rho_channels", rho_channels)
         if anchors not in (None, "fps"):

@@ -1,13 +1,12 @@
 """SampleNet, a baseline in the paper's tables: S-Net with a soft projection onto the cloud."""
 
-import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.errors import UserError, check_at_least, did_you_mean
 from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.snet import SNet
@@ -77,11 +76,8 @@ class SampleNet(SNet):
         **settings: Any,
     ) -> None:
         super().__init__(m, **settings)
-        for name, value in {"beta": beta, "gamma": gamma or 0, "sigma_min": sigma_min}.items():
-            if not 0 <= value < math.inf:
-                raise UserError(f"{name} must be a number of at least 0, got {value}.")
-        if k < 1:
-            raise UserError(f"k must be at least 1, got {k}.")
+        check_at_least(0, beta=beta, gamma=gamma or 0, sigma_min=sigma_min)
+        check_at_least(1, k=k)
         self.k = k
         self.beta = beta
         self.alpha = self.alpha if gamma is None else gamma
@@ -159,8 +155,7 @@ class ProgressiveSampleNet(SampleNet):
         **settings: Any,
     ) -> None:
         super().__init__(m_max, **settings)
-        if min_size < 1:
-            raise UserError(f"min_size must be at least 1, got {min_size}.")
+        check_at_least(1, min_size=min_size)
         if size_reduction not in ("sum", "mean"):
             hint = did_you_mean(size_reduction, ("sum", "mean"))
             raise UserError(f"size_reduction: unknown {size_reduction!r}.{hint}")

@@ -1,11 +1,10 @@
 """S-Net, a baseline in the paper's tables: points generated from the global feature."""
 
-import math
 from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import check_at_least
 from mops_lightning.losses.subset import simplification_losses
 from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
 from mops_lightning.nets.max_pool import PointMaxPool
@@ -52,10 +51,7 @@ class SNet(Sampler):
         output_norm: bool = True,
     ) -> None:
         super().__init__(m)
-        weights = {"alpha": alpha, "coverage": coverage, "coverage_per_point": coverage_per_point}
-        for name, value in weights.items():
-            if not 0 <= value < math.inf:
-                raise UserError(f"{name} must be a number of at least 0, got {value}.")
+        check_at_least(0, alpha=alpha, coverage=coverage, coverage_per_point=coverage_per_point)
         check_channels("feature_channels", feature_channels, 2)
         check_channels("head_channels", head_channels)
         self.alpha = alpha
