@@ -6,7 +6,6 @@ needed here: distribute ranges, and distribute them again when a worker dies.
 
 import logging
 import sys
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol
@@ -17,9 +16,6 @@ from mops_lightning.errors import UserError
 
 PATIENCE = 20
 """Seconds to wait for a scheduler and its first worker."""
-
-AHEAD = 4
-"""Ranges per thread that are submitted before the first result is used."""
 
 
 class Engine(Protocol):
@@ -142,15 +138,10 @@ class DaskEngine:
     def _results(self, function: Callable[[range], Any], row_ranges: list[range]) -> Iterator[Any]:
         # A task, not scattered data: Dask repeats it when the worker that holds it dies.
         shared = self.client.submit(_same, function, pure=False)
-        ahead = AHEAD * max(sum(self.client.nthreads().values()), 1)
-        futures: deque[Any] = deque()
-        rest = iter(row_ranges)
-        while True:
-            while len(futures) < ahead and (rows := next(rest, None)) is not None:
-                futures.append(self.client.submit(_call, shared, rows, pure=False))
-            if not futures:
-                return
-            yield futures.popleft().result()
+        functions = [shared] * len(row_ranges)
+        futures = self.client.map(_call, functions, row_ranges, pure=False)[::-1]
+        while futures:
+            yield futures.pop().result()  # workers forget a result that nothing refers to
 
 
 def _same(value: Any) -> Any:
