@@ -17,6 +17,7 @@ from mops_lightning.records.run_record import dotted
 ROOT = Path(__file__).parents[2] / "sweeps"
 SWEEPS = sorted(path.stem for path in ROOT.glob("*.yaml"))
 ON_SHAPES = ("ablation",)
+TESTS_ONLY = ("noise", "corruptions")
 """Sweeps that use the procedural shapes without the overlay."""
 
 
@@ -51,11 +52,11 @@ def test_sweep_cells_are_valid_and_named_by_swept_settings(name):
         assert known_as in raw["subdir"] or "run_label" in raw["subdir"]
     assert "${" not in f"{cfg.hydra.sweep.dir}/{cfg.hydra.sweep.subdir}"
     assert cfg.hydra.mode.name == "MULTIRUN"
-    assert (cfg.names.dataset == "shapes") == (name in (*ON_SHAPES, "noise"))
+    assert (cfg.names.dataset == "shapes") == (name in (*ON_SHAPES, *TESTS_ONLY))
     checked(cfg)
 
 
-@pytest.mark.parametrize("name", sorted({*SWEEPS} - {*ON_SHAPES, "noise"}))
+@pytest.mark.parametrize("name", sorted({*SWEEPS} - {*ON_SHAPES, *TESTS_ONLY}))
 def test_quick_overlay_runs_any_sweep_on_shapes(name):
     full = composed(name)
     quick = composed(name, ["+quick=shapes", "dataset=shapes"])
