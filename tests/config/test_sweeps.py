@@ -17,8 +17,9 @@ from mops_lightning.records.run_record import dotted
 ROOT = Path(__file__).parents[2] / "sweeps"
 SWEEPS = sorted(path.stem for path in ROOT.glob("*.yaml"))
 ON_SHAPES = ("ablation",)
-TESTS_ONLY = ("noise", "corruptions")
 """Sweeps that use the procedural shapes without the overlay."""
+TESTS_ONLY = ("noise", "corruptions")
+"""Sweeps that test a trained run."""
 
 
 def composed(name, overrides=()):
