@@ -23,7 +23,7 @@ LINES = int(os.environ.get("MOPS_FUZZ", "2"))
 
 GROUPS = {
     "sampler": (
-        *("mops", "fmops", "snet", "snet_progressive", "samplenet", "samplenet_progressive"),
+        *("mops", "fmops", "snet", "samplenet", "samplenet_progressive"),
         *("fps", "random", "voxel", "poisson", "serial"),
     ),
     "task": ("classification", "registration", "reconstruction"),

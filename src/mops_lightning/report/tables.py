@@ -31,7 +31,7 @@ READOUTS = (INDEX_READOUT, *GENERATED_READOUTS)
 
 ORDER = (
     *("random", "serial", "voxel", "fps", "poisson", "critical", "submodular", "gumbel", "snet"),
-    *("snet_progressive", "samplenet", "samplenet_progressive", "mops", "fmops"),
+    *("samplenet", "samplenet_progressive", "mops", "fmops"),
 )
 """Samplers in the order of the paper's tables; others follow by name."""
 
