@@ -1,5 +1,7 @@
 """What a refused run leaves."""
 
+import re
+
 import pytest
 from omegaconf import OmegaConf
 
@@ -40,19 +42,56 @@ def test_second_run_in_folder_writes_nothing(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        (["sampler=fps", "recipe.distillation=5"], "sampler=fps, which is not trained"),
-        (["learn=task", "recipe.ema_span=0.1"], "learn=task. Leave it out"),
+        (["sampler=fps", "recipe.distillation=5"], "with sampler=fps, which is not trained"),
+        (["sampler=submodular", "optimizer.lr=0.1"], "with sampler=submodular, which is not"),
+        (["sampler=voxel", "baselines.fps=null"], "with sampler=voxel, which is not trained"),
+        (["learn=nothing", "sampler=fps", "recipe.ema_span=0.1"], "with learn=nothing"),
+        (["learn=task", "recipe.ema_span=0.1"], "with learn=task"),
+        (["learn=task", "sampler.alpha=3"], "with learn=task"),
+        (["learn=task", "sizes=[8,16]"], "with learn=task"),
+        (["learn=task", "pretrain.lr=0.1"], "with learn=task"),
+        (["learn=joint", "recipe.distillation=1"], "without learn=sampler"),
+        (["learn=joint", "sampler=fps", "recipe.ema_span=0.1"], "with sampler=fps, which"),
+        (["task_lr_scale=0.1"], "with learn=sampler"),
+        (["weights=null", "pretrain.lr=0.1"], "with weights=null"),
+        (["sampler.anchor_width=1"], "without sampler.anchors"),
+        (["sampler=fmops", "recipe=paper", "sampler.num_sizes=8"], "without sampler.size_sampling"),
+        (["recipe=paper", "recipe.all_points_from=0.5"], "without recipe.train_points"),
+        (["augment.sampler.jitter_clip=0.1"], "without augment.sampler.jitter"),
+        (["dataset=clouds", "dataset.root=.", "dataset.gap=2"], "without dataset.test_frames"),
     ],
 )
-def test_recipe_without_effect_is_refused(settings, said, tmp_path):
-    err = refused([*TINY, *settings], tmp_path)
-    assert f"mops_lightning: {settings[1]}: has no effect with {said}" in err
+def test_setting_without_effect_is_refused(settings, said):
+    with pytest.raises(UserError, match=re.escape(f"{settings[-1]}: has no effect {said}")):
+        check_effect(compose(settings), settings)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        [
+            "sampler=fps",
+            "recipe=paper",
+            "recipe.task_points=[8,64]",
+            "epochs.joint=3",
+            "pictures=0",
+        ],
+        ["sampler=fps", "trainer.max_epochs=1", "pretrain.lr=0.1", "augment.sampler.jitter=0.1"],
+        ["sampler=fps", "learn=joint", "optimizer.lr=0.1", "task_lr_scale=0.1"],
+        ["sampler=gumbel", "recipe.ema_span=0.1", "optimizer.lr=0.1", "baselines.fps=null"],
+        ["sampler=snet", "learn=task", "recipe=fast", "recipe.task_points=64", "m=8"],
+        ["sampler.anchors=fps", "sampler.anchor_width=1"],
+        ["sampler=fmops", "sampler.num_sizes=8", "hydra.run.dir=x", "sizes=[8]"],
+    ],
+)
+def test_setting_with_effect_is_accepted(settings):
+    check_effect(compose(settings), settings)
+
+
+def test_refused_setting_without_effect_leaves_nothing(tmp_path):
+    err = refused([*TINY, "sampler=fps", "recipe.distillation=5"], tmp_path)
+    assert err.startswith("mops_lightning: recipe.distillation=5: has no effect with sampler=fps")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_recipe_of_the_task_net_has_an_effect_without_a_trained_sampler():
-    cfg = compose(["sampler=fps"])
-    check_effect(cfg, ["sampler=fps", "recipe=paper", "recipe.task_points=[8,64]"])
 
 
 IMPOSSIBLE = {
@@ -82,6 +121,11 @@ def test_check_paths_impossible_path_is_one_line(setting, tmp_path, monkeypatch)
 def test_run_with_an_impossible_path_leaves_nothing(value, tmp_path):
     for setting in ("out", "cache", "weights", "ckpt_path", "evaluate"):
         assert ".." not in refused([*TINY, f"{setting}={value}"], tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_run_folder_of_no_user_is_not_made(tmp_path):
+    assert "no user has this name" in refused([*TINY, "hydra.run.dir=~nosuchuser"], tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from mops_lightning.config import distributed, overrides, settings
+from mops_lightning.config.build import accepted, build
 from mops_lightning.config.compose import explain
 from mops_lightning.errors import USER_ERROR, UserError, end, end_in_one_line, line_about, one_line
 from mops_lightning.zoo import names
@@ -28,6 +29,20 @@ MISSING = {
     "weights": "no file {}. Give a weights file, a run, a model, or weights=auto.",
 }
 """Errors of inputs that nothing else checks before a run begins."""
+NEEDS = {
+    "sampler.anchor_width": "sampler.anchors",
+    "sampler.num_sizes": "sampler.size_sampling=nested",
+    "dataset.gap": "dataset.test_frames",
+    "recipe.all_points_from": "recipe.train_points",
+    "recipe.distillation": "learn=sampler",
+    "recipe.feature_distillation": "learn=sampler",
+    "augment.task.jitter_clip": "augment.task.jitter",
+    "augment.sampler.jitter_clip": "augment.sampler.jitter",
+}
+"""Settings without effect unless another one is set, or has the value behind ``=``."""
+OF_TRAINED = ("recipe.", "optimizer.", "baselines.")
+"""Settings of the training of a sampler, and of what a trained one is compared with."""
+UNTRAINED = "which is not trained"
 LIGHTNING = ("trainer.", "logger.", "callbacks.")
 """Settings that are arguments of Lightning's classes."""
 
@@ -66,7 +81,9 @@ class RunStart(Callback):
 
 
 def check_effect(cfg: DictConfig, given: list[str]) -> None:
-    """Refuse a single run's settings of a recipe that nothing follows; a sweep's cells may differ.
+    """Refuse a single run's settings that nothing follows; a sweep's cells may differ.
+
+    Settings of a stage that is not run, such as ``epochs.joint``, are allowed.
 
     Args:
         cfg: the run's settings.
@@ -75,20 +92,38 @@ def check_effect(cfg: DictConfig, given: list[str]) -> None:
     Raises:
         UserError: there is one.
     """
-    of_recipe = [one for one in given if overrides.path(one).startswith("recipe.")]
-    if not of_recipe:
-        return
+    for argument in given:
+        if reason := _why_without_effect(cfg, overrides.path(argument)):
+            raise UserError(f"{argument}: has no effect {reason}. Leave it out.")
+
+
+def _why_without_effect(cfg: DictConfig, path: str) -> str:
+    """Return why nothing follows a setting; empty if something may."""
+    setting = settings.of(path)
+    if path in settings.declared() and setting.group:
+        return ""  # a choice may change settings of other groups
+    if not setting.counts(cfg.learn):
+        return f"with learn={cfg.learn}"
+    name, _, value = NEEDS.get(path, "learn").partition("=")
+    needed = OmegaConf.select(cfg, name)
+    if not needed or (value and needed != value):
+        return f"without {NEEDS[path]}"
+    if path.startswith("pretrain.") and cfg.weights != "auto":
+        return f"with weights={cfg.weights or 'null'}"
+    trains_task = cfg.learn == "task" or (cfg.learn == "joint" and path.startswith("optimizer."))
+    counts = trains_task or path == "recipe.task_points" or not path.startswith(OF_TRAINED)
+    return "" if counts or _is_trained(cfg) else f"with sampler={cfg.names.sampler}, {UNTRAINED}"
+
+
+def _is_trained(cfg: DictConfig) -> bool:
+    """Return whether the sampler has weights; one that is given the task net has its losses."""
     from hydra.utils import get_object
 
     from mops_lightning.samplers.base import Sampler  # imports torch
 
-    learn, where = cfg.learn, f"learn={cfg.learn}"
-    cls = get_object(cfg.sampler._target_)
-    if learn == "sampler" and getattr(cls, "losses", None) is Sampler.losses:
-        learn, where = "nothing", f"sampler={cfg.names.sampler}, which is not trained"
-    for argument in of_recipe:
-        if not settings.of(overrides.path(argument)).counts(learn):
-            raise UserError(f"{argument}: has no effect with {where}. Leave it out.")
+    if accepted(cfg.sampler, {"net": None}):
+        return get_object(cfg.sampler._target_).losses is not Sampler.losses
+    return bool(getattr(build(cfg.sampler, "sampler"), "learned", True))
 
 
 def line_about_run(error: Exception, given: list[str]) -> str | None:

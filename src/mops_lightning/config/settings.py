@@ -152,6 +152,7 @@ class RunSettings:
             "auto or a list of whole numbers of at least 1",
             lambda x: x == "auto" or (type(x) is list and x != [] and all(map(whole(1).fits, x))),
         ),
+        learn=WITH_SAMPLER,
         compare=False,
     )
     # What a run learned, its weights, data and task net are compared by the record's notes.
