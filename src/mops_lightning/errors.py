@@ -1,5 +1,6 @@
 """The errors that users see, and how a command ends: one line on stderr and an exit status."""
 
+import argparse
 import errno
 import math
 import os
@@ -22,6 +23,25 @@ CLOSED_PIPE = 141
 
 class UserError(ValueError):
     """A mistake in settings, files or arguments; the command line prints it without a traceback."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Parser of a subcommand's arguments.
+
+    Its errors show no control characters: a shell puts names of files in the place of ``*``.
+
+    Args:
+        prog: what the user typed to start the subcommand.
+        description: keeps its lines.
+    """
+
+    def __init__(self, prog: str, description: str) -> None:
+        kept = argparse.RawDescriptionHelpFormatter
+        super().__init__(prog=prog, description=description, formatter_class=kept)
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and a message, and exit."""
+        super().error(printable(message))
 
 
 class Interrupted(Exception):

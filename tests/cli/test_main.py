@@ -9,7 +9,7 @@ import pytest
 
 from mops_lightning.cli.main import COMMANDS
 from mops_lightning.records import run_record
-from tests.support.command_line import TINY, call, refused, runs, start
+from tests.support.command_line import TINY, call, call_anew, refused, runs, start
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -34,10 +34,29 @@ def test_subcommand_error_names_the_subcommand(arguments, tmp_path):
     assert err.startswith(f"mops_lightning {arguments[0]}: nowhere")
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_subcommand_error_shows_no_control_characters(name, tmp_path):
+    status, _, err = call([name, *["\x1b[31m.ply"] * 5, "--nosuch"], tmp_path)
+    assert status == 2
+    assert "\x1b" not in err
+
+
 def test_version_is_that_of_the_package(tmp_path):
     status, out, err = call(["--version"], tmp_path)
     assert (status, err) == (0, "")
     assert out == f"mops_lightning {version('mops-lightning')}\n"
+
+
+@pytest.mark.parametrize(
+    ("variables", "spins"),
+    [({}, "1000"), ({"GOMP_SPINCOUNT": "5"}, "5"), ({"OMP_WAIT_POLICY": "PASSIVE"}, "0")],
+)
+def test_waiting_threads_soon_sleep(variables, spins, tmp_path):
+    arguments = ["sampler=fps", "m=0"]  # imports torch, then ends
+    _, _, err = call_anew(arguments, tmp_path, OMP_DISPLAY_ENV="VERBOSE", **variables)
+    if "GOMP_SPINCOUNT" not in err:
+        pytest.skip("torch uses another OpenMP library")
+    assert f"GOMP_SPINCOUNT = '{spins}'" in err
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,8 @@
 """The subcommand ``export``."""
 
-import argparse
 from pathlib import Path
 
-from mops_lightning.errors import UserError, one_line_endings
+from mops_lightning.errors import Parser, UserError, one_line_endings
 
 DESCRIPTION = """Write a trained sampler as ONNX (.onnx) or as a PyTorch program (.pt2).
 
@@ -19,9 +18,7 @@ def main(arguments: list[str], prog: str) -> None:
         arguments: of the command line.
         prog: what the user typed to start this command.
     """
-    parser = argparse.ArgumentParser(
-        prog=prog, description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(prog, DESCRIPTION)
     add = parser.add_argument
     add("sampler", metavar="SAMPLER", help="a model's name, a run or a weights file")
     add("target", metavar="OUT", type=Path, help="a file that ends in .onnx or .pt2")

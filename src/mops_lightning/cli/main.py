@@ -3,6 +3,7 @@
 Nothing heavy is imported before the command is known, so that ``--help`` is quick.
 """
 
+import os
 import re
 import sys
 from importlib import import_module
@@ -24,9 +25,18 @@ COMMANDS = {
 WORD = re.compile(r"[^-+~=][^=]*")
 """An argument that is neither an option nor an override."""
 
+SPINS = "1000"
+"""How often a thread of libgomp looks for work before it sleeps, by default 300,000 times.
+
+On a machine that others use, too, threads that wait without sleeping hold the cores that the
+threads they wait for need: beside two busy processes, two threads took four times as long as one.
+"""
+
 
 def main() -> None:
     """Run the subcommand that is the first argument; without one, train."""
+    if "OMP_WAIT_POLICY" not in os.environ:  # libgomp reads both when torch is imported
+        os.environ.setdefault("GOMP_SPINCOUNT", SPINS)
     arguments = sys.argv[1:]
     first = arguments[0] if arguments else ""
     with quiet_on_closed_pipe():

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from mops_lightning.errors import UserError, one_line_endings, printable
+from mops_lightning.errors import Parser, UserError, one_line_endings, printable
 from mops_lightning.zoo import model_file, names
 
 DESCRIPTION = f"""List trained models, show the card of one, or publish a run as one.
@@ -26,9 +26,7 @@ def main(arguments: list[str], prog: str) -> None:
         arguments: of the command line.
         prog: what the user typed to start this command.
     """
-    parser = argparse.ArgumentParser(
-        prog=prog, description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(prog, DESCRIPTION)
     add = parser.add_argument
     add("words", nargs="*", metavar="NAME | add RUN NAME", help="see above")
     add("--json", action="store_true", help="print the card of NAME as JSON, with the record")
@@ -43,7 +41,7 @@ def main(arguments: list[str], prog: str) -> None:
         print(printable("\n".join(_run(chosen))))
 
 
-def _refuse_unused(chosen: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+def _refuse_unused(chosen: argparse.Namespace, parser: Parser) -> None:
     """Refuse options that the subcommand does not use.
 
     Raises:

@@ -9,7 +9,7 @@ from dataclasses import fields
 from os.path import realpath
 from pathlib import Path
 
-from mops_lightning.errors import UserError, did_you_mean, one_line_endings, printable
+from mops_lightning.errors import Parser, UserError, did_you_mean, one_line_endings, printable
 from mops_lightning.files.engine import Engine, LocalEngine
 from mops_lightning.files.options import Options
 from mops_lightning.filesystem import remove_temporary
@@ -45,9 +45,7 @@ def parsed(
     arguments: list[str], prog: str, description: str, declare: Callable[[Add], None]
 ) -> argparse.Namespace:
     """Parse the arguments of a subcommand, which ``declare`` adds to the parser."""
-    parser = argparse.ArgumentParser(
-        prog=prog, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser(prog, description)
     declare(parser.add_argument)
     return parser.parse_args(arguments)
 

@@ -1,9 +1,8 @@
 """The command ``mops-lightning report``."""
 
-import argparse
 from pathlib import Path
 
-from mops_lightning.errors import one_line_endings
+from mops_lightning.errors import Parser, one_line_endings
 from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.records import run_record
 from mops_lightning.report.build import Report, build_report
@@ -41,13 +40,9 @@ def main(arguments: list[str] | None = None, prog: str = "mops-lightning report"
         print(f"files in {chosen.folder}/: {', '.join(written)}")
 
 
-def make_parser(prog: str) -> argparse.ArgumentParser:
+def make_parser(prog: str) -> Parser:
     """Return the parser of this command's arguments."""
-    parser = argparse.ArgumentParser(
-        prog=prog,
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser(prog, DESCRIPTION)
     parser.add_argument("folder", type=Path, help="folder of a run, of a sweep, or of several")
     parser.add_argument(
         "--metric", nargs="+", default=[], help="names of metrics; default: the task's score"
