@@ -43,9 +43,10 @@ def test_sampler_as_task_net_is_refused(run, tmp_path):
 
 
 def test_half_precision_is_for_wide_layers(run, tmp_path):
-    path = publish.add(run, "fmops.half", tmp_path, half=True)
+    path = publish.add(run, "fmops.half", tmp_path, half=True, notes="Mine.")
     content = weights.read(path)
-    assert model_file.read_card(path)["precision"] == "float16"
+    card = model_file.read_card(path)
+    assert (card["precision"], card["notes"]) == ("float16", f"Mine. {publish.ROUNDED}")
     assert content["state"]["rho_local.weight"].dtype == torch.float16
     assert content["state"]["queries.weight"].dtype == torch.float32  # 2,048 entries
     assert load(path).rho_local.weight.dtype == torch.float32  # type: ignore[union-attr]

@@ -31,7 +31,7 @@ from mops_lightning.training.scores import Scores
 from mops_lightning.types import Batch, SampleOutput
 
 TEST = "test/"
-"""Prefix of the test metrics, which the run logs together after the test, not as curves."""
+"""Prefix of the test metrics."""
 
 
 class Experiment(L.LightningModule):
@@ -55,6 +55,9 @@ class Experiment(L.LightningModule):
 
     Raises:
         UserError: ``learn`` is unknown, or task and sampler do not allow it; see ``Refinement``.
+
+    Attributes:
+        test_logger: False keeps test metrics from the loggers and from ``trainer.test``'s result.
     """
 
     def __init__(
@@ -87,6 +90,7 @@ class Experiment(L.LightningModule):
         self.recipe = recipe or Recipe()
         self.distillation = Distillation(task, self.recipe) if learn == "sampler" else None
         self.total_steps = 1
+        self.test_logger: bool | None = None  # True warns where there is no logger
         for module in self._frozen():
             module.requires_grad_(False)
         self.m: int = m or (self.sampler.m if self.sampler is not None else 0)
@@ -292,7 +296,7 @@ class Experiment(L.LightningModule):
             batch: the clouds.
             sets: points by readout, by prefix of a size.
         """
-        clouds, logger = len(batch.points), _logger_of(stage)
+        clouds, logger = len(batch.points), self.test_logger if stage == TEST else None
         samples = {
             (prefix, readout): points
             for prefix, by_readout in sets.items()
@@ -318,14 +322,10 @@ class Experiment(L.LightningModule):
         """Update and log the metrics of the sampled sets themselves."""
         if self.sampler is None:
             return
+        logger = self.test_logger if stage == TEST else None
         updated = self.scores.update_sets(points, outputs, self.sampler.nested, prefixes)
         for name, metric in updated.items():
-            self.log(f"{stage}{name}", metric, batch_size=len(points), logger=_logger_of(stage))
-
-
-def _logger_of(stage: str) -> bool | None:
-    """Return whether metrics go to the logger; None: if there is one."""
-    return False if stage == TEST else None
+            self.log(f"{stage}{name}", metric, batch_size=len(points), logger=logger)
 
 
 def _check_learn(learn: Learn, task: Task, sampler: Sampler | None) -> None:

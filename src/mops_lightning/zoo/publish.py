@@ -12,6 +12,8 @@ from mops_lightning.zoo import model_file, names, weights
 
 WIDE = 4096
 """Weight matrices with this number of entries may be stored in 16 bits."""
+ROUNDED = "The test figures are those before wide layers were rounded to 16 bits."
+"""Note of a model with rounded weights, since its figures are those of the run."""
 
 
 def add(
@@ -32,7 +34,8 @@ def add(
         name: the model's name, such as ``fmops.chairs-m64``.
         folder: where ``NAME.safetensors`` is written.
         task_net: the model of a sampler's task net; None looks for the one that was used.
-        half: store weight matrices with at least ``WIDE`` entries in float16.
+        half: store weight matrices with at least ``WIDE`` entries in float16; the card notes that
+            its figures are those before.
         licence: of the model.
         notes: what a user must know besides.
         overwrite: replace a model of this name.
@@ -57,8 +60,9 @@ def add(
     content = weights.read(weights.of_run(run))
     state = content["state"]
     wide = {name for name, value in state.items() if value.ndim == 2 and value.numel() >= WIDE}
-    if half:
+    if half and wide:
         state |= {name: state[name].half() for name in wide}
+        notes = f"{notes} {ROUNDED}".lstrip()
     files = {"weights": name}
     if record.config["learn"] == "sampler":
         used = _task_net(task_net, record)
