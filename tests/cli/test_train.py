@@ -173,7 +173,8 @@ def test_folder_of_meshes_trains(tmp_path):
     [
         ("m=8 --cfg job sampler=fps", "--cfg job m=8 sampler=fps"),
         ("m=8,16 -m --config-dir=x ~x +y=2", "-m --config-dir=x m=8,16 ~x +y=2"),
-        ("m=8 --info", "--info m=8"),
+        ("m=8 --info", "--info=all m=8"),
+        ("m=8 --info defaults", "--info defaults m=8"),
         ("-m --config-dir sweeps m=8", "-m --config-dir sweeps m=8"),
         ("m=8 m=8 -p trainer m=8", "-p trainer m=8 m=8 m=8"),
         ("", ""),

@@ -2,6 +2,7 @@ import pytest
 
 from mops_lightning.config import overrides
 from mops_lightning.config.compose import compose
+from mops_lightning.errors import UserError
 
 
 @pytest.mark.parametrize(
@@ -39,3 +40,13 @@ def test_own_class_chooses_the_group_of_own_and_takes_any_setting():
     ]
     kept = ["sampler=mops", "sampler._target_=my.MOPSNet", "~sampler.overlap"]
     assert overrides.with_own_classes(kept) == [kept[0], f"++{kept[1]}", kept[2]]
+
+
+def test_home_folder_is_known_by_its_tilde(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    for key in overrides.FOLDERS:
+        assert overrides.with_home(f"{key}=~/a=b") == f"{key}='/home/me/a=b'"
+        with pytest.raises(UserError, match=f"^{key}=~nosuchuser: no user has this name"):
+            overrides.with_home(f"{key}=~nosuchuser")
+    for other in ("out=a/~", "out=choice(~/a,~/b)", "~out", "weights=~/x", "--cfg"):
+        assert overrides.with_home(other) == other

@@ -157,6 +157,7 @@ def test_rival_samplers_have_published_settings():
         (["batch_size=1"], "batch_size must be a whole number of at least 2"),
         (["trainer=ddp", "trainer.strategy=fsdp"], "trainer.strategy: several devices work with"),
         (["trainer=ddp", "+trainer.sync_batchnorm=true"], "trainer.sync_batchnorm must be false"),
+        (["+sampler.alpha.x=3"], r"sampler\.alpha must be a number, got {'x': 3}"),
         (["sampler.alpha=abc"], r"sampler\.alpha must be a number, got 'abc'"),
         (["~pretrain"], "pretrain cannot be removed"),
         (["dataset.n_points=abc"], r"dataset\.n_points must be a whole number"),
@@ -170,6 +171,7 @@ def test_rival_samplers_have_published_settings():
         (["dataset=meshes"], "dataset.root must be set"),
         (["sampler=own"], "sampler._target_ must be set: give sampler._target_=MODULE.CLASS"),
         (["sampler._target_=mops_lightning.samplers.mops.MOPSNett"], "cannot import"),
+        (["sampler._target_=mops_lightning"], "'mops_lightning' is neither a class nor a function"),
     ],
 )
 def test_check_mistake_names_setting(overrides, said):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mops_lightning.config.hydra_conf import conf_dir
-from mops_lightning.config.overrides import key, readable, with_own_classes
+from mops_lightning.config.overrides import key, readable, with_home, with_own_classes
 from mops_lightning.errors import (
     INTERRUPTED,
     USER_ERROR,
@@ -59,7 +59,8 @@ def _run() -> None:
             from mops_lightning.training.evaluation import command_line
 
             sys.argv[1:] = command_line(sys.argv[1:])
-        sys.argv[1:] = with_own_classes([readable(argument) for argument in sys.argv[1:]])
+        readables = [with_home(readable(argument)) for argument in sys.argv[1:]]
+        sys.argv[1:] = with_own_classes(readables)
         app = hydra.main(config_path=str(conf_dir()), config_name="config", version_base="1.3")
         app(_job)()
     except Exception as error:
@@ -101,6 +102,8 @@ def flags_first(arguments: list[str]) -> list[str]:
     flags = list(arguments)
     for setting in read.overrides:
         flags.remove(setting)
+    if flags[-1:] in (["-i"], ["--info"]):  # a setting behind it would be taken for its value
+        flags[-1] = "--info=all"
     return [*flags, *read.overrides]
 
 

@@ -142,7 +142,7 @@ def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
     """Return the parameters of a target, with those that a class passes on to its bases.
 
     Raises:
-        UserError: the target cannot be imported.
+        UserError: the target cannot be imported, or cannot be called.
     """
     from hydra.utils import get_object
 
@@ -152,6 +152,8 @@ def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
         # The last line says what failed; Hydra puts others before and after it.
         reason = str(error.__cause__ or error).strip().splitlines()[-1]
         raise UserError(f"{where}._target_: cannot import {target!r}: {reason}") from None
+    if not callable(found):
+        raise UserError(f"{where}._target_: {target!r} is neither a class nor a function.")
     if not inspect.isclass(found):
         return _own_signature(found)
     parameters: dict[str, inspect.Parameter] = {}

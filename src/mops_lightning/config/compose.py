@@ -1,6 +1,8 @@
 """Composing a configuration; a mistake becomes one line with the setting and the nearest known."""
 
+import io
 import re
+import traceback
 from collections.abc import Sequence
 from typing import Any
 
@@ -57,7 +59,10 @@ def check_overrides(arguments: Sequence[str]) -> None:
         name = key_of(argument)
         if override is not None and not name:
             raise UserError(f"{argument!r} has no key. Settings are KEY=VALUE.")
-        if override is None or override.is_delete() or name not in groups:
+        if name.partition(".")[0] == "names":
+            raise UserError(f"{argument}: names follow from the chosen groups. Leave it out.")
+        group = name.partition("@")[0]
+        if override is None or override.is_delete() or group not in groups:
             continue
         value: Any = override.value()
         values = [value]
@@ -84,7 +89,7 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
     from hydra.errors import MissingConfigException
 
     if isinstance(error, UnicodeDecodeError):
-        return f"a file is not in UTF-8: {error}."
+        return f"{_file_being_read(error)} is not in UTF-8: {error}."
     if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
         mark = error.problem_mark
         return f"{mark.name}, line {mark.line + 1}: not valid YAML: {error.problem}."
@@ -107,11 +112,22 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
         if unknown := re.search(r"In '(.+)': ConfigKeyError .*\nKey '(\w+)' not in 'Run", text):
             hint = did_you_mean(unknown.group(2), settings.declared())
             return f"{unknown.group(1)}.yaml: {unknown.group(2)}: no such setting.{hint}"
+        if unread := re.match(r"Lexer\w+: (.*)", text):
+            return f"{unread.group(1).strip()!r} is not a setting. Settings are KEY=VALUE."
         if removed := re.search(r"Key '(\w+)' not in 'RunSettings'", text):
             return f"{removed.group(1)} cannot be removed."
     # Hydra's and OmegaConf's own messages, without their notes for developers.
     lines = [line for text in texts for line in text.splitlines() if line.strip()]
     return " ".join(dict.fromkeys(line.strip() for line in lines if line[0] != " "))
+
+
+def _file_being_read(error: BaseException) -> str:
+    """Return the name of the file that was open where an error was raised."""
+    for frame, _ in reversed(list(traceback.walk_tb(error.__traceback__))):
+        for value in frame.f_locals.values():
+            if isinstance(value, io.TextIOBase):
+                return str(getattr(value, "name", "a file"))
+    return "a file"
 
 
 def _groups() -> list[str]:

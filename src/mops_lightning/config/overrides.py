@@ -1,10 +1,15 @@
 """Reading overrides such as ``++task/net@task.net=pcrnet`` with Hydra's own parser."""
 
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from mops_lightning.errors import UserError
 
 OWN = {"sampler": "sampler", "task": "task", "task.net": "task/net", "dataset": "dataset"}
 """Settings that describe an object of a class that may be the user's, and their groups."""
+FOLDERS = ("out", "hydra.run.dir", "hydra.sweep.dir")
+"""Folders that Hydra makes, which takes ``~`` for the name of a folder."""
 
 if TYPE_CHECKING:
     from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -57,6 +62,25 @@ def with_own_classes(arguments: list[str]) -> list[str]:
         f"++{argument.lstrip('+')}" if name.startswith(below) and argument[0] != "~" else argument
         for argument, name in zip(arguments, keys, strict=True)
     ] + chosen
+
+
+def with_home(argument: str) -> str:
+    """Return an override with the ``~`` of a run's folder replaced by the home folder.
+
+    Raises:
+        UserError: there is no such user.
+    """
+    override = parse_override(argument)
+    swept = override is None or override.is_sweep_override()
+    value = None if override is None or swept else override.value()
+    if key(argument) not in FOLDERS or not str(value).startswith("~"):
+        return argument
+    try:
+        return f"{argument.partition('=')[0]}={quote(str(Path(str(value)).expanduser()))}"
+    except RuntimeError:
+        raise UserError(
+            f"{argument}: no user has this name. For a folder of this name, write ./{value}"
+        ) from None
 
 
 def quote(text: str) -> str:

@@ -157,7 +157,8 @@ def _check_node(node: Any, where: str) -> None:
                 )
             if node[key] == MISSING:
                 raise UserError(f"{where}.{name} must be set: try {where}.{name}=VALUE.")
-            if name in parameters and not isinstance(node[key], dict):
+            built = isinstance(node[key], dict) and "_target_" in node[key]
+            if name in parameters and not built:
                 wanted = misfit(node[key], parameters[name].annotation)
                 if wanted:
                     raise UserError(f"{where}.{name} must be {wanted}, got {node[key]!r}.")
