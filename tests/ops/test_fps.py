@@ -22,6 +22,26 @@ def test_fps_equals_double_loop(n, m, dtype, rng):
         assert chosen == plain_farthest(cloud, [first], m)
 
 
+@pytest.mark.usefixtures("farthest_form")
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (20, 20), (75, 30), (3000, 9)])
+def test_fps_multiplies_distances_by_weights(n, m, rng):
+    points = torch.randn(3, n, 3, dtype=torch.float64, generator=rng)
+    weight = torch.rand(3, n, generator=rng).square() * 100
+    weight[:, : n // 4] = 0  # these are the last
+    indices = farthest_point_sample(points, m, n - 1, weight)
+    for cloud, part, chosen in zip(points, weight, indices.tolist(), strict=True):
+        expected = plain_farthest(cloud, [n - 1], min(m, n - n // 4), part)
+        assert chosen[: len(expected)] == expected
+        assert len(set(chosen)) == m
+
+
+def test_fps_equal_weights_change_nothing(rng):
+    points = torch.randint(0, 9, (2, 5000, 3), generator=rng).float()  # many ties and copies
+    weight = torch.full((2, 5000), 0.3)
+    unweighted = farthest_point_sample(points, 400)
+    assert torch.equal(farthest_point_sample(points, 400, weight=weight), unweighted)
+
+
 def test_fps_start_is_given_or_zero(rng):
     points = torch.randn(4, 30, 3, generator=rng)
     assert farthest_point_sample(points, 3, start=7)[:, 0].tolist() == [7] * 4

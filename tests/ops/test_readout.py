@@ -45,6 +45,14 @@ def test_complete_equals_sequential_form(dtype, rng):
     assert torch.equal(completed[1], indices[1])
 
 
+def test_complete_fills_up_by_weight(rng):
+    points = torch.randn(4, 50, 3, dtype=torch.float64, generator=rng)
+    indices, weight = torch.randint(8, (4, 20), generator=rng), torch.rand(4, 50, generator=rng)
+    for b, completed in enumerate(complete(indices, points, weight).tolist()):
+        chosen = list(dict.fromkeys(indices[b].tolist()))
+        assert completed == plain_farthest(points[b], chosen, 20, weight[b])
+
+
 def test_complete_of_coincident_points_is_distinct():
     indices = torch.tensor([[4, 4, 2, 4, 2, 0, 0, 0]])
     assert sorted(complete(indices, torch.ones(1, 8, 3))[0].tolist()) == list(range(8))

@@ -23,7 +23,7 @@ def published(cloud, m, reach):
     return kept
 
 
-def in_steps(points, m):
+def in_steps(points, m, weight=None):
     """Sample elimination with whole weights and the distances to all points in a step."""
     points = points.double()
     number = points.shape[1]
@@ -35,10 +35,11 @@ def in_steps(points, m):
         return ((1 - squared.sqrt() / bound).clamp_min(0).square().square().square() * scale).long()
 
     kept = []
-    for cloud, bound in zip(points, reach, strict=True):
+    shares = torch.ones(points.shape[:2]) if weight is None else weight.amin() / weight
+    for cloud, bound, share in zip(points, reach, shares, strict=True):
         crowding = weights(cloud, cloud[:, None], bound).sum(1)
         for _ in range(number - m):
-            worst = crowding.argmax()
+            worst = (crowding if weight is None else (crowding * share).long()).argmax()
             crowding -= weights(cloud, cloud[worst], bound)
             crowding[worst] = -1
         kept.append((crowding > 0).nonzero()[:, 0])
@@ -65,6 +66,17 @@ def test_eliminate_to_one_point_has_reach_of_bounding_box(rng):
 def test_eliminate_equals_plain_form(n, m, kind, rng):
     points = cloud_of(kind, (2, n), torch.float32, rng)
     assert torch.equal(eliminate(points, m), in_steps(points, m))
+
+
+@pytest.mark.parametrize("kind", ["sphere", "copies", "outlier"])
+@pytest.mark.parametrize(("n", "m"), [(40, 39), (300, 1), (300, 20), (300, 150)])
+def test_eliminate_divides_crowding_by_weight(n, m, kind, rng):
+    points = cloud_of(kind, (1, n), torch.float32, rng)
+    weight = torch.rand(1, n, generator=rng).double() + 0.01
+    kept = eliminate(points, m, weight)
+    assert torch.equal(kept, in_steps(points, m, weight))
+    if kind == "sphere" and m == 150:
+        assert weight.gather(1, kept).mean() > 1.2 * weight.mean()
 
 
 def test_eliminate_non_contiguous_equals_plain_form(rng):

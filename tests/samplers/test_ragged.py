@@ -5,9 +5,14 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
+from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.weights import curvature
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.poisson import PoissonSampler
+from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.snet import SNet
+from mops_lightning.samplers.voxel import VoxelSampler
 
 
 @pytest.fixture
@@ -146,3 +151,61 @@ def test_mistakes_are_one_line(net, mistake):
     with pytest.raises(UserError, match=words) as refused:
         net.downsample(*arguments, **named)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("sampler", [FPSSampler(8), PoissonSampler(8), RandomSampler(8), "net"])
+def test_weights_of_single_batched_and_ragged_clouds_agree(sampler, net, rng):
+    sampler = net if sampler == "net" else sampler
+    points = 9 * torch.rand(3, 40, 3, generator=rng)
+    weight = torch.rand(3, 40, generator=rng)
+    weight[1, ::2] = 0  # left out
+    chosen, rows = sampler.downsample(points, weight=weight)
+    assert torch.equal(chosen, gather_points(points, rows))
+    assert (weight.gather(1, rows) > 0).all()
+    assert all(len(set(part)) == 8 for part in rows.tolist())
+    single = [
+        sampler.downsample(cloud, weight=part)[1]
+        for cloud, part in zip(points, weight, strict=True)
+    ]
+    assert torch.equal(torch.stack(single), rows)
+    batch = torch.arange(3).repeat_interleave(40)
+    flat = sampler.downsample(
+        points.flatten(0, 1).numpy(), batch=batch, weight=weight.flatten().numpy()
+    )
+    assert flat[1].tolist() == (rows + 40 * torch.arange(3)[:, None]).flatten().tolist()
+
+
+def test_weights_by_curvature_are_those_of_each_cloud(rng):
+    points = torch.rand(90, 3, generator=rng)
+    weight = curvature(points.numpy())
+    expected = FPSSampler(8).downsample(points, weight=weight)[1]
+    assert torch.equal(FPSSampler(8).downsample(points, weight="curvature")[1], expected)
+    both = FPSSampler(8).downsample(
+        points.repeat(2, 1), batch=torch.arange(180) // 90, weight="curvature"
+    )
+    assert torch.equal(both[1][:8], expected)
+
+
+@pytest.mark.parametrize(
+    ("weight", "said"),
+    [
+        (torch.ones(39), r"shape \(40,\)"),
+        ("density", "must be 'curvature' or numbers, got 'density'"),
+        (torch.arange(40) < 7, "7 points have a weight above 0, fewer than m=8"),
+    ],
+)
+def test_weights_that_cannot_be_used_are_rejected(weight, said):
+    with pytest.raises(UserError, match=said):
+        RandomSampler(8).downsample(torch.rand(40, 3), weight=weight)
+
+
+def test_weights_of_too_few_points_are_rejected():
+    with pytest.raises(UserError, match="m must be at most the number of points N=5, got m=8"):
+        RandomSampler(8).downsample(torch.rand(5, 3), weight=torch.ones(5))
+
+
+def test_weights_for_other_methods_are_rejected(net):
+    with pytest.raises(UserError, match="VoxelSampler takes no weights"):
+        VoxelSampler(8).downsample(torch.rand(40, 3), weight=torch.ones(40))
+    with pytest.raises(UserError, match="generated readout takes no weights"):
+        net.downsample(torch.rand(40, 3), readout="generated", weight=torch.ones(40))

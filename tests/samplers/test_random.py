@@ -49,3 +49,18 @@ def test_random_copies_are_chosen_independently(rng):
     # Neither copy of a point is drawn with probability (300·299)/(400·399).
     expected = 200 * (1 - 300 * 299 / (400 * 399))
     assert abs(different.mean() - expected) < 2.5
+
+
+def test_random_by_weight_equals_successive_draws():
+    """The probability of a pair is the product of two draws in proportion to the weights."""
+    points, weight = torch.rand(1, 4, 3), torch.tensor([[1.0, 2, 3, 6]])
+    pairs: Counter[tuple[int, ...]] = Counter()
+    for seed in range(3000):
+        rows = RandomSampler(2, seed).sample_weighted(points, 2, weight)
+        pairs[tuple(rows[0].tolist())] += 1
+    total, statistic = 12.0, 0.0
+    for i, j in permutations(range(4), 2):
+        a, b = float(weight[0, i]), float(weight[0, j])
+        expected = 3000 * a / total * b / (total - a)
+        statistic += (pairs[i, j] - expected) ** 2 / expected
+    assert chdtrc(11, statistic) > 1e-3

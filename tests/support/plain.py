@@ -22,12 +22,16 @@ def plain_nearest(queries, points):
     return torch.stack(distances).view(shape), torch.tensor(indices).view(shape)
 
 
-def plain_farthest(cloud, chosen, m):
+def plain_farthest(cloud, chosen, m, weight=None):
     cloud, chosen = cloud.tolist(), list(chosen)
+    weight = [1.0] * len(cloud) if weight is None else weight.tolist()
     while len(chosen) < m:
         best, place = -1.0, -1
         for i, p in enumerate(cloud):
-            if i not in chosen and (d := min(squared(p, cloud[j]) for j in chosen)) > best:
+            if i in chosen:
+                continue
+            d = min(squared(p, cloud[j]) for j in chosen) * weight[i] ** 2
+            if d > best:
                 best, place = d, i
         chosen.append(place)
     return chosen

@@ -102,6 +102,12 @@ def _downsample_arguments(add: Add) -> None:
         "back by mops_lightning.propagate",
     )
     add("--map-k", type=int, default=1, help="rows per point in --map, with weights 1/d^2")
+    add(
+        "--weight",
+        metavar="FIELD",
+        help="prefer points by this column of IN, such as opacity or intensity, or by 'curvature', "
+        "which is computed; with --method fps, random, poisson, or --readout completed",
+    )
     add("--seed", type=int, default=0, help="seed of random choices")
     add("--overwrite", action="store_true", help="replace existing files")
 

@@ -18,7 +18,9 @@ from mops_lightning.files.engine import Engine, LocalEngine
 from mops_lightning.files.options import Options
 from mops_lightning.files.propagate import write_map
 from mops_lightning.files.tiles import sample_by_tiles
+from mops_lightning.files.weights import weights_of
 from mops_lightning.ops.readout import select
+from mops_lightning.ops.weights import check_positive
 from mops_lightning.samplers.base import Sampler, stream_sample
 from mops_lightning.zoo.downsample import untrained
 from mops_lightning.zoo.load import load
@@ -37,6 +39,16 @@ def load_sampler(options: Options) -> Sampler:
     Raises:
         UserError: the weights are not a sampler's, or were trained for another number of points.
     """
+    sampler = _load(options)
+    if options.weight is not None:
+        try:
+            sampler.check_weighted(options.readout)
+        except UserError as error:
+            raise UserError(f"--{error}") from None
+    return sampler
+
+
+def _load(options: Options) -> Sampler:
     torch.manual_seed(options.seed)
     if options.method:
         assert options.m is not None
@@ -97,7 +109,8 @@ def _sample_whole(
     finite = table.finite()
     number = len(finite.points)
     check_size(source, number, m)
-    rows, points = sample_cloud(finite.points, sampler, m, options, source)
+    weight = weights_of(finite, options.weight, source) if options.weight else None
+    rows, points = sample_cloud(finite.points, sampler, m, options, source, weight)
     if rows is None:
         kept = Table(points, {}, table.header)
     else:
@@ -107,7 +120,12 @@ def _sample_whole(
 
 
 def sample_cloud(
-    points: NDArray[np.float64], sampler: Sampler, m: int, options: Options, source: Path
+    points: NDArray[np.float64],
+    sampler: Sampler,
+    m: int,
+    options: Options,
+    source: Path,
+    weight: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
     """Sample a cloud in the file's own unit.
 
@@ -117,6 +135,7 @@ def sample_cloud(
         m: number of points to keep.
         options: how.
         source: the file, for errors.
+        weight: ``(N,)`` of at least 0; None: all points are equal.
 
     Returns:
         The rows ``(m,)`` of the kept points, or None for generated points; the points ``(m, 3)``.
@@ -128,8 +147,14 @@ def sample_cloud(
     if options.tile is not None:
         rows = sample_by_tiles(points, options.tile, m, sampler)
         return rows, points[rows]
+    if weight is not None and not weight.all():  # points of weight 0 are left out
+        kept = np.flatnonzero(weight)
+        check_positive(len(kept), m, f"--weight {options.weight} of {source}")
+        places, sampled = sample_cloud(points[kept], sampler, m, options, source, weight[kept])
+        return None if places is None else kept[places], sampled
     sphere = UnitSphere.around(points)
-    chosen, generated = _select(sampler, sphere.normalise(points), m, options.readout)
+    weights = None if weight is None else torch.from_numpy(weight)
+    chosen, generated = _select(sampler, sphere.normalise(points), m, options.readout, weights)
     if chosen is None:
         return None, sphere.restore(generated)
     rows = chosen.numpy()
@@ -137,8 +162,13 @@ def sample_cloud(
 
 
 @torch.no_grad()
-def _select(sampler: Sampler, points: Tensor, m: int, readout: str) -> tuple[Tensor | None, Tensor]:
+def _select(
+    sampler: Sampler, points: Tensor, m: int, readout: str, weight: Tensor | None
+) -> tuple[Tensor | None, Tensor]:
     """Return the rows ``(m,)`` of the points to keep, or None, and the generated points."""
+    weights = None if weight is None else weight[None]
+    if weights is not None and not sampler.generates:
+        return sampler.sample_weighted(points[None], m, weights)[0], points
     if sampler.streams:
         generated = stream_sample(sampler, lambda: list(points.split(PART)), m)
     else:
@@ -146,5 +176,5 @@ def _select(sampler: Sampler, points: Tensor, m: int, readout: str) -> tuple[Ten
         generated = output.points[0]
         if not sampler.generates:
             return output.indices[0], generated
-    rows = select(points[None], generated[None], readout)[1]
+    rows = select(points[None], generated[None], readout, weights)[1]
     return None if rows is None else rows[0], generated

@@ -24,6 +24,7 @@ class Options:
         tile: most points of a tile; None: no tiles.
         map: file to write for ``mops_lightning.propagate``; None: no file.
         map_k: number of sampled points per point in this file.
+        weight: a column with a weight per point, or ``curvature``; None: all points are equal.
 
     Raises:
         UserError: a value is out of range, or options exclude each other.
@@ -40,6 +41,7 @@ class Options:
     tile: int | None = None
     map: Path | None = None
     map_k: int = 1
+    weight: str | None = None
 
     def __post_init__(self) -> None:
         """Reject values out of range and options that exclude each other."""
@@ -78,6 +80,8 @@ class Options:
             raise UserError("--tile needs --m, the number of points to keep of all tiles together.")
         if self.tile is not None and self.readout != "completed":
             raise UserError(f"--tile keeps different input points: no --readout {self.readout}.")
+        if self.weight is not None and (self.tile is not None or self.chunk is not None):
+            raise UserError("--weight needs the whole cloud at once: no --tile and no --chunk.")
         if self.chunk is not None and self.map is not None:
             raise UserError(
                 "--map needs the whole cloud in memory: use mops-lightning propagate after --chunk."

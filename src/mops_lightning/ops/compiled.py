@@ -27,13 +27,16 @@ THREADS_MIN_WORK = 2**22
 Array = NDArray[Any]
 
 
-def farthest(points: Tensor, steps: int, distances: Tensor) -> Tensor | None:
+def farthest(
+    points: Tensor, steps: int, distances: Tensor, factors: Tensor | None = None
+) -> Tensor | None:
     """Repeatedly choose the point with the largest distance and update the distances.
 
     Args:
         points: ``(B, N, C)``.
         steps: number of points to choose, at most the number of points that are not chosen.
         distances: ``(B, N)`` initial squared distances; -1 marks chosen points.
+        factors: ``(B, N)`` float64 of the squared distances in the choice; None: 1.
 
     Returns:
         ``(B, steps)`` int64, the lowest row in case of ties.
@@ -42,11 +45,11 @@ def farthest(points: Tensor, steps: int, distances: Tensor) -> Tensor | None:
         return None
     planes = _planes(points)
     bits = np.ascontiguousarray(distances.numpy()).view(_integer(planes))
+    scales = np.empty((len(points), 0)) if factors is None else factors.contiguous().numpy()
     fixed = (steps, points.shape[2], FARTHEST_LEAF)
     work = steps * points.shape[1] * len(points)
-    return _rows(
-        lambda cloud: kernels.farthest(*cloud, *fixed), zip(planes, bits, strict=True), work
-    )
+    clouds = zip(planes, bits, scales, strict=True)
+    return _rows(lambda cloud: kernels.farthest(*cloud, *fixed), clouds, work)
 
 
 def nearest(queries: Tensor, points: Tensor) -> Tensor | None:

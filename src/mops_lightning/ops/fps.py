@@ -8,8 +8,13 @@ from mops_lightning.ops import compiled
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.points import cloud_sizes, distance_dtype, gather_points, to_planes
 
+LEAST_FACTOR = 1e-200
+"""Least squared weight: products of a chosen point, whose distance is -1, must be below 0."""
 
-def farthest_point_sample(points: Tensor, m: int, start: int | Tensor = 0) -> Tensor:
+
+def farthest_point_sample(
+    points: Tensor, m: int, start: int | Tensor = 0, weight: Tensor | None = None
+) -> Tensor:
     """Choose m points, each as far as possible from the points chosen before it.
 
     Eldar et al., "The Farthest Point Strategy for Progressive Image Sampling", IEEE TIP 1997.
@@ -18,6 +23,9 @@ def farthest_point_sample(points: Tensor, m: int, start: int | Tensor = 0) -> Te
         points: ``(B, N, C)``.
         m: number of points to choose, 1 ≤ m ≤ N.
         start: index of the first point, one for all clouds or ``(B,)``.
+        weight: ``(B, N)`` finite, not all 0: the distance of a point is multiplied by its weight,
+            as in the weighted centre problem (Dyer and Frieze, Operations Research Letters 1985)
+            and in S-FPS (Chen et al., "SASA", AAAI 2022).
 
     Returns:
         ``(B, m)`` distinct int64 indices in the order of choice, the lowest index in case of ties;
@@ -44,10 +52,12 @@ def farthest_point_sample(points: Tensor, m: int, start: int | Tensor = 0) -> Te
     first = torch.as_tensor(start, device=points.device).expand(clouds)
     dtype = distance_dtype(points)
     distances = points.new_full((clouds, n), torch.finfo(dtype).max, dtype=dtype)
-    return _farthest(points, distances.scatter_(1, first[:, None], torch.inf), m)
+    return _farthest(points, distances.scatter_(1, first[:, None], torch.inf), m, weight)
 
 
-def farthest_point_fill(points: Tensor, indices: Tensor, counts: Tensor) -> Tensor:
+def farthest_point_fill(
+    points: Tensor, indices: Tensor, counts: Tensor, weight: Tensor | None = None
+) -> Tensor:
     """Fill up subsets of every cloud by farthest point sampling.
 
     Args:
@@ -55,6 +65,7 @@ def farthest_point_fill(points: Tensor, indices: Tensor, counts: Tensor) -> Tens
         indices: ``(B, M)`` int64, M ≤ N; the first ``counts[b]`` entries of row b are the given
             points, all distinct. The remaining entries are replaced.
         counts: ``(B,)`` int64, 1 ≤ counts ≤ M.
+        weight: as for ``farthest_point_sample``.
 
     Returns:
         ``(B, M)`` int64, all distinct: the given points, followed by points that are each farthest
@@ -69,26 +80,35 @@ def farthest_point_fill(points: Tensor, indices: Tensor, counts: Tensor) -> Tens
     distinct = chosen[:, : int(counts.max())]
     distances, _ = nearest(points.detach(), gather_points(points.detach(), distinct))
     distances = distances.to(distance_dtype(points)).scatter_(1, chosen, -1.0)
-    added = _farthest(points, distances, missing)
+    added = _farthest(points, distances, missing, weight)
     # Clouds that lack fewer points write the surplus beyond column M, which is then cut off.
     filled = torch.cat([chosen, added], 1)
     return filled.scatter_(1, counts[:, None] + slot[:missing], added)[:, :wanted]
 
 
 @torch.no_grad()
-def _farthest(points: Tensor, distances: Tensor, steps: int) -> Tensor:
+def _farthest(
+    points: Tensor, distances: Tensor, steps: int, weight: Tensor | None = None
+) -> Tensor:
     """Choose farthest points; arguments and result as in ``compiled.farthest``."""
-    rows = compiled.farthest(points, steps, distances)
-    return farthest_in_steps(points, distances, steps) if rows is None else rows
+    factors = None
+    if weight is not None:
+        relative = weight.double() / weight.double().amax(1, keepdim=True)
+        factors = relative.square().clamp_min(LEAST_FACTOR)
+    rows = compiled.farthest(points, steps, distances, factors)
+    return farthest_in_steps(points, distances, steps, factors) if rows is None else rows
 
 
-def farthest_in_steps(points: Tensor, distances: Tensor, steps: int) -> Tensor:
+def farthest_in_steps(
+    points: Tensor, distances: Tensor, steps: int, factors: Tensor | None = None
+) -> Tensor:
     """Choose farthest points in torch, for GPUs; arguments as for ``compiled.farthest``."""
     planes = to_planes(points.to(distances.dtype))
     distances, differences = distances.clone(), torch.empty_like(planes)
     chosen = []
     for _ in range(steps):
-        index = distances.argmax(1, keepdim=True)
+        gains = distances if factors is None else distances * factors
+        index = gains.argmax(1, keepdim=True)
         chosen.append(index)
         distances.scatter_(1, index, -1.0)
         torch.sub(planes, planes.gather(2, index.expand(len(planes), -1, -1)), out=differences)

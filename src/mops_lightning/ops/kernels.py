@@ -14,25 +14,9 @@ does not notice that a cached function calls one that has changed in another fil
 
 # mypy: disable-error-code="no-untyped-def"
 
-from functools import partial
-from typing import Any
-
 import numpy as np
-from numba import extending, njit
 
-jit: Any = partial(njit, nogil=True, error_model="numpy")
-"""Compile; never with ``fastmath``, which could change distances."""
-
-intrinsic: Any = extending.intrinsic
-
-
-def jit_cached(function: Any) -> Any:
-    """Compile, and keep the compiled form in a file next to this one or in the user's cache."""
-    try:
-        return jit(function, cache=True)
-    except RuntimeError:  # neither folder can be written to
-        return jit(function)
-
+from mops_lightning.ops.jit import intrinsic, jit, jit_cached
 
 FANOUT, PROBES = 8, 8
 """Maximum number of children of a node, and sampled coordinates per child for where to split."""
@@ -102,9 +86,7 @@ def _build(planes, channels, leaf):
         lowest and the highest coordinates.
     """
     size = len(planes) // channels
-    rows = np.empty(size, np.int64)
-    for i in range(size):
-        rows[i] = i
+    rows = np.arange(size)
     # A node has at least two children or none, hence fewer than 2·N nodes. Unused memory of large
     # arrays is never touched.
     nodes = np.empty(8 * size, np.int64)
@@ -170,14 +152,12 @@ def _split(line, low, high, child, counts):
     middle = low / 2 + high / 2
     if not low <= middle < high:
         middle = low
-    for i in range(len(line)):
-        child[i] = 0
+    child[: len(line)] = 0
     for k in range(FANOUT - 1):  # the first cut is below the highest coordinate
         cut = samples[PROBES * (k + 1) - 1] if samples[PROBES - 1] < high else middle
         for i in range(len(line)):
             child[i] += line[i] > cut
-    for k in range(FANOUT):
-        counts[k] = 0
+    counts[:] = 0
     for i in range(len(line)):
         counts[child[i]] += 1
 
@@ -192,8 +172,7 @@ def _move(line, child, counts, places, moved):
     for i in range(len(line)):
         moved[places[child[i]]] = line[i]
         places[child[i]] += 1
-    for i in range(len(line)):
-        line[i] = moved[i]
+    line[:] = moved[: len(line)]
 
 
 @jit
@@ -223,13 +202,15 @@ def _place(bits, wanted):
 
 
 @jit_cached
-def farthest(planes, distances, steps, channels, leaf):
+def farthest(planes, distances, factors, steps, channels, leaf):
     """Repeatedly choose the point with the largest distance and update the distances.
 
     Args:
         planes: ``(C·N,)`` coordinates, sorted in place.
         distances: ``(N,)`` initial squared distances, their bits read as integers; a negative
             number marks points that are never chosen.
+        factors: ``(N,)`` float64, at least 0: the point with the largest product of factor and
+            squared distance is chosen; or ``(0,)``.
         steps: number of points to choose, at most the number of points that are not chosen.
         channels: C.
         leaf: maximum number of points of a leaf.
@@ -244,52 +225,72 @@ def farthest(planes, distances, steps, channels, leaf):
     known = len(nodes) // 4
     left, new = np.empty(size, planes.dtype), np.empty(size, planes.dtype)
     bits, new_bits = left.view(distances.dtype), new.view(distances.dtype)
-    for i in range(size):
-        bits[i] = new_bits[i] = distances[rows[i]]
-    peaks = np.empty(known, np.int64)  # the place of the farthest point of every node
+    bits[:] = distances[rows]
+    new_bits[:] = bits
+    if len(factors):
+        factors = factors[rows]
+    # The largest distance of every node, and the place of the point to choose of it.
+    tops, peaks = np.empty(known, planes.dtype), np.empty(known, np.int64)
     for node in range(known - 1, -1, -1):
         if nodes[4 * node + 3]:
-            _choose_child(nodes, peaks, left, rows, node)
+            _choose_child(nodes, peaks, tops, left, factors, rows, node)
         else:
             start, stop = nodes[4 * node], nodes[4 * node + 1]
-            peaks[node] = start + _lower(bits[start:stop], new_bits[start:stop])
+            place = start + _lower(bits[start:stop], new_bits[start:stop])
+            tops[node], peaks[node] = left[place], _choose(left, factors, start, stop, place)
     chosen, point = np.empty(steps, np.int64), np.empty(channels, planes.dtype)
     stack = np.empty(known + FANOUT, np.int64)
     for step in range(steps):
-        place = peaks[0]
-        chosen[step] = rows[place]
-        left[place] = -1
-        for axis in range(channels):
-            point[axis] = planes[axis * size + place]
+        latest = peaks[0]
+        chosen[step] = rows[latest]
+        left[latest] = -1
+        point[:] = planes[latest::size]
         stack[0], depth = 0, 1
         while depth:
             depth -= 1
             node = stack[depth]
             if node < 0:  # all children are up to date
-                _choose_child(nodes, peaks, left, rows, ~node)
+                _choose_child(nodes, peaks, tops, left, factors, rows, ~node)
             elif nodes[4 * node + 3]:
                 stack[depth] = ~node
                 depth += 1
                 for k in range(nodes[4 * node + 2], nodes[4 * node + 2] + nodes[4 * node + 3]):
-                    near = _distance_to_box(boxes, k, point) < left[peaks[k]]
-                    if near or nodes[4 * k] <= place < nodes[4 * k + 1]:
+                    near = _distance_to_box(boxes, k, point) < tops[k]
+                    if near or nodes[4 * k] <= latest < nodes[4 * k + 1]:
                         stack[depth] = k
                         depth += 1
             else:
                 start, stop = nodes[4 * node], nodes[4 * node + 1]
                 _write_distances(planes, size, start, stop, point, new)
-                peaks[node] = start + _lower(bits[start:stop], new_bits)
+                place = start + _lower(bits[start:stop], new_bits)
+                tops[node], peaks[node] = left[place], _choose(left, factors, start, stop, place)
     return chosen
 
 
 @jit
-def _choose_child(nodes, peaks, left, rows, node):
-    """Take over the farthest of the children's points."""
+def _choose(left, factors, start, stop, farthest):
+    """Return the place of a leaf's point to choose, given the place of its farthest point."""
+    if not len(factors):
+        return farthest
+    best = start
+    for i in range(start + 1, stop):
+        if left[i] * factors[i] > left[best] * factors[best]:
+            best = i
+    return best
+
+
+@jit
+def _choose_child(nodes, peaks, tops, left, factors, rows, node):
+    """Take over the children's largest distance and the best of their points."""
     first = nodes[4 * node + 2]
-    best = peaks[first]
+    best, tops[node] = peaks[first], tops[first]
     for k in range(first + 1, first + nodes[4 * node + 3]):
+        tops[node] = max(tops[node], tops[k])
         other = peaks[k]
-        if left[other] > left[best] or (left[other] == left[best] and rows[other] < rows[best]):
+        gain, most = np.float64(left[other]), np.float64(left[best])
+        if len(factors):
+            gain, most = gain * factors[other], most * factors[best]
+        if gain > most or (gain == most and rows[other] < rows[best]):
             best = other
     peaks[node] = best
 
@@ -317,8 +318,7 @@ def nearest(planes, queries, scratch, channels, leaf):
     distances, point = scratch.view(planes.dtype), np.empty(channels, planes.dtype)
     bounds, stack = np.empty(known + FANOUT, planes.dtype), np.empty(known + FANOUT, np.int64)
     for query in range(len(nearest_rows)):
-        for axis in range(channels):
-            point[axis] = queries[query * channels + axis]
+        point[:] = queries[query * channels : (query + 1) * channels]
         best, row = planes.dtype.type(np.inf), np.int64(size)
         stack[0], bounds[0], depth = 0, 0, 1
         while depth:

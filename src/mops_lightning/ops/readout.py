@@ -14,13 +14,16 @@ from mops_lightning.ops.points import gather_points
 READOUTS = ("generated", "matched", "completed")
 
 
-def select(points: Tensor, generated: Tensor, readout: str) -> tuple[Tensor, Tensor | None]:
+def select(
+    points: Tensor, generated: Tensor, readout: str, weight: Tensor | None = None
+) -> tuple[Tensor, Tensor | None]:
     """Return the points that a user takes as the sampled set.
 
     Args:
         points: ``(B, N, 3)`` the clouds.
         generated: ``(B, M, 3)`` the points that a sampler generated for them.
         readout: one of ``READOUTS``.
+        weight: see ``complete``.
 
     Returns:
         ``(B, M, 3)``, and their rows ``(B, M)`` in the clouds, or None for generated points.
@@ -29,7 +32,7 @@ def select(points: Tensor, generated: Tensor, readout: str) -> tuple[Tensor, Ten
         return generated, None
     rows = match(generated, points)
     if readout == "completed":
-        rows = complete(rows, points)
+        rows = complete(rows, points, weight)
     return gather_points(points, rows), rows
 
 
@@ -69,12 +72,13 @@ def unique_count(indices: Tensor) -> Tensor:
     return _is_first(indices).sum(1)
 
 
-def complete(indices: Tensor, points: Tensor) -> Tensor:
+def complete(indices: Tensor, points: Tensor, weight: Tensor | None = None) -> Tensor:
     """Remove repeated matches and fill up by farthest point sampling from the matched points.
 
     Args:
         indices: ``(B, M)`` int64 rows of ``points``, from ``match``.
         points: ``(B, N, 3)``, N ≥ M.
+        weight: ``(B, N)`` of the points in the filling up, see ``farthest_point_sample``.
 
     Returns:
         ``(B, M)`` int64, all distinct: the matched rows in the order of their first occurrence,
@@ -108,7 +112,7 @@ def complete(indices: Tensor, points: Tensor) -> Tensor:
     first = _is_first(indices)
     # A stable sort moves first occurrences to the front and keeps their order.
     order = first.logical_not().byte().argsort(dim=1, stable=True)
-    return farthest_point_fill(points, indices.gather(1, order), first.sum(1))
+    return farthest_point_fill(points, indices.gather(1, order), first.sum(1), weight)
 
 
 def _is_first(indices: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.ops.attention import Partial
+from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.precision import restrict_autocast_to_pointwise
 from mops_lightning.ops.readout import READOUTS, select
 from mops_lightning.samplers.fused import FusedMOPSNet
@@ -18,6 +19,9 @@ from mops_lightning.types import SampleOutput
 
 Chunks = Callable[[], Iterable[Tensor]]
 """Function that iterates over the chunks ``(n, 3)`` of a cloud, in the same order at every call."""
+
+WEIGHTED = "Use fps, random, poisson, or the completed readout of a trained sampler."
+"""Advice where weights are not possible."""
 
 
 class Sampler(nn.Module):
@@ -92,6 +96,7 @@ class Sampler(nn.Module):
         m: int | None = None,
         readout: str = "completed",
         batch: Any = None,
+        weight: Any = None,
     ) -> tuple[Any, Any]:
         """Sample clouds in their own unit: normalised as in training, sampled, mapped back.
 
@@ -102,6 +107,10 @@ class Sampler(nn.Module):
                 perhaps repeated) or ``completed`` (m different input points).
             batch: ``(P,)`` the cloud of every point, ascending from 0, where clouds of several
                 sizes are one after the other.
+            weight: ``(N,)``, ``(B, N)`` or ``(P,)`` numbers of at least 0, or ``"curvature"`` to
+                compute them. Points with a larger weight are preferred; points of weight 0 are left
+                out. For samplers with ``sample_weighted``, and for completed sets, which are then
+                filled up by weight.
 
         Returns:
             The points, and their indices in the input, or None for generated points; tensors or
@@ -125,14 +134,20 @@ class Sampler(nn.Module):
             raise UserError(f"readout: unknown {readout!r}.{did_you_mean(readout, READOUTS)}")
         if self.learned and self.training:
             raise UserError("downsample needs a sampler in eval mode: call eval() first.")
+        if weight is not None:
+            self.check_weighted(readout)
 
-        def sample(clouds: Tensor, m: int) -> tuple[Tensor, Tensor | None]:
+        def sample(clouds: Tensor, m: int, weight: Tensor | None) -> tuple[Tensor, Tensor | None]:
+            if weight is not None and not self.generates:
+                check_points(clouds, at_least=m)
+                rows = self.sample_weighted(clouds, m, weight)
+                return gather_points(clouds, rows), rows
             output = self(clouds.to(next(self.parameters(), clouds)), m)  # dtype and device
             if not self.generates:
                 return output.points, output.indices
-            return select(clouds, output.points.to(clouds.device), readout)
+            return select(clouds, output.points.to(clouds.device), readout, weight)
 
-        return select_points(sample, points, m, batch)
+        return select_points(sample, points, m, batch, weight)
 
     def _checked(self, points: Tensor, m: int) -> SampleOutput:
         """Check the points and sample them, without losses."""
@@ -170,6 +185,25 @@ class Sampler(nn.Module):
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Sample checked input; arguments and result as in ``forward``."""
         raise NotImplementedError
+
+    def sample_weighted(self, points: Tensor, m: int, weight: Tensor) -> Tensor:
+        """Return rows ``(B, m)`` of checked input, chosen by positive weights ``(B, N)``.
+
+        Raises:
+            UserError: the method has no weights.
+        """
+        raise UserError(f"weight: {type(self).__name__} takes no weights. {WEIGHTED}")
+
+    def check_weighted(self, readout: str) -> None:
+        """Check that the sampler takes weights.
+
+        Raises:
+            UserError: neither the method nor the readout of generated points has weights.
+        """
+        if self.generates and readout != "completed":
+            raise UserError(f"weight: the {readout} readout takes no weights. {WEIGHTED}")
+        if not self.generates and type(self).sample_weighted is Sampler.sample_weighted:
+            raise UserError(f"weight: {type(self).__name__} takes no weights. {WEIGHTED}")
 
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]

@@ -79,8 +79,22 @@ class FPSSampler(Sampler):
         indices = farthest_rows(points, m, self.seed, self.start)
         return SampleOutput(gather_points(points, indices), indices, {})
 
+    def sample_weighted(self, points: Tensor, m: int, weight: Tensor) -> Tensor:
+        """Multiply distances by weights; the first point is the heaviest, unless ``start`` is set.
 
-def farthest_rows(points: Tensor, m: int, seed: int = 0, start: int | str | None = None) -> Tensor:
+        See ``ops.fps.farthest_point_sample``.
+        """
+        self.check_cloud_size(points.shape[1])
+        return farthest_rows(points, m, self.seed, self.start, weight)
+
+
+def farthest_rows(
+    points: Tensor,
+    m: int,
+    seed: int = 0,
+    start: int | str | None = None,
+    weight: Tensor | None = None,
+) -> Tensor:
     """Return rows ``(B, m)`` of farthest points in the order of choice.
 
     Args:
@@ -88,13 +102,15 @@ def farthest_rows(points: Tensor, m: int, seed: int = 0, start: int | str | None
         m: number of points.
         seed: of the order that breaks ties and, without ``start``, determines the first point.
         start: the first point, as for ``FPSSampler``.
+        weight: ``(B, N)`` as for ``farthest_point_sample``.
     """
     order = seeded_order(points, seed)
     ordered = gather_points(points.detach(), order)
-    first: int | Tensor = 0
+    weight = None if weight is None else weight.gather(1, order)
+    first: int | Tensor = 0 if weight is None else weight.argmax(1)
     if start == FARTHEST:
         # The mean of ordered points has the same rounding error for every order of the input.
         first = (ordered - ordered.mean(1, keepdim=True)).square().sum(2).argmax(1)
     elif isinstance(start, int):
         first = torch.eq(order, start).byte().argmax(1)
-    return order.gather(1, farthest_point_sample(ordered, m, start=first))
+    return order.gather(1, farthest_point_sample(ordered, m, first, weight))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.ops.fps import farthest_point_sample
-from mops_lightning.ops.kernels import jit, jit_cached
+from mops_lightning.ops.jit import jit, jit_cached
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import seeded_order
@@ -69,14 +69,21 @@ class PoissonSampler(Sampler):
         indices = order.gather(1, kept)
         return SampleOutput(gather_points(points, indices), indices, {})
 
+    def sample_weighted(self, points: Tensor, m: int, weight: Tensor) -> Tensor:
+        """Divide the crowding of every point by its weight, which the publication does not do."""
+        order = seeded_order(points, self.seed)
+        ordered = gather_points(points.detach(), order)
+        return order.gather(1, eliminate(ordered, m, weight.gather(1, order)))
+
 
 @torch.no_grad()
-def eliminate(points: Tensor, m: int) -> Tensor:
+def eliminate(points: Tensor, m: int, weight: Tensor | None = None) -> Tensor:
     """Remove the most crowded point of every cloud until m remain; see ``PoissonSampler``.
 
     Args:
         points: ``(B, N, 3)``, finite; the first point is removed in case of ties.
         m: number of points that remain, 1 ≤ m ≤ N.
+        weight: ``(B, N)``, above 0: the crowding of a point is divided by its weight.
 
     Returns:
         ``(B, m)`` int64 rows of ``points``, ascending.
@@ -86,8 +93,11 @@ def eliminate(points: Tensor, m: int) -> Tensor:
     reach = spacing_bound(points, m).clamp_min(torch.finfo(points.dtype).tiny)
     # Sums of integers do not depend on the order of the points.
     scale = 2.0 ** min(50, 62 - number.bit_length())
-    clouds = zip(points.cpu().numpy(), reach.flatten().tolist(), strict=True)
-    remaining = [_eliminate_by_cells(cloud, m, bound, scale) for cloud, bound in clouds]
+    shares = np.empty((len(points), 0))
+    if weight is not None:
+        shares = (weight.double().amin(1, keepdim=True) / weight.double()).cpu().numpy()
+    clouds = zip(points.cpu().numpy(), reach.flatten().tolist(), shares, strict=True)
+    remaining = [_eliminate_by_cells(cloud, m, *given, scale) for cloud, *given in clouds]
     rows = [torch.from_numpy(np.flatnonzero(remains)) for remains in remaining]
     return torch.stack(rows).to(points.device)
 
@@ -114,7 +124,7 @@ def spacing_bound(points: Tensor, m: int) -> Tensor:
 
 
 def _eliminate_by_cells(
-    points: NDArray[np.float64], m: int, reach: float, scale: float
+    points: NDArray[np.float64], m: int, reach: float, shares: NDArray[np.float64], scale: float
 ) -> NDArray[np.bool_]:
     """Return whether each of ``(N, 3)`` points remains, by the compiled loops."""
     low = points.min(0)
@@ -132,7 +142,7 @@ def _eliminate_by_cells(
     planes = np.ascontiguousarray(points[order].T)
     ends = np.append(starts[1:], len(points))
     remains: NDArray[np.bool_] = _remove_crowded(
-        planes, order, starts, ends, cell_of, around, m, reach, scale
+        planes, order, starts, ends, cell_of, around, shares, m, reach, scale
     )
     return remains
 
@@ -158,8 +168,13 @@ def _change(planes, starts, ends, near, point, sign, reach, scale, crowding):
     return total
 
 
+@jit
+def _shared(crowding, shares, row):
+    return np.int64(crowding * shares[row]) if len(shares) else np.int64(crowding)
+
+
 @jit_cached
-def _remove_crowded(planes, order, starts, ends, cell_of, around, m, reach, scale):
+def _remove_crowded(planes, order, starts, ends, cell_of, around, shares, m, reach, scale):
     """Remove the most crowded point until m remain.
 
     Args:
@@ -169,6 +184,7 @@ def _remove_crowded(planes, order, starts, ends, cell_of, around, m, reach, scal
         ends: ``(K,)`` the point after the last one of every cell.
         cell_of: ``(N,)`` cell of every point.
         around: ``(K, 27)`` cells with all points nearer than ``reach``; -1 for none.
+        shares: ``(N,)`` factors of the crowding of every row, from 0 to 1; or ``(0,)``.
         m: number of points that remain.
         reach: distance from which weights are 0, positive.
         scale: factor of the weights before they are truncated to integers.
@@ -183,13 +199,13 @@ def _remove_crowded(planes, order, starts, ends, cell_of, around, m, reach, scal
         near, zero = around[cell_of[i]], np.int64(0)
         total = _change(planes, starts, ends, near, i, zero, reach, scale, crowding)
         crowding[i] = total
-    heap = [(-crowding[i], order[i], i) for i in range(size)]
+    heap = [(-_shared(crowding[i], shares, order[i]), order[i], i) for i in range(size)]
     heapify(heap)
     for _ in range(size - m):
         key, row, point = heap[0]
-        while -key != crowding[point]:
+        while -key != _shared(crowding[point], shares, row):
             # Crowding only falls: a key is an upper bound, and is corrected when it is the largest.
-            heapreplace(heap, (-crowding[point], row, point))
+            heapreplace(heap, (-_shared(crowding[point], shares, row), row, point))
             key, row, point = heap[0]
         heappop(heap)
         remains[row] = False

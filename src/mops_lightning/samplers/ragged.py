@@ -1,6 +1,6 @@
 """Input clouds: arrays or tensors, one or many, of one or several sizes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,18 +9,24 @@ from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import as_tensor, cloud_sizes, gather_points
+from mops_lightning.ops.weights import CURVATURE, check_positive, check_weight, curvature
 
-Select = Callable[[Tensor, int], tuple[Tensor, Tensor | None]]
-"""``select(points, m)`` maps ``(B, N, 3)`` float32 in the unit sphere to points ``(B, m, 3)`` and
-their rows ``(B, m)``, None for generated points."""
+Select = Callable[[Tensor, int, Tensor | None], tuple[Tensor, Tensor | None]]
+"""``select(points, m, weight)`` maps ``(B, N, 3)`` float32 in the unit sphere, with weights
+``(B, N)`` above 0 or None, to points ``(B, m, 3)`` and their rows ``(B, m)``, None for generated
+points."""
 
+Weight = Tensor | str | None
+"""Weights of at least 0, or ``"curvature"``."""
 
 Sample = tuple[Tensor, Tensor | None]
 """Selected points in the clouds' own unit, and their rows, None for generated points: ``(m, 3)``
 and ``(m,)`` of one cloud, ``(B, m, 3)`` and ``(B, m)`` of a batch."""
 
 
-def select_points(select: Select, points: Any, m: int, batch: Any = None) -> tuple[Any, Any]:
+def select_points(
+    select: Select, points: Any, m: int, batch: Any = None, weight: Any = None
+) -> tuple[Any, Any]:
     """Move clouds into the unit sphere, select points, and map them back.
 
     Args:
@@ -29,6 +35,7 @@ def select_points(select: Select, points: Any, m: int, batch: Any = None) -> tup
         points: see there.
         m: see there.
         batch: see there.
+        weight: see there.
 
     Raises:
         UserError: an argument has a wrong type, shape or value.
@@ -36,16 +43,19 @@ def select_points(select: Select, points: Any, m: int, batch: Any = None) -> tup
     tensor = as_tensor("points", points)
     if not tensor.is_floating_point():
         raise UserError(f"points must be floating point, got {tensor.dtype}. Try points.float().")
+    if weight is not None and not isinstance(weight, str):
+        weight = check_weight(weight, tuple(tensor.shape[:-1])).to(tensor.device)
     if batch is not None:
         _check_shape(tensor, 2, "(P, 3) with batch")
-        result = _flat(select, tensor, m, as_tensor("batch", batch))
+        result = _flat(select, tensor, m, as_tensor("batch", batch), weight)
     elif tensor.ndim == 2:
         _check_shape(tensor, 2, "(N, 3) or (B, N, 3)")
-        chosen, rows = _selected(select, tensor[None], m)
+        alone = weight[None] if isinstance(weight, Tensor) else weight
+        chosen, rows = _selected(select, tensor[None], m, alone)
         result = chosen[0], None if rows is None else rows[0]
     else:
         _check_shape(tensor, 3, "(N, 3) or (B, N, 3)")
-        result = _selected(select, tensor, m)
+        result = _selected(select, tensor, m, weight)
     if not isinstance(points, np.ndarray):
         return result
     return result[0].numpy(), None if result[1] is None else result[1].numpy()
@@ -56,12 +66,13 @@ def _check_shape(points: Tensor, ndim: int, wanted: str) -> None:
         raise UserError(f"points must have shape {wanted}, got {tuple(points.shape)}.")
 
 
-def _flat(select: Select, points: Tensor, m: int, batch: Tensor) -> Sample:
+def _flat(select: Select, points: Tensor, m: int, batch: Tensor, weight: Weight) -> Sample:
     """Select from clouds one after the other; rows count through all clouds."""
     counts = cloud_sizes(len(points), batch).tolist()
     if 0 in counts:
         raise UserError(f"batch: cloud {counts.index(0)} has no points. Number clouds from 0.")
-    samples = _each(select, list(points.split(counts)), m)
+    weights = weight.split(counts) if isinstance(weight, Tensor) else [weight] * len(counts)
+    samples = _each(select, list(points.split(counts)), m, weights)
     starts = np.cumsum([0, *counts[:-1]]).tolist()
     chosen = torch.cat([sampled for sampled, _ in samples])
     parts = zip(samples, starts, strict=True)
@@ -69,7 +80,7 @@ def _flat(select: Select, points: Tensor, m: int, batch: Tensor) -> Sample:
     return chosen, torch.cat(rows) if len(rows) == len(samples) else None
 
 
-def _each(select: Select, clouds: list[Tensor], m: int) -> list[Sample]:
+def _each(select: Select, clouds: list[Tensor], m: int, weights: Sequence[Weight]) -> list[Sample]:
     """Select from every cloud; clouds of one size are processed together."""
     if not clouds:
         raise UserError("points must have at least one cloud.")
@@ -80,23 +91,50 @@ def _each(select: Select, clouds: list[Tensor], m: int) -> list[Sample]:
             everything = torch.arange(size, device=clouds[0].device)
             samples |= {i: (clouds[i], everything) for i in members}
             continue
-        points, rows = _selected(select, torch.stack([clouds[i] for i in members]), m)
+        tensors = [part for part in (weights[i] for i in members) if isinstance(part, Tensor)]
+        weight = torch.stack(tensors) if tensors else weights[0]
+        points, rows = _selected(select, torch.stack([clouds[i] for i in members]), m, weight)
         for place, i in enumerate(members):
             samples[i] = points[place], None if rows is None else rows[place]
     return [samples[i] for i in range(len(clouds))]
 
 
-def _selected(select: Select, points: Tensor, m: int) -> Sample:
+def _selected(select: Select, points: Tensor, m: int, weight: Weight) -> Sample:
     """Select from clouds of one size, in their own unit."""
     if points.shape[0] == 0 or points.shape[1] == 0:
         raise UserError(
             f"points must have at least one cloud and one point, got shape {tuple(points.shape)}."
         )
+    if isinstance(weight, str):
+        weight = _computed(weight, points)
+    if weight is not None and not bool(weight.all()):
+        return _without_zeros(select, points, m, weight)
     exact = points.double()
     centre = exact.mean(1, keepdim=True)
     radius = torch.linalg.vector_norm(exact - centre, dim=2, keepdim=True).amax(1, keepdim=True)
     radius = torch.where(radius > 0, radius, 1.0)
-    chosen, rows = select(((exact - centre) / radius).float(), m)
+    chosen, rows = select(((exact - centre) / radius).float(), m, weight)
     if rows is not None:
         return gather_points(points, rows), rows
     return (chosen.double() * radius + centre).to(points.dtype), None
+
+
+def _computed(word: str, points: Tensor) -> Tensor:
+    """Return the weights ``(B, N)`` that a word asks for."""
+    if word != CURVATURE:
+        raise UserError(f"weight must be {CURVATURE!r} or numbers, got {word!r:.99}.")
+    parts = [torch.from_numpy(curvature(cloud.cpu().numpy())) for cloud in points.detach()]
+    return torch.stack(parts).to(points.device)
+
+
+def _without_zeros(select: Select, points: Tensor, m: int, weight: Tensor) -> Sample:
+    """Select from the points of positive weight only."""
+    chosen, rows = [], []
+    for cloud, part in zip(points, weight, strict=True):
+        kept = part.nonzero()[:, 0]
+        check_positive(len(kept), m)
+        sampled, places = _selected(select, cloud[kept][None], m, part[kept][None])
+        assert places is not None  # generated points have no weights
+        chosen.append(sampled[0])
+        rows.append(kept[places[0]])
+    return torch.stack(chosen), torch.stack(rows)

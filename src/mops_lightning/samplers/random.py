@@ -1,5 +1,6 @@
 """Random sampling (RS), a baseline in the paper's tables."""
 
+import torch
 from torch import Tensor
 
 from mops_lightning.ops.points import gather_points
@@ -40,3 +41,15 @@ class RandomSampler(Sampler):
         """Return m of the points ``(B, N, 3)`` with their indices, in random order."""
         indices = seeded_order(points, self.seed)[:, :m].contiguous()
         return SampleOutput(gather_points(points, indices), indices, {})
+
+    def sample_weighted(self, points: Tensor, m: int, weight: Tensor) -> Tensor:
+        """Draw without replacement, each time with probabilities in proportion to the weights.
+
+        Efraimidis and Spirakis, "Weighted random sampling with a reservoir", Information Processing
+        Letters 2006, as times of exponential clocks: ``torch.multinomial`` takes up to 2²⁴ points.
+        """
+        order = seeded_order(points, self.seed)
+        generator = torch.Generator().manual_seed(self.seed)
+        times = torch.empty(points.shape[1], dtype=torch.float64).exponential_(generator=generator)
+        times = times.to(points.device) / weight.double().gather(1, order)
+        return order.gather(1, times.argsort(1)[:, :m])

@@ -21,6 +21,7 @@ def downsample(
     batch: Any = None,
     start: int | str | None = None,
     seed: int | None = None,
+    weight: Any = None,
 ) -> tuple[Any, Any]:
     """Downsample clouds by a method or a model.
 
@@ -39,6 +40,8 @@ def downsample(
         start: with ``fps``, the row of the first point in every cloud, or ``"farthest"`` for the
             point farthest from the mean.
         seed: of random choices; None means 0.
+        weight: one number of at least 0 per point, or ``"curvature"``; with ``random``, ``fps``,
+            ``poisson`` and completed sets. See ``Sampler.downsample``.
 
     Returns:
         The points, and their indices in the input, or None for generated points; tensors or arrays
@@ -61,7 +64,7 @@ def downsample(
         sampler = untrained(str(method), m, seed or 0, **arguments)
     else:
         sampler = _model(str(method), str(getattr(points, "device", "cpu")))
-    return sampler.downsample(points, m, readout, batch)
+    return sampler.downsample(points, m, readout, batch, weight)
 
 
 def untrained(method: str, m: int, seed: int = 0, **arguments: Any) -> Sampler:
