@@ -97,7 +97,9 @@ def eliminate(points: Tensor, m: int, weight: Tensor | None = None) -> Tensor:
     if weight is not None:
         shares = (weight.double().amin(1, keepdim=True) / weight.double()).cpu().numpy()
     clouds = zip(points.cpu().numpy(), reach.flatten().tolist(), shares, strict=True)
-    remaining = [_eliminate_by_cells(cloud, m, *given, scale) for cloud, *given in clouds]
+    remaining = [
+        _eliminate_by_cells(cloud, m, bound, share, scale) for cloud, bound, share in clouds
+    ]
     rows = [torch.from_numpy(np.flatnonzero(remains)) for remains in remaining]
     return torch.stack(rows).to(points.device)
 
