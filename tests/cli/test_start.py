@@ -57,7 +57,6 @@ def test_second_run_in_folder_writes_nothing(tmp_path):
         (["sampler.anchor_width=1"], "without sampler.anchors"),
         (["sampler=fmops", "recipe=paper", "sampler.num_sizes=8"], "without sampler.size_sampling"),
         (["recipe=paper", "recipe.all_points_from=0.5"], "without recipe.train_points"),
-        (["augment.sampler.jitter_clip=0.1"], "without augment.sampler.jitter"),
         (["dataset=clouds", "dataset.root=.", "dataset.gap=2"], "without dataset.test_frames"),
     ],
 )

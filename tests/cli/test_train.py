@@ -143,7 +143,7 @@ def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
     }
     assert (run / "task_weights.safetensors").is_file()
     status, out, err = call(
-        [f"evaluate={run}", "task/net=icp", "task.pairs.resample=48", "pictures=0"], tmp_path
+        [f"evaluate={run}", "task/net=icp", "task.resample=48", "pictures=0"], tmp_path
     )
     assert status == 0, err
     assert "registration by icp" in out

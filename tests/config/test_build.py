@@ -68,10 +68,10 @@ def test_build_with_an_argument_from_code_names_the_argument():
 def test_build_of_a_partial_function_names_the_setting_when_it_is_called():
     def made(factor):
         node = {"_target_": f"{__name__}.scale", "_partial_": True, "factor": factor}
-        return build(OmegaConf.create(node), "task.loss")
+        return build(OmegaConf.create(node), "optimizer.schedule")
 
     assert made(2.0)(3.0) == 6.0
-    with pytest.raises(UserError, match=r"^task\.loss\.factor must not be negative"):
+    with pytest.raises(UserError, match=r"^optimizer\.schedule\.factor must not be negative"):
         made(-1.0)(3.0)
     with pytest.raises(UserError, match=r"^value must not be negative"):
         made(1.0)(-3.0)

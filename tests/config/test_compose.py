@@ -11,7 +11,6 @@ from tests.support.command_line import TINY, TINY_WITH_PICTURES, refused
     [
         (["sampler.alhpa=3"], "sampler.alpha"),
         (["sampler=mosp"], "mops"),
-        (["task=registration", "task/lss=quaternion"], "Did you mean 'task/loss'"),
         (["sampler/mops=registration"], "chosen by other groups"),
         (["task/nets=pointnet"], "Did you mean 'task/net'"),
         (["sampler.log=2"], "sampler.log: no such setting"),

@@ -10,7 +10,7 @@ from mops_lightning.errors import UserError
     [
         ("m=8", "m", "m"),
         ("++sampler.alpha=3", "sampler.alpha", "sampler.alpha"),
-        ("~task.pairs", "task.pairs", "task.pairs"),
+        ("~task.resample", "task.resample", "task.resample"),
         ("task/net=icp", "task/net", "task.net"),
         ("optimizer@pretrain=x", "optimizer@pretrain", "pretrain"),
         ("m=4,8", "m", "m"),

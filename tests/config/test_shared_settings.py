@@ -31,9 +31,9 @@ def test_table_settings_fill_in_defaults_of_constructors():
     old = plain("sampler=fmops", "task=registration")
     for node, names in (
         (old["sampler"], ["overlap", "threshold", "rho_channels"]),
-        (old["task"]["net"], ["iterations", "head_channels"]),
-        (old["optimizer"]["schedule"], ["start_factor"]),
-        (old["augment"]["sampler"], ["jitter_clip"]),
+        (old["task"]["net"], ["iterations", "feature_channels"]),
+        (old["optimizer"]["schedule"], ["warmup"]),
+        (old["augment"]["sampler"], ["jitter"]),
     ):
         for name in names:
             del node[name]

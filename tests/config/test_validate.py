@@ -32,12 +32,10 @@ EXTRA = {
     "dataset=clouds": ["dataset.root=somewhere"],
     "experiment=own_scans": ["dataset.root=somewhere"],
     "dataset=mesh_sequence": ["dataset.root=somewhere"],
-    "task/loss=quaternion": ["task=registration"],
 }
 FROM_CODE = {
     *("params", "optimizer", "total_steps"),  # of optimizers and schedules
     *("net", "num_classes", "attributes"),  # of tasks, nets and samplers
-    *("predicted", "true", "source", "target"),  # of losses
     *("m", "seed"),  # of baselines
     *("save_dir", "checkpoint", "score", "batch", "titles", "folder"),  # of loggers and callbacks
 }

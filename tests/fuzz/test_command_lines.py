@@ -28,7 +28,6 @@ GROUPS = {
     ),
     "task": ("classification", "registration", "reconstruction"),
     "task/net": ("pointnet", "pcrnet", "icp", "autoencoder", "foldingnet", "atlasnet"),
-    "task/loss": ("quaternion",),
     "optimizer": ("one_cycle", "exponential", "step_decay", "one_cycle_snet", "muon"),
     "logger": ("none", "csv"),
     "trainer": ("auto", "cpu"),

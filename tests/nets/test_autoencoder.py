@@ -12,7 +12,7 @@ def test_encoder_has_published_layers():
 
 
 def test_autoencoder_other_number_of_points_raises(rng):
-    net = AutoEncoder(50, 16, (8, 8), (16,))
+    net = AutoEncoder(50, 16, (8, 8))
     with pytest.raises(UserError, match=r"^n_points must be 50, .* got 60.*mfoldingnet"):
         net(torch.randn(2, 40, 3, generator=rng), 60)
 
@@ -28,7 +28,6 @@ def test_autoencoder_has_published_size():
         (lambda: AutoEncoder(0), r"^n_points must be at least 1, got 0"),
         (lambda: AutoEncoder(codeword=0), r"^codeword must be at least 1, got 0"),
         (lambda: AutoEncoder(encoder_channels=[]), r"^encoder_channels must be .*got \[\]"),
-        (lambda: AutoEncoder(decoder_channels=[]), r"^decoder_channels must be .*got \[\]"),
         (lambda: PointEncoder(0), r"^codeword must be at least 1, got 0"),
         (lambda: PointEncoder(channels=[0]), r"^channels must be .*got \[0\]"),
     ],

@@ -13,7 +13,7 @@ from mops_lightning.nets.pointnet import PointNetTransform, PointNetVanilla, Tra
 from tests.support.mixed import check_close_in_mixed_precision
 
 NETS = {
-    "autoencoder": lambda n: AutoEncoder(n, 16, (8, 8), (16,)),
+    "autoencoder": lambda n: AutoEncoder(n, 16, (8, 8)),
     "foldingnet": lambda n: MFoldingNet(n, 1, 16, fold_channels=(32, 8)),
     "mfoldingnet": lambda n: MFoldingNet(n, 4, 16, fold_channels=(32, 8)),
     "atlasnet": lambda n: AtlasNet(n, 3, 16, (32, 8)),

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pcrnet import PCRNet
 
-SMALL = {"feature_channels": (16, 32), "head_channels": (32, 16)}
+SMALL = {"feature_channels": (16, 32)}
 
 
 def net(**extra):
@@ -91,5 +91,3 @@ def test_pcrnet_invalid_argument_raises():
         PCRNet(0)
     with pytest.raises(UserError, match=r"^feature_channels must be .* got \[8\]"):
         PCRNet(feature_channels=[8])
-    with pytest.raises(UserError, match=r"^head_channels must be .* got \[\]"):
-        PCRNet(head_channels=[])

@@ -40,7 +40,6 @@ SMALL_PCRNET = [
     "task=registration",
     "weights=auto",
     "task.net.feature_channels=[16,32]",
-    "task.net.head_channels=[32]",
 ]
 """Registration by a net that is written to disk in no time."""
 

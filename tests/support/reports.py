@@ -76,13 +76,14 @@ def put_planes(folder):
 DEGREES = "rotation_error_deg"
 
 
-def put_pairs(folder, sampler, m, value, net="pcrnet", rotation=45, **changes):
+def put_pairs(folder, sampler, m, value, net="pcrnet", resample=None, **changes):
     changes = {"score_name": f"test/sampled/{DEGREES}", **changes}
     if net == "icp":  # there are no weights to record
         changes["task_weights_sha256"] = None
     metrics = {f"test/sampled/{DEGREES}": value, f"test/full/{DEGREES}": 7.5}
-    pairs = {"pairs": {"rotation": rotation}}
-    put(folder, sampler, m, metrics, "registration", net, settings=pairs, **changes)
+    put(
+        folder, sampler, m, metrics, "registration", net, settings={"resample": resample}, **changes
+    )
 
 
 def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):

@@ -6,8 +6,6 @@ import pytest
 import torch
 
 from mops_lightning.data.loader import CloudLoader
-from mops_lightning.data.pairs import Pairs
-from mops_lightning.losses.registration import quaternion_loss
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pcrnet import PCRNet
@@ -25,9 +23,7 @@ TASKS = {
     "classification": lambda: Classification(PointNetVanilla(3), 3),
     "reconstruction": lambda: Reconstruction(AutoEncoder(POINTS, 8)),
     "reconstruction_folding": lambda: Reconstruction(MFoldingNet(POINTS, 2, 8)),
-    "registration": lambda: Registration(
-        PCRNet(feature_channels=(8, 16), head_channels=(16,)), Pairs(), quaternion_loss
-    ),
+    "registration": lambda: Registration(PCRNet(feature_channels=(8, 16))),
 }
 # Sizes on both sides of 32 points, where the pooling layer changes its algorithm, in one step.
 LEARNED = ("mops", "fmops", "snet", "samplenet", "samplenet-progressive")

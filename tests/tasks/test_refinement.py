@@ -3,9 +3,7 @@ from typing import Any
 import pytest
 import torch
 
-from mops_lightning.data.pairs import Pairs
 from mops_lightning.errors import UserError
-from mops_lightning.losses.registration import quaternion_loss
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import PointNetVanilla
@@ -23,8 +21,8 @@ from mops_lightning.types import Batch, PairBatch
 
 TASKS = {
     "classification": lambda: Classification(PointNetVanilla(5), 5),
-    "reconstruction": lambda: Reconstruction(AutoEncoder(50, 16, (8, 8), (16,))),
-    "registration": lambda: Registration(PCRNet(), Pairs(), quaternion_loss),
+    "reconstruction": lambda: Reconstruction(AutoEncoder(50, 16, (8, 8))),
+    "registration": lambda: Registration(PCRNet()),
 }
 
 
@@ -85,7 +83,7 @@ def test_refinement_of_pairs_refines_sources_for_whole_targets_then_targets_for_
 
 
 def test_refinement_of_unsuitable_task_or_net_raises():
-    pairs = Registration(PCRNet(iterations=2), Pairs(), quaternion_loss)
+    pairs = Registration(PCRNet(iterations=2))
     with pytest.raises(UserError, match=r"refine must be 0 with this PCRNet, got 2.*iterations=1"):
         Refinement(pairs, 2)
 

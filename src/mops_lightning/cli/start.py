@@ -36,8 +36,6 @@ NEEDS = {
     "recipe.all_points_from": "recipe.train_points",
     "recipe.distillation": "learn=sampler",
     "recipe.feature_distillation": "learn=sampler",
-    "augment.task.jitter_clip": "augment.task.jitter",
-    "augment.sampler.jitter_clip": "augment.sampler.jitter",
 }
 """Settings without effect unless another one is set, or has the value behind ``=``."""
 OF_TRAINED = ("recipe.", "optimizer.", "baselines.")

@@ -12,6 +12,9 @@ from mops_lightning.errors import check_at_least
 from mops_lightning.seeding import generator
 from mops_lightning.types import Batch
 
+JITTER_CLIP = 5
+"""Largest noise of the augmentation in standard deviations, as PointNet was trained."""
+
 
 @dataclass(frozen=True)
 class Augmentation:
@@ -19,8 +22,8 @@ class Augmentation:
 
     Attributes:
         rotate_up: rotate every cloud by a random angle about the up axis (y).
-        jitter: standard deviation of the noise added to every coordinate.
-        jitter_clip: largest absolute noise.
+        jitter: standard deviation of the noise added to every coordinate, which is clipped at five
+            standard deviations.
 
     Raises:
         UserError: an argument is out of range.
@@ -28,11 +31,10 @@ class Augmentation:
 
     rotate_up: bool = False
     jitter: float = 0.0
-    jitter_clip: float = 0.05
 
     def __post_init__(self) -> None:
         """Check the arguments."""
-        check_at_least(0, jitter=self.jitter, jitter_clip=self.jitter_clip)
+        check_at_least(0, jitter=self.jitter)
 
     @property
     def active(self) -> bool:
@@ -47,8 +49,9 @@ class Augmentation:
             rows = [cos, zero, sin, zero, zero + 1, zero, -sin, zero, cos]
             points = points @ torch.stack(rows, 1).view(-1, 3, 3)
         if self.jitter:
+            most = JITTER_CLIP * self.jitter
             noise = torch.randn(points.shape, generator=rng).mul_(self.jitter)
-            points = points + noise.clamp_(-self.jitter_clip, self.jitter_clip)
+            points = points + noise.clamp_(-most, most)
         return points
 
 

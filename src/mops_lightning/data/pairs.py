@@ -56,7 +56,7 @@ class Pairs:
         if self.resample is not None and self.resample > n_points:
             raise UserError(
                 f"resample must be at most the {n_points} points of a shape, got {self.resample} "
-                "(task.pairs.resample and dataset.n_points on the command line)."
+                "(task.resample and dataset.n_points on the command line)."
             )
         motion = random_motion(ROTATION, TRANSLATION, generators)
         source = target = points

@@ -26,8 +26,6 @@ def quaternion_distance(predicted: Tensor, true: Tensor) -> Tensor:
 def quaternion_loss(
     predicted: Motion,
     true: Motion,
-    source: Tensor,
-    target: Tensor,
 ) -> dict[str, Tensor]:
     """Return the paper's quaternion loss and a translation loss.
 
@@ -36,8 +34,6 @@ def quaternion_loss(
     Args:
         predicted: the predicted motion between centred clouds.
         true: the true motion between centred clouds.
-        source: ``(B, M, 3)`` points of the centred source; unused.
-        target: ``(B, M, 3)`` points of the centred target; unused.
 
     Returns:
         The terms ``quaternion`` and ``translation``, scalars. The paper does not mention the L2

@@ -16,6 +16,9 @@ from mops_lightning.nets.layers import (
 )
 from mops_lightning.nets.max_pool import PointMaxPool
 
+DECODER_CHANNELS = (256, 256)
+"""Sizes of the decoder's hidden layers, with ReLU and without BatchNorm."""
+
 
 class PointEncoder(nn.Module):
     """Pointwise layers with BatchNorm and ReLU, then the maximum over points: the codeword.
@@ -85,7 +88,6 @@ class AutoEncoder(Reconstructor):
         n_points: n, the fixed number of output points.
         codeword: size d of the codeword.
         encoder_channels: sizes of the encoder's layers before the codeword.
-        decoder_channels: sizes of the decoder's hidden layers, with ReLU and without BatchNorm.
 
     Raises:
         UserError: an argument is out of range.
@@ -96,17 +98,15 @@ class AutoEncoder(Reconstructor):
         n_points: int = 1024,
         codeword: int = 128,
         encoder_channels: Sequence[int] = (64, 128, 128, 256),
-        decoder_channels: Sequence[int] = (256, 256),
     ) -> None:
         super().__init__()
         check_at_least(1, n_points=n_points)
         check_channels("encoder_channels", encoder_channels)
-        check_channels("decoder_channels", decoder_channels)
         self.n_points = n_points
         self.encoder = PointEncoder(codeword, encoder_channels)
         self.decoder = nn.Sequential(
-            *linear_norm_relu([codeword, *decoder_channels], norm=False),
-            nn.Linear(decoder_channels[-1], 3 * n_points),
+            *linear_norm_relu([codeword, *DECODER_CHANNELS], norm=False),
+            nn.Linear(DECODER_CHANNELS[-1], 3 * n_points),
         )
 
     def from_pooled(self, pooled: Tensor, n_points: int | None = None) -> Tensor:

@@ -15,6 +15,9 @@ from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_rel
 from mops_lightning.nets.max_pool import PointMaxPool
 from mops_lightning.ops.rigid import Motion, identity_motion
 
+HEAD_CHANNELS = (1024, 1024, 512, 512, 256)
+"""Sizes of the hidden layers of the head."""
+
 
 class PCRNet(nn.Module):
     """A PointNet shared by both clouds, and a head that predicts quaternion and translation.
@@ -31,7 +34,6 @@ class PCRNet(nn.Module):
         iterations: number of passes. Each pass registers the source as moved by the passes before
             it, and the motions are composed. The paper uses 1, PCRNet's authors 8.
         feature_channels: sizes of the pointwise layers.
-        head_channels: sizes of the hidden layers of the head.
 
     Raises:
         UserError: an argument is out of range.
@@ -41,17 +43,15 @@ class PCRNet(nn.Module):
         self,
         iterations: int = 1,
         feature_channels: Sequence[int] = (64, 64, 64, 128, 1024),
-        head_channels: Sequence[int] = (1024, 1024, 512, 512, 256),
     ) -> None:
         super().__init__()
         check_at_least(1, iterations=iterations)
         check_channels("feature_channels", feature_channels, 2)
-        check_channels("head_channels", head_channels)
         self.iterations = iterations
         self.features = PointMLP([3, *feature_channels[:-1]], norm=False)
         self.pool = PointMaxPool(feature_channels[-2], feature_channels[-1], norm=False)
-        self.head = linear_norm_relu([2 * feature_channels[-1], *head_channels], norm=False)
-        self.motion = nn.Linear(head_channels[-1], 7)
+        self.head = linear_norm_relu([2 * feature_channels[-1], *HEAD_CHANNELS], norm=False)
+        self.motion = nn.Linear(HEAD_CHANNELS[-1], 7)
         for module in self.modules():
             if isinstance(module, nn.Linear) and module is not self.motion:
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")

@@ -213,8 +213,8 @@ def _row(record: RunRecord) -> tuple[str, str]:
 
 
 def _task(record: RunRecord) -> tuple[str, ...]:
-    names, pairs = record.config["names"], record.config["task"].get("pairs")
-    return names["task"], names["dataset"], f"pairs={json.dumps(pairs, sort_keys=True)}"
+    names = record.config["names"]
+    return names["task"], names["dataset"], f"resample={record.config['task'].get('resample')}"
 
 
 def _trained(record: RunRecord) -> tuple[str, ...] | None:
@@ -222,9 +222,8 @@ def _trained(record: RunRecord) -> tuple[str, ...] | None:
     if weightless(record):
         return None
     task, learned = record.config["task"], trained_with(record)
-    loss = f"loss={json.dumps(task.get('loss'), sort_keys=True)}" if learned == "joint" else ""
     settings = f"task.net={json.dumps(task.get('net'), sort_keys=True)}"
-    return record.config["names"]["net"], settings, f"learn={learned}", loss
+    return record.config["names"]["net"], settings, f"learn={learned}"
 
 
 def commit(record: RunRecord) -> str:

@@ -1,13 +1,13 @@
 """Registration of sampled clouds (paper section "Registration-oriented Downsampling")."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from torch import Tensor, nn
 from torchmetrics import MetricCollection
 
 from mops_lightning.data.pairs import Pairs
-from mops_lightning.errors import UserError
+from mops_lightning.losses.registration import quaternion_loss
 from mops_lightning.metrics.base import collection
 from mops_lightning.metrics.registration import (
     DoubledRotationError,
@@ -24,8 +24,6 @@ from mops_lightning.types import PairBatch, TaskOutput
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Loss = Callable[[Motion, Motion, Tensor, Tensor], dict[str, Tensor]]
-
 
 class Registration(Task):
     """Estimates the rigid motion between two clouds from sampled points of both.
@@ -35,12 +33,11 @@ class Registration(Task):
 
     Args:
         net: maps sources ``(B, M, 3)`` and targets ``(B, M, 3)`` to a ``Motion``.
-        pairs: makes the training and test pairs.
-        loss: takes the predicted and the true motion between the centred clouds, and the sampled
-            points ``(B, M, 3)`` of source and target; returns its terms by name.
+        resample: number of points of source and target, drawn independently; None uses all points
+            of a cloud in both. See ``data.pairs.Pairs``.
 
     Raises:
-        UserError: ``pairs`` or ``loss`` is None.
+        UserError: an argument is out of range.
     """
 
     score = RotationError.name
@@ -49,16 +46,12 @@ class Registration(Task):
     maps_pooled = "from_pooled_pair"
 
     def __init__(
-        self, net: nn.Module, pairs: Pairs | None = None, loss: Loss | None = None
+        self,
+        net: nn.Module,
+        resample: int | None = None,
     ) -> None:
         super().__init__(net)
-        for name, part in (("pairs", pairs), ("loss", loss)):
-            if part is None:
-                raise UserError(f"{name} cannot be None. Leave it at its default.")
-        assert pairs is not None
-        assert loss is not None
-        self.make_batch = pairs
-        self.loss = loss
+        self.make_batch = Pairs(resample)
 
     def predict(self, batch: PairBatch, points: Tensor) -> Motion:
         """Return the motions between the centred clouds from ``(2B, M, 3)`` points of both."""
@@ -90,7 +83,7 @@ class Registration(Task):
         from_source, from_target = batch.centroids.chunk(2)
         # The true motion between the centred clouds: R·(p + c) + t = R·p + (R·c + t).
         shift = true.apply(from_source[:, None])[:, 0] - from_target
-        losses = self.loss(found, true._replace(translation=shift), *points.chunk(2))
+        losses = quaternion_loss(found, true._replace(translation=shift))
         turned = found._replace(translation=from_target).apply(-from_source[:, None])[:, 0]
         predicted = Motion(found.quaternion, found.translation + turned)
         return TaskOutput(losses, predicted, true, found)

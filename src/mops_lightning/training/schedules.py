@@ -10,39 +10,32 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from mops_lightning.errors import UserError
 
+START_FACTOR, END_FACTOR = 0.04, 1e-4
+"""First and last learning rate of one cycle over its peak."""
 
-def one_cycle(
-    optimizer: Optimizer,
-    total_steps: int,
-    warmup: float = 0.3,
-    start_factor: float = 0.04,
-    end_factor: float = 1e-4,
-) -> LambdaLR:
+
+def one_cycle(optimizer: Optimizer, total_steps: int, warmup: float = 0.3) -> LambdaLR:
     """Increase to the optimizer's rate along a half cosine, then decrease (Smith and Topin, 2018).
 
     Args:
         optimizer: its learning rate is the peak.
         total_steps: optimizer steps in the run.
         warmup: fraction of the run in which the rate increases.
-        start_factor: first rate over peak.
-        end_factor: last rate over peak.
 
     Raises:
-        UserError: one of these is not between 0 and 1.
+        UserError: ``warmup`` is not between 0 and 1.
     """
-    shares = {"warmup": warmup, "start_factor": start_factor, "end_factor": end_factor}
-    for name, share in shares.items():
-        if not 0 <= share <= 1:
-            raise UserError(f"{name} must be between 0 and 1, got {share}.")
+    if not 0 <= warmup <= 1:
+        raise UserError(f"warmup must be between 0 and 1, got {warmup}.")
     last = max(total_steps - 1, 1)
     peak = warmup * total_steps - 1
 
     def factor(step: int) -> float:
         step = min(step, last)
         if step < peak:
-            low, part = start_factor, 1 - step / peak
+            low, part = START_FACTOR, 1 - step / peak
         else:
-            low, part = end_factor, (step - peak) / max(last - peak, 1)
+            low, part = END_FACTOR, (step - peak) / max(last - peak, 1)
         return low + (1 - low) * (1 + math.cos(math.pi * part)) / 2
 
     return LambdaLR(optimizer, factor)

@@ -42,7 +42,7 @@ def test_factory_sampler_that_the_clouds_rule_out_raises_before_training(overrid
 
 
 def test_factory_counts_the_points_that_pairs_draw():
-    overrides = ["task=registration", "sampler=fps", "m=8", "task.pairs.resample=16"]
+    overrides = ["task=registration", "sampler=fps", "m=8", "task.resample=16"]
     make_experiment(compose([*overrides, "sampler.start=15"]), small_dataset(), {})
     with pytest.raises(UserError, match=r"^sampler.start must be less than .* N=16, got 16"):
         make_experiment(compose([*overrides, "sampler.start=16"]), small_dataset(), {})

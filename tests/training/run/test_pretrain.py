@@ -98,10 +98,8 @@ def test_diverged_training_fails_without_weights(tmp_path):
             r"task\.net must take \(source, target\).*PointNetVanilla.*\(points\)",
         ),
         (["task.net=null"], r"task.net cannot be removed"),
-        (["~task.pairs"], r"task\.pairs cannot be None"),
-        (["task.loss=null"], r"task\.loss cannot be None"),
-        (["task.pairs.resample=0"], r"task.pairs.resample must be .*got 0"),
-        (["task.pairs.resample=16", "m=24"], r"task.pairs.resample"),
+        (["task.resample=0"], r"task.resample must be .*got 0"),
+        (["task.resample=16", "m=24"], r"task.resample"),
     ],
 )
 def test_mistake_fails_before_pretraining(settings, said, tmp_path):

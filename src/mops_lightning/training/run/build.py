@@ -47,8 +47,7 @@ STANDARD = (8, 16, 32, 64, 128, 256, 512)
 """The sizes of the paper's tables."""
 AUTO = "auto"
 MORE_POINTS = (
-    "Lower it, or give clouds of more points (dataset.n_points; for pairs also "
-    "task.pairs.resample)."
+    "Lower it, or give clouds of more points (dataset.n_points; for pairs also task.resample)."
 )
 
 
