@@ -61,6 +61,21 @@ def build(node: Any, where: str = "", **extra: Any) -> Any:
     return made
 
 
+def build_as(kind: type, node: DictConfig, where: str, **extra: Any) -> Any:
+    """Make the object that a node describes, which must be of a class; see ``build``.
+
+    Raises:
+        UserError: also if it is of another class.
+    """
+    made = build(node, where, **extra)
+    if not isinstance(made, kind):
+        raise UserError(
+            f"{where}: {node.get('_target_')} must return a {kind.__name__}, got "
+            f"{type(made).__name__}."
+        )
+    return made
+
+
 def _known_cause(error: BaseException, node: Any, where: str) -> UserError | None:
     """Return the user's mistake behind an error of Hydra's, if it is one."""
     cause: BaseException | None = error

@@ -62,9 +62,13 @@ def check_overrides(arguments: Sequence[str]) -> None:
         if name.partition(".")[0] == "names":
             raise UserError(f"{argument}: names follow from the chosen groups. Leave it out.")
         group = name.partition("@")[0]
-        if override is None or override.is_delete() or group not in groups:
+        if override is None or override.is_delete():
             continue
         value: Any = override.value()
+        if name == "hydra.verbose" and type(value) in (int, float, dict, type(None)):
+            raise UserError(f"{argument}: give true, false, or a list of loggers.")
+        if group not in (*groups, "hydra"):
+            continue
         values = [value]
         if override.is_sweep_override():
             values = value.list if override.is_choice_sweep() else []

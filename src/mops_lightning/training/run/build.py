@@ -22,9 +22,10 @@ from typing import Any
 import lightning as L
 import torch
 from omegaconf import DictConfig, OmegaConf
+from torch import nn
 
 from mops_lightning.config import distributed
-from mops_lightning.config.build import accepted, build, settings_named
+from mops_lightning.config.build import accepted, build, build_as, settings_named
 from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
@@ -163,14 +164,14 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     """
     L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
     classes = {"num_classes": len(dataset.class_names)}
-    own_net = build(cfg.task.net, "task.net", **accepted(cfg.task.net, classes))
-    task: Task = build(cfg.task, "task", net=own_net, **accepted(cfg.task, classes))
+    own_net = build_as(nn.Module, cfg.task.net, "task.net", **accepted(cfg.task.net, classes))
+    task: Task = build_as(Task, cfg.task, "task", net=own_net, **accepted(cfg.task, classes))
     # Another seed: the sampler's initial weights must not depend on the task net's size.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
     # For samplers that select points by the task net's features.
     net = {"net": task.net}
     own = accepted(cfg.sampler, net)
-    sampler = build(cfg.sampler, "sampler", **own) if cfg.learn != "task" else None
+    sampler = build_as(Sampler, cfg.sampler, "sampler", **own) if cfg.learn != "task" else None
     # Pairs may have fewer points than the clouds they are drawn from.
     one = CloudLoader(dataset.test, 1, make_batch=task.make_batch).batch_of(torch.tensor([0]))
     points = one.points.shape[1]
@@ -195,7 +196,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         m=cfg.m,
         task_lr_scale=cfg.task_lr_scale,
         refine=cfg.refine,
-        recipe=_in_force(build(cfg.recipe, "recipe"), sampler),
+        recipe=_in_force(build_as(Recipe, cfg.recipe, "recipe"), sampler),
     )
 
 
@@ -284,7 +285,7 @@ def _make_baselines(cfg: DictConfig, m: int, net: dict[str, Any]) -> dict[str, S
     for name, node in cfg.baselines.items():
         if node:
             own = accepted(node, net if "seed" in node else {**net, "seed": cfg.seed})
-            baselines[str(name)] = build(node, f"baselines.{name}", m=m, **own)
+            baselines[str(name)] = build_as(Sampler, node, f"baselines.{name}", m=m, **own)
     return baselines
 
 

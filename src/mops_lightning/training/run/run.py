@@ -11,7 +11,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config import distributed
-from mops_lightning.config.build import build
+from mops_lightning.config.build import build_as
 from mops_lightning.config.validate import check
 from mops_lightning.data.clouds import CloudDataset, noisy, scale_warning
 from mops_lightning.data.corruptions import corrupt
@@ -169,12 +169,7 @@ def claim(folder: Path) -> None:
 
 def _load_data(cfg: DictConfig) -> CloudDataset:
     """Load both splits and corrupt the test clouds."""
-    dataset = build(cfg.dataset, "dataset")
-    if not isinstance(dataset, CloudDataset):
-        raise UserError(
-            f"dataset: {cfg.dataset.get('_target_')} must return a CloudDataset, got "
-            f"{type(dataset).__name__}."
-        )
+    dataset: CloudDataset = build_as(CloudDataset, cfg.dataset, "dataset")
     if warning := scale_warning(dataset):
         print(warning, file=sys.stderr)
     test = noisy(corrupt(dataset.test, cfg.test_corruption), cfg.test_noise_std)
