@@ -40,6 +40,8 @@ from tests.support.command_line import TINY, TINY_WITH_PICTURES, refused
         (["m=8", "--resolve"], "write --cfg job --resolve."),
         (["--cfg", "jobs", "m=8"], "--cfg/-c: invalid choice: 'jobs'"),
         (["..=8"], "'..=8' is not a setting. Settings are KEY=VALUE."),
+        (["~dataset=3"], "~dataset=3: write ~dataset."),
+        ([*TINY, "trainer._target_=builtins.dict"], "must return a Trainer, got dict."),
         (["hydra=null"], "hydra=null: choose one"),
         (["hydra.verbose={a: 1}"], "hydra.verbose={a: 1}: give true, false, or a list"),
         (["hydra.verbose=1984"], "give true, false, or a list of loggers."),

@@ -62,9 +62,13 @@ def check_overrides(arguments: Sequence[str]) -> None:
         if name.partition(".")[0] == "names":
             raise UserError(f"{argument}: names follow from the chosen groups. Leave it out.")
         group = name.partition("@")[0]
-        if override is None or override.is_delete():
+        if override is None:
             continue
         value: Any = override.value()
+        if override.is_delete():
+            if group in groups and value is not None and not _is_choice(value):
+                raise UserError(f"{argument}: write ~{name}.")
+            continue
         if name == "hydra.verbose" and type(value) in (int, float, dict, type(None)):
             raise UserError(f"{argument}: give true, false, or a list of loggers.")
         if group not in (*groups, "hydra"):

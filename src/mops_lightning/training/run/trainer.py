@@ -12,13 +12,13 @@ import lightning as L
 import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import ProgressBar
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig
 from torch import Tensor
 from torch.utils.tensorboard.summary import hparams
 
-from mops_lightning.config.build import accepted, build
+from mops_lightning.config.build import accepted, build_as
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
@@ -107,7 +107,8 @@ def make_trainer(
         StopBetweenSteps(folder / "checkpoints" / CHECKPOINT),
         CPUTime(),
     ]
-    trainer: L.Trainer = build(
+    trainer: L.Trainer = build_as(
+        L.Trainer,
         cfg.trainer,
         "trainer",
         logger=logger,
@@ -149,7 +150,7 @@ def _logger(node: DictConfig, folder: Path) -> Any:
     if below := LOGGER_FOLDERS.get(node["_target_"].rpartition(".")[2]):
         own |= {"name": below, "version": ""}  # the progress bar would show a version
     unset = {name: value for name, value in own.items() if name not in node}
-    return build(node, "logger", save_dir=str(folder), **unset)
+    return build_as(Logger, node, "logger", save_dir=str(folder), **unset)
 
 
 def _silence_lightning() -> None:
