@@ -71,8 +71,8 @@ def curves(table: Table) -> Figure:
         axis.set_xticks(
             range(len(columns)), [one if isinstance(one, str) else f"{one:g}" for one in columns]
         )
-    if len(columns) > MAX_COLUMNS:
-        axis.tick_params(axis="x", rotation=90, labelsize=5)
+        if len(columns) > MAX_COLUMNS:
+            axis.tick_params(axis="x", rotation=90, labelsize=5)
         axis.grid(alpha=0.3)
     panels[0].set_ylabel(table.metric.title)
     panels[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
