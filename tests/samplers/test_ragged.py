@@ -199,6 +199,13 @@ def test_weights_that_cannot_be_used_are_rejected(weight, said):
         RandomSampler(8).downsample(torch.rand(40, 3), weight=weight)
 
 
+@pytest.mark.parametrize("weight", [None, "curvature", torch.ones(40)])
+def test_points_that_are_not_finite_are_rejected(weight):
+    points = torch.rand(40, 3).index_fill(0, torch.tensor([3]), torch.nan)
+    with pytest.raises(UserError, match="points must be finite"):
+        RandomSampler(8).downsample(points, weight=weight)
+
+
 def test_weights_of_too_few_points_are_rejected():
     with pytest.raises(UserError, match="m must be at most the number of points N=5, got m=8"):
         RandomSampler(8).downsample(torch.rand(5, 3), weight=torch.ones(5))

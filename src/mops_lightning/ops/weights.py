@@ -61,7 +61,12 @@ def curvature(points: NDArray[Any]) -> NDArray[np.float64]:
     Pauly, Gross and Kobbelt, "Efficient Simplification of Point-Sampled Surfaces", IEEE
     Visualization 2002; the λ are the eigenvalues of the covariance of the nearest points,
     ascending. It is 0 for a plane and at most 1/3.
+
+    Raises:
+        UserError: a point is not finite.
     """
+    if not np.isfinite(points).all():
+        raise UserError("points must be finite, got NaN or infinity.")
     tree = cKDTree(points)
     result = np.full(len(points), LEAST)
     for start in range(0, len(points), PART):
