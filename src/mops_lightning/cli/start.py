@@ -2,6 +2,8 @@
 
 import sys
 import traceback
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -90,12 +92,13 @@ def check_effect(cfg: DictConfig, given: list[str]) -> None:
     Raises:
         UserError: there is one.
     """
+    is_trained = cache(partial(_is_trained, cfg))  # builds the sampler
     for argument in given:
-        if reason := _why_without_effect(cfg, overrides.path(argument)):
+        if reason := _why_without_effect(cfg, overrides.path(argument), is_trained):
             raise UserError(f"{argument}: has no effect {reason}. Leave it out.")
 
 
-def _why_without_effect(cfg: DictConfig, path: str) -> str:
+def _why_without_effect(cfg: DictConfig, path: str, is_trained: Callable[[], bool]) -> str:
     """Return why nothing follows a setting; empty if something may."""
     setting = settings.of(path)
     if path in settings.declared() and setting.group:
@@ -110,7 +113,7 @@ def _why_without_effect(cfg: DictConfig, path: str) -> str:
         return f"with weights={cfg.weights or 'null'}"
     trains_task = cfg.learn == "task" or (cfg.learn == "joint" and path.startswith("optimizer."))
     counts = trains_task or path == "recipe.task_points" or not path.startswith(OF_TRAINED)
-    return "" if counts or _is_trained(cfg) else f"with sampler={cfg.names.sampler}, {UNTRAINED}"
+    return "" if counts or is_trained() else f"with sampler={cfg.names.sampler}, {UNTRAINED}"
 
 
 def _is_trained(cfg: DictConfig) -> bool:

@@ -9,11 +9,12 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, normalize
 
 from mops_lightning.data.clouds import Clouds
-from mops_lightning.data.unit_sphere import UnitSphere
 from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.ops.points import normalize_unit_sphere
+from mops_lightning.ops.rigid import quaternion_to_matrix
 from mops_lightning.seeding import generator
 
 STREAM = 17
@@ -62,10 +63,9 @@ def jitter(points: Tensor, std: float, rng: torch.Generator) -> Tensor:
 
 def rotation(points: Tensor, degrees: float, rng: torch.Generator) -> Tensor:
     """Rotate by an angle of up to ``degrees`` about a random axis."""
-    axis = torch.nn.functional.normalize(torch.randn(3, generator=rng), dim=0)
-    angle = math.radians(degrees) * _uniform((), rng)
-    turn = torch.linalg.matrix_exp(angle * torch.linalg.cross(axis.expand(3, 3), torch.eye(3)))
-    return points @ turn
+    axis = normalize(torch.randn(3, generator=rng), dim=0)
+    half = math.radians(degrees) * _uniform((1,), rng) / 2
+    return points @ quaternion_to_matrix(torch.cat([half.cos(), half.sin() * axis]))
 
 
 def scaling(points: Tensor, factor: float, rng: torch.Generator) -> Tensor:
@@ -131,7 +131,7 @@ def drop_local(points: Tensor, share: float, rng: torch.Generator) -> Tensor:
 def add_global(points: Tensor, share: float, rng: torch.Generator) -> Tensor:
     """Add points that are uniform in the unit ball; ``share`` is relative to the cloud."""
     count = round(share * len(points))
-    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=rng), dim=1)
+    direction = normalize(torch.randn(count, 3, generator=rng), dim=1)
     radius = torch.rand(count, 1, generator=rng) ** (1 / 3)
     return torch.cat([points, radius * direction])
 
@@ -175,8 +175,7 @@ def _uniform(shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
 
 
 def _normalised(points: Tensor) -> Tensor:
-    cloud = points.double().numpy()
-    return UnitSphere.around(cloud).normalise(cloud)
+    return normalize_unit_sphere(points[None])[0]
 
 
 def _nearest(points: Tensor, size: int, rng: torch.Generator) -> Tensor:

@@ -23,10 +23,7 @@ def quaternion_distance(predicted: Tensor, true: Tensor) -> Tensor:
     return torch.linalg.vector_norm(predicted - sign * true, dim=1).mean()
 
 
-def quaternion_loss(
-    predicted: Motion,
-    true: Motion,
-) -> dict[str, Tensor]:
+def quaternion_loss(predicted: Motion, true: Motion) -> dict[str, Tensor]:
     """Return the paper's quaternion loss and a translation loss.
 
     Paper section "Registration-oriented Downsampling".

@@ -21,16 +21,20 @@ from mops_lightning.report.collect import (
     trained_with,
     training_time,
 )
-from mops_lightning.report.comparable import Group, commit, groups, net_groups, weightless
+from mops_lightning.report.comparable import (
+    OF_TEST_CLOUDS,
+    Group,
+    commit,
+    groups,
+    net_groups,
+    weightless,
+)
 from mops_lightning.report.nets import nets_grid
 from mops_lightning.report.tables import Table, make_table, sort_key
 from mops_lightning.report.text import PAPER, Grid
 
 SETS = "generated / matched / completed sets, or one figure for samplers that choose input points."
 """The content of a cell, for titles."""
-
-CHANGED = ("test_noise_std", "test_corruption")
-"""Settings that change the test clouds, to which the paper's values do not apply."""
 
 MAX_COLUMNS = 8
 """Most values of a setting that a table shows side by side; more are below each other."""
@@ -264,7 +268,7 @@ def _full_lines(table: Table) -> list[str]:
 
 def _published(table: Table, full_clouds: bool = False) -> dict[str, Any]:
     """Return the paper's table; empty if it has none, and for test clouds that were changed."""
-    if any(one.config.get(key) for one in table.group.records for key in CHANGED):
+    if any(one.config.get(key) for one in table.group.records for key in OF_TEST_CLOUDS):
         return {}
     metric = table.full_metric if full_clouds else table.metric
     joint = trained_with(table.group.records[0]) == "joint"

@@ -12,8 +12,8 @@ from mops_lightning.config.shared_settings import table_settings
 from mops_lightning.records.run_record import RunRecord, dotted
 from mops_lightning.report.collect import epochs, recorded_recipe, sampler_row, seed, trained_with
 
-CORRUPTION = "test_corruption"
-"""The one setting without numbers whose values give the columns of a table."""
+OF_TEST_CLOUDS = ("test_noise_std", "test_corruption")
+"""Settings that change the test clouds; their values give the columns of a table."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def _with_layout(group: Group, mixed: bool) -> list[Group]:
     keys = sorted({key for one in different.values() for key in one})
     if group.column == "net" or not keys:
         return [group]
-    line = len(keys) == 1 and (_numeric(group.records, keys) or keys == [CORRUPTION])
+    line = len(keys) == 1 and (_numeric(group.records, keys) or keys[0] in OF_TEST_CLOUDS)
     plane = all(len(one) == 2 and _numeric(rows[row], one) for row, one in different.items())
     sizes = {record.config["m"] for record in group.records}
     if mixed and (len(sizes) > 1 or not (line or plane)):

@@ -187,12 +187,8 @@ class Sampler(nn.Module):
         raise NotImplementedError
 
     def sample_weighted(self, points: Tensor, m: int, weight: Tensor) -> Tensor:
-        """Return rows ``(B, m)`` of checked input, chosen by positive weights ``(B, N)``.
-
-        Raises:
-            UserError: the method has no weights.
-        """
-        raise UserError(f"weight: {type(self).__name__} takes no weights. {WEIGHTED}")
+        """Return rows ``(B, m)`` of checked input, chosen by positive weights ``(B, N)``."""
+        raise NotImplementedError  # see check_weighted
 
     def check_weighted(self, readout: str) -> None:
         """Check that the sampler takes weights.

@@ -45,11 +45,7 @@ class Registration(Task):
     clouds_per_prediction = 2
     maps_pooled = "from_pooled_pair"
 
-    def __init__(
-        self,
-        net: nn.Module,
-        resample: int | None = None,
-    ) -> None:
+    def __init__(self, net: nn.Module, resample: int | None = None) -> None:
         super().__init__(net)
         self.make_batch = Pairs(resample)
 

@@ -51,13 +51,12 @@ class Experiment(L.LightningModule):
         recipe: how the sampler is trained beyond its own losses; None: by these alone.
         task_lr_scale: with ``learn="joint"``, the task net's learning rate over the sampler's.
         refine: passes of the refined readout in tests; 0: without this readout.
+        test_logger: False keeps test metrics from the loggers and from ``trainer.test``'s result;
+            None: they go to a logger if there is one.
         m: the size that is validated and gives the run's score; None: the sampler's.
 
     Raises:
         UserError: ``learn`` is unknown, or task and sampler do not allow it; see ``Refinement``.
-
-    Attributes:
-        test_logger: False keeps test metrics from the loggers and from ``trainer.test``'s result.
     """
 
     def __init__(
@@ -75,6 +74,7 @@ class Experiment(L.LightningModule):
         task_lr_scale: float = 1.0,
         recipe: Recipe | None = None,
         refine: int = 0,
+        test_logger: bool | None = None,
     ) -> None:
         super().__init__()
         _check_learn(learn, task, sampler)
@@ -90,7 +90,7 @@ class Experiment(L.LightningModule):
         self.recipe = recipe or Recipe()
         self.distillation = Distillation(task, self.recipe) if learn == "sampler" else None
         self.total_steps = 1
-        self.test_logger: bool | None = None  # True warns where there is no logger
+        self.test_logger = test_logger
         for module in self._frozen():
             module.requires_grad_(False)
         self.m: int = m or (self.sampler.m if self.sampler is not None else 0)

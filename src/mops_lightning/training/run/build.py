@@ -196,6 +196,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         m=cfg.m,
         task_lr_scale=cfg.task_lr_scale,
         refine=cfg.refine,
+        test_logger=False,  # stages.test logs them, as one table
         recipe=_in_force(build_as(Recipe, cfg.recipe, "recipe"), sampler),
     )
 

@@ -108,7 +108,6 @@ def test(parts: Parts, record: RunRecord) -> None:
     """Score all test clouds."""
     experiment, trainer = parts.experiment, parts.trainer
     loader = parts.score_loader(parts.dataset.test)
-    experiment.test_logger = False  # log_test logs them, as one table
     with _errors_of_lightning():
         trainer.test(experiment, loader, verbose=False)
     if (tested := trainer.num_test_batches[0]) < len(loader):
