@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.dgcnn import DGCNN, max_of_rows
+from mops_lightning.nets.dgcnn import DGCNN
+from mops_lightning.nets.layers import max_of_rows
 from mops_lightning.nets.pointnet import TransformNet
 
 

@@ -10,10 +10,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mops_lightning.errors import check_at_least
-from mops_lightning.nets.layers import check_channels
+from mops_lightning.nets.layers import check_channels, max_of_rows
 from mops_lightning.nets.max_pool import PointMaxPool
 from mops_lightning.nets.pointnet import classifier_head
-from mops_lightning.ops.points import gather_points
 
 
 class EdgeConv(nn.Module):
@@ -44,27 +43,6 @@ class EdgeConv(nn.Module):
         edges = self.edge(features)
         mixed = self.own(features) - edges + max_of_rows(edges, rows)
         return F.relu(self.norm(mixed.flatten(0, 1))).unflatten(0, (-1, n))
-
-
-def max_of_rows(features: Tensor, rows: Tensor) -> Tensor:
-    """Return the maximum of every channel over selected rows, without the tensor of all of them.
-
-    Args:
-        features: ``(B, N, C)``.
-        rows: ``(B, M, k)`` int64.
-
-    Returns:
-        ``(B, M, C)``; gradients flow to the winning rows.
-    """
-    with torch.no_grad():
-        winners = rows[..., :1].expand(-1, -1, features.shape[2])
-        best = features.gather(1, winners)
-        for row in rows[..., 1:].unbind(2):
-            values = gather_points(features, row)
-            larger = values > best
-            best = torch.where(larger, values, best)
-            winners = torch.where(larger, row[..., None], winners)
-    return features.gather(1, winners)
 
 
 class DGCNN(nn.Module):
