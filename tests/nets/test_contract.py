@@ -9,7 +9,9 @@ from mops_lightning.nets.atlasnet import AtlasNet
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.dgcnn import DGCNN
 from mops_lightning.nets.foldingnet import MFoldingNet
+from mops_lightning.nets.hierarchical import HierarchicalNet
 from mops_lightning.nets.pointnet import PointNetTransform, PointNetVanilla, TransformNet
+from mops_lightning.samplers.fps import FPSSampler
 from tests.support.mixed import check_close_in_mixed_precision
 
 NETS = {
@@ -22,6 +24,7 @@ CLASSIFIERS = {
     "pointnet": lambda _: PointNetVanilla(5),
     "pointnet_transform": lambda _: PointNetTransform(5),
     "dgcnn": lambda _: DGCNN(5),
+    "hierarchical": lambda _: HierarchicalNet(5, FPSSampler, (20, 8), (8, 16, 16), 4),
 }
 ALL = {**NETS, **CLASSIFIERS}
 

@@ -52,11 +52,13 @@ class Classification(Task):
             points: ``(B, M, 3)`` sampled from the clouds.
 
         Returns:
-            The cross entropy, logits ``(B, num_classes)`` and labels.
+            The cross entropy, the losses of samplers inside the net, logits ``(B, num_classes)``
+            and labels.
         """
         logits = self.predict(batch, points)
-        loss = F.cross_entropy(logits, batch.labels)
-        return TaskOutput({"cross_entropy": loss}, logits, batch.labels, logits)
+        losses = {"cross_entropy": F.cross_entropy(logits, batch.labels)}
+        losses |= getattr(self.net, "losses", {})
+        return TaskOutput(losses, logits, batch.labels, logits)
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return overall and mean class accuracy, both in [0, 1]."""

@@ -180,10 +180,11 @@ class Experiment(L.LightningModule):
             loader.set_epoch(self.current_epoch)
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Seed dropout and the like by (seed, epoch, step), and set the temperature."""
+        """Seed dropout and the like by (seed, epoch, step), and set the temperatures."""
         torch.manual_seed(derive_seed(self.seed, self.current_epoch, batch_idx))
-        if self.sampler is not None:
-            self.sampler.anneal(self._progress)
+        for module in self.modules():  # a task net may have samplers, too
+            if isinstance(module, Sampler):
+                module.anneal(self._progress)
 
     @property
     def _progress(self) -> float:

@@ -1,0 +1,99 @@
+"""The hierarchical net; see test_contract for what all nets guarantee."""
+
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+
+from mops_lightning import (
+    FMOPSNet,
+    FPSSampler,
+    GumbelSampler,
+    MOPSNet,
+    RandomSampler,
+    SampleNet,
+    SerialSampler,
+    SNet,
+    VoxelSampler,
+)
+from mops_lightning.errors import UserError
+from mops_lightning.nets.hierarchical import HierarchicalNet, Stage, carried
+from mops_lightning.types import Batch
+
+SAMPLERS: dict[str, Any] = {
+    "fps": FPSSampler,
+    "random": RandomSampler,
+    "serial": SerialSampler,
+    "voxel": VoxelSampler,
+    "mops": MOPSNet,
+    "anchored": partial(MOPSNet, anchors="fps"),
+    "fmops": lambda m: FMOPSNet(m_max=m),
+    "snet": SNet,
+    "samplenet": SampleNet,
+    "gumbel": GumbelSampler,
+}
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_stages_train_any_sampler(name, rng):
+    torch.manual_seed(0)
+    net: Any = HierarchicalNet(5, SAMPLERS[name], (20, 8), (8, 16, 16), 4)
+    logits = net(torch.randn(4, 40, 3, generator=rng))
+    assert logits.shape == (4, 5)
+    (logits.square().sum() + sum(net.losses.values())).backward()
+    for stage in net.stages:
+        assert stage.sampler.m in (20, 8)
+        assert all(p.grad is not None for p in stage.sampler.parameters())
+
+
+@pytest.mark.parametrize("sampler", [FPSSampler, MOPSNet])
+def test_stage_equals_maximum_over_explicit_edges(sampler, rng):
+    torch.manual_seed(0)
+    stage = Stage(sampler(m=7), 7, 6, 10, 4).eval()
+    points, features = (torch.randn(2, 30, c, generator=rng) for c in (3, 6))
+    output = stage.sampler(points)
+    centres = output.points
+    near = torch.cdist(centres, points).topk(4, largest=False).indices
+    cloud = torch.arange(2)[:, None, None]
+    offsets = points[cloud, near] - centres[:, :, None]
+    edges = stage.feature(features[cloud, near]) + stage.offset(offsets)
+    if output.indices is None:
+        own = output.matrix.dense().mT @ features
+    else:
+        own = features[torch.arange(2)[:, None], output.indices]
+    mixed = (edges + stage.centre(own)[:, :, None]).amax(2)
+    mixed = stage.norm(mixed.flatten(0, 1)).relu().unflatten(0, (2, 7))
+    expected = mixed + stage.mlp(mixed)
+    found_centres, found = stage(points, features)
+    torch.testing.assert_close(found_centres, centres)
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+
+
+def test_points_without_matrix_carry_the_feature_of_the_nearest_point(rng):
+    points, features = (torch.randn(2, 30, c, generator=rng) for c in (3, 6))
+    output = SNet(m=5).eval()(points)
+    near = torch.cdist(output.points, points).argmin(2)
+    expected = features[torch.arange(2)[:, None], near]
+    torch.testing.assert_close(carried(output, points, features), expected)
+
+
+def test_losses_of_stages_are_part_of_the_step(rng):
+    from mops_lightning.tasks.classification import Classification
+
+    torch.manual_seed(0)
+    net = HierarchicalNet(5, partial(MOPSNet, alpha=2.0), (20, 8), (8, 16, 16), 4)
+    task = Classification(net, 5)
+    points = torch.randn(4, 40, 3, generator=rng)
+    batch = Batch(points, torch.tensor([0, 1, 2, 3]))
+    losses = task.step(batch, points).losses
+    assert sorted(losses) == ["cross_entropy", "stage1_subset", "stage2_subset"]
+    assert losses["stage1_subset"] > 0
+    assert sorted(task.eval().step(batch, points).losses) == ["cross_entropy"]
+
+
+def test_bad_arguments_raise():
+    with pytest.raises(UserError, match="channels must have one number more than the 2 of points"):
+        HierarchicalNet(5, FPSSampler, (20, 8), (8, 16))
+    with pytest.raises(UserError, match="k must be at least 1, got 0"):
+        HierarchicalNet(5, FPSSampler, k=0)
