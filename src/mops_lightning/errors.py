@@ -38,6 +38,7 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, prog: str, description: str) -> None:
         kept = argparse.RawDescriptionHelpFormatter
         super().__init__(prog=prog, description=description, formatter_class=kept)
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # also the first of several numbers
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and a message, and exit."""

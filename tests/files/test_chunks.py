@@ -29,6 +29,20 @@ def test_chunks_equal_whole_file(suffix, readout, folder, tmp_path):
         np.testing.assert_array_equal(parts.columns[name], column)
 
 
+def test_bounds_hold_for_chunks_and_whole_files(folder, tmp_path):
+    points = np.random.default_rng(1).normal(size=(500, 3))
+    np.save(tmp_path / "all.npy", points)
+    part = points[(np.abs(points[:, :2]) <= 1).all(1)]
+    np.save(tmp_path / "part.npy", part)
+    settings = ["--weights", folder, "--readout", "matched", "--m", 30]
+    assert call(tmp_path / "part.npy", tmp_path / "want.npy", *settings)[0] == 0
+    for more in ([], ["--chunk", 60]):
+        bounds = ["--bounds", "-1,-1,1,1", "--overwrite"]
+        status, out, _ = call(tmp_path / "all.npy", tmp_path / "out.npy", *settings, *bounds, *more)
+        assert (status, f"30 of {len(part)} points, " in out) == (0, True)
+        np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.load(tmp_path / "want.npy"))
+
+
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [

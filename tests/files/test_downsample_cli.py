@@ -6,6 +6,7 @@ from mops_lightning.data.formats.registry import read
 from mops_lightning.filesystem import TEMPORARY
 from tests.support.downsample import call, refused
 
+FPS = ["--m", 5, "--method", "fps"]
 GENERATED = ["--weights", "weights.safetensors", "--readout", "generated"]
 
 
@@ -35,6 +36,14 @@ GENERATED = ["--weights", "weights.safetensors", "--readout", "generated"]
         (["--m", 5, "--method", "fps", "--surface", -5], "--surface must be"),
         (["--m", 5, "--method", "fps", "--seed", 2**64], "--seed must be from 0"),
         (["--m", 5, "--method", "fps", "--seed", -1], "--seed must be from 0"),
+        ([*FPS, "--bounds", "0,0,5"], "--bounds must be xmin,ymin,xmax,ymax or"),
+        ([*FPS, "--bounds", "0,0,nan,5"], "every min below its max, got '0,0,nan,5'"),
+        ([*FPS, "--bounds", "-5,-5,0,0"], "holds 0 points in the chosen area, fewer than --m 5"),
+        ([*FPS, "--level", -1], "--level must be from 0"),
+        ([*FPS, "--level", 1, "--resolution", 0.5], "--level or --resolution, not both"),
+        ([*FPS, "--resolution", 0], "--resolution must be a number above 0"),
+        ([*FPS, "--resolution", 1], "in/a.ply: --level and --resolution need a COPC file"),
+        ([*FPS, "--level", 1, "--map", "map.npz"], "--map has a row for every point"),
     ],
 )
 def test_mistake_ends_in_one_line(arguments, said, folder, tmp_path, monkeypatch):

@@ -76,7 +76,7 @@ def sample_by_chunks(
     assert options.chunk is not None
     net = sampler.fused()
     sampler.check_m(m)
-    file = open_cloud_file(source)
+    file = open_cloud_file(source, options.area)
     cloud, row_ranges = replace(file, header=None), file.row_ranges(options.chunk)
 
     def over(title: str, function: Callable[..., Any], *common: Any) -> Iterable[Any]:
@@ -87,13 +87,13 @@ def sample_by_chunks(
     for count, part in over("centre", _count_and_sum):
         number += count
         summed += part
-    check_size(source, number, m)
+    check_size(source, number, m, options.area)
     centre = summed / number
     sphere = UnitSphere(centre, max(over("radius", _radius, centre)) or 1.0)
     global_ = reduce(torch.maximum, over("global feature", _global, sphere, net))
     sums: Partial = reduce(Partial.merge, over("sampling", _sum, sphere, net, global_, m))
     generated = sums.result()
-    outcome = Outcome(m, number, file.number - number)
+    outcome = Outcome(m, number, 0 if options.area else file.number - number)
     if options.readout == "generated":
         return Table(sphere.restore(generated)), outcome
     matched: Nearest = reduce(Nearest.merge, over("matching", _nearest, sphere, generated))

@@ -9,6 +9,7 @@ from dataclasses import fields
 from os.path import realpath
 from pathlib import Path
 
+from mops_lightning.data.formats.table import Area
 from mops_lightning.errors import Parser, UserError, did_you_mean, one_line_endings, printable
 from mops_lightning.files.engine import Engine, LocalEngine
 from mops_lightning.files.options import Options
@@ -108,6 +109,19 @@ def _downsample_arguments(add: Add) -> None:
         help="prefer points by this column of IN, such as opacity or intensity, or by 'curvature', "
         "which is computed; with --method fps, random, poisson, or --readout completed",
     )
+    add(
+        "--bounds",
+        metavar="XMIN,YMIN[,ZMIN],XMAX,YMAX[,ZMAX]",
+        help="sample the points in this box only, in the file's unit; of a COPC file, only the "
+        "cells of its octree that overlap the box are read",
+    )
+    add("--level", type=int, help="of a COPC file: deepest level of its octree to read; 0: root")
+    add(
+        "--resolution",
+        type=float,
+        metavar="DISTANCE",
+        help="of a COPC file: read the levels down to this distance of neighbouring points",
+    )
     add("--seed", type=int, default=0, help="seed of random choices")
     add("--overwrite", action="store_true", help="replace existing files")
 
@@ -158,6 +172,7 @@ def _options(chosen: argparse.Namespace) -> Options:
         raise UserError("--cluster must be the address of a Dask scheduler, got ''.")
     if chosen.cluster and chosen.chunk is None:
         raise UserError("--cluster distributes the chunks of a file: give --chunk as well.")
+    chosen.area = Area.parse(chosen.bounds, chosen.level, chosen.resolution)
     values = {field.name: getattr(chosen, field.name) for field in fields(Options)}
     return Options(**{**values, "readout": chosen.readout or "completed"})
 

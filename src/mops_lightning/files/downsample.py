@@ -105,10 +105,11 @@ def _sample_whole(
     source: Path, sampler: Sampler, m: int, options: Options
 ) -> tuple[NDArray[np.float64], Table, Outcome]:
     """Sample a file that is read as a whole; also return all of its points."""
-    table = read(source, options.surface or max(SURFACE, 8 * m), options.seed)
+    surface = options.surface or max(SURFACE, 8 * m)
+    table = read(source, surface, options.seed, options.area)
     finite = table.finite()
     number = len(finite.points)
-    check_size(source, number, m)
+    check_size(source, number, m, options.area)
     weight = weights_of(finite, options.weight, source) if options.weight else None
     rows, points = sample_cloud(finite.points, sampler, m, options, source, weight)
     if rows is None:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from mops_lightning.data.formats.table import Area
 from mops_lightning.errors import UserError
 from mops_lightning.records.readout_names import GENERATED_READOUTS
 from mops_lightning.zoo.names import UNTRAINED
@@ -25,6 +26,7 @@ class Options:
         map: file to write for ``mops_lightning.propagate``; None: no file.
         map_k: number of sampled points per point in this file.
         weight: a column with a weight per point, or ``curvature``; None: all points are equal.
+        area: the part of the file to sample; None: all of it.
 
     Raises:
         UserError: a value is out of range, or options exclude each other.
@@ -42,6 +44,7 @@ class Options:
     map: Path | None = None
     map_k: int = 1
     weight: str | None = None
+    area: Area | None = None
 
     def __post_init__(self) -> None:
         """Reject values out of range and options that exclude each other."""
@@ -86,6 +89,8 @@ class Options:
             raise UserError(
                 "--map needs the whole cloud in memory: use mops-lightning propagate after --chunk."
             )
+        if self.area is not None and self.map is not None:
+            raise UserError("--map has a row for every point of IN: no --bounds or level with it.")
         if self.chunk is not None and self.chunk < 1:
             raise UserError(f"--chunk must be at least 1, got {self.chunk}.")
         needs_all = self.method or self.tile is not None or self.readout == "completed"

@@ -8,16 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.data.formats.guard import BadCloudError, check_coordinates, reading
+from mops_lightning.data.formats.guard import (
+    BadCloudError,
+    WholeOnlyError,
+    check_coordinates,
+    reading,
+)
 from mops_lightning.data.formats.registry import READERS, open_cloud_file, write
-from mops_lightning.data.formats.table import Column, Table, TableParts
+from mops_lightning.data.formats.table import PART, Column, Table, TableParts
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.files.engine import with_progress
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.ops.propagation import propagate, propagation_map
-
-PART = 500_000
-"""Number of points that are read at a time."""
 
 Points = NDArray[np.float64]
 
@@ -102,7 +104,7 @@ def _tables(path: Path) -> Callable[[str], Iterable[Table]]:
     """Return a function of a title that reads a file's finite points, in parts if possible."""
     try:
         file = open_cloud_file(path)
-    except BadCloudError:  # for example ascii PLY; a broken file fails again here
+    except WholeOnlyError:  # for example ascii PLY
         whole = _read(path).finite()
         return lambda title: [whole]
     ranges = file.row_ranges(PART)

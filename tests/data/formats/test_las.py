@@ -1,14 +1,16 @@
 """LAS and LAZ files."""
 
+import io
 import struct
 
 import laspy
 import numpy as np
 import pytest
 
-from mops_lightning.data.formats.registry import WRITERS, open_cloud_file, read
-from mops_lightning.data.formats.table import Table
+from mops_lightning.data.formats.registry import WRITERS, open_cloud_file, read, write
+from mops_lightning.data.formats.table import Area, Table
 from mops_lightning.errors import UserError
+from tests.support.copc import write_copc
 
 RECORDS, NUMBER, EVLRS, LONG_NUMBER = 100, 107, 243, 247
 """Places of counts in the header."""
@@ -136,3 +138,84 @@ def test_laz_with_extra_bytes_reads(form, tmp_path):
     cloud["depth"] = np.arange(300)
     cloud.write(path)
     np.testing.assert_array_equal(read(path, 9, 0).columns["depth"], np.arange(300))
+
+
+def write_scan(path, number):
+    points = np.random.default_rng(0).uniform(0, 100, (number, 3)) * [1, 1, 0.1] + [5e5, 4e6, 0]
+    write_copc(path, points, spacing=8.0)
+    return path
+
+
+@pytest.fixture
+def scan(tmp_path):
+    """A COPC file of four levels; cells have up to 300 points, but for the deepest."""
+    return write_scan(tmp_path / "scan.copc.laz", 30_000)
+
+
+def rows_of(table):
+    return set(table.columns["intensity"].astype(int))
+
+
+@pytest.mark.parametrize("bounds", ["500010,4000020,500030,4000050", "5e5,4e6,5,500050,4000090,9"])
+def test_area_by_bounds_equals_all_points_clipped(bounds, scan, tmp_path):
+    area, whole, plain = Area.parse(bounds, None, None), read(scan, 9, 0), tmp_path / "plain.las"
+    assert area is not None
+    inside = ((whole.points >= area.low) & (whole.points <= area.high)).all(1)
+    expected = rows_of(whole.take(np.flatnonzero(inside)))
+    write(plain, whole)
+    for name in (scan, plain):
+        assert rows_of(read(name, 9, 0, area)) == expected
+        parts = open_cloud_file(name, area)
+        found = [rows_of(parts.read(rows)) for rows in parts.row_ranges(700)]
+        assert sum(map(len, found)) == len(set.union(*found)) == len(expected)
+
+
+@pytest.mark.parametrize(
+    ("level", "resolution", "depth"), [(0, None, 0), (2, None, 2), (None, 4.1, 1), (None, 0.1, 9)]
+)
+def test_area_by_level_reads_the_levels_above(level, resolution, depth, scan):
+    area = Area.parse(None, level, resolution)
+    with laspy.CopcReader.open(scan) as reader:
+        expected = set(reader.query(level=range(depth + 1)).intensity)
+    assert rows_of(read(scan, 9, 0, area)) == expected
+
+
+def test_one_percent_of_copc_reads_less_than_a_tenth(tmp_path, monkeypatch):
+    scan, total = write_scan(tmp_path / "large.copc.laz", 150_000), 0
+
+    class Counted(io.FileIO):
+        def readinto(self, buffer):
+            nonlocal total
+            number = super().readinto(buffer)
+            total += number
+            return number
+
+    def opened(path, mode="r", *_, **__):
+        return io.BufferedReader(Counted(path, mode.strip("b")))
+
+    monkeypatch.setattr("builtins.open", opened)
+    monkeypatch.setattr("io.open", opened)
+    monkeypatch.setattr("mops_lightning.data.formats.las.isolated", lambda do, *rest: do(*rest))
+    table = read(scan, 9, 0, Area(level=1))
+    assert len(table.points) > 1500  # 1 %
+    assert 0 < total < 0.1 * scan.stat().st_size
+
+
+def test_copc_damaged_is_broken(scan):
+    content = bytearray(scan.read_bytes())
+    content[-8:-4] = struct.pack("<i", -7)  # the length of the last cell
+    scan.write_bytes(content)
+    with pytest.raises(UserError, match=r"scan\.copc\.laz is broken"):
+        read(scan, 9, 0, Area.parse("0,0,1e9,1e9", None, None))
+
+
+def test_box_outside_of_las_says_where_it_is(scan):
+    with pytest.raises(UserError, match=r"scan\.copc\.laz are in 500000\.\d+,4000000"):
+        read(scan, 9, 0, Area.parse("0,0,9,9", None, None))
+
+
+def test_file_without_levels_says_so(tmp_path):
+    for suffix in (".las", ".npy", ".xyz"):
+        WRITERS[suffix](tmp_path / f"a{suffix}", Table(np.eye(3)))
+        with pytest.raises(UserError, match="need a COPC file"):
+            read(tmp_path / f"a{suffix}", 9, 0, Area(level=1))

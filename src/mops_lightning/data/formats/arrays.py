@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.data.formats.guard import BadCloudError, WholeOnlyError
 from mops_lightning.data.formats.table import (
     CloudFile,
     Column,
@@ -46,7 +46,7 @@ def locate_npy(path: Path) -> CloudFile:
     names, kind = column_names(array, path), array.dtype
     if kind.names is None:
         if not array.flags.c_contiguous:
-            raise BadCloudError(f"{path}: --chunk needs an array in C order, got Fortran order.")
+            raise WholeOnlyError(f"{path}: --chunk needs an array in C order, got Fortran order.")
         kind = np.dtype([(name, kind) for name in names])
     return binary_file(path, array.shape[0], kind, array.offset)
 

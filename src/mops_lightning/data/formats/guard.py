@@ -18,6 +18,10 @@ class BadCloudError(UserError):
     """A file that holds no usable cloud or mesh."""
 
 
+class WholeOnlyError(BadCloudError):
+    """A file that can be read as a whole only, not in ranges of its rows."""
+
+
 @contextmanager
 def naming_file(path: Path) -> Iterator[None]:
     """Turn any error of a parser into one that names the file.
@@ -57,10 +61,11 @@ def ends_early(path: Path, number: int) -> BadCloudError:
     return BadCloudError(f"{path} is broken: it ends after {number} points.")
 
 
-def check_size(path: Path, number: int, m: int) -> None:
-    """Reject a cloud of fewer points than are to be kept."""
+def check_size(path: Path, number: int, m: int, area: object = None) -> None:
+    """Reject a cloud, or an area of it, of fewer points than are to be kept."""
     if number < m:
-        raise BadCloudError(f"{path} holds {number} points, fewer than --m {m}.")
+        where = "" if area is None else " in the chosen area"
+        raise BadCloudError(f"{path} holds {number} points{where}, fewer than --m {m}.")
 
 
 def check_coordinates(path: Path, points: NDArray[np.float64]) -> None:

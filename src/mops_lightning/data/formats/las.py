@@ -2,7 +2,9 @@
 
 from contextlib import suppress
 from copy import deepcopy
+from dataclasses import replace
 from functools import partial
+from math import ceil, log2
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import numpy as np
 from mops_lightning.data.formats.guard import BadCloudError, ends_early
 from mops_lightning.data.formats.isolated import isolated
 from mops_lightning.data.formats.table import (
+    Area,
     CloudFile,
     Column,
     Table,
@@ -47,6 +50,30 @@ def locate(path: Path) -> CloudFile:
     """
     header = isolated(_parse_header, path)
     return CloudFile(path, header.point_count, partial(isolated, _parse_rows), header)
+
+
+def locate_area(file: CloudFile, area: Area) -> CloudFile:
+    """Return the part of a file in an area.
+
+    The rows of a COPC file are then those of the cells of its octree that overlap the area.
+    Nothing else is read.
+
+    Raises:
+        UserError: the file is broken, or lies outside of the box.
+    """
+    if file.header is None:
+        return replace(file, area=area)
+    low, high = np.asarray(file.header.mins), np.asarray(file.header.maxs)
+    if (low > area.high).any() or (high < area.low).any():
+        corners = ",".join(f"{number:.10g}" for number in (*low, *high))
+        raise BadCloudError(f"--bounds: all points of {file.path} are in {corners}.")
+    if not any(record.user_id == COPC for record in file.header.vlrs):
+        return replace(file, area=area)
+    number = isolated(_count_in_nodes, file.path, area)
+    parse = partial(isolated, partial(_parse_nodes, area))
+    return CloudFile(
+        file.path, number, parse, file.header, replace(area, level=None, resolution=None)
+    )
 
 
 def _parse_header(path: Path) -> Any:
@@ -91,8 +118,49 @@ def _parse_rows(path: Path, rows: range) -> Table:
     """
     with _laspy(path).open(path, read_evlrs=False) as file:
         file.seek(rows.start)
-        table = _table(file.read_points(len(rows)), None)
-        low, high = np.asarray(file.header.mins), np.asarray(file.header.maxs)
+        return _table_near(path, file.read_points(len(rows)), file.header)
+
+
+def _count_in_nodes(path: Path, area: Area) -> int:
+    with _laspy(path).CopcReader.open(path) as reader:
+        return sum(node.point_count for node in _nodes(reader, area))
+
+
+def _parse_nodes(area: Area, path: Path, rows: range) -> Table:
+    """Read a range of the rows of the octree's cells that overlap an area.
+
+    Raises:
+        BadCloudError: see ``_parse_rows``.
+    """
+    with _laspy(path).CopcReader.open(path) as reader:
+        nodes, first = _nodes(reader, area), 0
+        while nodes and first + nodes[0].point_count <= rows.start:
+            first += nodes.pop(0).point_count
+        ends = np.cumsum([node.point_count for node in nodes]) + first
+        read = nodes[: 1 + np.searchsorted(ends, rows.stop)]
+        # The public queries have no limit of memory.
+        points = reader._fetch_and_decompress_points_of_nodes(read)
+        table = _table_near(path, points, reader.header)
+    return table.take(np.arange(len(table.points))[rows.start - first : rows.stop - first])
+
+
+def _nodes(reader: Any, area: Area) -> list[Any]:
+    """Return the cells of a COPC file's octree that overlap an area, in the order of the file."""
+    from laspy.copc import Bounds, load_octree_for_query
+
+    levels, spacing = area.level, reader.copc_info.spacing
+    if area.resolution is not None:  # the distance of points is halved at each level
+        levels = max(0, ceil(log2(spacing / area.resolution)))
+    box = Bounds(np.array(area.low), np.array(area.high))
+    depth = None if levels is None else range(levels + 1)
+    nodes = load_octree_for_query(reader.source, reader.copc_info, reader.root_page, box, depth)
+    return sorted((n for n in nodes if n.point_count), key=lambda node: node.offset)
+
+
+def _table_near(path: Path, cloud: Any, header: Any) -> Table:
+    """Make a table of points, none of which is far outside of the header's bounds."""
+    table = _table(cloud, None)
+    low, high = np.asarray(header.mins), np.asarray(header.maxs)
     far = (high - low).max()
     if far > 0 and ((table.points < low - far) | (table.points > high + far)).any():
         raise BadCloudError(f"{path} is broken: it has points far outside of its header's bounds.")

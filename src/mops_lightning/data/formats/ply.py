@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.data.formats.guard import BadCloudError, WholeOnlyError
 from mops_lightning.data.formats.isolated import isolated
 from mops_lightning.data.formats.table import (
     CloudFile,
@@ -140,14 +140,16 @@ def locate(path: Path) -> CloudFile:
     form, *elements = words or [["format", "missing"]]
     begin = [place for place, line in enumerate(elements) if line[0] == "element"]
     if form[:1] != ["format"] or form[1] not in order or begin[:1] != [0]:
-        raise BadCloudError(f"{path}: --chunk needs binary PLY with a complete header.")
+        raise WholeOnlyError(f"{path}: --chunk needs binary PLY with a complete header.")
     first, *others = (elements[start] for start in begin)
     if first[1] != "vertex":
-        raise BadCloudError(f"{path}: --chunk needs PLY whose vertices come before other elements.")
+        raise WholeOnlyError(
+            f"{path}: --chunk needs PLY whose vertices come before other elements."
+        )
     if any(other[1] == "face" and other[2] != "0" for other in others):
-        raise BadCloudError(f"{path} is a mesh: --chunk needs a cloud.")
+        raise WholeOnlyError(f"{path} is a mesh: --chunk needs a cloud.")
     fields = elements[1 : begin[1] if others else None]
     if any(field[1] not in KINDS for field in fields):
-        raise BadCloudError(f"{path}: --chunk needs vertices without lists.")
+        raise WholeOnlyError(f"{path}: --chunk needs vertices without lists.")
     kind = np.dtype([(name, order[form[1]] + KINDS[typed]) for _, typed, name in fields])
     return binary_file(path, int(first[2]), kind, offset)

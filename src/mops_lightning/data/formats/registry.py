@@ -4,10 +4,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mops_lightning.data.formats import arrays, las, pcd, ply, text
-from mops_lightning.data.formats.guard import BadCloudError, reading
+from mops_lightning.data.formats.guard import BadCloudError, WholeOnlyError, reading
 from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
 from mops_lightning.data.formats.mesh import sample_mesh
-from mops_lightning.data.formats.table import CloudFile, Table, TableParts
+from mops_lightning.data.formats.table import Area, CloudFile, Table, TableParts
 from mops_lightning.errors import one_line
 from mops_lightning.filesystem import atomic_write
 
@@ -38,17 +38,23 @@ CHUNKED: dict[str, Callable[[Path], CloudFile]] = {
 READABLE = tuple(dict.fromkeys((*READERS, *MESHES)))
 
 
-def read(path: Path, surface: int, seed: int) -> Table:
+def read(path: Path, surface: int, seed: int, area: Area | None = None) -> Table:
     """Read a cloud, or sample a mesh.
 
     Args:
         path: a file that ends in one of ``READABLE``.
         surface: number of points to sample from a mesh's surface, uniform by area.
         seed: of these.
+        area: the part of the file to read.
 
     Raises:
         UserError: the file is missing or broken.
     """
+    if area is not None:
+        try:
+            return open_cloud_file(path, area).read_all()
+        except WholeOnlyError:
+            return area.clip(read(path, surface, seed), path)
     suffix = path.suffix.lower()
     if suffix not in READABLE:
         raise BadCloudError(f"{path} must end in {', '.join(READABLE)}.")
@@ -78,14 +84,20 @@ def write(path: Path, table: Table | TableParts) -> None:
         ) from None
 
 
-def open_cloud_file(path: Path) -> CloudFile:
+def open_cloud_file(path: Path, area: Area | None = None) -> CloudFile:
     """Open a file whose rows can be read in any range.
 
+    Args:
+        path: the file.
+        area: the part of it to read.
+
     Raises:
-        BadCloudError: the file is missing, broken, or of a format that is read as a whole only.
+        WholeOnlyError: the file is of a kind that is read as a whole only.
+        BadCloudError: the file is missing or broken.
     """
     suffix = path.suffix.lower()
     if suffix not in CHUNKED:
-        raise BadCloudError(f"{path}: --chunk works with {', '.join(CHUNKED)}.")
+        raise WholeOnlyError(f"{path}: --chunk works with {', '.join(CHUNKED)}.")
     with reading(path):
-        return CHUNKED[suffix](path)
+        file = CHUNKED[suffix](path)
+        return file if area is None else las.locate_area(file, area)

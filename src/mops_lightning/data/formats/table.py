@@ -1,8 +1,10 @@
 """A cloud as its file has it: coordinates and columns of attributes, whole or in ranges of rows."""
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mops_lightning.data.formats.guard import BadCloudError, ends_early, reading
+from mops_lightning.errors import UserError
 
 Column = NDArray[Any]
+
+PART = 500_000
+"""Number of rows that are read at a time."""
 
 RESERVED = ("x", "y", "z", "points")
 """Names that a column cannot have in a file."""
@@ -48,6 +54,77 @@ class Table:
 
 
 @dataclass(frozen=True)
+class Area:
+    """The part of a file to read: a box, and how deep to go into the octree of a COPC file.
+
+    Attributes:
+        low: lowest x, y and z; -inf for no limit.
+        high: highest x, y and z, which belong to the box.
+        level: deepest level of the octree, 0 for its root; None: all levels.
+        resolution: distance of neighbouring points, in the file's unit, at which to stop; None: all
+            levels.
+
+    Raises:
+        UserError: a value is out of range.
+    """
+
+    low: tuple[float, ...] = (-inf,) * 3
+    high: tuple[float, ...] = (inf,) * 3
+    level: int | None = None
+    resolution: float | None = None
+
+    def __post_init__(self) -> None:
+        """Reject values out of range."""
+        if self.level is not None and self.resolution is not None:
+            raise UserError("give --level or --resolution, not both.")
+        if self.level is not None and not 0 <= self.level < 32:
+            raise UserError(f"--level must be from 0 to 31, got {self.level}.")
+        if self.resolution is not None and not 0 < self.resolution < inf:
+            raise UserError(f"--resolution must be a number above 0, got {self.resolution}.")
+
+    @classmethod
+    def parse(
+        cls, bounds: str | None, level: int | None, resolution: float | None
+    ) -> "Area | None":
+        """Return the area of the options of a command line; None without any.
+
+        Args:
+            bounds: ``xmin,ymin,xmax,ymax`` or ``xmin,ymin,zmin,xmax,ymax,zmax``.
+            level: see ``Area``.
+            resolution: see ``Area``.
+        """
+        if bounds is None:
+            levels = cls(level=level, resolution=resolution)
+            return None if levels == cls() else levels
+        numbers: list[float] = []
+        with suppress(ValueError):
+            numbers = [float(word) for word in bounds.split(",")]
+        half = len(numbers) // 2
+        low, high = numbers[:half], numbers[half:]
+        if len(numbers) not in (4, 6) or not all(a < b for a, b in zip(low, high, strict=True)):
+            raise UserError(
+                "--bounds must be xmin,ymin,xmax,ymax or xmin,ymin,zmin,xmax,ymax,zmax with every "
+                f"min below its max, got {bounds!r}."
+            )
+        flat = half == 2
+        return cls((*low, *[-inf] * flat), (*high, *[inf] * flat), level, resolution)
+
+    def clip(self, table: Table, path: Path) -> Table:
+        """Return the points of a file that are in the box.
+
+        Raises:
+            BadCloudError: the area has levels, but the file has none.
+        """
+        if self.level is not None or self.resolution is not None:
+            raise BadCloudError(
+                f"{path}: --level and --resolution need a COPC file, which has levels of detail. "
+                "Use --bounds alone, or --method voxel."
+            )
+        inside = ((table.points >= self.low) & (table.points <= self.high)).all(axis=1)
+        return table if inside.all() else table.take(np.flatnonzero(inside))
+
+
+@dataclass(frozen=True)
 class CloudFile:
     """A file whose rows can be read in any range, so that it need not fit in memory.
 
@@ -56,12 +133,14 @@ class CloudFile:
         number: how many points it has, including those with non-finite coordinates.
         parse: reads a range of rows, or fewer where the file ends too early.
         header: see ``Table``; the tables that are read have none.
+        area: the part of the file to read.
     """
 
     path: Path
     number: int
     parse: Callable[[Path, range], Table]
     header: Any = None
+    area: Area | None = None
 
     def row_ranges(self, size: int) -> list[range]:
         """Split the rows into ranges of up to ``size``."""
@@ -69,7 +148,7 @@ class CloudFile:
         return [range(start, min(start + size, self.number)) for start in starts]
 
     def read(self, rows: range) -> Table:
-        """Read a range of rows, without the points that are not finite.
+        """Read a range of rows, without the points that are not finite or outside of the area.
 
         Raises:
             BadCloudError: the file is missing or broken, or ends too early.
@@ -78,7 +157,16 @@ class CloudFile:
             table = self.parse(self.path, rows)
             if len(table.points) < len(rows):
                 raise ends_early(self.path, rows.start + len(table.points))
-            return table.finite()
+            table = table.finite()
+            return table if self.area is None else self.area.clip(table, self.path)
+
+    def read_all(self) -> Table:
+        """Read all rows, range by range; see ``read``."""
+        tables = [self.read(rows) for rows in self.row_ranges(PART)]
+        if not tables:
+            return Table(np.empty((0, 3)), {}, self.header)
+        columns = {n: np.concatenate([t.columns[n] for t in tables]) for n in tables[0].columns}
+        return Table(np.concatenate([t.points for t in tables]), columns, self.header)
 
 
 @dataclass(frozen=True)

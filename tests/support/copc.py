@@ -1,0 +1,78 @@
+"""Writing small COPC files, which laspy reads only.
+
+Layout: https://copc.io, version 1.0. The cells of the octree are chunks of LAZ of any size.
+"""
+
+import struct
+from pathlib import Path
+
+import laspy
+import lazrs
+import numpy as np
+from numpy.typing import NDArray
+
+INFO, HIERARCHY = 1, 1000
+"""Numbers of COPC's records."""
+
+
+def write_copc(
+    path: Path, points: NDArray[np.float64], spacing: float, depth: int = 3, each: int = 300
+) -> None:
+    """Write points ``(n, 3)`` with their rows as ``intensity`` modulo 65,536.
+
+    Args:
+        path: the file.
+        points: in random order.
+        spacing: of the root's points; it is halved at each level.
+        depth: deepest level, which takes all points that are left.
+        each: points of every other cell.
+    """
+    half = float(np.ptp(points, axis=0).max()) / 2 + 1e-3
+    centre = (points.min(0) + points.max(0)) / 2
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.offsets, header.scales = centre, [1e-3] * 3
+    record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
+    record.x, record.y, record.z = points.T
+    record.intensity = np.arange(len(points)) % 2**16
+    header.point_count, header.are_points_compressed = len(points), True
+    header.mins, header.maxs = points.min(0), points.max(0)
+    laz = lazrs.LazVlr.new_for_compression(6, 0, True)
+
+    def write_header(page: int, size: int) -> None:
+        """Write the header; the place of the octree's page is known when all cells are written."""
+        info = struct.pack("<5d2Q2d88x", *centre, half, spacing, page, size, 0, 0)
+        records = [laspy.VLR("copc", INFO, "", info)]
+        records += [laspy.VLR("laszip encoded", 22204, "", laz.record_data())]
+        header.vlrs = laspy.vlrs.vlrlist.VLRList(records)
+        header.number_of_evlrs, header.start_of_first_evlr = int(page > 0), max(page - 60, 0)
+        stream.seek(0)
+        header.write_to(stream)
+
+    with path.open("wb") as stream:
+        write_header(0, 0)
+        cells = _write_cells(stream, laz, record, points, centre - half, 2 * half, depth, each)
+        end = stream.seek(0, 2)
+        page = b"".join(struct.pack("<4iQ2i", *cell) for cell in cells)
+        stream.write(struct.pack("<H16sHQ32s", 0, b"copc", HIERARCHY, len(page), b"") + page)
+        write_header(end + 60, len(page))
+
+
+def _write_cells(stream, laz, record, points, corner, side, depth, each):
+    """Write the points of every cell, and return the entries of the octree's page."""
+    compressor = lazrs.LasZipCompressor(stream, laz)
+    compressor.reserve_offset_to_chunk_table()
+    left, entries = np.arange(len(points)), []
+    for level in range(depth + 1):
+        keys = ((points[left] - corner) / side * 2**level).astype(int)
+        taken = []
+        for key in np.unique(keys, axis=0):
+            rows = left[(keys == key).all(1)]
+            rows = rows if level == depth else rows[:each]
+            start = stream.tell()
+            compressor.compress_many(np.frombuffer(record.array[rows].tobytes(), np.uint8))
+            compressor.finish_current_chunk()
+            entries.append((level, *key, start, stream.tell() - start, len(rows)))
+            taken.append(rows)
+        left = np.setdiff1d(left, np.concatenate(taken))
+    compressor.done()
+    return entries
