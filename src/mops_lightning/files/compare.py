@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import QhullError, cKDTree
 
 from mops_lightning.data.formats.guard import check_size
 from mops_lightning.data.formats.registry import read
@@ -35,8 +36,13 @@ TRAINED = "trained"
 FILES = ("table.csv", "compare.html")
 """The files of a comparison."""
 
-COLUMNS = {"chamfer": ".4g", "hausdorff": ".4g", "density": ".2f", "seconds": ".2f"}
+COLUMNS = {
+    "chamfer": ".4g", "hausdorff": ".4g", "density": ".2f", "ground": ".4g", "seconds": ".2f"
+}  # fmt: skip
 """The measures, and their formats."""
+
+CLASSES, GROUND = "classification", 2
+"""The column with the classes of airborne scans, and the class of the ground (LAS 1.4)."""
 
 MEANINGS = [
     "All values are better when lower. Distances are in the file's own unit, and not squared.",
@@ -44,6 +50,8 @@ MEANINGS = [
     "largest one.",
     "- density: standard deviation over mean of the number of input points per kept point. At 0 "
     "the sample has the density of the input; even sampling of an uneven scan has a high value.",
+    "- ground: root mean square error of the heights of all ground points (class 2 of airborne "
+    "scans) on the surface through the kept ground points.",
     "- seconds: time of the sampling alone, on this machine.",
 ]
 
@@ -60,6 +68,7 @@ class Result:
         hausdorff: the largest of these distances.
         density: standard deviation over mean of the number of input points that a kept point is
             nearest to; 0 if the sample is as dense as the input everywhere.
+        ground: see ``ground_error``; None for a file without ground points.
         seconds: time of the sampling alone.
     """
 
@@ -68,6 +77,7 @@ class Result:
     chamfer: float
     hausdorff: float
     density: float
+    ground: float | None
     seconds: float
 
 
@@ -121,7 +131,8 @@ def compare_file(path: Path, m: int, methods: dict[str, Options], seed: int) -> 
     Raises:
         UserError: the file holds no usable cloud, or too few points.
     """
-    points = read(path, max(SURFACE, 8 * m), seed).finite().points
+    table = read(path, max(SURFACE, 8 * m), seed).finite()
+    points, ground = table.points, table.columns.get(CLASSES, np.empty(0)) == GROUND
     check_size(path, len(points), m)
     results = []
     for name, options in methods.items():
@@ -129,7 +140,8 @@ def compare_file(path: Path, m: int, methods: dict[str, Options], seed: int) -> 
         start = time.perf_counter()
         rows = _sample(path, points, m, options)
         seconds = time.perf_counter() - start
-        results.append(Result(name, rows, *coverage(points, points[rows]), seconds))
+        error = ground_error(points[ground], points[rows[ground[rows]]]) if ground.any() else None
+        results.append(Result(name, rows, *coverage(points, points[rows]), error, seconds))
     return FileResult(path, points, m, results)
 
 
@@ -144,6 +156,31 @@ def coverage(points: Points, kept: Points) -> tuple[float, float, float]:
     distance, nearest = neighbours
     members = np.bincount(nearest, minlength=len(kept))
     return float(distance.mean()), float(distance.max()), float(members.std() / members.mean())
+
+
+def ground_error(ground: Points, kept: Points) -> float:
+    """Return the root mean square error of heights on a surface through some of the points.
+
+    The surface is linear in the triangles of a Delaunay triangulation in x and y. Outside of them
+    it has the height of the nearest kept point.
+
+    Args:
+        ground: ``(N, 3)`` all ground points.
+        kept: ``(k, 3)`` some of them.
+
+    Returns:
+        The error in the file's unit; NaN if no ground point was kept.
+    """
+    if not len(kept):
+        return float("nan")
+    middle = ground[:, :2].mean(0)  # float64 has too few digits for products of map coordinates
+    places, known = ground[:, :2] - middle, kept[:, :2] - middle
+    nearest: Any = cKDTree(known).query(places)
+    height = kept[nearest[1], 2]
+    with suppress(QhullError, ValueError):  # fewer than three points, or all on one line
+        surface = LinearNDInterpolator(known, kept[:, 2])(places)
+        height = np.where(np.isnan(surface), height, surface)
+    return float(np.sqrt(np.square(height - ground[:, 2]).mean()))
 
 
 def _warm_up(path: Path, points: Points, m: int, options: Options) -> None:
@@ -173,11 +210,12 @@ def write_comparison(results: Sequence[FileResult], folder: Path) -> str:
 
 def _grid(compared: FileResult) -> Grid:
     title = f"{compared.path.name}: {compared.m:,} of {len(compared.points):,} points"
+    forms = {n: f for n, f in COLUMNS.items() if getattr(compared.results[0], n) is not None}
     rows = [
-        [result.method, *(format(getattr(result, name), form) for name, form in COLUMNS.items())]
+        [result.method, *(format(getattr(result, name), form) for name, form in forms.items())]
         for result in compared.results
     ]
-    return Grid(title, ["method", *COLUMNS], rows)
+    return Grid(title, ["method", *forms], rows)
 
 
 def _csv(results: Sequence[FileResult]) -> str:
@@ -186,7 +224,7 @@ def _csv(results: Sequence[FileResult]) -> str:
     writer.writerow(["file", "points", "m", "method", *COLUMNS])
     for compared in results:
         for result in compared.results:
-            values = [repr(getattr(result, name)) for name in COLUMNS]
+            values = [getattr(result, name) for name in COLUMNS]  # None is left empty
             number = len(compared.points)
             writer.writerow([compared.path, number, compared.m, result.method, *values])
     return out.getvalue()
