@@ -5,6 +5,7 @@ import pytest
 
 from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
+from mops_lightning.files import chunks
 from tests.support.downsample import call, refused
 
 
@@ -27,6 +28,33 @@ def test_chunks_equal_whole_file(suffix, readout, folder, tmp_path):
     assert list(parts.columns) == list(whole.columns)
     for name, column in whole.columns.items():
         np.testing.assert_array_equal(parts.columns[name], column)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["--method", "voxel"],
+        ["--method", "serial"],
+        ["--weights", "FOLDER", "--readout", "completed"],
+        ["--weights", "FOLDER", "--tile", 64],
+    ],
+)
+def test_other_methods_sample_random_points_of_all_parts(settings, folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(chunks, "PART", 120)
+    points = np.random.default_rng(1).normal(size=(500, 3))
+    points[100:160] = np.nan
+    finite = np.isfinite(points).all(1)
+    parts = [np.flatnonzero(finite[first : first + 120]) + first for first in range(0, 500, 120)]
+    keys = [np.random.default_rng([3, 120 * i]).random(len(part)) for i, part in enumerate(parts)]
+    drawn = np.sort(np.concatenate(parts)[np.concatenate(keys).argsort()[:200]])
+    np.save(tmp_path / "all.npy", np.column_stack([points, np.arange(500)]))
+    np.save(tmp_path / "drawn.npy", np.column_stack([points, np.arange(500)])[drawn])
+    settings = [folder if one == "FOLDER" else one for one in settings]
+    settings += ["--m", 30, "--seed", 3, "--keep-attributes"]
+    assert call(tmp_path / "drawn.npy", tmp_path / "want.npy", *settings)[0] == 0
+    status, out, _ = call(tmp_path / "all.npy", tmp_path / "out.npy", *settings, "--chunk", 200)
+    assert (status, "30 of 440 points (60 more without" in out) == (0, True)
+    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.load(tmp_path / "want.npy"))
 
 
 def test_bounds_hold_for_chunks_and_whole_files(folder, tmp_path):

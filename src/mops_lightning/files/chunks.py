@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mops_lightning.data.formats.guard import check_coordinates, check_size
 from mops_lightning.data.formats.registry import open_cloud_file
-from mops_lightning.data.formats.table import CloudFile, Table
+from mops_lightning.data.formats.table import PART, CloudFile, Table, join_tables
 from mops_lightning.data.unit_sphere import UnitSphere, largest_distance
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
@@ -99,6 +99,58 @@ def sample_by_chunks(
     matched: Nearest = reduce(Nearest.merge, over("matching", _nearest, sphere, generated))
     kept = replace(matched.table, header=file.header)
     return kept if options.keep_attributes else kept.without_attributes(), outcome
+
+
+def draw(source: Path, options: Options, engine: Engine) -> tuple[Table, int, int]:
+    """Draw random points of a file without reading it as a whole.
+
+    Every point gets a random key, and the points with the lowest keys are drawn. The keys depend on
+    the seed and the place in the file, not on ``options.chunk``.
+
+    Args:
+        source: of a format in ``registry.CHUNKED``.
+        options: ``chunk`` is the number of points to draw.
+        engine: reads the ranges.
+
+    Returns:
+        The points, in the order of the file, or all if there are fewer; how many points with finite
+        coordinates the file has, and how many without.
+
+    Raises:
+        UserError: the file is broken.
+    """
+    file = open_cloud_file(source, options.area)
+    function = partial(_draw, replace(file, header=None), options)
+    drawn = Drawn(np.empty(0), join_tables([]), 0)
+    for part in engine.map("drawing", function, file.row_ranges(PART)):
+        keys = np.concatenate([drawn.keys, part.keys])
+        both = Drawn(keys, join_tables([drawn.table, part.table]), drawn.number + part.number)
+        drawn = both.lowest(options.chunk)
+    dropped = 0 if options.area else file.number - drawn.number
+    return replace(drawn.table, header=file.header), drawn.number, dropped
+
+
+class Drawn(NamedTuple):
+    """The points with the lowest keys so far: their keys, their table, and of how many points."""
+
+    keys: NDArray[np.float64]
+    table: Table
+    number: int
+
+    def lowest(self, most: int | None) -> "Drawn":
+        """Keep the points with the lowest keys."""
+        if most is None or len(self.keys) <= most:
+            return self
+        rows = np.sort(self.keys.argpartition(most)[:most])
+        return Drawn(self.keys[rows], self.table.take(rows), self.number)
+
+
+def _draw(cloud: CloudFile, options: Options, rows: range) -> Drawn:
+    table = cloud.read(rows)
+    check_coordinates(cloud.path, table.points)
+    table = table if options.keep_attributes else table.without_attributes()
+    keys = np.random.default_rng([options.seed, rows.start]).random(len(table.points))
+    return Drawn(keys, table, len(keys)).lowest(options.chunk)
 
 
 def _count_and_sum(cloud: CloudFile, rows: range) -> tuple[int, NDArray[np.float64]]:

@@ -89,7 +89,13 @@ def _downsample_arguments(add: Add) -> None:
         help="cut large scenes into tiles of up to so many points (a balanced kd-tree), sample "
         "each as in training, and keep --m points in total",
     )
-    add("--chunk", type=int, help="points to read at a time, for clouds larger than memory")
+    add(
+        "--chunk",
+        type=int,
+        metavar="POINTS",
+        help="for clouds larger than memory: MOPS-Net's generated and matched points are computed "
+        "from all points, so many at a time; everything else samples so many random points",
+    )
     add(
         "--cluster",
         metavar="ADDRESS",

@@ -13,7 +13,7 @@ from mops_lightning.data.formats.registry import read, write
 from mops_lightning.data.formats.table import Table
 from mops_lightning.data.unit_sphere import UnitSphere
 from mops_lightning.errors import UserError
-from mops_lightning.files.chunks import Outcome, sample_by_chunks
+from mops_lightning.files.chunks import Outcome, draw, sample_by_chunks
 from mops_lightning.files.engine import Engine, LocalEngine
 from mops_lightning.files.options import Options
 from mops_lightning.files.propagate import write_map
@@ -91,33 +91,34 @@ def downsample_file(
     """
     sampler = load_sampler(options)
     m = options.m or sampler.m
-    if options.chunk is None:
-        points, table, outcome = _sample_whole(source, sampler, m, options)
-        if options.map is not None:
-            write_map(options.map, points, table.points, options.map_k)
+    engine = engine or LocalEngine()
+    if options.draws:
+        drawn, number, dropped = draw(source, options, engine)
+        table = _sample_table(source, drawn, sampler, m, options)
+        outcome = Outcome(m, number, dropped)
+    elif options.chunk is not None:
+        table, outcome = sample_by_chunks(source, sampler, m, options, engine)
     else:
-        table, outcome = sample_by_chunks(source, sampler, m, options, engine or LocalEngine())
+        surface = options.surface or max(SURFACE, 8 * m)
+        whole = read(source, surface, options.seed, options.area)
+        finite = whole.finite()
+        table, number = _sample_table(source, finite, sampler, m, options), len(finite.points)
+        outcome = Outcome(m, number, len(whole.points) - number)
+        if options.map is not None:
+            write_map(options.map, whole.points, table.points, options.map_k)
     write(target, table)  # last, so that a file that exists is complete
     return outcome
 
 
-def _sample_whole(
-    source: Path, sampler: Sampler, m: int, options: Options
-) -> tuple[NDArray[np.float64], Table, Outcome]:
-    """Sample a file that is read as a whole; also return all of its points."""
-    surface = options.surface or max(SURFACE, 8 * m)
-    table = read(source, surface, options.seed, options.area)
-    finite = table.finite()
-    number = len(finite.points)
-    check_size(source, number, m, options.area)
+def _sample_table(source: Path, finite: Table, sampler: Sampler, m: int, options: Options) -> Table:
+    """Sample the finite points of a file, or some of them."""
+    check_size(source, len(finite.points), m, options.area)
     weight = weights_of(finite, options.weight, source) if options.weight else None
     rows, points = sample_cloud(finite.points, sampler, m, options, source, weight)
     if rows is None:
-        kept = Table(points, {}, table.header)
-    else:
-        kept = finite.take(rows)
-        kept = kept if options.keep_attributes else kept.without_attributes()
-    return table.points, kept, Outcome(m, number, len(table.points) - number)
+        return Table(points, {}, finite.header)
+    kept = finite.take(rows)
+    return kept if options.keep_attributes else kept.without_attributes()
 
 
 def sample_cloud(

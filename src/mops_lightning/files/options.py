@@ -21,7 +21,7 @@ class Options:
         keep_attributes: keep colours, normals and the like of the kept points.
         surface: number of points to sample from a mesh's surface first.
         seed: of random choices.
-        chunk: number of points to read at a time; None: the whole file.
+        chunk: number of points in memory; see ``draws``. None: the whole file.
         tile: most points of a tile; None: no tiles.
         map: file to write for ``mops_lightning.propagate``; None: no file.
         map_k: number of sampled points per point in this file.
@@ -93,9 +93,11 @@ class Options:
             raise UserError("--map has a row for every point of IN: no --bounds or level with it.")
         if self.chunk is not None and self.chunk < 1:
             raise UserError(f"--chunk must be at least 1, got {self.chunk}.")
-        needs_all = self.method or self.tile is not None or self.readout == "completed"
-        if self.chunk is not None and needs_all:
-            raise UserError(
-                "--chunk needs --weights of MOPS-Net and --readout generated or matched, without "
-                "--tile: everything else needs the whole cloud in memory."
-            )
+        if self.draws and self.m is not None and self.m > (self.chunk or 0):
+            raise UserError(f"--chunk must be at least --m {self.m}, got {self.chunk}.")
+
+    @property
+    def draws(self) -> bool:
+        """Whether ``chunk`` random points of a file are drawn first, and sampled."""
+        streams = self.weights is not None and self.readout != "completed"
+        return self.chunk is not None and not streams

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -51,6 +51,15 @@ class Table:
     def without_attributes(self) -> "Table":
         """Return the points alone."""
         return Table(self.points, {}, self.header)
+
+
+def join_tables(tables: Iterable[Table]) -> Table:
+    """Return the points of tables with the same columns in one, without a header."""
+    filled = [table for table in tables if len(table.points)]
+    if not filled:
+        return Table(np.empty((0, 3)))
+    columns = {n: np.concatenate([t.columns[n] for t in filled]) for n in filled[0].columns}
+    return Table(np.concatenate([table.points for table in filled]), columns)
 
 
 @dataclass(frozen=True)
@@ -163,10 +172,7 @@ class CloudFile:
     def read_all(self) -> Table:
         """Read all rows, range by range; see ``read``."""
         tables = [self.read(rows) for rows in self.row_ranges(PART)]
-        if not tables:
-            return Table(np.empty((0, 3)), {}, self.header)
-        columns = {n: np.concatenate([t.columns[n] for t in tables]) for n in tables[0].columns}
-        return Table(np.concatenate([t.points for t in tables]), columns, self.header)
+        return replace(join_tables(tables), header=self.header)
 
 
 @dataclass(frozen=True)
