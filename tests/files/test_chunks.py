@@ -43,8 +43,8 @@ def test_other_methods_sample_random_points_of_all_parts(settings, folder, tmp_p
     monkeypatch.setattr(chunks, "PART", 120)
     points = np.random.default_rng(1).normal(size=(500, 3))
     points[100:160] = np.nan
-    finite = np.isfinite(points).all(1)
-    parts = [np.flatnonzero(finite[first : first + 120]) + first for first in range(0, 500, 120)]
+    finite = np.delete(np.arange(500), slice(100, 160))
+    parts = [finite[finite // 120 == place] for place in range(5)]
     keys = [np.random.default_rng([3, 120 * i]).random(len(part)) for i, part in enumerate(parts)]
     drawn = np.sort(np.concatenate(parts)[np.concatenate(keys).argsort()[:200]])
     np.save(tmp_path / "all.npy", np.column_stack([points, np.arange(500)]))
