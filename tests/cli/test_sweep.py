@@ -12,6 +12,7 @@ from mops_lightning.config.compose import compose
 from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE, FAILED
+from mops_lightning.zoo import model_file, names
 from tests.support.command_line import TINY, call
 
 
@@ -163,3 +164,21 @@ def test_run_cell_removes_temporary_files(start, tmp_path):
     left.write_bytes(b"half")
     start("sampler=fps", "weights=null")
     assert not left.exists()
+
+
+def test_sweep_ends_in_models_whose_cards_name_each_other(tmp_path, monkeypatch):
+    sweep = ["-m", *TINY, "hydra.callbacks.summary.models=true", "hydra.sweep.dir=Own"]
+    subdir = "hydra.sweep.subdir=${run_label:}"
+    grids = (
+        "{learn: task, weights: null}, {sampler: mops, weights: Own/pointnet/weights.safetensors}"
+    )
+    grid = ["hydra/sweeper=grid", f"hydra.sweeper.grids=[{grids}]"]
+    status, out, err = call([*sweep, subdir, *grid], tmp_path)
+    assert status == 0, err
+    assert "2 models in Own/models" in out
+    monkeypatch.setenv("MOPS_MODELS", str(tmp_path / "Own/models"))
+    card = model_file.read_card(names.available()["own.mops-m8"])
+    assert card["record"]["files"]["task_weights"].startswith("own.pointnet@sha256:")
+    status, out, err = call(["evaluate=own.mops-m8", "pictures=0", "logger=none"], tmp_path)
+    assert status == 0, err
+    assert card["figures"]["values"]["completed"] in out

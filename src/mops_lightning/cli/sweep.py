@@ -189,6 +189,17 @@ def _state(cell: Path) -> str:
         return "not started"
 
 
+def _add_models(cells: list[Path], folder: Path) -> None:
+    """Write the nets that cells trained as models in ``models/`` of the sweep's folder."""
+    from mops_lightning.zoo import publish
+
+    added = publish.add_all(cells, folder, folder / "models")
+    if added:
+        first = added[0].stem
+        print(f"{len(added)} models in {folder}/models; to test one: MOPS_MODELS={folder}/models")
+        print(f"python -m mops_lightning evaluate={first}")
+
+
 class SweepSummary(Callback):
     """Counts the cells at the end of a sweep and reports them; the exit status is 1 if any failed.
 
@@ -198,10 +209,13 @@ class SweepSummary(Callback):
     Args:
         mixed: whether the report joins runs that differ in settings which the sweep does not vary
             for comparison, such as epochs chosen for each size.
+        models: whether the nets that were trained become models with cards, in ``models/`` of the
+            sweep's folder.
     """
 
-    def __init__(self, mixed: bool = False) -> None:
+    def __init__(self, mixed: bool = False, models: bool = False) -> None:
         self.mixed = mixed
+        self.models = models
 
     def on_multirun_start(self, config: DictConfig, **extra: Any) -> None:
         """Mark the start, on the clock of the folder's file system."""
@@ -218,17 +232,21 @@ class SweepSummary(Callback):
 
         folder = Path(os.path.relpath(config.hydra.sweep.dir))
         begun = (folder / BEGUN).stat().st_mtime_ns
-        states: Counter[str] = Counter()
+        states: dict[Path, str] = {}
         # Hydra writes this into every cell that it starts.
         for path in folder.rglob(".hydra/overrides.yaml"):
             cell = path.parents[1]
             if path.stat().st_mtime_ns >= begun:
-                states[_state(cell)] += 1
-        counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
-        print(f"{sum(states.values())} cells: {counts}; in {folder}")
-        if states["completed"]:
+                states[cell] = _state(cell)
+        found = set(states.values())
+        numbers = sorted(Counter(states.values()).items())
+        counts = ", ".join(f"{count} {state}" for state, count in numbers)
+        print(f"{len(states)} cells: {counts}; in {folder}")
+        if "completed" in found:
             options = ["--mixed"] if self.mixed else []
             report.main([str(folder), *options], "python -m mops_lightning report")
-        if set(states) - {"completed", ELSEWHERE} or not states:
+        if self.models:
+            _add_models([cell for cell, state in states.items() if state == "completed"], folder)
+        if found - {"completed", ELSEWHERE} or not found:
             print(f"To repeat the rest: the same command with hydra.sweep.dir={folder}")
             raise SystemExit(1)

@@ -35,9 +35,14 @@ def available() -> dict[str, Path]:
     """Return the files of all models by name, sorted."""
     models: dict[str, Path] = {}
     for folder in reversed(folders()):
-        files = folder.glob(f"*{model_file.SUFFIX}")
-        models |= {path.stem: path for path in files if is_name(path.stem) and path.is_file()}
+        models |= in_folder(folder)
     return dict(sorted(models.items()))
+
+
+def in_folder(folder: Path) -> dict[str, Path]:
+    """Return the files of a folder's models by name."""
+    files = folder.glob(f"*{model_file.SUFFIX}")
+    return {path.stem: path for path in files if is_name(path.stem) and path.is_file()}
 
 
 def is_name(text: str) -> bool:

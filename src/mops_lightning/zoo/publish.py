@@ -1,5 +1,7 @@
 """From a run to a model: the card is written from the run's record."""
 
+import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,8 @@ def add(
         run: folder of a completed run with weights.
         name: the model's name, such as ``fmops.chairs-m64``.
         folder: where ``NAME.safetensors`` is written.
-        task_net: the model of a sampler's task net; None looks for the one that was used.
+        task_net: the model of a sampler's task net; None looks for the one that was used, in
+            ``folder`` first.
         half: store weight matrices with at least ``WIDE`` entries in float16; the card notes that
             its figures are those before.
         licence: of the model.
@@ -65,7 +68,7 @@ def add(
         notes = f"{notes} {ROUNDED}".lstrip()
     files = {"weights": name}
     if record.config["learn"] == "sampler":
-        used = _task_net(task_net, record)
+        used = _task_net(task_net, record, folder)
         files |= {"task_weights": used} if used else {}
     card = {
         "schema": model_file.MODEL,
@@ -80,6 +83,30 @@ def add(
     }
     model_file.write(path, card, state)
     return path
+
+
+def add_all(runs: Iterable[Path], sweep: Path, folder: Path) -> list[Path]:
+    """Write the nets that runs of a sweep trained as models, named ``SWEEP.RUN`` after its folders.
+
+    Task nets come first, so that the cards of samplers name them. Models of these names are
+    replaced. Runs that are not completed or kept no weights are left out.
+
+    Args:
+        runs: folders of runs.
+        sweep: folder that contains them.
+        folder: where the files are written.
+
+    Returns:
+        The files, in the order in which they were written.
+    """
+    trained = []
+    for run in runs:
+        record = run_record.read(run)
+        if record.status == "completed" and "weights" in record.files:
+            parts = (sweep.name, str(run.relative_to(sweep)))
+            name = ".".join(re.sub(r"[^a-z0-9_-]+", "-", part.lower()) for part in parts)
+            trained.append((record.config["learn"] != "task", name, run))
+    return [add(run, name, folder, overwrite=True) for _, name, run in sorted(trained)]
 
 
 def card_figures(record: RunRecord) -> dict[str, Any]:
@@ -104,7 +131,7 @@ def card_figures(record: RunRecord) -> dict[str, Any]:
     }
 
 
-def _task_net(name: str | None, record: RunRecord) -> str | None:
+def _task_net(name: str | None, record: RunRecord, folder: Path) -> str | None:
     """Return a reference to the model of a sampler's task net, or None if it is not a model."""
     if name is not None:
         path = names.find_model(name)
@@ -117,7 +144,7 @@ def _task_net(name: str | None, record: RunRecord) -> str | None:
             raise UserError(f"--task-net: {name} is a sampler. Give the model of a task net.")
         return names.pinned(name, card["sha256"])
     used = {record.weights_loaded, record.task_weights_sha256}
-    for model, path in names.available().items():
+    for model, path in {**names.available(), **names.in_folder(folder)}.items():
         try:
             sha256 = model_file.read_card(path)["sha256"]
         except UserError:  # a damaged or foreign file is not the one that was used
