@@ -10,7 +10,7 @@ from mops_lightning.config.compose import compose
 from mops_lightning.config.hydra_conf import conf_dir
 from mops_lightning.config.settings import declared
 from mops_lightning.config.validate import check
-from mops_lightning.records.run_record import dotted
+from mops_lightning.records.run_record import dotted, read
 from tests.support.command_line import TINY, TINY_ANY_DATA, call, runs
 
 TASKS = ("classification", "registration", "reconstruction")
@@ -105,7 +105,7 @@ def test_snet_rate_depends_on_task(task, learn, rate):
         (["dataset=shapenet_core", "task=reconstruction"], (100, 30)),
         (["dataset=clouds", "dataset.root=x", "task=reconstruction"], (100, 30)),
         (["experiment=reconstruction_paper"], (400, 250)),
-        (["experiment=own_scans", "dataset.root=x"], (30, 10)),
+        (["experiment=own_scans", "dataset.root=x"], (60, 30)),
     ],
 )
 def test_epochs_depend_on_dataset_and_task(overrides, epochs):
@@ -223,15 +223,20 @@ def test_run_label_names_net_or_sampler(learn, label):
     assert cfg.logger.name2 == label
 
 
-def test_own_scans_needs_a_folder_and_gives_a_sampler_for_tiles(tmp_path):
+@pytest.mark.parametrize("files", [2, 4])
+def test_own_scans_needs_a_folder_and_gives_a_sampler_for_tiles(files, tmp_path):
+    """Of two files, none is held out for early stopping."""
     (tmp_path / "scans").mkdir()
-    for seed in range(4):
+    for seed in range(files):
         points = np.random.default_rng(seed).normal(size=(300, 3)) + 1000
         np.save(tmp_path / "scans" / f"{seed}.npy", points)
     chosen = ["experiment=own_scans", "dataset.root=scans", "dataset.crops=4", "sizes=[8]"]
+    chosen.append("trainer.check_val_every_n_epoch=1")
     status, _, err = call([*chosen, *TINY_ANY_DATA, "sampler.m_max=16"], tmp_path)
     assert status == 0, err
     (run,) = runs(tmp_path)
+    metrics = read(run).validation
+    assert ("val/completed/nre_cd" in metrics) == (files == 4)
     arguments = ["scans/0.npy", "small.npy", "--weights", str(run), "--tile", "64", "--m", "70"]
     status, out, err = call(["downsample", *arguments], tmp_path)
     assert (status, err) == (0, "")

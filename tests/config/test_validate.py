@@ -138,7 +138,7 @@ def test_rival_samplers_have_published_settings():
         (["augment.sampler=null"], "augment has settings of task and sampler, got sampler: None"),
         (["+augment.all=1"], "augment has settings of task and sampler, got all: 1"),
         (["+augment.task.jiter=0"], "Did you mean 'jitter'"),
-        (["augment.task.rotate_up=3"], "augment.task.rotate_up must be true or false, got 3"),
+        (["augment.task.rotate_up=3"], "rotate_up must be true or false or x or y or z, got 3"),
         (["task_lr_scale=-1"], "task_lr_scale must be a number above 0"),
         (["pretrain=foo"], "pretrain must be settings, got 'foo'"),
         (["+sampler._partial_=true"], "sampler._partial_ must be left out"),

@@ -92,6 +92,23 @@ def test_augmentation_equals_written_out_formulas():
     torch.testing.assert_close(got, turned + noise.clamp(-0.2, 0.2))
 
 
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_augmentation_turns_about_its_vertical_axis(up):
+    points, axis = clouds(20).points, "xyz".index(up)
+    turned = Augmentation(rotate_up=up)(points, torch.Generator().manual_seed(3))
+    torch.testing.assert_close(turned[..., axis], points[..., axis])
+    # As about y, after the axes were moved in a circle, which mirrors nothing.
+    moved = points.roll(1 - axis, 2)
+    about_y = Augmentation(rotate_up=True)(moved, torch.Generator().manual_seed(3))
+    torch.testing.assert_close(turned, about_y.roll(axis - 1, 2))
+    assert not torch.allclose(turned, points)
+
+
+def test_augmentation_unknown_axis_raises():
+    with pytest.raises(UserError, match=r"rotate_up must be true, false, x, y or z .* got 'w'"):
+        Augmentation(rotate_up="w")
+
+
 def test_augmentation_default_is_identity(rng):
     points = clouds().points
     assert torch.equal(Augmentation()(points, rng), points)

@@ -96,10 +96,12 @@ def test_sampler_with_anchors_is_named_as_in_reports():
 
 def test_fps_names_its_start():
     """The baseline of a run and a run of FPS may start from other points."""
-    metrics = {"test/generated/accuracy": 0.5, "test/fps/accuracy": 0.25, "test/full/accuracy": 1.0}
-    farthest = {"fps": {"start": "farthest"}}
-    text = printed(metrics, "test/generated/accuracy", baselines=farthest)
-    assert cells(text)[1] == ["fps from farthest", "25.00"]
+    metrics = {"test/generated/accuracy": 0.5, "test/full/accuracy": 1.0}
+    for name in ("fps", "fps_farthest"):
+        farthest = {name: {"start": "farthest"}}
+        scores = {f"test/{name}/accuracy": 0.25, **metrics}
+        text = printed(scores, "test/generated/accuracy", baselines=farthest)
+        assert cells(text)[1] == ["fps from farthest", "25.00"]
     names = {**NAMES, "sampler": "fps"}
     metrics = {"test/sampled/accuracy": 0.5, "test/full/accuracy": 0.875}
     text = printed(metrics, "test/sampled/accuracy", names=names, sampler={"start": 0})

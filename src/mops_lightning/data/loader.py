@@ -2,18 +2,19 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Generator, Tensor
 
 from mops_lightning.data.clouds import Clouds
-from mops_lightning.errors import check_at_least
+from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.seeding import generator
 from mops_lightning.types import Batch
 
 JITTER_CLIP = 5
 """Largest noise of the augmentation in standard deviations, as PointNet was trained."""
+AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,8 @@ class Augmentation:
     """Random changes of the coordinates of training clouds.
 
     Attributes:
-        rotate_up: rotate every cloud by a random angle about the up axis (y).
+        rotate_up: rotate every cloud by a random angle about the vertical axis: ``x``, ``y`` or
+            ``z``; true means y.
         jitter: standard deviation of the noise added to every coordinate, which is clipped at five
             standard deviations.
 
@@ -29,17 +31,22 @@ class Augmentation:
         UserError: an argument is out of range.
     """
 
-    rotate_up: bool = False
+    rotate_up: bool | Literal["x", "y", "z"] = False
     jitter: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the arguments."""
         check_at_least(0, jitter=self.jitter)
+        if self.rotate_up not in (True, False, *AXES):
+            raise UserError(
+                "rotate_up must be true, false, x, y or z (the vertical axis), got "
+                f"{self.rotate_up!r}."
+            )
 
     @property
     def active(self) -> bool:
         """Whether clouds are changed at all."""
-        return self.rotate_up or self.jitter > 0
+        return bool(self.rotate_up) or self.jitter > 0
 
     def __call__(self, points: Tensor, rng: Generator) -> Tensor:
         """Return the augmented ``(B, N, 3)`` points."""
@@ -47,7 +54,10 @@ class Augmentation:
             angle = torch.rand(len(points), generator=rng) * (2 * torch.pi)
             cos, sin, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
             rows = [cos, zero, sin, zero, zero + 1, zero, -sin, zero, cos]
-            points = points @ torch.stack(rows, 1).view(-1, 3, 3)
+            # These matrices are for y; moved along the diagonal, they are for another axis.
+            up = self.rotate_up if isinstance(self.rotate_up, str) else "y"
+            shift = AXES.index(up) - AXES.index("y")
+            points = points @ torch.stack(rows, 1).view(-1, 3, 3).roll((shift, shift), (1, 2))
         if self.jitter:
             most = JITTER_CLIP * self.jitter
             noise = torch.randn(points.shape, generator=rng).mul_(self.jitter)

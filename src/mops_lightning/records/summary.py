@@ -85,8 +85,12 @@ def sampler_name(config: dict[str, Any]) -> str:
 
 
 def baseline_name(config: dict[str, Any], name: str) -> str:
-    """Return the name of a run's baseline, and for FPS the start point if it is set."""
-    return name + _start((config.get("baselines") or {}).get(name) or {})
+    """Return the name of a run's baseline, and for FPS the start point if it is set.
+
+    Two baselines need two names: ``fps`` and ``fps_farthest``, which is ``fps from farthest``.
+    """
+    node = (config.get("baselines") or {}).get(name) or {}
+    return name.removesuffix(f"_{node.get('start')}") + _start(node)
 
 
 def _start(sampler: dict[str, Any]) -> str:
