@@ -6,12 +6,7 @@ import pytest
 
 from mops_lightning import filesystem
 from mops_lightning.errors import UserError, file_error
-from mops_lightning.filesystem import (
-    atomic_write,
-    is_temporary,
-    load_npz,
-    remove_temporary,
-)
+from mops_lightning.filesystem import atomic_write, is_temporary, load_npz, remove_temporary
 from tests.support.full_disk import full_disk
 
 

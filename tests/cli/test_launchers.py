@@ -15,12 +15,7 @@ LAUNCHERS = {
 
 @pytest.mark.parametrize("name", LAUNCHERS)
 def test_cells_run_side_by_side(name, tmp_path):
-    fixed = [
-        *TINY,
-        "sampler=random",
-        "weights=null",
-        "hydra.sweep.dir=cells",
-    ]
+    fixed = [*TINY, "sampler=random", "weights=null", "hydra.sweep.dir=cells"]
     command = ["-m", *LAUNCHERS[name], *fixed, "m=4,8"]
     status, out, err = call(command, tmp_path)
     assert status == 0, out + err
@@ -40,11 +35,7 @@ def test_optuna_searches_and_keeps_every_trial(tmp_path):
         "hydra.sweeper.n_trials=2",
         "hydra.sweeper.direction=maximize",
     ]
-    settings = [
-        *TINY,
-        "weights=null",
-        "hydra.sweep.dir=trials",
-    ]
+    settings = [*TINY, "weights=null", "hydra.sweep.dir=trials"]
     command = ["-m", *search, *settings, "sampler.alpha=interval(0.1,30)"]
     status, out, err = call(command, tmp_path)
     assert status == 0, out + err

@@ -1,21 +1,14 @@
 import pytest
 import torch
 
-from mops_lightning.data.clouds import (
-    CloudDataset,
-    Clouds,
-    choose_classes,
-    noisy,
-    scale_warning,
-)
+from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, noisy, scale_warning
 from mops_lightning.errors import UserError
 
 KNOWN = ("chair", "lamp", "table")
 
 
 @pytest.mark.parametrize(
-    ("classes", "chosen"),
-    [(None, KNOWN), ([], KNOWN), (["table", "chair"], ("chair", "table"))],
+    ("classes", "chosen"), [(None, KNOWN), ([], KNOWN), (["table", "chair"], ("chair", "table"))]
 )
 def test_choose_classes_keeps_order_of_dataset(classes, chosen):
     assert choose_classes(classes, KNOWN) == chosen

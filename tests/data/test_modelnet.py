@@ -85,12 +85,7 @@ def test_modelnet_fingerprint_depends_on_content(layout: Path, tmp_path: Path) -
 def test_modelnet_missing_folder_raises(tmp_path: Path) -> None:
     with pytest.raises(UserError) as caught:
         modelnet40(tmp_path / "none")
-    for words in (
-        "root: ",
-        str(tmp_path / "none"),
-        "shape_names.txt",
-        "dataset.download=true",
-    ):
+    for words in ("root: ", str(tmp_path / "none"), "shape_names.txt", "dataset.download=true"):
         assert words in str(caught.value)
 
 

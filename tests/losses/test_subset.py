@@ -52,10 +52,7 @@ def test_simplification_loss_equals_double_loop(coverage, per_point, rng):
 
 @pytest.mark.parametrize(
     ("losses", "loss", "weights"),
-    [
-        (subset_losses, subset_loss, ()),
-        (simplification_losses, simplification_loss, (0.5, 0.1)),
-    ],
+    [(subset_losses, subset_loss, ()), (simplification_losses, simplification_loss, (0.5, 0.1))],
 )
 def test_losses_of_several_sizes_equal_each_size(losses, loss, weights, rng):
     points = torch.randn(3, 30, 3, generator=rng, dtype=torch.float64)

@@ -1,8 +1,6 @@
 import torch
 
-from mops_lightning.nets.layers import (
-    PointFeatures,
-)
+from mops_lightning.nets.layers import PointFeatures
 
 
 def test_point_features_global_is_maximum_of_local(rng):

@@ -2,11 +2,7 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.fps import (
-    farthest_point_fill,
-    farthest_point_sample,
-    fps,
-)
+from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample, fps
 from tests.support.plain import plain_farthest
 
 

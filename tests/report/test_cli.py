@@ -5,11 +5,7 @@ import pytest
 
 from mops_lightning.report.cli import main
 from tests.support.command_line import TINY, call, runs
-from tests.support.reports import (
-    put,
-    put_planes,
-    rows,
-)
+from tests.support.reports import put, put_planes, rows
 
 
 def test_user_metric_appears_in_closing_table_and_report(tmp_path, capsys):

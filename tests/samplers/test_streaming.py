@@ -28,11 +28,7 @@ def test_stream_sample_is_nested(rng):
 @pytest.mark.parametrize(
     ("make", "chunks", "message"),
     [
-        (
-            lambda: SNet(4),
-            [torch.zeros(9, 3)],
-            "^SNet needs all points .* cannot sample in chunks",
-        ),
+        (lambda: SNet(4), [torch.zeros(9, 3)], "^SNet needs all points .* cannot sample in chunks"),
         (lambda: MOPSNet(4), [], "number of points N=0"),
         (lambda: MOPSNet(4), [torch.zeros(2, 3), torch.zeros(1, 3)], "number of points N=3"),
         (lambda: MOPSNet(4), [torch.zeros(9, 2)], "shape"),

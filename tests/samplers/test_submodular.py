@@ -3,11 +3,7 @@ import torch
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.samplers.submodular import (
-    SHORTLIST,
-    SubmodularSampler,
-    facility_location,
-)
+from mops_lightning.samplers.submodular import SHORTLIST, SubmodularSampler, facility_location
 
 
 @pytest.fixture

@@ -65,11 +65,7 @@ def put_planes(folder):
             beta = 10.0**-number
             values = {"generated": gamma + beta, "matched": 3.0}
             put_cell(
-                folder,
-                f"b{beta}{gamma}",
-                "samplenet",
-                values,
-                of={"beta": beta, "gamma": gamma},
+                folder, f"b{beta}{gamma}", "samplenet", values, of={"beta": beta, "gamma": gamma}
             )
 
 

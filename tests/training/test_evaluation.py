@@ -149,8 +149,7 @@ def test_evaluation_record_with_code_as_value_raises(path, value, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "path",
-    ["cache", "out", "dataset.cache", "callbacks", "optimizer", "ckpt_path"],
+    "path", ["cache", "out", "dataset.cache", "callbacks", "optimizer", "ckpt_path"]
 )
 def test_evaluation_record_chooses_no_folder_to_write_and_no_part_of_training(path, run, tmp_path):
     evil = write_run(tmp_path / "evil", changes={path: "/evil"})

@@ -20,12 +20,7 @@ from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.schedules import exponential
 from tests.support.losses import simplification_loss, subset_loss
-from tests.support.recording import (
-    Fingerprint,
-    MeanFingerprint,
-    RecordingTask,
-    numbered_clouds,
-)
+from tests.support.recording import Fingerprint, MeanFingerprint, RecordingTask, numbered_clouds
 from tests.support.training import quiet_trainer
 
 MOPS: dict[str, Any] = {"feature_channels": (8, 6), "rho_channels": (12, 10), "alpha": 2.0}

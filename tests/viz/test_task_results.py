@@ -1,11 +1,7 @@
 import numpy as np
 import torch
 
-from mops_lightning.viz.task_results import (
-    MAX_POINTS,
-    ReconstructionResult,
-    reconstruction_grid,
-)
+from mops_lightning.viz.task_results import MAX_POINTS, ReconstructionResult, reconstruction_grid
 
 
 def test_reconstruction_grid_thins_large_clouds_only(rng):

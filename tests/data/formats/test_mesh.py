@@ -43,8 +43,7 @@ def test_parse_off_header_variants(head: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "face",
-    ["4 0 1 2 3", "4 0 1 2 3 255 0 0", "3 0 1 2\n3 0 2 3", "3 0 1 2 0.5 0.5 0.5\n3 0 2 3"],
+    "face", ["4 0 1 2 3", "4 0 1 2 3 255 0 0", "3 0 1 2\n3 0 2 3", "3 0 1 2 0.5 0.5 0.5\n3 0 2 3"]
 )
 def test_parse_off_polygons_and_colours(face: str) -> None:
     text = f"OFF\n4 {1 + face.count(chr(10))} 0\n0 0 5\n3 0 5\n3 3 5\n0 3 5\n{face}\n"
