@@ -19,8 +19,7 @@ from PIL import Image
 from mops_lightning import load, propagation_map
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.tasks.classification import Classification
-from mops_lightning.viz.clouds import frame_cloud, upright
-from mops_lightning.viz.figures import cloud_axes, new_figure
+from mops_lightning.viz.figures import cloud_axes, frame_cloud, new_figure, upright
 from mops_lightning.zoo import model_file, names
 from mops_lightning.zoo.weights import load_into
 

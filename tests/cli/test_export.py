@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from mops_lightning import load
-from mops_lightning.cli.export import main
+from mops_lightning.cli.models import export
 from tests.support.captured import captured, refused
 
 
@@ -10,7 +10,7 @@ def test_export_of_a_model_writes_a_file_that_runs_at_any_size(tmp_path):
     target = tmp_path / "net.pt2"
     command = "mops-lightning export"
     model = "fmops.modelnet40-m512"
-    status, out, err = captured(main, [model, target, "--m", 10], command)
+    status, out, err = captured(export, [model, target, "--m", 10], command)
     assert (status, err) == (0, "")
     assert out.startswith(f"{target}: ")
     net, sampler = torch.export.load(target).module(), load(model)
@@ -33,7 +33,7 @@ def test_export_of_a_model_writes_a_file_that_runs_at_any_size(tmp_path):
 def test_export_mistakes_are_one_line(arguments, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "old.onnx").touch()
-    err = refused(main, arguments, "mops-lightning export")
+    err = refused(export, arguments, "mops-lightning export")
     assert err.startswith("mops-lightning export: ")
     assert words in err
     assert [path.name for path in tmp_path.iterdir()] == ["old.onnx"]

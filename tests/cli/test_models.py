@@ -1,4 +1,3 @@
-import json
 import os
 
 import pytest
@@ -36,7 +35,6 @@ def test_models_shows_the_card_of_every_model(name):
     assert shown["name"] == name
     for key in ("input", "data", "recipe", "commit", "licence", "test", "sha256"):
         assert shown[key], key
-    assert json.loads(call(name, "--json")[1]) == model_file.read_card(names.available()[name])
 
 
 def test_models_add_publishes_a_run(tmp_path, monkeypatch):
@@ -108,8 +106,6 @@ def test_models_leaves_out_a_named_pipe_and_refuses_it_by_path(tmp_path, monkeyp
         (["add", "nowhere", "a.b", "--folder", "."], "no run record"),
         (["pointnet.modelnet40", "--notes", "new"], "--notes is an option of `models add"),
         (["--task-net", "a.b"], "--task-net is an option of `models add RUN NAME`"),
-        (["--json"], "--json is an option of `models NAME`"),
-        (["add", "run", "a.b", "--json"], "--json is an option of `models NAME`"),
     ],
 )
 def test_models_mistakes_are_one_line(arguments, words):

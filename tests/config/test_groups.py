@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from mops_lightning.config.compose import compose
-from mops_lightning.config.hydra_conf import conf_dir
+from mops_lightning.config.compose import compose, conf_dir
 from mops_lightning.config.settings import declared
 from mops_lightning.config.validate import check
 from mops_lightning.records.run_record import dotted, read

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from mops_lightning.config.annotations import misfit
 from mops_lightning.config.build import signature
-from mops_lightning.config.compose import compose
-from mops_lightning.config.hydra_conf import conf_dir
+from mops_lightning.config.compose import compose, conf_dir
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 

@@ -2,7 +2,7 @@ from pathlib import PurePath, PurePosixPath
 
 import pytest
 
-from mops_lightning.data.file_splits import (
+from mops_lightning.data.cloud_folder import (
     by_number,
     class_of,
     split_by_folder,

@@ -7,8 +7,7 @@ import pytest
 import torch
 from hydra.utils import get_class
 
-from mops_lightning.config.compose import compose
-from mops_lightning.config.hydra_conf import conf_dir
+from mops_lightning.config.compose import compose, conf_dir
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler

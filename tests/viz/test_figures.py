@@ -1,7 +1,80 @@
+import matplotlib.image
 import numpy as np
+import torch
 from PIL import Image
+from torch.nn import functional as F
 
-from mops_lightning.viz.figures import new_figure, save_figure
+from mops_lightning.viz.figures import (
+    COLOURS,
+    cloud_grid,
+    comparison,
+    matrix_figure,
+    new_figure,
+    save_figure,
+)
+
+
+def pixels(figure, tmp_path):
+    return matplotlib.image.imread(save_figure(figure, tmp_path / "figure.png"))[..., :3]
+
+
+def test_cloud_grid_draws_readout_in_its_colour(tmp_path, rng):
+    points = torch.rand(2, 300, 3, generator=rng)
+    readouts = dict.fromkeys(("generated", "matched", "completed"), points[:, :20])
+    figure = cloud_grid(points, readouts, ["chair", "vase"])
+    image = pixels(figure, tmp_path)
+    width = image.shape[1] // 4
+    for column, name in enumerate(readouts, start=1):
+        part = image[:, column * width : (column + 1) * width].reshape(-1, 3)
+        colour = np.array(COLOURS[name]) / 255
+        assert (np.abs(part - colour).max(1) < 0.02).sum() > 200
+    texts = {t.get_text() for axes in figure.axes for t in (*axes.texts, axes.title)}
+    assert {"chair", "vase", "input", "generated", "matched", "completed"} <= texts
+
+
+def test_matrix_figure_shows_ideal_matrix_as_diagonal():
+    dense = torch.zeros(30, 4)
+    dense[torch.tensor([11, 3, 20, 7]), torch.arange(4)] = 1.0
+    figure = matrix_figure(dense, dense.T @ dense, "chair")
+    left, right = (axes.images[0].get_array() for axes in figure.axes[:2])
+    rows = np.asarray(left).argmax(0)
+    assert (np.diff(rows) > 0).all()
+    np.testing.assert_array_equal(np.asarray(right), np.eye(4))
+
+
+def test_matrix_figure_of_many_points_keeps_every_large_entry():
+    dense = torch.zeros(1000, 4)
+    dense[torch.tensor([500, 3, 999, 7]), torch.arange(4)] = 1.0
+    drawn = matrix_figure(dense, dense.T @ dense, "chair").axes[0].images[0]
+    assert np.asarray(drawn.get_array()).max(0).tolist() == [1.0] * 4
+    assert list(drawn.get_extent()) == [-0.5, 3.5, 999.5, -0.5]
+
+
+def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, rng):
+    points = F.normalize(torch.randn(8192, 3, generator=rng), dim=1)
+    far = points[points[:, 0] < -0.3][:100]
+    pixel_counts = []
+    for cloud in (points, far):
+        image = pixels(cloud_grid(cloud[None], {"matched": far[None]}, [""]), tmp_path)
+        pixel_counts.append(
+            (np.abs(image - np.array(COLOURS["matched"]) / 255).max(2) < 0.02).sum()
+        )
+    # Without the hiding cloud the frame is tighter, hence markers cover more pixels.
+    assert pixel_counts[0] > 0.2 * pixel_counts[1]
+
+
+def test_comparison_draws_every_sample_and_whole_cloud(tmp_path, rng):
+    points = torch.rand(300, 3, generator=rng)
+    captions = {"fps": "fps: 78.75 %", "generated": "MOPSNet: 96.25 %", "full": "all points"}
+    figure = comparison(points, {"fps": points[:20], "generated": points[:20]}, captions)
+    assert [axes.get_title() for axes in figure.axes] == list(captions.values())
+    image = pixels(figure, tmp_path)
+    width = image.shape[1] // 3
+    drawn = []
+    for column, colour in enumerate((COLOURS["sampled"], COLOURS["generated"])):
+        part = image[:, column * width : (column + 1) * width].reshape(-1, 3)
+        drawn.append((np.abs(part - np.array(colour) / 255).max(1) < 0.02).sum())
+    assert min(drawn) > 200
 
 
 def test_save_figure_png_has_a_palette_near_the_colours(tmp_path):

@@ -18,7 +18,7 @@ COMMANDS = {
     "propagate": "mops_lightning.files.cli.propagate",
     "compare": "mops_lightning.files.cli.compare",
     "models": "mops_lightning.cli.models.main",
-    "export": "mops_lightning.cli.export.main",
+    "export": "mops_lightning.cli.models.export",
 }
 """Subcommands and their functions of ``(arguments, prog)``."""
 

@@ -1,7 +1,6 @@
-"""The subcommand ``models``."""
+"""The subcommands ``models`` and ``export``."""
 
 import argparse
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,12 @@ DESCRIPTION = f"""List trained models, show the card of one, or publish a run as
 A name can be given wherever a weights file or a run can: weights=NAME, evaluate=NAME,
 downsample --weights NAME, export NAME. ${names.VARIABLE} is a list of folders, as in PATH."""
 
+EXPORT = """Write a trained sampler as ONNX (.onnx) or as a PyTorch program (.pt2).
+
+The file maps points (batch, points, 3), float32 in the unit sphere, to generated points
+(batch, m, 3), for any number of clouds and points, and runs without mops_lightning. It is compared
+with the sampler before it is written."""
+
 
 def main(arguments: list[str], prog: str) -> None:
     """Do what the arguments say.
@@ -29,7 +34,6 @@ def main(arguments: list[str], prog: str) -> None:
     parser = Parser(prog, DESCRIPTION)
     add = parser.add_argument
     add("words", nargs="*", metavar="NAME | add RUN NAME", help="see above")
-    add("--json", action="store_true", help="print the card of NAME as JSON, with the record")
     new = parser.add_argument_group("options of add")
     new.add_argument("--folder", type=Path, help=f"where to; default: first of ${names.VARIABLE}")
     new.add_argument("--task-net", metavar="NAME", help="model of the sampler's task net")
@@ -42,21 +46,16 @@ def main(arguments: list[str], prog: str) -> None:
 
 
 def _refuse_unused(chosen: argparse.Namespace, parser: Parser) -> None:
-    """Refuse options that the subcommand does not use.
+    """Refuse options of `models add` without it.
 
     Raises:
         UserError: an option is not used.
     """
     values = {name: value for name, value in vars(chosen).items() if name != "words"}
     given = {name for name, value in values.items() if value != parser.get_default(name)}
-    used = {"json"} if chosen.words else set()
-    if chosen.words[:1] == ["add"]:
-        used = given - {"json"}
-    unused = sorted(given - used)
-    if unused:
-        option = unused[0].replace("_", "-")
-        use = "models NAME" if option == "json" else "models add RUN NAME"
-        raise UserError(f"--{option} is an option of `{use}`. Leave it out.")
+    if given and chosen.words[:1] != ["add"]:
+        option = min(given).replace("_", "-")
+        raise UserError(f"--{option} is an option of `models add RUN NAME`. Leave it out.")
 
 
 def _run(chosen: argparse.Namespace) -> list[str]:
@@ -71,7 +70,7 @@ def _run(chosen: argparse.Namespace) -> list[str]:
         case [name]:
             path = names.resolve(name)
             card = model_file.read_card(path)
-            return [json.dumps(card, indent=1)] if chosen.json else _card(card, path)
+            return _card(card, path)
     raise UserError(f"give one NAME, or add RUN NAME, got {' '.join(chosen.words)}.")
 
 
@@ -184,3 +183,30 @@ def _figures(card: dict[str, Any]) -> str:
 
 def _megabytes(path: Path) -> str:
     return f"{path.stat().st_size / 1e6:.2f}"
+
+
+def export(arguments: list[str], prog: str) -> None:
+    """Write the file and print how far its points are from the sampler's.
+
+    Args:
+        arguments: of the command line.
+        prog: what the user typed to start this command.
+    """
+    parser = Parser(prog, EXPORT)
+    add = parser.add_argument
+    add("sampler", metavar="SAMPLER", help="a model's name, a run or a weights file")
+    add("target", metavar="OUT", type=Path, help="a file that ends in .onnx or .pt2")
+    add("--m", type=int, help="number of points; default: as the sampler was trained for")
+    add("--overwrite", action="store_true", help="replace an existing file")
+    with one_line_endings(prog):
+        chosen = parser.parse_args(arguments)
+        if chosen.target.exists() and not chosen.overwrite:
+            raise UserError(f"{chosen.target} exists. Give another OUT, or --overwrite.")
+        from mops_lightning.zoo import export as files
+        from mops_lightning.zoo.load import load
+
+        difference = files.export(load(chosen.sampler), chosen.target, chosen.m)
+        size = chosen.target.stat().st_size / 1e6
+        print(
+            f"{chosen.target}: {size:.2f} MB; largest difference from the sampler {difference:.1e}"
+        )

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mops_lightning.config.hydra_conf import conf_dir
+from mops_lightning.config.compose import check_overrides, conf_dir, explain
 from mops_lightning.config.overrides import key, readable, with_home, with_own_classes
 from mops_lightning.errors import (
     INTERRUPTED,
@@ -42,8 +42,6 @@ def _run() -> None:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError  # type: ignore[import-untyped]
-
-    from mops_lightning.config.compose import check_overrides, explain
 
     show_traceback = bool(os.environ.get("HYDRA_FULL_ERROR"))
     # Makes Hydra raise instead of printing its own shortened traceback.

@@ -25,9 +25,9 @@ from mops_lightning.data.procedural.furniture import bed, desk, lamp, shelf, tab
 from mops_lightning.data.procedural.seats import chair, sofa, stool
 from mops_lightning.data.procedural.vessels import bottle, bowl, bucket, cup, goblet, teapot, vase
 from mops_lightning.data.surfaces import cached
-from mops_lightning.data.unit_sphere import UnitSphere
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import remove_temporary
+from mops_lightning.ops.points import UnitSphere
 
 BUILDERS: Mapping[str, Callable[[Generator], trimesh.Trimesh]] = MappingProxyType({
     builder.__name__: builder for builder in (

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from mops_lightning.data.formats.guard import reading
 from mops_lightning.data.formats.mesh import sample_mesh
-from mops_lightning.data.unit_sphere import UnitSphere
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write, load_npz
+from mops_lightning.ops.points import UnitSphere
 
 VERSION = 1
 """Part of the cache key; increment it when the same file gives another cloud."""

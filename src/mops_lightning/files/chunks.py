@@ -18,11 +18,11 @@ from torch import Tensor
 from mops_lightning.data.formats.guard import check_coordinates, check_size
 from mops_lightning.data.formats.registry import open_cloud_file
 from mops_lightning.data.formats.table import PART, CloudFile, Table, join_tables
-from mops_lightning.data.unit_sphere import UnitSphere, largest_distance
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.nearest import nearest
+from mops_lightning.ops.points import UnitSphere, largest_distance
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fused import FusedMOPSNet
 

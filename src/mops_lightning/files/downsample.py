@@ -11,7 +11,6 @@ from torch import Tensor
 from mops_lightning.data.formats.guard import check_coordinates, check_size
 from mops_lightning.data.formats.registry import read, write
 from mops_lightning.data.formats.table import Table
-from mops_lightning.data.unit_sphere import UnitSphere
 from mops_lightning.errors import UserError
 from mops_lightning.files.chunks import Outcome, draw, sample_by_chunks
 from mops_lightning.files.engine import Engine, LocalEngine
@@ -19,6 +18,7 @@ from mops_lightning.files.options import Options
 from mops_lightning.files.propagate import write_map
 from mops_lightning.files.tiles import sample_by_tiles
 from mops_lightning.files.weights import weights_of
+from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.readout import select
 from mops_lightning.ops.weights import check_positive
 from mops_lightning.samplers.base import Sampler, stream_sample

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from mops_lightning.data.unit_sphere import UnitSphere
 from mops_lightning.errors import UserError
+from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.readout import select
 from mops_lightning.samplers.base import Sampler
 

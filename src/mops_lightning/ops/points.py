@@ -1,9 +1,10 @@
 """Input, gathering, normalisation and memory layout of batched point clouds."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.errors import UserError
@@ -74,6 +75,36 @@ def normalize_unit_sphere(points: Tensor) -> Tensor:
     # The mean of equal numbers can have a rounding error, which must not be scaled up.
     flat = (points == points[:, :1]).all(2, keepdim=True).all(1, keepdim=True) | (radius == 0)
     return torch.where(flat, 0.0, centred / torch.where(flat, 1.0, radius))
+
+
+class UnitSphere(NamedTuple):
+    """A cloud's centre ``(3,)`` and its largest distance from a point, or 1 for equal points.
+
+    In float64, because float32 has too few digits for coordinates of a map.
+    """
+
+    centre: NDArray[np.float64]
+    radius: float
+
+    @classmethod
+    def around(cls, points: NDArray[np.float64]) -> "UnitSphere":
+        """Measure a cloud ``(n, 3)``."""
+        centre = points.sum(0) / len(points)
+        return cls(centre, largest_distance(points, centre) or 1.0)
+
+    def normalise(self, points: NDArray[np.float64]) -> Tensor:
+        """Return points ``(n, 3)`` of the cloud in the unit sphere, float32, as for training."""
+        return torch.from_numpy(((points - self.centre) / self.radius).astype(np.float32))
+
+    def restore(self, points: Tensor) -> NDArray[np.float64]:
+        """Return points ``(n, 3)`` of the unit sphere in the file's own unit."""
+        restored: NDArray[np.float64] = points.double().numpy() * self.radius + self.centre
+        return restored
+
+
+def largest_distance(points: NDArray[np.float64], centre: NDArray[np.float64]) -> float:
+    """Return the largest distance of points ``(n, 3)`` from ``centre`` ``(3,)``."""
+    return float(np.linalg.norm(points - centre, axis=1).max(initial=0.0))
 
 
 def distance_dtype(points: Tensor) -> torch.dtype:

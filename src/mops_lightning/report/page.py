@@ -13,7 +13,7 @@ from typing import Any
 from mops_lightning.errors import UserError
 from mops_lightning.report.build import Report
 from mops_lightning.report.text import PAPER, Grid, marked
-from mops_lightning.viz.clouds import COLOURS, INPUT_COLOUR
+from mops_lightning.viz.figures import COLOURS, INPUT_COLOUR
 from mops_lightning.viz.snapshots import INPUT, load_clouds
 
 MAX_RUNS = 24

@@ -1,15 +1,32 @@
-"""Creating and saving matplotlib figures, without pyplot's global state."""
+"""Figures of sampled clouds and of the sampling matrix, without pyplot's global state."""
 
 import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from PIL import Image
+from torch import Tensor
+from torch.nn.functional import adaptive_max_pool1d
 
 from mops_lightning.filesystem import atomic_write
+
+COLOURS = {
+    "generated": (31, 119, 220),
+    "matched": (214, 39, 40),
+    "completed": (255, 140, 0),
+    "sampled": (44, 140, 60),
+}
+"""RGB, 0 to 255. Blue, red and orange as in the paper; green for index samplers."""
+INPUT_COLOUR = (190, 190, 190)
+MATRIX_ROWS = 256
+"""Most rows of a drawn matrix: single points of more would not be visible."""
+LARGE_MARKER_SAMPLES = 256
+"""Above this number of samples, markers shrink."""
 
 
 def new_figure(width: float, height: float, layout: Any = "constrained") -> Figure:
@@ -61,3 +78,119 @@ def save_figure(figure: Figure, path: Path, dpi: float = 110) -> Path:
     with atomic_write(path) as temporary:
         temporary.write_bytes(buffer.getvalue())
     return path
+
+
+def cloud_grid(points: Tensor, readouts: Mapping[str, Tensor], titles: Sequence[str]) -> Figure:
+    """Draw clouds as rows and readouts as columns, each over its faint input.
+
+    Args:
+        points: ``(K, N, 3)`` input, y up.
+        readouts: ``(K, M, 3)`` by name; names that are not in ``COLOURS`` are drawn green.
+        titles: one per cloud.
+
+    Returns:
+        A figure; the first column is the input alone.
+    """
+    columns = {"input": None, **readouts}
+    figure = new_figure(2.6 * len(columns), 2.6 * len(points), "tight")
+    for row, cloud in enumerate(upright(points)):
+        for column, (name, samples) in enumerate(columns.items()):
+            title = name if row == 0 else ""
+            label = titles[row] if column == 0 else ""
+            axes = cloud_axes(figure, len(points), len(columns), row, column, title, label)
+            draw_cloud(axes, cloud, None if samples is None else upright(samples)[row], name)
+    return figure
+
+
+def comparison(
+    points: Tensor, samples: Mapping[str, Tensor], captions: Mapping[str, str]
+) -> Figure:
+    """Draw one cloud with the sample of each method side by side, and the whole cloud last.
+
+    Args:
+        points: ``(N, 3)`` input, y up.
+        samples: ``(M, 3)`` by the name of a readout or baseline, which gives the colour.
+        captions: by the same names, then one for the whole cloud.
+    """
+    figure = new_figure(2.4 * len(captions), 2.9)
+    cloud = upright(points)
+    for column, (name, caption) in enumerate(captions.items()):
+        axes = cloud_axes(figure, 1, len(captions), 0, column, caption)
+        draw_cloud(axes, cloud, upright(samples[name]) if name in samples else None, name)
+    return figure
+
+
+def draw_cloud(
+    axes: Axes3D, cloud: np.ndarray, samples: np.ndarray | None, readout: str, size: float = 22
+) -> None:
+    """Draw a cloud, faintly if samples are drawn over it.
+
+    Args:
+        axes: where to draw.
+        cloud: ``(N, 3)``, z up.
+        samples: ``(M, 3)`` or None. They are drawn over the whole cloud, because a dense cloud
+            would hide the samples behind it.
+        readout: gives the samples' colour.
+        size: marker area of up to ``LARGE_MARKER_SAMPLES`` samples; more get smaller markers.
+    """
+    axes.computed_zorder = False
+    faint = samples is not None
+    axes.scatter(
+        *cloud.T,
+        s=1 if faint else 3,
+        color=np.array(INPUT_COLOUR) / 255 if faint else "0.35",
+        alpha=0.35 if faint else 1.0,
+        depthshade=False,
+        rasterized=True,  # thousands of points would make an SVG of megabytes
+    )
+    if samples is not None:
+        colour = np.array(COLOURS.get(readout, COLOURS["sampled"])) / 255
+        size = max(size * min(1, LARGE_MARKER_SAMPLES / max(len(samples), 1)), 1.5)
+        axes.scatter(*samples.T, s=size, color=colour, depthshade=False, zorder=2)
+    frame_cloud(axes, cloud)
+
+
+def matrix_figure(dense: Tensor, gram: Tensor, title: str) -> Figure:
+    """Draw S and SᵀS as heat maps on one colour scale (the paper's figure of S).
+
+    Args:
+        dense: ``(N, M)``. Rows are sorted by their strongest column, so that an ideal matrix
+            shows as a diagonal. Of more than ``MATRIX_ROWS`` rows, the largest entries of
+            consecutive ones are drawn.
+        gram: ``(M, M)``.
+        title: the cloud and sampler of the matrix.
+    """
+    values = dense.detach().cpu()
+    order = values.argmax(1).mul(2.0).sub(values.amax(1)).argsort()
+    rows = adaptive_max_pool1d(values[order].T, min(MATRIX_ROWS, len(values))).T
+    extent = (-0.5, values.shape[1] - 0.5, len(values) - 0.5, -0.5)
+    scale: dict[str, Any] = {"vmin": 0, "vmax": 1, "cmap": "viridis"}
+    figure = new_figure(9, 4.4)
+    left, right = figure.subplots(1, 2, gridspec_kw={"wspace": 0.08})
+    images = [
+        left.imshow(rows.numpy(), aspect="auto", interpolation="nearest", extent=extent, **scale),
+        right.imshow(gram.detach().cpu().numpy(), **scale),
+    ]
+    left.set(title="S (points sorted by strongest column)", xlabel="column", ylabel="point")
+    right.set(title="SᵀS", xlabel="column", ylabel="column")
+    figure.colorbar(images[1], ax=[left, right], shrink=0.8)
+    figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def upright(points: Tensor | np.ndarray) -> np.ndarray:
+    """Turn y-up clouds into matplotlib's z-up ones."""
+    array = points if isinstance(points, np.ndarray) else points.detach().cpu().float().numpy()
+    return np.stack([array[..., 0], -array[..., 2], array[..., 1]], -1)
+
+
+def frame_cloud(axes: Axes3D, cloud: np.ndarray) -> None:
+    """Fit the axes to a cloud with equal scales, and hide them."""
+    centre, reach = (cloud.max(0) + cloud.min(0)) / 2, np.ptp(cloud, axis=0).max() / 2 or 1.0
+    for name, middle in zip("xyz", centre, strict=True):
+        getattr(axes, f"set_{name}lim")(middle - reach, middle + reach)
+    axes.set_box_aspect((1, 1, 1), zoom=1.3)
+    axes.set_axis_off()
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.set_visible(False)  # matplotlib measures the ticks of hidden axes, too
+    axes.view_init(elev=18, azim=-60)

@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
-from mops_lightning.viz.clouds import draw_cloud, frame_cloud, upright
-from mops_lightning.viz.figures import cloud_axes, new_figure
+from mops_lightning.viz.figures import cloud_axes, draw_cloud, frame_cloud, new_figure, upright
 
 SOURCE_COLOUR, TARGET_COLOUR = (0.12, 0.47, 0.86), (0.84, 0.3, 0.05)
 SAMPLE_SIZE = 14

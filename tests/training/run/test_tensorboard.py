@@ -62,7 +62,7 @@ def test_hparams_compare_all_runs_and_begin_with_what_differs(board):
     assert "hparams/test/generated/accuracy" in shown
 
 
-def test_tensorboard_shows_curves_settings_images_meshes(board, opened):
+def test_tensorboard_shows_curves_settings_images(board, opened):
     def see(address, *what):
         page, errors, requests = opened("about:blank")
         page.goto(f"{board}/{address}")
@@ -74,13 +74,7 @@ def test_tensorboard_shows_curves_settings_images_meshes(board, opened):
     see("?tagFilter=mean_loss#timeseries", "mean_loss", "canvas")
     see("#text", "test/generated/accuracy")
     see("#hparams", "tau_min")
-    see("#images", "matrix")
-    page, errors, requests = see("#mesh", "run1/tensorboard", "canvas")
-    meshes = page.locator("canvas")
-    meshes.nth(len(RUNS) - 1).wait_for(state="attached")  # a view of each run
-    context = "(canvas.getContext('webgl2') || canvas.getContext('webgl'))"
-    lost = meshes.evaluate_all(f"all => all.filter(canvas => {context}.isContextLost()).length")
-    assert lost == 0, "the browser stopped drawing some"
+    _, errors, requests = see("#images", "matrix")
     hosts = {urlparse(url).hostname for url in requests if urlparse(url).scheme.startswith("http")}
     assert hosts == {"127.0.0.1"}
     assert errors == []

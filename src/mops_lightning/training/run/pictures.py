@@ -18,22 +18,11 @@ from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.tasks.base import Task, figures_of
 from mops_lightning.training.readouts import readouts
-from mops_lightning.viz.clouds import (
-    COLOURS,
-    INPUT_COLOUR,
-    cloud_grid,
-    comparison,
-    matrix_figure,
-)
-from mops_lightning.viz.figures import save_figure
+from mops_lightning.viz.figures import cloud_grid, comparison, matrix_figure, save_figure
 from mops_lightning.viz.snapshots import CLOUDS, save_clouds
 
 DENSE_PIXELS = 2**20
 """Most entries of S that are drawn: 1,024 points by 1,024 columns."""
-MESHES = 2
-"""Clouds in TensorBoard's mesh tab."""
-MESH_SPACING = 2.2
-"""Between the centres of clouds in the mesh tab; clouds are in the unit sphere."""
 
 
 class CloudVisualization(Callback):
@@ -87,8 +76,6 @@ class CloudVisualization(Callback):
             else:  # what was drawn already
                 pixels = np.asarray(Image.open(path).convert("RGB"))
                 board.experiment.add_image(name, pixels, trainer.global_step, dataformats="HWC")
-        if board is not None:
-            _add_meshes(board, batch.points, samples, titles, trainer.global_step)
 
     @torch.no_grad()
     def _figures(
@@ -147,33 +134,3 @@ def cloud_titles(task: Task, titles: Sequence[str]) -> list[str]:
     if task.clouds_per_prediction == 1:
         return list(titles)
     return [f"{title}_{side}" for side in ("source", "target") for title in titles]
-
-
-def _add_meshes(
-    board: TensorBoardLogger,
-    points: Tensor,
-    samples: Mapping[str, Tensor],
-    titles: Sequence[str],
-    step: int,
-) -> None:
-    """Show clouds as rows and readouts as columns in one view, to be turned with the mouse.
-
-    Browsers draw about 16 views on a page, so that each run has one.
-    """
-    if not samples:
-        return
-    titles = titles[:MESHES]
-    vertices, colours = [], []
-    for row in range(len(titles)):
-        for column, (name, chosen) in enumerate(samples.items()):
-            place = MESH_SPACING * torch.tensor([column, -row, 0.0])
-            for colour, part in ((INPUT_COLOUR, points[row]), (COLOURS[name], chosen[row])):
-                vertices.append(part.cpu() + place)
-                colours.append(torch.tensor(colour, dtype=torch.uint8).expand(len(part), 3))
-    board.experiment.add_mesh(
-        f"clouds/{'_'.join(titles)}",
-        vertices=torch.cat(vertices)[None],
-        colors=torch.cat(colours)[None],
-        config_dict={"material": {"cls": "PointsMaterial", "size": 0.03}},
-        global_step=step,
-    )

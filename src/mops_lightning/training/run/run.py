@@ -23,7 +23,6 @@ from mops_lightning.training.divergence import Diverged
 from mops_lightning.training.evaluation import TrainedRun, as_trained
 from mops_lightning.training.run import pretrain, stages
 from mops_lightning.training.run.build import Parts, build_parts
-from mops_lightning.training.run.load import load_weights
 
 STARTED = ".started"
 """Empty file in the folder of a run that has begun."""
@@ -81,7 +80,7 @@ def train_and_test(parts: Parts, record: RunRecord, task_weights: Path | None) -
         record: is filled.
         task_weights: a file for the task net; None leaves it as initialised.
     """
-    load_weights(parts, record, task_weights)
+    stages.load_weights(parts, record, task_weights)
     try:
         if parts.trains:
             stages.warm_start(parts, record)
