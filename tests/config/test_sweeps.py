@@ -1,5 +1,6 @@
 """The files below sweeps/: each composes, and names every cell apart."""
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,16 @@ TESTS_ONLY = ("noise", "corruptions")
 """Sweeps that test a trained run."""
 
 
-def composed(name, overrides=()):
+@cache
+def composed_once(name, overrides):
     path = [f"hydra.searchpath=[file://{conf_dir()}]"]
     with initialize_config_dir(str(ROOT), version_base="1.3"):
         cfg = compose(name, [*path, *overrides], return_hydra_config=True)
+    return cfg
+
+
+def composed(name, overrides=()):
+    cfg = composed_once(name, tuple(overrides)).copy()
     HydraConfig.instance().set_config(cfg)
     return cfg
 

@@ -1,15 +1,15 @@
 """The examples of docs/extend.md, run as written."""
 
 import re
+import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
 from mops_lightning import load
 from mops_lightning.records import run_record
-from tests.support.command_line import TINY_ANY_DATA, call_anew, runs
+from tests.support.command_line import TINY_ANY_DATA, call, call_anew, runs
 
 PAGE = (Path(__file__).parents[2] / "docs" / "extend.md").read_text()
 MODULES = dict(re.findall(r"```python\n# (\w+\.py)\n(.*?)```", PAGE, flags=re.S))
@@ -22,14 +22,24 @@ def test_example_has_at_most_30_lines(name):
     assert len(MODULES[name].strip().splitlines()) <= 30
 
 
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.split("=")[0])
-def test_example_trains_with_a_class_from_outside(command, tmp_path):
+@pytest.fixture
+def modules(tmp_path, monkeypatch):
+    """The modules of the page, which this process imports from the test's folder."""
     for name, text in MODULES.items():
         (tmp_path / name).write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    for name in MODULES:
+        sys.modules.pop(Path(name).stem, None)
+
+
+@pytest.mark.usefixtures("modules")
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.split("=")[0])
+def test_example_trains_with_a_class_from_outside(command, tmp_path):
     given = command.split()
     data = [] if "dataset._target_" in command else SMALL_SHAPES
     tiny = [one for one in TINY_ANY_DATA if not one.startswith("dataset.") or data]
-    status, _, err = call_anew([*tiny, *data, *given], tmp_path)
+    status, _, err = call([*tiny, *data, *given], tmp_path)
     assert (status, err) == (0, "")
     (run,) = runs(tmp_path)
     record = run_record.read(run)
@@ -42,19 +52,18 @@ def test_example_trains_with_a_class_from_outside(command, tmp_path):
         assert str(node) == value
 
 
+@pytest.mark.usefixtures("modules")
 def test_run_of_own_sampler_is_evaluated_with_its_class_only(tmp_path):
-    (tmp_path / "my_sampler.py").write_text(MODULES["my_sampler.py"])
     named, setting = COMMANDS[0].split()
     status, _, err = call_anew([*TINY_ANY_DATA, *SMALL_SHAPES, named, setting], tmp_path)
     assert (status, err) == (0, "")
     (run,) = runs(tmp_path)
-    status, _, err = call_anew([f"evaluate={run}"], tmp_path)
+    status, _, err = call([f"evaluate={run}"], tmp_path)
     assert status == 2
     assert "not accepted from a record" in err
     again = [f"evaluate={run}", named, "pictures=0", "trainer=cpu", "hydra.run.dir=again"]
-    status, _, err = call_anew(again, tmp_path)
+    status, _, err = call(again, tmp_path)
     assert (status, err) == (0, "")
     assert run_record.read(tmp_path / "again").score == run_record.read(run).score
-    own: dict[str, Any] = {"__name__": "my_sampler"}
-    exec(MODULES["my_sampler.py"], own)
-    assert load(run, cls=own["MySampler"])(torch.rand(2, 64, 3)).points.shape == (2, 8, 3)
+    own = sys.modules["my_sampler"].MySampler
+    assert load(run, cls=own)(torch.rand(2, 64, 3)).points.shape == (2, 8, 3)

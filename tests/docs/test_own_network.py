@@ -1,7 +1,7 @@
 """The examples of docs/own_network.md, run as written."""
 
 import re
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ net = Net()
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, monkeypatch):
     """A user's folder: long boxes along x or y, and a net that tells them apart."""
     random = np.random.default_rng(0)
     labels = np.arange(64) % 2
@@ -41,13 +41,10 @@ def folder(tmp_path):
     (tmp_path / "my_net.py").write_text(MY_NET)
     for name, text in SCRIPTS.items():
         (tmp_path / name).write_text(text)
-    return tmp_path
-
-
-def run(script, folder):
-    done = subprocess.run([sys.executable, script], cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    sys.modules.pop("my_net", None)
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
@@ -56,7 +53,7 @@ def test_example_has_at_most_30_lines(name):
 
 
 def test_plain_loop_trains_a_sampler_for_the_net(folder):
-    run("plain_loop.py", folder)
+    runpy.run_path("plain_loop.py", run_name="__main__")
     data = np.load(folder / "clouds.npz")
     points, labels = torch.from_numpy(data["points"]), torch.from_numpy(data["labels"])
     own: dict[str, Any] = {}
@@ -72,7 +69,11 @@ def test_plain_loop_trains_a_sampler_for_the_net(folder):
     assert losses[1] < losses[0] / 5
 
 
-def test_lightning_scores_every_readout(folder):
-    out = run("by_lightning.py", folder)
+# Lightning's hints to users: there are no validation clouds, and few batches.
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.usefixtures("folder")
+def test_lightning_scores_every_readout(capsys):
+    runpy.run_path("by_lightning.py", run_name="__main__")
+    out = capsys.readouterr().out
     for readout in ("generated", "matched", "completed", "fps", "full"):
         assert f"test/{readout}/accuracy" in out
