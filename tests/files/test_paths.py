@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from mops_lightning.errors import UserError
-from mops_lightning.files.paths import file_pairs
+from mops_lightning.files.batch import file_pairs
 from mops_lightning.filesystem import TEMPORARY
 from tests.support.downsample import refused
 

@@ -342,12 +342,6 @@ def _of(schema: type, path: str) -> Setting:
     return found
 
 
-def limits_by_setting() -> dict[str, Limits]:
-    """Return the limits of all settings that have some, by dotted name."""
-    found = {name: of(name).limits for name in (*declared(), *INSIDE)}
-    return {name: limits for name, limits in found.items() if limits is not None}
-
-
 def register() -> None:
     """Make the declaration known to Hydra as the schema that ``conf/config.yaml`` begins with."""
     ConfigStore.instance().store("run_settings", SCHEMA)

@@ -114,9 +114,9 @@ def _check_numbers(value: Any, path: str) -> None:
 
 def _check_limits(config: dict[str, Any]) -> None:
     values = dotted(config)
-    for path, limits in settings.limits_by_setting().items():
-        value = values.get(path, MISSING)
-        if value != MISSING and not limits.fits(value):
+    for path in (*settings.declared(), *settings.INSIDE):
+        limits, value = settings.of(path).limits, values.get(path, MISSING)
+        if limits and value != MISSING and not limits.fits(value):
             raise refusal(path, value)
 
 

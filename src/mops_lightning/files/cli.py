@@ -135,9 +135,8 @@ def _downsample_arguments(add: Add) -> None:
 def _downsample(chosen: argparse.Namespace) -> int:
     """Do what the arguments say and return the exit status."""
     options = _options(chosen)
-    from mops_lightning.files.batch import process_file, process_folder
+    from mops_lightning.files.batch import file_pairs, process_file, process_folder
     from mops_lightning.files.downsample import load_sampler
-    from mops_lightning.files.paths import file_pairs
 
     load_sampler(options)  # reports its mistakes before any file is read
     if chosen.cluster:  # workers may have a different working directory

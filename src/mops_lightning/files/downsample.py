@@ -8,19 +8,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.data.formats.guard import check_coordinates, check_size
+from mops_lightning.data.formats.guard import BadCloudError, check_coordinates, check_size
 from mops_lightning.data.formats.registry import read, write
 from mops_lightning.data.formats.table import Table
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.files.chunks import Outcome, draw, sample_by_chunks
 from mops_lightning.files.engine import Engine, LocalEngine
 from mops_lightning.files.options import Options
 from mops_lightning.files.propagate import write_map
 from mops_lightning.files.tiles import sample_by_tiles
-from mops_lightning.files.weights import weights_of
 from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.readout import select
-from mops_lightning.ops.weights import check_positive
+from mops_lightning.ops.weights import CURVATURE, check_positive, check_weight, curvature
 from mops_lightning.samplers.base import Sampler, stream_sample
 from mops_lightning.zoo.downsample import untrained
 from mops_lightning.zoo.load import load
@@ -30,6 +29,9 @@ PART = 65536
 
 SURFACE = 10_000
 """Least number of points that are sampled from a mesh."""
+
+SPLAT = {"opacity", "f_dc_0", "scale_0", "rot_0"}
+"""Columns of a splat file (Kerbl et al., "3D Gaussian Splatting", SIGGRAPH 2023)."""
 
 
 @cache
@@ -119,6 +121,32 @@ def _sample_table(source: Path, finite: Table, sampler: Sampler, m: int, options
         return Table(points, {}, finite.header)
     kept = finite.take(rows)
     return kept if options.keep_attributes else kept.without_attributes()
+
+
+def weights_of(table: Table, field: str, source: Path) -> NDArray[np.float64]:
+    """Return one number of at least 0 per point.
+
+    Args:
+        table: of finite points.
+        field: a column, or ``curvature``. Splat files hold the logit of the opacity; its weight is
+            the opacity itself.
+        source: the file, for errors.
+
+    Raises:
+        UserError: there is no such column, or it holds numbers that are no weights.
+    """
+    values = table.columns.get(field)
+    if values is None and field == CURVATURE:
+        return curvature(table.points)
+    if values is None:
+        hint = did_you_mean(field, [*table.columns, CURVATURE])
+        raise BadCloudError(f"--weight: {source} has no column {field!r}.{hint}")
+    values = values.astype(np.float64)
+    if field == "opacity" and table.columns.keys() >= SPLAT:
+        values = 1 / (1 + np.exp(-values))
+    name = f"--weight {field} of {source}"
+    weight: NDArray[np.float64] = check_weight(values, values.shape, name).numpy()
+    return weight
 
 
 def sample_cloud(

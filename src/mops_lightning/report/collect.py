@@ -69,18 +69,14 @@ def _records(folder: Path) -> list[tuple[Path, RunRecord | str]]:
         try:
             found[run] = run_record.read(run)
         except UserError as error:
-            found[run] = _failure(run) or str(error)
+            failure = "\n".join(_lines(run / FAILED)).strip()  # the last start of a sweep's cell
+            found[run] = failure or str(error)
     return sorted(found.items(), key=lambda item: item[0])
 
 
 def _lines(path: Path) -> list[str]:
     """Return the lines of a regular file; other files give none."""
     return path.read_text(errors="replace").splitlines() if path.is_file() else []
-
-
-def _failure(run: Path) -> str:
-    """Return why the last start of a sweep's cell failed; empty if nothing says so."""
-    return "\n".join(_lines(run / FAILED)).strip()
 
 
 def trained_with(record: RunRecord) -> str:
