@@ -150,18 +150,12 @@ def test_changed_setting_changes_no_other(learn, change):
 def test_fmops_for_registration_has_anchors_and_points_for_them():
     cfg = compose(["task=registration", "sampler=fmops"])
     assert (cfg.sampler.anchors, cfg.sampler.m_max, cfg.recipe.train_points) == ("fps", 64, 512)
-    assert (cfg.weights, cfg.recipe.warm_start) == ("pcrnet.modelnet40", True)
+    assert (cfg.weights, cfg.pretrain_from) == ("auto", "pcrnet.modelnet40")
+    assert cfg.recipe.warm_start is True
     assert cfg.optimizer.lr == 1e-3
     plain = compose(["task=registration", "sampler=fmops", "recipe=paper"])
     assert (plain.sampler.anchors, plain.sampler.m_max) == (None, 64)
     assert compose(["sampler=fmops"]).sampler.m_max == 512
-
-
-def test_registration_quick_is_the_default_with_its_own_values():
-    own = ["recipe.warm_start=fmops.pairs-m64", "epochs.sampler=3", "optimizer.lr=5e-5"]
-    assert compose(["experiment=registration_quick"]) == compose(
-        ["task=registration", "sampler=fmops", *own]
-    )
 
 
 LEARN = ("task", "sampler", "joint", "nothing")

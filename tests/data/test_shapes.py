@@ -16,7 +16,7 @@ from trimesh import Trimesh
 from mops_lightning.data import shapes as source
 from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.data.procedural.mesh_parts import join, turned
-from mops_lightning.data.shapes import BUILDERS, shapes
+from mops_lightning.data.shapes import ASYMMETRIC, BUILDERS, shapes
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
 
@@ -283,3 +283,10 @@ def test_builder_gives_valid_meshes(name: str) -> None:
         assert mesh.faces.max() < len(mesh.vertices)
         assert (mesh.extents > 0.1).all()
         assert mesh.extents.max() < 4
+
+
+def test_asymmetric_classes_are_a_choice_of_their_own() -> None:
+    few = {"n_points": 8, "train_per_class": 1, "test_per_class": 1}
+    assert shapes(**few, classes="asymmetric").class_names == ASYMMETRIC
+    with pytest.raises(UserError, match="classes must be a list of names"):
+        shapes(**few, classes="chair")  # type: ignore[arg-type]

@@ -36,7 +36,12 @@ TINY = [
 ]
 """The smallest job that runs every stage, on procedural shapes."""
 
-SMALL_PCRNET = ["task=registration", "weights=auto", "task.net.feature_channels=[16,32]"]
+SMALL_PCRNET = [
+    "task=registration",
+    "weights=auto",
+    "pretrain_from=null",
+    "task.net.feature_channels=[16,32]",
+]
 """Registration by a net that is written to disk in no time."""
 
 TINY_WITH_PICTURES = [*TINY, "pictures=2", "logger=tensorboard"]

@@ -179,6 +179,13 @@ class RunSettings:
         repeat=False,
         compare=False,
     )
+    pretrain_from: str | None = setting(
+        None,
+        "weights, as for weights=, that the training of the task net by weights=auto starts from",
+        Affects.TRAINING,
+        nullable=True,
+        compare=False,
+    )
     ckpt_path: str | None = setting(
         None,
         "resume training: last (newest run of these settings), a run folder or a .ckpt file",

@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Literal
 
 import numpy as np
 import torch
@@ -37,6 +38,9 @@ BUILDERS: Mapping[str, Callable[[Generator], trimesh.Trimesh]] = MappingProxyTyp
 })  # fmt: skip
 """Builders by class name, in the order of the labels; each call draws new proportions."""
 
+ASYMMETRIC = ("airplane", "bed", "chair", "shelf", "sofa", "teapot")
+"""Classes whose shapes do not look alike from several sides, for registration."""
+
 GENERATOR_VERSION = 1
 """Part of the fingerprint; increment it with every change of the shapes."""
 
@@ -51,7 +55,7 @@ def shapes(
     n_points: int = 1024,
     train_per_class: int = 80,
     test_per_class: int = 20,
-    classes: Sequence[str] | None = None,
+    classes: Sequence[str] | Literal["asymmetric"] | None = None,
     seed: int = 0,
     cache: str | Path | None = None,
 ) -> CloudDataset:
@@ -66,7 +70,7 @@ def shapes(
         n_points: number of points per shape.
         train_per_class: number of training shapes per class.
         test_per_class: number of test shapes per class.
-        classes: names to keep; None or empty means all.
+        classes: names to keep, or ``asymmetric`` for ``ASYMMETRIC``; None or empty means all.
         seed: seed of all shapes and points.
         cache: folder for generated clouds, or None. A damaged file is generated again.
 
@@ -84,7 +88,8 @@ def shapes(
     for name, value, minimum in zip(names, values, (1, 1, 1, 0), strict=True):
         if not isinstance(value, int) or isinstance(value, bool) or value < minimum:
             raise UserError(f"{name} must be a whole number of at least {minimum}, got {value!r}.")
-    chosen = choose_classes(classes, tuple(BUILDERS))
+    wanted = ASYMMETRIC if classes == "asymmetric" else classes
+    chosen = choose_classes(wanted, tuple(BUILDERS))
     settings = {
         "dataset": "shapes",
         "version": GENERATOR_VERSION,

@@ -43,6 +43,17 @@ def test_task_net_is_pretrained_by_its_own_optimizer(tmp_path):
     assert by_run.task_weights_sha256 == alone["sha256"]
 
 
+def test_pretraining_starts_from_given_weights(tmp_path):
+    train(tmp_path, "learn=task", *SMALL_PCRNET)
+    start = tmp_path / "run0"
+    own = [*SMALL_PCRNET, f"pretrain_from={start}", "sampler=fps", "pretrain.lr=0"]
+    record = train(tmp_path, *own)
+    # At a rate of 0 nothing moves.
+    assert record.task_weights_sha256 == weights.read(start / "weights.safetensors")["sha256"]
+    with pytest.raises(UserError, match="no file"):
+        train(tmp_path, *own, "pretrain_from=nowhere/net.pt")
+
+
 def test_weights_file_for_net_without_weights_raises(tmp_path):
     with pytest.raises(UserError, match=r"weights: icp.*got pointnet"):
         train(

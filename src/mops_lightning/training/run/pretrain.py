@@ -29,15 +29,17 @@ Train = Callable[[DictConfig, Path, CloudDataset], None]
 def task_weights(cfg: DictConfig, dataset: CloudDataset, train: Train) -> Path | None:
     """Return the file that ``weights`` names; ``auto`` trains the net when it is not cached.
 
-    With ``learn=task``, training starts from the given file; with ``auto`` from scratch.
+    With ``learn=task``, training starts from the given file; with ``auto`` from
+    ``pretrain_from``, if it is set.
 
     Returns:
         None for ``weights=null`` (the net stays as initialised), for a resumed run (its checkpoint
         contains the task net), and for an evaluated run.
     """
-    from_scratch = cfg.weights == "auto" and cfg.learn == "task"
-    if cfg.weights in (None, OF_RUN) or cfg.ckpt_path is not None or from_scratch:
+    if cfg.weights in (None, OF_RUN) or cfg.ckpt_path is not None:
         return None
+    if cfg.weights == "auto" and cfg.learn == "task":
+        return cfg.pretrain_from and weights.of_task_net(cfg.pretrain_from)
     if cfg.weights != "auto":
         return weights.of_task_net(cfg.weights)
     folder = cache_folder(cfg, dataset)

@@ -69,7 +69,8 @@ def run(
 def _train_task_net(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
     """Train a task net by the same stages, with its own record."""
     with recorded(cfg, folder, []) as record:
-        train_and_test(build_parts(cfg, folder, dataset, record), record, None)
+        start = pretrain.task_weights(cfg, dataset, _train_task_net)
+        train_and_test(build_parts(cfg, folder, dataset, record), record, start)
 
 
 def train_and_test(parts: Parts, record: RunRecord, task_weights: Path | None) -> None:
