@@ -27,8 +27,7 @@ TESTS_ONLY = ("noise", "corruptions")
 def composed_once(name, overrides):
     path = [f"hydra.searchpath=[file://{conf_dir()}]"]
     with initialize_config_dir(str(ROOT), version_base="1.3"):
-        cfg = compose(name, [*path, *overrides], return_hydra_config=True)
-    return cfg
+        return compose(name, [*path, *overrides], return_hydra_config=True)
 
 
 def composed(name, overrides=()):

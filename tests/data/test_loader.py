@@ -106,7 +106,7 @@ def test_augmentation_turns_about_its_vertical_axis(up):
 
 def test_augmentation_unknown_axis_raises():
     with pytest.raises(UserError, match=r"rotate_up must be true, false, x, y or z .* got 'w'"):
-        Augmentation(rotate_up="w")
+        Augmentation(rotate_up="w")  # type: ignore[arg-type]
 
 
 def test_augmentation_default_is_identity(rng):
