@@ -163,6 +163,7 @@ def test_rival_samplers_have_published_settings():
         (["m=null"], "m must be a whole number .*, got None"),
         (["cache=null"], "cache must be a text, got None"),
         (["task_lr_scale=0", "learn=joint"], "task_lr_scale must be a number above 0"),
+        (["test_corruption=sheer-3"], "test_corruption must be a kind .*Did you mean 'shear'"),
         (["test_noise_std=inf"], "test_noise_std must be a number of at least 0"),
         (["trainer.precision=bf16"], "precision must be one of .*Did you mean 'bf16-mixed'"),
         (["dataset=meshes"], "dataset.root must be set"),

@@ -48,9 +48,10 @@ def parse(spec: str) -> tuple[Corruption, float]:
     """Return the function and the level of ``KIND-SEVERITY``."""
     kind, _, severity = spec.rpartition("-")
     if kind not in KINDS or severity not in ("1", "2", "3", "4", "5"):
+        known = kind in KINDS or spec in KINDS
         raise UserError(
-            "test_corruption must be one of these, with a severity of -1 to -5: "
-            f"{', '.join(KINDS)}; got {spec!r}.{did_you_mean(kind or spec, KINDS)}"
+            "test_corruption must be a kind with a severity of 1 to 5, such as shear-3, got "
+            f"{spec!r}.{'' if known else did_you_mean(kind or spec, KINDS)}"
         )
     apply, levels = KINDS[kind]
     return apply, levels[int(severity) - 1]
