@@ -5,12 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
 import mops_lightning
 from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
 from mops_lightning.files import propagate as module
 from mops_lightning.files.cli import propagate as main
+from mops_lightning.ops import propagation
 from tests.support.captured import captured, refused
 from tests.support.downsample import call as downsample
 from tests.support.downsample import refused as not_downsampled
@@ -132,6 +134,18 @@ def test_points_without_coordinates_are_left_out_and_columns_kept(scan, tmp_path
     np.testing.assert_array_equal(made.points, whole.points)
     np.testing.assert_array_equal(made.columns["intensity"], whole.columns["intensity"])
     np.testing.assert_array_equal(made.columns["label"], nearest(whole.points, sample.points))
+
+
+def test_parts_share_one_tree_of_the_sample(scan, tmp_path, monkeypatch):
+    sample, built = contents(scan).take(np.arange(0, 90, 3)), []
+    monkeypatch.setattr(propagation, "cKDTree", lambda rows: built.append(rows) or cKDTree(rows))
+    scores = np.random.default_rng(1).random(30)
+    WRITERS[".ply"](tmp_path / "small.ply", Table(sample.points, {"score": scores}))
+    assert call(tmp_path / "small.ply", scan, "--field", "score", "--k", 3)[0] == 0
+    assert len(built) == 1
+    whole = propagation.propagation_map(contents(scan).finite().points, sample.points, 3)
+    made = contents(tmp_path / "big_propagated.ply").columns["score"]
+    np.testing.assert_allclose(made, mops_lightning.propagate(scores, whole), atol=1e-12)
 
 
 @pytest.mark.parametrize("target", [".ply", ".las"])

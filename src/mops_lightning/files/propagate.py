@@ -19,7 +19,7 @@ from mops_lightning.data.formats.table import PART, Column, Table, TableParts
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.files.engine import with_progress
 from mops_lightning.filesystem import atomic_write
-from mops_lightning.ops.propagation import propagate, propagation_map
+from mops_lightning.ops.propagation import mapper, propagate, propagation_map
 
 Points = NDArray[np.float64]
 
@@ -76,9 +76,10 @@ def propagate_file(
             f"--k must be from 1 to the {len(sample.points)} points of {small}, got {k}."
         )
     carried = {name: sample.columns[name] for name in fields}
+    map_part = mapper(sample.points, k)
 
     def carry(table: Table) -> Table:
-        found = propagation_map(table.points, sample.points, k)
+        found = map_part(table.points)
         columns = {name: propagate(values, found, mean) for name, values in carried.items()}
         return Table(table.points, {**table.columns, **columns}, table.header)
 

@@ -5,6 +5,7 @@ weights, as in PointNet++ (Qi et al., NeurIPS 2017); whole numbers are never ave
 caller asks for it, so that a label stays a label.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -95,8 +96,25 @@ def propagation_map(
     return PropagationMap(torch.cat(shifted), torch.cat(weights), len(sampled))
 
 
+def mapper(sampled: Any, k: int = 1) -> Callable[[Any], PropagationMap]:
+    """Return ``propagation_map`` for the parts of one cloud; its tree is built only once.
+
+    Args:
+        sampled: ``(m, C)``, on the CPU.
+        k: number of sampled points.
+    """
+    sampled = as_tensor("sampled", sampled)
+    tree = cKDTree(sampled.double().numpy()) if k > 1 else None
+
+    def map_part(points: Any) -> PropagationMap:
+        rows, weights = _search(as_tensor("points", points), sampled, k, tree)
+        return PropagationMap(rows, weights, len(sampled))
+
+    return map_part
+
+
 @torch.no_grad()
-def _search(points: Tensor, sampled: Tensor, k: int) -> tuple[Tensor, Tensor]:
+def _search(points: Tensor, sampled: Tensor, k: int, tree: Any = None) -> tuple[Tensor, Tensor]:
     """Return the k nearest rows ``(N, k)`` of one cloud, and their weights."""
     if points.shape[1] != sampled.shape[1]:
         raise UserError(
@@ -115,7 +133,7 @@ def _search(points: Tensor, sampled: Tensor, k: int) -> tuple[Tensor, Tensor]:
         rows = nearest(points[None], sampled[None])[1][0, :, None]
         return rows, torch.ones_like(rows, dtype=torch.promote_types(dtype, torch.float32))
     if points.is_cpu:
-        tree: Any = cKDTree(sampled.double().numpy())
+        tree = cKDTree(sampled.double().numpy()) if tree is None else tree
         distances, rows = map(torch.from_numpy, tree.query(points.double().numpy(), k=k))
         squared = distances.square()
     else:
