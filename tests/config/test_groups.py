@@ -99,7 +99,7 @@ def test_snet_rate_depends_on_task(task, learn, rate):
     ("overrides", "epochs"),
     [
         ([], (12, 10)),
-        (["task=registration"], (10, 15)),
+        (["task=registration"], (30, 15)),
         (["dataset=modelnet40"], (30, 8)),
         (["dataset=modelnet40", "task=reconstruction"], (200, 60)),
         (["dataset=shapenet_core", "task=reconstruction"], (100, 30)),
