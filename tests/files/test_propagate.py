@@ -137,8 +137,14 @@ def test_points_without_coordinates_are_left_out_and_columns_kept(scan, tmp_path
 
 
 def test_parts_share_one_tree_of_the_sample(scan, tmp_path, monkeypatch):
-    sample, built = contents(scan).take(np.arange(0, 90, 3)), []
-    monkeypatch.setattr(propagation, "cKDTree", lambda rows: built.append(rows) or cKDTree(rows))
+    sample = contents(scan).take(np.arange(0, 90, 3))
+    built = []
+
+    def counted(rows: Any) -> Any:
+        built.append(rows)
+        return cKDTree(rows)
+
+    monkeypatch.setattr(propagation, "cKDTree", counted)
     scores = np.random.default_rng(1).random(30)
     WRITERS[".ply"](tmp_path / "small.ply", Table(sample.points, {"score": scores}))
     assert call(tmp_path / "small.ply", scan, "--field", "score", "--k", 3)[0] == 0
