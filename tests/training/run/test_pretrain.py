@@ -50,7 +50,7 @@ def test_pretraining_starts_from_given_weights(tmp_path):
     record = train(tmp_path, *own)
     # At a rate of 0 nothing moves.
     assert record.task_weights_sha256 == weights.read(start / "weights.safetensors")["sha256"]
-    with pytest.raises(UserError, match="no file"):
+    with pytest.raises(UserError, match="pretrain_from: no file"):
         train(tmp_path, *own, "pretrain_from=nowhere/net.pt")
 
 

@@ -44,15 +44,17 @@ def load_weights(parts: Parts, record: RunRecord, task_weights: Path | None) -> 
     Raises:
         UserError: they do not fit.
     """
-    task = parts.experiment.task
+    task, cfg = parts.experiment.task, parts.cfg
     if task_weights is not None:
+        trains_from = cfg.learn == "task" and cfg.weights == "auto"
+        setting = "pretrain_from" if trains_from else "weights"
         try:
             content = weights.load_into(task, task_weights)
         except UserError as error:
-            raise UserError(f"weights: {error}") from None
+            raise UserError(f"{setting}: {error}") from None
         record.weights_loaded = content["sha256"]
         if task.requires_same_classes and content.get("classes"):
-            check_classes(content["classes"], parts.dataset, f"weights: {task_weights}")
+            check_classes(content["classes"], parts.dataset, f"{setting}: {task_weights}")
     if parts.trained is not None:
         of_run = parts.cfg.weights == OF_RUN
         record.evaluated = load_trained(parts.trained, of_run, parts.experiment, parts.dataset)
