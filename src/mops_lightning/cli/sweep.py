@@ -195,9 +195,9 @@ def _add_models(cells: list[Path], folder: Path) -> None:
 
     added = publish.add_all(cells, folder, folder / "models")
     if added:
-        first = added[0].stem
-        print(f"{len(added)} models in {folder}/models; to test one: MOPS_MODELS={folder}/models")
-        print(f"python -m mops_lightning evaluate={first}")
+        place = folder / "models"
+        print(f"{len(added)} models in {place}; to test one:")
+        print(f"MOPS_MODELS={place} python -m mops_lightning evaluate={added[-1].stem}")
 
 
 class SweepSummary(Callback):
