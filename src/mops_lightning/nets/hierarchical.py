@@ -1,4 +1,4 @@
-"""A hierarchical classifier whose stages sample their points by any sampler.
+"""A hierarchical classifier whose stages sample their points.
 
 The paper's conclusion proposes its sampler in place of farthest point sampling inside such nets,
 of which PointNet++ is the first (Qi et al., NeurIPS 2017).
