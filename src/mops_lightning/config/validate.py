@@ -11,7 +11,6 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from mops_lightning.config import distributed, settings
 from mops_lightning.config.annotations import describe, misfit
 from mops_lightning.config.build import signature
-from mops_lightning.data import corruptions
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.records.run_record import dotted
 
@@ -54,6 +53,8 @@ def check(cfg: DictConfig) -> None:
     _check_limits(plain)
     _check_numbers(plain, "")
     if plain["test_corruption"] is not None:
+        from mops_lightning.data import corruptions  # imports torch, which --help does without
+
         corruptions.parse(plain["test_corruption"])
     _check_evaluation(plain)
     for key in plain["epochs"]:
