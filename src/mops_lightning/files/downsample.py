@@ -24,9 +24,6 @@ from mops_lightning.samplers.base import Sampler, stream_sample
 from mops_lightning.zoo.downsample import untrained
 from mops_lightning.zoo.load import load
 
-PART = 65536
-"""Number of points that a learned sampler processes at a time; it bounds the memory of features."""
-
 SURFACE = 10_000
 """Least number of points that are sampled from a mesh."""
 
@@ -200,7 +197,7 @@ def _select(
     if weights is not None and not sampler.generates:
         return sampler.sample_weighted(points[None], m, weights)[0], points
     if sampler.streams:
-        generated = stream_sample(sampler, lambda: list(points.split(PART)), m)
+        generated = stream_sample(sampler, lambda: [points], m)
     else:
         output = sampler(points[None], m)
         generated = output.points[0]

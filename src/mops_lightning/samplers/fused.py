@@ -1,5 +1,6 @@
 """MOPS-Net for inference: BatchNorm fused into linear layers, points processed in blocks."""
 
+from functools import partial, reduce
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -11,6 +12,9 @@ from mops_lightning.ops.attention import Partial, attend
 
 BLOCK_ROWS = {"cpu": 2048, "cuda": 2**18}
 """Points per block: on a CPU, the widest layer of a block stays in the cache."""
+
+PART = 65536
+"""Points whose features are in memory at a time."""
 
 
 class Layer(NamedTuple):
@@ -74,7 +78,8 @@ class FusedMOPSNet(NamedTuple):
 
         Contributions merge by maximum.
         """
-        return self.local_features(points).amax(0)
+        peaks = [self.local_features(part).amax(0) for part in points.split(PART)]
+        return torch.stack(peaks).amax(0)
 
     def sum_part(self, points: Tensor, global_: Tensor, m: int) -> Partial:
         """Return the contribution of a chunk to the generated points; ``Partial.merge`` merges.
@@ -87,7 +92,9 @@ class FusedMOPSNet(NamedTuple):
         Returns:
             Sums for m points, with values ``(m, 3)``.
         """
-        return attend(self.queries[:m], self.keys(self.local_features(points), global_), points)
+        queries, parts = self.queries[:m], points.split(PART)
+        keys = (self.keys(self.local_features(part), global_) for part in parts)
+        return reduce(Partial.merge, map(partial(attend, queries), keys, parts))
 
 
 def fused_layers(stack: nn.Sequential) -> tuple[Layer, ...]:
