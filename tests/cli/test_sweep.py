@@ -48,6 +48,18 @@ def test_run_cell_other_settings_keeps_result(start, tmp_path, caplog):
     assert not (tmp_path / "cell" / FAILED).exists()
 
 
+def test_sweep_of_evaluations_started_again_is_skipped(tmp_path):
+    more = ["sampler=snet", "val_fraction=0.25", "weights=null", "hydra.run.dir=trained"]
+    status, _, err = call([*TINY, *more], tmp_path)
+    assert status == 0, err
+    sweep = ["-m", "evaluate=trained", "pictures=0", "logger=none", "hydra.sweep.dir=sweep"]
+    for _ in range(2):
+        status, out, err = call([*sweep, "test_corruption=null,shear-3"], tmp_path)
+        assert status == 0, err
+        assert "2 cells: 2 completed" in out
+    assert out.count("already completed") == 2
+
+
 def test_run_cell_failed_is_repeated(start, tmp_path, caplog):
     file = tmp_path / "net.pt"
     assert math.isnan(start("sampler=fps", f"weights={file}"))

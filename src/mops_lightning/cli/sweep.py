@@ -54,7 +54,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
     Raises:
         Interrupted: the user stopped the sweep.
     """
-    from mops_lightning.training.run.run import STARTED, run
+    from mops_lightning.training.run.run import STARTED, checked, claim, run
 
     try:
         with _lock(folder):
@@ -62,6 +62,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
             remove_temporary(folder)
             if (folder / ASIDE / MOVING).is_dir():
                 _move_aside(folder)  # an earlier start was killed in the middle of it
+            cfg = checked(cfg, overrides)  # an evaluation has the settings of its run
             earlier = _earlier(cfg, folder)
             status, score = earlier or ("killed", math.nan)
             if status == "completed":
@@ -77,7 +78,8 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
                 log.info(f"{folder}: the last attempt was {status}; {action}")
             # A process that was killed before it wrote a record left this file.
             (folder / STARTED).unlink(missing_ok=True)
-            new = run(cfg, folder, overrides).score
+            claim(folder)
+            new = run(cfg, folder, overrides, claimed=True).score
             return math.nan if new is None else float(new)
     except (Interrupted, BrokenPipeError):
         raise
