@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from pathlib import Path
 from typing import NoReturn, TextIO
 
 USER_ERROR = 2
@@ -28,7 +29,8 @@ class UserError(ValueError):
 class Parser(argparse.ArgumentParser):
     """Parser of a subcommand's arguments.
 
-    Its errors show no control characters: a shell puts names of files in the place of ``*``.
+    Its errors show no control characters: a shell puts names of files in the place of ``*``. A
+    path that begins with ``~`` is below a home folder unless there is a file of this name.
 
     Args:
         prog: what the user typed to start the subcommand.
@@ -38,11 +40,17 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, prog: str, description: str) -> None:
         kept = argparse.RawDescriptionHelpFormatter
         super().__init__(prog=prog, description=description, formatter_class=kept)
+        self.register("type", Path, _with_home)
         self._negative_number_matcher = re.compile(r"-\.?\d")  # also the first of several numbers
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and a message, and exit."""
         super().error(printable(message))
+
+
+def _with_home(text: str) -> Path:
+    path = Path(text)
+    return path if os.path.lexists(path) else path.expanduser()
 
 
 class Interrupted(Exception):

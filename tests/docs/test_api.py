@@ -1,4 +1,4 @@
-"""The examples of docs/api.md for all points and for PyTorch Geometric, run as written."""
+"""Examples of docs/api.md and docs/selection.md, run as written."""
 
 import re
 from pathlib import Path
@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 import torch
 
-PAGE = (Path(__file__).parents[2] / "docs" / "api.md").read_text()
+DOCS = Path(__file__).parents[2] / "docs"
 
 
-def example(title):
+def example(title, page="api.md"):
     """Return the first Python block below a title."""
-    text = re.search(rf"#+ {title}\n.*?```python\n(.*?)```", PAGE, flags=re.S)
+    text = re.search(rf"#+ {title}\n.*?```python\n(.*?)```", (DOCS / page).read_text(), flags=re.S)
     assert text is not None
     return text[1]
 
@@ -23,6 +23,12 @@ def test_labels_come_back_to_all_points():
     labels, points = names["labels"], names["points"]
     assert (labels.shape, labels.dtype) == ((4096,), torch.bool)
     assert ((points[:, 0] > 0.5) == labels).float().mean() > 0.9
+
+
+def test_points_are_selected_with_the_task_net():
+    names: dict[str, Any] = {}
+    exec(example("In Python", "selection.md"), names)
+    assert names["rows"].shape == (8, 64)
 
 
 def test_pointnet2_layer_runs_with_one_import_replaced():

@@ -103,7 +103,7 @@ def check_overrides(arguments: Sequence[str]) -> None:
             continue
         value: Any = override.value()
         if override.is_delete():
-            if group in groups and value is not None and not _is_choice(value):
+            if group in groups and value is not None and not _is_choice(value, group):
                 raise UserError(f"{argument}: write ~{name}.")
             continue
         if name == "hydra.verbose" and type(value) in (int, float, dict, type(None)):
@@ -113,15 +113,17 @@ def check_overrides(arguments: Sequence[str]) -> None:
         values = [value]
         if override.is_sweep_override():
             values = value.list if override.is_choice_sweep() else []
-        if not (all(map(_is_choice, values)) or (name == "baselines" and value == {})):
+        chosen = all(_is_choice(one, group) for one in values)
+        if not (chosen or (name == "baselines" and value == {})):
             raise UserError(f"{argument}: choose one with {name}=NAME{OTHERWISE.get(name, '')}.")
 
 
-def _is_choice(value: Any) -> bool:
-    """Return whether a value is a choice of a group: a name, or settings of a single object."""
+def _is_choice(value: Any, group: str) -> bool:
+    """Return whether a value is a choice of a group: a name, or settings of a top-level object."""
     from hydra.core.override_parser.types import QuotedString
 
-    return isinstance(value, str | QuotedString) or (isinstance(value, dict) and bool(value))
+    settings_of_it = isinstance(value, dict) and bool(value) and "/" not in group
+    return isinstance(value, str | QuotedString) or settings_of_it
 
 
 def explain(error: BaseException, arguments: Sequence[str]) -> str:
@@ -153,7 +155,8 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
     for text in texts:
         if "Could not override '" in text:
             key = text.split("Could not override '")[1].split("'")[0]
-            return _no_such_setting(key, arguments)
+            inside = re.search(r"is not in struct\s+full_key: (\S+)", "\n".join(texts))
+            return _no_such_setting(inside.group(1) if inside else key, arguments)
         if unknown := re.search(r"In '(.+)': ConfigKeyError .*\nKey '(\w+)' not in 'Run", text):
             hint = did_you_mean(unknown.group(2), settings.declared())
             return f"{unknown.group(1)}.yaml: {unknown.group(2)}: no such setting.{hint}"

@@ -317,6 +317,12 @@ INSIDE: dict[str, dict[str, Any]] = {
             "-1 or a whole number of at least 1", lambda x: x == -1 or whole(1).fits(x)
         )
     },
+    # Lightning uses these only when training begins, after pretraining.
+    "trainer.gradient_clip_val": {
+        "limits": Limits("null or a number above 0", lambda x: x is None or ABOVE_ZERO.fits(x))
+    },
+    "trainer.accumulate_grad_batches": {"limits": whole(1)},
+    "logger.flush_logs_every_n_steps": {"limits": whole(1)},
     "trainer.limit_train_batches": {"limits": ABOVE_ZERO},
     "trainer.limit_test_batches": {"limits": ABOVE_ZERO},
     "trainer.precision": {"limits": one_of(*PRECISIONS, others=("32", 32, None))},
