@@ -21,6 +21,9 @@ FARTHEST_LEAF, NEAREST_LEAF = 1024, 256
 """Maximum number of points of a leaf of the tree: more leaves exclude more points, larger ones
 take less time per point."""
 
+SPARSE = 100
+"""Points per chosen point from which a tree with four times as large leaves is faster."""
+
 THREADS_MIN_WORK = 2**22
 """Minimum number of distances in a batch, estimated, for using several threads."""
 
@@ -46,7 +49,8 @@ def farthest(
     planes = _planes(points)
     bits = np.ascontiguousarray(distances.numpy()).view(_integer(planes))
     scales = np.empty((len(points), 0)) if factors is None else factors.contiguous().numpy()
-    fixed = (steps, points.shape[2], FARTHEST_LEAF)
+    sparse = points.shape[1] > SPARSE * steps
+    fixed = (steps, points.shape[2], FARTHEST_LEAF * (4 if sparse else 1))
     work = steps * points.shape[1] * len(points)
     clouds = zip(planes, bits, scales, strict=True)
     return _rows(lambda cloud: kernels.farthest(*cloud, *fixed), clouds, work)

@@ -86,14 +86,14 @@ def _build(planes, channels, leaf):
         lowest and the highest coordinates.
     """
     size = len(planes) // channels
-    rows = np.arange(size)
+    rows = np.arange(size).astype(np.uint32)
     # A node has at least two children or none, hence fewer than 2·N nodes. Unused memory of large
     # arrays is never touched.
     nodes = np.empty(8 * size, np.int64)
     boxes = np.empty(4 * channels * size, planes.dtype)
-    child = np.empty(size, np.uint8)
-    moved, moved_rows = np.empty(size, planes.dtype), np.empty(size, np.int64)
-    counts, places = np.empty(FANOUT, np.int64), np.empty(FANOUT, np.int64)
+    child, counts = np.empty(size, np.uint8), np.empty(FANOUT, np.int64)
+    places, moved_rows = np.empty(size, np.uint32), np.empty(size, np.uint32)
+    moved = np.empty(size, planes.dtype)
     nodes[0], nodes[1] = 0, size
     node, known = 0, 1
     while node < known:
@@ -104,7 +104,7 @@ def _build(planes, channels, leaf):
         low, high = boxes[box], boxes[box + channels]
         if stop - start > leaf and low < high:
             line = planes[axis * size + start : axis * size + stop]
-            _split(line, low, high, child, counts)
+            _split(line, low, high, child, counts, places)
             nodes[4 * node + 2] = known
             for k in range(FANOUT):
                 if counts[k]:
@@ -115,8 +115,8 @@ def _build(planes, channels, leaf):
             nodes[4 * node + 3] = known - nodes[4 * node + 2]
             start = nodes[4 * node]
             for c in range(channels):
-                _move(planes[c * size + start : c * size + stop], child, counts, places, moved)
-            _move(rows[start:stop], child, counts, places, moved_rows)
+                _move(planes[c * size + start : c * size + stop], places, moved)
+            _move(rows[start:stop], places, moved_rows)
         node += 1
     return rows, nodes[: 4 * known], boxes
 
@@ -139,8 +139,8 @@ def _write_box(planes, channels, start, stop, boxes, node):
 
 
 @jit
-def _split(line, low, high, child, counts):
-    """Write the number of every point's child and count the points of every child."""
+def _split(line, low, high, child, counts, places):
+    """Write every point's child and its place in the order of children; count their points."""
     samples = np.empty(PROBES * FANOUT - 1, line.dtype)
     for i in range(len(samples)):
         value = line[(2 * i + 1) * len(line) // (2 * len(samples))]
@@ -160,18 +160,17 @@ def _split(line, low, high, child, counts):
     counts[:] = 0
     for i in range(len(line)):
         counts[child[i]] += 1
+    following = np.cumsum(counts) - counts
+    for i in range(len(line)):
+        places[i] = following[child[i]]
+        following[child[i]] += 1
 
 
 @jit
-def _move(line, child, counts, places, moved):
-    """Sort values by the number of the child."""
-    begin = 0
-    for k in range(FANOUT):
-        places[k] = begin
-        begin += counts[k]
+def _move(line, places, moved):
+    """Move values to their places."""
     for i in range(len(line)):
-        moved[places[child[i]]] = line[i]
-        places[child[i]] += 1
+        moved[places[i]] = line[i]
     line[:] = moved[: len(line)]
 
 
