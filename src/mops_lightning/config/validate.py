@@ -9,7 +9,7 @@ from typing import Any, get_type_hints
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from mops_lightning.config import distributed, settings
-from mops_lightning.config.annotations import describe, misfit
+from mops_lightning.config.annotations import misfit
 from mops_lightning.config.build import signature
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.records.run_record import dotted
@@ -83,7 +83,8 @@ def check(cfg: DictConfig) -> None:
 def refusal(path: str, value: Any) -> UserError:
     """Return the error about a value that does not fit a setting's type or limits."""
     limits = settings.of(path).limits
-    allowed = limits.allowed if limits else describe(get_type_hints(settings.SCHEMA).get(path, Any))
+    hint = get_type_hints(settings.SCHEMA).get(path, Any)
+    allowed = limits.allowed if limits else misfit(value, hint)
     near = did_you_mean(str(value), limits.choices) if limits and limits.choices else ""
     return UserError(f"{path} must be {allowed}, got {value!r}.{near.partition(' Allowed:')[0]}")
 
