@@ -3,8 +3,6 @@
 import inspect
 import logging
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -130,21 +128,6 @@ def _with_path(error: UserError, node: Any, where: str, extra: tuple[str, ...]) 
     shared = re.fullmatch(r"\$\{(\w+)\}", value) if isinstance(value, str) else None
     setting = shared.group(1) if shared else f"{where}.{name}"
     return UserError(setting + str(error)[len(name) :])
-
-
-@contextmanager
-def settings_named(node: DictConfig, where: str, *given: str) -> Iterator[None]:
-    """Put the setting's path in place of the argument that an error of a built object starts with.
-
-    Args:
-        node: the configuration of the object.
-        where: its dotted path.
-        *given: arguments that code gave, not the configuration.
-    """
-    try:
-        yield
-    except UserError as error:
-        raise _with_path(error, node, where, given) from error.__cause__
 
 
 def accepted(node: DictConfig, offered: dict[str, Any]) -> dict[str, Any]:

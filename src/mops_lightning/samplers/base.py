@@ -255,13 +255,6 @@ class Sampler(nn.Module):
                 f"m must be {self.m}, the size this {type(self).__name__} was made for, got {m}."
             )
 
-    def check_cloud_size(self, n: int) -> None:
-        """Check that the sampler's settings allow clouds of ``n`` points.
-
-        Raises:
-            UserError: they do not allow it.
-        """
-
 
 def check_points(points: Tensor, at_least: int = 1, finite: bool = True) -> None:
     """Check that an argument is a batch of clouds with enough points.

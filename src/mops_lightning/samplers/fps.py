@@ -58,24 +58,8 @@ class FPSSampler(Sampler):
         self.seed = seed
         self.start = start
 
-    def check_cloud_size(self, n: int) -> None:
-        """Check that ``start`` is the index of one of ``n`` points.
-
-        Raises:
-            UserError: it is not an index.
-        """
-        if isinstance(self.start, int) and self.start >= n:
-            raise UserError(
-                f"start must be less than the number of points N={n}, got {self.start}."
-            )
-
     def sample(self, points: Tensor, m: int) -> SampleOutput:
-        """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice.
-
-        Raises:
-            UserError: ``start`` is not the index of a point.
-        """
-        self.check_cloud_size(points.shape[1])
+        """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice."""
         indices = farthest_rows(points, m, self.seed, self.start)
         return SampleOutput(gather_points(points, indices), indices, {})
 
@@ -84,7 +68,6 @@ class FPSSampler(Sampler):
 
         See ``ops.fps.farthest_point_sample``.
         """
-        self.check_cloud_size(points.shape[1])
         return farthest_rows(points, m, self.seed, self.start, weight)
 
 
@@ -103,7 +86,13 @@ def farthest_rows(
         seed: of the order that breaks ties and, without ``start``, determines the first point.
         start: the first point, as for ``FPSSampler``.
         weight: ``(B, N)`` as for ``farthest_point_sample``.
+
+    Raises:
+        UserError: ``start`` is at least N.
     """
+    n = points.shape[1]
+    if isinstance(start, int) and start >= n:
+        raise UserError(f"start must be less than the number of points N={n}, got {start}.")
     order = seeded_order(points, seed)
     ordered = gather_points(points.detach(), order)
     weight = None if weight is None else weight.gather(1, order)

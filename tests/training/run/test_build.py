@@ -29,25 +29,6 @@ def test_factory_net_without_point_features_raises():
         make_experiment(cfg, small_dataset(), {})
 
 
-@pytest.mark.parametrize(
-    ("overrides", "setting"),
-    [
-        (["sampler=fps", "sampler.start=5000"], "sampler.start"),
-        (["sampler=mops", "+baselines.fps.start=5000"], "baselines.fps.start"),
-    ],
-)
-def test_factory_sampler_that_the_clouds_rule_out_raises_before_training(overrides, setting):
-    with pytest.raises(UserError, match=rf"^{setting} must be less than .* N=\d+, got 5000"):
-        make_experiment(compose([*overrides, "m=8"]), small_dataset(), {})
-
-
-def test_factory_counts_the_points_that_pairs_draw():
-    overrides = ["task=registration", "sampler=fps", "m=8", "task.resample=16"]
-    make_experiment(compose([*overrides, "sampler.start=15"]), small_dataset(), {})
-    with pytest.raises(UserError, match=r"^sampler.start must be less than .* N=16, got 16"):
-        make_experiment(compose([*overrides, "sampler.start=16"]), small_dataset(), {})
-
-
 @pytest.mark.parametrize("learn", ["task", "sampler"])
 def test_factory_recipe_without_a_setting_is_that_of_the_publication(learn):
     recipe = compose().recipe.items()

@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from mops_lightning.config import distributed
-from mops_lightning.config.build import accepted, build, build_as, settings_named
+from mops_lightning.config.build import accepted, build, build_as
 from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
@@ -181,7 +181,6 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         baselines = _make_baselines(cfg, max(sizes), net)
     elif sampler is not None and sampler.flexible:
         sampler = build(cfg.sampler, "sampler", m=max(sizes), **own)
-    _check_cloud_size(cfg, sampler, baselines, points)
     make_optimizer, make_schedule = _optimizer_makers(cfg)
     return Experiment(
         task,
@@ -288,18 +287,6 @@ def _make_baselines(cfg: DictConfig, m: int, net: dict[str, Any]) -> dict[str, S
             own = accepted(node, net if "seed" in node else {**net, "seed": cfg.seed})
             baselines[str(name)] = build_as(Sampler, node, f"baselines.{name}", m=m, **own)
     return baselines
-
-
-def _check_cloud_size(
-    cfg: DictConfig, sampler: Sampler | None, baselines: dict[str, Sampler], n: int
-) -> None:
-    """Let samplers refuse clouds of ``n`` points before anything is trained."""
-    if sampler is not None:
-        with settings_named(cfg.sampler, "sampler", "m"):
-            sampler.check_cloud_size(n)
-    for name, baseline in baselines.items():
-        with settings_named(cfg.baselines[name], f"baselines.{name}", "m", "seed"):
-            baseline.check_cloud_size(n)
 
 
 def _optimizer_makers(cfg: DictConfig) -> tuple[Any, Any]:
