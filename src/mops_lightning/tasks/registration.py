@@ -1,13 +1,14 @@
 """Registration of sampled clouds (paper section "Registration-oriented Downsampling")."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from torch import Tensor, nn
+import torch
+from torch import Generator, Tensor, nn
 from torchmetrics import MetricCollection
 
-from mops_lightning.data.pairs import Pairs
-from mops_lightning.losses.registration import quaternion_loss
+from mops_lightning.errors import UserError
 from mops_lightning.metrics.base import collection
 from mops_lightning.metrics.registration import (
     DoubledRotationError,
@@ -17,12 +18,85 @@ from mops_lightning.metrics.registration import (
     RotationRecall10,
     TranslationError,
 )
-from mops_lightning.ops.rigid import Motion, identity_motion, quaternion_to_matrix
+from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.rigid import Motion, identity_motion, quaternion_to_matrix, random_motion
 from mops_lightning.tasks.base import Task, figures_of
 from mops_lightning.types import PairBatch, TaskOutput
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+ROTATION = 45.0
+"""Largest angle about each axis, in degrees, as PCRNet's authors chose it."""
+TRANSLATION = 1.0
+"""Largest translation along each axis, in units of the coordinates."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Converts clouds to pairs of source and target.
+
+    The target is the source under a random motion, with uniform angles about the fixed axes x, y
+    and z and a uniform translation (paper section "Registration-oriented Downsampling").
+
+    Attributes:
+        resample: number of points of source and target, drawn independently from the shape, so that
+            both have different points of one surface; None uses all points in both.
+
+    Raises:
+        UserError: ``resample`` is below 1.
+    """
+
+    resample: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check the arguments."""
+        if self.resample is not None and self.resample < 1:
+            raise UserError(f"resample must be None or at least 1, got {self.resample}.")
+
+    def __call__(self, points: Tensor, generators: Sequence[Generator]) -> PairBatch:
+        """Convert every cloud to a pair.
+
+        Args:
+            points: ``(B, N, 3)``.
+            generators: B generators; each determines the pair of its cloud.
+
+        Returns:
+            B pairs.
+
+        Raises:
+            UserError: ``resample`` is larger than N.
+        """
+        n_points = points.shape[1]
+        if self.resample is not None and self.resample > n_points:
+            raise UserError(
+                f"resample must be at most the {n_points} points of a shape, got {self.resample} "
+                "(task.resample and dataset.n_points on the command line)."
+            )
+        motion = random_motion(ROTATION, TRANSLATION, generators)
+        source = target = points
+        if self.resample is not None:
+            source, target = (self._drawn(points, generators) for _ in range(2))
+        target = motion.apply(target)
+        return pair_batch(source, target, motion)
+
+    def _drawn(self, points: Tensor, generators: Sequence[Generator]) -> Tensor:
+        rows = [torch.randperm(points.shape[1], generator=g)[: self.resample] for g in generators]
+        return gather_points(points, torch.stack(rows))
+
+
+def pair_batch(source: Tensor, target: Tensor, motion: Motion) -> PairBatch:
+    """Combine sources and targets into a batch, with every centroid at the origin.
+
+    Args:
+        source: ``(B, N, 3)`` the clouds to register.
+        target: ``(B, N, 3)`` the clouds to register them to.
+        motion: the true motions from source to target.
+    """
+    both = torch.cat([source, target])
+    centroids = both.mean(1)
+    return PairBatch(both - centroids[:, None], centroids, motion.quaternion, motion.translation)
 
 
 class Registration(Task):
@@ -34,7 +108,7 @@ class Registration(Task):
     Args:
         net: maps sources ``(B, M, 3)`` and targets ``(B, M, 3)`` to a ``Motion``.
         resample: number of points of source and target, drawn independently; None uses all points
-            of a cloud in both. See ``data.pairs.Pairs``.
+            of a cloud in both. See ``Pairs``.
 
     Raises:
         UserError: an argument is out of range.
@@ -94,6 +168,43 @@ class Registration(Task):
             RotationRecall10(),
             TranslationError(),
         )
+
+
+def quaternion_distance(predicted: Tensor, true: Tensor) -> Tensor:
+    """Return the L2 distance between unit quaternions up to sign.
+
+    min(‖q̂ − q‖, ‖q̂ + q‖) = 2·sin(θ/4) for the geodesic angle θ. Both signs are the same rotation,
+    so the nearer one is the target. Paper section "Registration-oriented Downsampling".
+
+    Args:
+        predicted: ``(B, 4)``.
+        true: ``(B, 4)``.
+
+    Returns:
+        A scalar, the mean over the batch.
+    """
+    sign = torch.where((predicted * true).sum(1, keepdim=True) < 0, -1.0, 1.0)
+    return torch.linalg.vector_norm(predicted - sign * true, dim=1).mean()
+
+
+def quaternion_loss(predicted: Motion, true: Motion) -> dict[str, Tensor]:
+    """Return the paper's quaternion loss and a translation loss.
+
+    Paper section "Registration-oriented Downsampling".
+
+    Args:
+        predicted: the predicted motion between centred clouds.
+        true: the true motion between centred clouds.
+
+    Returns:
+        The terms ``quaternion`` and ``translation``, scalars. The paper does not mention the L2
+        distance between translations, but without it they would not be trained.
+    """
+    shift = torch.linalg.vector_norm(predicted.translation - true.translation, dim=1).mean()
+    return {
+        "quaternion": quaternion_distance(predicted.quaternion, true.quaternion),
+        "translation": shift,
+    }
 
 
 @figures_of.register(Registration)

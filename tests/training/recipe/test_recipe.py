@@ -8,13 +8,13 @@ import torch
 from mops_lightning.config.build import build
 from mops_lightning.config.compose import compose
 from mops_lightning.data.loader import CloudLoader
-from mops_lightning.data.pairs import Pairs
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.readout import complete
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.classification import Classification
+from mops_lightning.tasks.registration import Pairs
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.moving_average import MovingAverage
 from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through

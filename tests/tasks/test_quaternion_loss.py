@@ -2,8 +2,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from mops_lightning.losses.registration import quaternion_distance, quaternion_loss
 from mops_lightning.ops.rigid import Motion, rotation_angle
+from mops_lightning.tasks.registration import quaternion_distance, quaternion_loss
 
 
 def quaternions(seed, number=50):

@@ -1,10 +1,10 @@
 import pytest
 import torch
 
-from mops_lightning.data.pairs import Pairs
 from mops_lightning.errors import UserError
 from mops_lightning.ops.rigid import Motion
 from mops_lightning.seeding import generator
+from mops_lightning.tasks.registration import Pairs
 
 
 def generators(number, key=0):
