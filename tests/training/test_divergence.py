@@ -6,8 +6,7 @@ from lightning.pytorch.strategies import SingleDeviceStrategy
 
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-from mops_lightning.training.checkpoint import CHECKPOINT
-from mops_lightning.training.divergence import Diverged, check_finite
+from mops_lightning.training.checkpoint import CHECKPOINT, Diverged, check_finite
 from mops_lightning.zoo import weights
 from tests.support.command_line import job
 

@@ -1,4 +1,4 @@
-"""Finding the checkpoint to resume from, and checking that it belongs to this run."""
+"""The checkpoint to resume from: finding it, and checking that it is finite and this run's."""
 
 import hashlib
 import io
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lightning.pytorch.strategies import Strategy
 
 from mops_lightning.config.shared_settings import training_settings
 from mops_lightning.errors import UserError
@@ -20,6 +21,9 @@ CHECKPOINT_KEY = "mops_lightning"
 
 LENGTH = "trainer.max_epochs"
 """The planned length of a run."""
+
+SAVED = ("state_dict", "current_model_state", "optimizer_states")
+"""Parts of a checkpoint that hold tensors of the training; the second is of a moving average."""
 
 SEAL_BYTES = hashlib.sha256().digest_size
 
@@ -168,3 +172,23 @@ def read_sealed(path: Path) -> Any:
         return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except Exception:  # torch's messages advise to execute the file's code
         raise weights.damaged(path, "expected a checkpoint of plain data") from None
+
+
+class Diverged(UserError):
+    """A loss, a weight or a score is NaN or infinite."""
+
+
+def check_finite(values: dict[str, Any], steps: int, strategy: Strategy) -> None:
+    """End training, on all processes of a run, if a value of one is not finite.
+
+    Args:
+        values: tensors by name, nested as in a checkpoint.
+        steps: number of optimizer steps so far.
+        strategy: Lightning's; reaches the other processes.
+
+    Raises:
+        Diverged: a value is NaN or infinite.
+    """
+    name = weights.first_nonfinite(values)
+    if strategy.reduce_boolean_decision(name is not None, all=False):
+        raise Diverged(f"training diverged: {name or 'a value'} is not finite at step {steps}.")

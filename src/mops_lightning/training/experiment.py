@@ -22,8 +22,7 @@ from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
 from mops_lightning.tasks.refinement import Refinement
-from mops_lightning.training.checkpoint import CHECKPOINT_KEY
-from mops_lightning.training.divergence import SAVED, check_finite
+from mops_lightning.training.checkpoint import CHECKPOINT_KEY, SAVED, check_finite
 from mops_lightning.training.readouts import names_of_readouts, readouts
 from mops_lightning.training.recipe.distillation import Distillation, Targets
 from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through

@@ -17,8 +17,7 @@ from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records.metric_info import foreign_metrics
 from mops_lightning.records.readout_names import parse_metric_name
 from mops_lightning.records.run_record import Evaluated, RunRecord
-from mops_lightning.training.checkpoint import CHECKPOINT, read_sealed
-from mops_lightning.training.divergence import Diverged, check_finite
+from mops_lightning.training.checkpoint import CHECKPOINT, Diverged, check_finite, read_sealed
 from mops_lightning.training.evaluation import KEY, OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
