@@ -80,7 +80,7 @@ def test_read_hostile_file_ends_in_one_printable_line(tmp_path, text):
 
 def test_read_named_pipe_does_not_wait(tmp_path):
     os.mkfifo(tmp_path / "result.json")
-    with pytest.raises(UserError, match="not a regular file"):
+    with pytest.raises(UserError, match="no run record"):
         run_record.read(tmp_path)
 
 

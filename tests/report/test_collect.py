@@ -75,4 +75,4 @@ def test_collect_named_pipe_is_skipped(tmp_path):
     (tmp_path / "pipe").mkdir()
     for name in ("result.json", "runs.jsonl", ".failed"):
         os.mkfifo(tmp_path / "pipe" / name)
-    assert "result.json: not a regular file" in table(tmp_path)
+    assert "result.json: no run record" in table(tmp_path)

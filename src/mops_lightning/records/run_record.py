@@ -247,15 +247,9 @@ def read(folder: Path) -> RunRecord:
         UserError: the folder has no ``result.json``, or it is not a run record.
     """
     path = folder / FILE
-    if not path.exists():
-        raise UserError(f"{path}: no run record. Give a run's folder.")
     if not path.is_file():  # reading a named pipe would wait forever
-        raise UserError(f"{path}: not a regular file.")
-    try:
-        text = path.read_text(errors="replace")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror}.") from None
-    return from_json(text, str(path))
+        raise UserError(f"{path}: no run record. Give a run's folder.")
+    return from_json(path.read_text(errors="replace"), str(path))
 
 
 def from_json(text: str, place: str) -> RunRecord:
