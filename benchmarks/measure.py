@@ -147,7 +147,7 @@ def peak_memory(setup: str, call: str) -> tuple[int, float]:
 
 def machine() -> dict[str, Any]:
     """Return a record's description of the machine and the software."""
-    from mops_lightning.records.environment import environment
+    from mops_lightning.records.run_record import environment
 
     name = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")

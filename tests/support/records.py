@@ -1,7 +1,6 @@
 """Made-up run records."""
 
-from mops_lightning.records.environment import environment
-from mops_lightning.records.run_record import Evaluated, RunRecord
+from mops_lightning.records.run_record import Evaluated, RunRecord, environment
 
 NAMES = {"task": "classification", "net": "pointnet", "dataset": "shapes", "sampler": "mops"}
 CONFIG = {

@@ -3,12 +3,15 @@
 import json
 import math
 import os
+import platform
+import subprocess
 import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
@@ -17,7 +20,6 @@ import msgspec
 from mops_lightning.errors import UserError, printable
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.metrics.info import MetricInfo
-from mops_lightning.records.environment import environment
 
 SCHEMA: Literal["mops_lightning/result/2"] = "mops_lightning/result/2"
 FILE = "result.json"
@@ -29,6 +31,16 @@ MAX_DEPTH = 50
 """Deepest nesting of a record that is read."""
 FAILED = ".failed"
 """File in a cell's folder that says why its last start failed, with or without a record."""
+PACKAGES = (
+    "mops-lightning",
+    "torch",
+    "lightning",
+    "hydra-core",
+    "torchmetrics",
+    "trimesh",
+    "numpy",
+)
+"""Packages whose versions are recorded."""
 
 
 class Names(TypedDict):
@@ -300,3 +312,38 @@ def _finite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def environment() -> dict[str, Any]:
+    """Return versions, machine and the commit of the code, as plain data."""
+    import torch
+
+    return {
+        "versions": {"python": platform.python_version()}
+        | {name: version(name) for name in PACKAGES},
+        "platform": f"{platform.system()} {platform.machine()}",
+        "threads": torch.get_num_threads(),
+        "git": git_state(),
+    }
+
+
+def git_state() -> dict[str, Any]:
+    """Return the commit of the checkout that this package runs from, and whether it has changes.
+
+    Both are None for an installed wheel.
+    """
+    here = Path(__file__).resolve().parent
+    top = here.parents[2]
+    if not (top / ".git").exists():
+        return {"commit": None, "dirty": None}
+    try:
+        commit = _git(top, "rev-parse", "HEAD")
+        dirty = _git(top, "status", "--porcelain", "--untracked-files=no")
+    except (OSError, subprocess.CalledProcessError):
+        return {"commit": None, "dirty": None}
+    return {"commit": commit, "dirty": bool(dirty)}
+
+
+def _git(top: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(top), *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
