@@ -93,12 +93,8 @@ class SampleNet(SNet):
         """Generate points, in training together with their soft projection.
 
         Raises:
-            UserError: there are fewer than k points.
+            UserError: there are fewer than k points in training.
         """
-        if self.k > points.shape[1]:
-            raise UserError(
-                f"k must be at most the number of points N={points.shape[1]}, got {self.k}."
-            )
         output = super().sample(points, m)
         if not self.training:
             return output
