@@ -96,19 +96,3 @@ def test_refinement_of_unsuitable_task_or_net_raises():
 
     with pytest.raises(UserError, match=r"refine must be 0 with this Mean, got 2.*pointnet"):
         Refinement(Classification(Mean(), 3), 2)
-
-
-@pytest.mark.parametrize("refine", [0, -1, 1.5, True, "2"])
-def test_refinement_passes_out_of_range_raises(refine):
-    with pytest.raises(UserError, match=r"refine must be a whole number of at least 1, got"):
-        Refinement(TASKS["classification"](), refine)
-
-
-def test_refinement_of_other_batch_or_rows_raises(rng):
-    points = torch.randn(4, 50, 3, generator=rng)
-    rows = torch.arange(6).expand(4, -1)
-    pairs = Refinement(TASKS["registration"](), 1)
-    with pytest.raises(UserError, match="batch must be a PairBatch for registration, got Batch"):
-        pairs(batch_of("classification", points), {6: rows})
-    with pytest.raises(UserError, match=r"samples\[6\] must be \(4, 6\) rows, got \(2, 6\)"):
-        pairs(batch_of("registration", points), {6: rows[:2]})

@@ -34,8 +34,6 @@ class Refinement:
     """
 
     def __init__(self, task: Task, refine: int) -> None:
-        if isinstance(refine, bool) or not isinstance(refine, int) or refine < 1:
-            raise UserError(f"refine must be a whole number of at least 1, got {refine!r}.")
         if task.maps_pooled is None:
             raise UserError(
                 f"refine must be 0 for {type(task).__name__.lower()}, got {refine}: its prediction "
@@ -61,21 +59,7 @@ class Refinement:
 
         Returns:
             The same sizes with other rows of the same shape, distinct.
-
-        Raises:
-            UserError: there are not as many samples as clouds.
         """
-        clouds = len(batch.points)
-        if clouds != batch.num_clouds * self.task.clouds_per_prediction:
-            raise UserError(
-                f"batch must be a {'PairBatch' if self.task.clouds_per_prediction > 1 else 'Batch'}"
-                f" for {type(self.task).__name__.lower()}, got {type(batch).__name__}."
-            )
-        for m, indices in samples.items():
-            if indices.shape != (clouds, m):
-                raise UserError(
-                    f"samples[{m}] must be ({clouds}, {m}) rows, got {tuple(indices.shape)}."
-                )
         # Lightning tests in inference mode, whose tensors cannot be differentiated.
         with torch.inference_mode(False), torch.no_grad():
             parts = []
