@@ -1,6 +1,5 @@
 """Downsampling as a transform of PyTorch Geometric's data."""
 
-import copy
 import warnings
 from pathlib import Path
 from typing import Any
@@ -54,10 +53,6 @@ class Downsample(BaseTransform):
         self.readout = readout
         self.start = start
         self.seed = seed
-
-    def __call__(self, data: Any) -> Any:
-        """Return the downsampled data; see the class."""
-        return self.forward(copy.copy(data))
 
     def forward(self, data: Any) -> Any:
         """Downsample data in place; of a batch, cloud by cloud."""
