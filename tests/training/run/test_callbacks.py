@@ -45,7 +45,9 @@ def test_added_callback_is_built_with_its_settings(tmp_path):
 @pytest.mark.parametrize("target", ["torch.nn.ReLU", None])
 def test_node_of_no_callback_is_refused(target, tmp_path):
     given = [] if target is None else [f"+callbacks.mine._target_={target}"]
-    with pytest.raises(UserError, match=r"callbacks\.mine must be .* callbacks\.mine\._target_="):
+    with pytest.raises(
+        UserError, match=r"callbacks\.mine: (torch.nn.ReLU must return|give its class)"
+    ):
         build_from([*given, "+callbacks.mine.inplace=true"], tmp_path)
 
 

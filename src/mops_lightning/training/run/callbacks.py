@@ -11,7 +11,7 @@ import lightning as L
 from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, RichProgressBar
 from omegaconf import DictConfig
 
-from mops_lightning.config.build import accepted, build
+from mops_lightning.config.build import accepted, build_as
 from mops_lightning.errors import Interrupted, UserError
 
 STANDARD = ("learning_rate", "checkpoint", "progress", "pictures")
@@ -184,11 +184,7 @@ def build_callbacks(nodes: DictConfig, offered: dict[str, Any], logged: bool) ->
     built = []
     for name, node in chosen.items():
         where = f"callbacks.{name}"
-        callback = build(node, where, **accepted(node, offered)) if "_target_" in node else None
-        if not isinstance(callback, Callback):
-            raise UserError(
-                f"{where} must be a Lightning callback, got {node.get('_target_')!r}. "
-                f"Give its class as {where}._target_=MODULE.CLASS."
-            )
-        built.append(callback)
+        if "_target_" not in node:
+            raise UserError(f"{where}: give its class as {where}._target_=MODULE.CLASS.")
+        built.append(build_as(Callback, node, where, **accepted(node, offered)))
     return built
