@@ -1,6 +1,5 @@
 """The subcommands ``models`` and ``export``."""
 
-import argparse
 import os
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ DESCRIPTION = f"""List trained models, show the card of one, or publish a run as
 
   models                list all models: of this package and of ${names.VARIABLE}
   models NAME           show a card
-  models add RUN NAME   write the net that RUN trained to a folder, as NAME.safetensors
+  models add RUN NAME   write the net that RUN trained to a folder, as NAME.safetensors; see models add --help
 
 A name can be given wherever a weights file or a run can: weights=NAME, evaluate=NAME,
 downsample --weights NAME, export NAME. ${names.VARIABLE} is a list of folders, as in PATH."""
@@ -31,60 +30,38 @@ def main(arguments: list[str], prog: str) -> None:
         arguments: of the command line.
         prog: what the user typed to start this command.
     """
-    parser = Parser(prog, DESCRIPTION)
-    add = parser.add_argument
-    add("words", nargs="*", metavar="NAME | add RUN NAME", help="see above")
-    new = parser.add_argument_group("options of add")
-    new.add_argument("--folder", type=Path, help=f"where to; default: first of ${names.VARIABLE}")
-    new.add_argument("--task-net", metavar="NAME", help="model of the sampler's task net")
-    new.add_argument("--notes", default="", help="what a user must know besides")
-    new.add_argument("--overwrite", action="store_true", help="replace a model of this name")
     with one_line_endings(prog):
-        chosen = parser.parse_args(arguments)
-        _refuse_unused(chosen, parser)
-        print(printable("\n".join(_run(chosen))))
+        if arguments[:1] == ["add"]:
+            lines = _add(arguments[1:], f"{prog} add")
+        else:
+            parser = Parser(prog, DESCRIPTION)
+            parser.add_argument("name", nargs="?", metavar="NAME", help="see above")
+            chosen = parser.parse_args(arguments)
+            lines = _table() if chosen.name is None else _card(names.resolve(chosen.name))
+        print(printable("\n".join(lines)))
 
 
-def _refuse_unused(chosen: argparse.Namespace, parser: Parser) -> None:
-    """Refuse options of `models add` without it.
-
-    Raises:
-        UserError: an option is not used.
-    """
-    values = {name: value for name, value in vars(chosen).items() if name != "words"}
-    given = {name for name, value in values.items() if value != parser.get_default(name)}
-    if given and chosen.words[:1] != ["add"]:
-        option = min(given).replace("_", "-")
-        raise UserError(f"--{option} is an option of `models add RUN NAME`. Leave it out.")
-
-
-def _run(chosen: argparse.Namespace) -> list[str]:
-    """Return the lines to print."""
-    match chosen.words:
-        case []:
-            return _table()
-        case ["add", run, name]:
-            return _add(chosen, Path(run).expanduser(), name)
-        case ["add", *_]:
-            raise UserError("add takes a run and a name: models add RUN NAME.")
-        case [name]:
-            path = names.resolve(name)
-            card = model_file.read_card(path)
-            return _card(card, path)
-    raise UserError(f"give one NAME, or add RUN NAME, got {' '.join(chosen.words)}.")
-
-
-def _add(chosen: argparse.Namespace, run: Path, name: str) -> list[str]:
+def _add(arguments: list[str], prog: str) -> list[str]:
+    """Write the net of a run as a model, and return the lines to print."""
+    parser = Parser(prog, "Write the net that RUN trained to a folder, as NAME.safetensors.")
+    add = parser.add_argument
+    add("run", type=Path, metavar="RUN", help="folder of a run")
+    add("name", metavar="NAME", help="such as fmops.chairs-m64")
+    add("--folder", type=Path, help=f"where to; default: first of ${names.VARIABLE}")
+    add("--task-net", metavar="NAME", help="model of the sampler's task net")
+    add("--notes", default="", help="what a user must know besides")
+    add("--overwrite", action="store_true", help="replace a model of this name")
+    chosen = parser.parse_args(arguments)
     from mops_lightning.zoo import publish
 
-    own = os.environ.get(names.VARIABLE)
+    name, own = chosen.name, os.environ.get(names.VARIABLE)
     folder = chosen.folder or (names.folders()[0] if own else None)
     if folder is None:
         raise UserError(
             f"give --folder FOLDER, or set ${names.VARIABLE} to the folder of your models."
         )
     path = publish.add(
-        run,
+        chosen.run.expanduser(),
         name,
         folder,
         task_net=chosen.task_net,
@@ -132,7 +109,8 @@ def _table() -> list[str]:
     return lines + unreadable
 
 
-def _card(card: dict[str, Any], path: Path) -> list[str]:
+def _card(path: Path) -> list[str]:
+    card = model_file.read_card(path)
     record = card["record"]
     config, commit = record["config"], record["git"]["commit"]
     chosen = config["names"]
