@@ -116,11 +116,11 @@ def test_rival_samplers_have_published_settings():
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["sampler=mops", "sampler.alpha=nan"], "sampler.alpha must be finite, got nan"),
+        (["sampler=mops", "sampler.alpha=nan"], "sampler.alpha must be finite .*, got nan"),
         (["task_lr_scale=inf"], "task_lr_scale must be .*got inf"),
-        (["optimizer.lr=1e400"], "optimizer.lr must be finite, got inf"),
-        (["+optimizer.betas=[nan,1]"], "optimizer.betas must be finite, got nan"),
-        (["seed=18446744073709551616"], r"seed must be below 2\*\*63, got one of 65 bits"),
+        (["optimizer.lr=1e400"], "optimizer.lr must be finite .*, got inf"),
+        (["+optimizer.betas=[nan,1]"], "optimizer.betas must be finite .*, got nan"),
+        (["seed=18446744073709551616"], r"seed must be finite and below 2\*\*63, got 1844"),
         (["m=0"], "m must be a whole number of at least 1, got 0"),
         (["m=2.5"], "m must be a whole number"),
         (

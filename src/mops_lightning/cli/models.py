@@ -11,7 +11,8 @@ DESCRIPTION = f"""List trained models, show the card of one, or publish a run as
 
   models                list all models: of this package and of ${names.VARIABLE}
   models NAME           show a card
-  models add RUN NAME   write the net that RUN trained to a folder, as NAME.safetensors; see models add --help
+  models add RUN NAME   write the net that RUN trained to a folder, as NAME.safetensors:
+                        see models add --help
 
 A name can be given wherever a weights file or a run can: weights=NAME, evaluate=NAME,
 downsample --weights NAME, export NAME. ${names.VARIABLE} is a list of folders, as in PATH."""

@@ -3,7 +3,6 @@
 Checked are names, types and run-level limits. The range of an argument is checked by its class.
 """
 
-import math
 from typing import Any, get_type_hints
 
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -51,7 +50,6 @@ def check(cfg: DictConfig) -> None:
     # Resolved once: OmegaConf parses an interpolation each time it is read.
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     _check_limits(plain)
-    _check_numbers(plain, "")
     if plain["test_corruption"] is not None:
         from mops_lightning.data import corruptions  # imports torch, which --help does without
 
@@ -103,26 +101,17 @@ def _check_table(value: Any, name: str) -> None:
             )
 
 
-def _check_numbers(value: Any, path: str) -> None:
-    """Refuse NaN, infinity and whole numbers beyond 64 bits, which no setting allows."""
-    if isinstance(value, dict):
-        for key, below in value.items():
-            _check_numbers(below, f"{path}.{key}" if path else str(key))
-    elif isinstance(value, list):
-        for item in value:
-            _check_numbers(item, path)
-    elif isinstance(value, float) and not math.isfinite(value):
-        raise UserError(f"{path} must be finite, got {value}.")
-    elif isinstance(value, int) and abs(value) >= 2**63:
-        raise UserError(f"{path} must be below 2**63, got one of {value.bit_length()} bits.")
-
-
 def _check_limits(config: dict[str, Any]) -> None:
+    """Refuse values outside of limits, NaN, infinity and whole numbers beyond 64 bits."""
     values = dotted(config)
     for path in (*settings.declared(), *settings.INSIDE):
         limits, value = settings.of(path).limits, values.get(path, MISSING)
         if limits and value != MISSING and not limits.fits(value):
             raise refusal(path, value)
+    for path, value in values.items():
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, int | float) and not abs(number) < 2**63:  # NaN neither
+                raise UserError(f"{path} must be finite and below 2**63, got {number!r:.30}.")
 
 
 def _check_evaluation(config: dict[str, Any]) -> None:
