@@ -1,13 +1,12 @@
 """Additions to the published training of a sampler."""
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.types import Batch, PairBatch, SampleOutput
@@ -68,11 +67,9 @@ class Recipe:
             share = getattr(self, name)
             if share is not None and not 0 <= share <= 1:
                 raise UserError(f"{name} must be between 0 and 1 or null, got {share}.")
-        for name in ("distillation", "feature_distillation"):
-            weight = getattr(self, name)
-            if not 0 <= weight < math.inf:
-                raise UserError(f"{name} must be at least 0, got {weight}.")
-
+        check_at_least(
+            0, distillation=self.distillation, feature_distillation=self.feature_distillation
+        )
         if self.straight_through_set not in STRAIGHT_THROUGH_SETS:
             raise UserError(
                 f"straight_through_set must be one of {', '.join(STRAIGHT_THROUGH_SETS)}, got "
