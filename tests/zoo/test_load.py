@@ -69,7 +69,7 @@ def test_load_other_targets_are_refused(save, target):
     [
         ({"colour": 3}, "colour"),
         ({"m_max": -1}, "at least 1, got -1"),
-        ({"m_max": None}, "a whole number, got None"),
+        ({"m_max": None}, "a whole number of at least 1, got None"),
         ({"tau_min": "low"}, "cannot build"),
         ({"feature_channels": {"_target_": "os.getcwd"}}, "cannot build"),
         ({"feature_channels": [{"_target_": "os.getcwd"}]}, "cannot build"),

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache, partial
-from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ from torch import Tensor
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 import mops_lightning
-from mops_lightning.config.annotations import misfit
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.zoo import names, weights
@@ -88,11 +86,6 @@ def _build(cls: type[Sampler], node: Any, state: dict[str, Tensor], path: Path) 
     if not isinstance(node, dict):
         raise UserError(f"{path}: sampler must be a group of settings, got {node!r:.99}.")
     arguments = {name: value for name, value in node.items() if name != "_target_"}
-    parameters = signature(cls).parameters
-    for name, value in arguments.items():
-        wanted = misfit(value, parameters[name].annotation) if name in parameters else None
-        if wanted:
-            raise UserError(f"{path}: sampler.{name} must be {wanted}, got {value!r:.99}.")
     make = partial(_built, cls, arguments, path)
     with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
         # Without memory first: a small file can describe a large net.
