@@ -5,10 +5,9 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from mops_lightning.config.annotations import misfit
 from mops_lightning.config.build import signature
 from mops_lightning.config.compose import compose, conf_dir
-from mops_lightning.config.validate import check
+from mops_lightning.config.validate import check, misfit
 from mops_lightning.errors import UserError
 
 SPECIALISED = ("task_settings", "dataset_task")

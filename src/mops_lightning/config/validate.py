@@ -3,12 +3,15 @@
 Checked are names, types and run-level limits. The range of an argument is checked by its class.
 """
 
-from typing import Any, get_type_hints
+import re
+from inspect import Parameter
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
+import msgspec
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from mops_lightning.config import distributed, settings
-from mops_lightning.config.annotations import misfit
 from mops_lightning.config.build import signature
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.records.run_record import dotted
@@ -24,6 +27,15 @@ OBJECTS = ("task", "task.net", "dataset", "sampler", "recipe", "trainer", "logge
 
 AUGMENTATION = "mops_lightning.data.loader.Augmentation"
 """The class behind each part of ``augment``."""
+
+WORDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "str": "a text",
+    "array": "a list",
+}
+"""Msgspec's names of types in words, behind "must be"."""
 
 
 def check(cfg: DictConfig) -> None:
@@ -158,3 +170,30 @@ def _check_node(node: Any, where: str) -> None:
                     raise UserError(f"{where}.{name} must be {wanted}, got {node[key]!r}.")
     for key in node:
         _check_node(node[key], f"{where}.{key!s}")
+
+
+def misfit(value: Any, annotation: Any) -> str | None:
+    """Say what an annotation wants when a value does not fit it.
+
+    Args:
+        value: plain data: a number, a text, a truth value, None, a list or a dict.
+        annotation: as written in the signature. One that msgspec does not know fits any value.
+
+    Returns:
+        Such as "a whole number or null"; None where the value fits. A wrong text of several fixed
+        ones fits: the constructor names the nearest right one.
+    """
+    if get_origin(annotation) in (Union, UnionType):  # rates of torch's optimizers may be tensors
+        parts = (one for one in get_args(annotation) if getattr(one, "__name__", "") != "Tensor")
+        annotation = Union[tuple(parts)]  # noqa: UP007
+    if annotation is Parameter.empty:
+        return None
+    try:
+        msgspec.convert(value, annotation)
+    except msgspec.ValidationError as error:
+        if expected := re.match("Expected `([^`]+)`", str(error)):
+            words = " or ".join(WORDS.get(word, word) for word in expected[1].split(" | "))
+            return f"a list, each of it {words}" if "`$[" in str(error) else words
+    except TypeError:
+        pass
+    return None
