@@ -8,14 +8,13 @@ from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.points import gather_points
-from mops_lightning.ops.refine import refine
 from mops_lightning.ops.rigid import Motion
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.tasks import refinement
 from mops_lightning.tasks.base import Task
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.tasks.reconstruction import Reconstruction
-from mops_lightning.tasks.refinement import Refinement
+from mops_lightning.tasks.refinement import Refinement, improve
 from mops_lightning.tasks.registration import Registration
 from mops_lightning.types import Batch, PairBatch
 
@@ -70,7 +69,7 @@ def test_refinement_of_pairs_refines_sources_for_whole_targets_then_targets_for_
             found = refinement.predict_pooled(task, batch, torch.cat(of_pair(candidates, cloud)))
             return task.disagreement(found, Motion(*(part[cloud] for part in whole)))
 
-        return refine(features, start, apart, 3)
+        return improve(features, start, apart, 3)
 
     def targets_for(pooled):
         return refined_for(target, rows[3:], lambda found, cloud: [pooled[cloud], found])

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from mops_lightning.ops import refine as module
-from mops_lightning.ops.refine import estimated_changes, refine
+from mops_lightning.tasks import refinement as module
+from mops_lightning.tasks.refinement import estimated_changes, improve
 
 
 def distance(wanted):
@@ -15,7 +15,7 @@ def distance(wanted):
     return objective
 
 
-def plain_refine(features, indices, objective, passes):
+def plain_improve(features, indices, objective, passes):
     """One cloud: every row at every place, scored exactly."""
     rows = list(indices)
     cloud = torch.zeros(1, dtype=torch.int64)
@@ -40,27 +40,27 @@ def test_refine_with_full_shortlist_equals_exhaustive_exchange(m, rng, monkeypat
     features = torch.randn(3, 30, 12, dtype=torch.float64, generator=rng).relu()
     indices = torch.stack([torch.randperm(30, generator=rng)[:m] for _ in range(3)])
     objective = distance(features.amax(1))
-    found = refine(features, indices, objective, 3)
+    found = improve(features, indices, objective, 3)
     for number, got in enumerate(found.tolist()):
         alone = features[number]
 
         def one(pooled, cloud, number=number):
             return objective(pooled, cloud + number)
 
-        assert got == plain_refine(alone, indices[number].tolist(), one, 3)
+        assert got == plain_improve(alone, indices[number].tolist(), one, 3)
 
 
 def test_refine_exchanges_nothing_for_rounding_errors(rng):
     features = torch.rand(2, 30, 8, generator=rng)
     rows = torch.arange(20).expand(2, -1)
-    assert torch.equal(refine(features, rows, lambda p, _: 1e-10 * p.mean(1), 2), rows)
-    assert not torch.equal(refine(features, rows, lambda p, _: p.mean(1), 2), rows)
+    assert torch.equal(improve(features, rows, lambda p, _: 1e-10 * p.mean(1), 2), rows)
+    assert not torch.equal(improve(features, rows, lambda p, _: p.mean(1), 2), rows)
 
 
 def test_refine_of_all_points_leaves_them(rng):
     features = torch.rand(2, 30, 8, generator=rng)
     rows = torch.arange(30).expand(2, -1)
-    assert torch.equal(refine(features, rows, lambda p, _: p.mean(1), 2), rows)
+    assert torch.equal(improve(features, rows, lambda p, _: p.mean(1), 2), rows)
 
 
 def test_refine_lowers_objective_and_keeps_rows_distinct(rng):
@@ -73,12 +73,12 @@ def test_refine_lowers_objective_and_keeps_rows_distinct(rng):
         pooled = features.gather(1, rows[..., None].expand(-1, -1, 20)).amax(1)
         return objective(pooled, torch.arange(6))
 
-    values = [scores(refine(features, indices, objective, passes)) for passes in (0, 1, 4)]
+    values = [scores(improve(features, indices, objective, passes)) for passes in (0, 1, 4)]
     assert (values[1] < values[0]).all()
     assert (values[2] <= values[1]).all()
-    rows = refine(features, indices, objective, 4)
+    rows = improve(features, indices, objective, 4)
     assert all(len(set(row)) == 9 for row in rows.tolist())
-    one_cloud = refine(features[:1], indices[:1], objective, 4)
+    one_cloud = improve(features[:1], indices[:1], objective, 4)
     assert torch.equal(one_cloud, rows[:1])
 
 
