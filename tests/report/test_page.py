@@ -8,7 +8,7 @@ import torch
 
 from mops_lightning.records import run_record
 from mops_lightning.report.cli import main
-from mops_lightning.viz.snapshots import save_clouds
+from mops_lightning.viz.figures import save_clouds
 from tests.support.reports import put, put_planes
 
 

@@ -62,7 +62,7 @@ def read_record(path):
 
 
 def read_pictured(path):
-    from mops_lightning.viz.snapshots import load_clouds
+    from mops_lightning.viz.figures import load_clouds
 
     load_clouds(path)
 

@@ -14,7 +14,7 @@ from mops_lightning.data.formats.table import Table
 from mops_lightning.records import run_record
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.training.checkpoint import CHECKPOINT_KEY, sealed
-from mops_lightning.viz.snapshots import save_clouds
+from mops_lightning.viz.figures import save_clouds
 from mops_lightning.zoo import weights
 from tests.support.meshes import BOX
 from tests.support.mutations import flip_bits

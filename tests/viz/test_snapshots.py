@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.viz.snapshots import MAX_INPUT_POINTS, load_clouds, save_clouds
+from mops_lightning.viz.figures import MAX_INPUT_POINTS, load_clouds, save_clouds
 
 
 def test_save_clouds_large_thins_input_and_keeps_samples(tmp_path, rng):

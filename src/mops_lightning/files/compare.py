@@ -25,7 +25,7 @@ from mops_lightning.files.options import Options
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.report.page import render
 from mops_lightning.report.text import Grid, markdown
-from mops_lightning.viz.snapshots import INPUT, MAX_INPUT_POINTS
+from mops_lightning.viz.figures import INPUT, MAX_INPUT_POINTS
 from mops_lightning.zoo.names import UNTRAINED
 
 Points = NDArray[np.float64]

@@ -12,8 +12,7 @@ from typing import Any
 from mops_lightning.errors import UserError
 from mops_lightning.report.build import Report
 from mops_lightning.report.text import PAPER, Grid, marked
-from mops_lightning.viz.figures import COLOURS, INPUT_COLOUR
-from mops_lightning.viz.snapshots import INPUT, load_clouds
+from mops_lightning.viz.figures import COLOURS, INPUT, INPUT_COLOUR, load_clouds
 
 MAX_RUNS = 24
 """Most runs whose clouds are in a page; more make it too large to open."""

@@ -1,4 +1,7 @@
-"""Figures of sampled clouds and of the sampling matrix, without pyplot's global state."""
+"""Figures of sampled clouds and of the sampling matrix, and the clouds for 3-D views in reports.
+
+Without pyplot's global state.
+"""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -9,11 +12,13 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
+from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import adaptive_max_pool1d
 
-from mops_lightning.filesystem import atomic_write
+from mops_lightning.errors import UserError
+from mops_lightning.filesystem import atomic_write, load_npz
 
 COLOURS = {
     "generated": (31, 119, 220),
@@ -27,6 +32,11 @@ MATRIX_ROWS = 256
 """Most rows of a drawn matrix: single points of more would not be visible."""
 LARGE_MARKER_SAMPLES = 256
 """Above this number of samples, markers shrink."""
+CLOUDS = "clouds.npz"
+INPUT = "input"
+TITLES = "titles"
+MAX_INPUT_POINTS = 8192
+"""Most input points saved of a cloud; all samples are saved."""
 
 
 def new_figure(width: float, height: float, layout: Any = "constrained") -> Figure:
@@ -194,3 +204,44 @@ def frame_cloud(axes: Axes3D, cloud: np.ndarray) -> None:
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_visible(False)  # matplotlib measures the ticks of hidden axes, too
     axes.view_init(elev=18, azim=-60)
+
+
+def save_clouds(
+    path: Path, points: Tensor, sampled: Mapping[str, Tensor], titles: Sequence[str]
+) -> None:
+    """Write clouds and their samples.
+
+    Args:
+        path: the file.
+        points: ``(K, N, 3)`` input, y up.
+        sampled: ``(K, M, 3)`` by readout.
+        titles: one per cloud.
+    """
+    thinned = points[:, :: -(-points.shape[1] // MAX_INPUT_POINTS)]
+    clouds = {INPUT: thinned, **sampled}
+    arrays = {name: cloud.detach().cpu().float().numpy() for name, cloud in clouds.items()}
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **{TITLES: np.array(titles)}, **arrays)
+
+
+def load_clouds(path: Path) -> tuple[list[str], dict[str, NDArray[np.float32]]]:
+    """Read a file of ``save_clouds``.
+
+    Returns:
+        The titles, and ``(K, points, 3)`` by name, ``input`` first.
+
+    Raises:
+        UserError: the file is missing or not of this format.
+    """
+    try:
+        arrays = load_npz(path)
+        titles = [str(title) for title in arrays.pop(TITLES)]
+        clouds = {INPUT: arrays.pop(INPUT), **arrays}
+        shapes = {cloud.shape[::2] for cloud in clouds.values()}
+        finite = all(np.isfinite(cloud).all() for cloud in clouds.values())
+        if len(clouds) < 2 or not titles or shapes != {(len(titles), 3)} or not finite:
+            raise ValueError("expected finite clouds and samples for each title")
+    # Numpy raises TypeError for other kinds of numbers, SystemError for odd characters.
+    except (KeyError, SystemError, TypeError, ValueError) as error:
+        raise UserError(f"{path}: cannot read saved clouds: {error}.") from None
+    return titles, clouds

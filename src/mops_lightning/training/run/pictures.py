@@ -18,8 +18,14 @@ from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.tasks.base import Task, figures_of
 from mops_lightning.training.readouts import readouts
-from mops_lightning.viz.figures import cloud_grid, comparison, matrix_figure, save_figure
-from mops_lightning.viz.snapshots import CLOUDS, save_clouds
+from mops_lightning.viz.figures import (
+    CLOUDS,
+    cloud_grid,
+    comparison,
+    matrix_figure,
+    save_clouds,
+    save_figure,
+)
 
 DENSE_PIXELS = 2**20
 """Most entries of S that are drawn: 1,024 points by 1,024 columns."""

@@ -25,7 +25,7 @@ from mops_lightning.training.recipe.warm_start import warm_start_sampler
 from mops_lightning.training.run.build import Parts, augmentation
 from mops_lightning.training.run.callbacks import CPUTime
 from mops_lightning.training.run.trainer import log_test
-from mops_lightning.viz.snapshots import CLOUDS
+from mops_lightning.viz.figures import CLOUDS
 from mops_lightning.zoo import weights
 
 OUTPUTS = {
