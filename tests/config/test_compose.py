@@ -71,7 +71,7 @@ def test_mistake_ends_in_one_line(arguments, said, tmp_path):
             b"# @package _global_\nsede: 3",
             "mine.yaml: sede: no such setting. Did you mean 'seed'",
         ),
-        ("sampler", "a: é".encode("latin-1"), "mine.yaml is not in UTF-8"),
+        ("sampler", "a: é".encode("latin-1"), "a file of settings is not in UTF-8"),
         ("sampler", b"a: [1\nb: 2", "mine.yaml, line 2: not valid YAML: "),
     ],
 )

@@ -3,10 +3,8 @@
 A mistake becomes one line with the setting and the nearest known one.
 """
 
-import io
 import re
 import textwrap
-import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -136,7 +134,7 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
     from hydra.errors import MissingConfigException
 
     if isinstance(error, UnicodeDecodeError):
-        return f"{_file_being_read(error)} is not in UTF-8: {error}."
+        return f"a file of settings is not in UTF-8: {error.object[:30]!r}: {error.reason}."
     if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
         mark = error.problem_mark
         return f"{mark.name}, line {mark.line + 1}: not valid YAML: {error.problem}."
@@ -167,15 +165,6 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
     # Hydra's and OmegaConf's own messages, without their notes for developers.
     lines = [line for text in texts for line in text.splitlines() if line.strip()]
     return " ".join(dict.fromkeys(line.strip() for line in lines if line[0] != " "))
-
-
-def _file_being_read(error: BaseException) -> str:
-    """Return the name of the file that was open where an error was raised."""
-    for frame, _ in reversed(list(traceback.walk_tb(error.__traceback__))):
-        for value in frame.f_locals.values():
-            if isinstance(value, io.TextIOBase):
-                return str(getattr(value, "name", "a file"))
-    return "a file"
 
 
 def _groups() -> list[str]:
