@@ -1,15 +1,15 @@
 """Names, units and order of metrics in tables; imports no torch, so that ``--help`` stays quick."""
 
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, fields
 from typing import Any, Self
+
+import msgspec
 
 DEFAULT_ORDER = 10
 """Place in the closing table of metrics that declare none: after all that declare one."""
 
 
-@dataclass(frozen=True)
-class MetricInfo:
+class MetricInfo(msgspec.Struct, frozen=True, omit_defaults=True):
     """Name, format and order of a metric. Metric classes declare them; see ``of``.
 
     Attributes:
@@ -41,24 +41,18 @@ class MetricInfo:
             name: the metric's key in its collection.
             metric: the metric or its class.
         """
-        return cls.from_dict(
-            name, {f.name: getattr(metric, f.name) for f in fields(cls) if hasattr(metric, f.name)}
-        )
+        declared = [field for field in cls.__struct_fields__ if hasattr(metric, field)]
+        return cls.from_dict(name, {field: getattr(metric, field) for field in declared})
 
     @classmethod
     def from_dict(cls, name: str, values: Mapping[str, Any]) -> Self:
         """Build from the content of a record; keys of other versions are ignored."""
-        known = {field.name for field in fields(cls)} - {"name"}
-        return cls(name, **{key: value for key, value in values.items() if key in known})
+        return msgspec.convert({**values, "name": name}, cls)
 
     def as_dict(self) -> dict[str, Any]:
         """Return what differs from the defaults, without the name, as plain data."""
-        values = asdict(self)
-        return {
-            field.name: values[field.name]
-            for field in fields(self)
-            if field.default is not MISSING and values[field.name] != field.default
-        }
+        plain = msgspec.to_builtins(self)
+        return {name: value for name, value in plain.items() if name != "name"}
 
     @property
     def title(self) -> str:
