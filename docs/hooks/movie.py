@@ -17,11 +17,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mops_lightning import load, propagation_map
-from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.tasks.classification import Classification
 from mops_lightning.viz.figures import cloud_axes, frame_cloud, new_figure, upright
 from mops_lightning.zoo import model_file, names
-from mops_lightning.zoo.weights import load_into
+from mops_lightning.zoo.load import load_net
 
 SAMPLER, CLASSIFIER = "mops.modelnet40-m32", "pointnet.modelnet40"
 CLOUDS = Path(__file__).parents[2] / "tests" / "zoo" / "clouds.npz"
@@ -44,10 +42,8 @@ def sample_and_classify(cloud: NDArray[np.float32]) -> tuple[NDArray[np.float32]
     """Return the generated points ``(m, 3)``, and the class that the classifier predicts."""
     card = model_file.read_card(names.available()[CLASSIFIER])
     classes = card["record"]["class_names"]
-    task = Classification(PointNetVanilla(num_classes=len(classes)), num_classes=len(classes))
-    load_into(task, CLASSIFIER)
     sampled = load(SAMPLER)(torch.from_numpy(cloud)[None]).points
-    share = task.eval().net(sampled).softmax(1)[0]
+    share = load_net(CLASSIFIER)(sampled).softmax(1)[0]
     return sampled[0].numpy(), f"{classes[int(share.argmax())]}, {float(share.max()):.0%}"
 
 

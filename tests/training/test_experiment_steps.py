@@ -42,7 +42,7 @@ def noting(kind, *arguments, **settings):
     return made
 
 
-def fitted(sampler, epochs=1, task=None, recipe=None, augment=None, **extra):
+def fitted(sampler, epochs=1, task=None, recipe=None, augment=None, others=(), **extra):
     """Train with a rate of 0, so that all steps see the same weights, and validate each epoch."""
     data = numbered_clouds()
     module = Experiment(
@@ -50,6 +50,7 @@ def fitted(sampler, epochs=1, task=None, recipe=None, augment=None, **extra):
         sampler,
         make_optimizer=lambda parameters: torch.optim.SGD(parameters, lr=0.0),
         recipe=recipe,
+        other_tasks=others,
     )
     trainer = quiet_trainer(epochs, **extra)
     train = CloudLoader(data.train, 4, shuffle=True, augment=augment, drop_last=True)
@@ -182,13 +183,34 @@ def test_distillation_targets_are_whole_clouds_and_features_of_seen_points(augme
     ((_, seen, output),) = sampler.samples
     (call,) = calls
     assert (seen.shape[1], call.clouds.shape[1]) == (20, 40)
-    assert (module.distillation.table is None) == (augment is not None)
+    assert (module.distillation.tables == []) == (augment is not None)
     with torch.no_grad():
         apart = (module.task.net(output.points) - module.task.net(call.clouds)).square().mean()
         found, wanted = (points.relu().amax(1) for points in (output.points, seen))
     relative = ((found - wanted).square().sum(1) / wanted.square().sum(1)).mean()
     assert logged["train/loss/distillation"] == pytest.approx(3 * float(apart), rel=1e-4)
     assert logged["train/loss/feature_distillation"] == pytest.approx(float(relative) / 2, rel=1e-4)
+
+
+def test_losses_under_several_nets_are_means_and_scores_of_the_first(calls):
+    first, other = FingerprintOfMaxima(), FingerprintOfMaxima()
+    torch.nn.init.constant_(other.weight, 2.5)
+    recipe = Recipe(distillation=3.0, feature_distillation=0.5, straight_through=0.0)
+    logged = {}
+    for nets in ((first,), (other,), (first, other)):
+        task, *others = map(ComparedTask, nets)
+        module, logged[nets] = fitted(
+            noting(MOPSNet, 8, **MOPS), task=task, others=others, recipe=recipe, epochs=2
+        )
+        assert not any(net.weight.requires_grad for net in nets)
+        assert not any(one.training for one in module.other_tasks)
+    one, two, both = logged.values()
+    for name in ("task", "distillation", "feature_distillation"):
+        values = [found[f"train/loss/{name}"] for found in (one, two, both)]
+        assert values[2] == pytest.approx((values[0] + values[1]) / 2, rel=1e-4)
+    assert one["train/loss/task"] != pytest.approx(two["train/loss/task"], rel=0.1)
+    own = [name for name in one if "/loss/" not in name and "loss" not in name]
+    assert [both[name] for name in own] == [one[name] for name in own]
 
 
 class InTests(MeanFingerprint):

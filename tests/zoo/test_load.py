@@ -7,9 +7,11 @@ from omegaconf import OmegaConf
 
 from mops_lightning import SampleOutput, Sampler, load
 from mops_lightning.errors import UserError
+from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.tasks.classification import Classification
 from mops_lightning.zoo import weights
-from mops_lightning.zoo.load import package_samplers
+from mops_lightning.zoo.load import load_net, package_samplers
 from tests.support.models import write_run
 
 ROOT = Path(__file__).parents[2]
@@ -39,6 +41,28 @@ def test_load_file_or_folder_gives_the_saved_sampler(save):
         assert not sampler.training
         with torch.no_grad():
             assert torch.equal(sampler(points, 5).points, saved(points, 5).points)
+
+
+def test_load_net_gives_the_saved_task_net(tmp_path):
+    torch.manual_seed(0)
+    task = Classification(PointNetVanilla(3, dropout=0.1), 3).eval()
+    node = {"_target_": "mops_lightning.nets.pointnet.PointNetVanilla", "dropout": 0.1}
+    config = {"learn": "task", "task": {"net": node}}
+    weights.save(tmp_path / weights.FILE, task, config, {}, ("a", "b", "c"))
+    net = load_net(tmp_path)
+    assert not net.training
+    points = torch.rand(2, 40, 3)
+    assert torch.equal(net(points), task.net(points))
+
+
+def test_load_net_refuses_samplers_and_other_classes(save, tmp_path):
+    with pytest.raises(UserError, match="holds a sampler, not a task net"):
+        load_net(save(FMOPS))
+    for target in ("os.system", "torch.nn.Linear", ["os.system"], FMOPS["_target_"]):
+        config = {"learn": "task", "task": {"net": {"_target_": target}}}
+        weights.save(tmp_path / weights.FILE, FMOPSNet(16), config, {})
+        with pytest.raises(UserError, match=r"task\.net must be one of PointNetVanilla.*got"):
+            load_net(tmp_path)
 
 
 def test_load_leaves_the_random_state_alone(save):

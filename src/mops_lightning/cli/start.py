@@ -40,7 +40,7 @@ NEEDS = {
     "recipe.feature_distillation": "learn=sampler",
 }
 """Settings without effect unless another one is set, or has the value behind ``=``."""
-OF_TRAINED = ("recipe.", "optimizer.", "baselines.")
+OF_TRAINED = ("recipe.", "optimizer.", "baselines.", "other_nets")
 """Settings of the training of a sampler, and of what a trained one is compared with."""
 UNTRAINED = "which is not trained"
 LIGHTNING = ("trainer.", "logger.", "callbacks.")

@@ -186,6 +186,19 @@ class RunSettings:
         nullable=True,
         compare=False,
     )
+    other_nets: Any = setting(
+        None,
+        "[NAME,...]: further frozen task nets that the sampler is trained under, models or runs",
+        Affects.TRAINING,
+        limits=Limits(
+            "null or a list of models or runs that trained a task net",
+            lambda x: x is None or (type(x) is list and all(type(one) is str for one in x)),
+        ),
+        learn=("sampler",),
+        nullable=True,
+        by_content=True,
+        compare=False,  # the number is a part of the row's name
+    )
     ckpt_path: str | None = setting(
         None,
         "resume training: last (newest run of these settings), a run folder or a .ckpt file",

@@ -93,9 +93,12 @@ def recorded_recipe(record: RunRecord) -> dict[str, Any]:
 def sampler_row(record: RunRecord) -> str:
     """Return the name of a record's sampler, with the settings that make it a separate row.
 
-    That is ``anchored`` for a MOPS-Net with anchors, and its recipe unless it is the paper's.
+    That is ``anchored`` for a MOPS-Net with anchors, its recipe unless it is the paper's, and the
+    number of task nets that it was trained under if there were several.
     """
     parts = [sampler_name(record.config), recorded_recipe(record).get("name")]
+    if others := record.config.get("other_nets"):
+        parts.append(f"{1 + len(others)} nets")
     return " ".join(str(part) for part in parts if part)
 
 

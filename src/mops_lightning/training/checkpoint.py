@@ -40,12 +40,19 @@ def checkpoint_identity(config: dict[str, Any], fingerprint: str) -> dict[str, s
     """
     parts = {**training_settings(config), "dataset": fingerprint}
     if config["weights"] not in (None, "auto", "run"):
-        try:
-            content = weights.read(weights.of_task_net(config["weights"]))
-        except UserError as error:
-            raise UserError(f"weights: {error}") from None
-        parts["weights"] = str(content["sha256"])
+        parts["weights"] = _sha256("weights", config["weights"])
+    others = config.get("other_nets") if config["learn"] == "sampler" else None
+    for number, name in enumerate(others or [], 1):
+        parts[f"other_nets.{number}"] = _sha256("other_nets", name)
     return {name: json.dumps(value, sort_keys=True) for name, value in parts.items()}
+
+
+def _sha256(setting: str, name: str) -> str:
+    """Return the hash of the task net's weights that a setting names."""
+    try:
+        return str(weights.read(weights.of_task_net(name))["sha256"])
+    except UserError as error:
+        raise UserError(f"{setting}: {error}") from None
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ Per batch: loader, ``sampler.sample_sizes``, ``readouts``, ``task.step``, losses
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import product
 from typing import Any, get_args
 
 import lightning as L
@@ -50,6 +51,7 @@ class Experiment(L.LightningModule):
         recipe: how the sampler is trained beyond its own losses; None: by these alone.
         task_lr_scale: with ``learn="joint"``, the task net's learning rate over the sampler's.
         refine: passes of the refined readout in tests; 0: without this readout.
+        other_tasks: the task with further frozen nets, under which the sampler is trained, too.
         test_logger: False keeps test metrics from the loggers and from ``trainer.test``'s result;
             None: they go to a logger if there is one.
         m: the size that is validated and gives the run's score; None: the sampler's.
@@ -73,6 +75,7 @@ class Experiment(L.LightningModule):
         task_lr_scale: float = 1.0,
         recipe: Recipe | None = None,
         refine: int = 0,
+        other_tasks: Sequence[Task] = (),
         test_logger: bool | None = None,
     ) -> None:
         super().__init__()
@@ -87,7 +90,9 @@ class Experiment(L.LightningModule):
         self.identity = identity
         self.task_lr_scale = task_lr_scale
         self.recipe = recipe or Recipe()
-        self.distillation = Distillation(task, self.recipe) if learn == "sampler" else None
+        self.other_tasks = nn.ModuleList(other_tasks)
+        tasks = [task, *other_tasks]
+        self.distillation = Distillation(tasks, self.recipe) if learn == "sampler" else None
         self.total_steps = 1
         self.test_logger = test_logger
         for module in self._frozen():
@@ -116,7 +121,7 @@ class Experiment(L.LightningModule):
         return self
 
     def _frozen(self) -> list[nn.Module]:
-        frozen: list[nn.Module] = list(self.baselines.values())
+        frozen: list[nn.Module] = [*self.baselines.values(), *self.other_tasks]
         if self.learn in ("sampler", "nothing"):
             frozen.append(self.task)
         if self.learn == "nothing" and self.sampler is not None:
@@ -227,11 +232,12 @@ class Experiment(L.LightningModule):
         return total
 
     def _losses(
-        self, batch: Batch, seen: Tensor, sampled: SampleOutput, targets: Targets | None
+        self, batch: Batch, seen: Tensor, sampled: SampleOutput, targets: list[Targets] | None
     ) -> dict[str, Tensor]:
         """Return the loss terms at one size: the task's, distillation and the sampler's own.
 
-        The task's target is the whole batch, also where the sampler has seen a part of its points.
+        The first two are means over the task nets. The task's target is the whole batch, also
+        where the sampler has seen a part of its points.
         """
         soft = sampled.soft_projected
         inputs = [sampled.points if soft is None else soft]
@@ -239,15 +245,16 @@ class Experiment(L.LightningModule):
             completed = self.recipe.straight_through_set == "completed"
             inputs.append(straight_through(sampled, seen, completed))
         terms: dict[str, Tensor] = {}
-        for points in inputs:
-            result = self.task.step(batch, points)
-            if points is inputs[0]:
+        tasks: list[Any] = [self.task, *self.other_tasks]
+        for points, (number, task) in product(inputs, enumerate(tasks)):
+            result = task.step(batch, points)
+            if points is inputs[0] and task is self.task:
                 self.train_scores.update(result.predictions, result.targets)
             losses = dict(result.losses)
             if self.distillation is not None and targets is not None:
-                losses |= self.distillation.losses(points, result.output, targets)
+                losses |= self.distillation.losses(number, points, result.output, targets)
             for name, value in losses.items():
-                terms[name] = terms.get(name, 0) + value / len(inputs)
+                terms[name] = terms.get(name, 0) + value / (len(inputs) * len(tasks))
         return {**terms, **sampled.losses}
 
     def _log_training(self, losses: dict[str, Tensor], readout: str, clouds: int) -> None:

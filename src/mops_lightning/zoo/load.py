@@ -1,22 +1,32 @@
-"""Samplers by name or from weights files, without Hydra."""
+"""Samplers and task nets by name or from weights files, without Hydra."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache, partial
+from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 import mops_lightning
 from mops_lightning.errors import UserError
+from mops_lightning.nets import atlasnet, autoencoder, dgcnn, foldingnet, pcrnet, pointnet
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.zoo import names, weights
 from mops_lightning.zoo.weights import check_shapes, fit_state
 
+M = TypeVar("M", bound=nn.Module)
+
 HINT = "Give a sampler, or the weights of a run with learn=sampler or learn=joint."
+NET_HINT = "Give the weights of a task net, such as those of a run with learn=task."
+NETS: tuple[type[nn.Module], ...] = (
+    *(pointnet.PointNetVanilla, pointnet.PointNetTransform, dgcnn.DGCNN, pcrnet.PCRNet),
+    *(autoencoder.AutoEncoder, atlasnet.AtlasNet, foldingnet.MFoldingNet),
+)
+"""The task nets that files may name."""
 
 
 @cache
@@ -61,42 +71,85 @@ def load(path: str | Path, cls: type[Sampler] | None = None) -> Sampler:
     if config.get("learn") == "task":
         raise UserError(f"{path} holds a task net, not a sampler. {HINT}")
     node = config.get("sampler")
-    return _build(cls or _known_class(node, path), node, content["state"], path)
+    found = cls or _known_class(node, package_samplers())
+    if found is None:
+        raise UserError(
+            f"{path}: sampler._target_ must be a sampler of mops_lightning, got "
+            f"{_target(node)!r:.99}. For a sampler of your own, give load() its class: "
+            "load(path, cls=MySampler)."
+        )
+    return _build(found, node, content["state"], path, "sampler", HINT)
 
 
-def _known_class(node: Any, path: Path) -> type[Sampler]:
-    """Return the class that a file names, if it is one of ours."""
-    target = node.get("_target_") if isinstance(node, dict) else None
-    for cls in package_samplers():
-        if target == f"{cls.__module__}.{cls.__qualname__}":
-            return cls
-    raise UserError(
-        f"{path}: sampler._target_ must be a sampler of mops_lightning, got {target!r:.99}. For a "
-        "sampler of your own, give load() its class: load(path, cls=MySampler)."
-    )
+def load_net(path: str | Path) -> nn.Module:
+    """Load a trained task net by its name, or from a weights file; see ``load``.
 
+    Args:
+        path: a model's name, a weights file or the folder of a run that trained a task net.
 
-def _build(cls: type[Sampler], node: Any, state: dict[str, Tensor], path: Path) -> Sampler:
-    """Build a sampler with the arguments (``node``) and the tensors of a file.
+    Returns:
+        The net in eval mode on the CPU, such as a PointNet, which maps points ``(B, N, 3)`` to
+        logits ``(B, num_classes)``.
 
     Raises:
-        UserError: an argument is not plain or not the class's, or the tensors do not match the
-            sampler.
+        UserError: the file is missing, damaged, not a task net's, or does not match the net.
+    """
+    path = weights.of_task_net(path)
+    content = weights.read(path)
+    if content["config"].get("learn") not in ("task", "joint"):
+        raise UserError(f"{path} holds a sampler, not a task net. {NET_HINT}")
+    task = content["config"].get("task")
+    node = task.get("net") if isinstance(task, dict) else None
+    found: type[nn.Module] | None = _known_class(node, NETS)
+    if node is None or found is None:
+        known = ", ".join(cls.__name__ for cls in NETS)
+        raise UserError(f"{path}: task.net must be one of {known}, got {_target(node)!r:.99}.")
+    if "num_classes" in signature(found).parameters:
+        node = {**node, "num_classes": len(content["classes"])}
+    state = {name.removeprefix("net."): value for name, value in content["state"].items()}
+    return _build(found, node, state, path, "task.net", NET_HINT)
+
+
+def _target(node: Any) -> Any:
+    return node.get("_target_") if isinstance(node, dict) else None
+
+
+def _known_class(node: Any, known: Iterable[type[M]]) -> type[M] | None:
+    """Return the class that a file names, if it is one of the known ones."""
+    target = _target(node)
+    return next((cls for cls in known if target == f"{cls.__module__}.{cls.__qualname__}"), None)
+
+
+def _build(
+    cls: type[M], node: Any, state: dict[str, Tensor], path: Path, part: str, hint: str
+) -> M:
+    """Build a module with the arguments (``node``) and the tensors of a file.
+
+    Args:
+        cls: its class.
+        node: the settings of ``part``, from the file.
+        state: the tensors.
+        path: the file, for errors.
+        part: what the node is called in the file's configuration.
+        hint: what to try next, for errors.
+
+    Raises:
+        UserError: an argument is not plain or not the class's, or the tensors do not match.
     """
     if not isinstance(node, dict):
-        raise UserError(f"{path}: sampler must be a group of settings, got {node!r:.99}.")
+        raise UserError(f"{path}: {part} must be a group of settings, got {node!r:.99}.")
     arguments = {name: value for name, value in node.items() if name != "_target_"}
     make = partial(_built, cls, arguments, path)
     with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
         # Without memory first: a small file can describe a large net.
         with torch.device("meta"), _at_most(len(state)):
-            check_shapes(make(), state, path, HINT)
-        sampler = make()
-    fit_state(sampler, state, path, HINT)
-    return sampler.eval()
+            check_shapes(make(), state, path, hint)
+        module = make()
+    fit_state(module, state, path, hint)
+    return module.eval()
 
 
-def _built(cls: type[Sampler], arguments: dict[str, Any], path: Path) -> Sampler:
+def _built(cls: type[M], arguments: dict[str, Any], path: Path) -> M:
     try:
         return cls(**arguments)
     except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: sizes beyond 64 bits

@@ -1,5 +1,6 @@
 """Losses that compare the frozen task net's outputs for a sample and for the whole cloud."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -20,18 +21,18 @@ class Targets(NamedTuple):
 
 
 class Distillation:
-    """The recipe's two distillation losses of one experiment.
+    """The recipe's two distillation losses of one experiment, for each of its frozen task nets.
 
     Args:
-        task: with the frozen task net.
+        tasks: with one task net each.
         recipe: for the weights of the losses.
     """
 
-    def __init__(self, task: Task, recipe: Recipe) -> None:
-        self.task = task
+    def __init__(self, tasks: Sequence[Task], recipe: Recipe) -> None:
+        self.tasks = tasks
         self.recipe = recipe
         self.predicts = recipe.distillation > 0
-        self.table: Tensor | None = None
+        self.tables: list[Tensor] = []
 
     def start(self, loader: Any, device: torch.device) -> None:
         """Compute the predictions for all points of every training cloud, if they stay the same.
@@ -45,41 +46,47 @@ class Distillation:
         """
         fixed = isinstance(loader, CloudLoader) and loader.keeps_clouds
         if self.predicts and fixed:
-            self.table = full_predictions(self.task, loader, device)
+            self.tables = [full_predictions(task, loader, device) for task in self.tasks]
 
     @torch.no_grad()
-    def targets(self, batch: Batch, seen: Tensor) -> Targets:
-        """Return what samples are compared with.
+    def targets(self, batch: Batch, seen: Tensor) -> list[Targets]:
+        """Return what samples are compared with, by task net.
 
         Args:
             batch: whose points the prediction is of.
             seen: ``(B, N, 3)`` the points that the step sees, whose features are pooled.
         """
         compares_features = self.recipe.feature_distillation > 0
-        return Targets(
-            self._prediction(batch) if self.predicts else None,
-            pooled_features(self.task.net, seen) if compares_features else None,
-        )
+        return [
+            Targets(
+                self._prediction(number, batch) if self.predicts else None,
+                pooled_features(task.net, seen) if compares_features else None,
+            )
+            for number, task in enumerate(self.tasks)
+        ]
 
-    def _prediction(self, batch: Batch) -> Any:
-        if self.table is None or batch.rows is None:
-            return self.task.predict(batch, batch.points)
-        return self.table[batch.rows]
+    def _prediction(self, number: int, batch: Batch) -> Any:
+        if not self.tables or batch.rows is None:
+            return self.tasks[number].predict(batch, batch.points)
+        return self.tables[number][batch.rows]
 
-    def losses(self, points: Tensor, output: Any, targets: Targets) -> dict[str, Tensor]:
-        """Return the weighted losses of a sample.
+    def losses(
+        self, number: int, points: Tensor, output: Any, targets: list[Targets]
+    ) -> dict[str, Tensor]:
+        """Return the weighted losses of a sample under one task net.
 
         Args:
+            number: of the task net.
             points: ``(B, M, 3)`` the sample.
             output: the task net's output for it.
             targets: see ``targets``.
         """
-        losses = {}
-        if targets.prediction is not None:
-            apart = self.task.disagreement(output, targets.prediction).mean()
+        losses, task, target = {}, self.tasks[number], targets[number]
+        if target.prediction is not None:
+            apart = task.disagreement(output, target.prediction).mean()
             losses["distillation"] = self.recipe.distillation * apart
-        if targets.features is not None:
-            apart = feature_distance(pooled_features(self.task.net, points), targets.features)
+        if target.features is not None:
+            apart = feature_distance(pooled_features(task.net, points), target.features)
             losses["feature_distillation"] = self.recipe.feature_distillation * apart
         return losses
 

@@ -42,6 +42,7 @@ from mops_lightning.training.checkpoint import (
 from mops_lightning.training.evaluation import OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
+from mops_lightning.training.run.other_nets import other_tasks
 from mops_lightning.training.run.trainer import device_name, make_trainer
 
 STANDARD = (8, 16, 32, 64, 128, 256, 512)
@@ -195,6 +196,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         m=cfg.m,
         task_lr_scale=cfg.task_lr_scale,
         refine=cfg.refine,
+        other_tasks=other_tasks(cfg, dataset) if sampler is not None and sampler.learned else (),
         test_logger=False,  # stages.test logs them, as one table
         recipe=_in_force(build_as(Recipe, cfg.recipe, "recipe"), sampler),
     )

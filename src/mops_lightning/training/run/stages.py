@@ -24,6 +24,7 @@ from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.recipe.warm_start import warm_start_sampler
 from mops_lightning.training.run.build import Parts, augmentation
 from mops_lightning.training.run.callbacks import CPUTime
+from mops_lightning.training.run.other_nets import check_classes
 from mops_lightning.training.run.trainer import log_test
 from mops_lightning.viz.figures import CLOUDS
 from mops_lightning.zoo import weights
@@ -103,33 +104,6 @@ def load_trained(
         dataset=record.config["names"]["dataset"],
         weights_sha256=content["sha256"],
     )
-
-
-def check_classes(names: list[str] | None, dataset: CloudDataset, what: str) -> None:
-    """Reject a net whose class numbers differ from the data's.
-
-    Args:
-        names: the classes that the net was trained on; None if unknown.
-        dataset: the data.
-        what: the file or folder of the net.
-
-    Raises:
-        UserError: they differ, or are unknown.
-    """
-    classes = list(dataset.class_names)
-    if names is None:
-        raise UserError(
-            f"{what} does not name the classes of its net, so it can be used with its own data "
-            "only."
-        )
-    if list(names) != classes:
-        missing = [name for name in names if name not in classes] or list(names)
-        raise UserError(
-            f"{what}: its net has {len(names)} classes, which are not the {len(classes)} classes "
-            f"of the data: {', '.join(missing[:3])} ... instead of {', '.join(classes[:3])} .... "
-            "Give a task net of these classes with weights=auto, or data of its classes with "
-            "dataset.classes."
-        )
 
 
 def _load_trained_task(task: nn.Module, trained: TrainedRun) -> None:

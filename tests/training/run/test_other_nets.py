@@ -1,0 +1,55 @@
+"""Samplers that are trained under several task nets."""
+
+import json
+
+import pytest
+
+from mops_lightning.config.compose import compose
+from mops_lightning.config.overrides import readable
+from mops_lightning.errors import UserError
+from mops_lightning.report.collect import sampler_row
+from mops_lightning.training.evaluation import command_line
+from mops_lightning.training.run.run import run
+from tests.support.command_line import job
+
+
+def test_sampler_trained_under_several_nets(tmp_path):
+    nets = [tmp_path / f"net{seed}" for seed in (1, 2)]
+    for seed, folder in enumerate(nets, 1):
+        job(folder, "learn=task", f"seed={seed}", "dataset.seed=0")
+    alone = job(tmp_path / "alone")
+    record = job(tmp_path / "both", f"other_nets=[{nets[0]},{nets[1]}]")
+    assert sampler_row(record) == f"{sampler_row(alone)} 3 nets"
+    assert record.metrics != alone.metrics
+    assert record.metrics["test/full/accuracy"] == alone.metrics["test/full/accuracy"]
+    # Another second net is another training.
+    with pytest.raises(UserError, match=r"other settings .*other_nets\.2"):
+        job(tmp_path / "new", f"other_nets=[{nets[0]}]", f"ckpt_path={tmp_path / 'both'}")
+    # An evaluation needs none of them.
+    for folder in nets:
+        (folder / "weights.safetensors").unlink()
+    given = [f"evaluate={tmp_path / 'both'}", "pictures=0", "logger=none"]
+    chosen = [readable(argument) for argument in command_line(given)]
+    again = run(compose(chosen), tmp_path / "again", chosen)
+    assert again.metrics == record.metrics
+    assert sampler_row(again) == sampler_row(record)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("nowhere", "no file or model .nowhere"),
+        ("mops.modelnet40-m32", "holds a sampler, not a task net"),
+        ("pcrnet.modelnet40", "net must take .points"),
+        ("pointnet.modelnet40", "its net has 40 classes, which are not the 3 classes"),
+    ],
+)
+def test_other_nets_that_cannot_be_used_raise(tmp_path, given, words):
+    with pytest.raises(UserError, match=f"^other_nets: .*{words}"):
+        job(tmp_path / "run", f"other_nets=[{given}]")
+
+
+@pytest.mark.parametrize("given", ["pointnet.modelnet40", json.dumps([3])])
+def test_other_nets_that_are_no_list_of_names_raise(tmp_path, given):
+    with pytest.raises(UserError, match=r"^other_nets must be null or a list of models or runs"):
+        job(tmp_path / "run", f"other_nets={given}")
