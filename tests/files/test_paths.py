@@ -27,6 +27,8 @@ def inputs(tmp_path, monkeypatch):
         ("b.npy", "in", ["in/b.npy"]),
         ("in", "out", ["out/a.npy", "out/c.ply", "out/deep/b.ply"]),
         ("in", "in/deep", ["in/deep/a.npy", "in/deep/c.ply"]),
+        ("in/*.npy", "out", ["out/a.npy"]),
+        ("in/[bc]*", "out", ["out/c.ply"]),
     ],
 )
 def test_outputs_follow_inputs(source, target, expected, inputs):
@@ -42,7 +44,9 @@ def test_outputs_follow_inputs(source, target, expected, inputs):
         ("b.npy", "out.stl", "OUT must end in"),
         ("nowhere", "out", "nowhere: no such file or folder"),
         ("in", "b.npy", "OUT must be a folder"),
-        ("empty", "out", "empty contains no file"),
+        ("empty", "out", "no file ends in"),
+        ("in/*.las", "out", "no file ends in"),
+        ("n*/b.npy", "out", "no such file or folder"),
         ("in", "out", "in/c.ply and in/c.stl have the same output out/c.ply"),
     ],
 )

@@ -72,6 +72,7 @@ def test_curvature_is_computed_unless_it_is_a_column(tmp_path):
         ("labl", ["--method", "fps"], "has no column 'labl'. Did you mean 'label'?"),
         ("low", ["--method", "fps"], "must be finite and at least 0, got -1.0 in row 0"),
         ("hole", ["--method", "fps"], "must be finite and at least 0, got nan in row 2"),
+        ("", ["--method", "fps"], "has no column ''"),
         ("few", ["--method", "fps"], "4 points have a weight above 0, fewer than m=5"),
         ("label", ["--method", "voxel"], "--weight: VoxelSampler takes no weights. Use fps"),
         ("label", ["--weights", "MODEL", "--readout", "matched"], "matched readout takes no"),

@@ -38,22 +38,23 @@ def file_pairs(source: Path, target: Path) -> list[FilePair]:
     An output file in a folder has the format of its input, or .ply where that cannot be written.
 
     Args:
-        source: a file or a folder.
-        target: a file or a folder; a folder if ``source`` is one.
+        source: a file, a folder, or a pattern of files, such as ``county/*.laz``.
+        target: a file or a folder; a folder if ``source`` is no file.
 
     Raises:
         UserError: an input is missing, or an output is ambiguous or cannot be written.
     """
-    if not source.exists():
+    if not source.exists() and not is_many(source):
         raise UserError(f"{source}: no such file or folder.")
     if realpath(target) == realpath(source):
         raise UserError(f"OUT must differ from IN, got {source} for both.")
     if blocking := next((p for p in target.parents if p.exists() and not p.is_dir()), None):
         raise UserError(f"OUT: {blocking} is a file, not a folder. Give another OUT.")
-    if source.is_dir():
-        inputs = _inputs(source, target)
+    if is_many(source):
+        base, pattern = (source, "**/*") if source.is_dir() else (source.parent, source.name)
+        inputs = _inputs(base, pattern, target)
         return _distinct(
-            [(path, _output(path, target / path.relative_to(source))) for path in inputs]
+            [(path, _output(path, target / path.relative_to(base))) for path in inputs]
         )
     if target.is_dir():
         target = _output(source, target / source.name)
@@ -62,25 +63,30 @@ def file_pairs(source: Path, target: Path) -> list[FilePair]:
     return [(source, target)]
 
 
+def is_many(source: Path) -> bool:
+    """Return whether a path is a folder, or a pattern such as ``county/*.laz``."""
+    return source.is_dir() or not (source.exists() or set("*?[").isdisjoint(source.name))
+
+
 def _output(source: Path, path: Path) -> Path:
     """Return ``path`` with the suffix of ``source``, or .ply where that cannot be written."""
     own = source.suffix.lower()
     return path.with_suffix(own if own in WRITERS else ".ply")
 
 
-def _inputs(source: Path, target: Path) -> list[Path]:
-    """Return the readable files below a folder, without those below ``target``."""
+def _inputs(folder: Path, pattern: str, target: Path) -> list[Path]:
+    """Return the readable files of a pattern below a folder, without those below ``target``."""
     if target.is_file():
-        raise UserError(f"OUT must be a folder because IN is one, got the file {target}.")
+        raise UserError(f"OUT must be a folder because IN is several, got the file {target}.")
     outputs = Path(realpath(target))
     files = sorted(
         path
-        for path in source.rglob("*")
+        for path in folder.glob(pattern)
         if path.suffix.lower() in READABLE and path.is_file() and not is_temporary(path)
         if outputs not in Path(realpath(path)).parents
     )
     if not files:
-        raise UserError(f"{source} contains no file that ends in {', '.join(READABLE)}.")
+        raise UserError(f"{folder / pattern}: no file ends in {', '.join(READABLE)}.")
     return files
 
 

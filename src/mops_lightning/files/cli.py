@@ -18,10 +18,11 @@ from mops_lightning.zoo.names import UNTRAINED
 
 DOWNSAMPLE = """Downsample clouds and meshes from files.
 
-IN is a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt .off .obj .stl .glb) or a folder of them,
-OUT a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt) or a folder. Clouds are normalised to
-the unit sphere, as in training, sampled by a trained sampler (--weights) or an untrained method
-(--method), and mapped back. Meshes are first sampled on their surface."""
+IN is a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt .off .obj .stl .glb), a folder of them, a
+pattern such as 'county/*.laz', or the web address of a COPC file, of which an area is read. OUT is
+a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt) or a folder. Clouds are normalised to the unit
+sphere, as in training, sampled by a trained sampler (--weights) or an untrained method (--method),
+and mapped back. Meshes are first sampled on their surface."""
 
 PROPAGATE = """Carry labels, colours or scores from a sample to all points of a cloud.
 
@@ -62,7 +63,7 @@ def downsample(arguments: list[str], prog: str = "mops-lightning downsample") ->
 
 
 def _downsample_arguments(add: Add) -> None:
-    add("source", metavar="IN", type=Path, help="a file or a folder")
+    add("source", metavar="IN", help="a file, a folder, a pattern, or the address of a COPC file")
     add("target", metavar="OUT", type=Path, help="a file or a folder")
     add("--m", type=int, help="number of points to keep; default: as the weights were trained for")
     add("--weights", help=WEIGHTS)
@@ -75,12 +76,7 @@ def _downsample_arguments(add: Add) -> None:
     )
     add("--keep-attributes", action="store_true", help="keep colours, normals, intensities, ...")
     add("--surface", type=int, help="points to sample from a mesh first; default: 10000 or 8m")
-    add(
-        "--workers",
-        type=int,
-        default=1,
-        help="processes that share a folder's files",
-    )
+    add("--workers", type=int, default=1, help="processes that share a folder's files")
     add(
         "--tile",
         type=int,
@@ -134,20 +130,26 @@ def _downsample_arguments(add: Add) -> None:
 def _downsample(chosen: argparse.Namespace) -> int:
     """Do what the arguments say and return the exit status."""
     options = _options(chosen)
-    from mops_lightning.files.batch import file_pairs, process_file, process_folder
+    from mops_lightning.data.formats.remote import local
     from mops_lightning.files.downsample import load_sampler
 
     load_sampler(options)  # reports its mistakes before any file is read
+    with local(chosen.source, options.area) as chosen.source:
+        return _downsample_files(chosen, options)
+
+
+def _downsample_files(chosen: argparse.Namespace, options: Options) -> int:
+    from mops_lightning.files.batch import file_pairs, is_many, process_file, process_folder
+
     if chosen.cluster:  # workers may have a different working directory
         chosen.source = chosen.source.absolute()
     pairs = file_pairs(chosen.source, chosen.target)
-    is_folder = chosen.source.is_dir()
+    is_folder = is_many(chosen.source)
     if not is_folder and pairs[0][1].exists() and not chosen.overwrite:
         raise UserError(f"{pairs[0][1]} exists. Give another OUT, or --overwrite.")
     if chosen.map is not None:
         _check_map(chosen, is_folder, pairs[0])
-    # Of a run that was killed.
-    with _engine(chosen) as engine:
+    with _engine(chosen, not is_folder) as engine:
         if not is_folder:
             process_file(*pairs[0], options, engine)
             return 0
@@ -159,7 +161,7 @@ def _downsample(chosen: argparse.Namespace) -> int:
 def _check_map(chosen: argparse.Namespace, is_folder: bool, files: tuple[Path, Path]) -> None:
     """Reject a map of several files, and one that would replace another file."""
     if is_folder:
-        raise UserError(f"--map is the map of one file, but IN is the folder {chosen.source}.")
+        raise UserError(f"--map is the map of one file, but IN is {chosen.source}.")
     if realpath(chosen.map) in map(realpath, files):
         raise UserError(f"--map must differ from IN and OUT, got {chosen.map}.")
     if chosen.map.exists() and not chosen.overwrite:
@@ -173,6 +175,8 @@ def _options(chosen: argparse.Namespace) -> Options:
         raise UserError(f"--workers must be at least 1, got {chosen.workers}.")
     if chosen.cluster == "":
         raise UserError("--cluster must be the address of a Dask scheduler, got ''.")
+    if chosen.cluster and "://" in chosen.source:
+        raise UserError("--cluster: the workers do not see a copy from the web. Download the file.")
     if chosen.cluster and chosen.chunk is None:
         raise UserError("--cluster distributes the chunks of a file: give --chunk as well.")
     chosen.area = Area.parse(chosen.bounds, chosen.level, chosen.resolution)
@@ -180,9 +184,8 @@ def _options(chosen: argparse.Namespace) -> Options:
     return Options(**{**values, "readout": chosen.readout or "completed"})
 
 
-def _engine(chosen: argparse.Namespace) -> AbstractContextManager[Engine | None]:
+def _engine(chosen: argparse.Namespace, is_file: bool) -> AbstractContextManager[Engine | None]:
     """Return the engine; None for a folder without ``--cluster``: its files are shared."""
-    is_file = not chosen.source.is_dir()
     if not chosen.cluster:
         return nullcontext(LocalEngine(progress=True) if is_file else None)
     from mops_lightning.files.engine import dask_engine

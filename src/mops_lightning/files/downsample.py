@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from mops_lightning.data.formats.guard import BadCloudError, check_coordinates, check_size
 from mops_lightning.data.formats.registry import read, write
@@ -17,10 +16,8 @@ from mops_lightning.files.engine import Engine, LocalEngine
 from mops_lightning.files.options import Options
 from mops_lightning.files.propagate import write_map
 from mops_lightning.files.tiles import sample_by_tiles
-from mops_lightning.ops.points import UnitSphere
-from mops_lightning.ops.readout import select
 from mops_lightning.ops.weights import CURVATURE, check_positive, check_weight, curvature
-from mops_lightning.samplers.base import Sampler, stream_sample
+from mops_lightning.samplers.base import Sampler
 from mops_lightning.zoo.downsample import untrained
 from mops_lightning.zoo.load import load
 
@@ -112,7 +109,10 @@ def downsample_file(
 def _sample_table(source: Path, finite: Table, sampler: Sampler, m: int, options: Options) -> Table:
     """Sample the finite points of a file, or some of them."""
     check_size(source, len(finite.points), m, options.area)
-    weight = weights_of(finite, options.weight, source) if options.weight else None
+    field, weight = options.weight, None
+    if field is not None:
+        weight = weights_of(finite, field, source)
+        check_positive(int((weight > 0).sum()), m, f"--weight {field} of {source}")
     rows, points = sample_cloud(finite.points, sampler, m, options, source, weight)
     if rows is None:
         return Table(points, {}, finite.header)
@@ -174,34 +174,5 @@ def sample_cloud(
     if options.tile is not None:
         rows = sample_by_tiles(points, options.tile, m, sampler)
         return rows, points[rows]
-    if weight is not None and not weight.all():  # points of weight 0 are left out
-        kept = np.flatnonzero(weight)
-        check_positive(len(kept), m, f"--weight {options.weight} of {source}")
-        places, sampled = sample_cloud(points[kept], sampler, m, options, source, weight[kept])
-        return None if places is None else kept[places], sampled
-    sphere = UnitSphere.around(points)
-    weights = None if weight is None else torch.from_numpy(weight)
-    chosen, generated = _select(sampler, sphere.normalise(points), m, options.readout, weights)
-    if chosen is None:
-        return None, sphere.restore(generated)
-    rows = chosen.numpy()
-    return rows, points[rows]
-
-
-@torch.no_grad()
-def _select(
-    sampler: Sampler, points: Tensor, m: int, readout: str, weight: Tensor | None
-) -> tuple[Tensor | None, Tensor]:
-    """Return the rows ``(m,)`` of the points to keep, or None, and the generated points."""
-    weights = None if weight is None else weight[None]
-    if weights is not None and not sampler.generates:
-        return sampler.sample_weighted(points[None], m, weights)[0], points
-    if sampler.streams:
-        generated = stream_sample(sampler, lambda: [points], m)
-    else:
-        output = sampler(points[None], m)
-        generated = output.points[0]
-        if not sampler.generates:
-            return output.indices[0], generated
-    rows = select(points[None], generated[None], readout, weights)[1]
-    return None if rows is None else rows[0], generated
+    sampled, chosen = sampler.downsample(points, m, options.readout, weight=weight)
+    return chosen, sampled

@@ -1,7 +1,7 @@
 """Base class of all samplers, and sampling in chunks."""
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import reduce
+from functools import partial, reduce
 from numbers import Integral
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.precision import restrict_autocast_to_pointwise
 from mops_lightning.ops.readout import READOUTS, select
-from mops_lightning.samplers.fused import FusedMOPSNet
+from mops_lightning.samplers.fused import PART, FusedMOPSNet
 from mops_lightning.samplers.ragged import select_points
 from mops_lightning.types import SampleOutput
 
@@ -142,10 +142,14 @@ class Sampler(nn.Module):
                 check_points(clouds, at_least=m)
                 rows = self.sample_weighted(clouds, m, weight)
                 return gather_points(clouds, rows), rows
-            output = self(clouds.to(next(self.parameters(), clouds)), m)  # dtype and device
-            if not self.generates:
-                return output.points, output.indices
-            return select(clouds, output.points.to(clouds.device), readout, weight)
+            given = clouds.to(next(self.parameters(), clouds))  # dtype and device
+            if self.streams and given.shape[1] > PART:  # features of all points take more memory
+                generated = torch.stack([stream_sample(self, partial(iter, [x]), m) for x in given])
+            else:
+                generated, rows, *_ = self(given, m)
+                if not self.generates:
+                    return generated, rows
+            return select(clouds, generated.to(clouds.device), readout, weight)
 
         return select_points(sample, points, m, batch, weight)
 

@@ -26,6 +26,9 @@ from mops_lightning.errors import UserError
 COPC = "copc"
 """The user of the records that index the points of a COPC file."""
 
+GAP = 2**16
+"""Bytes that are read with their neighbours rather than left out."""
+
 POINTS_PER_BYTE = 1024
 """Largest number of points per byte of a file, which may be compressed."""
 
@@ -126,6 +129,21 @@ def _count_in_nodes(path: Path, area: Area) -> int:
         return sum(node.point_count for node in _nodes(reader, area))
 
 
+def ranges_of_bytes(path: Path, area: Area) -> list[tuple[int, int]]:
+    """Return where the octree's cells that overlap an area are in a file: starts and ends.
+
+    Cells with little between them are joined: an answer of a server takes as long as ``GAP`` bytes.
+    """
+    joined: list[tuple[int, int]] = []
+    with _laspy(path).CopcReader.open(path) as reader:
+        for node in _nodes(reader, area):
+            start, stop = node.offset, node.offset + node.byte_size
+            if joined and start - joined[-1][1] < GAP:
+                start = joined.pop()[0]
+            joined.append((start, stop))
+    return joined
+
+
 def _parse_nodes(area: Area, path: Path, rows: range) -> Table:
     """Read a range of the rows of the octree's cells that overlap an area.
 
@@ -148,9 +166,11 @@ def _nodes(reader: Any, area: Area) -> list[Any]:
     """Return the cells of a COPC file's octree that overlap an area, in the order of the file."""
     from laspy.copc import Bounds, load_octree_for_query
 
+    if not reader.root_page.entries:
+        raise ValueError("it ends before its octree")
     levels, spacing = area.level, reader.copc_info.spacing
     if area.resolution is not None:  # the distance of points is halved at each level
-        levels = max(0, ceil(log2(spacing / area.resolution)))
+        levels = max(0, ceil(log2(spacing) - log2(area.resolution)))
     box = Bounds(np.array(area.low), np.array(area.high))
     depth = None if levels is None else range(levels + 1)
     nodes = load_octree_for_query(reader.source, reader.copc_info, reader.root_page, box, depth)
