@@ -42,6 +42,8 @@ NEEDS = {
 """Settings without effect unless another one is set, or has the value behind ``=``."""
 OF_TRAINED = ("recipe.", "optimizer.", "baselines.", "other_nets")
 """Settings of the training of a sampler, and of what a trained one is compared with."""
+OF_JOINT = ("optimizer.", *(f"recipe.{name}" for name in settings.RECIPE_OF_TASK_NETS))
+"""Those that also serve a task net trained on the points of an index sampler."""
 UNTRAINED = "which is not trained"
 LIGHTNING = ("trainer.", "logger.", "callbacks.")
 """Settings that are arguments of Lightning's classes."""
@@ -111,7 +113,7 @@ def _why_without_effect(cfg: DictConfig, path: str, is_trained: Callable[[], boo
         return f"without {NEEDS[path]}"
     if path.startswith("pretrain.") and cfg.weights != "auto":
         return f"with weights={cfg.weights or 'null'}"
-    trains_task = cfg.learn == "task" or (cfg.learn == "joint" and path.startswith("optimizer."))
+    trains_task = cfg.learn == "task" or (cfg.learn == "joint" and path.startswith(OF_JOINT))
     counts = trains_task or path == "recipe.task_points" or not path.startswith(OF_TRAINED)
     return "" if counts or is_trained() else f"with sampler={cfg.names.sampler}, {UNTRAINED}"
 

@@ -17,6 +17,8 @@ from hydra.core.config_store import ConfigStore
 Learn = Literal["task", "sampler", "joint", "nothing"]
 LEARN = get_args(Learn)
 """The choices of ``learn``."""
+RECIPE_OF_TASK_NETS = ("train_points", "all_points_from", "ema_span")
+"""Settings of ``recipe`` that also serve a task net trained on an index sampler's points."""
 WITH_SAMPLER = ("sampler", "joint", "nothing")
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 """Allowed values of ``trainer.precision``; Lightning has more."""

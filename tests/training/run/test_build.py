@@ -39,6 +39,20 @@ def test_factory_recipe_without_a_setting_is_that_of_the_publication(learn):
         assert getattr(made.recipe, name) == getattr(Recipe(), name)
 
 
+@pytest.mark.parametrize("learn", ["joint", "sampler"])
+def test_factory_recipe_of_index_sampler_serves_a_task_net_that_learns(learn):
+    given = [
+        "recipe.train_points=20",
+        "recipe.ema_span=0.3",
+        f"learn={learn}",
+        "sampler=fps",
+        "m=8",
+    ]
+    made = make_experiment(compose(given), small_dataset(), {})
+    expected = Recipe(train_points=20, ema_span=0.3) if learn == "joint" else Recipe()
+    assert made.recipe == expected
+
+
 def rows(part, whole):
     """Rows of a part's clouds in the whole split."""
     return [int((whole == cloud).all(2).all(1).nonzero()) for cloud in part]

@@ -26,6 +26,7 @@ from torch import nn
 
 from mops_lightning.config import distributed
 from mops_lightning.config.build import accepted, build, build_as
+from mops_lightning.config.settings import RECIPE_OF_TASK_NETS
 from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
@@ -198,7 +199,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         refine=cfg.refine,
         other_tasks=other_tasks(cfg, dataset) if sampler is not None and sampler.learned else (),
         test_logger=False,  # stages.test logs them, as one table
-        recipe=_in_force(build_as(Recipe, cfg.recipe, "recipe"), sampler),
+        recipe=_in_force(build_as(Recipe, cfg.recipe, "recipe"), sampler, cfg.learn),
     )
 
 
@@ -274,11 +275,15 @@ def sizes_to_test(
     return wanted
 
 
-def _in_force(recipe: Recipe, sampler: Sampler | None) -> Recipe:
+def _in_force(recipe: Recipe, sampler: Sampler | None, learn: str) -> Recipe:
     """Return the part of a recipe that counts; the task net's training has its own record."""
     if sampler is None:
         return Recipe(task_points=recipe.task_points)
-    return replace(recipe, task_points=None) if sampler.learned else Recipe()
+    if sampler.learned:
+        return replace(recipe, task_points=None)
+    # A task net that is trained on the sampler's points sees as many clouds as with a learned one.
+    kept = {name: getattr(recipe, name) for name in RECIPE_OF_TASK_NETS} if learn == "joint" else {}
+    return Recipe(**kept)
 
 
 def _make_baselines(cfg: DictConfig, m: int, net: dict[str, Any]) -> dict[str, Sampler]:
