@@ -53,6 +53,16 @@ def test_completed_set_is_filled_up_by_weight(folder, tmp_path):
     assert read(tmp_path / "b.npz", 9, 0).columns["score"].tolist() == [1] * 40
 
 
+def test_weight_acts_among_the_points_of_a_chunk(splat, tmp_path):
+    settings = ["--method", "fps", "--m", 90, "--weight", "opacity", "--chunk", 250]
+    assert call(splat[0], tmp_path / "a.ply", *settings, "--keep-attributes")[0] == 0
+    table = read(tmp_path / "a.ply", 9, 0)
+    assert len(table.points) == 90
+    assert (table.columns["opacity"] > 0).mean() > 0.9
+    assert call(splat[0], tmp_path / "b.ply", *settings)[0] == 0
+    assert not read(tmp_path / "b.ply", 9, 0).columns
+
+
 def test_curvature_is_computed_unless_it_is_a_column(tmp_path):
     plane, sphere = np.random.default_rng(0).normal(size=(2, 500, 3))
     plane *= [3, 3, 0]
@@ -76,7 +86,7 @@ def test_curvature_is_computed_unless_it_is_a_column(tmp_path):
         ("few", ["--method", "fps"], "4 points have a weight above 0, fewer than m=5"),
         ("label", ["--method", "voxel"], "--weight: VoxelSampler takes no weights. Use fps"),
         ("label", ["--weights", "MODEL", "--readout", "matched"], "matched readout takes no"),
-        ("label", ["--method", "fps", "--tile", 9], "--weight needs the whole cloud at once"),
+        ("label", ["--method", "fps", "--tile", 9], "leave --tile out"),
     ],
 )
 def test_weight_that_cannot_be_used_ends_in_one_line(field, arguments, said, folder, tmp_path):

@@ -148,7 +148,8 @@ class Drawn(NamedTuple):
 def _draw(cloud: CloudFile, options: Options, rows: range) -> Drawn:
     table = cloud.read(rows)
     check_coordinates(cloud.path, table.points)
-    table = table if options.keep_attributes else table.without_attributes()
+    needed = options.keep_attributes or options.weight is not None
+    table = table if needed else table.without_attributes()
     keys = np.random.default_rng([options.seed, rows.start]).random(len(table.points))
     return Drawn(keys, table, len(keys)).lowest(options.chunk)
 

@@ -16,6 +16,7 @@ from mops_lightning.files.engine import Engine, LocalEngine
 from mops_lightning.files.options import Options
 from mops_lightning.files.propagate import write_map
 from mops_lightning.files.tiles import sample_by_tiles
+from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.weights import CURVATURE, check_positive, check_weight, curvature
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.zoo.downsample import untrained
@@ -109,10 +110,8 @@ def downsample_file(
 def _sample_table(source: Path, finite: Table, sampler: Sampler, m: int, options: Options) -> Table:
     """Sample the finite points of a file, or some of them."""
     check_size(source, len(finite.points), m, options.area)
-    field, weight = options.weight, None
-    if field is not None:
-        weight = weights_of(finite, field, source)
-        check_positive(int((weight > 0).sum()), m, f"--weight {field} of {source}")
+    field = options.weight
+    weight = None if field is None else weights_of(finite, field, source)
     rows, points = sample_cloud(finite.points, sampler, m, options, source, weight)
     if rows is None:
         return Table(points, {}, finite.header)
@@ -174,5 +173,16 @@ def sample_cloud(
     if options.tile is not None:
         rows = sample_by_tiles(points, options.tile, m, sampler)
         return rows, points[rows]
-    sampled, chosen = sampler.downsample(points, m, options.readout, weight=weight)
-    return chosen, sampled
+    if weight is not None and not weight.all():  # points of weight 0 are left out
+        kept = np.flatnonzero(weight)
+        check_positive(len(kept), m, f"--weight {options.weight} of {source}")
+        chosen, _ = sample_cloud(points[kept], sampler, m, options, source, weight[kept])
+        rows = kept[chosen]
+        return rows, points[rows]
+    sphere = UnitSphere.around(points)
+    weights = None if weight is None else torch.from_numpy(weight)[None]
+    new, found = sampler.select(options.readout, sphere.normalise(points)[None], m, weights)
+    if found is None:
+        return None, sphere.restore(new[0])
+    rows = found[0].numpy()
+    return rows, points[rows]

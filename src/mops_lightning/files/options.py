@@ -83,8 +83,8 @@ class Options:
             raise UserError("--tile needs --m, the number of points to keep of all tiles together.")
         if self.tile is not None and self.readout != "completed":
             raise UserError(f"--tile keeps different input points: no --readout {self.readout}.")
-        if self.weight is not None and (self.tile is not None or self.chunk is not None):
-            raise UserError("--weight needs the whole cloud at once: no --tile and no --chunk.")
+        if self.weight is not None and self.tile is not None:
+            raise UserError("--weight needs the whole cloud at once: leave --tile out.")
         if self.chunk is not None and self.map is not None:
             raise UserError(
                 "--map needs the whole cloud in memory: use mops-lightning propagate after --chunk."

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import UnitSphere
-from mops_lightning.ops.readout import select
 from mops_lightning.samplers.base import Sampler
 
 Points = NDArray[np.float64]
@@ -67,7 +66,7 @@ def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler) -> Rows
             batch = places[first : first + step]
             clouds = [points[tiles[place]] for place in batch]
             stacked = torch.stack([UnitSphere.around(one).normalise(one) for one in clouds])
-            rows = sample_tiles(sampler, stacked, number).numpy()
+            rows = sample_tiles(sampler, stacked, number)
             for place, chosen in zip(batch, rows, strict=True):
                 selected[place] = tiles[place][chosen]
     kept = np.concatenate(selected)
@@ -111,17 +110,13 @@ def shares(m: int, sizes: list[int]) -> Rows:
     return np.diff(m * ends // ends[-1])
 
 
-@torch.no_grad()
-def sample_tiles(sampler: Sampler, tiles: Tensor, m: int) -> Tensor:
+def sample_tiles(sampler: Sampler, tiles: Tensor, m: int) -> Rows:
     """Return m different rows ``(B, m)`` of every tile ``(B, n, 3)``."""
     if m == tiles.shape[1]:
-        return torch.arange(m).expand(len(tiles), m)
-    output = sampler(tiles, m)
-    if output.indices is not None:
-        return output.indices
-    rows = select(tiles, output.points, "completed")[1]
+        return np.broadcast_to(np.arange(m), (len(tiles), m))
+    rows = sampler.select("completed", tiles, m)[1]
     assert rows is not None
-    return rows
+    return rows.numpy()
 
 
 def thin(points: Points, m: int) -> Rows:

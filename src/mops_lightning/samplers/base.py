@@ -137,21 +137,28 @@ class Sampler(nn.Module):
         if weight is not None:
             self.check_weighted(readout)
 
-        def sample(clouds: Tensor, m: int, weight: Tensor | None) -> tuple[Tensor, Tensor | None]:
-            if weight is not None and not self.generates:
-                check_points(clouds, at_least=m)
-                rows = self.sample_weighted(clouds, m, weight)
-                return gather_points(clouds, rows), rows
-            given = clouds.to(next(self.parameters(), clouds))  # dtype and device
-            if self.streams and given.shape[1] > PART:  # features of all points take more memory
-                generated = torch.stack([stream_sample(self, partial(iter, [x]), m) for x in given])
-            else:
-                generated, rows, *_ = self(given, m)
-                if not self.generates:
-                    return generated, rows
-            return select(clouds, generated.to(clouds.device), readout, weight)
+        return select_points(partial(self.select, readout), points, m, batch, weight)
 
-        return select_points(sample, points, m, batch, weight)
+    @torch.no_grad()
+    def select(
+        self, readout: str, clouds: Tensor, m: int, weight: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
+        """Sample clouds ``(B, N, 3)`` in the unit sphere; see ``downsample``.
+
+        Weights ``(B, N)`` are above 0. Returns the points ``(B, m, 3)``, and their rows or None.
+        """
+        if weight is not None and not self.generates:
+            check_points(clouds, at_least=m)
+            rows = self.sample_weighted(clouds, m, weight)
+            return gather_points(clouds, rows), rows
+        given = clouds.to(next(self.parameters(), clouds))  # dtype and device
+        if self.streams and given.shape[1] > PART:  # features of all points take more memory
+            generated = torch.stack([stream_sample(self, partial(iter, [x]), m) for x in given])
+        else:
+            generated, indices, *_ = self(given, m)
+            if not self.generates:
+                return generated, indices
+        return select(clouds, generated.to(clouds.device), readout, weight)
 
     def _checked(self, points: Tensor, m: int) -> SampleOutput:
         """Check the points and sample them, without losses."""
