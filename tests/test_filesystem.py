@@ -6,7 +6,7 @@ import pytest
 
 from mops_lightning import filesystem
 from mops_lightning.errors import UserError, file_error
-from mops_lightning.filesystem import atomic_write, is_temporary, load_npz
+from mops_lightning.filesystem import atomic_write, is_temporary, load_npz, remove_temporary
 from tests.support.full_disk import full_disk
 
 
@@ -36,13 +36,26 @@ def test_atomic_write_after_an_error_keeps_the_old_file(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_temporary_names_of_long_names_are_possible_and_known(tmp_path):
+def test_remove_temporary_removes_what_a_kill_left(tmp_path):
     path = tmp_path / "below" / f"{'n' * 240}.txt"
     with atomic_write(path) as temporary:
-        temporary.write_text("text")
+        temporary.write_text("half")
+        left = temporary.with_name(f"{temporary.name}2").write_bytes(b"as after a kill")
         assert is_temporary(temporary)
+    assert left
+    assert len(list(path.parent.iterdir())) == 2
+    remove_temporary(tmp_path)
+    assert list(path.parent.iterdir()) == [path]
     assert not is_temporary(path)
+
+
+def test_remove_temporary_keeps_what_is_being_written(tmp_path):
+    path = tmp_path / "file.txt"
+    with atomic_write(path) as temporary:
+        temporary.write_text("text")
+        remove_temporary(tmp_path)
     assert path.read_text() == "text"
+    remove_temporary(path / "below")  # no folder
 
 
 def test_load_npz_small_file_of_large_arrays_is_refused(tmp_path, monkeypatch):

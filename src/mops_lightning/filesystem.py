@@ -1,15 +1,19 @@
-"""Files that are written whole or not at all, and unpacking."""
+"""Files that are written whole or not at all, what a kill leaves, and unpacking."""
 
 import errno
 import os
+import sys
 import tempfile
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from mops_lightning.errors import UserError, one_line
+
+if sys.platform != "win32":
+    import fcntl
 
 TEMPORARY = ".mops_lightning-"
 """Prefix of the names of temporary files."""
@@ -23,8 +27,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path that replaces ``path`` when the block ends without an error.
 
     A reader sees the old file or the new one, never part of one. After an error the old file is
-    unchanged and the temporary one is deleted. A killed process leaves the temporary one, a hidden
-    file that nothing reads.
+    unchanged and the temporary one is deleted. A killed process leaves the temporary one; see
+    ``remove_temporary``.
 
     Args:
         path: the file to write; its folder is created if necessary.
@@ -41,9 +45,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     # A part of the name only: with all of a long one the temporary name would be too long.
     prefix = f"{TEMPORARY}{path.stem[:32]}-"
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
+    temporary, handle = _locked_temporary(path.parent, prefix, path.suffix)
     try:
         yield temporary
         # mkstemp makes files that only their owner can read.
@@ -60,11 +62,53 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         raise
     finally:
         temporary.unlink(missing_ok=True)
+        if handle is not None:
+            os.close(handle)
+
+
+def _locked_temporary(folder: Path, prefix: str, suffix: str) -> tuple[Path, int | None]:
+    """Make a temporary file and lock it, so that ``remove_temporary`` leaves it alone.
+
+    The lock ends with the process.
+
+    Returns:
+        The path, and the descriptor that holds the lock; None on systems without such locks.
+    """
+    while True:
+        handle, name = tempfile.mkstemp(dir=folder, prefix=prefix, suffix=suffix)
+        if sys.platform == "win32":
+            os.close(handle)
+            return Path(name), None
+        with suppress(OSError):  # some network file systems have no locks
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        if Path(name).exists():  # nobody removed it before it was locked
+            return Path(name), handle
+        os.close(handle)
 
 
 def is_temporary(path: Path) -> bool:
     """Return whether a file is a temporary one of ``atomic_write``, and so not an input."""
     return path.name.startswith(TEMPORARY)
+
+
+def remove_temporary(folder: Path, below: bool = True) -> None:
+    """Remove what killed processes left of ``atomic_write`` in a folder.
+
+    Files that a process is writing are kept, and so are all on systems without locks of files.
+
+    Args:
+        folder: it need not exist.
+        below: also in all folders below it.
+    """
+    if sys.platform == "win32":
+        return
+    pattern = f"{TEMPORARY}*"
+    with suppress(OSError):  # the folder cannot be read
+        found = list(folder.rglob(pattern) if below else folder.glob(pattern))
+        for path in found:
+            with suppress(OSError), path.open("rb+") as file:  # in use, gone, or another user's
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                path.unlink()
 
 
 def memory(path: Path) -> int:

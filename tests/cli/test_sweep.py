@@ -9,6 +9,7 @@ from filelock import FileLock
 
 from mops_lightning.cli.sweep import run_cell
 from mops_lightning.config.compose import compose
+from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE, FAILED
 from mops_lightning.zoo import model_file, names
@@ -167,6 +168,14 @@ def test_sweep_with_cell_in_another_process_exits_with_zero(tmp_path):
         status, out, err = call(["-m", *TINY, "m=4", "hydra.sweep.dir=sweep"], tmp_path)
     assert status == 0, err
     assert "1 cells: 1 left to another process; in sweep" in out
+
+
+def test_run_cell_removes_temporary_files(start, tmp_path):
+    left = tmp_path / "cell" / "checkpoints" / f"{TEMPORARY}last-x.ckpt"
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"half")
+    start("sampler=fps", "weights=null")
+    assert not left.exists()
 
 
 def test_sweep_ends_in_models_whose_cards_name_each_other(tmp_path, monkeypatch):

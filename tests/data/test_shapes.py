@@ -18,6 +18,7 @@ from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.data.procedural.mesh_parts import join, turned
 from mops_lightning.data.shapes import ASYMMETRIC, BUILDERS, shapes
 from mops_lightning.errors import UserError
+from mops_lightning.filesystem import TEMPORARY
 
 SMALL: dict[str, Any] = {
     "n_points": 64,
@@ -197,6 +198,7 @@ def test_shapes_damaged_cache_is_replaced(tmp_path: Path) -> None:
         assert same(shapes(**SMALL, cache=tmp_path), fresh)
         assert list(tmp_path.iterdir()) == [path]
     path.write_bytes(damaged[1])
+    (tmp_path / f"{TEMPORARY}left by a kill.npz").touch()
     shapes(**SMALL, cache=tmp_path)
     assert list(tmp_path.iterdir()) == [path]
     assert path.read_bytes() == whole

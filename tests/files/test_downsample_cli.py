@@ -3,6 +3,7 @@
 import pytest
 
 from mops_lightning.data.formats.registry import read
+from mops_lightning.filesystem import TEMPORARY
 from tests.support.downsample import call, refused
 
 FPS = ["--m", 5, "--method", "fps"]
@@ -58,6 +59,14 @@ def test_existing_output_needs_overwrite(folder, tmp_path):
     assert target.read_text() == "mine"
     assert call(source, target, *settings, "--overwrite")[0] == 0
     assert len(read(target, 9, 0).points) == 5
+
+
+def test_folder_removes_what_a_killed_run_left(folder, tmp_path):
+    left = tmp_path / "out" / "below" / f"{TEMPORARY}cloud-x.ply"
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"half")
+    assert call(folder / "in", tmp_path / "out", "--m", 5, "--method", "fps")[0] == 0
+    assert not left.exists()
 
 
 def test_real_scans_keep_attributes(real_data, tmp_path):

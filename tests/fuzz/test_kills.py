@@ -18,6 +18,7 @@ import pytest
 
 from mops_lightning.cli.sweep import run_cell
 from mops_lightning.config.compose import compose
+from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE
 from mops_lightning.training.run.run import run
@@ -142,6 +143,9 @@ def check(folder, work, want, **kill):
     if status:
         assert attempt(folder, work)[0] == 0
     assert results(folder) == want, kill
+    # A single run that was killed has a folder of its own, which no later run uses.
+    left = [path for path in folder.rglob(f"{TEMPORARY}*") if work != "single"]
+    assert left == [], kill
 
 
 @pytest.mark.parametrize("work", WORK)

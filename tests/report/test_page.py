@@ -1,5 +1,7 @@
 """The page of a report, opened in a browser."""
 
+import base64
+import hashlib
 import json
 import re
 
@@ -115,8 +117,12 @@ def test_page_planes_have_table_and_plot(tmp_path, opened):
     assert errors == []
 
 
-def test_page_loads_nothing(reported):
+def test_page_runs_its_own_scripts_only(reported):
     text = reported.read_text()
     (policy,) = re.findall('Content-Security-Policy" content="([^"]*)"', text)
     assert "default-src 'none'" in policy
+    scripts = re.findall("<script>(.*?)</script>", text, re.DOTALL)
+    digests = {base64.b64encode(hashlib.sha256(one.encode()).digest()).decode() for one in scripts}
+    assert digests == set(re.findall("'sha256-([^']*)'", policy))
+    assert len(digests) == 2
     assert '<meta name="viewport"' in text

@@ -20,6 +20,7 @@ from mops_lightning.cli.start import line_about_run
 from mops_lightning.config import settings
 from mops_lightning.config.settings import Affects
 from mops_lightning.errors import USER_ERROR, Interrupted, UserError, end, one_line
+from mops_lightning.filesystem import remove_temporary
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
 
@@ -58,6 +59,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
     try:
         with _lock(folder):
             (folder / FAILED).unlink(missing_ok=True)
+            remove_temporary(folder)
             if (folder / ASIDE / MOVING).is_dir():
                 _move_aside(folder)  # an earlier start was killed in the middle of it
             cfg = checked(cfg, overrides)  # an evaluation has the settings of its run

@@ -22,6 +22,7 @@ from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
 from mops_lightning.data.formats.registry import READABLE, read
 from mops_lightning.data.surfaces import VERSION, sample_surface
 from mops_lightning.errors import UserError, check_at_least, did_you_mean
+from mops_lightning.filesystem import remove_temporary
 from mops_lightning.ops.points import normalize_unit_sphere
 from mops_lightning.seeding import derive_seed
 
@@ -151,6 +152,8 @@ def _read_files(
         The clouds of every file, ``(crops, n_points, 3)``, and the sha256 of every mesh's file.
     """
     kept = Path(cache).expanduser() if cache else None
+    if kept is not None:
+        remove_temporary(kept, below=False)
     console = Console(stderr=True)
     clouds, digests = [], []
     for name in track(names, "Reading files", console=console, disable=not console.is_terminal):

@@ -27,6 +27,7 @@ from mops_lightning.data.procedural.seats import chair, sofa, stool
 from mops_lightning.data.procedural.vessels import bottle, bowl, bucket, cup, goblet, teapot, vase
 from mops_lightning.data.surfaces import cached
 from mops_lightning.errors import UserError
+from mops_lightning.filesystem import remove_temporary
 from mops_lightning.ops.points import UnitSphere
 
 BUILDERS: Mapping[str, Callable[[Generator], trimesh.Trimesh]] = MappingProxyType({
@@ -98,7 +99,10 @@ def shapes(
         "seed": seed,
     }
     fingerprint = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
-    path = Path(cache).expanduser() / f"shapes-{fingerprint[:20]}.npz" if cache else None
+    path = None
+    if cache is not None:
+        path = Path(cache).expanduser() / f"shapes-{fingerprint[:20]}.npz"
+        remove_temporary(path.parent, below=False)
     expected = [(count * len(chosen), n_points, 3) for count in counts]
     points = cached(path, expected, lambda: _generate(n_points, counts, chosen, seed))
     train, test = (

@@ -13,6 +13,7 @@ from mops_lightning.data.formats.table import Area
 from mops_lightning.errors import Parser, UserError, did_you_mean, one_line_endings, printable
 from mops_lightning.files.engine import Engine, LocalEngine
 from mops_lightning.files.options import Options
+from mops_lightning.filesystem import remove_temporary
 from mops_lightning.records.readout_names import GENERATED_READOUTS
 from mops_lightning.zoo.names import UNTRAINED
 
@@ -149,6 +150,8 @@ def _downsample_files(chosen: argparse.Namespace, options: Options) -> int:
         raise UserError(f"{pairs[0][1]} exists. Give another OUT, or --overwrite.")
     if chosen.map is not None:
         _check_map(chosen, is_folder, pairs[0])
+    # Of a run that was killed.
+    remove_temporary(chosen.target if is_folder else pairs[0][1].parent, below=is_folder)
     with _engine(chosen, not is_folder) as engine:
         if not is_folder:
             process_file(*pairs[0], options, engine)
@@ -242,6 +245,7 @@ def _propagate(chosen: argparse.Namespace) -> None:
         raise UserError(f"OUT must differ from SMALL and BIG, got {target}.")
     if target.exists() and not chosen.overwrite:
         raise UserError(f"{target} exists. Give another OUT, or --overwrite.")
+    remove_temporary(target.parent, below=False)
     number = propagate_file(chosen.small, big, target, chosen.field, chosen.k, chosen.mean)
     names, seconds = ", ".join(chosen.field), time.perf_counter() - start
     print(printable(f"{target}: {names} of {number:,} points, {seconds:.1f} s"))

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from mops_lightning.errors import Parser, one_line_endings
-from mops_lightning.filesystem import atomic_write
+from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.records import run_record
 from mops_lightning.report.build import Report, build_report
 from mops_lightning.report.tables import NOT_IN_CSV, long_form
@@ -64,6 +64,7 @@ def write(report: Report, folder: Path) -> list[str]:
     from mops_lightning.report.plots import plots
     from mops_lightning.viz.figures import save_figure
 
+    remove_temporary(folder, below=False)
     keys = {key for table in report.tables for key in table.group.settings}
     net = report.tables[0].net if report.tables else ""
     long = long_form(report.found.done, net, sorted(keys)).drop(columns=[*NOT_IN_CSV])

@@ -7,6 +7,7 @@ from filelock import FileLock
 from mops_lightning.config.build import build
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
+from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.training.run.pretrain import cache_folder
 from mops_lightning.zoo import weights
 from tests.support.command_line import SMALL_PCRNET, TINY, call, job, start
@@ -67,6 +68,8 @@ def test_weights_file_for_net_without_weights_raises(tmp_path):
 def test_resumed_run_from_file_is_not_published(tmp_path):
     cfg = compose([*TINY, f"cache={tmp_path}/cache", "learn=task", *SMALL_PCRNET])
     folder = cache_folder(cfg, build(cfg.dataset, "dataset"))
+    folder.mkdir(parents=True)
+    (folder / f"{TEMPORARY}left by a kill.pt").touch()
     train(tmp_path, "learn=task", *SMALL_PCRNET)
     assert [path.name for path in folder.iterdir()] == [weights.FILE]
     (first,) = tmp_path.glob("run*/weights.safetensors")

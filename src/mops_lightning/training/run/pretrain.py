@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from mops_lightning.config import distributed
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
-from mops_lightning.filesystem import atomic_write
+from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.training.checkpoint import CHECKPOINT, checkpoint_identity
 from mops_lightning.training.evaluation import OF_RUN
 from mops_lightning.training.run.build import Parts
@@ -43,6 +43,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, train: Train) -> Path |
     if cfg.weights != "auto":
         return weights.of_task_net(cfg.weights)
     folder = cache_folder(cfg, dataset)
+    remove_temporary(folder)
     if not (folder / FILE).is_file():
         if distributed.started_together(cfg):
             raise UserError(
@@ -112,6 +113,7 @@ def add_to_cache(parts: Parts) -> None:
         return
     target = cache_folder(cfg, parts.dataset) / FILE
     if not target.is_file():
+        remove_temporary(target.parent, below=False)
         with atomic_write(target) as temporary:
             shutil.copyfile(parts.folder / FILE, temporary)
 
