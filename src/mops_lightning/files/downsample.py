@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from mops_lightning.data.formats.guard import BadCloudError, check_coordinates, check_size
 from mops_lightning.data.formats.registry import read, write
@@ -108,10 +109,13 @@ def downsample_file(
 
 
 def _sample_table(source: Path, finite: Table, sampler: Sampler, m: int, options: Options) -> Table:
-    """Sample the finite points of a file, or some of them."""
+    """Sample the finite points of a file, or some of them; without those of weight 0."""
     check_size(source, len(finite.points), m, options.area)
-    field = options.weight
-    weight = None if field is None else weights_of(finite, field, source)
+    weight = None
+    if options.weight is not None:
+        weight = weights_of(finite, options.weight, source)
+        check_positive(int((weight > 0).sum()), m, f"--weight {options.weight} of {source}")
+        finite, weight = finite.take(weight.nonzero()[0]), weight[weight > 0]
     rows, points = sample_cloud(finite.points, sampler, m, options, source, weight)
     if rows is None:
         return Table(points, {}, finite.header)
@@ -139,7 +143,7 @@ def weights_of(table: Table, field: str, source: Path) -> NDArray[np.float64]:
         raise BadCloudError(f"--weight: {source} has no column {field!r}.{hint}")
     values = values.astype(np.float64)
     if field == "opacity" and table.columns.keys() >= SPLAT:
-        values = 1 / (1 + np.exp(-values))
+        values = expit(values)
     name = f"--weight {field} of {source}"
     weight: NDArray[np.float64] = check_weight(values, values.shape, name).numpy()
     return weight
@@ -161,7 +165,7 @@ def sample_cloud(
         m: number of points to keep.
         options: how.
         source: the file, for errors.
-        weight: ``(N,)`` of at least 0; None: all points are equal.
+        weight: ``(N,)`` above 0; None: all points are equal.
 
     Returns:
         The rows ``(m,)`` of the kept points, or None for generated points; the points ``(m, 3)``.
@@ -172,12 +176,6 @@ def sample_cloud(
     check_coordinates(source, points)
     if options.tile is not None:
         rows = sample_by_tiles(points, options.tile, m, sampler)
-        return rows, points[rows]
-    if weight is not None and not weight.all():  # points of weight 0 are left out
-        kept = np.flatnonzero(weight)
-        check_positive(len(kept), m, f"--weight {options.weight} of {source}")
-        chosen, _ = sample_cloud(points[kept], sampler, m, options, source, weight[kept])
-        rows = kept[chosen]
         return rows, points[rows]
     sphere = UnitSphere.around(points)
     weights = None if weight is None else torch.from_numpy(weight)[None]
