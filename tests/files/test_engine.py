@@ -14,7 +14,7 @@ from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from mops_lightning.files.chunks import sample_by_chunks
-from mops_lightning.files.engine import DaskEngine, dask_engine
+from mops_lightning.files.engine import DaskEngine, Engine, dask_engine
 from mops_lightning.files.options import Options
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.zoo import weights
@@ -69,10 +69,11 @@ def same(one: Table, other: Table) -> None:
         np.testing.assert_array_equal(column, other.columns[name])
 
 
-class Watched:
+class Watched(Engine):
     """An engine that calls a function after every result."""
 
     def __init__(self, engine, watch):
+        super().__init__()
         self.engine, self.watch = engine, watch
 
     def map(self, title, function, row_ranges):

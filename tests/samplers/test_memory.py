@@ -51,7 +51,7 @@ IN_CHUNKS = """
 import numpy as np
 
 from mops_lightning.files.chunks import sample_by_chunks
-from mops_lightning.files.engine import LocalEngine
+from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.samplers.mops import MOPSNet
 
@@ -68,7 +68,7 @@ for number in sizes:
 for number in sizes:
     path = Path(sys.argv[1]) / f"{number}.npy"
     reset_peak()
-    sample_by_chunks(path, sampler, 16, options, LocalEngine())
+    sample_by_chunks(path, sampler, 16, options, Engine())
     peaks.append(status("VmHWM"))
 print(peaks[1] - peaks[0])
 """

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from mops_lightning.data.formats.table import Area
 from mops_lightning.errors import Parser, UserError, did_you_mean, one_line_endings, printable
-from mops_lightning.files.engine import Engine, LocalEngine
+from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.records.readout_names import GENERATED_READOUTS
@@ -190,7 +190,7 @@ def _options(chosen: argparse.Namespace) -> Options:
 def _engine(chosen: argparse.Namespace, is_file: bool) -> AbstractContextManager[Engine | None]:
     """Return the engine; None for a folder without ``--cluster``: its files are shared."""
     if not chosen.cluster:
-        return nullcontext(LocalEngine(progress=True) if is_file else None)
+        return nullcontext(Engine(progress=True) if is_file else None)
     from mops_lightning.files.engine import dask_engine
 
     return dask_engine(chosen.cluster, progress=is_file)

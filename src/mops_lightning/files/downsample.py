@@ -13,7 +13,7 @@ from mops_lightning.data.formats.registry import read, write
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.files.chunks import Outcome, draw, sample_by_chunks
-from mops_lightning.files.engine import Engine, LocalEngine
+from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.files.propagate import write_map
 from mops_lightning.files.tiles import sample_by_tiles
@@ -89,7 +89,7 @@ def downsample_file(
     """
     sampler = load_sampler(options)
     m = options.m or sampler.m
-    engine = engine or LocalEngine()
+    engine = engine or Engine()
     if options.draws:
         drawn, number, dropped = draw(source, options, engine)
         table = _sample_table(source, drawn, sampler, m, options)

@@ -8,7 +8,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 from rich.progress import track
 
@@ -18,23 +18,8 @@ PATIENCE = 20
 """Seconds to wait for a scheduler and its first worker."""
 
 
-class Engine(Protocol):
-    """Calls a function for ranges of rows, in this process or elsewhere."""
-
-    def map(
-        self, title: str, function: Callable[[range], Any], row_ranges: list[range]
-    ) -> Iterable[Any]:
-        """Return ``function(rows)`` for every range of rows, in order.
-
-        Args:
-            title: name of the step, for progress and errors.
-            function: can be pickled, such as a ``partial`` of a function of a module.
-            row_ranges: ranges of rows, which are independent of each other.
-        """
-
-
-class LocalEngine:
-    """Processes one range after the other in this process.
+class Engine:
+    """Calls a function for ranges of rows: here, one after the other in this process.
 
     Args:
         progress: show the progress on a terminal.
@@ -46,7 +31,13 @@ class LocalEngine:
     def map(
         self, title: str, function: Callable[[range], Any], row_ranges: list[range]
     ) -> Iterable[Any]:
-        """See ``Engine.map``."""
+        """Return ``function(rows)`` for every range of rows, in order.
+
+        Args:
+            title: name of the step, for progress and errors.
+            function: can be pickled, such as a ``partial`` of a function of a module.
+            row_ranges: ranges of rows, which are independent of each other.
+        """
         results = map(function, row_ranges)
         return with_progress(results, title, len(row_ranges)) if self.progress else results
 
@@ -94,7 +85,7 @@ def dask_engine(address: str, progress: bool) -> Iterator["DaskEngine"]:
         yield DaskEngine(client, progress)
 
 
-class DaskEngine:
+class DaskEngine(Engine):
     """Submits ranges to a Dask client; a range is repeated when its worker dies.
 
     Args:
@@ -103,8 +94,8 @@ class DaskEngine:
     """
 
     def __init__(self, client: Any, progress: bool = False) -> None:
+        super().__init__(progress)
         self.client = client
-        self.progress = progress
 
     def map(
         self, title: str, function: Callable[[range], Any], row_ranges: list[range]
