@@ -30,7 +30,7 @@ class Parser(argparse.ArgumentParser):
     """Parser of a subcommand's arguments.
 
     Its errors show no control characters: a shell puts names of files in the place of ``*``. A
-    path that begins with ``~`` is below a home folder unless there is a file of this name.
+    path may begin with ``~`` for a home folder.
 
     Args:
         prog: what the user typed to start the subcommand.
@@ -40,17 +40,12 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, prog: str, description: str) -> None:
         kept = argparse.RawDescriptionHelpFormatter
         super().__init__(prog=prog, description=description, formatter_class=kept)
-        self.register("type", Path, _with_home)
+        self.register("type", Path, lambda text: Path(text).expanduser())
         self._negative_number_matcher = re.compile(r"-\.?\d")  # also the first of several numbers
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and a message, and exit."""
         super().error(printable(message))
-
-
-def _with_home(text: str) -> Path:
-    path = Path(text)
-    return path if os.path.lexists(path) else path.expanduser()
 
 
 class Interrupted(Exception):

@@ -40,7 +40,9 @@ from tests.support.command_line import TINY, TINY_WITH_PICTURES, refused
         (["m=8", "--resolve"], "write --cfg job --resolve."),
         (["--cfg", "jobs", "m=8"], "--cfg/-c: invalid choice: 'jobs'"),
         (["..=8"], "'..=8' is not a setting. Settings are KEY=VALUE."),
-        (["~dataset=3"], "~dataset=3: write ~dataset."),
+        (["~task/net=3"], "~task/net=3: write ~task/net."),
+        (["~sampler"], "~sampler: sampler cannot be removed; choose another one with sampler="),
+        (["~callbacks"], "leave single callbacks out with callbacks.NAME=null."),
         ([*TINY, "trainer._target_=builtins.dict"], "must return a Trainer, got dict."),
         (["hydra=null"], "hydra=null: choose one"),
         (["hydra.verbose={a: 1}"], "hydra.verbose={a: 1}: give true, false, or a list"),
@@ -55,6 +57,7 @@ from tests.support.command_line import TINY, TINY_WITH_PICTURES, refused
         (["sampler@baselines.x=null"], "sampler@baselines.x=null: choose one"),
         (["--shell-completion"], "--shell-completion: add install=bash"),
         (["--shell-completion", "install=sh"], "--shell-completion: add install=bash"),
+        (["pretrain_from=nowhere"], "pretrain_from: no file or model 'nowhere'"),
         (["weights=nowhere.pt", *TINY_WITH_PICTURES], "weights: no file nowhere.pt"),
     ],
 )

@@ -58,13 +58,19 @@ def test_read_no_record_raises(tmp_path):
         run_record.read(tmp_path)
 
 
+def with_fact(value):
+    """The text of a record that a value is put into."""
+    text = json.dumps(record(dataset_facts={"files": "here"}).plain())
+    return text.replace('"here"', value)
+
+
 @pytest.mark.parametrize(
     "text",
     [
         '{"schema": ' + "1" * 5000 + "}",
         "[" * 2000 + "]" * 2000,
-        "[" * 60 + "]" * 60,
-        '{"config": 1' + "0" * 400 + "}",
+        with_fact("[" * 60 + "]" * 60),
+        with_fact("1" + "0" * 400),
         '"\x1b[31m"',
         "\xff\xfe",
         "[" * 100_000,

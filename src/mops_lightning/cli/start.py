@@ -20,6 +20,7 @@ from mops_lightning.zoo import names
 
 INPUTS = {
     "weights": ("auto", "run"),
+    "pretrain_from": (),
     "ckpt_path": ("last",),
     "evaluate": (),
     "dataset.root": (),
@@ -29,6 +30,7 @@ OUTPUTS = ("out", "cache", "dataset.cache")
 MISSING = {
     "ckpt_path": "no checkpoint {}. Give a run's folder, a .ckpt file, or last.",
     "weights": "no file {}. Give a weights file, a run, a model, or weights=auto.",
+    "pretrain_from": "no file {}. Give a weights file, a run or a model.",
 }
 """Errors of inputs that nothing else checks before a run begins."""
 NEEDS = {
@@ -36,6 +38,7 @@ NEEDS = {
     "sampler.num_sizes": "sampler.size_sampling=nested",
     "dataset.gap": "dataset.test_frames",
     "recipe.all_points_from": "recipe.train_points",
+    "trainer.gradient_clip_algorithm": "trainer.gradient_clip_val",
     "recipe.distillation": "learn=sampler",
     "recipe.feature_distillation": "learn=sampler",
 }
@@ -111,7 +114,7 @@ def _why_without_effect(cfg: DictConfig, path: str, is_trained: Callable[[], boo
     needed = OmegaConf.select(cfg, name)
     if not needed or (value and needed != value):
         return f"without {NEEDS[path]}"
-    if path.startswith("pretrain.") and cfg.weights != "auto":
+    if path.startswith(("pretrain.", "pretrain_from")) and cfg.weights != "auto":
         return f"with weights={cfg.weights or 'null'}"
     trains_task = cfg.learn == "task" or (cfg.learn == "joint" and path.startswith(OF_JOINT))
     counts = trains_task or path == "recipe.task_points" or not path.startswith(OF_TRAINED)
@@ -176,12 +179,14 @@ def check_paths(cfg: DictConfig) -> None:
 
 
 def _check_missing(name: str, value: str) -> None:
-    """Refuse a path that does not exist where the setting needs one; ``weights`` may be a model."""
+    """Refuse a path that does not exist where the setting needs one; weights may be of a model."""
+    if name not in MISSING:
+        return
     try:
-        found = names.resolve(value).exists() if name == "weights" else False
+        found = name != "ckpt_path" and names.resolve(value).exists()
     except UserError as error:
         raise UserError(f"{name}: {error}") from None
-    if name in MISSING and not found:
+    if not found:
         raise UserError(f"{name}: {MISSING[name].format(value)}")
 
 

@@ -17,6 +17,9 @@ logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
 REJECTIONS = (ValueError, TypeError, OverflowError, ZeroDivisionError)
 """Errors that constructors of other libraries raise for invalid settings."""
 
+PASSED_ON = {"lightning.pytorch.loggers.TensorBoardLogger": "torch.utils.tensorboard.SummaryWriter"}
+"""Classes that pass further settings on to others, which refuse them after pretraining."""
+
 
 def build(node: Any, where: str = "", **extra: Any) -> Any:
     """Make the object that a node describes, with the objects of the nodes below it.
@@ -167,6 +170,8 @@ def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
         parameters = {**named, **parameters}
         if not rest:
             return parameters
+    if target in PASSED_ON:
+        return {**signature(PASSED_ON[target], where), **parameters}
     return {**parameters, **own}  # the target takes any further argument
 
 

@@ -101,6 +101,10 @@ def check_overrides(arguments: Sequence[str]) -> None:
             continue
         value: Any = override.value()
         if override.is_delete():
+            declared = settings.declared().get(group)
+            if declared is not None and declared.group and not declared.nullable:
+                other = f"choose another one with {name}=NAME{OTHERWISE.get(name, '')}"
+                raise UserError(f"{argument}: {name} cannot be removed; {other}.")
             if group in groups and value is not None and not _is_choice(value, group):
                 raise UserError(f"{argument}: write ~{name}.")
             continue

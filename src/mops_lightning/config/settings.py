@@ -296,7 +296,7 @@ class RunSettings:
     sampler: Any = group(learn=WITH_SAMPLER)
     optimizer: Any = group(Affects.TRAINING, repeat=False)
     trainer: Any = group(Affects.TRAINING, repeat=False, compare=False)
-    callbacks: Any = group(Affects.TRAINING, nullable=True, repeat=False, compare=False)
+    callbacks: Any = group(Affects.TRAINING, repeat=False, compare=False)
     logger: Any = group(Affects.NOTHING, nullable=True)
 
 
@@ -317,6 +317,8 @@ INSIDE: dict[str, dict[str, Any]] = {
     "sampler.seed": {"compare": False},
     "sampler.threshold": {"affects": Affects.SCORES},
     "recipe.task_points": {"learn": None},
+    "optimizer.lr": {"limits": ABOVE_ZERO},
+    "pretrain.lr": {"limits": ABOVE_ZERO},
     "augment.task.jitter": {"limits": NOT_NEGATIVE},
     "augment.sampler.jitter": {"limits": NOT_NEGATIVE},
     # Before trainer.max_epochs, so that an error names the setting that it takes its value from.

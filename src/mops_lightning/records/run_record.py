@@ -5,6 +5,7 @@ import math
 import os
 import platform
 import subprocess
+import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -26,6 +27,8 @@ MANY = "runs.jsonl"
 """File with the records of several runs, one a line."""
 ASIDE = ".attempts"
 """Folder with the earlier attempts of a sweep's cell."""
+MAX_DEPTH = 50
+"""Deepest nesting of a record that is read."""
 FAILED = ".failed"
 """File in a cell's folder that says why its last start failed, with or without a record."""
 PACKAGES = (
@@ -272,10 +275,23 @@ def from_json(text: str, place: str) -> RunRecord:
         UserError: it is not a run record.
     """
     try:
-        return from_plain(msgspec.json.decode(text))
+        plain = json.loads(text)  # msgspec's decoder refuses names that are no text
+        _check_extent(plain, MAX_DEPTH)
+        return from_plain(plain)
     except (ValueError, RecursionError) as error:
         reason = printable(str(error).splitlines()[0][:200])
         raise UserError(f"{place}: not a run record: {reason}") from None
+
+
+def _check_extent(plain: Any, deepest: int) -> None:
+    """Check that nothing is nested too deeply, and that a float can hold every number."""
+    if deepest < 0:
+        raise ValueError(f"nested more than {MAX_DEPTH} levels deep")
+    if isinstance(plain, int) and abs(plain) > sys.float_info.max:
+        raise ValueError("Number out of range")
+    if isinstance(plain, dict | list):
+        for item in plain.values() if isinstance(plain, dict) else plain:
+            _check_extent(item, deepest - 1)
 
 
 def dotted(tree: Any, prefix: str = "") -> dict[str, Any]:

@@ -46,21 +46,6 @@ def test_run_on_part_of_the_batches_says_so(tmp_path, capsys):
     assert record.partial == ["trained for 1 of 6 steps"]
 
 
-@pytest.mark.parametrize(
-    ("argument", "named"),
-    [
-        ("+trainer.fast_dev_run=true", "trainer.fast_dev_run must be false; .*got True"),
-        ("+trainer.overfit_batches=0.5", "trainer.overfit_batches must be 0; .*got 0.5"),
-        ("+trainer.max_steps=0", "trainer.max_steps must be -1 or .*at least 1, got 0"),
-        ("+trainer.limit_test_batches=0", "limit_test_batches must be a number above 0, got 0"),
-        ("+trainer.limit_train_batches=0.0", "limit_train_batches must be .* above 0, got 0.0"),
-    ],
-)
-def test_run_that_trains_or_tests_nothing_is_refused(argument, named, tmp_path):
-    with pytest.raises(UserError, match=named):
-        job(tmp_path / "run", argument)
-
-
 def test_completed_run_resumed_is_completed_with_the_cpu_time_of_all_parts(tmp_path):
     first = job(tmp_path / "first", "weights=null")
     assert first.partial == []

@@ -18,10 +18,10 @@ from omegaconf import DictConfig
 from torch import Tensor
 from torch.utils.tensorboard.summary import hparams
 
-from mops_lightning.config.build import accepted, build_as, signature
+from mops_lightning.config.build import accepted, build_as
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.loader import CloudLoader
-from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.records.run_record import dotted
 from mops_lightning.training.checkpoint import CHECKPOINT, sealed
@@ -44,8 +44,6 @@ HARMLESS = (
 
 LOG_EVERY = 10
 """Steps between two points of a curve."""
-WRITER = "torch.utils.tensorboard.SummaryWriter"
-"""The class that TensorBoard's logger passes further settings to."""
 LOGGER_FOLDERS = {"TensorBoardLogger": "tensorboard", "CSVLogger": "csv"}
 """Subfolder of the run's folder that a logger writes to."""
 
@@ -149,15 +147,7 @@ def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str
 def _logger(node: DictConfig, folder: Path) -> Any:
     """Build the logger, which writes into the run's folder itself unless it has a name."""
     own = accepted(node, {"name": ""})
-    target = str(node["_target_"])
-    if target.endswith("TensorBoardLogger"):  # passes the rest on when it writes its first curve
-        known = {**signature(target, "logger"), **signature(WRITER, "logger")}
-        for name in map(str, node):
-            if name[0] != "_" and name not in known:
-                raise UserError(
-                    f"logger: {target} takes no setting {name!r}.{did_you_mean(name, known)}"
-                )
-    if below := LOGGER_FOLDERS.get(target.rpartition(".")[2]):
+    if below := LOGGER_FOLDERS.get(node["_target_"].rpartition(".")[2]):
         own |= {"name": below, "version": ""}  # the progress bar would show a version
     unset = {name: value for name, value in own.items() if name not in node}
     return build_as(Logger, node, "logger", save_dir=str(folder), **unset)
