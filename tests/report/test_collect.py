@@ -18,7 +18,6 @@ def test_collect_counts_but_hides_unfinished_runs(tmp_path):
 
 def test_collect_lists_partial_tests_apart(tmp_path):
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
-    (tmp_path / "more").mkdir()
     part = ["tested on 1 of 4 batches"]
     put(tmp_path / "more", "fps", 32, {"test/sampled/accuracy": 0.9}, seed=1, partial=part)
     text = table(tmp_path)
@@ -44,8 +43,7 @@ def test_collect_lists_unreadable_records(tmp_path):
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
     (tmp_path / "bad").mkdir()
     (tmp_path / "bad" / "result.json").write_text("")
-    put(tmp_path, "random", 32, {"test/sampled/accuracy": 0.2})
-    path = tmp_path / "random-32-pointnet" / "result.json"
+    path = put(tmp_path, "random", 32, {"test/sampled/accuracy": 0.2})
     path.write_text(path.read_text().replace('"m": 32', '"m": "x"'))
     (tmp_path / "folder" / "result.json").mkdir(parents=True)
     text = table(tmp_path)

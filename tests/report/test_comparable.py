@@ -1,21 +1,16 @@
 """Which runs share a table, and what its columns are."""
 
-import json
 import re
 
 import pytest
 
 from mops_lightning.records import run_record
 from tests.support.records import evaluated
-from tests.support.reports import put, put_cell, put_pairs, put_planes, rows, table
+from tests.support.reports import edited, put, put_cell, put_planes, rows, table
 
 
 def titles(text):
     return [line for line in text.splitlines() if line.startswith("Test ")]
-
-
-def edited(path, **changes):
-    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
 @pytest.mark.parametrize("name", ["dataset_fingerprint", "task_weights_sha256"])
@@ -27,10 +22,8 @@ def test_other_data_or_weights_have_table_of_their_own(tmp_path, name):
     assert first.endswith(("(data d)", "(task weights w)"))
     assert second.endswith(("(data other)", "(task weights other)"))
     assert "2 groups of runs are not comparable" in text
-    assert [row[0] for row in rows(text) if "paper" not in row[0]] == [
-        *("sampled by", "fps"),
-        *("sampled by", "mops"),
-    ]
+    names = [row[0] for row in rows(text) if "paper" not in row[0]]
+    assert names == ["sampled by", "fps", "sampled by", "mops"]
 
 
 def test_joint_runs_have_own_task_nets(tmp_path):
@@ -47,23 +40,17 @@ def test_joint_runs_have_own_task_nets(tmp_path):
     assert "learn=sampler alone" in other
 
 
-def test_other_pairs_have_table_of_their_own(tmp_path):
-    put_pairs(tmp_path, "fps", 32, 12.0)
-    put_pairs(tmp_path, "mops", 32, 9.0, resample=512)
-    assert [re.findall("resample=(\\w+)", one) for one in titles(table(tmp_path))] == [
-        ["None"],
-        ["512"],
-    ]
-
-
-def test_other_net_settings_have_table_of_their_own(tmp_path):
-    for name, passes in (("fps", 1), ("mops", 3)):
-        net = {"net": {"iterations": passes}}
-        put(tmp_path, name, 32, {"test/sampled/accuracy": 0.5}, settings=net)
-    assert [re.findall("iterations.: ([0-9])", one) for one in titles(table(tmp_path))] == [
-        ["1"],
-        ["3"],
-    ]
+@pytest.mark.parametrize(
+    ("settings", "pattern", "found"),
+    [
+        ([{"resample": None}, {"resample": 512}], r"resample=(\w+)", ["None", "512"]),
+        ([{"net": {"iterations": n}} for n in (1, 3)], "iterations.: ([0-9])", ["1", "3"]),
+    ],
+)
+def test_other_pairs_or_net_settings_have_table_of_their_own(tmp_path, settings, pattern, found):
+    for name, own in zip(("fps", "mops"), settings, strict=True):
+        put(tmp_path, name, 32, {"test/sampled/accuracy": 0.5}, settings=own)
+    assert re.findall(pattern, "".join(titles(table(tmp_path)))) == found
 
 
 def test_data_per_seed_need_every_sampler_per_seed(tmp_path):
@@ -100,10 +87,8 @@ def test_runs_of_differing_settings_have_tables_of_their_own(tmp_path):
     for name in ("adam", "sgd"):
         put_cell(tmp_path, name, "mops", {"generated": 1.0}, optimizer={"name": name})
     text = table(tmp_path)
-    assert [one.rsplit("(")[-1] for one in titles(text)] == [
-        "optimizer.name=adam)",
-        "optimizer.name=sgd)",
-    ]
+    endings = [one.rsplit("(")[-1] for one in titles(text)]
+    assert endings == ["optimizer.name=adam)", "optimizer.name=sgd)"]
     assert [row[0] for row in rows(text)].count("fps") == 2, "comparable with both"
     assert len(titles(table(tmp_path, mixed=True))) == 1
 
@@ -158,15 +143,6 @@ def test_one_differing_setting_gives_columns(tmp_path):
     assert ["mops", "1.5", "1.5"] in rows(text)
 
 
-def test_mixed_sizes_and_settings_give_columns_by_size(tmp_path):
-    put_cell(tmp_path, "a", "mops", {"generated": 1.0}, test_noise_std=0.0, m=32)
-    put_cell(tmp_path, "b", "mops", {"generated": 2.0}, test_noise_std=0.1, m=8)
-    assert rows(table(tmp_path, mixed=True))[:2] == [
-        ["sampled by", "m=32", "m=8", "training (wall)"],
-        ["mops", "1", "2", "1 s"],
-    ]
-
-
 def test_two_differing_settings_give_plane_per_sampler(tmp_path):
     put_planes(tmp_path)
     text = table(tmp_path)
@@ -195,12 +171,9 @@ def test_same_samples_under_several_nets_have_column_per_net(tmp_path):
         value = {"w": 0.8, "a": 0.6, "b": 0.4}[digest]
         metrics = {f"test/m{m}/generated/accuracy": value - m / 100 for m in (8, 32)}
         metrics |= {"test/m8/fps/accuracy": 0.1, "test/full/accuracy": 0.9}
-        folder = tmp_path / digest
-        folder.mkdir()
         changes = {"evaluated": evaluated(), "task_weights_sha256": digest}
-        put(folder, "fmops", 32, metrics, net=net, **changes)
-        path = next(folder.rglob("result.json"))
-        edited(path, config={**json.loads(path.read_text())["config"], "weights": weights})
+        config = {"weights": weights}
+        put(tmp_path / digest, "fmops", 32, metrics, net=net, config=config, **changes)
     text = table(tmp_path)
     assert rows(text) == [
         ["m", "sampled by", "pointnet of the training", "dgcnn (x)", "pointnet-1"],

@@ -3,7 +3,7 @@ import json
 import pytest
 
 from mops_lightning.errors import UserError
-from tests.support.reports import DEGREES, put_net, rows, table
+from tests.support.reports import DEGREES, edited, put, put_net, rows, table
 
 
 def test_nets_grid_has_row_per_net(tmp_path):
@@ -18,26 +18,27 @@ def test_nets_grid_has_row_per_net(tmp_path):
     ]
 
 
-def test_nets_grid_unknown_metric_is_refused(tmp_path):
-    put_net(tmp_path, "first", {DEGREES: 7.5}, "registration", iterations=1)
+def test_unknown_metric_is_refused(tmp_path):
+    put_net(tmp_path / "nets", "first", {DEGREES: 7.5}, "registration", iterations=1)
+    put(tmp_path / "samplers", "fps", 32, {"test/sampled/accuracy": 0.3})
     with pytest.raises(UserError, match=r"--metric: no run has 'chamfr'"):
-        table(tmp_path, "chamfr")
+        table(tmp_path / "nets", "chamfr")
+    with pytest.raises(UserError, match=r"--metric: no run has 'acuracy'.*accuracy"):
+        table(tmp_path / "samplers", "acuracy")
 
 
 def test_nets_grid_of_two_seeds_shows_mean_and_deviation(tmp_path):
     put_net(tmp_path, "first", {DEGREES: 6.5}, "registration")
     path = put_net(tmp_path, "second", {DEGREES: 6.0}, "registration")
     assert len(rows(table(tmp_path))) == 2, "the later run of a seed counts"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "seed": 1}))
+    edited(path, seed=1)
     assert rows(table(tmp_path))[1][2] == "6.25 ± 0.35 (n=2)"
 
 
 def test_nets_of_differing_settings_share_a_table_if_mixed(tmp_path):
     put_net(tmp_path, "first", {DEGREES: 6.5}, "registration", iterations=1)
     path = put_net(tmp_path, "second", {DEGREES: 6.0}, "registration", iterations=8)
-    content = json.loads(path.read_text())
-    content["config"]["batch_size"] = 7
-    path.write_text(json.dumps(content))
+    edited(path, config={**json.loads(path.read_text())["config"], "batch_size": 7})
     text = table(tmp_path)
     assert text.count("No sampler was tested") == 2
     assert "(batch_size=7)" in text

@@ -2,13 +2,11 @@
 
 import base64
 import hashlib
-import json
 import re
 
 import pytest
 import torch
 
-from mops_lightning.records import run_record
 from mops_lightning.report.cli import main
 from mops_lightning.viz.figures import save_clouds
 from tests.support.reports import put, put_planes
@@ -29,20 +27,17 @@ def reported(tmp_path_factory):
     """The report of a folder of records, two with clouds."""
     tmp_path = tmp_path_factory.mktemp("reported")
     rng = torch.Generator().manual_seed(0)
-    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3, "test/full/accuracy": 0.9})
     put(tmp_path, "fps", 8, {"test/sampled/accuracy": 0.4})
-    put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.8, "test/matched/accuracy": 0.77})
     put(tmp_path, "voxel", 32, {"test/sampled/accuracy": 0.055})
-    for name, readout in (("fps-32", "sampled"), ("mops-32", "generated")):
-        path = tmp_path / f"{name}-pointnet" / run_record.FILE
-        content = json.loads(path.read_text())
-        content["files"]["clouds"] = "pictures/clouds.npz"
-        path.write_text(json.dumps(content))
+    pictured = {
+        "fps": {"test/sampled/accuracy": 0.3, "test/full/accuracy": 0.9},
+        "mops": {"test/generated/accuracy": 0.8, "test/matched/accuracy": 0.77},
+    }
+    for sampler, metrics in pictured.items():
+        path = put(tmp_path, sampler, 32, metrics, files={"clouds": "clouds.npz"})
         points = torch.rand(2, 50, 3, generator=rng)
-        titles = ["0_chair", "1_</script>"]
-        save_clouds(
-            path.parent / "pictures" / "clouds.npz", points, {readout: points[:, :8]}, titles
-        )
+        drawn = {next(iter(metrics)).split("/")[1]: points[:, :8]}
+        save_clouds(path.parent / "clouds.npz", points, drawn, ["0_chair", "1_</script>"])
     main([str(tmp_path)])
     return tmp_path / "report.html"
 

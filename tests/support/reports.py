@@ -1,5 +1,6 @@
 """Folders of made-up runs, and their tables."""
 
+import json
 import re
 
 from mops_lightning.records import run_record
@@ -20,12 +21,17 @@ def put(folder, sampler, m, metrics, task="classification", net="pointnet", **ch
         "names": names,
         "task": changes.pop("settings", {}),
         "sampler": changes.pop("of", {}),
+        **changes.pop("config", {}),
     }
     score = {"score_name": next(iter(metrics))}
     changes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **score, **changes}
-    target = folder / f"{sampler}-{m}-{net}"
-    target.mkdir()
-    run_record.write(target, record(config=config, metrics=metrics, **changes))
+    made = record(config=config, metrics=metrics, **changes)
+    return run_record.write(folder / f"{sampler}-{m}-{net}", made)
+
+
+def edited(path, **changes):
+    """Change fields of a written record."""
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
 def rows(text):
@@ -48,12 +54,10 @@ def put_cell(folder, name, sampler, values, seed=0, cost=0.5, **settings):
         **settings,
     }
     metrics = {f"test/{readout}/nre_cd": value for readout, value in values.items()}
-    (folder / name).mkdir(parents=True)
     seconds = {"total": 1.0, "fit": cost}
     score = {"score_name": "test/generated/nre_cd", "dataset_fingerprint": "d"}
     content = record(config=config, metrics=metrics, seed=seed, seconds=seconds, **score)
-    run_record.write(folder / name, content)
-    return folder / name / run_record.FILE
+    return run_record.write(folder / name, content)
 
 
 def put_planes(folder):
@@ -64,27 +68,22 @@ def put_planes(folder):
         for gamma in (1e-5, 1e-3, 0.1):
             beta = 10.0**-number
             values = {"generated": gamma + beta, "matched": 3.0}
-            put_cell(
-                folder, f"b{beta}{gamma}", "samplenet", values, of={"beta": beta, "gamma": gamma}
-            )
+            of = {"beta": beta, "gamma": gamma}
+            put_cell(folder, f"b{beta}{gamma}", "samplenet", values, of=of)
 
 
 DEGREES = "rotation_error_deg"
 
 
-def put_pairs(folder, sampler, m, value, net="pcrnet", resample=None, **changes):
+def put_pairs(folder, sampler, m, value, net="pcrnet", **changes):
     changes = {"score_name": f"test/sampled/{DEGREES}", **changes}
     if net == "icp":  # there are no weights to record
         changes["task_weights_sha256"] = None
     metrics = {f"test/sampled/{DEGREES}": value, f"test/full/{DEGREES}": 7.5}
-    put(
-        folder, sampler, m, metrics, "registration", net, settings={"resample": resample}, **changes
-    )
+    put(folder, sampler, m, metrics, "registration", net, **changes)
 
 
 def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):
-    target = folder / f"{name}-{points}"
-    target.mkdir()
     metrics = {f"test/full/{metric}": value for metric, value in metrics.items()}
     config = {
         "learn": "task",
@@ -92,5 +91,6 @@ def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):
         "task": {"net": {"_target_": net, "n_points": points, **settings}},
         "dataset": {"n_points": points},
     }
-    made = {"score_name": next(iter(metrics)), "parameters": {"task": 1_025_000}}
-    return run_record.write(target, record(config=config, metrics=metrics, **made))
+    size = {"task": 1_025_000}
+    made = record(config, metrics=metrics, parameters=size, score_name=next(iter(metrics)))
+    return run_record.write(folder / f"{name}-{points}", made)
