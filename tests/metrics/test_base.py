@@ -82,11 +82,8 @@ def batch(metric):
 def test_metric_of_two_processes_with_equal_data_equals_that_of_one(metric):
     classes = (3,) if issubclass(metric, MulticlassAccuracy) else ()
     alone = metric(*classes)
-    shared = metric(
-        *classes,
-        dist_sync_fn=lambda state, group=None: [state, state],
-        distributed_available_fn=lambda: True,
-    )
+    gather = {"dist_sync_fn": lambda state, group=None: [state, state]}
+    shared = metric(*classes, **gather, distributed_available_fn=lambda: True)
     given = batch(metric)
     for one in (alone, shared):
         one.update(*given)
@@ -101,9 +98,8 @@ def test_collection_metrics_equal_after_first_batch_stay_apart():
     for predicted in (still, half_turn):
         metrics.update(predicted, still)
     found = {name: value.item() for name, value in metrics.compute().items()}
-    assert found == pytest.approx(
-        {"rotation_error_deg": 90, "translation_error": 0, "twice": 180}, abs=1e-3
-    )
+    expected = {"rotation_error_deg": 90, "translation_error": 0, "twice": 180}
+    assert found == pytest.approx(expected, abs=1e-3)
 
 
 class TwiceTheError(TranslationError):

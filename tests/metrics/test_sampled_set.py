@@ -3,9 +3,8 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from mops_lightning import SampleOutput, SamplingMatrix
 from mops_lightning.metrics.sampled_set import SET_METRICS
-from mops_lightning.ops.sampling_matrix import SamplingMatrix
-from mops_lightning.types import SampleOutput
 
 
 def values(name, points, output):
@@ -34,13 +33,10 @@ def test_subset_distance_matches_kd_tree(clouds, rng):
     torch.testing.assert_close(got, torch.tensor(want, dtype=torch.float32))
 
 
-def test_unique_points_counts_each_match_once(clouds):
+def test_unique_points_counts_each_match_or_index_once(clouds):
     samples = torch.stack([clouds[:, 4], clouds[:, 4], clouds[:, 9] + 1e-4], 1)
     got = values("matched/unique_points", clouds, SampleOutput(samples, None, {}))
     assert got.tolist() == [2, 2, 2]
-
-
-def test_unique_points_of_index_sampler_uses_indices(clouds):
     indices = torch.tensor([[0, 1, 1, 2]] * 3)
     output = SampleOutput(clouds[:, indices[0]], indices, {})
     assert values("matched/unique_points", clouds, output).tolist() == [3, 3, 3]
@@ -53,9 +49,8 @@ def test_matrix_metrics_match_ideal_and_uniform_matrix(clouds):
     samples = clouds[:, :5]
     for matrix, percent, error in ((ideal, 100 / 40, 0.0), (uniform, 100.0, None)):
         output = SampleOutput(samples, None, {}, matrix)
-        assert values("matrix/nonzero_percent", clouds, output).tolist() == pytest.approx(
-            [percent] * 3
-        )
+        found = values("matrix/nonzero_percent", clouds, output)
+        assert found.tolist() == pytest.approx([percent] * 3)
         # SᵀS of the uniform matrix is 1/40 everywhere.
         want = error if error is not None else (5 * (1 - 1 / 40) ** 2 + 20 / 40**2) ** 0.5
         got = values("matrix/orthogonality_error", clouds, output)

@@ -1,18 +1,23 @@
 """What every net of one cloud guarantees. A new net adds one line to NETS or CLASSIFIERS."""
 
+from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import pytest
 import torch
 
+from mops_lightning.errors import UserError
 from mops_lightning.nets.atlasnet import AtlasNet
-from mops_lightning.nets.autoencoder import AutoEncoder
+from mops_lightning.nets.autoencoder import AutoEncoder, PointEncoder
 from mops_lightning.nets.dgcnn import DGCNN
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.hierarchical import HierarchicalNet
+from mops_lightning.nets.layers import PointFeatures
+from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import PointNetTransform, PointNetVanilla, TransformNet
 from mops_lightning.samplers.fps import FPSSampler
-from tests.support.mixed import check_close_in_mixed_precision
+from tests.support.mixed import mixed
 
 NETS = {
     "autoencoder": lambda n: AutoEncoder(n, 16, (8, 8)),
@@ -31,7 +36,6 @@ ALL = {**NETS, **CLASSIFIERS}
 
 @pytest.mark.parametrize("name", ALL)
 def test_output_is_independent_of_order_and_batch(name, rng):
-    torch.manual_seed(0)
     net = ALL[name](50).eval()
     points = torch.randn(3, 40, 3, generator=rng)
     out = net(points)
@@ -44,7 +48,6 @@ def test_output_is_independent_of_order_and_batch(name, rng):
 
 @pytest.mark.parametrize("name", ALL)
 def test_all_parameters_have_gradients(name, rng):
-    torch.manual_seed(0)
     net = ALL[name](50)
     for module in net.modules():
         if isinstance(module, TransformNet):  # its last weights are zero, which stops gradients
@@ -55,14 +58,17 @@ def test_all_parameters_have_gradients(name, rng):
 
 @pytest.mark.parametrize("name", ALL)
 def test_mixed_precision_is_close_with_finite_gradients(name, rng):
-    torch.manual_seed(0)
-    check_close_in_mixed_precision(ALL[name](50).eval(), torch.randn(8, 60, 3, generator=rng))
+    net, points = ALL[name](50).eval(), torch.randn(8, 60, 3, generator=rng)
+    single, half = net(points), mixed(net, points)
+    assert half.dtype == torch.float32
+    torch.testing.assert_close(half, single, rtol=0.05, atol=0.05)
+    half.square().sum().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in net.parameters())
 
 
 @pytest.mark.parametrize("name", ["foldingnet", "mfoldingnet", "atlasnet"])
 @pytest.mark.parametrize("n", [4, 7, 50, 101, 300])
 def test_number_of_points_is_variable(name, n, rng):
-    torch.manual_seed(0)
     net = NETS[name](50).eval()
     points = torch.randn(2, 40, 3, generator=rng)
     assert net(points, n).shape == (2, n, 3)
@@ -72,10 +78,63 @@ def test_number_of_points_is_variable(name, n, rng):
 
 @pytest.mark.parametrize("name", [*NETS, "pointnet"])
 def test_result_follows_from_maxima_of_point_features(name, rng):
-    torch.manual_seed(0)
     net: Any = ALL[name](50).eval()
     points = torch.randn(2, 40, 3, generator=rng)
     features = net.point_features(points)
     assert features.min() >= 0
     torch.testing.assert_close(net.from_pooled(features.amax(1)), net(points))
     torch.testing.assert_close(net.point_features(points[:, 7:9]), features[:, 7:9])
+
+
+@pytest.mark.parametrize(
+    ("net", "channels"),
+    [
+        (PointNetVanilla(40), [3, 64, 64, 64, 128, 1024, 512, 256, 40]),
+        (PointEncoder(), [3, 64, 128, 128, 256, 128]),
+    ],
+)
+def test_net_has_published_layers(net, channels):
+    found = [tuple(m.weight.shape) for m in net.modules() if isinstance(m, torch.nn.Linear)]
+    assert found == [(b, a) for a, b in pairwise(channels)]
+
+
+def test_autoencoder_has_published_size():
+    megabytes = 4e-6 * sum(p.numel() for p in AutoEncoder().parameters())
+    assert megabytes == pytest.approx(4.1, abs=0.2)
+
+
+def test_point_features_global_is_maximum_of_local(rng):
+    local, global_ = PointFeatures((8, 6)).eval()(torch.randn(2, 30, 3, generator=rng))
+    assert local.shape == (2, 30, 6)
+    torch.testing.assert_close(global_, local.max(1).values)
+
+
+POINTS = torch.ones(2, 40, 3)
+INVALID: list[tuple[Callable[[], Any], str]] = [
+    (lambda: AtlasNet(pieces=0), r"^pieces must be at least 1, got 0"),
+    (lambda: AtlasNet(3, pieces=4), r"^n_points must be at least pieces=4, got 3"),
+    (lambda: AtlasNet(patch_channels=[0]), r"^patch_channels must be .*got \[0\]"),
+    (lambda: AutoEncoder(0), r"^n_points must be at least 1, got 0"),
+    (lambda: AutoEncoder(codeword=0), r"^codeword must be at least 1, got 0"),
+    (lambda: AutoEncoder(encoder_channels=[]), r"^encoder_channels must be .*got \[\]"),
+    (lambda: AutoEncoder(50)(POINTS, 60), "^n_points must be 50, .* got 60.*mfoldingnet"),
+    (lambda: PointEncoder(0), r"^codeword must be at least 1, got 0"),
+    (lambda: PointEncoder(channels=[0]), r"^channels must be .*got \[0\]"),
+    (lambda: MFoldingNet(pieces=3), r"^pieces must be a divisor of codeword=128, got 3"),
+    (lambda: MFoldingNet(n_points=2), r"^n_points must be at least pieces=4, got 2"),
+    (lambda: MFoldingNet(fold_channels=[]), r"^fold_channels must be .*got \[\]"),
+    (lambda: MFoldingNet()(POINTS, 3), r"^n_points must .* pieces=4, got 3"),
+    (lambda: MFoldingNet(codeword=0), "^codeword must be at least 1, got 0"),
+    (lambda: PCRNet(0), r"^iterations must be at least 1, got 0"),
+    (lambda: PCRNet(feature_channels=[8]), r"^feature_channels must be .* got \[8\]"),
+    (lambda: DGCNN(5, k=0), "k must be at least 1, got 0"),
+    (lambda: DGCNN(5, edge_channels=()), "edge_channels must be"),
+    (lambda: HierarchicalNet(5, FPSSampler, (20, 8), (8, 16)), "one number more than the 2 of po"),
+    (lambda: HierarchicalNet(5, FPSSampler, k=0), "k must be at least 1, got 0"),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), INVALID)
+def test_invalid_argument_raises(make, message):
+    with pytest.raises(UserError, match=message):
+        make()

@@ -17,8 +17,3 @@ def test_icp_of_coincident_points_is_finite():
     found = ICP()(torch.zeros(2, 5, 3), torch.ones(2, 5, 3))
     assert torch.isfinite(found.quaternion).all()
     torch.testing.assert_close(found.apply(torch.zeros(2, 1, 3)), torch.ones(2, 1, 3))
-
-
-def test_icp_has_no_weights():
-    assert not list(ICP().parameters())
-    assert not ICP.differentiable

@@ -31,9 +31,8 @@ def test_pcrnet_is_independent_of_order_and_batch(iterations, rng):
     order = torch.randperm(60, generator=rng)
     shuffled = module(source[:, order], target[:, order.flip(0)])
     torch.testing.assert_close(shuffled, motion, atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(
-        module(source[1:2], target[1:2]).quaternion, motion.quaternion[1:2], atol=1e-5, rtol=1e-5
-    )
+    alone = module(source[1:2], target[1:2]).quaternion
+    torch.testing.assert_close(alone, motion.quaternion[1:2], atol=1e-5, rtol=1e-5)
     assert module(source[:, :20], target).translation.shape == (4, 3)
 
 
@@ -77,17 +76,9 @@ def spread(module, rng):
 
 
 def test_pcrnet_initial_weights_keep_the_signal(rng):
-    torch.manual_seed(0)
     module = PCRNet().eval()
     ours = spread(module, rng)
     for layer in module.modules():
         if isinstance(layer, torch.nn.Linear):
             layer.reset_parameters()
     assert ours > 20 * spread(module, rng)
-
-
-def test_pcrnet_invalid_argument_raises():
-    with pytest.raises(UserError, match=r"^iterations must be at least 1, got 0"):
-        PCRNet(0)
-    with pytest.raises(UserError, match=r"^feature_channels must be .* got \[8\]"):
-        PCRNet(feature_channels=[8])

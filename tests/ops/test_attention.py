@@ -63,6 +63,5 @@ def test_attend_many_points_keep_precision(rng):
     queries, keys = torch.zeros(3, 4), torch.zeros(300_000, 4)
     values = torch.rand(300_000, 3, generator=rng)
     found = attend(queries, keys, values).result()
-    torch.testing.assert_close(
-        found, values.double().mean(0).float().expand(3, 3), rtol=1e-6, atol=0
-    )
+    expected = values.double().mean(0).float().expand(3, 3)
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)

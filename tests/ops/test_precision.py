@@ -84,7 +84,6 @@ def test_max_pool_half_precision_is_close_with_its_gradients(n, norm, rng):
     ids=["pcrnet", "mfoldingnet", "foldingnet"],
 )
 def test_nets_under_plain_autocast_are_close(make, rng):
-    torch.manual_seed(0)
     net = make()
     points = torch.randn(4, 60, 3, generator=rng)
     arguments = (points, points + 0.1) if isinstance(net, PCRNet) else (points,)

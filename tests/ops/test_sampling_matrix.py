@@ -55,11 +55,6 @@ def test_sample_is_streamed_above_a_number_of_entries(monkeypatch):
     assert len(calls) == 1
 
 
-def test_first_cloud_has_all_columns():
-    matrix, _ = random_matrix()
-    torch.testing.assert_close(matrix.first_cloud().dense(), matrix.dense()[:1])
-
-
 def test_sample_gradients_equal_dense(path):
     matrix, points = random_matrix()
     inputs = [t.clone().requires_grad_() for t in (matrix.queries, matrix.keys, points)]
@@ -78,9 +73,8 @@ def test_sample_large_logits_do_not_overflow(path):
     assert torch.isfinite(sampled).all()
     # At this temperature every column has one winner.
     winners = (matrix.keys @ matrix.queries.T).argmax(1)
-    torch.testing.assert_close(
-        sampled, points.gather(1, winners[..., None].expand(-1, -1, 3)), atol=1e-3, rtol=0
-    )
+    expected = points.gather(1, winners[..., None].expand(-1, -1, 3))
+    torch.testing.assert_close(sampled, expected, atol=1e-3, rtol=0)
 
 
 def test_sample_float32_streamed_is_as_accurate_as_dense():
@@ -146,7 +140,8 @@ def test_queries_of_every_cloud_equal_matrices_of_single_clouds(path):
     assert both.leftmost(4).m == 4
 
 
-def test_leftmost_is_first_columns():
+def test_leftmost_is_first_columns_and_first_cloud_has_all():
     matrix, points = random_matrix()
     torch.testing.assert_close(matrix.leftmost(4).dense(), matrix.dense()[:, :, :4])
     torch.testing.assert_close(matrix.leftmost(4).sample(points), matrix.sample(points)[:, :4])
+    torch.testing.assert_close(matrix.first_cloud().dense(), matrix.dense()[:1])

@@ -1,18 +1,15 @@
 """MOPS-Net with anchors against farthest points and a dense softmax of distances."""
 
-from typing import Any
-
 import pytest
 import torch
 
+from mops_lightning import FMOPSNet, MOPSNet
 from mops_lightning.errors import UserError
 from mops_lightning.ops import attention
 from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.anchors import SPACING_POINTS
 from mops_lightning.samplers.base import stream_sample
-from mops_lightning.samplers.fmops import FMOPSNet
-from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.training.recipe.warm_start import copy_tensors
 from mops_lightning.zoo.export import plain_net
 
@@ -143,21 +140,3 @@ def test_anchors_refuse_chunks_and_export(rng):
         stream_sample(net, lambda: torch.randn(50, 3, generator=rng).split(20))
     with pytest.raises(UserError, match="MOPSNet with anchors=fps cannot be exported"):
         plain_net(net)
-
-
-def test_unknown_anchors_raise():
-    unknown: Any = "voxel"
-    with pytest.raises(UserError, match=r"^anchors must be fps or null, got 'voxel'"):
-        MOPSNet(4, anchors=unknown)
-
-
-@pytest.mark.parametrize("width", [0.0, -1.0, float("nan"), 1e30])
-def test_anchor_width_out_of_range_raises(width):
-    with pytest.raises(UserError, match=r"^anchor_width must be above 0 and at most 100, got"):
-        small(anchor_width=width)
-
-
-def test_anchor_width_without_anchors_raises():
-    with pytest.raises(UserError, match=r"^anchor_width has no effect without anchors=fps"):
-        MOPSNet(4, anchor_width=0.3)
-    MOPSNet(4, anchor_width=0.5)

@@ -1,23 +1,29 @@
 """The samplers' constructors: documented defaults, limits of arguments, and sizes."""
 
 from inspect import Parameter, signature
+from math import inf, nan
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hydra.utils import get_class
 
+from mops_lightning import (
+    FMOPSNet,
+    FPSSampler,
+    GumbelSampler,
+    MOPSNet,
+    PoissonSampler,
+    ProgressiveSampleNet,
+    SampleNet,
+    Sampler,
+    SerialSampler,
+    SNet,
+    VoxelSampler,
+)
 from mops_lightning.config.compose import compose, conf_dir
-from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.fmops import FMOPSNet
-from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.gumbel import GumbelSampler
-from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.poisson import PoissonSampler
-from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
-from mops_lightning.samplers.serial import SerialSampler
-from mops_lightning.samplers.snet import SNet
-from mops_lightning.samplers.voxel import VoxelSampler
+from mops_lightning.errors import UserError
 from mops_lightning.zoo.load import package_samplers
 
 FILES = [
@@ -34,14 +40,54 @@ LIMITS: list[tuple[type[Sampler], dict[str, Any]]] = [
     (SNet, {"alpha": 0.0, "coverage": 0.0, "coverage_per_point": 0.0}),
     (SampleNet, {"k": 1, "beta": 0.0, "gamma": 0.0, "sigma_min": 0.0}),
     (SampleNet, {"k": 60}),
+    (MOPSNet, {"anchor_width": 0.5}),
     (ProgressiveSampleNet, {"min_size": 1}),
 ]
 """The smallest and largest allowed arguments."""
+START = "start must be at least 0, farthest, or null.* got"
+STARTS: tuple[Any, ...] = (-1, "nearest", "", True, 1.0, [0], np.array([1, 2]))
+WIDTH = "anchor_width must be above 0 and at most 100, got"
+WIDTHS = (0.0, -1.0, nan, 1e30)
+INVALID: list[tuple[type[Sampler], dict[str, Any], str]] = [
+    *((FPSSampler, {"start": start}, START) for start in STARTS),
+    (MOPSNet, {"tau_min": 0.0}, "tau_min must be above 0 and at most 1, got 0.0"),
+    (MOPSNet, {"tau_min": 1.5}, "tau_min must be above 0 and at most 1, got 1.5"),
+    (MOPSNet, {"feature_channels": ()}, "feature_channels must be sizes of at least 1 layer,"),
+    (MOPSNet, {"rho_channels": (8, 0)}, "rho_channels must be sizes"),
+    (MOPSNet, {"overlap": -1.0}, "overlap must be at least 0, got -1.0"),
+    (MOPSNet, {"overlap": nan}, "overlap must be at least 0, got nan"),
+    (MOPSNet, {"threshold": 1.0}, "threshold must be at least 0 and below 1, got 1.0"),
+    (MOPSNet, {"alpha": -1.0}, "alpha must be at least 0, got -1.0"),
+    (MOPSNet, {"alpha": inf}, "alpha must be at least 0, got inf"),
+    (MOPSNet, {"anchors": "voxel"}, "anchors must be fps or null, got 'voxel'"),
+    *((MOPSNet, {"anchors": "fps", "anchor_width": width}, WIDTH) for width in WIDTHS),
+    (MOPSNet, {"anchor_width": 0.3}, "anchor_width has no effect without anchors=fps"),
+    (FMOPSNet, {"size_sampling": "nestd"}, "size_sampling: unknown 'nestd'.*nested"),
+    (FMOPSNet, {"num_sizes": 0}, "num_sizes must be at least 1, got 0"),
+    (FMOPSNet, {"min_size": 0}, "min_size must be at least 1, got 0"),
+    (FMOPSNet, {"tau_min": 0.0}, "tau_min must"),
+    (GumbelSampler, {"tau_min": 0}, "tau_min must be above 0 and at most 1, got 0"),
+    (GumbelSampler, {"tau_min": 1.5}, "tau_min must be above 0 and at most 1, got 1.5"),
+    (GumbelSampler, {"feature_channels": ()}, "feature_channels must be sizes"),
+    (SNet, {"alpha": -1.0}, "alpha must be at least 0, got -1.0"),
+    (SNet, {"alpha": nan}, "alpha must be at least 0, got nan"),
+    (SNet, {"coverage": -1.0}, "coverage must be at least 0"),
+    (SNet, {"feature_channels": (8,)}, "feature_channels must be sizes of at least 2 layers"),
+    (SNet, {"head_channels": (0,)}, "head_channels must be .* each at least 1, got .0."),
+    (SampleNet, {"k": 0}, "k must be .*at least"),
+    (SampleNet, {"beta": -1.0}, "beta must be .*at least"),
+    (SampleNet, {"beta": nan}, "beta must be .*at least"),
+    (SampleNet, {"gamma": -1.0}, "gamma must be .*at least"),
+    (SampleNet, {"sigma_min": -1}, "sigma_min must be .*at least"),
+    (ProgressiveSampleNet, {"min_size": 0}, "min_size must be at least 1, got 0"),
+    (ProgressiveSampleNet, {"size_reduction": "summ"}, "size_reduction: unknown 'summ'.*sum"),
+]
+"""Arguments outside of these limits, and the errors."""
 NOT_FLEXIBLE = (GumbelSampler, MOPSNet, SNet, SampleNet)
 FLEXIBLE_NOT_NESTED = (VoxelSampler, PoissonSampler, SerialSampler)
 
 
-@pytest.mark.parametrize("name", [path.stem for path in FILES if path.stem != "own"])
+@pytest.mark.parametrize("name", [path.stem for path in FILES])
 def test_constructor_has_the_defaults_of_its_file(name):
     node = compose([f"sampler={name}", "recipe=paper"]).sampler
     defaults: dict[str, Any] = {}
@@ -65,3 +111,9 @@ def test_constructor_accepts_limits(sampler, arguments, rng):
     made = sampler(8, **arguments)
     clouds = torch.randn(3, 60, 3, generator=rng)
     assert made.train()(clouds).points.shape == (3, 8, 3)
+
+
+@pytest.mark.parametrize(("sampler", "arguments", "message"), INVALID)
+def test_constructor_names_the_argument_outside_of_its_limits(sampler, arguments, message):
+    with pytest.raises(UserError, match=f"^{message}"):
+        sampler(8, **arguments)

@@ -3,11 +3,8 @@
 import pytest
 import torch
 
+from mops_lightning import GumbelSampler, MOPSNet, Sampler, SNet
 from mops_lightning.errors import UserError
-from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.gumbel import GumbelSampler
-from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.snet import SNet
 from tests.support.samplers import SAMPLERS
 
 SEEDED = ["random", "fps", "poisson"]

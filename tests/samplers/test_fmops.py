@@ -3,9 +3,7 @@ import math
 import pytest
 import torch
 
-from mops_lightning.errors import UserError
-from mops_lightning.samplers.fmops import FMOPSNet
-from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning import FMOPSNet, MOPSNet
 from tests.support.losses import subset_loss
 
 
@@ -69,28 +67,12 @@ def test_training_sizes_begin_at_min_size(size_sampling):
     sizes = drawn(2000, 32, size_sampling=size_sampling, num_sizes=2, min_size=8)
     assert {size for step in sizes for size in step} == set(range(8, 33))
     assert set(small(4, size_sampling=size_sampling, min_size=8).training_sizes()) == {4}
+    assert set(small(1, size_sampling=size_sampling).training_sizes()) == {1}
+    tiny = drawn(99, 3, size_sampling=size_sampling, num_sizes=1)
+    assert {size for step in tiny for size in step} <= {1, 2, 3}
 
 
 def test_nested_training_sizes_split_the_range_from_min_size():
     for small_size, large_size in drawn(300, num_sizes=2, min_size=8):
         # The middle of the range of logarithms: sqrt(8 · 513) = 64.06.
         assert 8 <= small_size <= 64 <= large_size <= 512
-
-
-def test_training_sizes_of_tiny_net_are_valid():
-    assert set(small(1).training_sizes()) == {1}
-    assert {size for _ in range(99) for size in small(3, num_sizes=1).training_sizes()} <= {1, 2, 3}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"size_sampling": "nestd"}, "^size_sampling: unknown 'nestd'.*nested"),
-        ({"num_sizes": 0}, "^num_sizes must be at least 1, got 0"),
-        ({"min_size": 0}, "^min_size must be at least 1, got 0"),
-        ({"tau_min": 0.0}, "^tau_min must"),
-    ],
-)
-def test_fmops_invalid_argument_raises(arguments, message):
-    with pytest.raises(UserError, match=message):
-        small(**arguments)

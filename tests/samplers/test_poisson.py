@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning import FPSSampler, RandomSampler
 from mops_lightning.samplers.poisson import PoissonSampler, eliminate, spacing_bound
-from mops_lightning.samplers.random import RandomSampler
 from tests.support.clouds import cloud_of
 
 KINDS = ["sphere", "grid", "copies", "one point", "offset", "tiny", "huge", "outlier"]
@@ -79,9 +78,12 @@ def test_eliminate_divides_crowding_by_weight(n, m, kind, rng):
         assert weight.gather(1, kept).mean() > 1.2 * weight.mean()
 
 
-def test_eliminate_non_contiguous_equals_plain_form(rng):
+def test_eliminate_of_points_not_contiguous_or_with_gradients_equals_plain_form(rng):
     points = torch.rand(3, 400, 2, generator=rng, dtype=torch.float64).transpose(0, 2)[:, ::2]
-    assert torch.equal(eliminate(points, 30), in_steps(points, 30))
+    expected = in_steps(points, 30)
+    assert torch.equal(eliminate(points, 30), expected)
+    chosen = PoissonSampler(30)(points.clone().requires_grad_()).indices
+    assert torch.equal(chosen, PoissonSampler(30)(points).indices)
 
 
 def test_eliminate_of_many_copies_does_not_overflow():
@@ -100,12 +102,6 @@ def test_spacing_bound_is_upper_bound(m, rng):
         spacing = torch.cdist(points[:, rows], points[:, rows])
         spacing.diagonal(dim1=1, dim2=2).fill_(torch.inf)
         assert (spacing.amin((1, 2)) <= bound[:, 0]).all()
-
-
-def test_poisson_of_points_with_gradients_equals_points_without(rng):
-    points = torch.randn(1, 30, 3, generator=rng, dtype=torch.float64)
-    found = PoissonSampler(5)(points.clone().requires_grad_())
-    assert torch.equal(found.indices, PoissonSampler(5)(points).indices)
 
 
 def spacing(points):

@@ -4,20 +4,14 @@ import numpy as np
 import pytest
 import torch
 
+from mops_lightning import FPSSampler, MOPSNet, PoissonSampler, RandomSampler, SNet, VoxelSampler
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.weights import curvature
-from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.poisson import PoissonSampler
-from mops_lightning.samplers.random import RandomSampler
-from mops_lightning.samplers.snet import SNet
-from mops_lightning.samplers.voxel import VoxelSampler
 
 
 @pytest.fixture
 def net():
-    torch.manual_seed(0)
     return MOPSNet(8).eval()
 
 
@@ -26,10 +20,6 @@ def clouds():
     """Three clouds of 20, 40 and 20 points, far from the origin and large."""
     rng = torch.Generator().manual_seed(0)
     return [50 + 10 * torch.rand(number, 3, generator=rng) for number in (20, 40, 20)]
-
-
-def one_by_one(net, clouds, **arguments):
-    return [net.downsample(cloud, **arguments) for cloud in clouds]
 
 
 @pytest.mark.parametrize("readout", ["matched", "completed"])
@@ -62,7 +52,7 @@ def test_shift_and_scale_change_nothing(net, clouds):
 
 @pytest.mark.parametrize("readout", ["generated", "completed"])
 def test_batch_gives_the_same_as_single_clouds(net, clouds, readout):
-    single = one_by_one(net, clouds, readout=readout)
+    single = [net.downsample(cloud, readout=readout) for cloud in clouds]
     batch = torch.arange(3).repeat_interleave(torch.tensor([20, 40, 20]))
     flat, flat_indices = net.downsample(torch.cat(clouds), None, readout, batch=batch)
     for i, (expected, _) in enumerate(single):
@@ -118,11 +108,6 @@ def test_double_precision_sampler_takes_any_points(net, clouds):
     assert points.dtype == torch.float32
 
 
-def test_learned_sampler_in_training_mode_is_refused():
-    with pytest.raises(UserError, match=r"call eval\(\)"):
-        SNet(8).downsample(torch.rand(20, 3))
-
-
 POINTS = torch.rand(2, 20, 3)
 MISTAKES: dict[str, tuple[tuple[Any, ...], dict[str, Any], str]] = {
     "type": (([1.0],), {}, "points must be a tensor or an array, got list"),
@@ -163,15 +148,11 @@ def test_weights_of_single_batched_and_ragged_clouds_agree(sampler, net, rng):
     assert torch.equal(chosen, gather_points(points, rows))
     assert (weight.gather(1, rows) > 0).all()
     assert all(len(set(part)) == 8 for part in rows.tolist())
-    single = [
-        sampler.downsample(cloud, weight=part)[1]
-        for cloud, part in zip(points, weight, strict=True)
-    ]
+    clouds = zip(points, weight, strict=True)
+    single = [sampler.downsample(cloud, weight=part)[1] for cloud, part in clouds]
     assert torch.equal(torch.stack(single), rows)
-    batch = torch.arange(3).repeat_interleave(40)
-    flat = sampler.downsample(
-        points.flatten(0, 1).numpy(), batch=batch, weight=weight.flatten().numpy()
-    )
+    batch, flat_points = torch.arange(3).repeat_interleave(40), points.flatten(0, 1).numpy()
+    flat = sampler.downsample(flat_points, batch=batch, weight=weight.flatten().numpy())
     assert flat[1].tolist() == (rows + 40 * torch.arange(3)[:, None]).flatten().tolist()
 
 
@@ -180,9 +161,8 @@ def test_weights_by_curvature_are_those_of_each_cloud(rng):
     weight = curvature(points.numpy())
     expected = FPSSampler(8).downsample(points, weight=weight)[1]
     assert torch.equal(FPSSampler(8).downsample(points, weight="curvature")[1], expected)
-    both = FPSSampler(8).downsample(
-        points.repeat(2, 1), batch=torch.arange(180) // 90, weight="curvature"
-    )
+    twice, batch = points.repeat(2, 1), torch.arange(180) // 90
+    both = FPSSampler(8).downsample(twice, batch=batch, weight="curvature")
     assert torch.equal(both[1][:8], expected)
 
 
@@ -192,11 +172,13 @@ def test_weights_by_curvature_are_those_of_each_cloud(rng):
         (torch.ones(39), r"shape \(40,\)"),
         ("density", "must be 'curvature' or numbers, got 'density'"),
         (torch.arange(40) < 7, "7 points have a weight above 0, fewer than m=8"),
+        (torch.ones(5), "m must be at most the number of points N=5, got m=8"),
     ],
 )
 def test_weights_that_cannot_be_used_are_rejected(weight, said):
+    number = 5 if "N=5" in said else 40
     with pytest.raises(UserError, match=said):
-        RandomSampler(8).downsample(torch.rand(40, 3), weight=weight)
+        RandomSampler(8).downsample(torch.rand(number, 3), weight=weight)
 
 
 @pytest.mark.parametrize("weight", [None, "curvature", torch.ones(40)])
@@ -206,13 +188,10 @@ def test_points_that_are_not_finite_are_rejected(weight):
         RandomSampler(8).downsample(points, weight=weight)
 
 
-def test_weights_of_too_few_points_are_rejected():
-    with pytest.raises(UserError, match="m must be at most the number of points N=5, got m=8"):
-        RandomSampler(8).downsample(torch.rand(5, 3), weight=torch.ones(5))
-
-
-def test_weights_for_other_methods_are_rejected(net):
+def test_weights_for_other_methods_and_samplers_in_training_mode_are_rejected(net):
     with pytest.raises(UserError, match="VoxelSampler takes no weights"):
         VoxelSampler(8).downsample(torch.rand(40, 3), weight=torch.ones(40))
     with pytest.raises(UserError, match="generated readout takes no weights"):
         net.downsample(torch.rand(40, 3), readout="generated", weight=torch.ones(40))
+    with pytest.raises(UserError, match=r"call eval\(\)"):
+        SNet(8).downsample(torch.rand(20, 3))

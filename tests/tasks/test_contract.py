@@ -1,5 +1,6 @@
 """Every task trains with every sampler and every value of ``learn`` that exists."""
 
+from functools import partial
 from typing import Any
 
 import pytest
@@ -32,12 +33,8 @@ LEARNED = ("mops", "fmops", "snet", "samplenet", "samplenet-progressive")
 def trained_parts(task: str, sampler: str | None, learn: Any) -> set[str]:
     """Train one step and return which of task and sampler changed: weights or statistics."""
     torch.manual_seed(0)
-    module = Experiment(
-        TASKS[task](),
-        None if sampler is None else SAMPLERS[sampler](LARGEST),
-        learn=learn,
-        make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
-    )
+    made = None if sampler is None else SAMPLERS[sampler](LARGEST)
+    module = Experiment(TASKS[task](), made, learn, partial(torch.optim.Adam, lr=1e-2))
     data = small_dataset(train=4, points=POINTS)
     loader = CloudLoader(data.train, 4, shuffle=True, make_batch=module.task.make_batch)
     before = state(module)
@@ -65,7 +62,6 @@ def test_task_step_without_sampler_changes_task(task):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_disagreement_is_zero_only_for_equal_predictions(task: str) -> None:
-    torch.manual_seed(0)
     module = TASKS[task]().eval()
     loader = CloudLoader(small_dataset(4, points=POINTS).test, 4, make_batch=module.make_batch)
     batch = next(iter(loader))

@@ -35,7 +35,6 @@ def plain_improve(features, indices, objective, passes):
 
 @pytest.mark.parametrize("m", [1, 5])
 def test_refine_with_full_shortlist_equals_exhaustive_exchange(m, rng, monkeypatch):
-    torch.manual_seed(0)
     monkeypatch.setattr(module, "SHORTLIST", 30)
     features = torch.randn(3, 30, 12, dtype=torch.float64, generator=rng).relu()
     indices = torch.stack([torch.randperm(30, generator=rng)[:m] for _ in range(3)])
@@ -50,21 +49,15 @@ def test_refine_with_full_shortlist_equals_exhaustive_exchange(m, rng, monkeypat
         assert got == plain_improve(alone, indices[number].tolist(), one, 3)
 
 
-def test_refine_exchanges_nothing_for_rounding_errors(rng):
+def test_refine_exchanges_nothing_for_rounding_errors_or_without_other_points(rng):
     features = torch.rand(2, 30, 8, generator=rng)
-    rows = torch.arange(20).expand(2, -1)
-    assert torch.equal(improve(features, rows, lambda p, _: 1e-10 * p.mean(1), 2), rows)
-    assert not torch.equal(improve(features, rows, lambda p, _: p.mean(1), 2), rows)
-
-
-def test_refine_of_all_points_leaves_them(rng):
-    features = torch.rand(2, 30, 8, generator=rng)
-    rows = torch.arange(30).expand(2, -1)
-    assert torch.equal(improve(features, rows, lambda p, _: p.mean(1), 2), rows)
+    few, every = (torch.arange(number).expand(2, -1) for number in (20, 30))
+    assert torch.equal(improve(features, few, lambda p, _: 1e-10 * p.mean(1), 2), few)
+    assert not torch.equal(improve(features, few, lambda p, _: p.mean(1), 2), few)
+    assert torch.equal(improve(features, every, lambda p, _: p.mean(1), 2), every)
 
 
 def test_refine_lowers_objective_and_keeps_rows_distinct(rng):
-    torch.manual_seed(0)
     features = torch.randn(6, 80, 20, generator=rng).relu()
     indices = torch.stack([torch.randperm(80, generator=rng)[:9] for _ in range(6)])
     objective = distance(features.amax(1))

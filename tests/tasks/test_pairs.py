@@ -63,11 +63,8 @@ def test_pairs_resample_draws_different_points(rng):
         assert mine != theirs
 
 
-def test_pairs_resample_below_one_raises():
+def test_pairs_resample_out_of_range_raises(rng):
     with pytest.raises(UserError, match=r"^resample must be .*got 0"):
         Pairs(resample=0)
-
-
-def test_pairs_resample_above_n_points_raises(rng):
     with pytest.raises(UserError, match=r"^resample must be at most the 50 .*got 51"):
         Pairs(resample=51)(clouds(rng), generators(6))

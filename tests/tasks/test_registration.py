@@ -2,14 +2,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from mops_lightning import FPSSampler, MOPSNet
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.metrics.registration import RotationError
 from mops_lightning.nets.icp import ICP
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.ops.rigid import Motion, identity_motion
-from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.base import figures_of
 from mops_lightning.tasks.registration import Registration, pair_batch
 from mops_lightning.training.experiment import Experiment
