@@ -7,7 +7,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 import random
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,9 @@ SLOW_FILES = (
     *("cli/test_resume", "docs/test_site", "report/test_page", "fuzz/test_command_lines"),
     *("test_wheel", "training/test_precision", "training/run/test_load", "zoo/test_export"),
     *("training/recipe/test_warm_start", "cli/test_sweep", "files/test_batch", "zoo/test_models"),
+    *("docs/test_extend", "docs/test_own_network", "hydra_plugins/test_grid_sweeper"),
+    *("config/test_sweeps", "samplers/test_contract", "training/run/test_run"),
+    *("training/run/test_build", "training/test_evaluation", "tasks/test_contract"),
 )
 """Files of few tests that take long. They begin first, or one process would end alone with one."""
 
@@ -55,12 +58,16 @@ def pytest_runtest_setup() -> None:
 
 
 @pytest.fixture(scope="session")
-def real_data() -> Path:
-    """The folder of real data that the user names; tests on it are skipped without one."""
-    folder = os.environ.get("MOPS_DATA")
-    if not folder:
-        pytest.skip("MOPS_DATA is not set: no real data to test on")
-    return Path(folder)
+def real_data() -> Callable[[str], Path]:
+    """A function that finds real data below the folder that the user names, or skips the test."""
+
+    def find(name: str) -> Path:
+        path = Path(os.environ.get("MOPS_DATA", "MOPS_DATA")) / name
+        if not path.exists():
+            pytest.skip(f"{path} is not there: no real data to test on")
+        return path
+
+    return find
 
 
 @pytest.fixture

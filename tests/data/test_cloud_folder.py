@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import trimesh
+from trimesh.creation import box
 
 from mops_lightning.data import cloud_folder as module
 from mops_lightning.data.cloud_folder import random_crops
@@ -13,6 +13,7 @@ from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
+from tests.support.meshes import write_mesh
 
 cloud_folder = partial(module.cloud_folder, test_frames=None, crop="nearest", crops=32)
 
@@ -30,11 +31,11 @@ def folder(tmp_path):
     """One cloud per format, and a mesh."""
     for seed, suffix in enumerate(FORMATS):
         write(tmp_path / f"scan_{seed}{suffix}", seed)
-    trimesh.creation.box().export(tmp_path / "box.stl")
+    write_mesh(tmp_path / "box.stl", box())
     return tmp_path
 
 
-def test_cloud_folder_reads_every_format_without_labels(folder):
+def test_cloud_folder_reads_every_format_without_labels_and_each_file_for_one_split(folder):
     data = cloud_folder(folder, n_points=64, crops=3)
     assert data.class_names == ("cloud",)
     assert data.train.points.shape == (18, 64, 3)
@@ -43,13 +44,8 @@ def test_cloud_folder_reads_every_format_without_labels(folder):
     assert torch.isfinite(data.train.points).all()
     assert data.train.points.norm(dim=2).amax(1).allclose(torch.ones(18))
     assert data.train.points.mean(1).abs().max() < 1e-5
-
-
-def test_cloud_folder_file_is_in_one_split(folder):
-    data = cloud_folder(folder, n_points=64, crops=3)
-    train, test = data.train.sources, data.test.sources
-    assert train is not None
-    assert test is not None
+    sources: list[Any] = [data.train.sources, data.test.sources]
+    train, test = sources
     assert train.bincount()[train.unique()].eq(3).all()
     assert not set(train.tolist()) & set(test.tolist())
 
@@ -121,41 +117,25 @@ def test_cloud_folder_splits_every_class_by_share(tmp_path):
     assert torch.equal(again.test.points, data.test.points)
 
 
-@pytest.fixture
-def sequences(tmp_path):
+def test_cloud_folder_splits_sequences_by_time(tmp_path):
     """Two sequences of boxes that grow with time; frame numbers are not padded."""
     for name, frames in (("crane", 12), ("samba", 10)):
-        (tmp_path / name).mkdir()
         for frame in range(frames):
-            box = trimesh.creation.box((1, 1, 1 + frame))
-            box.export(tmp_path / name / f"mesh_{frame}.ply")
+            write_mesh(tmp_path / name / f"mesh_{frame}.ply", box((1, 1, 1 + frame)))
         (tmp_path / name / "notes.txt").write_text("no mesh")
-    return tmp_path
-
-
-def frame_numbers(clouds, label):
-    """Return the frames of a sequence from the proportions of the boxes."""
-    points = clouds.points[clouds.labels == label]
-    size = points.amax(1) - points.amin(1)
-    return sorted((size[:, 2] / size[:, 0] - 1).round().int().tolist())
-
-
-def test_cloud_folder_splits_sequences_by_time(sequences):
-    data = cloud_folder(
-        sequences, 3000, test_frames="last", test_share=0.25, gap=2, crop="surface", crops=1
-    )
+    by_time: dict[str, Any] = {"test_frames": "last", "test_share": 0.25, "gap": 2}
+    data = cloud_folder(tmp_path, 3000, crop="surface", crops=1, **by_time)
     assert data.class_names == ("crane", "samba")
-    assert [frame_numbers(data.test, label) for label in (0, 1)] == [[9, 10, 11], [8, 9]]
-    assert [frame_numbers(data.train, label) for label in (0, 1)] == [
-        list(range(7)),
-        list(range(6)),
-    ]
+    found = []
+    for clouds in (data.test, data.train):
+        size = clouds.points.amax(1) - clouds.points.amin(1)
+        times = (size[:, 2] / size[:, 0] - 1).round().int()
+        found += [sorted(times[clouds.labels == label].tolist()) for label in (0, 1)]
+    assert found == [[9, 10, 11], [8, 9], list(range(7)), list(range(6))]
 
 
 def test_cloud_folder_real_sequences(real_data):
-    root = real_data / "vlasic2008"
-    if not root.is_dir():
-        pytest.skip(f"{root} is not there")
+    root = real_data("vlasic2008")
     data = cloud_folder(root, 64, test_frames="last", gap=2, crop="surface", crops=1)
     assert data.class_names == ("crane", "samba")
     assert len(data.test.labels) == 24

@@ -57,36 +57,26 @@ def test_hdf5_invalid_input_raises(folder, tmp_path):
         hdf5(folder, 20)
 
 
-def change_file(path, key, **options):
-    with h5py.File(path, "a") as file:
-        del file[key]
-        file.create_dataset(key, **options)
+def of_shapes(number, **options):
+    """Arguments of datasets that announce a number of shapes."""
+    points = {"shape": (number, 50, 3), "dtype": "f4", **options}
+    return {"data": points, "label": {"shape": (number,), "dtype": "u1", **options}}
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"label": {"data": np.full(6, 2_000_000_000)}}, "labels from 0 to 9999, without shape_"),
-        (
-            {"data": {"shape": (0, 50, 3), "dtype": "f4"}, "label": {"shape": (0,), "dtype": "u1"}},
-            "no shapes",
-        ),
-        (
-            {
-                "data": {"shape": (10**9, 50, 3), "dtype": "f4", "chunks": (1, 50, 3)},
-                "label": {"shape": (10**9,), "dtype": "u1", "chunks": (9,)},
-            },
-            "announces 1,000,000,000 shapes",
-        ),
-        (
-            {"data": {"shape": (6, 50, 3), "dtype": "f4", "external": "/etc/passwd"}},
-            "'data' refers to other files",
-        ),
+        (of_shapes(0), "no shapes"),
+        (of_shapes(10**9, chunks=True), "announces 1,000,000,000 shapes"),
+        ({"data": of_shapes(6, external="/etc/passwd")["data"]}, "'data' refers to other files"),
     ],
 )
 def test_hdf5_crafted_file_raises(changes, message, folder):
-    for key, options in changes.items():
-        change_file(folder / "train.h5", key, **options)
+    with h5py.File(folder / "train.h5", "a") as file:
+        for key, options in changes.items():
+            del file[key]
+            file.create_dataset(key, **options)
     with pytest.raises(UserError, match=message):
         hdf5(folder, 20)
 
@@ -108,10 +98,7 @@ def test_hdf5_data_of_another_file_raises(link, folder):
 
 
 def test_hdf5_real_data(real_data):
-    root = real_data / "modelnet40_airplane_10000"
-    if not root.is_dir():
-        pytest.skip(f"{root} is not there")
-    data = hdf5(root, n_points=10_000)
+    data = hdf5(real_data("modelnet40_airplane_10000"), n_points=10_000)
     assert data.train.points.shape == (626, 10_000, 3)
     assert data.test.points.shape == (100, 10_000, 3)
     assert data.test.points.norm(dim=2).max() < 1.001

@@ -1,8 +1,6 @@
 import hashlib
-import os
 import shutil
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
@@ -21,14 +19,16 @@ FILES = {"train": (0, 1, 2, 10), "test": (0, 1)}
 STORED = 12
 
 
-def cloud(split: str, file: int, row: int) -> np.ndarray:
+def cloud(split, file, row):
     """Return points that identify where they are stored."""
     random = np.random.default_rng([len(split), file, row])
     return random.uniform(-1, 1, (STORED, 3)).astype(np.float32)
 
 
-def write_layout(folder: Path) -> Path:
+@pytest.fixture
+def layout(tmp_path):
     """Write the public layout with 5 shapes per file and labels 0, 1, 2, 0, 1."""
+    folder = tmp_path / "data" / FOLDER
     folder.mkdir(parents=True)
     (folder / "shape_names.txt").write_text("\n".join(NAMES) + "\n\n")
     for split, numbers in FILES.items():
@@ -42,13 +42,9 @@ def write_layout(folder: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def layout(tmp_path: Path) -> Path:
-    return write_layout(tmp_path / "data" / FOLDER)
-
-
-def test_modelnet_reads_all_shapes_in_order(layout: Path) -> None:
+def test_modelnet_reads_all_shapes_in_order(layout):
     dataset = modelnet40(layout, n_points=STORED)
+    assert modelnet40(str(layout.parent), n_points=STORED).fingerprint == dataset.fingerprint
     assert dataset.class_names == NAMES
     for split, clouds in (("train", dataset.train), ("test", dataset.test)):
         expected = [cloud(split, number, row) for number in FILES[split] for row in range(5)]
@@ -58,13 +54,7 @@ def test_modelnet_reads_all_shapes_in_order(layout: Path) -> None:
         assert clouds.points.is_contiguous()
 
 
-def test_modelnet_accepts_parent_folder(layout: Path) -> None:
-    above, itself = modelnet40(layout.parent, n_points=4), modelnet40(str(layout), n_points=4)
-    assert torch.equal(above.train.points, itself.train.points)
-    assert above.fingerprint == itself.fingerprint
-
-
-def test_modelnet_fingerprint_depends_on_content(layout: Path, tmp_path: Path) -> None:
+def test_modelnet_fingerprint_depends_on_content(layout, tmp_path):
     elsewhere = shutil.copytree(layout, tmp_path / "elsewhere")
     first = modelnet40(layout, n_points=4).fingerprint
     assert modelnet40(elsewhere, n_points=4).fingerprint == first
@@ -82,14 +72,14 @@ def test_modelnet_fingerprint_depends_on_content(layout: Path, tmp_path: Path) -
     assert len(others | {first}) == 6
 
 
-def test_modelnet_missing_folder_raises(tmp_path: Path) -> None:
+def test_modelnet_missing_folder_raises(tmp_path):
     with pytest.raises(UserError) as caught:
         modelnet40(tmp_path / "none")
     for words in ("root: ", str(tmp_path / "none"), "shape_names.txt", "dataset.download=true"):
         assert words in str(caught.value)
 
 
-def test_modelnet_missing_lists_raise(layout: Path) -> None:
+def test_modelnet_missing_lists_raise(layout):
     for path in layout.glob("*test*"):
         path.unlink()
     with pytest.raises(UserError, match=r"test_files\.txt: no such file"):
@@ -99,7 +89,7 @@ def test_modelnet_missing_lists_raise(layout: Path) -> None:
         modelnet40(layout, n_points=4)
 
 
-def test_modelnet_class_without_shapes_raises(layout: Path) -> None:
+def test_modelnet_class_without_shapes_raises(layout):
     for number in FILES["test"]:
         path = layout / f"ply_data_test{number}.h5"
         write_file(path, data=np.zeros((1, STORED, 3)), label=np.zeros(1, np.uint8))
@@ -108,25 +98,19 @@ def test_modelnet_class_without_shapes_raises(layout: Path) -> None:
 
 
 @pytest.fixture
-def mirror(layout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+def mirror(layout, tmp_path, monkeypatch):
     """The archive on the second of two mirrors, with the expected hash; what is requested."""
-    archive = Path(
-        shutil.make_archive(str(tmp_path / "shelf" / "set"), "zip", layout.parent, FOLDER)
-    )
-    monkeypatch.setattr(modelnet, "ARCHIVE_HASH", md5(archive))
+    shelf = str(tmp_path / "shelf" / "set")
+    archive = Path(shutil.make_archive(shelf, "zip", layout.parent, FOLDER))
+    digest = hashlib.md5(archive.read_bytes()).hexdigest()
+    monkeypatch.setattr(modelnet, "ARCHIVE_HASH", f"md5:{digest}")
     with served(archive.parent) as (address, requested):
         monkeypatch.setattr(modelnet, "MIRRORS", (f"{address}/gone.zip", f"{address}/set.zip"))
         yield requested
 
 
-def md5(path: Path) -> str:
-    return f"md5:{hashlib.md5(path.read_bytes()).hexdigest()}"
-
-
 @pytest.mark.parametrize("name", ["data", f"data/{FOLDER}"])
-def test_modelnet_downloads_once(
-    layout: Path, mirror: list[str], tmp_path: Path, name: str
-) -> None:
+def test_modelnet_downloads_once(layout, mirror, tmp_path, name):
     root = tmp_path / "new" / name
     found: list[str] = []
 
@@ -144,29 +128,23 @@ def test_modelnet_downloads_once(
     assert not list((tmp_path / "new").rglob("*.zip*"))
 
 
-def test_modelnet_existing_files_are_not_downloaded(layout: Path, mirror: list[str]) -> None:
+def test_modelnet_existing_files_are_not_downloaded(layout, mirror):
     modelnet40(layout, n_points=4, download=True)
     assert mirror == []
 
 
-def test_modelnet_wrong_hash_raises(
-    mirror: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_modelnet_wrong_hash_or_unwritable_root_raises(mirror, tmp_path, monkeypatch):
     monkeypatch.setattr(modelnet, "ARCHIVE_HASH", "md5:" + "0" * 32)
     with pytest.raises(UserError, match=r"gone\.zip: .*404.*set\.zip: .*hash.*save the file as"):
         modelnet40(tmp_path / "new", download=True)
     assert not list((tmp_path / "new").rglob("*.zip"))
-
-
-def test_modelnet_unwritable_root_raises(mirror: list[str], tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=r"Cannot download ModelNet40 into"):
         modelnet40(tmp_path / "file" / "data", download=True)
 
 
-@pytest.mark.skipif("MOPS_DATA" not in os.environ, reason="MOPS_DATA names no folder of real data")
-def test_modelnet_real_data() -> None:
-    dataset = modelnet40(Path(os.environ["MOPS_DATA"]) / "modelnet40_hdf5_1024")
+def test_modelnet_real_data(real_data):
+    dataset = modelnet40(real_data("modelnet40_hdf5_1024"))
     assert dataset.train.points.shape == (9843, 1024, 3)
     assert dataset.test.points.shape == (2468, 1024, 3)
     assert len(dataset.class_names) == 40

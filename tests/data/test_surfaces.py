@@ -2,7 +2,6 @@
 
 import shutil
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,7 +14,7 @@ from tests.support.meshes import BALL, write_mesh
 meshes = partial(cloud_folder, test_frames=None, crop="surface", crops=1)
 
 
-def test_sample_surface_is_uniform_by_area(tmp_path: Path) -> None:
+def test_sample_surface_is_uniform_by_area(tmp_path):
     # A big and a small triangle in the plane z = 5: 90 % and 10 % of the area.
     text = "OFF\n6 2 0\n0 0 5\n3 0 5\n0 3 5\n9 0 5\n10 0 5\n9 1 5\n3 0 1 2\n3 3 4 5\n"
     (tmp_path / "two.off").write_text(text)
@@ -26,7 +25,7 @@ def test_sample_surface_is_uniform_by_area(tmp_path: Path) -> None:
     assert len(np.unique(points, axis=0)) == 10_000
 
 
-def test_sampling_cloud_depends_on_content_and_seed(mesh_layout: Path, tmp_path: Path) -> None:
+def test_sampling_cloud_depends_on_content_and_seed(mesh_layout, tmp_path):
     before = repr(np.random.get_state())  # noqa: NPY002
     first = meshes(mesh_layout, n_points=50)
     assert repr(np.random.get_state()) == before  # noqa: NPY002
@@ -41,9 +40,7 @@ def test_sampling_cloud_depends_on_content_and_seed(mesh_layout: Path, tmp_path:
     assert not torch.allclose(first.train.points[1], first.train.points[2], atol=1e-3)
 
 
-def test_sampling_fingerprint_depends_on_content_names_and_arguments(
-    mesh_layout: Path, tmp_path: Path
-) -> None:
+def test_sampling_fingerprint_depends_on_content_names_and_arguments(mesh_layout, tmp_path):
     first = meshes(mesh_layout, n_points=20).fingerprint
     elsewhere = shutil.copytree(mesh_layout, tmp_path / "elsewhere")
     assert meshes(elsewhere, n_points=20, cache=tmp_path / "cache").fingerprint == first
@@ -60,7 +57,7 @@ def test_sampling_fingerprint_depends_on_content_names_and_arguments(
     assert len(prints) == 6
 
 
-def test_sampling_cache_depends_on_content_and_arguments(mesh_layout: Path, tmp_path: Path) -> None:
+def test_sampling_cache_depends_on_content_and_arguments(mesh_layout, tmp_path):
     cache = tmp_path / "new" / "cache"
     first = meshes(mesh_layout, n_points=20, cache=cache)
     kept = sorted(cache.iterdir())

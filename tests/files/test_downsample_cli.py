@@ -70,9 +70,7 @@ def test_folder_removes_what_a_killed_run_left(folder, tmp_path):
 
 
 def test_real_scans_keep_attributes(real_data, tmp_path):
-    scans = real_data / "scans"
-    if not scans.is_dir():
-        pytest.skip(f"no scans in {real_data}")
+    scans = real_data("scans")
     status, out, err = call(scans, tmp_path, "--method", "random", "--m", 100, "--keep-attributes")
     assert (status, err) == (0, "")
     fragment = read(tmp_path / "fragment.pcd", 9, 0)

@@ -1,14 +1,28 @@
 """What reads the fuzzed files, in a process with limits in time and memory."""
 
 import traceback
+from pkgutil import resolve_name
 
 from mops_lightning.errors import UserError
+
+READERS: dict[str, tuple] = {
+    "hdf5": ("mops_lightning.data.hdf5:read_clouds", 20, None),
+    "names": ("mops_lightning.data.hdf5:read_names",),
+    "weights": ("mops_lightning.zoo.load:load",),
+    "checkpoint": ("mops_lightning.training.checkpoint:Checkpoint.read",),
+    "record": ("tests.support.fuzz_readers:read_record",),
+    "pictured": ("mops_lightning.viz.figures:load_clouds",),
+}
+"""Functions that read a kind of file, with the arguments after its path; others are clouds."""
 
 
 def outcome(path, kind):
     """Read a file: ``read``, ``refused``, or the traceback of what must not happen."""
+    cloud = ("tests.support.fuzz_readers:read_cloud",)
+    reader, *arguments = READERS.get(kind.split()[0], cloud)
+    read = resolve_name(reader)
     try:
-        READERS.get(kind.split()[0], read_cloud)(path)
+        read(path, *arguments)
     except UserError as error:
         said = str(error)
         return "refused" if len(said) < 3000 and "\n" not in said else f"not one line: {said}"
@@ -30,45 +44,8 @@ def read_cloud(path):
     read(path, 50, 0)
 
 
-def read_hdf5(path):
-    from mops_lightning.data.hdf5 import read_clouds
-
-    read_clouds(path, 20, None)
-
-
-def read_names(path):
-    from mops_lightning.data.hdf5 import read_names
-
-    read_names(path)
-
-
-def read_weights(path):
-    from mops_lightning.zoo.load import load
-
-    load(path)
-
-
-def read_checkpoint(path):
-    from mops_lightning.training.checkpoint import Checkpoint
-
-    Checkpoint.read(path)
-
-
 def read_record(path):
     from mops_lightning.records import run_record
 
     path.replace(path.with_name(run_record.FILE))
     run_record.read(path.parent)
-
-
-def read_pictured(path):
-    from mops_lightning.viz.figures import load_clouds
-
-    load_clouds(path)
-
-
-READERS = {
-    "hdf5": read_hdf5, "names": read_names,
-    "weights": read_weights, "checkpoint": read_checkpoint,
-    "record": read_record, "pictured": read_pictured,
-}  # fmt: skip

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import torch
 import trimesh
+from trimesh import PointCloud
 
 from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
@@ -36,10 +37,8 @@ def seeds(folder):
     }  # fmt: skip
     rows = np.zeros(40, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("label", "i4")])
     made["npy"][1].append(_saved(lambda file: np.save(file, rows)))
-    made["ply ascii"] = (
-        ".ply",
-        [_ascii_ply(points), BOX.export(file_type="ply", encoding="ascii")],
-    )
+    in_ascii = {"file_type": "ply", "encoding": "ascii"}
+    made["ply ascii"] = (".ply", [one.export(**in_ascii) for one in (PointCloud(points), BOX)])
     made["ply mesh"] = (".ply", [BOX.export(file_type="ply"), made["ply"][1][0]])
     made["pcd ascii"] = (".pcd", [_pcd(points, "ascii")])
     made["pcd compressed"] = (".pcd", [_pcd(points, "binary_compressed")])
@@ -56,9 +55,8 @@ def seeds(folder):
     made["checkpoint"] = (".ckpt", [sealed(_saved(lambda file: torch.save(CHECKPOINT, file)))])
     run_record.write(folder, record(files={"weights": "weights.safetensors"}))
     made["record"] = (".json", [(folder / run_record.FILE).read_bytes()])
-    save_clouds(
-        folder / "c.npz", torch.rand(2, 9, 3), {"generated": torch.rand(2, 3, 3)}, ["a", "b"]
-    )
+    clouds = torch.rand(2, 9, 3)
+    save_clouds(folder / "c.npz", clouds, {"generated": clouds[:, :3]}, ["a", "b"])
     made["pictured clouds"] = (".npz", [(folder / "c.npz").read_bytes()])
     return made
 
@@ -84,13 +82,6 @@ def _saved(save):
 
 def _bytes(content):
     return content.encode() if isinstance(content, str) else content
-
-
-def _ascii_ply(points):
-    rows = "\n".join(" ".join(map(str, row)) for row in points)
-    axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    head = f"ply\nformat ascii 1.0\ncomment made\nelement vertex {len(points)}\n{axes}end_header\n"
-    return (head + rows + "\n").encode()
 
 
 def _pcd(points, kind):
@@ -120,9 +111,8 @@ def _las(path, form):
 
 def _hdf5(path, options):
     with h5py.File(path, "w") as file:
-        file.create_dataset(
-            "data", data=np.random.default_rng(0).random((6, 40, 3), "f4"), **options
-        )
+        points = np.random.default_rng(0).random((6, 40, 3), "f4")
+        file.create_dataset("data", data=points, **options)
         file["label"] = (np.arange(6) % 3).astype("u1")[:, None]
     return path.read_bytes()
 

@@ -16,10 +16,16 @@ RECORDS, NUMBER, EVLRS, LONG_NUMBER = 100, 107, 243, 247
 """Places of counts in the header."""
 
 
+def las_cloud(header, number, low=0, high=9):
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = np.random.default_rng(0).uniform(low, high, (3, number))
+    return cloud
+
+
 def test_las_keeps_format_scale_and_dimensions(tmp_path):
-    cloud = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
-    cloud.header.offsets, cloud.header.scales = [1000] * 3, [0.01] * 3
-    cloud.x, cloud.y, cloud.z = np.random.default_rng(0).uniform(1000, 1001, (3, 30))
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.offsets, header.scales = [1000] * 3, [0.01] * 3
+    cloud = las_cloud(header, 30, 1000, 1001)
     cloud.intensity = np.arange(30)
     cloud.write(tmp_path / "a.las")
     table = read(tmp_path / "a.las", 100, 0)
@@ -58,16 +64,12 @@ def test_las_arrays_and_extended_records_are_kept(tmp_path):
     header.add_extra_dim(laspy.ExtraBytesParams(name="Colors", type="3u1"))
     header.add_extra_dim(laspy.ExtraBytesParams(name="Height", type="f4"))
     header.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("LASF_Projection", 2112, "", b"WKT")])
-    cloud = laspy.LasData(header)
-    cloud.x, cloud.y, cloud.z = np.random.default_rng(0).uniform(0, 9, (3, 30))
+    cloud = las_cloud(header, 30)
     cloud["Colors"], cloud["Height"] = np.arange(90).reshape(30, 3), np.arange(30)
     cloud.write(tmp_path / "a.las")
-    for table in (
-        read(tmp_path / "a.las", 9, 0),
-        open_cloud_file(tmp_path / "a.las").read(range(30)),
-    ):
-        assert table.columns["Colors_1"].tolist() == list(range(1, 90, 3))
-    table = read(tmp_path / "a.las", 9, 0)
+    parts, table = open_cloud_file(tmp_path / "a.las"), read(tmp_path / "a.las", 9, 0)
+    for one in (table, parts.read(range(30))):
+        assert one.columns["Colors_1"].tolist() == list(range(1, 90, 3))
     WRITERS[".laz"](tmp_path / "b.laz", table.take(np.array([3, 5])))
     again = laspy.read(tmp_path / "b.laz")
     assert [list(again[f"Colors_{place}"]) for place in range(3)] == [[9, 15], [10, 16], [11, 17]]
@@ -87,11 +89,10 @@ def test_copc_is_written_without_its_index(tmp_path):
     assert not [*again.header.vlrs, *again.evlrs]
 
 
-def written(path, form, number=300):
-    cloud = laspy.LasData(laspy.LasHeader(point_format=form, version="1.4" if form > 5 else "1.2"))
-    cloud.header.scales = [0.001] * 3
-    cloud.x, cloud.y, cloud.z = np.random.default_rng(0).uniform(0, 9, (3, number))
-    cloud.write(path)
+def written(path, form):
+    header = laspy.LasHeader(point_format=form, version="1.4" if form > 5 else "1.2")
+    header.scales = [0.001] * 3
+    las_cloud(header, 300).write(path)
     return bytearray(path.read_bytes())
 
 
@@ -133,8 +134,7 @@ def test_laz_with_extra_bytes_reads(form, tmp_path):
     path = tmp_path / "a.laz"
     header = laspy.LasHeader(point_format=form, version="1.4")
     header.add_extra_dim(laspy.ExtraBytesParams("depth", "f4"))
-    cloud = laspy.LasData(header)
-    cloud.x, cloud.y, cloud.z = np.random.default_rng(0).uniform(0, 9, (3, 300))
+    cloud = las_cloud(header, 300)
     cloud["depth"] = np.arange(300)
     cloud.write(path)
     np.testing.assert_array_equal(read(path, 9, 0).columns["depth"], np.arange(300))
@@ -209,12 +209,9 @@ def test_copc_damaged_is_broken(scan):
         read(scan, 9, 0, Area.parse("0,0,1e9,1e9", None, None))
 
 
-def test_box_outside_of_las_says_where_it_is(scan):
+def test_box_outside_of_las_or_file_without_levels_says_so(scan, tmp_path):
     with pytest.raises(UserError, match=r"scan\.copc\.laz are in 500000\.\d+,4000000"):
         read(scan, 9, 0, Area.parse("0,0,9,9", None, None))
-
-
-def test_file_without_levels_says_so(tmp_path):
     for suffix in (".las", ".npy", ".xyz"):
         WRITERS[suffix](tmp_path / f"a{suffix}", Table(np.eye(3)))
         with pytest.raises(UserError, match="need a COPC file"):
