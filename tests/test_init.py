@@ -32,6 +32,26 @@ def test_import_leaves_heavy_libraries_alone():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+HELP = """
+from contextlib import suppress
+from mops_lightning.cli.main import main
+for command in ("report --help", "downsample --help", "--help"):
+    sys.argv[1:] = command.split()
+    with suppress(SystemExit):
+        main()
+"""
+CARDS = """
+from mops_lightning.zoo import model_file, names
+assert [model_file.read_card(path) for path in names.available().values()]
+"""
+
+
+@pytest.mark.parametrize("code", [HELP, CARDS], ids=["help", "cards"])
+def test_help_and_cards_of_models_need_no_torch(code):
+    command = f"import sys\n{code}assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", command], check=True, stdout=subprocess.DEVNULL)
+
+
 def test_unknown_name_raises_attribute_error():
     with pytest.raises(AttributeError, match="attribute MOPSNett"):
         _ = mops_lightning.MOPSNett  # type: ignore[attr-defined]

@@ -13,17 +13,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 # .gitignore too: hatchling leaves out of the wheel what git ignores.
 SOURCES = ("pyproject.toml", "README.md", "LICENSE", ".gitignore", "src", "conf")
-TINY_JOB = (
-    "learn=task",
-    "dataset=shapes",
-    "dataset.train_per_class=4",
-    "dataset.test_per_class=2",
-    "dataset.n_points=64",
-    "batch_size=16",
-    "m=8",
-    "trainer=cpu",
-    "trainer.max_epochs=1",
-)
+TINY_JOB = "learn=task dataset=shapes dataset.train_per_class=4 dataset.test_per_class=2"
+TINY_SIZES = "dataset.n_points=64 batch_size=16 m=8 trainer=cpu trainer.max_epochs=1"
 
 
 def python(*arguments: str, cwd: Path, path: Path | None = None) -> str:
@@ -69,9 +60,15 @@ def files_below(folder: Path, inside: str) -> set[str]:
     return {f"{inside}/{f.as_posix()}" for f in files if "__pycache__" not in f.parts}
 
 
-def test_wheel_contains_package_and_configs_only(wheel: Path) -> None:
+def test_wheel_contains_package_configs_console_script_and_licence_only(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
-        names = {name for name in archive.namelist() if ".dist-info/" not in name}
+        names = set(archive.namelist())
+        (info,) = {name.split("/")[0] for name in names if ".dist-info/" in name}
+        scripts = archive.read(f"{info}/entry_points.txt").decode().splitlines()
+        assert archive.read(f"{info}/licenses/LICENSE") == (ROOT / "LICENSE").read_bytes()
+    script = "mops-lightning = mops_lightning.cli.main:main"
+    assert scripts[scripts.index("[console_scripts]") + 1] == script
+    names = {name for name in names if not name.startswith(f"{info}/")}
     configs = files_below(ROOT / "conf", "mops_lightning/conf")
     assert "mops_lightning/conf/config.yaml" in configs
     assert {"mops_lightning/report/paper.json", "mops_lightning/py.typed"} <= names
@@ -79,22 +76,12 @@ def test_wheel_contains_package_and_configs_only(wheel: Path) -> None:
     assert names == configs.union(*(files_below(ROOT / "src" / name, name) for name in packages))
 
 
-def test_wheel_has_console_script_and_licence(wheel: Path) -> None:
-    with zipfile.ZipFile(wheel) as archive:
-        (info,) = {name.split("/")[0] for name in archive.namelist() if ".dist-info/" in name}
-        scripts = archive.read(f"{info}/entry_points.txt").decode().splitlines()
-        licence = archive.read(f"{info}/licenses/LICENSE")
-    assert scripts[scripts.index("[console_scripts]") + 1] == (
-        "mops-lightning = mops_lightning.cli.main:main"
-    )
-    assert licence == (ROOT / "LICENSE").read_bytes()
-
-
 def test_run_of_installed_copy_leaves_a_record(installed: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "empty"
     elsewhere.mkdir()
     folders = (f"out={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}")
-    python("-m", "mops_lightning", *TINY_JOB, *folders, cwd=elsewhere, path=installed)
+    job = [*TINY_JOB.split(), *TINY_SIZES.split(), *folders]
+    python("-m", "mops_lightning", *job, cwd=elsewhere, path=installed)
     (result,) = (tmp_path / "out").rglob("result.json")
     record = json.loads(result.read_text())
     assert record["status"] == "completed"

@@ -7,15 +7,7 @@ import pytest
 from mops_lightning.cli.train import flags_first
 from mops_lightning.records import run_record
 from mops_lightning.zoo import weights
-from tests.support.command_line import (
-    SMALL_PCRNET,
-    TINY,
-    TINY_ANY_DATA,
-    TINY_WITH_PICTURES,
-    call,
-    call_anew,
-    runs,
-)
+from tests.support.command_line import SMALL_PCRNET, TINY, TINY_WITH_PICTURES, call, call_anew, runs
 
 
 @pytest.fixture(scope="module")
@@ -118,14 +110,8 @@ def test_joint_training_starts_from_cached_task_net(main_job):
 
 
 def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
-    settings = [
-        *TINY_WITH_PICTURES,
-        *SMALL_PCRNET,
-        "sampler=fmops",
-        "sampler.m_max=16",
-        "pictures=1",
-    ]
-    status, out, err = call([*settings, "learn=joint"], tmp_path)
+    settings = ["learn=joint", "sampler=fmops", "sampler.m_max=16", "pictures=1"]
+    status, out, err = call([*TINY_WITH_PICTURES, *SMALL_PCRNET, *settings], tmp_path)
     assert status == 0, err
     assert "training it first" in out
     assert "registration by pcrnet, shapes, rotation error (°), test" in out
@@ -133,38 +119,16 @@ def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
     record = run_record.read(run)
     assert 0 < record.metrics["test/m16/matched/rotation_error_p90_deg"] < 180
     assert record.score == record.metrics["test/m8/generated/rotation_error_deg"]
-    assert {path.name for path in (run / "pictures").iterdir()} == {
-        "clouds.npz",
-        "comparison.png",
-        "clouds.png",
-        "matrix.png",
-        "pairs.png",
-    }
+    pictures = {f"{name}.png" for name in ("comparison", "clouds", "matrix", "pairs")}
+    assert {path.name for path in (run / "pictures").iterdir()} == {"clouds.npz", *pictures}
     assert (run / "task_weights.safetensors").is_file()
-    status, out, err = call(
-        [f"evaluate={run}", "task/net=icp", "task.resample=48", "pictures=0"], tmp_path
-    )
+    arguments = [f"evaluate={run}", "task/net=icp", "task.resample=48", "pictures=0"]
+    status, out, err = call(arguments, tmp_path)
     assert status == 0, err
     assert "registration by icp" in out
     status, _, err = call(["task=registration", "task/net=icp", "weights=null", *TINY], tmp_path)
     assert status == 2
     assert "learn=sampler: ICP has no weights" in err
-
-
-def test_folder_of_meshes_trains(tmp_path):
-    import trimesh
-
-    for name, mesh in (("ball", trimesh.creation.icosphere()), ("box", trimesh.creation.box())):
-        for split, number in (("train", 9), ("test", 2)):
-            folder = tmp_path / "mine" / name / split
-            folder.mkdir(parents=True)
-            for i in range(number):
-                mesh.export(folder / f"{i}.off")
-    settings = [*TINY_ANY_DATA, "pictures=2"]
-    status, out, err = call([*settings, "dataset=meshes", "dataset.root=mine"], tmp_path)
-    assert status == 0, err
-    (run,) = runs(tmp_path)
-    assert run_record.read(run).dataset_facts["train_files"] == 18
 
 
 @pytest.mark.parametrize(

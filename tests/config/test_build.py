@@ -6,7 +6,6 @@ import pytest
 from omegaconf import OmegaConf
 
 from mops_lightning.config.build import build
-from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 
 
@@ -55,12 +54,9 @@ def test_build_of_a_refused_argument_names_the_setting(settings, said):
     assert str(caught.value) == said
 
 
-def test_build_without_a_path_names_the_argument():
+def test_build_without_a_path_or_with_an_argument_from_code_names_the_argument():
     with pytest.raises(UserError, match=r"^tau must be"):
         build(sampler(tau=0))
-
-
-def test_build_with_an_argument_from_code_names_the_argument():
     with pytest.raises(UserError, match=r"^m must be"):
         build(sampler(), "sampler", m=0)
 
@@ -75,16 +71,6 @@ def test_build_of_a_partial_function_names_the_setting_when_it_is_called():
         made(-1.0)(3.0)
     with pytest.raises(UserError, match=r"^value must not be negative"):
         made(1.0)(-3.0)
-
-
-def test_build_makes_nodes_below_a_node():
-    made = build(sampler(inner={"_target_": PART, "inner": {"_target_": PART}}), "sampler")
-    assert isinstance(made.inner.inner, Part)
-
-
-def test_build_of_a_sampler_raises_its_own_error():
-    with pytest.raises(UserError, match=r"^sampler\.tau_min must be"):
-        build(compose(["sampler.tau_min=0"]).sampler, "sampler")
 
 
 def test_build_without_the_package_names_it():

@@ -5,6 +5,8 @@ import pytest
 from mops_lightning.config.compose import check_overrides
 from tests.support.command_line import TINY, TINY_WITH_PICTURES, refused
 
+LATE = "+trainer.val_check_interval=100"
+
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
@@ -44,6 +46,9 @@ from tests.support.command_line import TINY, TINY_WITH_PICTURES, refused
         (["~sampler"], "~sampler: sampler cannot be removed; choose another one with sampler="),
         (["~callbacks"], "leave single callbacks out with callbacks.NAME=null."),
         ([*TINY, "trainer._target_=builtins.dict"], "must return a Trainer, got dict."),
+        ([*TINY, "trainer.precision=16-mixed"], "trainer.precision=bf16-mixed"),
+        (["-m", *TINY, "trainer.devices=2", "m=4,8"], "hydra/launcher=joblib"),
+        ([*TINY, LATE, "learn=task"], f": {LATE}: not usable in this run: "),
         (["hydra=null"], "hydra=null: choose one"),
         (["hydra.verbose={a: 1}"], "hydra.verbose={a: 1}: give true, false, or a list"),
         (["hydra.verbose=1984"], "give true, false, or a list of loggers."),
@@ -86,11 +91,8 @@ def test_mistake_in_a_file_ends_in_one_line(name, content, said, tmp_path):
 
 @pytest.mark.parametrize("name", ["EarlyStopping", "ModelCheckpoint"])
 def test_callback_with_an_unknown_metric_ends_in_one_line(name, tmp_path):
-    added = [
-        f"+callbacks.mine._target_=lightning.pytorch.callbacks.{name}",
-        "+callbacks.mine.monitor=nope",
-    ]
-    err = refused([*TINY, "learn=task", *added], tmp_path)
+    target = f"+callbacks.mine._target_=lightning.pytorch.callbacks.{name}"
+    err = refused([*TINY, "learn=task", target, "+callbacks.mine.monitor=nope"], tmp_path)
     assert err.startswith("mops_lightning: callbacks: ")
     assert "nope" in err
 

@@ -1,5 +1,6 @@
 """The groups of conf/: what one run's configuration shows, and what depends on several groups."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from mops_lightning.config.validate import check
 from mops_lightning.records.run_record import dotted, read
 from tests.support.command_line import TINY, TINY_ANY_DATA, call, runs
 
+composed = cache(lambda chosen: compose(chosen.split()))
+"""What several tests read and none changes."""
 TASKS = ("classification", "registration", "reconstruction")
 
 
@@ -70,68 +73,77 @@ def test_specialised_files_belong_to_groups_that_exist():
         assert path.stem in TASKS or (root / group / f"{choice}.yaml").is_file()
 
 
-@pytest.mark.parametrize(
-    ("task", "alpha", "tau_min"),
-    [("classification", 30.0, 0.1), ("registration", 1.0, 0.1), ("reconstruction", 0.2, 0.5)],
-)
-def test_mops_alpha_and_tau_depend_on_task(task, alpha, tau_min):
-    for sampler in ("mops", "fmops"):
-        node = compose([f"task={task}", f"sampler={sampler}"]).sampler
-        assert (node.alpha, node.tau_min) == (alpha, tau_min)
+FOLLOWING = """
+: m=32 batch_size=32 learn=sampler weights=auto names.task=classification names.net=pointnet
+: names.dataset=shapes names.sampler=mops names.recipe=fast epochs.task=12 epochs.sampler=10
+: sampler.alpha=30.0 sampler.tau_min=0.1 task_lr_scale=1.0
+sampler=fmops: sampler.alpha=30.0 sampler.tau_min=0.1 sampler.m_max=512 optimizer.lr=0.001
+sampler=fmops recipe=paper: sampler.size_sampling=uniform
+task=registration: sampler.alpha=1.0 sampler.tau_min=0.1 task_lr_scale=0.1
+task=registration: epochs.task=30 epochs.sampler=15
+task=registration sampler=fmops: sampler.alpha=1.0 sampler.tau_min=0.1 sampler.anchors=fps
+task=registration sampler=fmops: sampler.m_max=64 recipe.train_points=512 recipe.warm_start=True
+task=registration sampler=fmops: weights=auto pretrain_from=pcrnet.modelnet40 optimizer.lr=0.001
+task=registration sampler=fmops recipe=paper: sampler.anchors=None sampler.m_max=64
+task=reconstruction: sampler.alpha=0.2 sampler.tau_min=0.5
+task=reconstruction sampler=fmops: sampler.alpha=0.2 sampler.tau_min=0.5
+sampler=snet: optimizer.lr=0.01 pretrain.lr=0.001
+sampler=snet optimizer=exponential: optimizer.lr=0.0005
+learn=joint sampler=snet: optimizer.lr=0.01 pretrain.lr=0.001
+task=registration sampler=snet: optimizer.lr=0.001 pretrain.lr=0.0005
+task=reconstruction sampler=snet: optimizer.lr=0.0005 pretrain.lr=0.001
+sampler=samplenet_progressive: sampler.m_max=1024 sampler.min_size=2 sampler.size_reduction=sum
+sampler=samplenet_progressive: sampler.coverage=0.5 sampler.coverage_per_point=0.03333333333333333
+dataset=modelnet40: epochs.task=30 epochs.sampler=8
+dataset=modelnet40 task=reconstruction: epochs.task=200 epochs.sampler=60
+dataset=shapenet_core task=reconstruction: epochs.task=100 epochs.sampler=30
+dataset=clouds dataset.root=x task=reconstruction: epochs.task=100 epochs.sampler=30
+experiment=own_scans dataset.root=x: epochs.task=60 epochs.sampler=30
+experiment=reconstruction_paper: epochs.task=400 epochs.sampler=250
+experiment=classification_paper: sampler.tau_min=0.1 sampler.alpha=30.0 optimizer.lr=0.0005
+experiment=classification_paper: optimizer.schedule.end_lr=1e-05 trainer.max_epochs=250
+experiment=classification_paper: names.dataset=modelnet40 val_fraction=0.0
+experiment=classification_paper sampler=fmops: sampler.size_sampling=uniform
+experiment=classification_snet sampler=samplenet: sampler.k=7 sampler.beta=1.0 sampler.alpha=30.0
+experiment=classification_snet sampler=samplenet: sampler.sigma_min=0.0 sampler.coverage=1.0
+experiment=classification_snet sampler=samplenet: sampler.coverage_per_point=0.0 optimizer.lr=0.01
+experiment=classification_snet sampler=samplenet: trainer.max_epochs=500 val_fraction=0.0
+"""
+"""Settings, and the values that others have then."""
 
 
-@pytest.mark.parametrize(
-    ("task", "learn", "rate"),
-    [
-        ("classification", "sampler", 1e-2),
-        ("classification", "joint", 1e-2),
-        ("registration", "sampler", 1e-3),
-        ("reconstruction", "sampler", 5e-4),
-    ],
-)
-def test_snet_rate_depends_on_task(task, learn, rate):
-    cfg = compose([f"task={task}", f"learn={learn}", "sampler=snet"])
-    own = 5e-4 if task == "registration" else 1e-3  # it starts from given weights
-    assert (cfg.optimizer.lr, cfg.pretrain.lr) == (rate, own)
+@pytest.mark.parametrize("line", FOLLOWING.strip().splitlines())
+def test_values_follow_from_the_chosen_groups(line):
+    chosen, values = line.split(": ")
+    cfg = composed(chosen)
+    for value in values.split():
+        path, _, expected = value.partition("=")
+        assert str(OmegaConf.select(cfg, path)) == expected, path
 
 
-@pytest.mark.parametrize(
-    ("overrides", "epochs"),
-    [
-        ([], (12, 10)),
-        (["task=registration"], (30, 15)),
-        (["dataset=modelnet40"], (30, 8)),
-        (["dataset=modelnet40", "task=reconstruction"], (200, 60)),
-        (["dataset=shapenet_core", "task=reconstruction"], (100, 30)),
-        (["dataset=clouds", "dataset.root=x", "task=reconstruction"], (100, 30)),
-        (["experiment=reconstruction_paper"], (400, 250)),
-        (["experiment=own_scans", "dataset.root=x"], (60, 30)),
-    ],
-)
-def test_epochs_depend_on_dataset_and_task(overrides, epochs):
-    cfg = compose(overrides)
-    assert (cfg.epochs.task, cfg.epochs.sampler) == epochs
-    lengths = {}
+@pytest.mark.parametrize("task", TASKS)
+def test_length_follows_from_what_is_learned(task):
+    cfg, lengths = compose([f"task={task}"]), {}
     for cfg.learn in LEARN:  # Hydra chooses no group by it
         lengths[cfg.learn] = cfg.trainer.max_epochs
-    assert lengths == {"task": epochs[0], "sampler": epochs[1], "joint": epochs[1], "nothing": 0}
+    epochs = {"task": cfg.epochs.task, "sampler": cfg.epochs.sampler}
+    assert lengths == {**epochs, "joint": cfg.epochs.sampler, "nothing": 0}
 
 
-@pytest.mark.parametrize("sampler", ["mops", "fmops", "samplenet", "fps"])
-def test_spelling_of_weights_changes_nothing_else(sampler):
+@pytest.mark.parametrize("sampler", ["mops", "fmops"])
+@pytest.mark.parametrize(
+    ("setting", "spellings"),
+    [
+        ("weights", "auto pcrnet.modelnet40 models/pcrnet.modelnet40.safetensors null"),
+        ("recipe.warm_start", "true fmops.pairs-m64 models/fmops.pairs-m64.safetensors"),
+    ],
+)
+def test_spelling_of_weights_changes_nothing_else(sampler, setting, spellings):
     chosen = ["task=registration", f"sampler={sampler}"]
-    spellings = ["auto", "pcrnet.modelnet40", "models/pcrnet.modelnet40.safetensors", "null"]
-    found: list[Any] = [compose([*chosen, f"weights={name}"]) for name in spellings]
+    found: list[Any] = [compose([*chosen, f"{setting}={name}"]) for name in spellings.split()]
     for cfg in found:
-        cfg.weights = "the same"
+        OmegaConf.update(cfg, setting, "the same")
     assert all(cfg == found[0] for cfg in found)
-    started: list[Any] = [
-        compose([*chosen, f"recipe.warm_start={name}"])
-        for name in ("true", "fmops.pairs-m64", "models/fmops.pairs-m64.safetensors")
-    ]
-    for cfg in started:
-        cfg.recipe.warm_start = True
-    assert all(cfg == started[0] for cfg in started)
 
 
 @pytest.mark.parametrize("learn", ["sampler", "joint", "task"])
@@ -139,24 +151,13 @@ def test_spelling_of_weights_changes_nothing_else(sampler):
     "change", ["task.resample=256", "task/net=pcrnet", "weights=pcrnet.modelnet40", "m=8"]
 )
 def test_changed_setting_changes_no_other(learn, change):
-    chosen = ["task=registration", "sampler=fmops", f"learn={learn}"]
+    chosen = f"task=registration sampler=fmops learn={learn}"
     before, after = (
-        dotted(OmegaConf.to_container(compose(given), resolve=True))
-        for given in (chosen, [*chosen, change])
+        dotted(OmegaConf.to_container(composed(given), resolve=True))
+        for given in (chosen, f"{chosen} {change}")
     )
     different = {name for name in {**before, **after} if before.get(name) != after.get(name)}
     assert different <= {change.partition("=")[0]}
-
-
-def test_fmops_for_registration_has_anchors_and_points_for_them():
-    cfg = compose(["task=registration", "sampler=fmops"])
-    assert (cfg.sampler.anchors, cfg.sampler.m_max, cfg.recipe.train_points) == ("fps", 64, 512)
-    assert (cfg.weights, cfg.pretrain_from) == ("auto", "pcrnet.modelnet40")
-    assert cfg.recipe.warm_start is True
-    assert cfg.optimizer.lr == 1e-3
-    plain = compose(["task=registration", "sampler=fmops", "recipe=paper"])
-    assert (plain.sampler.anchors, plain.sampler.m_max) == (None, 64)
-    assert compose(["sampler=fmops"]).sampler.m_max == 512
 
 
 LEARN = ("task", "sampler", "joint", "nothing")
@@ -229,8 +230,9 @@ def test_own_scans_needs_a_folder_and_gives_a_sampler_for_tiles(files, tmp_path)
     status, _, err = call([*chosen, *TINY_ANY_DATA, "sampler.m_max=16"], tmp_path)
     assert status == 0, err
     (run,) = runs(tmp_path)
-    metrics = read(run).validation
-    assert ("val/completed/nre_cd" in metrics) == (files == 4)
+    record = read(run)
+    assert ("val/completed/nre_cd" in record.validation) == (files == 4)
+    assert record.dataset_facts["train_files"] + record.dataset_facts["test_files"] == files
     arguments = ["scans/0.npy", "small.npy", "--weights", str(run), "--tile", "64", "--m", "70"]
     status, out, err = call(["downsample", *arguments], tmp_path)
     assert (status, err) == (0, "")

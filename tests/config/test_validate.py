@@ -1,4 +1,5 @@
 from collections.abc import Sequence
+from inspect import Parameter
 from typing import Any, Literal
 
 import pytest
@@ -24,13 +25,8 @@ def choices():
             yield f"{group}={path.stem}"
 
 
-EXTRA = {
-    "dataset=meshes": ["dataset.root=somewhere"],
-    "dataset=hdf5": ["dataset.root=somewhere"],
-    "dataset=clouds": ["dataset.root=somewhere"],
-    "experiment=own_scans": ["dataset.root=somewhere"],
-    "dataset=mesh_sequence": ["dataset.root=somewhere"],
-}
+WITH_ROOT = ("meshes", "hdf5", "clouds", "own_scans", "mesh_sequence")
+"""Choices whose files the user must name."""
 FROM_CODE = {
     *("params", "optimizer", "total_steps"),  # of optimizers and schedules
     *("net", "num_classes", "attributes"),  # of tasks, nets and samplers
@@ -51,7 +47,8 @@ def nodes(cfg):
 
 @pytest.mark.parametrize("override", list(choices()))
 def test_compose_every_choice_fits_its_constructor(override):
-    cfg = compose([override, *EXTRA.get(override, [])])
+    root = ["dataset.root=somewhere"] if override.endswith(WITH_ROOT) else []
+    cfg = compose([override, *root])
     OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     check(cfg)
     baselines = [id(node) for node in cfg.baselines.values()]
@@ -59,59 +56,18 @@ def test_compose_every_choice_fits_its_constructor(override):
         parameters = signature(node["_target_"], override)
         given = {key for key in node if not str(key).startswith("_")} - {"schedule"}
         assert given <= set(parameters), node["_target_"]
-        named = {
-            name: p
-            for name, p in parameters.items()
-            if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
-        }
-        if not node["_target_"].startswith("mops_lightning."):
-            named = {name: p for name, p in named.items() if p.default is p.empty}
+        own = node["_target_"].startswith("mops_lightning.")
+        several = (Parameter.VAR_KEYWORD, Parameter.VAR_POSITIONAL)
+        named = {name: p for name, p in parameters.items() if p.kind not in several}
+        named = {name: p for name, p in named.items() if own or p.default is p.empty}
         missing = set(named) - given - FROM_CODE
         missing -= {"start"} if id(node) in baselines else set()
         assert not missing, f"{node['_target_']}: no file shows {missing}"
 
 
-def test_default_settings_are_those_of_readme():
-    cfg = compose()
-    assert dict(cfg.names) == {
-        "task": "classification",
-        "net": "pointnet",
-        "dataset": "shapes",
-        "sampler": "mops",
-        "recipe": "fast",
-    }
-    assert (cfg.m, cfg.learn, cfg.weights) == (32, "sampler", "auto")
-
-
-def test_paper_experiments_have_paper_settings():
-    cfg = compose(["experiment=classification_paper"])
-    assert (cfg.sampler.tau_min, cfg.sampler.alpha) == (0.1, 30.0)
-    assert cfg.optimizer.lr == 5e-4
-    assert cfg.optimizer.schedule.end_lr == 1e-5
-    assert cfg.trainer.max_epochs == 250
-    assert cfg.names.dataset == "modelnet40"
-    assert cfg.val_fraction == 0
-    for chosen in ("experiment=classification_paper", "recipe=paper"):
-        assert compose([chosen, "sampler=fmops"]).sampler.size_sampling == "uniform"
-
-
-def test_rival_samplers_have_published_settings():
+def test_rates_of_rival_samplers_fall_at_the_published_number_of_clouds():
     cfg = compose(["experiment=classification_snet", "sampler=samplenet"])
-    assert (cfg.sampler.k, cfg.sampler.beta, cfg.sampler.alpha, cfg.sampler.sigma_min) == (
-        7,
-        1,
-        30,
-        0,
-    )
-    assert (cfg.sampler.coverage, cfg.sampler.coverage_per_point) == (1, 0)
-    assert cfg.optimizer.lr == 0.01
     assert cfg.optimizer.schedule.every * cfg.batch_size == 600_000
-    assert (cfg.trainer.max_epochs, cfg.val_fraction) == (500, 0)
-    assert compose(["sampler=snet", "optimizer=exponential"]).optimizer.lr == 5e-4
-    assert compose(["sampler=fmops"]).optimizer.lr == 0.001
-    cfg = compose(["sampler=samplenet_progressive"])
-    assert (cfg.sampler.m_max, cfg.sampler.min_size, cfg.sampler.size_reduction) == (1024, 2, "sum")
-    assert (cfg.sampler.coverage, cfg.sampler.coverage_per_point) == (0.5, pytest.approx(1 / 30))
 
 
 @pytest.mark.parametrize(
@@ -123,12 +79,10 @@ def test_rival_samplers_have_published_settings():
         (["+optimizer.betas=[nan,1]"], "optimizer.betas must be finite .*, got nan"),
         (["seed=18446744073709551616"], r"seed must be finite and below 2\*\*63, got 1844"),
         (["m=0"], "m must be a whole number of at least 1, got 0"),
-        (["m=2.5"], "m must be a whole number"),
         (
             ["sampler=fmops", "sampler.num_sizes=1.5"],
             "sampler.num_sizes must be a whole number, got 1.5",
         ),
-        (["sampler=samplenet", "sampler.k=null"], "sampler.k must be a whole number, got None"),
         (["sampler=snet", "sampler.head_channels=[a]"], "a list, each of it a whole number"),
         (["sizes=[8,x]"], "sizes must be auto or a list of whole numbers"),
         (["learn=task", "refine=1"], "refine must be 0 with learn=task, .*got 1"),
@@ -141,15 +95,12 @@ def test_rival_samplers_have_published_settings():
         (["augment.task.jitter=-1"], r"augment\.task\.jitter must be a number of at least 0"),
         (["augment.sampler.jitter=null"], r"sampler\.jitter must be a number of at least 0"),
         (["augment.task.rotate_up=3"], "rotate_up must be true or false or a text, got 3"),
-        (["task_lr_scale=-1"], "task_lr_scale must be a number above 0"),
         (["pretrain=foo"], "pretrain must be settings, got 'foo'"),
         (["+sampler._partial_=true"], "sampler._partial_ must be left out"),
         (["learn=smapler"], "Did you mean 'sampler'"),
         (["+sampler.alhpa=3"], "Did you mean 'alpha'"),
         (["+bacth_size=3"], "Did you mean 'batch_size'"),
-        (["+dataset.clases=[a]"], "Did you mean 'classes'"),
         (["epochs.task=0"], "^epochs.task must be a whole number of at least 1"),
-        (["epochs.task=abc"], "^epochs.task must be a whole number .*, got 'abc'"),
         (["epochs=3"], "^epochs must be settings, got 3"),
         (["+callbacks.early=3"], "callbacks.early must be null or settings .*, got 3"),
         (["baselines.fps=3"], "baselines.fps must be null or settings .*, got 3"),
@@ -158,9 +109,6 @@ def test_rival_samplers_have_published_settings():
         (["trainer=ddp", "trainer.strategy=fsdp"], "trainer.strategy: several devices work with"),
         (["trainer=ddp", "+trainer.sync_batchnorm=true"], "trainer.sync_batchnorm must be false"),
         (["+sampler.alpha.x=3"], r"sampler\.alpha must be a number, got {'x': 3}"),
-        (["sampler.alpha=abc"], r"sampler\.alpha must be a number, got 'abc'"),
-        (["~pretrain"], "pretrain cannot be removed"),
-        (["dataset.n_points=abc"], r"dataset\.n_points must be a whole number"),
         (["+trainer.gradient_clip_val=-1"], "gradient_clip_val must be null or a number above 0"),
         (["+trainer.accumulate_grad_batches=0"], "accumulate_grad_batches must be a whole number"),
         (["logger=csv", "+logger.flush_logs_every_n_steps=0"], "n_steps must be a whole number"),
@@ -172,7 +120,6 @@ def test_rival_samplers_have_published_settings():
         (["optimizer.lr=0"], "optimizer.lr must be a number above 0, got 0"),
         (["trainer.max_epochs=0"], "trainer.max_epochs must be a whole number"),
         (["val_fraction=1.0"], "val_fraction must be .* below 1, got 1.0"),
-        (["m=null"], "m must be a whole number .*, got None"),
         (["cache=null"], "cache must be a text, got None"),
         (["task_lr_scale=0", "learn=joint"], "task_lr_scale must be a number above 0"),
         (["test_corruption=sheer-3"], "test_corruption must be a kind .*Did you mean 'shear'"),

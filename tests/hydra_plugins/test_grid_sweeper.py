@@ -59,10 +59,13 @@ def test_grids_run_one_after_the_other_and_win_over_params(plan):
     assert "3 cells: 3 completed; in cells" in out
 
 
-def test_grids_command_line_applies_to_every_grid(tmp_path):
-    status, cells, out, err = start(tmp_path, "m=2")
+def test_grids_command_line_applies_to_every_grid_and_values_may_be_null_and_lists(tmp_path):
+    grids = "hydra.sweeper.grids=[{sampler:random,sizes:[2,6],weights:null},{sampler:fps}]"
+    status, cells, out, err = start(tmp_path, "m=2", grids)
     assert status == 0, out + err
     assert cells == ["random-m2", "fps-m2"]
+    config = record(tmp_path, "random-m2")["config"]
+    assert (config["sizes"], config["weights"]) == ([2, 6], None)
 
 
 def test_grids_repeated_command_runs_missing_cells_only(plan):
@@ -91,14 +94,6 @@ def test_grids_mistake_is_one_line_before_any_cell(grids, message, tmp_path):
     assert message in err
     assert len(err.splitlines()) == 1
     assert cells == []
-
-
-def test_grids_values_may_be_null_lists_and_numbers(tmp_path):
-    grids = "[{sampler:random,m:4,sizes:[4,6],weights:null}]"
-    status, cells, out, err = start(tmp_path, f"hydra.sweeper.grids={grids}")
-    assert status == 0, out + err
-    config = record(tmp_path, "random-m4")["config"]
-    assert (config["sizes"], config["weights"]) == ([4, 6], None)
 
 
 def test_sweep_may_report_runs_of_different_settings_in_one_table(tmp_path):

@@ -17,29 +17,19 @@ from mops_lightning.config.compose import compose
 from mops_lightning.training.run.run import run
 
 TINY_ANY_DATA = [
-    "trainer=cpu",
-    "trainer.max_epochs=1",
-    "epochs.task=1",
-    "dataset.n_points=64",
-    "batch_size=4",
-    "m=8",
-    "pictures=0",
-    "logger=none",
+    *("trainer=cpu", "trainer.max_epochs=1", "epochs.task=1", "dataset.n_points=64"),
+    *("batch_size=4", "m=8", "pictures=0", "logger=none"),
 ]
 """The settings of the smallest job that do not depend on the dataset."""
 
 TINY = [
-    *TINY_ANY_DATA,
-    "dataset.train_per_class=4",
-    "dataset.test_per_class=3",
+    *(*TINY_ANY_DATA, "dataset.train_per_class=4", "dataset.test_per_class=3"),
     "dataset.classes=[chair,vase,lamp]",
 ]
 """The smallest job that runs every stage, on procedural shapes."""
 
 SMALL_PCRNET = [
-    "task=registration",
-    "weights=auto",
-    "pretrain_from=null",
+    *("task=registration", "weights=auto", "pretrain_from=null"),
     "task.net.feature_channels=[16,32]",
 ]
 """Registration by a net that is written to disk in no time."""
