@@ -6,9 +6,8 @@ from mops_lightning.errors import Parser, UserError, did_you_mean, one_line_endi
 
 
 def test_did_you_mean_suggests_the_closest_names():
-    assert did_you_mean("chiar", ["chair", "table"]) == (
-        " Did you mean 'chair'? Allowed: chair, table."
-    )
+    said = " Did you mean 'chair'? Allowed: chair, table."
+    assert did_you_mean("chiar", ["chair", "table"]) == said
     assert did_you_mean("zzz", ["chair"]) == " Allowed: chair."
 
 

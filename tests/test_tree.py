@@ -31,8 +31,10 @@ def tracked() -> list[Path]:
     return [path for path in paths if path.is_file()]
 
 
-def test_tracked_files_stay_below_25_mb(tracked):
-    assert sum(path.stat().st_size for path in tracked) < TREE
+def test_tracked_files_stay_below_25_mb_and_pictures_below_300_kb(tracked):
+    sizes = {path: path.stat().st_size for path in tracked}
+    assert sum(sizes.values()) < TREE
+    assert not [path for path in sizes if path.suffix in PICTURES and sizes[path] >= PICTURE]
 
 
 def test_results_have_at_most_150_files_and_short_pages(tracked):
@@ -41,11 +43,6 @@ def test_results_have_at_most_150_files_and_short_pages(tracked):
     pages = {path: len(path.read_text().splitlines()) for path in files if path.suffix == ".md"}
     readmes = {path: lines for path, lines in pages.items() if path.name == "README.md"}
     assert {path: lines for path, lines in readmes.items() if lines > 65} == {}
-
-
-def test_pictures_stay_below_300_kb(tracked):
-    sizes = {path: path.stat().st_size for path in tracked if path.suffix in PICTURES}
-    assert {path: size for path, size in sizes.items() if size >= PICTURE} == {}
 
 
 def test_weights_are_models_of_the_package(tracked):

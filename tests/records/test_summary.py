@@ -19,12 +19,16 @@ def cells(text):
     return [[cell.strip() for cell in line[1:-1].replace("┃", "│").split("│")] for line in lines]
 
 
-def test_one_size_gives_column_per_metric():
+def test_one_size_gives_column_per_metric_and_rows_of_baselines_readouts_full():
     metrics = {
+        "test/full/accuracy": 0.875,
+        "test/refined/accuracy": 0.75,
+        "test/matched/accuracy": 0.625,
+        "test/fps/accuracy": 0.25,
         "test/generated/accuracy": 0.5,
         "test/generated/subset_distance": 0.1,
-        "test/full/accuracy": 0.875,
-        "test/fps/accuracy": 0.25,
+        "test/random/accuracy": 0.125,
+        "test/completed/unique_points": 32.0,
         "test/matrix/nonzero_percent": 3.0,
         "test/loss/cross_entropy": 1.0,
     }
@@ -33,7 +37,10 @@ def test_one_size_gives_column_per_metric():
     assert cells(text) == [
         ["sampled by", "accuracy (%)"],
         ["fps", "25.00"],
+        ["random", "12.50"],
         ["mops generated", "50.00"],
+        ["mops matched", "62.50"],
+        ["mops refined (with the task net)", "75.00"],
         ["all points", "87.50"],
     ]
 
@@ -43,20 +50,6 @@ def test_columns_follow_declared_order_and_hide_the_rest():
     infos = {"a": {"summary_order": 2}, "b": {"summary_order": None}, "c": {"summary_order": 1}}
     text = printed(metrics, "test/generated/c", infos)
     assert cells(text)[0] == ["sampled by", "c", "a"]
-
-
-def test_readout_without_task_metrics_has_no_row():
-    metrics = {
-        "test/sampled/accuracy": 0.5,
-        "test/full/accuracy": 0.875,
-        "test/generated/subset_distance": 0.0,
-        "test/matched/unique_points": 32.0,
-    }
-    assert [row[0] for row in cells(printed(metrics, "test/sampled/accuracy"))] == [
-        "sampled by",
-        "mops sampled",
-        "all points",
-    ]
 
 
 def test_seven_sizes_fit_eighty_columns():
@@ -78,14 +71,6 @@ def test_task_net_alone_has_no_size():
     text = printed({"test/full/accuracy": 0.5}, "test/full/accuracy", learn="task")
     assert "all points, test" in text
     assert "m=32" not in text
-
-
-def test_rows_are_baselines_readouts_full():
-    names = ("full", "refined", "matched", "fps", "generated", "random")
-    metrics: dict[str, float | None] = {f"test/{name}/accuracy": 0.5 for name in names}
-    labels = [row[0] for row in cells(printed(metrics, "test/generated/accuracy"))[1:]]
-    readouts = ("generated", "matched", "refined (with the task net)")
-    assert labels == ["fps", "random", *(f"mops {name}" for name in readouts), "all points"]
 
 
 def test_sampler_with_anchors_is_named_as_in_reports():

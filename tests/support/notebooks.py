@@ -35,10 +35,8 @@ def run(path: Path) -> list[list[dict[str, Any]]]:
             outputs.append({"output_type": "stream", "name": "stdout", "text": text})
         if value is not None:
             data = {"text/plain": repr(value).splitlines(keepends=True)}
-            outputs.append(
-                {"output_type": "execute_result", "data": data, "metadata": {}}
-                | {"execution_count": number + 1}
-            )
+            result = {"output_type": "execute_result", "data": data, "metadata": {}}
+            outputs.append({**result, "execution_count": number + 1})
         outputs += [_picture(plt.figure(figure)) for figure in plt.get_fignums()]
         plt.close("all")
         found.append(outputs)

@@ -1,7 +1,5 @@
 """A task that notes every set of points it is given, and clouds that can be told apart."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
@@ -34,15 +32,7 @@ class Call(NamedTuple):
 
 
 CALLS: list[Call] = []
-"""Of all recording tasks, in order; see ``recorded_calls``."""
-
-
-@contextmanager
-def recorded_calls() -> Iterator[list[Call]]:
-    """Give the calls that are made meanwhile."""
-    CALLS.clear()
-    yield CALLS
-    CALLS.clear()
+"""Of all recording tasks, in order; the fixture ``calls`` empties it."""
 
 
 class Fingerprint(nn.Module):
@@ -93,3 +83,18 @@ def numbered_clouds(
 
     train, test = clouds(train_per_class, 0), clouds(test_per_class, FIRST_TEST_CLOUD)
     return CloudDataset(("numbered",), train, test, "numbered")
+
+
+def noting(kind, *arguments, **settings):
+    """A sampler that keeps what it returned, in ``samples``."""
+
+    class Noting(kind):  # type: ignore[misc, valid-type]
+        def sample(self, points, m):
+            output = super().sample(points, m)
+            self.samples.append((self.training, points.detach(), output))
+            return output
+
+    torch.manual_seed(0)
+    made = Noting(*arguments, **settings)
+    made.samples = []
+    return made

@@ -34,26 +34,6 @@ def small_dataset(train: int = 24, test: int = 10, points: int = 48) -> CloudDat
     return CloudDataset(("long", "tall", "round"), clouds(train), clouds(test), "blobs")
 
 
-def quick_classifier(net: Any, clouds: Clouds) -> Any:
-    """Fit a classifier's BatchNorm and last layer to clouds in one pass."""
-    norms = [part for part in net.modules() if isinstance(part, torch.nn.BatchNorm1d)]
-    for norm in norms:
-        norm.momentum = 1.0
-    features: list[torch.Tensor] = []
-    last = net.head[-1]
-    hook = last.register_forward_pre_hook(lambda _, given: features.append(given[0]))
-    with torch.no_grad():
-        net.train()(clouds.points)
-        net.eval()(clouds.points)
-        hook.remove()
-        wanted = torch.nn.functional.one_hot(clouds.labels, last.out_features).float()
-        last.weight.copy_(
-            torch.linalg.lstsq(features[-1] - features[-1].mean(0), wanted).solution.T
-        )
-        last.bias.copy_(wanted.mean(0) - last.weight @ features[-1].mean(0))
-    return net
-
-
 def changed(before, module):
     after = module.state_dict()
     return {name for name in before if not torch.equal(before[name], after[name])}

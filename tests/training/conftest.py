@@ -1,12 +1,11 @@
-from collections.abc import Iterator
-
 import pytest
 
-from tests.support.recording import Call, recorded_calls
+from tests.support.recording import CALLS
 
 
 @pytest.fixture
-def calls() -> Iterator[list[Call]]:
+def calls():
     """What the recording task is given during the test."""
-    with recorded_calls() as found:
-        yield found
+    CALLS.clear()
+    yield CALLS
+    CALLS.clear()

@@ -1,6 +1,8 @@
 """The settings that ``evaluate=RUN`` takes from RUN's record, and those that it refuses to take."""
 
+import copy
 import json
+from functools import cache
 from typing import Any
 
 import pytest
@@ -16,10 +18,15 @@ from tests.support.records import record
 OVERRIDES = [*TINY, "sampler=fmops", "sampler.m_max=32"]
 
 
+@cache
+def composed(*overrides):
+    return OmegaConf.to_container(compose(list(overrides)), resolve=True)
+
+
 def write_run(folder, overrides=OVERRIDES, changes=None, more=()):
     """Write the record of a completed run; only the record is read here."""
     folder.mkdir()
-    config: Any = OmegaConf.to_container(compose(overrides), resolve=True)
+    config: Any = copy.deepcopy(composed(*overrides))
     for path, value in (changes or {}).items():
         *nodes, name = path.split(".")
         node = config
@@ -71,16 +78,12 @@ def test_evaluation_same_group_keeps_settings_and_another_drops_them(run, tmp_pa
     assert "train_per_class" not in other.dataset
 
 
-@pytest.mark.parametrize("nothing", ["{}", "{fps: null}"])
-def test_evaluation_repeats_removed_baselines(nothing, tmp_path):
-    run = write_run(tmp_path / "run", [*OVERRIDES, f"baselines={nothing}"])
-    want = compose([*OVERRIDES, f"baselines={nothing}"])
-    assert evaluated(run).baselines == want.baselines
-
-
-def test_evaluation_repeats_added_baseline(tmp_path):
-    run = write_run(tmp_path / "run", [*OVERRIDES, "+sampler@baselines.own=submodular"])
-    assert "own" in evaluated(run).baselines
+@pytest.mark.parametrize(
+    "given", ["baselines={}", "baselines={fps: null}", "+sampler@baselines.own=submodular"]
+)
+def test_evaluation_repeats_removed_and_added_baselines(given, tmp_path):
+    run = write_run(tmp_path / "run", [*OVERRIDES, given])
+    assert evaluated(run).baselines == compose([*OVERRIDES, given]).baselines
 
 
 def test_command_line_run_named_in_several_ways(run, tmp_path):
@@ -109,40 +112,35 @@ def test_evaluation_leaves_out_removed_setting_that_nobody_gave(tmp_path):
         evaluated(given)
 
 
-CLASSES = {
-    "target": "sampler._target_=os.system",
-    "added target": "+dataset.extra._target_=os.system",
-    "path as choice": "task/net=../../evil",
-    "path in a package": "+sampler@baselines.own=/evil",
-    "sweep": "task/net=a,b",
-}
+FOREIGN: list[tuple[str, Any]] = [
+    ("sampler._target_", "os.system"),
+    ("+dataset.extra._target_", "os.system"),
+    ("task/net", "../../evil"),
+    ("+sampler@baselines.own", "/evil"),
+    ("task/net", "a,b"),
+]
+"""Classes, paths and sweeps among the overrides of a record."""
 
 
-@pytest.mark.parametrize("attack", CLASSES)
-def test_evaluation_record_with_class_or_path_raises(attack, tmp_path):
-    run = write_run(tmp_path / "run", more=[CLASSES[attack]])
+@pytest.mark.parametrize(("key", "value"), FOREIGN)
+def test_evaluation_record_with_class_or_path_raises(key, value, tmp_path):
+    run = write_run(tmp_path / "run", more=[f"{key}={value}"])
     with pytest.raises(UserError, match="not accepted from a record") as refused:
         evaluated(run)
-    assert CLASSES[attack].partition("=")[0].lstrip("+") in str(refused.value)
-
-
-@pytest.mark.parametrize("group", ["task", "dataset", "sampler"])
-def test_evaluation_record_with_path_as_group_raises(group, tmp_path):
-    run = write_run(tmp_path / "run", changes={f"names.{group}": "../../../tmp/evil"})
-    with pytest.raises(UserError, match="not accepted from a record"):
-        evaluated(run)
+    assert key.lstrip("+") in str(refused.value)
 
 
 @pytest.mark.parametrize(
     ("path", "value"),
     [
+        *((f"names.{group}", "../../../tmp/evil") for group in ("task", "dataset", "sampler")),
         ("sampler.num_sizes", "${oc.env:HOME}"),
         ("sampler.alpha", [{"_target_": "os.system"}]),
         ("dataset.classes", {"a": ["${oc.env:HOME}"]}),
         ("task.x[0]", 1),
     ],
 )
-def test_evaluation_record_with_code_as_value_raises(path, value, tmp_path):
+def test_evaluation_record_with_path_as_group_or_code_as_value_raises(path, value, tmp_path):
     run = write_run(tmp_path / "run", changes={path: value})
     with pytest.raises(UserError, match="not accepted from a record"):
         evaluated(run)

@@ -1,12 +1,10 @@
 import pytest
 import torch
 
+from mops_lightning import FPSSampler, MOPSNet, RandomSampler
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.experiment import Experiment
 from tests.support.training import quiet_trainer, small_dataset
@@ -53,14 +51,11 @@ def test_test_refine_adds_readout():
     assert module.score_name == "test/generated/accuracy"
 
 
-def test_experiment_without_optimizer_only_tests():
-    module = Experiment(Classification(PointNetVanilla(3), 3), FPSSampler(8), "nothing")
-    with pytest.raises(UserError, match="built without an optimizer"):
-        module.configure_optimizers()
-
-
-def test_learn_unknown_or_without_sampler_raises():
+def test_learn_unknown_or_without_sampler_or_optimizer_raises():
     with pytest.raises(UserError, match="Did you mean 'sampler'"):
         experiment("samplr")
     with pytest.raises(UserError, match="needs a sampler"):
         experiment("joint", sampler=None)
+    module = Experiment(Classification(PointNetVanilla(3), 3), FPSSampler(8), "nothing")
+    with pytest.raises(UserError, match="built without an optimizer"):
+        module.configure_optimizers()

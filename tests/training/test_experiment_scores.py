@@ -5,11 +5,8 @@ from itertools import pairwise
 import pytest
 import torch
 
+from mops_lightning import FPSSampler, GumbelSampler, RandomSampler, VoxelSampler
 from mops_lightning.data.loader import CloudLoader
-from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.gumbel import GumbelSampler
-from mops_lightning.samplers.random import RandomSampler
-from mops_lightning.samplers.voxel import VoxelSampler
 from mops_lightning.training.experiment import Experiment
 from tests.support.plain import plain_farthest
 from tests.support.recording import Fingerprint, RecordingTask, numbered_clouds
@@ -106,10 +103,9 @@ def test_test_scores_each_readout_from_its_own_points(sampler, calls):
     for m in module.sizes if sampler.generates else ():
         sets = [expected_points(sampler, cloud, m)["matched"] for cloud in data.test.points]
         counted = sum(len(rows.unique(dim=0)) for rows in sets) / len(sets)
-        name = (
-            f"test/m{m}/matched/unique_points" if sampler.flexible else "test/matched/unique_points"
-        )
-        assert trainer.callback_metrics[name] == pytest.approx(counted)
+        size = f"m{m}/" if sampler.flexible else ""
+        found = trainer.callback_metrics[f"test/{size}matched/unique_points"]
+        assert found == pytest.approx(counted)
     main = "generated" if sampler.generates else "sampled"
     own_size = "m8/" if sampler.flexible else ""
     assert module.score_name == f"test/{own_size}{main}/fingerprint"
@@ -125,9 +121,8 @@ def test_validation_scores_readouts_at_own_size(sampler):
     trainer.validate(module, CloudLoader(data.train, 3), verbose=False)
     want = expected_scores(module, data.train.points, (8,), baselines={})
     assert_distinct(want.values())
-    assert scores(trainer) == pytest.approx(
-        {f"val/{name}": value for name, value in want.items()}, abs=1e-4
-    )
+    want = {f"val/{name}": value for name, value in want.items()}
+    assert scores(trainer) == pytest.approx(want, abs=1e-4)
 
 
 @pytest.mark.parametrize("sampler", ["fmops", "fps"], indirect=True)

@@ -1,10 +1,8 @@
 import pytest
 
+from mops_lightning import FMOPSNet, FPSSampler, MOPSNet
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.samplers.fmops import FMOPSNet
-from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.run.build import sizes_to_test

@@ -6,52 +6,35 @@ from typing import Any
 
 import pytest
 import torch
-from lightning.pytorch.callbacks import Callback
 
+from mops_lightning import FMOPSNet, MOPSNet, ProgressiveSampleNet, SampleNet, complete, match
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.metrics.base import collection
 from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.ops.points import gather_points
-from mops_lightning.ops.readout import complete, match
-from mops_lightning.samplers.fmops import FMOPSNet
-from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.schedules import exponential
 from tests.support.losses import simplification_loss, subset_loss
-from tests.support.recording import Fingerprint, MeanFingerprint, RecordingTask, numbered_clouds
+from tests.support.recording import (
+    Fingerprint,
+    MeanFingerprint,
+    RecordingTask,
+    noting,
+    numbered_clouds,
+)
 from tests.support.training import quiet_trainer
 
 MOPS: dict[str, Any] = {"feature_channels": (8, 6), "rho_channels": (12, 10), "alpha": 2.0}
+STILL = partial(torch.optim.SGD, lr=0.0)
 SNET: dict[str, Any] = {"feature_channels": (8, 6), "head_channels": (12,), "alpha": 2.0}
-
-
-def noting(kind, *arguments, **settings):
-    """A sampler that keeps what it returned, in ``samples``."""
-
-    class Noting(kind):  # type: ignore[misc, valid-type]
-        def sample(self, points, m):
-            output = super().sample(points, m)
-            self.samples.append((self.training, points.detach(), output))
-            return output
-
-    torch.manual_seed(0)
-    made = Noting(*arguments, **settings)
-    made.samples = []
-    return made
 
 
 def fitted(sampler, epochs=1, task=None, recipe=None, augment=None, others=(), **extra):
     """Train with a rate of 0, so that all steps see the same weights, and validate each epoch."""
     data = numbered_clouds()
-    module = Experiment(
-        task or RecordingTask(Fingerprint()),
-        sampler,
-        make_optimizer=lambda parameters: torch.optim.SGD(parameters, lr=0.0),
-        recipe=recipe,
-        other_tasks=others,
-    )
+    task = task or RecordingTask(Fingerprint())
+    module = Experiment(task, sampler, make_optimizer=STILL, recipe=recipe, other_tasks=others)
     trainer = quiet_trainer(epochs, **extra)
     train = CloudLoader(data.train, 4, shuffle=True, augment=augment, drop_last=True)
     trainer.fit(module, train, CloudLoader(data.test, 10))
@@ -130,9 +113,8 @@ def test_losses_over_sizes_are_summed_or_averaged(how, make, name, loss, calls):
 @pytest.mark.parametrize("chosen", ["matched", "completed"])
 def test_straight_through_losses_are_means_over_generated_and_chosen_points(chosen, calls):
     recipe = Recipe(straight_through=0.0, straight_through_set=chosen)
-    module, logged = fitted(
-        noting(MOPSNet, 8, **MOPS), recipe=recipe, limit_train_batches=1, limit_val_batches=0
-    )
+    one_step = {"limit_train_batches": 1, "limit_val_batches": 0}
+    module, logged = fitted(noting(MOPSNet, 8, **MOPS), recipe=recipe, **one_step)
     generated, matched = (call.points for call in calls)
     clouds = calls[0].clouds
     rows = match(generated, clouds)
@@ -225,11 +207,7 @@ class WithMoreInTests(RecordingTask):
 
 
 def test_training_logs_means_over_clouds_of_uneven_batches():
-    module = Experiment(
-        WithMoreInTests(Fingerprint()),
-        learn="task",
-        make_optimizer=lambda parameters: torch.optim.SGD(parameters, lr=0.0),
-    )
+    module = Experiment(WithMoreInTests(Fingerprint()), None, "task", STILL)
     data, trainer = numbered_clouds(), quiet_trainer(1, limit_val_batches=0)
     trainer.fit(module, CloudLoader(data.train, 6), CloudLoader(data.test, 4))
     prints = module.task.net(data.train.points).detach()
@@ -253,41 +231,29 @@ def test_random_numbers_of_a_step_depend_on_epoch_and_step(calls):
     assert len(set(first)) > 1
 
 
-class Rates(Callback):
-    """Notes the learning rate of every step."""
-
-    def __init__(self):
-        self.seen = []
-
-    def on_before_optimizer_step(self, trainer, pl_module, optimizer):
-        self.seen.append(optimizer.param_groups[0]["lr"])
-
-
 def test_schedule_sets_rate_of_each_step_of_the_run():
-    module = Experiment(
-        RecordingTask(Fingerprint()),
-        learn="task",
-        make_optimizer=lambda parameters: torch.optim.SGD(parameters, lr=1e-3),
-        make_schedule=partial(exponential, end_lr=1e-5),
-    )
-    rates, data = Rates(), numbered_clouds()
+    rates: list[float] = []
+
+    def optimizer(parameters):
+        made = torch.optim.SGD(parameters, lr=1e-3)
+        made.register_step_pre_hook(lambda one, *_: rates.append(one.param_groups[0]["lr"]))
+        return made
+
+    schedule = partial(exponential, end_lr=1e-5)
+    module = Experiment(RecordingTask(Fingerprint()), None, "task", optimizer, schedule)
+    data = numbered_clouds()
     loaders = CloudLoader(data.train, 4, shuffle=True), CloudLoader(data.test, 4)
-    quiet_trainer(2, callbacks=[rates], limit_val_batches=0).fit(module, *loaders)
+    quiet_trainer(2, limit_val_batches=0).fit(module, *loaders)
     # 2 epochs of 4 batches.
-    assert rates.seen == pytest.approx([1e-3 * 0.01 ** (step / 7) for step in range(8)])
+    assert rates == pytest.approx([1e-3 * 0.01 ** (step / 7) for step in range(8)])
 
 
 @pytest.mark.parametrize("learn", ["sampler", "joint", "task"])
 def test_step_follows_the_gradient_of_the_total_loss(learn, calls):
-    torch.manual_seed(0)
     task, sampler = RecordingTask(Fingerprint()), MOPSNet(8, **MOPS)
     before = copy.deepcopy((task, sampler))
-    module = Experiment(
-        task,
-        None if learn == "task" else sampler,
-        learn,
-        make_optimizer=lambda parameters: torch.optim.SGD(parameters, lr=0.01),
-    )
+    trained = None if learn == "task" else sampler
+    module = Experiment(task, trained, learn, partial(torch.optim.SGD, lr=0.01))
     data = numbered_clouds()
     trainer = quiet_trainer(1, limit_train_batches=1, limit_val_batches=0)
     trainer.fit(module, CloudLoader(data.train, 4, shuffle=True), CloudLoader(data.test, 4))

@@ -1,8 +1,11 @@
 import pytest
 import torch
 
+from mops_lightning.metrics.base import collection
+from mops_lightning.metrics.classification import Accuracy
 from mops_lightning.ops.points import gather_points
 from mops_lightning.training.readouts import names_of_readouts, readouts
+from mops_lightning.training.scores import Scores
 from tests.support.samplers import SAMPLERS
 
 
@@ -27,3 +30,8 @@ def test_readouts_refine_starts_from_distinct_rows(name, rng):
 
 def test_readout_names_without_sampler_is_full():
     assert names_of_readouts(None) == ("full",)
+
+
+def test_scores_loss_of_nan_is_nan():
+    made = Scores(lambda: collection(Accuracy(3)), ("generated",), ())
+    assert made.update_loss("test/loss/x", torch.tensor(torch.nan), 2).compute().isnan()

@@ -16,17 +16,11 @@ def rates(make, steps, lr=1.0, **settings):
     return seen
 
 
-def test_exponential_spans_first_to_last_rate():
+def test_exponential_spans_first_to_last_rate_and_step_decay_stops_at_floor():
     seen = rates(exponential, 101, lr=5e-4, end_lr=1e-5)
-    assert seen[0] == pytest.approx(5e-4)
-    assert seen[-1] == pytest.approx(1e-5)
-    assert seen[50] == pytest.approx((5e-4 * 1e-5) ** 0.5)
-
-
-@pytest.mark.parametrize("share", [-0.1, 2.0])
-def test_one_cycle_of_no_share_raises(share):
-    with pytest.raises(UserError, match=f"^warmup must be between 0 and 1, got {share}"):
-        rates(one_cycle, 5, warmup=share)
+    assert [seen[0], seen[50], seen[-1]] == pytest.approx([5e-4, (5e-4 * 1e-5) ** 0.5, 1e-5])
+    seen = rates(step_decay, 10, every=2, factor=0.5, floor_lr=0.2)
+    assert seen == pytest.approx([1, 1, 0.5, 0.5, 0.25, 0.25, 0.2, 0.2, 0.2, 0.2])
 
 
 def test_one_cycle_equals_torch():
@@ -49,17 +43,16 @@ def test_one_cycle_equals_torch():
     assert seen == pytest.approx(want)
 
 
-def test_step_decay_stops_at_floor():
-    seen = rates(step_decay, 10, every=2, factor=0.5, floor_lr=0.2)
-    assert seen == pytest.approx([1, 1, 0.5, 0.5, 0.25, 0.25, 0.2, 0.2, 0.2, 0.2])
-
-
-def test_exponential_zero_end_lr_raises():
-    with pytest.raises(UserError, match=r"end_lr.*positive.*0"):
-        rates(exponential, 3, end_lr=0.0)
-
-
-@pytest.mark.parametrize(("name", "value"), [("every", 0), ("factor", 0.0), ("factor", 2.0)])
-def test_step_decay_out_of_range_raises(name, value):
-    with pytest.raises(UserError, match=f"^{name} must be"):
-        rates(step_decay, 5, **{"every": 2, "factor": 0.5, "floor_lr": 0.0, name: value})
+@pytest.mark.parametrize(
+    ("make", "name", "value"),
+    [
+        *((one_cycle, "warmup", value) for value in (-0.1, 2.0)),
+        (exponential, "end_lr", 0.0),
+        (step_decay, "every", 0),
+        *((step_decay, "factor", value) for value in (0.0, 2.0)),
+    ],
+)
+def test_schedule_argument_out_of_range_raises(make, name, value):
+    others = {"every": 2, "factor": 0.5, "floor_lr": 0.0} if make is step_decay else {}
+    with pytest.raises(UserError, match=f"^{name} must be .*, got {value}"):
+        rates(make, 5, **{**others, name: value})

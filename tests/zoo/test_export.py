@@ -4,14 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from mops_lightning import FMOPSNet, FPSSampler, MOPSNet, SampleNet, SNet, load
 from mops_lightning.errors import UserError
-from mops_lightning.samplers.fmops import FMOPSNet
-from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.samplers.samplenet import SampleNet
-from mops_lightning.samplers.snet import SNet
 from mops_lightning.zoo.export import export, plain_net
-from mops_lightning.zoo.load import load
 
 SMALL: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
 SIZES = ((1, 12), (4, 100), (2, 257))

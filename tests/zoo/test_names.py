@@ -19,14 +19,11 @@ def own(tmp_path, monkeypatch):
     return folder
 
 
-def test_available_lists_own_folders_and_package(own):
+def test_available_lists_own_folders_before_the_package(own):
     found = names.available()
     assert list(found) == sorted(found)
     assert found["fmops.mine"] == own / "fmops.mine.safetensors"
     assert found["pointnet.modelnet40"].parent == names.SHIPPED
-
-
-def test_own_model_comes_before_one_of_the_package(own):
     (own / "pointnet.modelnet40.safetensors").touch()
     assert names.find_model("pointnet.modelnet40") == own / "pointnet.modelnet40.safetensors"
 

@@ -37,11 +37,6 @@ def test_task_net_is_found_by_hash_or_name(run, tmp_path):
     assert weights.of_run(path, "task_weights") == names.available()["pointnet.modelnet40"]
 
 
-def test_sampler_as_task_net_is_refused(run, tmp_path):
-    with pytest.raises(UserError, match=r"--task-net: fmops\.pairs-m64 is a sampler"):
-        publish.add(run, "fmops.mine", tmp_path, task_net="fmops.pairs-m64")
-
-
 def test_half_precision_is_for_wide_layers(run, tmp_path):
     path = publish.add(run, "fmops.half", tmp_path, half=True, notes="Mine.")
     content = weights.read(path)
@@ -58,23 +53,26 @@ def test_other_names_are_refused(run, tmp_path, name):
         publish.add(run, name, tmp_path)
 
 
-def test_taken_name_is_refused_unless_overwritten(run, tmp_path):
+def test_taken_name_is_refused_unless_overwritten_and_sampler_as_task_net(run, tmp_path):
     publish.add(run, "fmops.mine", tmp_path)
     with pytest.raises(UserError, match=r"exists.*--overwrite"):
         publish.add(run, "fmops.mine", tmp_path)
     publish.add(run, "fmops.mine", tmp_path, overwrite=True)
+    with pytest.raises(UserError, match=r"--task-net: fmops\.pairs-m64 is a sampler"):
+        publish.add(run, "fmops.other", tmp_path, task_net="fmops.pairs-m64")
 
 
-@pytest.mark.parametrize("fields", [{"status": "failed"}, {"files": {}}])
-def test_runs_without_weights_are_refused(tmp_path, fields):
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"status": "failed"}, "not a completed run that kept its weights"),
+        ({"files": {}}, "not a completed run that kept its weights"),
+        ({"metrics": {}, "score_name": ""}, "no test score"),
+    ],
+)
+def test_runs_without_weights_or_scores_are_refused(tmp_path, fields, words):
     write_run(tmp_path / "run", **fields)
-    with pytest.raises(UserError, match="not a completed run that kept its weights"):
-        publish.add(tmp_path / "run", "fmops.mine", tmp_path)
-
-
-def test_run_without_scores_is_refused(tmp_path):
-    write_run(tmp_path / "run", metrics={}, score_name="")
-    with pytest.raises(UserError, match="no test score"):
+    with pytest.raises(UserError, match=words):
         publish.add(tmp_path / "run", "fmops.mine", tmp_path)
 
 

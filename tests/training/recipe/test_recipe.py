@@ -1,86 +1,67 @@
 """Recipes: what a training step sees, what it adds to the loss, and which weights are kept."""
 
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
+from mops_lightning import MOPSNet, complete
 from mops_lightning.config.build import build
 from mops_lightning.config.compose import compose
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.points import gather_points
-from mops_lightning.ops.readout import complete
-from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.tasks.registration import Pairs
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.moving_average import MovingAverage
 from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through
 from mops_lightning.types import Batch, SampleOutput
+from tests.support.recording import Fingerprint, RecordingTask, noting
 from tests.support.training import quiet_trainer, small_dataset
 
 POINTS = 48
 
 
-class SeenBy(MOPSNet):
-    """Notes how many points it is given, in training and in evaluation."""
-
-    def __init__(self) -> None:
-        super().__init__(8, feature_channels=(8, 8), rho_channels=(16, 8))
-        self.seen: dict[bool, list[int]] = {True: [], False: []}
-
-    def sample(self, points: torch.Tensor, m: int) -> SampleOutput:
-        self.seen[self.training].append(points.shape[1])
-        return super().sample(points, m)
-
-
-def trained(recipe: Recipe, epochs: int = 2, **more: Any) -> Experiment:
+def trained(recipe, epochs=2, **more):
     """Train on 24 clouds in batches of 6."""
-    torch.manual_seed(0)
-    module = Experiment(
-        Classification(PointNetVanilla(3), 3),
-        SeenBy(),
-        make_optimizer=lambda parameters: torch.optim.Adam(parameters, lr=1e-2),
-        recipe=recipe,
-    )
+    sampler = noting(MOPSNet, 8, feature_channels=(8, 8), rho_channels=(16, 8))
+    task, adam = Classification(PointNetVanilla(3), 3), partial(torch.optim.Adam, lr=1e-2)
+    module = Experiment(task, sampler, make_optimizer=adam, recipe=recipe)
     data = small_dataset(points=POINTS)
     trainer = quiet_trainer(epochs, **more)
     trainer.fit(module, CloudLoader(data.train, 6, shuffle=True), CloudLoader(data.test, 6))
     return module
 
 
-def test_recipe_paper_and_fast_are_valid_and_differ():
-    assert build(compose(["recipe=paper"]).recipe, "recipe") == Recipe()
+def numbers_seen(module, training):
+    """How many points the sampler was given in each step."""
+    samples = module.sampler.samples
+    return [points.shape[1] for phase, points, _ in samples if phase == training]
+
+
+def test_recipe_paper_is_the_default_and_differs_from_fast(composed):
+    assert Recipe() == Recipe(None, None, None, False, 0.0, 0.0, None, None)
+    assert build(composed, "recipe") == Recipe()
     assert build(compose().recipe, "recipe") != Recipe()
 
 
-class NetSeenBy(PointNetVanilla):
-    """Notes how many points it is given, in training and in evaluation."""
-
-    def __init__(self) -> None:
-        super().__init__(3)
-        self.seen: dict[bool, set[int]] = {True: set(), False: set()}
-
-    def forward(self, points: torch.Tensor) -> torch.Tensor:
-        self.seen[self.training].add(points.shape[1])
-        return super().forward(points)
-
-
-def test_task_points_are_drawn_for_task_net_alone():
-    net, data = NetSeenBy(), small_dataset(points=POINTS)
-    module = Experiment(
-        Classification(net, 3),
-        learn="task",
-        make_optimizer=torch.optim.Adam,
-        recipe=Recipe(task_points=16),
-    )
+def test_task_points_are_drawn_for_task_net_alone(calls):
+    data = small_dataset(points=POINTS)
+    recipe, task = Recipe(task_points=16), RecordingTask(Fingerprint())
+    module = Experiment(task, None, "task", torch.optim.Adam, recipe=recipe)
     quiet_trainer(1).fit(module, CloudLoader(data.train, 6), CloudLoader(data.test, 6))
-    assert net.seen == {True: {16}, False: {POINTS}}
-    sampler = trained(Recipe(task_points=16)).sampler
-    assert isinstance(sampler, SeenBy)
-    assert set(sampler.seen[True]) == {POINTS}
+    seen = {(call.training, call.points.shape[1]) for call in calls}
+    assert seen == {(True, 16), (False, POINTS)}
+    assert set(numbers_seen(trained(recipe, 1), True)) == {POINTS}
+
+
+@pytest.fixture(scope="module")
+def composed():
+    return compose(["recipe=paper"]).recipe
 
 
 @pytest.mark.parametrize(
@@ -97,26 +78,19 @@ def test_task_points_are_drawn_for_task_net_alone():
         ("feature_distillation", -1.0),
     ],
 )
-def test_recipe_value_out_of_range_raises(name, value):
+def test_recipe_value_out_of_range_raises(composed, name, value):
     with pytest.raises(UserError, match=rf"{name} must be .* got"):
         Recipe(**{name: value})
     with pytest.raises(UserError, match=rf"recipe.{name} must be .* got"):
-        build(compose([f"recipe.{name}={value}"]).recipe, "recipe")
+        build(OmegaConf.merge(composed, {name: value}), "recipe")
 
 
-def test_recipe_set_without_straight_through_raises():
-    with pytest.raises(UserError, match="straight_through_set has no effect without"):
-        Recipe(straight_through_set="completed")
-
-
-def test_recipe_default_is_that_of_the_publication():
-    assert Recipe() == Recipe(None, None, None, False, 0.0, 0.0, None, None)
-
-
-def test_recipe_accepts_limits():
+def test_recipe_accepts_limits_but_no_set_without_straight_through():
     for share in (0.0, 1.0):
         Recipe(all_points_from=share, straight_through=share, ema_span=share)
     Recipe(train_points=1, task_points=1)
+    with pytest.raises(UserError, match="straight_through_set has no effect without"):
+        Recipe(straight_through_set="completed")
 
 
 def test_shares_of_the_training_include_their_first_step():
@@ -126,26 +100,18 @@ def test_shares_of_the_training_include_their_first_step():
     assert not Recipe().sees_matched(1.0)
 
 
-def test_points_at_of_task_net_alone_are_task_points():
-    recipe = Recipe(train_points=64, task_points=128)
-    assert recipe.points_at(0, 1024, 0) == 128
-    assert recipe.points_at(0, 100, 0) == 100
-    assert Recipe(train_points=64).points_at(0, 1024, 0) == 1024
-
-
 def test_training_sees_drawn_points_then_all_and_validation_always_all():
     module = trained(Recipe(train_points=20, all_points_from=0.5))
-    assert isinstance(module.sampler, SeenBy)
-    assert module.sampler.seen[True] == [20] * 4 + [POINTS] * 4
-    assert set(module.sampler.seen[False]) == {POINTS}
+    assert numbers_seen(module, True) == [20] * 4 + [POINTS] * 4
+    assert set(numbers_seen(module, False)) == {POINTS}
 
 
-def test_points_at_is_at_least_twice_the_sample():
-    recipe = Recipe(train_points=256)
-    assert recipe.points_at(0, 1024, 32) == 256
-    assert recipe.points_at(0, 1024, 200) == 400
-    assert recipe.points_at(0, 1024, 800) == 1024
+def test_points_at_is_at_least_twice_the_sample_or_as_many_as_for_a_task_net_alone():
+    recipe = Recipe(train_points=256, task_points=128)
+    assert [recipe.points_at(0, 1024, m) for m in (32, 200, 800)] == [256, 400, 1024]
     assert Recipe().points_at(0, 1024, 32) == 1024
+    assert [recipe.points_at(0, number, 0) for number in (1024, 100)] == [128, 100]
+    assert Recipe(train_points=64).points_at(0, 1024, 0) == 1024
 
 
 def test_draw_points_returns_distinct_rows_new_in_every_draw():
@@ -232,6 +198,5 @@ def test_moving_average_keeps_frozen_net_and_counters_of_batches():
     after = module.task.state_dict()
     assert any(name.endswith("num_batches_tracked") for name in before)
     assert all(torch.equal(after[name], value) for name, value in before.items())
-    assert module.sampler is not None
     counters = [b for b in module.sampler.buffers() if not b.is_floating_point()]
     assert {int(counter) for counter in counters} == {module.total_steps}

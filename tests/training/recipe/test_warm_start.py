@@ -48,7 +48,6 @@ def test_sampler_of_another_size_continues_from_a_run(tmp_path):
 
 
 def test_copy_pointwise_layers_copies_until_shapes_differ():
-    torch.manual_seed(0)
     source, target = PointMLP([3, 8, 8, 16, 32]), PointFeatures([8, 8, 16, 16])
     source(POINTS)  # moves the running statistics
     before = copy.deepcopy(target.state_dict())
@@ -64,7 +63,6 @@ def test_copy_pointwise_layers_copies_until_shapes_differ():
 
 
 def test_copy_pointwise_layers_without_batch_norm_computes_the_same():
-    torch.manual_seed(0)
     source, target = PointMLP([3, 8, 8, 16], norm=False), PointMLP([3, 8, 8, 16])
     assert copy_pointwise_layers(source, target, POINTS) == 3
     for mode in (False, True):  # in training, with the statistics of the same points
@@ -79,7 +77,6 @@ def test_copy_pointwise_layers_without_counterpart_copies_none():
 
 
 def test_copy_tensors_takes_the_rows_that_both_have():
-    torch.manual_seed(0)
     large, small = MOPSNet(12, **SIZES), MOPSNet(8, **SIZES)
     for source, target in ((large, small), (small, large)):
         target = copy.deepcopy(target)
@@ -93,7 +90,6 @@ def test_copy_tensors_takes_the_rows_that_both_have():
 
 
 def test_copy_tensors_leaves_other_shapes_and_names():
-    torch.manual_seed(0)
     source, target = nn.Linear(3, 4), nn.Linear(5, 4)
     before = target.weight.clone()
     assert copy_tensors(source.state_dict(), target) == ["bias"]

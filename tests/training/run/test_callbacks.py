@@ -22,16 +22,9 @@ def build_from(overrides, tmp_path):
     return build_callbacks(nodes, offered, logged=False)
 
 
-def test_standard_names_are_those_of_the_yaml():
+def test_without_logger_and_pictures_two_are_built_if_none_is_left_out(tmp_path):
     assert set(compose().callbacks) == set(STANDARD)
-
-
-def test_without_logger_and_pictures_two_are_built(tmp_path):
-    made = build_from([], tmp_path)
-    assert [type(one) for one in made] == [ModelCheckpoint, EpochLines]
-
-
-def test_null_leaves_a_callback_out(tmp_path):
+    assert [type(one) for one in build_from([], tmp_path)] == [ModelCheckpoint, EpochLines]
     made = build_from(["callbacks.progress=null"], tmp_path)
     assert [type(one) for one in made] == [ModelCheckpoint]
 

@@ -11,7 +11,7 @@ from mops_lightning.records import run_record
 from mops_lightning.training.evaluation import command_line
 from mops_lightning.training.run.run import run
 from mops_lightning.zoo import publish
-from tests.support.command_line import SMALL_PCRNET, job, refused, runs
+from tests.support.command_line import job, refused, runs
 
 
 @pytest.fixture(scope="module")
@@ -71,23 +71,25 @@ def test_evaluate_older_record_without_newer_setting(trained, tmp_path):
         evaluated(older, tmp_path / "other", "sampler.min_size=2")
 
 
-def test_evaluate_record_with_settings_of_its_recipe_and_of_no_file(trained, tmp_path):
-    sampler = {**trained[1].config["sampler"], "size_sampling": "uniform", "threshold": 0.0}
-    sampler["feature_channels"] = [64, 64, 64, 128, 128]
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"size_sampling": "uniform", "feature_channels": [64, 64, 64, 128, 128]},
+        {"_target_": "pathlib.Path"},
+    ],
+)
+def test_evaluate_takes_settings_of_a_recipe_but_no_code_from_a_record(trained, tmp_path, changes):
+    sampler = {**trained[1].config["sampler"], **changes}
     again = evaluated(changed_record(trained, tmp_path / "run", sampler), tmp_path)
-    assert again.config["sampler"]["size_sampling"] == "uniform"
+    assert again.config["sampler"]["size_sampling"] == sampler["size_sampling"]
     assert again.metrics == trained[1].metrics
 
 
-def test_evaluate_wrong_value_in_record_names_the_run_and_leaves_nothing(trained, tmp_path):
+def test_evaluate_wrong_value_in_record_or_other_sampler_leaves_nothing(trained, tmp_path):
     sampler = {**trained[1].config["sampler"], "alpha": "abc"}
     folder, _ = changed_record(trained, tmp_path / "run", sampler)
     err = refused([f"evaluate={folder}"], tmp_path)
     assert f"evaluate: the record of {folder}: sampler.alpha must be a number" in err
-    assert runs(tmp_path) == []
-
-
-def test_evaluate_other_sampler_is_refused_before_a_folder_is_made(trained, tmp_path):
     err = refused([f"evaluate={trained[0]}", "sampler=mops"], tmp_path)
     assert "was trained with sampler=fmops, got sampler=mops. Leave sampler out" in err
     assert runs(tmp_path) == []
@@ -99,12 +101,6 @@ def test_evaluate_model_without_its_task_net_asks_for_one(trained, tmp_path):
         evaluated((model, trained[1]), tmp_path)
 
 
-def test_evaluate_takes_no_code_from_settings_of_record(trained, tmp_path):
-    target = {**trained[1].config["sampler"], "_target_": "pathlib.Path"}
-    again = evaluated(changed_record(trained, tmp_path / "run", target), tmp_path)
-    assert again.metrics == trained[1].metrics
-
-
 def test_evaluate_other_sizes_and_data(trained, tmp_path):
     record = evaluated(trained, tmp_path, "sizes=[5,20]", "dataset.n_points=100")
     sizes = {name.split("/")[1] for name in record.metrics if name.endswith("matched/accuracy")}
@@ -113,21 +109,16 @@ def test_evaluate_other_sizes_and_data(trained, tmp_path):
     assert record.config["dataset"]["classes"] == ["chair", "vase", "lamp"]
 
 
-def test_evaluate_noise_changes_test_clouds_only(trained, tmp_path):
+@pytest.mark.parametrize("change", ["test_noise_std=0.5", "test_corruption=drop_global-5"])
+def test_evaluate_on_other_test_clouds_uses_the_same_data_and_net(trained, tmp_path, change):
     _, record = trained
-    noisy = evaluated(trained, tmp_path, "test_noise_std=0.5")
+    changed = evaluated(trained, tmp_path, change)
     key = "test/m8/generated/subset_distance"
-    assert noisy.metrics[key] != record.metrics[key]
+    assert changed.metrics[key] != record.metrics[key]
+    # A quarter of the points lies farther away.
+    assert "drop" not in change or changed.metrics[key] > record.metrics[key]
     for name in ("dataset_fingerprint", "task_weights_sha256"):
-        assert getattr(noisy, name) == getattr(record, name)
-
-
-def test_evaluate_on_corrupted_clouds(trained, tmp_path):
-    _, record = trained
-    thinned = evaluated(trained, tmp_path, "test_corruption=drop_global-5")
-    key = "test/m8/generated/subset_distance"
-    assert thinned.metrics[key] > record.metrics[key]  # a quarter of the points lies farther away
-    assert thinned.dataset_fingerprint == record.dataset_fingerprint
+        assert getattr(changed, name) == getattr(record, name)
 
 
 def test_evaluate_threshold_changes_generated_points(trained, tmp_path):
@@ -138,13 +129,6 @@ def test_evaluate_threshold_changes_generated_points(trained, tmp_path):
     assert sparse.metrics[changed] != record.metrics[changed]
     assert sparse.metrics[same] == record.metrics[same]
     assert sparse.config["sampler"]["threshold"] == 0.02
-
-
-def test_evaluate_another_task_net(trained, tmp_path):
-    job(tmp_path / "task", "learn=task", "seed=5", "dataset.seed=0")
-    record = evaluated(trained, tmp_path, f"weights={tmp_path}/task/weights.safetensors")
-    ours = trained[1].task_weights_sha256
-    assert record.task_weights_sha256 not in (None, ours)
 
 
 def test_evaluate_joint_run_uses_its_task_net(tmp_path):
@@ -167,11 +151,14 @@ def test_evaluate_mismatch_raises(trained, tmp_path, argument, named):
         evaluated(trained, tmp_path, argument)
 
 
-def test_task_net_other_classes_raises(tmp_path):
-    job(tmp_path / "task", "learn=task")
+def test_another_task_net_is_used_with_its_own_classes_only(trained, tmp_path):
+    job(tmp_path / "task", "learn=task", "seed=5", "dataset.seed=0")
+    other = f"weights={tmp_path}/task/weights.safetensors"
+    record = evaluated(trained, tmp_path, other)
+    assert record.task_weights_sha256 not in (None, trained[1].task_weights_sha256)
     swapped = ["sampler=fps", "dataset.classes=[vase,chair,bed]"]
     with pytest.raises(UserError, match="classes, which are not the"):
-        job(tmp_path / "new", *swapped, f"weights={tmp_path}/task/weights.safetensors")
+        job(tmp_path / "swapped", *swapped, other)
 
 
 def test_trained_run_not_evaluable_raises(trained, tmp_path):
@@ -228,9 +215,3 @@ def test_evaluate_missing_weights_raises(trained, tmp_path):
     (tmp_path / "result.json").write_text(json.dumps(record))
     with pytest.raises(UserError, match=r"evaluate: the sampler of .* cannot be loaded"):
         evaluated((tmp_path, record), tmp_path, "weights=null")
-
-
-def test_command_line_other_net_drops_its_settings(tmp_path):
-    job(tmp_path / "run", *SMALL_PCRNET, "task.net.iterations=2", "sampler=mops")
-    again = evaluated((tmp_path / "run", None), tmp_path / "icp", "task/net=icp")
-    assert again.status == "completed"

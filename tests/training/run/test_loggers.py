@@ -23,9 +23,8 @@ def test_csv_logger_writes_curves(tmp_path):
     record = logged(tmp_path, "logger=csv")
     with (tmp_path / "run" / "csv" / "metrics.csv").open() as file:
         values = [line["test/generated/accuracy"] for line in csv.DictReader(file)]
-    assert float(next(filter(None, values))) == pytest.approx(
-        record.metrics["test/generated/accuracy"]
-    )
+    score = record.metrics["test/generated/accuracy"]
+    assert float(next(filter(None, values))) == pytest.approx(score)
 
 
 def test_mlflow_logger_writes_settings_and_curves(tmp_path, monkeypatch):

@@ -22,18 +22,23 @@ def files(folder, pattern):
 
 
 def test_task_net_from_file_is_not_published(tmp_path):
+    cfg = compose([*TINY, f"cache={tmp_path}/cache", "learn=task", *SMALL_PCRNET])
+    folder = cache_folder(cfg, build(cfg.dataset, "dataset"))
+    folder.mkdir(parents=True)
+    (folder / f"{TEMPORARY}left by a kill.pt").touch()
     train(tmp_path, "learn=task", *SMALL_PCRNET)
-    (published,) = files(tmp_path, "cache/weights/*/weights.safetensors")
-    first = tmp_path / "run0" / "weights.safetensors"
+    assert [path.name for path in folder.iterdir()] == [weights.FILE]
+    published = weights.read(folder / weights.FILE)
     # A run's folder means its weights file.
-    record = train(
-        tmp_path, "learn=task", *SMALL_PCRNET, f"weights={first.parent}", "optimizer.lr=0"
-    )
+    given = ["learn=task", *SMALL_PCRNET, f"weights={tmp_path / 'run1'}", "optimizer.lr=0"]
+    record = train(tmp_path, *given)
     assert record.weights_loaded == published["sha256"]
-    paths = sorted(tmp_path.glob("run*/weights.safetensors"))
-    own, again = (weights.read(path)["state"] for path in paths)
+    own, again = (one["state"] for one in files(tmp_path, "run*/weights.safetensors"))
     assert all(torch.equal(own[name], again[name]) for name in own)  # at a rate of 0 nothing moves
     assert len(files(tmp_path, "cache/weights/*/weights.safetensors")) == 1
+    (folder / weights.FILE).unlink()
+    train(tmp_path, *given, f"ckpt_path={tmp_path / 'run2'}")
+    assert not files(tmp_path, "cache/weights/*/weights.safetensors")
 
 
 def test_task_net_is_pretrained_by_its_own_optimizer(tmp_path):
@@ -52,33 +57,6 @@ def test_pretraining_starts_from_given_weights(tmp_path):
     assert record.task_weights_sha256 == weights.read(start / "weights.safetensors")["sha256"]
     with pytest.raises(UserError, match="pretrain_from: no file"):
         train(tmp_path, *own, "pretrain_from=nowhere/net.pt")
-
-
-def test_weights_file_for_net_without_weights_raises(tmp_path):
-    with pytest.raises(UserError, match=r"weights: icp.*got pointnet"):
-        train(
-            tmp_path,
-            "task=registration",
-            "task/net=icp",
-            "sampler=fps",
-            "weights=pointnet.modelnet40",
-        )
-
-
-def test_resumed_run_from_file_is_not_published(tmp_path):
-    cfg = compose([*TINY, f"cache={tmp_path}/cache", "learn=task", *SMALL_PCRNET])
-    folder = cache_folder(cfg, build(cfg.dataset, "dataset"))
-    folder.mkdir(parents=True)
-    (folder / f"{TEMPORARY}left by a kill.pt").touch()
-    train(tmp_path, "learn=task", *SMALL_PCRNET)
-    assert [path.name for path in folder.iterdir()] == [weights.FILE]
-    (first,) = tmp_path.glob("run*/weights.safetensors")
-    given = ["learn=task", *SMALL_PCRNET, f"weights={first}"]
-    train(tmp_path, *given)
-    for path in (tmp_path / "cache" / "weights").rglob("weights.safetensors"):
-        path.unlink()
-    train(tmp_path, *given, f"ckpt_path={sorted(tmp_path.glob('run*'))[-1]}")
-    assert not files(tmp_path, "cache/weights/*/weights.safetensors")
 
 
 def test_resume_other_weights_raises(tmp_path):
@@ -107,6 +85,10 @@ def test_diverged_training_fails_without_weights(tmp_path):
         (
             ["task/net=pointnet"],
             r"task\.net must take \(source, target\).*PointNetVanilla.*\(points\)",
+        ),
+        (
+            ["task/net=icp", "sampler=fps", "weights=pointnet.modelnet40"],
+            r"weights: icp.*got pointnet",
         ),
         (["task.net=null"], r"task.net cannot be removed"),
         (["task.resample=0"], r"task.resample must be .*got 0"),

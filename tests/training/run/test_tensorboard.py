@@ -26,7 +26,7 @@ def board(tmp_path_factory):
     """The address of a TensorBoard that shows the small runs of a sweep."""
     folder = tmp_path_factory.mktemp("board")
     logged = [one for one in TINY if not one.startswith(("pictures", "logger"))]
-    overrides = [*logged, "weights=null", "pictures=3", "trainer.max_epochs=2"]
+    overrides = [*logged, "weights=null", "pictures=1", "trainer.max_epochs=2"]
     overrides += ["val_fraction=0.2", f"cache={folder}/cache"]
     for number, own in enumerate(RUNS):
         mine = [*overrides, *own]

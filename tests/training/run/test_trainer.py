@@ -18,37 +18,26 @@ from mops_lightning.training.run.trainer import (
     make_trainer,
 )
 from tests.support.command_line import TINY
+from tests.support.full_disk import full_disk
 from tests.support.training import small_dataset
 
 
-def test_make_trainer_writes_checkpoints_atomically(tmp_path):
-    experiment = Experiment(Classification(PointNetVanilla(3), 3), learn="task")
-    trainer = make_trainer(compose(TINY), tmp_path, small_dataset(), experiment, clouds=8)
-    assert isinstance(trainer.strategy.checkpoint_io, AtomicCheckpointIO)
-
-
-def test_make_trainer_progress_bar_shows_no_version(tmp_path):
+def test_make_trainer_writes_checkpoints_atomically_and_shows_no_version(tmp_path):
     experiment = Experiment(Classification(PointNetVanilla(3), 3), learn="task")
     cfg = compose([*(one for one in TINY if not one.startswith("logger")), "logger=tensorboard"])
     trainer = make_trainer(cfg, tmp_path, small_dataset(), experiment, clouds=8)
+    assert isinstance(trainer.strategy.checkpoint_io, AtomicCheckpointIO)
     assert trainer.logger is not None
     assert trainer.logger.log_dir is not None
     assert Path(trainer.logger.log_dir) == tmp_path / "tensorboard"
     assert "v_num" not in get_standard_metrics(trainer)
 
 
-class Unwritable:
-    """Fails in the middle of writing, as a full disk does."""
-
-    def __reduce__(self):
-        raise OSError("no space left on device")
-
-
-def test_save_checkpoint_error_keeps_previous(tmp_path):
+def test_save_checkpoint_on_full_disk_keeps_previous(tmp_path):
     path = tmp_path / "checkpoints" / "last.ckpt"
     AtomicCheckpointIO().save_checkpoint({"epoch": 1}, path)
-    with pytest.raises(OSError, match="no space left"):
-        AtomicCheckpointIO().save_checkpoint({"big": torch.zeros(9999), "bad": Unwritable()}, path)
+    with full_disk(), pytest.raises(OSError, match="too large"):
+        AtomicCheckpointIO().save_checkpoint({"big": torch.zeros(9999)}, path)
     assert torch.load(path) == {"epoch": 1}
     assert [one.name for one in path.parent.iterdir()] == ["last.ckpt"]
 
@@ -69,7 +58,7 @@ def test_keep_freed_memory_elsewhere_does_nothing(monkeypatch):
     assert not keep_freed_memory()
 
 
-def test_clouds_to_draw_spreads_over_classes():
+def test_clouds_to_draw_spreads_over_classes_that_have_test_clouds():
     dataset = small_dataset()
     chosen, names = clouds_to_draw(dataset, 2)
     assert names == ["long", "round"]
@@ -78,11 +67,6 @@ def test_clouds_to_draw_spreads_over_classes():
     assert clouds_to_draw(dataset, 9)[1] == ["long", "tall", "round"]
     assert clouds_to_draw(dataset, 1)[1] == ["long"]
     assert clouds_to_draw(dataset, 0)[1] == []
-
-
-def test_clouds_to_draw_leaves_out_classes_without_test_clouds():
-    dataset = small_dataset()
     test = dataset.test.take(dataset.test.labels != 0)
     chosen, names = clouds_to_draw(replace(dataset, test=test), 3)
-    assert names == ["tall", "round"]
-    assert test.labels[chosen].tolist() == [1, 2]
+    assert (names, test.labels[chosen].tolist()) == (["tall", "round"], [1, 2])
