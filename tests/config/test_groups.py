@@ -41,12 +41,6 @@ def test_help_shows_every_key_and_choice(tmp_path):
     assert not any(line.startswith(hidden) for line in out.splitlines())
 
 
-def test_no_default_is_computed_from_other_choices():
-    for path in conf_dir().rglob("*.yaml"):
-        text = path.read_text()
-        assert not any(word in text for word in ("choose:", "model_for:", "oc.select")), path
-
-
 def test_only_experiments_set_keys_of_other_groups():
     names = [
         path.relative_to(conf_dir()).as_posix()
@@ -55,22 +49,6 @@ def test_only_experiments_set_keys_of_other_groups():
     ]
     assert names
     assert {name.split("/")[0] for name in names} == {"experiment"}
-
-
-def test_specialised_files_belong_to_groups_that_exist():
-    root = conf_dir()
-    for path in root.glob("dataset_task/*.yaml"):
-        dataset, task = path.stem.rsplit("_", 1)
-        assert (root / "dataset" / f"{dataset}.yaml").is_file()
-        assert task in TASKS
-    for path in [
-        *root.glob("task_settings/*"),
-        *root.glob("sampler/*/*"),
-        *root.glob("optimizer/*/*"),
-    ]:
-        group, _, choice = path.stem.partition("_")
-        group = "recipe" if group in TASKS and choice else group
-        assert path.stem in TASKS or (root / group / f"{choice}.yaml").is_file()
 
 
 FOLLOWING = """

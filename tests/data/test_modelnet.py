@@ -128,11 +128,6 @@ def test_modelnet_downloads_once(layout, mirror, tmp_path, name):
     assert not list((tmp_path / "new").rglob("*.zip*"))
 
 
-def test_modelnet_existing_files_are_not_downloaded(layout, mirror):
-    modelnet40(layout, n_points=4, download=True)
-    assert mirror == []
-
-
 def test_modelnet_wrong_hash_or_unwritable_root_raises(mirror, tmp_path, monkeypatch):
     monkeypatch.setattr(modelnet, "ARCHIVE_HASH", "md5:" + "0" * 32)
     with pytest.raises(UserError, match=r"gone\.zip: .*404.*set\.zip: .*hash.*save the file as"):

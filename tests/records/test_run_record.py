@@ -1,6 +1,5 @@
 import json
 import math
-import os
 
 import pytest
 
@@ -83,12 +82,6 @@ def test_read_hostile_file_ends_in_one_printable_line(tmp_path, text):
     with pytest.raises(UserError, match="not a run record") as error:
         run_record.read(tmp_path)
     assert str(error.value).isprintable()
-
-
-def test_read_named_pipe_does_not_wait(tmp_path):
-    os.mkfifo(tmp_path / "result.json")
-    with pytest.raises(UserError, match="no run record"):
-        run_record.read(tmp_path)
 
 
 def test_begun_record_is_read_as_written(tmp_path):

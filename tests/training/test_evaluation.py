@@ -156,12 +156,6 @@ def test_evaluation_record_chooses_no_folder_to_write_and_no_part_of_training(pa
     assert same == evaluated(run)
 
 
-def test_evaluation_user_may_give_a_class_of_the_record(tmp_path):
-    run = write_run(tmp_path / "run", more=["sampler._target_=os.system"])
-    given = "sampler._target_=mops_lightning.samplers.fmops.FMOPSNet"
-    assert evaluated(run, given).sampler._target_.endswith("FMOPSNet")
-
-
 @pytest.mark.parametrize(
     "argument",
     [

@@ -2,16 +2,7 @@ import pytest
 
 from mops_lightning import FMOPSNet, FPSSampler, MOPSNet
 from mops_lightning.errors import UserError
-from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.tasks.classification import Classification
-from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.run.build import sizes_to_test
-
-
-def test_score_name_several_sizes_uses_own_size():
-    module = Experiment(Classification(PointNetVanilla(3), 3), FMOPSNet(20), sizes=(5, 8), m=8)
-    assert module.score_name == "test/m8/generated/accuracy"
-    assert Experiment(module.task, FMOPSNet(20), m=8).score_name == "test/generated/accuracy"
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import torch
 from mops_lightning.metrics.base import collection
 from mops_lightning.metrics.classification import Accuracy
 from mops_lightning.ops.points import gather_points
-from mops_lightning.training.readouts import names_of_readouts, readouts
+from mops_lightning.training.readouts import readouts
 from mops_lightning.training.scores import Scores
 from tests.support.samplers import SAMPLERS
 
@@ -26,10 +26,6 @@ def test_readouts_refine_starts_from_distinct_rows(name, rng):
     assert last == "refined"
     assert torch.equal(gather_points(points, started[8]), samples[names[-1]])
     assert torch.equal(samples["refined"], gather_points(points, 59 - started[8]))
-
-
-def test_readout_names_without_sampler_is_full():
-    assert names_of_readouts(None) == ("full",)
 
 
 def test_scores_loss_of_nan_is_nan():

@@ -11,7 +11,6 @@ from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.zoo import weights
 from mops_lightning.zoo.load import load_net, package_samplers
-from tests.support.models import write_run
 
 FMOPS = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 16}
 
@@ -108,20 +107,6 @@ def test_load_task_net_or_missing_file_is_refused(save, tmp_path):
         load(tmp_path / "nowhere.safetensors")
     with pytest.raises(UserError, match="path must be a string or a Path, got None"):
         load(None)  # type: ignore[arg-type]
-
-
-def test_load_run_folder_follows_its_record(tmp_path):
-    write_run(tmp_path / "run", files={"weights": "mops.modelnet40-m32"})
-    assert load(tmp_path / "run").m == 32
-
-
-def test_load_model_by_name_or_unknown_name():
-    sampler = load("mops.modelnet40-m32")
-    assert (sampler.m, sampler.training) == (32, False)
-    with pytest.raises(UserError, match=r"no file or model.*Did you mean 'mops\.modelnet40-m32'"):
-        load("mops.modelnet-m32")
-    with pytest.raises(UserError, match=r"pointnet\.modelnet40.*holds a task net"):
-        load("pointnet.modelnet40")
 
 
 def test_samplers_of_conf_can_all_be_loaded():

@@ -1,4 +1,3 @@
-import os
 import struct
 
 import pytest
@@ -55,9 +54,3 @@ def test_read_header_that_is_no_json_or_missing_or_too_large_is_refused(path):
 def test_read_card_of_weights_of_a_run_is_refused(path, tmp_path):
     with pytest.raises(UserError, match=r"holds the weights of a run.*models add"):
         model_file.read_card(tmp_path / "run" / weights.FILE)
-
-
-def test_read_named_pipe_does_not_wait(tmp_path):
-    os.mkfifo(tmp_path / "a.b.safetensors")
-    with pytest.raises(UserError, match="no file"):
-        weights.read(tmp_path / "a.b.safetensors")

@@ -6,10 +6,8 @@ from torch import nn
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.records import run_record
 from mops_lightning.zoo import weights
 from tests.support.models import rewrite
-from tests.support.records import record
 
 
 @pytest.fixture
@@ -73,14 +71,6 @@ def test_half_precision_tensors_are_cast_to_the_modules_dtype(saved):
     assert {value.dtype for value in net.parameters()} == {torch.float32}
     for name, value in state.items():
         assert torch.equal(net.state_dict()[name], value.float())
-
-
-def test_of_run_prefers_the_file_that_the_record_names(tmp_path):
-    run = tmp_path / "run"
-    run.mkdir()
-    assert weights.of_run(run) == run / "weights.safetensors"
-    run_record.write(run, record(files={"weights": "../kept/net.safetensors"}))
-    assert weights.of_run(run).resolve() == tmp_path / "kept" / "net.safetensors"
 
 
 @pytest.mark.parametrize(

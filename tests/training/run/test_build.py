@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from mops_lightning.config.compose import compose
-from mops_lightning.errors import UserError
 from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.seeding import generator
 from mops_lightning.training.recipe.recipe import Recipe
@@ -21,12 +20,6 @@ def test_factory_gives_task_net_to_samplers_that_need_it():
         assert isinstance(sampler, SubmodularSampler)
         assert sampler.net is made.task.net
         assert not any(name.startswith(("sampler.net", "baselines")) for name in made.state_dict())
-
-
-def test_factory_net_without_point_features_raises():
-    cfg = compose(["sampler=critical", "task=registration", "task/net=icp", "m=8"])
-    with pytest.raises(UserError, match=r"net must have features of single points.*got ICP"):
-        make_experiment(cfg, small_dataset(), {})
 
 
 @pytest.mark.parametrize("learn", ["task", "sampler"])

@@ -1,7 +1,7 @@
 """The callbacks group: standard ones, one left out, one added."""
 
 import pytest
-from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint
 
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
@@ -27,12 +27,6 @@ def test_without_logger_and_pictures_two_are_built_if_none_is_left_out(tmp_path)
     assert [type(one) for one in build_from([], tmp_path)] == [ModelCheckpoint, EpochLines]
     made = build_from(["callbacks.progress=null"], tmp_path)
     assert [type(one) for one in made] == [ModelCheckpoint]
-
-
-def test_added_callback_is_built_with_its_settings(tmp_path):
-    made = build_from(STOPPING, tmp_path)
-    assert isinstance(made[-1], EarlyStopping)
-    assert made[-1].monitor == "train/mean_loss"
 
 
 @pytest.mark.parametrize("target", ["torch.nn.ReLU", None])

@@ -191,8 +191,6 @@ def test_evaluate_task_net_on_other_data(tmp_path):
     more = evaluated(folder, tmp_path / "more", "dataset.n_points=90", "test_noise_std=0.01")
     assert more.config["task"]["net"]["n_points"] == 90
     assert more.score != made.score
-    with pytest.raises(UserError, match="trained a task net alone"):
-        evaluated(folder, tmp_path / "a", "weights=null")
     with pytest.raises(UserError, match="learn=nothing: has no effect"):
         evaluated(folder, tmp_path / "b", "learn=nothing")
 
