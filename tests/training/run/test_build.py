@@ -22,6 +22,15 @@ def test_factory_gives_task_net_to_samplers_that_need_it():
         assert not any(name.startswith(("sampler.net", "baselines")) for name in made.state_dict())
 
 
+def test_factory_first_weights_of_sampler_depend_on_seed_and_not_on_task_net():
+    def first(*overrides):
+        made: Any = make_experiment(compose([*overrides, "m=8"]), small_dataset(), {})
+        return next(made.sampler.parameters())
+
+    assert torch.equal(first(), first("task/net=dgcnn"))
+    assert not torch.equal(first(), first("seed=1"))
+
+
 @pytest.mark.parametrize("learn", ["task", "sampler"])
 def test_factory_recipe_without_its_settings_is_that_of_the_publication(learn):
     recipe = compose().recipe.items()
@@ -34,14 +43,8 @@ def test_factory_recipe_without_its_settings_is_that_of_the_publication(learn):
 
 @pytest.mark.parametrize("learn", ["joint", "sampler"])
 def test_factory_recipe_of_index_sampler_serves_a_task_net_that_learns(learn):
-    given = [
-        "recipe.train_points=20",
-        "recipe.ema_span=0.3",
-        f"learn={learn}",
-        "sampler=fps",
-        "m=8",
-    ]
-    made = make_experiment(compose(given), small_dataset(), {})
+    given = ["recipe.train_points=20", "recipe.ema_span=0.3", f"learn={learn}", "sampler=fps"]
+    made = make_experiment(compose([*given, "m=8"]), small_dataset(), {})
     expected = Recipe(train_points=20, ema_span=0.3) if learn == "joint" else Recipe()
     assert made.recipe == expected
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from mops_lightning.config.compose import compose
+from mops_lightning.seeding import generator
 from mops_lightning.training.run.run import run
 from mops_lightning.zoo.load import load
 from tests.support.command_line import TINY_ANY_DATA
@@ -24,6 +25,7 @@ SETTINGS = [
     f"batch_size={BATCH}",
     "weights=null",
     "recipe=paper",
+    "seed=3",
 ]
 
 
@@ -65,6 +67,8 @@ def test_run_phases_see_disjoint_complete_clouds(learn, changes, readouts, teste
     # Every training cloud once per epoch, in a new order; the held-out clouds always the same.
     assert all(sorted(order) == sorted(orders[0]) for order in orders)
     assert len({tuple(order) for order in orders}) == EPOCHS
+    shuffled = torch.randperm(len(orders[0]), generator=generator(3, 0)).tolist()
+    assert orders[0] == [sorted(orders[0])[row] for row in shuffled]
     assert held_out == [held_out[0]] * EPOCHS
     assert sorted([*orders[0], *held_out[0]]) == list(range(TRAIN))
     assert len(held_out[0]) == HELD_OUT
