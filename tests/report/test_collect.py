@@ -57,6 +57,7 @@ def test_collect_reads_records_of_many_runs_from_one_file(tmp_path):
     put(tmp_path, "random", 32, {"test/sampled/accuracy": 0.2})
     before = table(tmp_path)
     run_record.write_many(tmp_path / "runs.jsonl", collect(tmp_path).done)
+    assert str(tmp_path) not in (tmp_path / "runs.jsonl").read_text()
     for path in tmp_path.rglob("result.json"):
         path.unlink()
     assert table(tmp_path) == before
