@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mops_lightning.errors import UserError, check_at_least
+from mops_lightning.errors import check_at_least
 from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
 from mops_lightning.nets.max_pool import PointMaxPool
 from mops_lightning.ops.rigid import Motion, identity_motion
@@ -98,14 +98,8 @@ class PCRNet(nn.Module):
     def from_pooled_pair(self, of_source: Tensor, of_target: Tensor) -> Motion:
         """Map maxima of ``point_features`` of sources and targets, ``(B, C)`` each, to the motion.
 
-        Raises:
-            UserError: there are several iterations, which need the points.
+        Only where ``pools_points``.
         """
-        if not self.pools_points:
-            raise UserError(
-                "iterations must be 1 for what needs features of single points, got "
-                f"{self.iterations}."
-            )
         return self._step(of_source, of_target, of_source)
 
     def _global(self, points: Tensor) -> Tensor:
