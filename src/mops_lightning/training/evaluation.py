@@ -7,7 +7,6 @@ that names code is taken from it, and no path in place of a choice.
 import re
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import lru_cache
 from inspect import Parameter
 from pathlib import Path
 from typing import Any
@@ -65,11 +64,7 @@ class TrainedRun:
         Raises:
             UserError: there is none, or it is not the record of a completed run with weights.
         """
-        return cls._read(name.removesuffix(f"/{run_record.FILE}"), Path.cwd())
-
-    @classmethod
-    @lru_cache(maxsize=1)  # for the command line, the check of the settings, and the run
-    def _read(cls, name: str, folder: Path) -> "TrainedRun":
+        name = name.removesuffix(f"/{run_record.FILE}")
         try:
             place = names.resolve(name)
             if place.is_file() and place.suffix == model_file.SUFFIX:
