@@ -96,7 +96,6 @@ def test_rates_of_rival_samplers_fall_at_the_published_number_of_clouds():
         (["augment.sampler.jitter=null"], r"sampler\.jitter must be a number of at least 0"),
         (["augment.task.rotate_up=3"], "rotate_up must be true or false or a text, got 3"),
         (["pretrain=foo"], "pretrain must be settings, got 'foo'"),
-        (["+sampler._partial_=true"], "sampler._partial_ must be left out"),
         (["learn=smapler"], "Did you mean 'sampler'"),
         (["+sampler.alhpa=3"], "Did you mean 'alpha'"),
         (["+bacth_size=3"], "Did you mean 'batch_size'"),

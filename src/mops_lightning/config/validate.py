@@ -22,9 +22,6 @@ OPTIMIZERS = ("optimizer", "pretrain")
 TABLES = ("epochs", "augment", "pretrain")
 """Settings that contain settings but are not groups of choices."""
 
-OBJECTS = ("task", "task.net", "dataset", "sampler", "recipe", "trainer", "logger")
-"""Nodes that must not describe a function to call later."""
-
 AUGMENTATION = "mops_lightning.data.loader.Augmentation"
 """The class behind each part of ``augment``."""
 
@@ -145,8 +142,6 @@ def _check_node(node: Any, where: str) -> None:
         return
     if node.get("_target_") == MISSING:
         raise UserError(f"{where}._target_ must be set: give {where}._target_=MODULE.CLASS.")
-    if node.get("_partial_") and where in OBJECTS:
-        raise UserError(f"{where}._partial_ must be left out: {where} is an object.")
     if node.get("_target_") is not None:
         parameters = signature(str(node["_target_"]), where)
         takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
