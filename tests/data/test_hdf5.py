@@ -48,7 +48,7 @@ def test_hdf5_class_names_and_selection(folder):
 def test_hdf5_invalid_input_raises(folder, tmp_path):
     with pytest.raises(UserError, match=r"^n_points must be at least 1, got 0"):
         hdf5(folder, 0)
-    with pytest.raises(UserError, match=r"^root: .*/nowhere is not a folder"):
+    with pytest.raises(UserError, match=r"^root: .*/nowhere/train.h5 is missing"):
         hdf5(tmp_path / "nowhere")
     with pytest.raises(UserError, match=r"^n_points must be at most 50, .*h5, got 51"):
         hdf5(folder, 51)

@@ -91,8 +91,6 @@ def cloud_folder(
     if crop == "surface" and crops != 1:
         raise UserError(f"crops must be 1 with crop=surface, got {crops}.")
     folder = Path(root).expanduser()
-    if not folder.is_dir():
-        raise UserError(f"root: {folder} is not a folder.")
     suffixes = MESHES if crop == "surface" else READABLE
     names = list_files(folder, suffixes)
     chosen = choose_classes(classes, sorted(set(map(class_of, names))))

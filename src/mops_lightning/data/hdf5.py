@@ -35,10 +35,6 @@ def hdf5(
         UserError: an argument or a file is invalid.
     """
     folder = Path(root).expanduser()
-    if not folder.is_dir():
-        raise UserError(
-            f"root: {folder} is not a folder. Give a folder that contains train.h5 and test.h5."
-        )
     known = read_names(folder / NAMES) if (folder / NAMES).is_file() else None
     splits = {
         split: read_clouds(folder / f"{split}.h5", n_points, None if known is None else len(known))
