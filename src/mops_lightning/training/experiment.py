@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import product
-from typing import Any, get_args
+from typing import Any
 
 import lightning as L
 import torch
@@ -16,7 +16,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from mops_lightning.config.settings import Learn
-from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.errors import UserError
 from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
 from mops_lightning.records.readout_names import FULL, REFINED, SOFT_PROJECTED, size_prefix
 from mops_lightning.samplers.base import Sampler
@@ -57,7 +57,7 @@ class Experiment(L.LightningModule):
         m: the size that is validated and gives the run's score; None: the sampler's.
 
     Raises:
-        UserError: ``learn`` is unknown, or task and sampler do not allow it; see ``Refinement``.
+        UserError: task and sampler do not allow ``learn``; see ``Refinement``.
     """
 
     def __init__(
@@ -339,12 +339,9 @@ def _check_learn(learn: Learn, task: Task, sampler: Sampler | None) -> None:
     """Reject what cannot be trained.
 
     Raises:
-        UserError: ``learn`` is unknown, the sampler that it needs is missing, or the task net lets
-            no gradient through.
+        UserError: the sampler that ``learn`` needs is missing, or the task net lets no gradient
+            through.
     """
-    allowed = get_args(Learn)
-    if learn not in allowed:
-        raise UserError(f"learn: unknown value {learn!r}.{did_you_mean(learn, allowed)}")
     if sampler is None and learn != "task":
         raise UserError(f"learn={learn} needs a sampler; only learn=task works without one.")
     learned = sampler is not None and sampler.learned
