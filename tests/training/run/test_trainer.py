@@ -1,7 +1,9 @@
+import ctypes
 import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -48,14 +50,14 @@ def test_save_checkpoint_does_not_use_tmpdir(tmp_path, monkeypatch):
     assert torch.load(tmp_path / "last.ckpt") == {"epoch": 2}
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="mallopt is a function of Linux's C libraries")
-def test_keep_freed_memory_on_linux_is_accepted():
-    assert keep_freed_memory()
-
-
-def test_keep_freed_memory_elsewhere_does_nothing(monkeypatch):
-    monkeypatch.setattr(sys, "platform", "win32")
-    assert not keep_freed_memory()
+@pytest.mark.parametrize(("platform", "options"), [("linux", 3), ("win32", 0)])
+def test_keep_freed_memory_sets_options_of_linux(monkeypatch, platform, options):
+    called = []
+    library = SimpleNamespace(mallopt=lambda *option: called.append(option))
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: library)
+    monkeypatch.setattr(sys, "platform", platform)
+    keep_freed_memory()
+    assert len(called) == options
 
 
 def test_clouds_to_draw_spreads_over_classes_that_have_test_clouds():
