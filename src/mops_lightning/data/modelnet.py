@@ -87,7 +87,10 @@ def _download(root: Path) -> Path:
         with FileLock(folder.parent / f".{FOLDER}.lock"):
             if _find(folder) is None:
                 archive = _fetch(folder.parent)
-                _unpack(archive, folder)
+                prefix = f".{folder.name}-"  # unpacked completely or not at all
+                with tempfile.TemporaryDirectory(dir=folder.parent, prefix=prefix) as name:
+                    shutil.unpack_archive(archive, name)
+                    (Path(name) / FOLDER).replace(folder)
                 archive.unlink()
     except OSError as error:
         raise UserError(f"Cannot download ModelNet40 into {folder.parent}: {error}.") from error
@@ -110,13 +113,6 @@ def _fetch(folder: Path) -> Path:
         f"No mirror served ModelNet40 ({'; '.join(answers)}). Check the network and try again, or "
         f"save the file as {folder / f'{FOLDER}.zip'} yourself."
     )
-
-
-def _unpack(archive: Path, folder: Path) -> None:
-    """Unpack the archive's top folder as ``folder``, completely or not at all."""
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as name:
-        shutil.unpack_archive(archive, name)
-        (Path(name) / FOLDER).replace(folder)
 
 
 def _files(folder: Path, split: str) -> list[Path]:
