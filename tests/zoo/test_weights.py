@@ -29,9 +29,9 @@ def test_save_and_load_into_returns_equal_tensors_and_config(saved):
 
 def test_load_into_other_net_names_the_tensors(saved):
     _, path = saved
-    with pytest.raises(UserError, match=r"another net's weights: head.7.weight is \(4, 256\)"):
+    with pytest.raises(UserError, match=r"another net's weights: .*head.7.weight.*4, 256"):
         weights.load_into(PointNetVanilla(5), path)
-    with pytest.raises(UserError, match=r"weight is missing.*is unknown"):
+    with pytest.raises(UserError, match=r"Missing key.*weight.*Unexpected key"):
         weights.load_into(nn.Linear(2, 2, bias=False), path)
 
 

@@ -16,7 +16,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.nets import atlasnet, autoencoder, dgcnn, foldingnet, pcrnet, pointnet
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.zoo import names, weights
-from mops_lightning.zoo.weights import check_shapes, fit_state
+from mops_lightning.zoo.weights import fit_state
 
 M = TypeVar("M", bound=nn.Module)
 
@@ -143,7 +143,8 @@ def _build(
     with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
         # Without memory first: a small file can describe a large net.
         with torch.device("meta"), _at_most(len(state)):
-            check_shapes(make(), state, path, hint)
+            bare = make()
+        fit_state(bare, state, path, hint, assign=True)
         module = make()
     fit_state(module, state, path, hint)
     return module.eval()

@@ -147,7 +147,11 @@ def load_into(module: nn.Module, path: str | Path) -> dict[str, Any]:
 
 
 def fit_state(
-    module: nn.Module, state: dict[str, Tensor], path: str | Path, hint: str = OTHER_NET
+    module: nn.Module,
+    state: dict[str, Tensor],
+    path: str | Path,
+    hint: str = OTHER_NET,
+    assign: bool = False,
 ) -> None:
     """Load tensors into a module, strictly.
 
@@ -156,32 +160,17 @@ def fit_state(
         state: its tensors by name.
         path: the file that they come from, for the error.
         hint: what to try next, for the error.
+        assign: take the tensors themselves, for a module without memory.
 
     Raises:
         UserError: names or shapes differ from the module's.
     """
-    check_shapes(module, state, path, hint)
-    module.load_state_dict(state, strict=True)
-
-
-def check_shapes(
-    module: nn.Module, state: dict[str, Tensor], path: str | Path, hint: str = OTHER_NET
-) -> None:
-    """Reject tensors whose names or shapes are not a module's.
-
-    Arguments and errors as in ``fit_state``.
-    """
-    expected = module.state_dict()
-    wrong = [f"{name} is missing" for name in expected if name not in state]
-    wrong += [f"{name} is unknown" for name in state if name not in expected]
-    wrong += [
-        f"{name} is {tuple(state[name].shape)} instead of {tuple(expected[name].shape)}"
-        for name in expected
-        if name in state and state[name].shape != expected[name].shape
-    ]
-    if wrong:
-        more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
-        raise UserError(f"{path} holds another net's weights: {'; '.join(wrong[:3])}{more}. {hint}")
+    try:
+        module.load_state_dict(state, strict=True, assign=assign)
+    except RuntimeError as error:
+        _, *differences = str(error).splitlines()
+        listed = " ".join(" ".join(differences).split())
+        raise UserError(f"{path} holds another net's weights: {listed[:300]} {hint}") from None
 
 
 def first_nonfinite(state: Any, name: str = "") -> str | None:
