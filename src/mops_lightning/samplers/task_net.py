@@ -1,8 +1,5 @@
 """Base of the samplers that select points by the features of a frozen task net."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import torch
 from torch import Tensor, nn
 
@@ -86,21 +83,10 @@ class TaskNetSampler(Sampler):
     def _chosen(self, points: Tensor, m: int) -> tuple[Tensor, Tensor]:
         net = self._net[0]
         like = next(net.parameters(), points)
-        parts = []
-        with evaluating(net):
-            for part in points.split(max(1, BATCH_POINTS // points.shape[1])):
-                parts.append(self.choose(self.net.point_features(part.to(like)), m))
+        parts, training = [], net.training
+        net.eval()
+        for part in points.split(max(1, BATCH_POINTS // points.shape[1])):
+            parts.append(self.choose(self.net.point_features(part.to(like)), m))
+        net.train(training)
         rows, counts = zip(*parts, strict=True)
         return torch.cat(rows).to(points.device), torch.cat(counts).to(points.device)
-
-
-@contextmanager
-def evaluating(net: nn.Module) -> Iterator[None]:
-    """Set a net to evaluation mode, and its modules to their own modes again afterwards."""
-    training = [module for module in net.modules() if module.training]
-    net.eval()
-    try:
-        yield
-    finally:
-        for module in training:
-            module.training = True
