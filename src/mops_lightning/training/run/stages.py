@@ -81,19 +81,15 @@ def load_trained(
     own_data = record.dataset_fingerprint == dataset.fingerprint
     if experiment.task.requires_same_classes and task_net and not own_data:
         check_classes(record.class_names, dataset, f"{KEY}: {name}")
-    part = "task net" if trained.trained_task_net else "sampler"
     module = experiment.task if trained.trained_task_net else experiment.sampler
     assert module is not None  # learn=nothing builds a sampler
+    has_weights = any(True for _ in experiment.task.parameters())
     try:
         content = weights.load_into(module, weights.of_run(trained.place))
-    except UserError as error:
-        raise UserError(f"{KEY}: the {part} of {name} cannot be loaded: {error}") from None
-    has_weights = any(True for _ in experiment.task.parameters())
-    if task_net and has_weights and not trained.trained_task_net:
-        try:
+        if task_net and has_weights and not trained.trained_task_net:
             _load_trained_task(experiment.task, trained)
-        except UserError as error:
-            raise UserError(f"{KEY}: {error}") from None
+    except UserError as error:
+        raise UserError(f"{KEY}: {name} cannot be loaded: {error}") from None
     return Evaluated(
         run=name,
         commit=record.git["commit"],
