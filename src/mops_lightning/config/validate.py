@@ -119,7 +119,8 @@ def _check_limits(config: dict[str, Any]) -> None:
             raise refusal(path, value)
     for path, value in values.items():
         for number in value if isinstance(value, list) else [value]:
-            if isinstance(number, int | float) and not abs(number) < 2**63:  # NaN neither
+            limit = 2**63 if isinstance(number, int) else float("inf")
+            if isinstance(number, int | float) and not abs(number) < limit:  # NaN neither
                 raise UserError(f"{path} must be finite and below 2**63, got {number!r:.30}.")
 
 
