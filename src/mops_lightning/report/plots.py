@@ -1,7 +1,5 @@
 """Curves and heat maps of a report."""
 
-from collections.abc import Container
-from itertools import chain, count
 from typing import Any
 
 import numpy as np
@@ -27,17 +25,12 @@ def plots(report: Report) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     for table in report.tables:
         name, group = table.metric.name, table.group
-        if group.planes:
-            figures[_free(f"{name}_planes", figures)] = heat_maps(table)
-        elif group.column != "net" and len(table.columns()) > 1:
-            figures[_free(f"{name}_curves", figures)] = curves(table)
+        if group.column == "net" or not (group.planes or len(table.columns()) > 1):
+            continue
+        kind, draw = ("planes", heat_maps) if group.planes else ("curves", curves)
+        others = sum(other.startswith(f"{name}_{kind}") for other in figures)  # of other groups
+        figures[f"{name}_{kind}{f'_{others + 1}' if others else ''}"] = draw(table)
     return figures
-
-
-def _free(name: str, taken: Container[str]) -> str:
-    """Return a name that is not taken: figures of further groups get a number."""
-    numbered = (f"{name}_{number}" for number in count(2))
-    return next(one for one in chain([name], numbered) if one not in taken)
 
 
 def curves(table: Table) -> Figure:
