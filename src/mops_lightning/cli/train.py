@@ -2,8 +2,8 @@
 
 import argparse
 import os
-import re
 import sys
+import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,8 +23,6 @@ from mops_lightning.errors import (
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-COMPLETION = re.compile(r"((un)?install|query)=(bash|zsh|fish)")
-"""The setting that ``--shell-completion`` needs."""
 NAME = "mops_lightning"
 """Prefix of error messages."""
 
@@ -67,6 +65,9 @@ def _run() -> None:
         of_hydra = HydraException | OmegaConfBaseException | YAMLError | UnicodeDecodeError
         if isinstance(error, of_hydra):
             end(NAME, explain(error, sys.argv[1:]), USER_ERROR)
+        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+        if type(error) is ValueError and frame.f_globals["__name__"].startswith("hydra."):
+            end(NAME, " ".join(str(error).split()), USER_ERROR)  # flags that exclude each other
         end_in_one_line(NAME, error)
 
 
@@ -80,8 +81,7 @@ def flags_first(arguments: list[str]) -> list[str]:
         The same arguments; flags with their values and settings keep their order.
 
     Raises:
-        UserError: there is no such flag, flags exclude each other, or a flag's value is missing
-            or not allowed.
+        UserError: there is no such flag, or a flag's value is missing or not allowed.
     """
     from hydra._internal.utils import get_args_parser
 
@@ -96,29 +96,17 @@ def flags_first(arguments: list[str]) -> list[str]:
     for flag in unknown:
         hint = did_you_mean(flag.split("=")[0], known)
         raise UserError(f"no flag {flag!r}.{hint} Settings are KEY=VALUE, without dashes.")
-    _check_combination(read)
+    if read.experimental_rerun:
+        raise UserError(
+            "--experimental-rerun is not available, because the pickle that it reads can run code. "
+            "Repeat the run with the overrides in its result.json."
+        )
     flags = list(arguments)
     for setting in read.overrides:
         flags.remove(setting)
     if flags[-1:] in (["-i"], ["--info"]):  # a setting behind it would be taken for its value
         flags[-1] = "--info=all"
     return [*flags, *read.overrides]
-
-
-def _check_combination(read: argparse.Namespace) -> None:
-    actions = ("run", "multirun", "cfg", "info", "shell_completion")
-    chosen = [f"--{name.replace('_', '-')}" for name in actions if getattr(read, name)]
-    if len(chosen) > 1 and not (read.help or read.hydra_help):
-        raise UserError(f"{' and '.join(chosen)}: give one of them. `--cfg job` shows one run.")
-    if read.resolve and not (read.cfg or read.help):
-        raise UserError("--resolve belongs to --cfg: write --cfg job --resolve.")
-    if read.shell_completion and not COMPLETION.fullmatch(" ".join(read.overrides)):
-        raise UserError("--shell-completion: add install=bash, or zsh or fish, or uninstall=bash.")
-    if read.experimental_rerun:
-        raise UserError(
-            "--experimental-rerun is not available, because the pickle that it reads can run code. "
-            "Repeat the run with the overrides in its result.json."
-        )
 
 
 def _job(cfg: "DictConfig") -> float | None:
