@@ -39,7 +39,7 @@ LATE = "+trainer.val_check_interval=100"
         (["m=8", "--cfg"], "--cfg/-c: expected one argument."),
         (["-m", "m=8,16", "--cfg", "job"], "Only one of --run, --multirun, --cfg"),
         (["--experimental-rerun", "config.pickle"], "--experimental-rerun is not available"),
-        (["m=8", "--resolve"], "write --cfg job --resolve."),
+        (["m=8", "--resolve"], "can only be used in conjunction with --cfg"),
         (["--cfg", "jobs", "m=8"], "--cfg/-c: invalid choice: 'jobs'"),
         (["..=8"], "'..=8' is not a setting. Settings are KEY=VALUE."),
         (["~task/net=3"], "~task/net=3: write ~task/net."),
