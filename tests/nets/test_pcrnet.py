@@ -3,7 +3,6 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mops_lightning.errors import UserError
 from mops_lightning.nets.pcrnet import PCRNet
 
 SMALL = {"feature_channels": (16, 32)}
