@@ -9,7 +9,6 @@ from omegaconf import OmegaConf
 
 from mops_lightning.config.compose import compose, conf_dir
 from mops_lightning.config.settings import declared
-from mops_lightning.config.validate import check
 from mops_lightning.records.run_record import dotted, read
 from tests.support.command_line import TINY, TINY_ANY_DATA, call, runs
 
@@ -173,13 +172,6 @@ def test_devices_inherit_the_default_trainer():
     }
     for name, changes in expected.items():
         assert compose([f"trainer={name}"]).trainer == {**default, **changes}
-
-
-def test_baselines_are_left_out_added_and_checked(tmp_path):
-    given = ["baselines.voxel=null", "+sampler@baselines.poisson=poisson"]
-    cfg = compose(given)
-    check(cfg)
-    assert [name for name, node in cfg.baselines.items() if node] == ["random", "fps", "poisson"]
 
 
 @pytest.mark.parametrize(

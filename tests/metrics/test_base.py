@@ -2,10 +2,12 @@ import json
 
 import pytest
 import torch
+from torch.nn import functional as F
 from torchmetrics.classification import MulticlassAccuracy
 
 from mops_lightning.metrics import classification, reconstruction, registration, sampled_set
 from mops_lightning.metrics.base import TableMetric, collection
+from mops_lightning.metrics.classification import Accuracy, MeanClassAccuracy
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.metrics.reconstruction import Distances
 from mops_lightning.metrics.registration import RotationError, TranslationError
@@ -109,3 +111,16 @@ class TwiceTheError(TranslationError):
 
     def update(self, predicted, true):
         self.add(2 * RotationError.of(predicted, true))
+
+
+def test_accuracy_over_batches_matches_hand_computed_value():
+    labels = torch.tensor([0, 0, 0, 1, 2, 2])
+    answers = torch.tensor([0, 0, 1, 1, 2, 0])
+    logits = F.one_hot(answers, 3).float()
+    metrics = Accuracy(3), MeanClassAccuracy(3)
+    for metric in metrics:
+        metric.update(logits[:2], labels[:2])
+        metric.update(logits[2:], labels[2:])
+    accuracy, mean_class = (metric.compute().item() for metric in metrics)
+    assert accuracy == pytest.approx(4 / 6)
+    assert mean_class == pytest.approx((2 / 3 + 1 + 1 / 2) / 3)

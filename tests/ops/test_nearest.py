@@ -5,7 +5,7 @@ from scipy.spatial import cKDTree
 from mops_lightning.errors import UserError
 from mops_lightning.ops import compiled
 from mops_lightning.ops import nearest as search
-from mops_lightning.ops.nearest import k_nearest, nearest
+from mops_lightning.ops.nearest import chamfer_distance, k_nearest, nearest
 from mops_lightning.ops.points import gather_points
 from tests.support.plain import plain_nearest
 
@@ -109,3 +109,18 @@ def test_k_nearest_equals_sorted_distances(k, rng):
 def test_k_nearest_out_of_range_raises(k):
     with pytest.raises(UserError, match=rf"k must be from 1 .*N=5, got {k}"):
         k_nearest(torch.zeros(1, 2, 3), torch.zeros(1, 5, 3), k)
+
+
+def plain_chamfer(points, others):
+    squares = (points[:, :, None] - others[:, None]).square().sum(-1)
+    return squares.min(2).values.mean(1) + squares.min(1).values.mean(1)
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 7), (40, 25), (300, 900)])
+def test_chamfer_equals_plain_form(n, m, rng):
+    points = torch.randn(3, n, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+    others = torch.randn(3, m, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+    got, want = chamfer_distance(points, others), plain_chamfer(points, others)
+    torch.testing.assert_close(got, want)
+    gradients = [torch.autograd.grad(value.sum(), [points, others]) for value in (got, want)]
+    torch.testing.assert_close(*gradients)

@@ -2,7 +2,11 @@ from io import StringIO
 from pathlib import Path
 
 from rich.console import Console
+from torchmetrics.aggregation import SumMetric
 
+from mops_lightning.metrics.base import collection
+from mops_lightning.metrics.classification import Accuracy
+from mops_lightning.records.metric_info import foreign_metrics, metric_info
 from mops_lightning.records.summary import closing_lines
 from tests.support.records import NAMES, record
 
@@ -91,3 +95,11 @@ def test_fps_names_its_start():
     metrics = {"test/sampled/accuracy": 0.5, "test/full/accuracy": 0.875}
     text = printed(metrics, "test/sampled/accuracy", names=names, sampler={"start": 0})
     assert cells(text)[1] == ["fps from row 0 sampled", "50.00"]
+
+
+def test_plain_torchmetrics_class_gets_defaults():
+    """Even under the name of a metric of this package."""
+    assert foreign_metrics(collection(Accuracy(3)).items()) == {}
+    foreign = foreign_metrics([("accuracy", SumMetric())])
+    info = metric_info("accuracy", [record(metric_info=foreign)])
+    assert (info.title, info.format(0.5), info.summary_order) == ("accuracy", "0.5", 10)

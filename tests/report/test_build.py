@@ -1,5 +1,6 @@
 import pytest
 
+from mops_lightning.report import paper
 from tests.support.records import NAMES, evaluated
 from tests.support.reports import put, put_cell, put_pairs, rows, table
 
@@ -111,3 +112,21 @@ def test_provenance_hides_other_tasks_and_names_other_nets(tmp_path):
     assert "pointnet" not in text
     assert "- fps under icp: nothing to train" in text
     assert "- fps: nothing to train" in text
+
+
+SIZES = {
+    "classification": {"512", "256", "128", "64", "32", "16", "8"},
+    "registration": {"64", "32", "8"},
+    "registration_joint": {"64", "32", "8"},
+    "large_nre_cd": {"4096", "1024", "256"},
+    "large_nre_emd": {"4096", "1024", "256"},
+}
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_published_tables_are_complete(name):
+    assert set(paper.published_tables()) == {*SIZES, "frameworks"}
+    for sampler, sizes in paper.published_tables()[name]["rows"].items():
+        assert set(sizes) == SIZES[name]
+        count = 1 if sampler in ("random", "voxel", "fps") or "large" in name else 3
+        assert {len(values) for values in sizes.values()} == {count}

@@ -17,6 +17,7 @@ from mops_lightning.ops.points import gather_points
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.tasks.registration import Pairs
 from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.recipe.distillation import feature_distance, pooled_features
 from mops_lightning.training.recipe.moving_average import MovingAverage
 from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through
 from mops_lightning.types import Batch, SampleOutput
@@ -200,3 +201,14 @@ def test_moving_average_keeps_frozen_net_and_counters_of_batches():
     assert all(torch.equal(after[name], value) for name, value in before.items())
     counters = [b for b in module.sampler.buffers() if not b.is_floating_point()]
     assert {int(counter) for counter in counters} == {module.total_steps}
+
+
+def test_feature_distance_is_relative_to_the_reference():
+    found = torch.tensor([[1.0, 2.0], [0.0, 3.0]])
+    reference = torch.tensor([[3.0, 4.0], [0.0, 3.0]])
+    assert feature_distance(found, reference) == pytest.approx((8 / 25 + 0) / 2)
+
+
+def test_feature_distillation_of_net_without_point_features_raises():
+    with pytest.raises(UserError, match=r"feature_distillation must be 0 .* got Linear"):
+        pooled_features(torch.nn.Linear(3, 3), torch.randn(2, 7, 3))

@@ -3,11 +3,13 @@ from typing import Any
 import pytest
 import torch
 
+from mops_lightning import FMOPSNet, FPSSampler, MOPSNet
 from mops_lightning.config.compose import compose
+from mops_lightning.errors import UserError
 from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.seeding import generator
 from mops_lightning.training.recipe.recipe import Recipe
-from mops_lightning.training.run.build import augmentation, make_experiment, split
+from mops_lightning.training.run.build import augmentation, make_experiment, sizes_to_test, split
 from tests.support.training import small_dataset
 
 BASELINE = "+baselines.submodular._target_=mops_lightning.samplers.submodular.SubmodularSampler"
@@ -82,3 +84,35 @@ def test_augmentation_of_joint_training_is_that_of_the_sampler():
         for learn in ("task", "sampler", "joint")
     }
     assert found == {"task": 0.01, "sampler": 0.02, "joint": 0.02}
+
+
+@pytest.mark.parametrize(
+    ("sizes", "m", "sampler", "expected"),
+    [
+        ("auto", 32, FMOPSNet(512), (8, 16, 32, 64, 128, 256, 512)),
+        ("auto", 20, FMOPSNet(100), (8, 16, 20, 32, 64)),
+        ("auto", 32, MOPSNet(32), (32,)),
+        ("auto", 32, FPSSampler(32), (32,)),
+        ([64, 8], 32, FPSSampler(32), (8, 32, 64)),
+        ([64, 8, 8], 8, FMOPSNet(100), (8, 64)),
+        ([32], 32, MOPSNet(32), (32,)),
+        ("auto", 32, None, ()),
+    ],
+)
+def test_sizes_to_test_returns_ascending_sizes(sizes, m, sampler, expected):
+    assert sizes_to_test(sizes, m, sampler, 1024) == expected
+
+
+@pytest.mark.parametrize(
+    ("sizes", "m", "sampler", "named"),
+    [
+        ([8], 32, MOPSNet(32), r"returns 32 points.*got sizes=\[8\]"),
+        ([101], 32, FMOPSNet(100), "sizes must be at most sampler.m_max=100, got 101"),
+        ([201], 32, FPSSampler(32), "sizes must be at most the 200 points of a cloud, got 201"),
+        ("auto", 101, FMOPSNet(100), "m must be at most sampler.m_max=100, got 101"),
+        ("auto", 32, FMOPSNet(512), "sampler.m_max must be at most the 200 points .* got 512"),
+    ],
+)
+def test_sizes_to_test_out_of_range_raises(sizes, m, sampler, named):
+    with pytest.raises(UserError, match=named):
+        sizes_to_test(sizes, m, sampler, 200)
