@@ -20,6 +20,23 @@ def plain(*overrides: str) -> Any:
     return OmegaConf.to_container(compose(list(overrides)), resolve=True)
 
 
-def test_table_settings_leave_out_what_reports_do_not_compare():
+def test_table_settings_of_an_old_record_takes_defaults():
     found = table_settings({"m": 8, "out": "here", "sampler": {"alpha": 1.0}}, "sampler")
-    assert found == {"sampler.alpha": 1.0}
+    assert (found["sampler.alpha"], found["test_noise_std"]) == (1.0, 0.0)
+    assert not {"m", "out", "task_lr_scale"} & set(found)
+
+
+def test_table_settings_fill_in_defaults_of_constructors():
+    new = plain("sampler=fmops", "task=registration", "task.net.iterations=1")
+    old = plain("sampler=fmops", "task=registration", "task.net.iterations=1")
+    for node, names in (
+        (old["sampler"], ["overlap", "threshold", "rho_channels"]),
+        (old["task"]["net"], ["iterations", "feature_channels"]),
+        (old["optimizer"]["schedule"], ["warmup"]),
+        (old["augment"]["sampler"], ["jitter"]),
+    ):
+        for name in names:
+            del node[name]
+    assert table_settings(old, "sampler") == table_settings(new, "sampler")
+    old["sampler"]["_target_"] = "os.system"
+    assert table_settings(old, "sampler") != table_settings(new, "sampler")

@@ -1,11 +1,18 @@
 """The settings that two runs must share: to resume one, to reuse a net, to make one table."""
 
 from collections.abc import Mapping
+from dataclasses import asdict, fields
+from functools import cache
 from typing import Any
 
 from mops_lightning.config import settings
+from mops_lightning.config.build import signature
 from mops_lightning.config.settings import Affects
+from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import dotted
+
+OWN = "mops_lightning."
+"""Package of the classes whose defaults are known; a record's other classes are not imported."""
 
 
 def effective(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
@@ -36,7 +43,45 @@ def training_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def table_settings(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
-    """Return the dotted settings in which the runs of one table must not differ."""
+    """Return the dotted settings in which the runs of one table must not differ.
+
+    A setting that the record's version did not have yet counts with its default.
+    """
+    from mops_lightning.data.loader import Augmentation  # imports torch
+
+    defaults: dict[str, Any] = {
+        one.name: one.default
+        for one in fields(settings.SCHEMA)
+        if one.default is not None and not one.metadata["setting"].group
+    }
     known = {name: node for name, node in config.items() if name in settings.declared()}
-    flat = effective(known, learn)
+    defaults["augment"] = dict.fromkeys(("task", "sampler"), asdict(Augmentation()))
+    flat = effective(defaults, learn) | effective(with_defaults(known), learn)
     return {path: value for path, value in flat.items() if settings.of(path).compared}
+
+
+def with_defaults(node: Any) -> Any:
+    """Return settings with the defaults of their classes for arguments that they do not set.
+
+    Args:
+        node: plain data; a part with ``_target_`` describes an object.
+    """
+    if not isinstance(node, dict):
+        return node
+    filled = {name: with_defaults(child) for name, child in node.items()}
+    return {**_defaults(str(node["_target_"])), **filled} if "_target_" in node else filled
+
+
+@cache
+def _defaults(target: str) -> dict[str, Any]:
+    """Return the plain defaults of a class or function of this package."""
+    if not target.startswith(OWN):
+        return {}
+    try:
+        parameters = signature(target, "")
+    except UserError:  # an earlier version had it
+        return {}
+    plain = {name: one.default for name, one in parameters.items() if one.default is not one.empty}
+    return {
+        name: list(value) if isinstance(value, tuple) else value for name, value in plain.items()
+    }
