@@ -40,6 +40,12 @@ def test_help_shows_every_key_and_choice(tmp_path):
     assert not any(line.startswith(hidden) for line in out.splitlines())
 
 
+def test_no_default_is_computed_from_other_choices():
+    for path in conf_dir().rglob("*.yaml"):
+        text = path.read_text()
+        assert not any(word in text for word in ("choose:", "model_for:", "oc.select")), path
+
+
 def test_only_experiments_set_keys_of_other_groups():
     names = [
         path.relative_to(conf_dir()).as_posix()

@@ -1,7 +1,5 @@
 """Samplers that are trained under several task nets."""
 
-import json
-
 import pytest
 
 from mops_lightning.config.compose import compose
@@ -38,18 +36,13 @@ def test_sampler_trained_under_several_nets(tmp_path):
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ("nowhere", "no file or model .nowhere"),
-        ("mops.modelnet40-m32", "holds a sampler, not a task net"),
-        ("pcrnet.modelnet40", "net must take .points"),
-        ("pointnet.modelnet40", "its net has 40 classes, which are not the 3 classes"),
+        ("[nowhere]", ": no file or model .nowhere"),
+        ("[mops.modelnet40-m32]", ": .* holds a sampler, not a task net"),
+        ("[pcrnet.modelnet40]", ": .*net must take .points"),
+        ("[pointnet.modelnet40]", ": .*has 40 classes, which are not the 3 classes"),
+        ("pointnet.modelnet40", " must be null or a list of models or runs"),
     ],
 )
 def test_other_nets_that_cannot_be_used_raise(tmp_path, given, words):
-    with pytest.raises(UserError, match=f"^other_nets: .*{words}"):
-        job(tmp_path / "run", f"other_nets=[{given}]")
-
-
-@pytest.mark.parametrize("given", ["pointnet.modelnet40", json.dumps([3])])
-def test_other_nets_that_are_no_list_of_names_raise(tmp_path, given):
-    with pytest.raises(UserError, match=r"^other_nets must be null or a list of models or runs"):
+    with pytest.raises(UserError, match=f"^other_nets{words}"):
         job(tmp_path / "run", f"other_nets={given}")
