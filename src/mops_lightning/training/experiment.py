@@ -52,6 +52,8 @@ class Experiment(L.LightningModule):
         task_lr_scale: with ``learn="joint"``, the task net's learning rate over the sampler's.
         refine: passes of the refined readout in tests; 0: without this readout.
         other_tasks: the task with further frozen nets, under which the sampler is trained, too.
+        test_logger: False keeps test metrics from the loggers and from ``trainer.test``'s result;
+            None: they go to a logger if there is one.
         m: the size that is validated and gives the run's score; None: the sampler's.
 
     Raises:
@@ -74,6 +76,7 @@ class Experiment(L.LightningModule):
         recipe: Recipe | None = None,
         refine: int = 0,
         other_tasks: Sequence[Task] = (),
+        test_logger: bool | None = None,
     ) -> None:
         super().__init__()
         _check_learn(learn, task, sampler)
@@ -91,6 +94,7 @@ class Experiment(L.LightningModule):
         tasks = [task, *other_tasks]
         self.distillation = Distillation(tasks, self.recipe) if learn == "sampler" else None
         self.total_steps = 1
+        self.test_logger = test_logger
         for module in self._frozen():
             module.requires_grad_(False)
         self.m: int = m or (self.sampler.m if self.sampler is not None else 0)
@@ -299,7 +303,7 @@ class Experiment(L.LightningModule):
             batch: the clouds.
             sets: points by readout, by prefix of a size.
         """
-        clouds, logger = len(batch.points), False if stage == TEST else None
+        clouds, logger = len(batch.points), self.test_logger if stage == TEST else None
         samples = {
             (prefix, readout): points
             for prefix, by_readout in sets.items()
@@ -325,7 +329,7 @@ class Experiment(L.LightningModule):
         """Update and log the metrics of the sampled sets themselves."""
         if self.sampler is None:
             return
-        logger = False if stage == TEST else None  # the run logs a test as one table
+        logger = self.test_logger if stage == TEST else None
         updated = self.scores.update_sets(points, outputs, self.sampler.nested, prefixes)
         for name, metric in updated.items():
             self.log(f"{stage}{name}", metric, batch_size=len(points), logger=logger)
