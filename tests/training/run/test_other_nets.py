@@ -1,5 +1,3 @@
-"""Samplers that are trained under several task nets."""
-
 import pytest
 
 from mops_lightning.config.compose import compose
@@ -23,8 +21,7 @@ def test_sampler_trained_under_several_nets(tmp_path):
     # Another second net is another training.
     with pytest.raises(UserError, match=r"other settings .*other_nets\.2"):
         job(tmp_path / "new", f"other_nets=[{nets[0]}]", f"ckpt_path={tmp_path / 'both'}")
-    # An evaluation needs none of them.
-    for folder in nets:
+    for folder in nets:  # an evaluation needs none of them
         (folder / "weights.safetensors").unlink()
     given = [f"evaluate={tmp_path / 'both'}", "pictures=0", "logger=none"]
     chosen = [readable(argument) for argument in command_line(given)]

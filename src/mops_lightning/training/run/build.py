@@ -22,7 +22,7 @@ from typing import Any
 import lightning as L
 import torch
 from omegaconf import DictConfig, OmegaConf
-from torch import nn
+from torch import Tensor, nn
 
 from mops_lightning.config import distributed
 from mops_lightning.config.build import accepted, build, build_as
@@ -181,6 +181,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     baselines: dict[str, Sampler] = {}
     if sampler is not None and sampler.learned:
         baselines = _make_baselines(cfg, max(sizes), net)
+        _try_baselines(baselines, one.points[:1])
     elif sampler is not None and sampler.flexible:
         sampler = build(cfg.sampler, "sampler", m=max(sizes), **own)
     make_optimizer, make_schedule = _optimizer_makers(cfg)
@@ -294,6 +295,16 @@ def _make_baselines(cfg: DictConfig, m: int, net: dict[str, Any]) -> dict[str, S
             own = accepted(node, net if "seed" in node else {**net, "seed": cfg.seed})
             baselines[str(name)] = build_as(Sampler, node, f"baselines.{name}", m=m, **own)
     return baselines
+
+
+@torch.no_grad()
+def _try_baselines(baselines: dict[str, Sampler], points: Tensor) -> None:
+    """Sample one cloud, so that a mistake ends the run before its training, not in its test."""
+    for name, baseline in baselines.items():
+        try:
+            baseline.eval()(points)
+        except UserError as error:
+            raise UserError(f"baselines.{name}: {error}") from None
 
 
 def _optimizer_makers(cfg: DictConfig) -> tuple[Any, Any]:
