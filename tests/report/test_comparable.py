@@ -8,6 +8,8 @@ from mops_lightning.records import run_record
 from tests.support.records import evaluated
 from tests.support.reports import edited, put, put_cell, put_planes, rows, table
 
+PCRNET = {"_target_": "mops_lightning.nets.pcrnet.PCRNet"}
+
 
 def titles(text):
     return [line for line in text.splitlines() if line.startswith("Test ")]
@@ -45,6 +47,7 @@ def test_joint_runs_have_own_task_nets(tmp_path):
     [
         ([{"resample": None}, {"resample": 512}], r"resample=(\w+)", ["None", "512"]),
         ([{"net": {"iterations": n}} for n in (1, 3)], "iterations.: ([0-9])", ["1", "3"]),
+        ([{"net": PCRNET}, {"net": {**PCRNET, "iterations": 1}}], "net task.net", []),
     ],
 )
 def test_other_pairs_or_net_settings_have_table_of_their_own(tmp_path, settings, pattern, found):

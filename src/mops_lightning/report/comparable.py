@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from mops_lightning.config.shared_settings import table_settings
+from mops_lightning.config.shared_settings import table_settings, with_defaults
 from mops_lightning.records.run_record import RunRecord, dotted
 from mops_lightning.report.collect import epochs, recorded_recipe, sampler_row, seed, trained_with
 
@@ -222,7 +222,7 @@ def _trained(record: RunRecord) -> tuple[str, ...] | None:
     if weightless(record):
         return None
     task, learned = record.config["task"], trained_with(record)
-    settings = f"task.net={json.dumps(task.get('net'), sort_keys=True)}"
+    settings = f"task.net={json.dumps(with_defaults(task.get('net')), sort_keys=True)}"
     return record.config["names"]["net"], settings, f"learn={learned}"
 
 
