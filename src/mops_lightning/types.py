@@ -19,11 +19,13 @@ class Batch(NamedTuple):
         points: ``(B, N, 3)``.
         labels: ``(B,)`` int64 class numbers.
         rows: ``(B,)`` int64 rows of the clouds in their split, or None.
+        parts: ``(B, N)`` int64 part numbers of the points, or None.
     """
 
     points: Tensor
     labels: Tensor
     rows: Tensor | None = None
+    parts: Tensor | None = None
 
     @property
     def num_clouds(self) -> int:

@@ -178,7 +178,7 @@ def cloud(number=2000, side=10.0):
 
 def draw(points, crop="nearest", n_points=50, number=6, seed=1):
     rng = np.random.default_rng(seed)
-    return random_crops(points, n_points, number, crop, rng, PATH)
+    return random_crops(points, n_points, number, crop, rng, PATH)[0]
 
 
 def test_random_crops_nearest_is_a_ball_around_a_point():

@@ -165,7 +165,9 @@ def test_shapes_cache_is_written_and_read(tmp_path):
     assert same(shapes(**SMALL, cache=tmp_path / "new"), fresh)
     (path,) = (tmp_path / "new").iterdir()
     # Changed clouds in the file are returned, so it is read.
-    np.savez(path, train=fresh.train.points.numpy() / 2, test=fresh.test.points.numpy())
+    train, test = fresh.train, fresh.test
+    parts: list[Any] = [train.parts, test.parts]
+    np.savez(path, train.points / 2, test.points, *parts)
     again = shapes(**SMALL, cache=str(tmp_path / "new"))
     assert torch.equal(again.train.points, fresh.train.points / 2)
     assert torch.equal(again.train.labels, fresh.train.labels)

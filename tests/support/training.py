@@ -29,9 +29,11 @@ def small_dataset(train: int = 24, test: int = 10, points: int = 48) -> CloudDat
     def clouds(number: int) -> Clouds:
         labels = torch.arange(number) % 3
         scale = torch.tensor([[1.0, 0.1, 0.1], [0.1, 1.0, 0.1], [0.3, 0.3, 0.3]])[labels]
-        return Clouds(torch.randn(number, points, 3, generator=rng) * scale[:, None], labels)
+        drawn = torch.randn(number, points, 3, generator=rng) * scale[:, None]
+        return Clouds(drawn, labels, parts=drawn[..., 0].gt(0).long())
 
-    return CloudDataset(("long", "tall", "round"), clouds(train), clouds(test), "blobs")
+    names, parts = ("long", "tall", "round"), ("left", "right")
+    return CloudDataset(names, clouds(train), clouds(test), "blobs", part_names=parts)
 
 
 def changed(before, module):

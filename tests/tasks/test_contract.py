@@ -9,11 +9,14 @@ import torch
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
+from mops_lightning.nets.hierarchical import HierarchicalSegmentation
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.tasks.reconstruction import Reconstruction
 from mops_lightning.tasks.registration import Registration
+from mops_lightning.tasks.segmentation import Segmentation
 from mops_lightning.training.experiment import Experiment
 from tests.support.samplers import SAMPLERS
 from tests.support.training import changed, quiet_trainer, small_dataset, state
@@ -25,6 +28,9 @@ TASKS = {
     "reconstruction": lambda: Reconstruction(AutoEncoder(POINTS, 8)),
     "reconstruction_folding": lambda: Reconstruction(MFoldingNet(POINTS, 2, 8)),
     "registration": lambda: Registration(PCRNet(feature_channels=(8, 16))),
+    "segmentation": lambda: Segmentation(
+        HierarchicalSegmentation(2, FPSSampler, (20, 8), (8, 16, 16), 4), 2
+    ),
 }
 # Sizes on both sides of 32 points, where the pooling layer changes its algorithm, in one step.
 LEARNED = ("mops", "fmops", "snet", "samplenet", "samplenet-progressive")

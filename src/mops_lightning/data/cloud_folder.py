@@ -48,6 +48,7 @@ def cloud_folder(
     test_frames: Literal["last"] | None,
     crop: Crop,
     crops: int,
+    label: str | None = None,
 ) -> CloudDataset:
     """Read the clouds or meshes in a folder and its subfolders, one per file.
 
@@ -70,6 +71,8 @@ def cloud_folder(
             --tile``; ``whole`` random points of the cloud; ``surface`` random points on the
             surface of a mesh, uniform by area.
         crops: number of clouds per file; 1 for ``surface``.
+        label: column of the files that says to which part a point belongs, by a whole number; None:
+            the points have no parts. Not with ``surface``.
 
     Returns:
         Float32 clouds ``(S, n_points, 3)`` in the unit sphere, with the centroid at the origin, and
@@ -90,6 +93,8 @@ def cloud_folder(
         raise UserError(f"crop: unknown {crop!r}.{did_you_mean(crop, CROPS)}")
     if crop == "surface" and crops != 1:
         raise UserError(f"crops must be 1 with crop=surface, got {crops}.")
+    if crop == "surface" and label is not None:
+        raise UserError(f"label must be null with crop=surface, got {label!r}.")
     folder = Path(root).expanduser()
     suffixes = MESHES if crop == "surface" else READABLE
     names = list_files(folder, suffixes)
@@ -102,7 +107,10 @@ def cloud_folder(
     else:
         splits = split_by_folder(names) or split_by_share(names, test_share, seed)
     notes = _notes(folder, names, splits, chosen)
-    crops_of, digests = _read_files(folder, names, n_points, crop, crops, seed, cache)
+    crops_of, digests, labels_of = _read_files(
+        folder, names, n_points, crop, crops, seed, cache, label
+    )
+    numbers = np.unique(np.concatenate(labels_of)) if labels_of else np.empty(0, np.int64)
     clouds = {}
     for split in SPLITS:
         rows = [row for row, of_file in enumerate(splits) if of_file == split]
@@ -111,9 +119,13 @@ def cloud_folder(
             torch.cat([crops_of[row] for row in rows]),
             labels.repeat_interleave(crops),
             torch.tensor(rows).repeat_interleave(crops) if crops > 1 else None,
+            torch.from_numpy(np.searchsorted(numbers, np.concatenate([labels_of[r] for r in rows])))
+            if labels_of
+            else None,
         )
     if crop != "surface":
-        return replace(make_dataset("clouds", clouds, chosen, None, folder), notes=notes)
+        dataset = make_dataset("clouds", clouds, chosen, None, folder)
+        return replace(dataset, notes=notes, part_names=tuple(map(str, numbers.tolist())))
     digest = hashlib.sha256(repr(("meshes", VERSION, n_points, seed, chosen)).encode())
     for path, split, of_file in zip(names, splits, digests, strict=True):
         digest.update(repr((split, str(path), of_file)).encode())
@@ -143,17 +155,19 @@ def _read_files(
     crops: int,
     seed: int,
     cache: str | Path | None,
-) -> tuple[list[Tensor], list[str]]:
+    label: str | None,
+) -> tuple[list[Tensor], list[str], list[NDArray[np.int64]]]:
     """Sample the surfaces of meshes, or draw crops of clouds.
 
     Returns:
-        The clouds of every file, ``(crops, n_points, 3)``, and the sha256 of every mesh's file.
+        The clouds of every file, ``(crops, n_points, 3)``, the sha256 of every mesh's file, and the
+        labels of every cloud file's points, ``(crops, n_points)``, if ``label`` names them.
     """
     kept = Path(cache).expanduser() if cache else None
     if kept is not None:
         remove_temporary(kept, below=False)
     console = Console(stderr=True)
-    clouds, digests = [], []
+    clouds, digests, labels = [], [], []
     for name in track(names, "Reading files", console=console, disable=not console.is_terminal):
         path = folder / name
         if crop == "surface":
@@ -162,10 +176,12 @@ def _read_files(
             digests.append(digest)
             continue
         rng = np.random.default_rng(derive_seed(seed, zlib.crc32(str(name).encode())))
-        points = read(path, max(10_000, 8 * n_points), seed).finite().points
-        drawn = torch.from_numpy(random_crops(points, n_points, crops, crop, rng, path))
-        clouds.append(normalize_unit_sphere(drawn))
-    return clouds, digests
+        table = read(path, max(10_000, 8 * n_points), seed).finite()
+        drawn, rows = random_crops(table.points, n_points, crops, crop, rng, path)
+        clouds.append(normalize_unit_sphere(torch.from_numpy(drawn)))
+        if label is not None:
+            labels.append(table.whole_numbers(label, path)[rows])
+    return clouds, digests, labels
 
 
 def random_crops(
@@ -175,8 +191,11 @@ def random_crops(
     crop: Crop,
     rng: np.random.Generator,
     path: Path,
-) -> NDArray[np.float32]:
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Draw crops of a cloud ``(N, 3)``: ``(number, n_points, 3)``, each with its centroid at 0.
+
+    Returns:
+        The crops, and the rows ``(number, n_points)`` of their points.
 
     Raises:
         BadCloudError: the cloud has fewer than ``n_points`` points, or they coincide.
@@ -187,6 +206,7 @@ def random_crops(
             "dataset.n_points, or remove the file."
         )
     crops = np.empty((number, n_points, 3), np.float32)
+    chosen = np.empty((number, n_points), np.int64)
     for place in range(number):
         for _ in range(DRAWS):
             if crop == "nearest":
@@ -202,8 +222,8 @@ def random_crops(
                 f"{path}: the {n_points} points of a crop coincide. Clean the file."
             )
         # Before float32, which has too few digits for coordinates of a map.
-        crops[place] = drawn - drawn.mean(0)
-    return crops
+        crops[place], chosen[place] = drawn - drawn.mean(0), rows
+    return crops, chosen
 
 
 def _notes(

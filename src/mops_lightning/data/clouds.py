@@ -24,11 +24,13 @@ class Clouds(NamedTuple):
         labels: ``(S,)`` int64, positions in ``CloudDataset.class_names``.
         sources: ``(S,)`` int64, the same number for clouds that must be in the same split, such as
             the crops of a file; None: no two must.
+        parts: ``(S, N)`` int64, positions in ``CloudDataset.part_names``, or None.
     """
 
     points: Tensor
     labels: Tensor
     sources: Tensor | None = None
+    parts: Tensor | None = None
 
     def take(self, rows: Tensor) -> "Clouds":
         """Return the clouds of the given rows, or of a mask, with all that belongs to them."""
@@ -36,6 +38,7 @@ class Clouds(NamedTuple):
             self.points[rows],
             self.labels[rows],
             None if self.sources is None else self.sources[rows],
+            None if self.parts is None else self.parts[rows],
         )
 
 
@@ -50,6 +53,7 @@ class CloudDataset:
         fingerprint: sha256 of everything that determines the content; part of the cache key of task
             nets.
         notes: facts for the run record, such as the number of files.
+        part_names: the parts of shapes, in the order of ``Clouds.parts``; empty without parts.
     """
 
     class_names: tuple[str, ...]
@@ -57,6 +61,7 @@ class CloudDataset:
     test: Clouds
     fingerprint: str
     notes: dict[str, Any] = field(default_factory=dict)
+    part_names: tuple[str, ...] = ()
 
 
 def choose_classes(classes: Sequence[str] | None, known: Sequence[str]) -> tuple[str, ...]:
@@ -116,6 +121,8 @@ def make_dataset(
         digest.update(repr((split, *names, tuple(clouds.points.shape))).encode())
         digest.update(clouds.points.numpy().data)
         digest.update(clouds.labels.numpy().data)
+        if clouds.parts is not None:
+            digest.update(clouds.parts.numpy().data)
         kept.append(clouds)
     return CloudDataset(chosen, kept[0], kept[1], digest.hexdigest())
 

@@ -41,7 +41,7 @@ def corrupt(clouds: Clouds, spec: str | None) -> Clouds:
         return clouds
     apply, level = parse(spec)
     points = [apply(cloud, level, generator(STREAM, s)) for s, cloud in enumerate(clouds.points)]
-    return clouds._replace(points=torch.stack(points))
+    return clouds._replace(points=torch.stack(points), parts=None)  # other points, other order
 
 
 def parse(spec: str) -> tuple[Corruption, float]:

@@ -176,6 +176,8 @@ class CloudLoader:
 
     def _made(self, points: Tensor, rows: Tensor, epoch: int) -> Any:
         if self.make_batch is None:
-            return Batch(points, self.clouds.labels[rows], rows)
+            parts = self.clouds.parts
+            labels = self.clouds.labels[rows]
+            return Batch(points, labels, rows, None if parts is None else parts[rows])
         stream = (DRAWN, self.seed, epoch) if self.shuffle else (FIXED, self.seed)
         return self.make_batch(points, [generator(*stream, row) for row in rows.tolist()])

@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from mops_lightning.data.procedural.airplane import airplane
 from mops_lightning.data.procedural.furniture import bed, desk, lamp, shelf, table
 from mops_lightning.data.procedural.seats import chair, sofa, stool
 from mops_lightning.data.procedural.vessels import bottle, bowl, bucket, cup, goblet, teapot, vase
-from mops_lightning.data.surfaces import cached
+from mops_lightning.data.surfaces import FLOAT, PART, cached
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.ops.points import UnitSphere
@@ -41,6 +41,18 @@ BUILDERS: Mapping[str, Callable[[Generator], trimesh.Trimesh]] = MappingProxyTyp
 ASYMMETRIC = ("airplane", "bed", "chair", "shelf", "sofa", "teapot")
 """Classes whose shapes do not look alike from several sides, for registration."""
 
+PARTS: Mapping[str, tuple[str, ...]] = MappingProxyType({
+    "airplane": ("hull", "wing", "tail", "engine"),
+    "bed": ("frame", "mattress", "pillow", "board", "leg"),
+    "chair": ("seat", "back", "leg", "arm"),
+    "cup": ("vessel", "handle", "saucer"),
+    "lamp": ("base", "pole", "shade"),
+    "stool": ("seat", "leg"),
+    "table": ("top", "leg"),
+    "teapot": ("vessel", "lid", "spout", "handle"),
+})  # fmt: skip
+"""The classes whose shapes know their parts, for segmentation. Parts of one name are one part."""
+
 GENERATOR_VERSION = 1
 """Part of the fingerprint; increment it with every change of the shapes."""
 
@@ -55,7 +67,7 @@ def shapes(
     n_points: int = 1024,
     train_per_class: int = 80,
     test_per_class: int = 20,
-    classes: Sequence[str] | Literal["asymmetric"] | None = None,
+    classes: Sequence[str] | Literal["asymmetric", "parts"] | None = None,
     seed: int = 0,
     cache: str | Path | None = None,
 ) -> CloudDataset:
@@ -70,14 +82,15 @@ def shapes(
         n_points: number of points per shape.
         train_per_class: number of training shapes per class.
         test_per_class: number of test shapes per class.
-        classes: names to keep, or ``asymmetric`` for ``ASYMMETRIC``; None or empty means all.
+        classes: names to keep, or ``asymmetric`` for ``ASYMMETRIC``, or ``parts`` for those of
+            ``PARTS``; None or empty means all.
         seed: seed of all shapes and points.
         cache: folder for generated clouds, or None. A damaged file is generated again.
 
     Returns:
         Float32 clouds ``(S, n_points, 3)`` in the unit sphere, with the centroid at the origin, and
-        int64 labels ``(S,)``. The fingerprint depends on all arguments except ``cache``, and on the
-        version of the generator.
+        int64 labels ``(S,)``; of the classes in ``PARTS`` alone, also the parts of the points. The
+        fingerprint depends on all arguments except ``cache``, and on the version of the generator.
 
     Raises:
         UserError: an argument is invalid, or ``cache`` cannot be written.
@@ -88,8 +101,11 @@ def shapes(
     for name, value, minimum in zip(names, values, (1, 1, 1, 0), strict=True):
         if not isinstance(value, int) or isinstance(value, bool) or value < minimum:
             raise UserError(f"{name} must be a whole number of at least {minimum}, got {value!r}.")
-    wanted = ASYMMETRIC if classes == "asymmetric" else classes
+    named_sets = {"asymmetric": ASYMMETRIC, "parts": tuple(PARTS)}
+    wanted = named_sets.get(classes, classes) if isinstance(classes, str) else classes
     chosen = choose_classes(wanted, tuple(BUILDERS))
+    labelled = set(chosen) <= set(PARTS)
+    part_names = tuple(dict.fromkeys(sum((PARTS[name] for name in chosen), ()))) if labelled else ()
     settings = {
         "dataset": "shapes",
         "version": GENERATOR_VERSION,
@@ -103,19 +119,28 @@ def shapes(
     if cache is not None:
         path = Path(cache).expanduser() / f"shapes-{fingerprint[:20]}.npz"
         remove_temporary(path.parent, below=False)
-    expected = [(count * len(chosen), n_points, 3) for count in counts]
-    points = cached(path, expected, lambda: _generate(n_points, counts, chosen, seed))
+    sizes = [(count * len(chosen), n_points) for count in counts]
+    kinds = [((*size, 3), FLOAT) for size in sizes] + [(size, PART) for size in sizes if part_names]
+    arrays = cached(path, kinds, lambda: _generate(n_points, counts, chosen, seed, part_names))
     train, test = (
-        Clouds(torch.from_numpy(cloud), torch.arange(len(chosen)).repeat_interleave(count))
-        for cloud, count in zip(points, counts, strict=True)
+        Clouds(
+            torch.from_numpy(arrays[split]),
+            torch.arange(len(chosen)).repeat_interleave(count),
+            parts=torch.from_numpy(arrays[2 + split]) if part_names else None,
+        )
+        for split, count in enumerate(counts)
     )
-    return CloudDataset(chosen, train, test, fingerprint)
+    return CloudDataset(chosen, train, test, fingerprint, part_names=part_names)
 
 
 def _generate(
-    n_points: int, counts: tuple[int, int], chosen: Sequence[str], seed: int
-) -> list[NDArray[np.float32]]:
-    """Return the clouds of both splits, ``(S, n_points, 3)``, class by class."""
+    n_points: int,
+    counts: tuple[int, int],
+    chosen: Sequence[str],
+    seed: int,
+    part_names: Sequence[str],
+) -> list[NDArray[Any]]:
+    """Return the clouds of both splits, ``(S, n_points, 3)``, class by class, then their parts."""
     jobs = [
         (name, split, i)
         for split, count in enumerate(counts)
@@ -125,19 +150,23 @@ def _generate(
     # Not rich's is_terminal, which FORCE_COLOR makes true for log files.
     silent = not sys.stderr.isatty()
     console = Console(stderr=True)
-    clouds = np.stack(
-        [
-            _cloud(name, n_points, seed, split, i)
-            for name, split, i in track(
-                jobs, "Making shapes", console=console, transient=True, disable=silent
-            )
-        ]
+    progress = track(jobs, "Making shapes", console=console, transient=True, disable=silent)
+    clouds, names = zip(
+        *(_cloud(name, n_points, seed, split, i) for name, split, i in progress), strict=True
     )
-    return np.split(clouds, [counts[0] * len(chosen)])
+    first = counts[0] * len(chosen)
+    arrays = np.split(np.stack(clouds), [first])
+    if part_names:
+        order = np.argsort(part_names)
+        numbers = order[np.searchsorted(part_names, np.stack(names), sorter=order)]
+        arrays += np.split(numbers.astype(PART), [first])
+    return arrays
 
 
-def _cloud(name: str, n_points: int, seed: int, split: int, i: int) -> NDArray[np.float32]:
-    """Build shape i of a class in a split and sample it: ``(n_points, 3)``.
+def _cloud(
+    name: str, n_points: int, seed: int, split: int, i: int
+) -> tuple[NDArray[np.float32], NDArray[np.str_]]:
+    """Build shape i of a class in a split and sample it: ``(n_points, 3)``, and the parts' names.
 
     Form and points have separate random streams, so that the form does not depend on ``n_points``.
     """
@@ -149,6 +178,7 @@ def _cloud(name: str, n_points: int, seed: int, split: int, i: int) -> NDArray[n
     angle = rng.uniform(-YAW, YAW)
     cos, sin = np.cos(angle), np.sin(angle)
     number = int(spread.generate_state(1, np.uint64)[0])
-    cloud = np.asarray(trimesh.sample.sample_surface(mesh, n_points, seed=number)[0])
-    cloud = cloud @ ((cos, 0, -sin), (0, 1, 0), (sin, 0, cos))
-    return UnitSphere.around(cloud).normalise(cloud).numpy()
+    sampled, faces = trimesh.sample.sample_surface(mesh, n_points, seed=number)
+    cloud = np.asarray(sampled) @ ((cos, 0, -sin), (0, 1, 0), (sin, 0, cos))
+    parts = mesh.metadata.get("parts", np.full(len(mesh.faces), ""))
+    return UnitSphere.around(cloud).normalise(cloud).numpy(), parts[faces]

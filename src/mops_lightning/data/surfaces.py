@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +19,11 @@ from mops_lightning.ops.points import UnitSphere
 VERSION = 1
 """Part of the cache key; increment it when the same file gives another cloud."""
 
-FLOAT = np.dtype(np.float32)
+FLOAT, PART = np.dtype(np.float32), np.dtype(np.int64)
+"""Dtypes of coordinates and of part numbers."""
+
+Kind = tuple[tuple[int, ...], np.dtype[Any]]
+"""Shape and dtype of an array."""
 
 
 def sample_surface(
@@ -49,20 +54,20 @@ def sample_surface(
         points, _ = sample_mesh(path, data, n_points, random)
         return [UnitSphere.around(points).normalise(points).numpy()]
 
-    return digest, torch.from_numpy(cached(kept, [(n_points, 3)], sample)[0])
+    return digest, torch.from_numpy(cached(kept, [((n_points, 3), FLOAT)], sample)[0])
 
 
 def cached(
     path: Path | None,
-    shapes: Sequence[tuple[int, ...]],
-    make: Callable[[], list[NDArray[np.float32]]],
-) -> list[NDArray[np.float32]]:
-    """Return clouds from a cache file, or make them and write the file.
+    kinds: Sequence[Kind],
+    make: Callable[[], list[NDArray[Any]]],
+) -> list[NDArray[Any]]:
+    """Return clouds, and perhaps their parts, from a cache file, or make them and write the file.
 
     Args:
         path: the file, an .npz; a missing or damaged one is written again. None: no cache.
-        shapes: of the clouds; a file with other ones is replaced.
-        make: makes the clouds.
+        kinds: of the arrays; a file with other ones is replaced.
+        make: makes the arrays.
 
     Raises:
         UserError: the file cannot be written.
@@ -70,18 +75,18 @@ def cached(
     if path is None:
         return make()
     try:
-        clouds = list(load_npz(path).values())  # verifies the checksums of the arrays
+        arrays = list(load_npz(path).values())  # verifies the checksums of the arrays
     except UserError:
-        clouds = []
-    if [(cloud.shape, cloud.dtype) for cloud in clouds] == [(shape, FLOAT) for shape in shapes]:
-        return clouds
-    clouds = make()
+        arrays = []
+    if [(array.shape, array.dtype) for array in arrays] == list(kinds):
+        return arrays
+    arrays = make()
     try:
         with atomic_write(path) as temporary:
-            np.savez(temporary, *clouds)
+            np.savez(temporary, *arrays)
     except OSError as error:
         raise UserError(
             f"cache: cannot write to {path.parent} ({error}). Set it to a writable folder, or to "
             "None (null on the command line) for no cache."
         ) from error
-    return clouds
+    return arrays

@@ -1,4 +1,4 @@
-"""A hierarchical classifier whose stages sample their points.
+"""Hierarchical nets whose stages sample their points: a classifier and a segmentation net.
 
 The paper's conclusion proposes its sampler in place of farthest point sampling inside such nets,
 of which PointNet++ is the first (Qi et al., NeurIPS 2017).
@@ -15,6 +15,7 @@ from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu, max_of_rows
 from mops_lightning.ops.nearest import k_nearest, nearest
 from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.propagation import interpolate
 from mops_lightning.types import SampleOutput
 
 
@@ -80,8 +81,60 @@ def carried(output: SampleOutput, points: Tensor, features: Tensor) -> Tensor:
     return gather_points(features, nearest(output.points, points)[1])
 
 
-class HierarchicalNet(nn.Module):
-    """Stages that sample and look at neighbourhoods, then maximum and mean of the last features.
+class Hierarchy(nn.Module):
+    """Stages that sample and look at neighbourhoods; base of the nets of this module.
+
+    Args:
+        sampler: makes the sampler of a stage from its number of points, given as ``m``.
+        points: number of points after every stage.
+        channels: channels of the features before the first stage and after every stage.
+        k: number of neighbours.
+
+    Raises:
+        UserError: an argument is out of range.
+    """
+
+    def __init__(
+        self,
+        sampler: Callable[..., nn.Module],
+        points: Sequence[int],
+        channels: Sequence[int],
+        k: int,
+    ) -> None:
+        super().__init__()
+        check_at_least(1, k=k)
+        check_channels("points", points)
+        check_channels("channels", channels)
+        if len(channels) != len(points) + 1:
+            raise UserError(
+                f"channels must have one number more than the {len(points)} of points, got "
+                f"{len(channels)}."
+            )
+        self.stem = PointMLP([3, channels[0], channels[0]])
+        self.stages = nn.ModuleList(
+            Stage(sampler(m=m), m, before, after, k)
+            for m, (before, after) in zip(points, pairwise(channels), strict=True)
+        )
+
+    def levels(self, points: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return points ``(B, M, 3)`` and their features ``(B, M, C)``: the input, every stage."""
+        levels = [(points, self.stem(points).to(points))]
+        for stage in self.stages:
+            levels.append(stage(*levels[-1]))
+        return levels
+
+    @property
+    def losses(self) -> dict[str, Tensor]:
+        """The losses of the stages' samplers in the last training step, by stage and name."""
+        losses: dict[str, Tensor] = {}
+        for i, stage in enumerate(self.stages, 1):
+            assert isinstance(stage, Stage)
+            losses |= {f"stage{i}_{name}": loss for name, loss in stage.losses.items()}
+        return losses
+
+
+class HierarchicalNet(Hierarchy):
+    """A classifier: stages, then maximum and mean of the last features.
 
     The net has 0.15 million weights with its default sizes and 40 classes, without the samplers'.
 
@@ -106,20 +159,7 @@ class HierarchicalNet(nn.Module):
         k: int = 16,
         dropout: float = 0.3,
     ) -> None:
-        super().__init__()
-        check_at_least(1, k=k)
-        check_channels("points", points)
-        check_channels("channels", channels)
-        if len(channels) != len(points) + 1:
-            raise UserError(
-                f"channels must have one number more than the {len(points)} of points, got "
-                f"{len(channels)}."
-            )
-        self.stem = PointMLP([3, channels[0], channels[0]])
-        self.stages = nn.ModuleList(
-            Stage(sampler(m=m), m, before, after, k)
-            for m, (before, after) in zip(points, pairwise(channels), strict=True)
-        )
+        super().__init__(sampler, points, channels, k)
         last = channels[-1]
         self.head = nn.Sequential(
             *linear_norm_relu([2 * last, last]), nn.Dropout(dropout), nn.Linear(last, num_classes)
@@ -127,16 +167,50 @@ class HierarchicalNet(nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:
         """Map ``(B, N, 3)`` points to ``(B, num_classes)`` logits."""
-        features = self.stem(points).to(points)
-        for stage in self.stages:
-            points, features = stage(points, features)
+        _, features = self.levels(points)[-1]
         return self.head(torch.cat([features.amax(1), features.mean(1)], 1))
 
-    @property
-    def losses(self) -> dict[str, Tensor]:
-        """The losses of the stages' samplers in the last training step, by stage and name."""
-        losses: dict[str, Tensor] = {}
-        for i, stage in enumerate(self.stages, 1):
-            assert isinstance(stage, Stage)
-            losses |= {f"stage{i}_{name}": loss for name, loss in stage.losses.items()}
-        return losses
+
+class HierarchicalSegmentation(Hierarchy):
+    """A segmentation net: stages, and back through them to the points of the input.
+
+    On the way back, features of a stage are interpolated to the points before it, joined with the
+    features that these points have, and mapped by a pointwise layer, as in PointNet++.
+
+    Args:
+        num_parts: number of logits of a point.
+        sampler: see ``HierarchicalNet``, as all other arguments.
+        points: number of points after every stage.
+        channels: channels of the features before the first stage and after every stage.
+        k: number of neighbours.
+        dropout: dropout probability.
+
+    Raises:
+        UserError: an argument is out of range.
+    """
+
+    def __init__(
+        self,
+        num_parts: int,
+        sampler: Callable[..., nn.Module],
+        points: Sequence[int] = (256, 64),
+        channels: Sequence[int] = (32, 64, 128),
+        k: int = 16,
+        dropout: float = 0.3,
+    ) -> None:
+        super().__init__(sampler, points, channels, k)
+        # The deepest level also knows the whole cloud, by the maximum of its features.
+        sizes = [2 * channels[-1], *reversed(channels[:-1])]
+        self.back = nn.ModuleList(PointMLP([deep + skip, skip]) for deep, skip in pairwise(sizes))
+        self.head = nn.Sequential(nn.Dropout(dropout), nn.Linear(channels[0], num_parts))
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Map ``(B, N, 3)`` points to ``(B, N, num_parts)`` logits."""
+        *before, (centres, features) = self.levels(points)
+        peaks = features.amax(1, keepdim=True).expand_as(features)
+        features = torch.cat([features, peaks], 2)
+        for layer, (target, skip) in zip(self.back, reversed(before), strict=True):
+            carried_back = interpolate(features, centres, target)
+            features = layer(torch.cat([carried_back, skip], 2)).to(points)
+            centres = target
+        return self.head(features)

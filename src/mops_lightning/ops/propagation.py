@@ -17,7 +17,10 @@ from torch import Tensor
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import load_npz
 from mops_lightning.ops.nearest import k_nearest, nearest
-from mops_lightning.ops.points import as_tensor, cloud_sizes
+from mops_lightning.ops.points import as_tensor, cloud_sizes, gather_points
+
+CLOSE = 1e-8
+"""Squared distance in the unit sphere below which a point has nearly all of the weight."""
 
 
 class PropagationMap(NamedTuple):
@@ -192,6 +195,30 @@ def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> An
         result[missing] = fill
     result = result.reshape(*map.rows.shape[:-1], *numbers.shape[leading:])
     return result if isinstance(values, Tensor) else result.numpy()
+
+
+def interpolate(values: Tensor, points: Tensor, queries: Tensor, k: int = 3) -> Tensor:
+    """Return values at other points: means of the nearest points' values, weighted by 1/d².
+
+    The interpolation of PointNet++ (Qi et al., NeurIPS 2017). Unlike ``propagate``, it has
+    gradients with respect to all three arguments.
+
+    Args:
+        values: ``(B, M, C)``, one row per point.
+        points: ``(B, M, 3)``.
+        queries: ``(B, N, 3)``, where to interpolate.
+        k: number of nearest points; all if there are fewer.
+
+    Returns:
+        ``(B, N, C)``.
+    """
+    with torch.no_grad():
+        rows = k_nearest(queries, points, min(k, points.shape[1]))[1]
+    shape, flat = rows.shape[1:], rows.flatten(1)
+    near = gather_points(points, flat).unflatten(1, shape)
+    weights = 1 / ((near - queries[:, :, None]).square().sum(3, keepdim=True) + CLOSE)
+    weights = weights / weights.sum(2, keepdim=True)
+    return (gather_points(values, flat).unflatten(1, shape) * weights).sum(2)
 
 
 def _rows(map: PropagationMap, values: Tensor) -> Tensor:

@@ -122,6 +122,26 @@ def reconstruction_grid(
     return figure
 
 
+def part_grid(points: Tensor, parts: Mapping[str, Tensor], titles: Sequence[str]) -> Figure:
+    """Draw clouds as rows, coloured by part, with one column for each way to tell the parts.
+
+    Args:
+        points: ``(K, N, 3)``, y up.
+        parts: ``(K, N)`` part numbers by the name of a column.
+        titles: one per cloud.
+    """
+    figure = new_figure(2.4 * len(parts), 2.4 * len(points), "tight")
+    most = max(int(numbers.max()) for numbers in parts.values())
+    for row, cloud in enumerate(upright(points)):
+        for column, (name, numbers) in enumerate(parts.items()):
+            title, label = name if row == 0 else "", titles[row] if column == 0 else ""
+            axes = cloud_axes(figure, len(points), len(parts), row, column, title, label)
+            colours: Any = {"c": numbers[row].cpu(), "cmap": "tab20", "vmin": 0, "vmax": most}
+            axes.scatter(*cloud.T, s=2, depthshade=False, **colours)
+            frame_cloud(axes, cloud)
+    return figure
+
+
 def _draw_depth(axes: Axes3D, drawn: np.ndarray, cloud: np.ndarray) -> None:
     """Draw points coloured by depth, framed as ``cloud``."""
     axes.scatter(*drawn.T, s=2, c=drawn[:, 1], cmap="viridis", depthshade=False)

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -52,6 +53,14 @@ def test_factory_recipe_of_index_sampler_serves_a_task_net_that_learns(learn):
     made = make_experiment(compose([*given, "m=8"]), small_dataset(), {})
     expected = Recipe(train_points=20, ema_span=0.3) if learn == "joint" else Recipe()
     assert made.recipe == expected
+
+
+def test_factory_segmentation_needs_data_with_parts():
+    cfg = compose(["task=segmentation", "m=8", "task.net.points=[16,8]"])
+    made: Any = make_experiment(cfg, small_dataset(), {})
+    assert made.task.num_parts == made.task.net.head[-1].out_features == 2
+    with pytest.raises(UserError, match=r"nothing says which part .* dataset\.label=COLUMN"):
+        make_experiment(cfg, replace(small_dataset(), part_names=()), {})
 
 
 def rows(part, whole):

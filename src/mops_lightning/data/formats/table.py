@@ -48,6 +48,22 @@ class Table:
         finite = np.isfinite(self.points).all(axis=1)
         return self if finite.all() else self.take(np.flatnonzero(finite))
 
+    def whole_numbers(self, name: str, path: Path) -> NDArray[np.int64]:
+        """Return a column of whole numbers ``(N,)``, such as the classes of points.
+
+        Raises:
+            BadCloudError: there is no such column, or it holds other numbers.
+        """
+        column = self.columns.get(name)
+        if column is None:
+            known = ", ".join(self.columns) or "none"
+            raise BadCloudError(f"{path} has no column {name!r}. Its columns: {known}.")
+        with np.errstate(invalid="ignore"):  # NaN is no whole number, either
+            whole = column.astype(np.int64)
+        if (whole != column).any():
+            raise BadCloudError(f"{path}: column {name!r} must hold whole numbers.")
+        return whole
+
     def without_attributes(self) -> "Table":
         """Return the points alone."""
         return Table(self.points, {}, self.header)

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.random import Generator
 from trimesh import Trimesh
 
-from mops_lightning.data.procedural.mesh_parts import Array, join, loft, rod, smooth, tube
+from mops_lightning.data.procedural.mesh_parts import Array, join, loft, named, rod, smooth, tube
 
 
 def airplane(rng: Generator) -> Trimesh:
@@ -19,7 +19,7 @@ def airplane(rng: Generator) -> Trimesh:
     wide = radius * np.array((0.12, 0.45, 0.85, 1, 1, 0.55, 0.15))
     body = smooth(np.column_stack((y, z, wide)), 24)
     path = np.column_stack((np.zeros(24), body[:, 0], body[:, 1]))
-    parts = [tube(path, body[:, 2], 20, across=(1, 0, 0))]
+    parts = named("hull", tube(path, body[:, 2], 20, across=(1, 0, 0)))
 
     prop = rng.random() < 0.3
     span = rng.uniform(0.7, 1.1)
@@ -32,19 +32,20 @@ def airplane(rng: Generator) -> Trimesh:
     for side in (-1, 1):
         root = np.array((side * radius * 0.5, level, root_z))
         tip = np.array((side * span, level + dihedral * span, root_z - sweep * span))
-        parts.append(_wing(root, tip, root_chord, tip_chord))
+        parts += named("wing", _wing(root, tip, root_chord, tip_chord))
     tall = rng.uniform(0.25, 0.42)
     high = rng.random() < 0.25
     rear = tail + 0.32
     back = rng.uniform(0.15, 0.3)
     fin_top = np.array((0, radius * 0.5 + tall, rear - back))
-    parts.append(_wing(np.array((0, radius * 0.3, rear)), fin_top, 0.32, 0.16, upright=True))
+    fin = np.array((0, radius * 0.3, rear))
+    parts += named("tail", _wing(fin, fin_top, 0.32, 0.16, upright=True))
     half = span * rng.uniform(0.32, 0.45)
     tail_y = fin_top[1] if high else radius * 0.5
     tail_z = fin_top[2] if high else rear - 0.05
     for side in (-1, 1):
         tip = np.array((side * half, tail_y + 0.02, tail_z - back * half / 0.4))
-        parts.append(_wing(np.array((0, tail_y, tail_z)), tip, 0.24, 0.12))
+        parts += named("tail", _wing(np.array((0, tail_y, tail_z)), tip, 0.24, 0.12))
     if prop:
         parts += _propeller(rng, nose, -radius * 0.3)
         return join(parts)
@@ -75,11 +76,12 @@ def _propeller(rng: Generator, nose: float, y: float) -> list[Trimesh]:
         out = np.array((np.cos(turn), np.sin(turn), 0))
         path = hub + np.outer((0.02, 0.12, 0.25), out)
         parts.append(tube(path, (0.02, 0.035, 0.02), 8, across=(0, 0, 1), flatten=0.3))
-    return parts
+    return named("engine", *parts)
 
 
 def _engine(rng: Generator, x: float, y: float, z: float, size: float) -> list[Trimesh]:
     """Return a jet engine on each side; ``size`` is its radius at the front."""
     long = rng.uniform(0.22, 0.32)
     front, rear = z + long * 0.4, z - long * 0.6
-    return [rod((at, y, front), (at, y, rear), (size, size * 0.7), 14) for at in (-x, x)]
+    sides = (rod((at, y, front), (at, y, rear), (size, size * 0.7), 14) for at in (-x, x))
+    return named("engine", *sides)

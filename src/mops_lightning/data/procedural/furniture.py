@@ -14,6 +14,7 @@ from mops_lightning.data.procedural.mesh_parts import (
     disc,
     four_legs,
     join,
+    named,
     rod,
     rungs,
     smooth,
@@ -35,32 +36,32 @@ def table(rng: Generator) -> Trimesh:
     else:
         top = box(around(width), (under, y), around(depth))
         inset = rng.uniform(0.82, 0.98)
-    parts = [top]
+    parts = named("top", top)
+    legs: list[Trimesh] = []
     kind = rng.random()
     if kind < 0.2:
         foot = min(width, depth) * rng.uniform(0.22, 0.34)
         turned_foot = [(foot, 0), (foot, 0.04), (0.08, 0.14), (0.07, under * 0.5), (0.1, under)]
-        parts.append(turned([(0, 0), *smooth(turned_foot, 16)]))
+        legs = [turned([(0, 0), *smooth(turned_foot, 16)])]
     elif kind < 0.35:
         for side in (-1, 1):
             x = side * width * 0.34
-            parts.append(box(around(0.07, x), (0.05, under), around(depth * 0.16)))
-            parts.append(box(around(0.09, x), (0, 0.06), around(depth * 0.75)))
-        parts.append(box(around(width * 0.68), around(0.1, under * 0.4), around(0.05)))
+            legs.append(box(around(0.07, x), (0.05, under), around(depth * 0.16)))
+            legs.append(box(around(0.09, x), (0, 0.06), around(depth * 0.75)))
+        legs.append(box(around(width * 0.68), around(0.1, under * 0.4), around(0.05)))
     else:
         radius = rng.uniform(0.035, 0.06)
         legs, ends = four_legs(
             rng, width * inset, depth * inset, under, radius, rng.uniform(0, 0.1)
         )
-        parts += legs
         if rng.random() < 0.4:
             apron = (under - rng.uniform(0.07, 0.14), under)
             wide, deep = width * inset, depth * inset
-            parts += [box(around(wide - 0.1), apron, around(0.03, z)) for z in around(deep - 0.06)]
-            parts += [box(around(0.03, x), apron, around(deep - 0.1)) for x in around(wide - 0.06)]
+            legs += [box(around(wide - 0.1), apron, around(0.03, z)) for z in around(deep - 0.06)]
+            legs += [box(around(0.03, x), apron, around(deep - 0.1)) for x in around(wide - 0.06)]
         if rng.random() < 0.25:
-            parts += rungs(ends, rng.uniform(0.12, 0.25), 0.03)
-    return join(parts)
+            legs += rungs(ends, rng.uniform(0.12, 0.25), 0.03)
+    return join(parts + named("leg", *legs))
 
 
 def desk(rng: Generator) -> Trimesh:
@@ -157,7 +158,8 @@ def _books(rng: Generator, x: Span, y: float, room: float, z: Span) -> list[Trim
 def lamp(rng: Generator) -> Trimesh:
     """Return a lamp: on a pole, on a turned foot, with a bent pole, or with a jointed arm."""
     base = rng.uniform(0.14, 0.28)
-    parts = [turned([(0, 0), (base, 0), (base, 0.03), (base * 0.3, 0.06), (0, 0.06)])]
+    foot_profile = [(0, 0), (base, 0), (base, 0.03), (base * 0.3, 0.06), (0, 0.06)]
+    parts = named("base", turned(foot_profile))
     kind = rng.random()
     wide, low = rng.uniform(0.2, 0.36), rng.uniform(0.3, 0.95)
     deep = rng.uniform(0.2, 0.36)
@@ -165,33 +167,33 @@ def lamp(rng: Generator) -> Trimesh:
     pole = rng.uniform(0.016, 0.03)
     if kind < 0.45:  # pole
         y = rng.uniform(0.65, 1.25)
-        parts.append(rod((0, 0.03, 0), (0, y + deep * 0.8, 0), pole, 8))
-        parts.append(turned([(wide, y), (narrow, y + deep)]))
+        parts += named("pole", rod((0, 0.03, 0), (0, y + deep * 0.8, 0), pole, 8))
+        shade = [turned([(wide, y), (narrow, y + deep)])]
         bar = y + deep - 0.01
-        parts.append(rod((-narrow, bar, 0), (narrow, bar, 0), 0.01, 6))
+        shade.append(rod((-narrow, bar, 0), (narrow, bar, 0), 0.01, 6))
         bulb = [(0, y + 0.04), (0.05, y + 0.07), (0.06, y + 0.1), (0, y + 0.16)]
-        parts.append(turned(bulb, 10))
+        shade.append(turned(bulb, 10))
     elif kind < 0.7:  # turned foot, as of table lamps
         foot = rng.uniform(0.1, 0.22)
         profile = [(base * 0.5, 0.05), (foot, low * 0.4), (0.03, low * 0.9), (0.025, low + deep)]
-        parts.append(turned(smooth(profile, 18)))
-        parts.append(turned([(wide, low), (narrow, low + deep)]))
+        parts += named("base", turned(smooth(profile, 18)))
+        shade = [turned([(wide, low), (narrow, low + deep)])]
     elif kind < 0.85:  # bent pole
         y, reach = rng.uniform(0.9, 1.3), rng.uniform(0.35, 0.6)
         path = [(0, 0.05, 0), (0, y * 0.75, 0), (reach * 0.4, y, 0), (reach, y * 0.85, 0)]
-        parts.append(tube(smooth(path, 20), pole, 8, across=(0, 0, 1)))
-        shade = turned([(wide * 0.7, y * 0.85 - 0.2), (0.05, y * 0.85 + 0.02)])
-        parts.append(shade.apply_translation((reach, 0, 0)))
+        parts += named("pole", tube(smooth(path, 20), pole, 8, across=(0, 0, 1)))
+        cone = turned([(wide * 0.7, y * 0.85 - 0.2), (0.05, y * 0.85 + 0.02)])
+        shade = [cone.apply_translation((reach, 0, 0))]
     else:  # jointed arm
         elbow = np.array((-rng.uniform(0.1, 0.35), rng.uniform(0.4, 0.6), 0))
         head = elbow + np.array((rng.uniform(0.4, 0.65), rng.uniform(0.1, 0.4), 0))
-        parts += [rod((0, 0.05, 0), elbow, pole), rod(elbow, head, pole)]
         hinge = np.array((0, 0, 0.04))
-        parts.append(rod(elbow - hinge, elbow + hinge, 0.04))
+        arm = [rod((0, 0.05, 0), elbow, pole), rod(elbow, head, pole)]
+        parts += named("pole", *arm, rod(elbow - hinge, elbow + hinge, 0.04))
         aim = np.array((rng.uniform(0.1, 0.5), -1.0, 0))
         tip = head + 0.22 * aim / np.linalg.norm(aim)
-        parts.append(rod(head - (tip - head) * 0.3, tip, (0.05, wide * 0.55), 24))
-    return join(parts)
+        shade = [rod(head - (tip - head) * 0.3, tip, (0.05, wide * 0.55), 24)]
+    return join(parts + named("shade", *shade))
 
 
 def bed(rng: Generator) -> Trimesh:
@@ -202,31 +204,37 @@ def bed(rng: Generator) -> Trimesh:
     head = top + rng.uniform(0.2, 0.7)
     z = around(length)
     # Rails instead of a box, and no mattress under the blanket: hidden surfaces get no points.
-    parts = [box(around(width), (foot, foot + frame), around(0.06, at)) for at in z]
-    parts += [box(around(0.06, x), (foot, foot + frame), z) for x in around(width - 0.06)]
+    rails = [box(around(width), (foot, foot + frame), around(0.06, at)) for at in z]
+    rails += [box(around(0.06, x), (foot, foot + frame), z) for x in around(width - 0.06)]
+    parts = named("frame", *rails)
     fold = z[1] - (length * rng.uniform(0.3, 0.6) if rng.random() < 0.5 else 0.0)
     mattress = (z[0] + 0.03, fold - 0.03)
-    parts.append(cushion(around(width * 0.96), (foot + frame * 0.8, top), mattress, 0.08))
+    soft = [cushion(around(width * 0.96), (foot + frame * 0.8, top), mattress, 0.08)]
     if fold < z[1]:
         blanket = (foot + frame * 0.6, top + 0.04)
-        parts.append(cushion(around(width * 1.03), blanket, (fold - 0.05, z[1] + 0.02), 0.06))
+        soft.append(cushion(around(width * 1.03), blanket, (fold - 0.05, z[1] + 0.02), 0.06))
+    parts += named("mattress", *soft)
     for x in (-width / 2 + 0.06, width / 2 - 0.06):
-        parts += [rod((x, 0, at), (x, foot + 0.02, at), 0.05, 4) for at in (z[0] + 0.1, z[1] - 0.1)]
+        legs = [rod((x, 0, at), (x, foot + 0.02, at), 0.05, 4) for at in (z[0] + 0.1, z[1] - 0.1)]
+        parts += named("leg", *legs)
     double = width > 1.15
     wide = width * 0.42 if double else min(0.62, width * 0.8)
     for x in (-width / 4, width / 4) if double else (0.0,):
         pillow = around(0.38, z[0] + 0.3)
-        parts.append(cushion(around(wide, x), (top - 0.03, top + 0.11), pillow, 0.1))
-    parts += _board(rng, width, (0.0, head), z[0] - 0.03)
+        pillows = cushion(around(wide, x), (top - 0.03, top + 0.11), pillow, 0.1)
+        parts += named("pillow", pillows)
+    parts += named("board", *_board(rng, width, (0.0, head), z[0] - 0.03))
     if rng.random() < 0.45:
-        parts += _board(rng, width, (0.0, top + rng.uniform(0.0, 0.25)), z[1] + 0.05)
+        low = (0.0, top + rng.uniform(0.0, 0.25))
+        parts += named("board", *_board(rng, width, low, z[1] + 0.05))
     elif rng.random() < 0.3:
         tall = top + rng.uniform(0.8, 1.1)
         posts = [(x, at) for at in z for x in around(width)]
-        parts += [rod((x, 0, at), (x, tall, at), 0.045, 8) for x, at in posts]
+        bars = [rod((x, 0, at), (x, tall, at), 0.045, 8) for x, at in posts]
         for start, end in ((0, 1), (1, 3), (3, 2), (2, 0)):
             (x0, z0), (x1, z1) = posts[start], posts[end]
-            parts.append(rod((x0, tall, z0), (x1, tall, z1), 0.035, 8))
+            bars.append(rod((x0, tall, z0), (x1, tall, z1), 0.035, 8))
+        parts += named("frame", *bars)
     return join(parts)
 
 

@@ -12,6 +12,7 @@ from mops_lightning.data.procedural.mesh_parts import (
     disc,
     four_legs,
     join,
+    named,
     rod,
     rungs,
     tube,
@@ -23,23 +24,23 @@ def chair(rng: Generator) -> Trimesh:
     width, depth = rng.uniform(0.75, 1.05), rng.uniform(0.75, 1.0)
     seat, rise = rng.uniform(0.65, 1.15), rng.uniform(0.3, 1.25)
     thick = rng.uniform(0.06, 0.16)
-    parts = [_pad(rng, width, depth, (seat - thick, seat))]
+    parts = named("seat", _pad(rng, width, depth, (seat - thick, seat)))
     if rng.random() < 0.25:
-        parts += _swivel(rng, seat - thick, min(width, depth) * 0.5)
+        parts += named("leg", *_swivel(rng, seat - thick, min(width, depth) * 0.5))
     else:
         legs, ends = four_legs(
             rng, width, depth, seat - thick, rng.uniform(0.035, 0.06), rng.uniform(0, 0.12)
         )
-        parts += legs
+        parts += named("leg", *legs)
         if rng.random() < 0.4:
-            parts += rungs(ends, rng.uniform(0.25, 0.5), 0.025)
-    parts.append(_chair_back(rng, width, -depth / 2, (seat, seat + rise)))
+            parts += named("leg", *rungs(ends, rng.uniform(0.25, 0.5), 0.025))
+    parts += named("back", _chair_back(rng, width, -depth / 2, (seat, seat + rise)))
     if rng.random() < 0.3:
         y, reach = seat + rise * rng.uniform(0.3, 0.6), depth * rng.uniform(0.25, 0.45)
         for side in (-1, 1):
             x = side * (width / 2 - 0.03)
-            parts.append(box(around(0.09, x), around(0.05, y), (-depth / 2, reach)))
-            parts.append(rod((x, seat - thick / 2, reach - 0.06), (x, y, reach - 0.06), 0.03, 8))
+            post = rod((x, seat - thick / 2, reach - 0.06), (x, y, reach - 0.06), 0.03, 8)
+            parts += named("arm", box(around(0.09, x), around(0.05, y), (-depth / 2, reach)), post)
     return join(parts)
 
 
@@ -91,17 +92,18 @@ def stool(rng: Generator) -> Trimesh:
     thick = rng.uniform(0.04, 0.2)
     y = (height - thick, height)
     is_round = rng.random() < 0.55
-    parts = [disc(width / 2, y) if is_round else _pad(rng, width, depth, y)]
+    parts = named("seat", disc(width / 2, y) if is_round else _pad(rng, width, depth, y))
     kind = rng.random()
     if kind < 0.25:
         base = width * rng.uniform(0.4, 0.55)
-        parts += [disc(base, (0, 0.05)), rod((0, 0, 0), (0, height - thick, 0), 0.05)]
+        pillar = rod((0, 0, 0), (0, height - thick, 0), 0.05)
+        parts += named("leg", disc(base, (0, 0.05)), pillar)
         if height > 0.9:
             ring, y_ring = width * 0.33, height * rng.uniform(0.3, 0.45)
             turn = np.linspace(0, 2 * np.pi, 25)
             path = np.column_stack((np.cos(turn) * ring, np.full(25, y_ring), np.sin(turn) * ring))
-            parts.append(tube(path, 0.025, 8, across=(0, 1, 0)))
-            parts.append(rod((-ring, y_ring, 0), (ring, y_ring, 0), 0.02, 8))
+            bar = rod((-ring, y_ring, 0), (ring, y_ring, 0), 0.02, 8)
+            parts += named("leg", tube(path, 0.025, 8, across=(0, 1, 0)), bar)
         return join(parts)
     splay, radius = rng.uniform(0.03, 0.2), rng.uniform(0.03, 0.055)
     inset = 0.75 if is_round else 1.0
@@ -110,12 +112,12 @@ def stool(rng: Generator) -> Trimesh:
         out = np.column_stack((np.cos(turn), np.zeros(3), np.sin(turn)))
         tops = out * width * 0.36 + (0, y[0], 0)
         ends = np.stack((tops, out * (width * 0.36 + splay * y[0])), axis=1)
-        parts += [rod(top, foot, (radius, radius * 0.8)) for top, foot in ends]
+        legs = [rod(top, foot, (radius, radius * 0.8)) for top, foot in ends]
     else:
         legs, ends = four_legs(rng, width * inset, depth * inset, y[0], radius, splay)
-        parts += legs
+    parts += named("leg", *legs)
     if rng.random() < 0.7:
-        parts += rungs(ends, rng.uniform(0.2, 0.45), 0.025)
+        parts += named("leg", *rungs(ends, rng.uniform(0.2, 0.45), 0.025))
     return join(parts)
 
 

@@ -11,6 +11,7 @@ from mops_lightning.data.procedural.mesh_parts import (
     Array,
     disc,
     join,
+    named,
     rod,
     smooth,
     tube,
@@ -86,12 +87,13 @@ def cup(rng: Generator) -> Trimesh:
     waist = rng.uniform(0.85, 1.12)
     middle = (radius + foot) / 2 * waist
     wall = smooth([(foot, 0), (middle, height * 0.45), (radius, height)], 14)
-    parts = [turned([(0.0, 0.0), *wall])]
+    parts = named("vessel", turned([(0.0, 0.0), *wall]))
     top, low = height * rng.uniform(0.78, 0.92), height * rng.uniform(0.15, 0.4)
-    parts.append(_handle(wall, top, low, rng.uniform(0.15, 0.36), rng.uniform(0.025, 0.05)))
+    handle = _handle(wall, top, low, rng.uniform(0.15, 0.36), rng.uniform(0.025, 0.05))
+    parts += named("handle", handle)
     if rng.random() < 0.25:
         plate = radius * rng.uniform(1.5, 1.9)
-        parts.append(turned([(0, -0.03), (plate * 0.6, -0.03), (plate, 0.05)]))
+        parts += named("saucer", turned([(0, -0.03), (plate * 0.6, -0.03), (plate, 0.05)]))
     return join(parts)
 
 
@@ -154,11 +156,9 @@ def teapot(rng: Generator) -> Trimesh:
     lid = smooth([(mouth, height), (mouth * 0.7, height + dome * 0.7), (0, height + dome)], 8)
     knob = rng.uniform(0.045, 0.075)
     ball = height + dome + knob * 0.8 + knob * np.array((-1, -0.7, 0, 0.7, 1))
-    parts = [
-        turned([(0.0, 0.0), *wall]),
-        turned(lid),
-        turned(np.column_stack((knob * np.array((0, 0.7, 1, 0.7, 0)), ball)), 12),
-    ]
+    ball_profile = np.column_stack((knob * np.array((0, 0.7, 1, 0.7, 0)), ball))
+    parts = named("vessel", turned([(0.0, 0.0), *wall]))
+    parts += named("lid", turned(lid), turned(ball_profile, 12))
     reach, tip = rng.uniform(0.3, 0.5), height * rng.uniform(0.85, 1.1)
     root = widest * rng.uniform(0.6, 1.0)
     spout = [
@@ -168,7 +168,8 @@ def teapot(rng: Generator) -> Trimesh:
         (-radius - reach, tip, 0),
     ]
     wide = rng.uniform(0.09, 0.14)
-    parts.append(tube(smooth(spout, 12), np.linspace(wide, wide * 0.4, 12), 12, across=(0, 0, 1)))
+    widths = np.linspace(wide, wide * 0.4, 12)
+    parts += named("spout", tube(smooth(spout, 12), widths, 12, across=(0, 0, 1)))
     thick = rng.uniform(0.03, 0.05)
     if rng.random() < 0.25:  # over the top
         turn = np.linspace(0, np.pi, 16)
@@ -176,10 +177,10 @@ def teapot(rng: Generator) -> Trimesh:
         start = np.interp(y, wall[:, 1], wall[:, 0])
         rise = y + np.sin(turn) * rng.uniform(0.5, 0.75)
         path = np.column_stack((np.cos(turn) * start, rise, np.zeros(16)))
-        parts.append(tube(path, thick, 10, across=(0, 0, 1)))
+        parts += named("handle", tube(path, thick, 10, across=(0, 0, 1)))
     else:
         top, low = height * rng.uniform(0.75, 0.92), height * rng.uniform(0.15, 0.35)
-        parts.append(_handle(wall, top, low, rng.uniform(0.28, 0.45), thick))
+        parts += named("handle", _handle(wall, top, low, rng.uniform(0.28, 0.45), thick))
     return join(parts)
 
 

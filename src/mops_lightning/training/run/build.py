@@ -5,6 +5,7 @@ Besides the settings of its node, a constructor is offered these values, by argu
 | argument | of | value |
 |---|---|---|
 | ``num_classes`` | task, task net | number of classes of the data |
+| ``num_parts`` | task, task net | number of parts that the points of the data belong to |
 | ``net`` | task, samplers, baselines | the task net |
 | ``seed`` | baselines | the run's seed, unless the node sets one |
 | ``m`` | baselines, untrained samplers | the largest tested size |
@@ -165,7 +166,15 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         UserError: a setting that its part or the data do not allow.
     """
     L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
-    classes = {"num_classes": len(dataset.class_names)}
+    classes = {
+        "num_classes": len(dataset.class_names),
+        "num_parts": len(dataset.part_names),
+    }
+    if not dataset.part_names and "num_parts" in accepted(cfg.task, classes):
+        raise UserError(
+            "dataset: nothing says which part a point belongs to. Give dataset=shapes "
+            "dataset.classes=parts, or your own clouds with dataset.label=COLUMN."
+        )
     own_net = build_as(nn.Module, cfg.task.net, "task.net", **accepted(cfg.task.net, classes))
     task: Task = build_as(Task, cfg.task, "task", net=own_net, **accepted(cfg.task, classes))
     # Another seed: the sampler's initial weights must not depend on the task net's size.

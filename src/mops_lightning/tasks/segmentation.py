@@ -1,0 +1,90 @@
+"""Segmentation of whole clouds into parts, from their sampled points."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torchmetrics import MetricCollection
+
+from mops_lightning.errors import UserError, check_at_least
+from mops_lightning.metrics.base import collection
+from mops_lightning.metrics.segmentation import MeanIoU, PointAccuracy
+from mops_lightning.ops.propagation import interpolate
+from mops_lightning.tasks.base import Task, figures_of
+from mops_lightning.types import Batch, TaskOutput
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Segmentation(Task):
+    """Names the part of every point of a cloud, though the net sees the sampled points only.
+
+    The logits of the sampled points are interpolated to all points of the cloud, see
+    ``ops.propagation.interpolate``. Loss and metrics are over all points.
+
+    Args:
+        net: maps ``(B, M, 3)`` points to ``(B, M, num_parts)`` logits.
+        num_parts: number of parts.
+        k: number of sampled points that a point's logits are interpolated from.
+
+    Raises:
+        UserError: there are fewer than two parts, or ``k`` is below 1.
+    """
+
+    score = MeanIoU.name
+    requires_same_classes = True
+
+    def __init__(self, net: nn.Module, num_parts: int, k: int = 3) -> None:
+        super().__init__(net)
+        check_at_least(2, num_parts=num_parts)
+        check_at_least(1, k=k)
+        self.num_parts = num_parts
+        self.k = k
+
+    def predict(self, batch: Batch, points: Tensor) -> Tensor:
+        """Return the logits ``(B, N, num_parts)`` of all points from ``(B, M, 3)`` sampled ones."""
+        return interpolate(self.net(points), points, batch.points, self.k)
+
+    def disagreement(self, found: Tensor, reference: Tensor) -> Tensor:
+        """Return KL(reference ‖ found), the mean over the points of a cloud."""
+        expected = reference.log_softmax(2)
+        return (expected.exp() * (expected - found.log_softmax(2))).sum(2).mean(1)
+
+    def step(self, batch: Batch, points: Tensor) -> TaskOutput:
+        """Segment one batch.
+
+        Args:
+            batch: the clouds and the parts ``(B, N)`` of their points.
+            points: ``(B, M, 3)`` sampled from the clouds.
+
+        Returns:
+            The cross entropy, the losses of samplers inside the net, predicted parts ``(B, N)``
+            and parts.
+
+        Raises:
+            UserError: the batch has no parts.
+        """
+        if batch.parts is None:
+            raise UserError("segmentation needs clouds whose points have parts, got none.")
+        logits = self.predict(batch, points)
+        losses = {"cross_entropy": F.cross_entropy(logits.mT, batch.parts)}
+        losses |= getattr(self.net, "losses", {})
+        return TaskOutput(losses, logits.argmax(2), batch.parts, logits)
+
+    def metrics(self, training: bool = False) -> MetricCollection:
+        """Return mean intersection over union of the parts and accuracy, both in [0, 1]."""
+        return collection(MeanIoU(self.num_parts), PointAccuracy(self.num_parts))
+
+
+@figures_of.register(Segmentation)
+def _(
+    task: Segmentation, batch: Batch, samples: Mapping[str, Tensor], titles: Sequence[str]
+) -> "dict[str, Figure]":
+    """Draw the true parts, and those predicted from the points of every readout."""
+    from mops_lightning.viz.task_results import part_grid
+
+    assert batch.parts is not None
+    predicted = {name: task.step(batch, points).predictions for name, points in samples.items()}
+    return {"parts": part_grid(batch.points, {"true parts": batch.parts, **predicted}, titles)}
