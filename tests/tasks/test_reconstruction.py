@@ -48,12 +48,13 @@ def values_of(module, result):
     return metrics.compute()
 
 
-def test_normalized_errors_full_cloud_are_one(rng):
-    module = task().eval()
-    given = batch(rng)
+@pytest.mark.parametrize("distances", [{"cd"}, {"cd", "emd"}])
+def test_normalized_errors_full_cloud_are_one(rng, distances):
+    module, given = task(emd="emd" in distances).eval(), batch(rng)
     values = values_of(module, scored(module, given, given.points))
-    for name in ("nre_cd", "nre_emd", "nre_cd_of_means", "nre_emd_of_means"):
-        assert values[name] == 1
+    assert len(module.step(given, given.points).losses) == len(distances)
+    ratios = {name: value for name, value in values.items() if name.startswith("nre")}
+    assert ratios == {f"nre_{kind}{of}": 1 for kind in distances for of in ("", "_of_means")}
 
 
 def test_normalized_errors_sample_match_plain_formula(rng):

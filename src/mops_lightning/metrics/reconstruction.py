@@ -13,11 +13,11 @@ class Distances(NamedTuple):
 
     Attributes:
         chamfer: ``(B,)``, see ``ops.nearest.chamfer_distance``.
-        emd: ``(B,)``, see ``ops.emd.earth_movers_distance``.
+        emd: ``(B,)``, see ``ops.emd.earth_movers_distance``; None where it was left out.
     """
 
     chamfer: Tensor
-    emd: Tensor
+    emd: Tensor | None
 
 
 Kind = Literal["chamfer", "emd"]
