@@ -98,16 +98,21 @@ ROWS = np.zeros((5, 2), np.int32)
 @pytest.mark.parametrize(
     ("arrays", "said"),
     [
-        ({"m": np.array(3)}, r"is no map: .*rows \(N, k\) and m, got m"),
+        ({"m": np.array(3)}, r"is no map: .*rows \(N, k\) and m of at least 1, got m"),
         ({"rows": ROWS}, "is no map"),
         ({"rows": ROWS / 2, "m": np.array(3)}, "must hold whole numbers"),
         ({"rows": ROWS[0], "m": np.array(3)}, "is no map"),
         ({"rows": ROWS[:, :0], "m": np.array(3)}, "is no map"),
-        ({"rows": ROWS + 3, "m": np.array(3)}, "rows must be from -1 to 2, got 3 to 3"),
-        ({"rows": ROWS - 2, "m": np.array(3)}, "rows must be from -1 to 2, got -2"),
-        ({"rows": ROWS - 1, "m": np.array(3)}, "5 points have no finite coordinates.* fill=0"),
-        ({"rows": ROWS, "m": np.array(4)}, r"each of 4 sampled points, shape \(4,\), got \(3,\)"),
-        ({"rows": ROWS, "m": np.array(3), "weights": ROWS[:2]}, "weights must be finite"),
+        ({"rows": ROWS, "m": np.array([3, 3])}, "is no map"),
+        ({"rows": ROWS, "m": np.array(-3)}, "m of at least 1"),
+        ({"rows": ROWS[:, :1] + 3, "m": np.array(3)}, "rows must be from -1 to 2, got 3 to 3"),
+        ({"rows": ROWS[:, :1] - 2, "m": np.array(3)}, "rows must be from -1 to 2, got -2"),
+        (
+            {"rows": ROWS[:, :1] - 1, "m": np.array(3)},
+            "5 points have no finite coordinates.* fill=0",
+        ),
+        ({"rows": ROWS[:, :1], "m": np.array(4)}, r"each of 4 sampled points, shape \(4,\), got"),
+        ({"rows": ROWS, "m": np.array(3)}, "weights must be finite"),
         ({"rows": ROWS, "m": np.array(3), "weights": ROWS * np.nan}, "weights must be finite"),
     ],
 )

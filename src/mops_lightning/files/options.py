@@ -73,6 +73,8 @@ class Options:
             raise UserError(f"--map must end in .npz, got {self.map}.")
         if self.map_k < 1 or (self.m is not None and self.map_k > self.m):
             raise UserError(f"--map-k must be from 1 to --m, got {self.map_k}.")
+        if self.map is None and self.map_k != 1:
+            raise UserError(f"--map-k {self.map_k} has no effect without --map FILE.npz.")
         self._check_parts()
 
     def _check_parts(self) -> None:

@@ -271,12 +271,13 @@ def read_map(path: Path) -> PropagationMap:
     arrays = load_npz(path)
     rows, m = arrays.get("rows"), arrays.get("m")
     kinds = {array.dtype.kind for array in (rows, m) if array is not None}
-    if rows is None or m is None or kinds != {"i"} or rows.ndim != 2 or not rows.shape[1]:
+    sizes = rows is not None and m is not None and rows.ndim == 2 and rows.shape[1] and m.ndim == 0
+    if not sizes or kinds != {"i"} or m < 1:
         raise UserError(
-            f"{path} is no map: it must hold whole numbers, rows (N, k) and m, got "
+            f"{path} is no map: it must hold whole numbers, rows (N, k) and m of at least 1, got "
             f"{', '.join(arrays) or 'no arrays'}. Write it by downsample --map."
         )
-    weights = arrays.get("weights", np.ones(rows.shape, np.float32))
+    weights = arrays.get("weights", np.ones((len(rows), 1), np.float32))  # may lack for k = 1
     if weights.shape != rows.shape or not (np.isfinite(weights).all() and (weights >= 0).all()):
         raise UserError(f"{path}: weights must be finite, at least 0, and of shape {rows.shape}.")
     return PropagationMap(torch.from_numpy(rows), torch.from_numpy(weights), int(m))
