@@ -36,7 +36,8 @@ def warm_start_sampler(
     if isinstance(source, str):
         return _from_file(source, sampler)
     copied = copy_pointwise_layers(net, sampler, clouds[:CLOUDS])
-    return {"layers": copied}, f"the first {copied} layers are copies of the task net's"
+    text = f"the first {copied} layers are copies of the task net's"
+    return {"layers": copied}, text if copied else "no layer is like one of the task net's"
 
 
 def _from_file(name: str, sampler: nn.Module) -> tuple[dict[str, Any], str]:
