@@ -59,6 +59,8 @@ def test_all_points_are_scored_from_few(rng):
     assert 0.7 < right < 1
     losses = {n: task.step(batch, points[:, :n]).losses["cross_entropy"].item() for n in (25, 200)}
     assert losses[200] < losses[25]
+    same, copy = task.predict(batch, points), task.predict(batch, points.clone())
+    torch.testing.assert_close(same, copy, atol=1e-2, rtol=1e-4)
     metrics = task.metrics()
     metrics.update(few.predictions, few.targets)
     values = metrics.compute()

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import load_npz
@@ -218,7 +219,16 @@ def interpolate(values: Tensor, points: Tensor, queries: Tensor, k: int = 3) -> 
     near = gather_points(points, flat).unflatten(1, shape)
     weights = 1 / ((near - queries[:, :, None]).square().sum(3, keepdim=True) + CLOSE)
     weights = weights / weights.sum(2, keepdim=True)
-    return (gather_points(values, flat).unflatten(1, shape) * weights).sum(2)
+    clouds, m, channels = values.shape
+    places = rows + torch.arange(clouds, device=rows.device)[:, None, None] * m
+    # One sum per query, without the tensor of all neighbours' values.
+    mean = F.embedding_bag(
+        places.flatten(0, 1),
+        values.flatten(0, 1),
+        mode="sum",
+        per_sample_weights=weights.flatten(0, 1)[..., 0].to(values),
+    )
+    return mean.view(clouds, -1, channels)
 
 
 def _rows(map: PropagationMap, values: Tensor) -> Tensor:

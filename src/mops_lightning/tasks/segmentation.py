@@ -45,7 +45,10 @@ class Segmentation(Task):
 
     def predict(self, batch: Batch, points: Tensor) -> Tensor:
         """Return the logits ``(B, N, num_parts)`` of all points from ``(B, M, 3)`` sampled ones."""
-        return interpolate(self.net(points), points, batch.points, self.k)
+        logits = self.net(points)
+        if points is batch.points:  # every point is its own nearest one
+            return logits
+        return interpolate(logits, points, batch.points, self.k)
 
     def disagreement(self, found: Tensor, reference: Tensor) -> Tensor:
         """Return KL(reference ‖ found), the mean over the points of a cloud."""
