@@ -108,6 +108,12 @@ def test_flat_fps_equals_torch_cluster(sizes, ratio, shape, rng):
         assert torch.equal(rows, fps(x, ratio=ratio, random_start=False))
 
 
+def test_ratio_of_each_cloud_is_its_own(rng):
+    x, batch = torch.rand(60, 3, generator=rng), torch.arange(2).repeat_interleave(30)
+    alone = [fps(x[i * 30 :][:30], None, r, False) + i * 30 for i, r in enumerate((0.1, 0.5))]
+    assert torch.equal(fps(x, batch, torch.tensor([0.1, 0.5]), False), torch.cat(alone))
+
+
 def test_random_start_differs_between_clouds_and_repeats_with_torch_seed():
     x, batch = torch.rand(600, 3), torch.arange(6).repeat_interleave(100)
     torch.manual_seed(3)
@@ -121,7 +127,10 @@ def test_random_start_differs_between_clouds_and_repeats_with_torch_seed():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"x": torch.zeros(0, 3)}, "x must have shape"),
+        ({"x": torch.zeros(0, 3)}, r"x must be a tensor .*\(0, 3\)"),
+        ({"x": torch.rand(4, 3).numpy()}, "x must be a tensor"),
+        ({"x": torch.full((4, 3), torch.nan)}, "x must be finite"),
+        ({"ratio": torch.tensor([0.5, 0.5])}, "one or one per cloud"),
         ({"ratio": 0.0}, "ratio must be above 0 and at most 1"),
         ({"ratio": 1.5}, "ratio must be above 0 and at most 1"),
         ({"batch": torch.tensor([0, 1, 0, 0])}, "must be ascending"),

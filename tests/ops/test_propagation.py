@@ -129,6 +129,8 @@ def test_missing_or_broken_map_gets_one_line(tmp_path):
     (tmp_path / "map.npz").write_bytes(b"PK" * 40)
     with pytest.raises(UserError, match=r"map.npz is broken"):
         propagate(np.arange(3), tmp_path / "map.npz")
+    with pytest.raises(UserError, match="map must be a PropagationMap or a file, got dict"):
+        propagate(np.arange(3), {"rows": 3})
 
 
 POINTS = torch.rand(6, 3)

@@ -123,7 +123,7 @@ def farthest_in_steps(
 def fps(
     x: Tensor,
     batch: Tensor | None = None,
-    ratio: float = 0.5,
+    ratio: float | Tensor = 0.5,
     random_start: bool = True,
     batch_size: int | None = None,
 ) -> Tensor:
@@ -136,7 +136,8 @@ def fps(
     Args:
         x: ``(P, C)`` points of all clouds, or ``(P,)`` numbers.
         batch: ``(P,)`` the cloud of every point, ascending from 0; None: one cloud.
-        ratio: share of the points to choose, 0 < ratio ≤ 1: ⌈ratio · n⌉ of a cloud's n points.
+        ratio: share of the points to choose, 0 < ratio ≤ 1: ⌈ratio · n⌉ of a cloud's n points; a
+            tensor holds one for all clouds, or one for each.
         random_start: start from a random point of every cloud instead of its first point.
         batch_size: number of clouds; None: as many as ``batch`` has.
 
@@ -154,21 +155,24 @@ def fps(
         >>> fps(square, torch.tensor([0, 0, 0, 0]), ratio=0.5, random_start=False)
         tensor([0, 3])
     """
-    if x.ndim == 0 or len(x) == 0:
-        raise UserError(f"x must have shape (P, C) with P ≥ 1, got {tuple(x.shape)}.")
+    if not isinstance(x, Tensor) or x.ndim == 0 or len(x) == 0:
+        shape = tuple(getattr(x, "shape", ()))
+        raise UserError(f"x must be a tensor (P, C) with P ≥ 1, got {type(x).__name__} {shape}.")
+    if not bool(x.isfinite().all()):
+        raise UserError("x must be finite, got NaN or infinity.")
     counts = torch.tensor([len(x)]) if batch is None else cloud_sizes(len(x), batch)
     if batch_size is not None and batch_size < len(counts):
         raise UserError(f"batch_size must be at least {len(counts)}, got {batch_size}.")
     points = x.detach().reshape(len(x), -1)
-    if not 0 < ratio <= 1:
-        raise UserError(f"ratio must be above 0 and at most 1, got {ratio}.")
-    share = torch.tensor(ratio, dtype=points.dtype).cpu()  # torch_cluster rounds as here
+    share = torch.as_tensor(ratio, dtype=points.dtype).cpu()  # torch_cluster rounds as here
+    if not bool(((share > 0) & (share <= 1)).all()) or share.numel() not in (1, len(counts)):
+        raise UserError(f"ratio must be above 0 and at most 1, one or one per cloud, got {ratio}.")
     sizes = (counts.float() * share).ceil().long()
     starts = torch.zeros_like(counts)
     if random_start:
         starts = torch.randint(2**62, counts.shape) % counts.clamp_min(1)
     begins = counts.cumsum(0) - counts
-    if len(counts.unique()) == 1:
+    if len(counts.unique()) == len(sizes.unique()) == 1:
         clouds = points.reshape(len(counts), int(counts[0]), -1)
         rows = farthest_point_sample(clouds, int(sizes[0]), starts.to(x.device))
         return (rows + begins[:, None].to(x.device)).flatten()

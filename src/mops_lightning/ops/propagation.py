@@ -6,6 +6,7 @@ caller asks for it, so that a label stays a label.
 """
 
 from collections.abc import Callable
+from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -175,8 +176,10 @@ def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> An
         >>> propagate(torch.tensor([7, 8]), propagation_map(line, line[[0, 2]]))
         tensor([7, 7, 8])
     """
-    if not isinstance(map, PropagationMap):
+    if isinstance(map, str | PathLike):
         map = read_map(Path(map))
+    if not isinstance(map, PropagationMap):
+        raise UserError(f"map must be a PropagationMap or a file, got {type(map).__name__}.")
     numbers = as_tensor("values", values)
     rows, leading = _rows(map, numbers).to(numbers.device), map.rows.ndim - 1
     missing = rows[:, 0] < 0
