@@ -81,12 +81,14 @@ def test_mistake_ends_in_one_line(arguments, said, tmp_path):
         ),
         ("sampler", "a: é".encode("latin-1"), "a file of settings is not in UTF-8"),
         ("sampler", b"a: [1\nb: 2", "mine.yaml, line 2: not valid YAML: "),
+        ("logger", b"_target_: nosuch.Logger", "logger.mine: no such setting."),
     ],
 )
 def test_mistake_in_a_file_ends_in_one_line(name, content, said, tmp_path):
     (tmp_path / name).mkdir()
     (tmp_path / name / "mine.yaml").write_bytes(content)
-    assert said in refused(["--config-dir", str(tmp_path), f"{name}=mine"], tmp_path)
+    arguments = [f"{name}=mine"] + ["logger.mine=1"] * (name == "logger")
+    assert said in refused(["--config-dir", str(tmp_path), *arguments], tmp_path)
 
 
 @pytest.mark.parametrize("name", ["EarlyStopping", "ModelCheckpoint"])

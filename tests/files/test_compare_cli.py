@@ -77,6 +77,7 @@ def test_compare_page_opens_without_errors(folder, tmp_path, opened):
         (["--m", 701], "fewer than --m 701"),
         (["--m", 60, "--weights", "FOLDER"], "trained for up to 32 points, got 60"),
         (["--m", 5, "--out", "FOLDER/one.ply"], "--out must be a folder"),
+        (["--m", 5, "--out", "FOLDER", "--overwrite"], "has other files, such as one.ply"),
     ],
 )
 def test_compare_mistake_ends_in_one_line(arguments, said, folder):

@@ -6,6 +6,7 @@ A mistake becomes one line with the setting and the nearest known one.
 import re
 import textwrap
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -186,8 +187,9 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     cfg = _composed(groups, arguments)
     node, _, name = key.rpartition(".")
     target = OmegaConf.select(cfg, f"{node}._target_")
-    if target and name in signature(target, node):
-        return f"{key}: {target} accepts it, but no file sets it. Write +{key}=..."
+    with suppress(UserError):  # the class of a user's own file may not be importable
+        if target and name in signature(str(target), node):
+            return f"{key}: {target} accepts it, but no file sets it. Write +{key}=..."
     choices = _choices_with(node, name)
     if choices:
         return f"{key}: no such setting here. It belongs to {' and '.join(choices)}."

@@ -284,9 +284,11 @@ def _compare(chosen: argparse.Namespace) -> None:
 
     if chosen.out.exists() and not chosen.out.is_dir():
         raise UserError(f"--out must be a folder, got the file {chosen.out}.")
-    earlier = [chosen.out / name for name in FILES if (chosen.out / name).exists()]
-    if earlier and not chosen.overwrite:
-        raise UserError(f"--out: {earlier[0]} exists. Give another folder, or --overwrite.")
+    found = {path.name for path in chosen.out.glob("[!.]*")}
+    if other := sorted(found.difference(FILES)):
+        raise UserError(f"--out: {chosen.out} has other files, such as {other[0]}. Give a new one.")
+    if found and not chosen.overwrite:
+        raise UserError(f"--out: {chosen.out / max(found)} exists. Give another, or --overwrite.")
     by_size = {
         m: options_by_method(m, chosen.methods, chosen.weights, chosen.tile, chosen.seed)
         for m in chosen.m
