@@ -28,7 +28,8 @@ def corrupt(clouds: Clouds, spec: str | None) -> Clouds:
     """Corrupt every cloud of a split.
 
     The draw depends on the position of a cloud in the split only, so that every method is tested on
-    the same clouds. Points that a corruption adds come last.
+    the same clouds. Points that a corruption adds come last. Parts are kept where no point is
+    added or removed.
 
     Args:
         clouds: a split, in the unit sphere.
@@ -41,7 +42,9 @@ def corrupt(clouds: Clouds, spec: str | None) -> Clouds:
         return clouds
     apply, level = parse(spec)
     points = [apply(cloud, level, generator(STREAM, s)) for s, cloud in enumerate(clouds.points)]
-    return clouds._replace(points=torch.stack(points), parts=None)  # other points, other order
+    stacked = torch.stack(points)
+    same = stacked.shape == clouds.points.shape  # the same points in the same order, moved
+    return clouds._replace(points=stacked, parts=clouds.parts if same else None)
 
 
 def parse(spec: str) -> tuple[Corruption, float]:

@@ -6,6 +6,7 @@ import torch
 
 from mops_lightning import FMOPSNet, FPSSampler, MOPSNet
 from mops_lightning.config.compose import compose
+from mops_lightning.data.corruptions import corrupt
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.seeding import generator
@@ -59,8 +60,17 @@ def test_factory_segmentation_needs_data_with_parts():
     cfg = compose(["task=segmentation", "m=8", "task.net.points=[16,8]"])
     made: Any = make_experiment(cfg, small_dataset(), {})
     assert made.task.num_parts == made.task.net.head[-1].out_features == 2
-    with pytest.raises(UserError, match=r"nothing says which part .* dataset\.label=COLUMN"):
+    with pytest.raises(UserError, match=r"at least two parts, got none\. .* dataset\.label=COLUMN"):
         make_experiment(cfg, replace(small_dataset(), part_names=()), {})
+    data = small_dataset()
+    assert corrupt(data.test, "shear-1").parts is data.test.parts
+    cfg = compose(["task=segmentation", "m=8", "test_corruption=cutout-1"])
+    with pytest.raises(UserError, match=r"test_corruption=cutout-1 adds or removes points"):
+        make_experiment(cfg, replace(data, test=corrupt(data.test, "cutout-1")), {})
+    of_parts = "hierarchical_segmentation"
+    for task, net in (("segmentation", "pointnet"), ("classification", of_parts)):
+        with pytest.raises(UserError, match=rf"task/net={net} takes .*, but task={task} gives"):
+            make_experiment(compose([f"task={task}", f"task/net={net}"]), data, {})
 
 
 def rows(part, whole):

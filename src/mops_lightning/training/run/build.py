@@ -166,17 +166,9 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         UserError: a setting that its part or the data do not allow.
     """
     L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
-    classes = {
-        "num_classes": len(dataset.class_names),
-        "num_parts": len(dataset.part_names),
-    }
-    if not dataset.part_names and "num_parts" in accepted(cfg.task, classes):
-        raise UserError(
-            "dataset: nothing says which part a point belongs to. Give dataset=shapes "
-            "dataset.classes=parts, or your own clouds with dataset.label=COLUMN."
-        )
-    own_net = build_as(nn.Module, cfg.task.net, "task.net", **accepted(cfg.task.net, classes))
-    task: Task = build_as(Task, cfg.task, "task", net=own_net, **accepted(cfg.task, classes))
+    of_task, of_net = _numbers(cfg, dataset)
+    own_net = build_as(nn.Module, cfg.task.net, "task.net", **of_net)
+    task: Task = build_as(Task, cfg.task, "task", net=own_net, **of_task)
     # Another seed: the sampler's initial weights must not depend on the task net's size.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
     # For samplers that select points by the task net's features.
@@ -211,6 +203,33 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         test_logger=False,  # stages.test logs them, as one table
         recipe=_in_force(build_as(Recipe, cfg.recipe, "recipe"), sampler, cfg.learn),
     )
+
+
+def _numbers(cfg: DictConfig, dataset: CloudDataset) -> tuple[dict[str, int], dict[str, int]]:
+    """Return the numbers of classes or parts that the task and its net take.
+
+    Raises:
+        UserError: one takes classes and the other parts, or the data have no parts.
+    """
+    offered = {"num_classes": len(dataset.class_names), "num_parts": len(dataset.part_names)}
+    of_task, of_net = accepted(cfg.task, offered), accepted(cfg.task.net, offered)
+    if of_task and of_net and not of_task.keys() & of_net.keys():
+        raise UserError(
+            f"task/net={cfg.names.net} takes {', '.join(of_net)}, but task={cfg.names.task} gives "
+            f"{', '.join(of_task)}. Choose a net of this task (docs/tasks.md)."
+        )
+    if "num_parts" in of_task and len(dataset.part_names) < 2:
+        raise UserError(
+            "dataset: its points must belong to at least two parts, got "
+            f"{', '.join(dataset.part_names) or 'none'}. Give dataset=shapes "
+            "dataset.classes=parts, or your own clouds with dataset.label=COLUMN."
+        )
+    if cfg.test_corruption and "num_parts" in of_task and dataset.test.parts is None:
+        raise UserError(
+            f"test_corruption={cfg.test_corruption} adds or removes points, whose parts nobody "
+            "knows. Give jitter, rotation, scaling, shear or distortion."
+        )
+    return of_task, of_net
 
 
 def augmentation(cfg: DictConfig) -> Augmentation:
