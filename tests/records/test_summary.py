@@ -72,8 +72,9 @@ def test_seven_sizes_fit_eighty_columns():
 
 
 def test_task_net_alone_has_no_size():
-    text = printed({"test/full/accuracy": 0.5}, "test/full/accuracy", learn="task")
-    assert "all points, test" in text
+    corrupted = {"learn": "task", "test_corruption": "shear-3"}
+    text = printed({"test/full/accuracy": 0.5}, "test/full/accuracy", **corrupted)
+    assert "all points, test, test_corruption=shear-3" in text
     assert "m=32" not in text
 
 

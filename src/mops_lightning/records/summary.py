@@ -10,6 +10,9 @@ from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL, REFINED, ROWS, parse_metric_name
 from mops_lightning.records.run_record import FILE, RunRecord
 
+OF_TEST_CLOUDS = ("test_noise_std", "test_corruption")
+"""Settings that change the test clouds; in reports, their values give the columns of a table."""
+
 
 def closing_lines(folder: Path, record: RunRecord, console: Console | None = None) -> None:
     """Print the table of test results and the output paths.
@@ -71,7 +74,9 @@ def results_table(record: RunRecord) -> tuple[str, Table]:
             for column, value in values.items()
         ]
         table.add_row(_label(readout, config), *cells)
-    return f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test", table
+    title = f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test"
+    changed = [f"{name}={config[name]}" for name in OF_TEST_CLOUDS if config.get(name)]
+    return ", ".join([title, *changed]), table
 
 
 def sampler_name(config: dict[str, Any]) -> str:

@@ -9,6 +9,7 @@ import pandas as pd
 
 from mops_lightning.records.readout_names import FULL, parse_metric_name
 from mops_lightning.records.run_record import RunRecord
+from mops_lightning.records.summary import OF_TEST_CLOUDS
 from mops_lightning.report import paper
 from mops_lightning.report.collect import (
     Found,
@@ -21,14 +22,7 @@ from mops_lightning.report.collect import (
     trained_with,
     training_time,
 )
-from mops_lightning.report.comparable import (
-    OF_TEST_CLOUDS,
-    Group,
-    commit,
-    groups,
-    net_groups,
-    weightless,
-)
+from mops_lightning.report.comparable import Group, commit, groups, net_groups, weightless
 from mops_lightning.report.nets import nets_grid
 from mops_lightning.report.tables import Table, make_table, sort_key
 from mops_lightning.report.text import PAPER, Grid

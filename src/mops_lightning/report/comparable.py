@@ -10,10 +10,8 @@ import pandas as pd
 
 from mops_lightning.config.shared_settings import table_settings, with_defaults
 from mops_lightning.records.run_record import RunRecord, dotted
+from mops_lightning.records.summary import OF_TEST_CLOUDS
 from mops_lightning.report.collect import epochs, recorded_recipe, sampler_row, seed, trained_with
-
-OF_TEST_CLOUDS = ("test_noise_std", "test_corruption")
-"""Settings that change the test clouds; their values give the columns of a table."""
 
 
 @dataclass(frozen=True)
