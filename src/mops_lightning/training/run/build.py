@@ -219,10 +219,10 @@ def _numbers(cfg: DictConfig, dataset: CloudDataset) -> tuple[dict[str, int], di
             f"{', '.join(of_task)}. Choose a net of this task (docs/tasks.md)."
         )
     if "num_parts" in of_task and len(dataset.part_names) < 2:
+        found = f"only part {dataset.part_names[0]}" if dataset.part_names else "none"
         raise UserError(
-            "dataset: its points must belong to at least two parts, got "
-            f"{', '.join(dataset.part_names) or 'none'}. Give dataset=shapes "
-            "dataset.classes=parts, or your own clouds with dataset.label=COLUMN."
+            f"dataset: its points must belong to at least two parts, got {found}. Give "
+            "dataset=shapes dataset.classes=parts, or your own clouds with dataset.label=COLUMN."
         )
     if cfg.test_corruption and "num_parts" in of_task and dataset.test.parts is None:
         raise UserError(
