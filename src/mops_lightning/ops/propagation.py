@@ -282,7 +282,8 @@ def read_map(path: Path) -> PropagationMap:
     if not path.is_file():
         raise UserError(f"map: no file {path}. Write it by downsample --map {path}.")
     arrays = load_npz(path)
-    rows, m = arrays.get("rows"), arrays.get("m")
+    rows: Any = arrays.get("rows")
+    m: Any = arrays.get("m")
     kinds = {array.dtype.kind for array in (rows, m) if array is not None}
     sizes = rows is not None and m is not None and rows.ndim == 2 and rows.shape[1] and m.ndim == 0
     if not sizes or kinds != {"i"} or m < 1:
