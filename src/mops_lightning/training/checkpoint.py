@@ -13,7 +13,7 @@ from lightning.pytorch.strategies import Strategy
 
 from mops_lightning.config.shared_settings import training_settings
 from mops_lightning.errors import UserError
-from mops_lightning.zoo import weights
+from mops_lightning.zoo import model_file, weights
 
 CHECKPOINT = "last.ckpt"
 CHECKPOINT_KEY = "mops_lightning"
@@ -48,9 +48,9 @@ def checkpoint_identity(config: dict[str, Any], fingerprint: str) -> dict[str, s
 
 
 def _sha256(setting: str, name: str) -> str:
-    """Return the hash of the task net's weights that a setting names."""
+    """Return the hash of the task net's weights that a setting names, from the file's header."""
     try:
-        return str(weights.read(weights.of_task_net(name))["sha256"])
+        return str(model_file.read_header(weights.of_task_net(name))["sha256"])
     except UserError as error:
         raise UserError(f"{setting}: {error}") from None
 

@@ -94,6 +94,11 @@ def load_net(path: str | Path) -> nn.Module:
     Raises:
         UserError: the file is missing, damaged, not a task net's, or does not match the net.
     """
+    return read_net(path)[0]
+
+
+def read_net(path: str | Path) -> tuple[nn.Module, list[str]]:
+    """Load a trained task net, and the names of its classes; see ``load_net``."""
     path = weights.of_task_net(path)
     content = weights.read(path)
     if content["config"].get("learn") not in ("task", "joint"):
@@ -107,7 +112,7 @@ def load_net(path: str | Path) -> nn.Module:
     if "num_classes" in signature(found).parameters:
         node = {**node, "num_classes": len(content["classes"])}
     state = {name.removeprefix("net."): value for name, value in content["state"].items()}
-    return _build(found, node, state, path, "task.net", NET_HINT)
+    return _build(found, node, state, path, "task.net", NET_HINT), content["classes"]
 
 
 def _target(node: Any) -> Any:

@@ -6,8 +6,7 @@ from mops_lightning.config.build import accepted, build_as
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.tasks.base import Task
-from mops_lightning.zoo import weights
-from mops_lightning.zoo.load import load_net
+from mops_lightning.zoo.load import read_net
 
 
 def other_tasks(cfg: DictConfig, dataset: CloudDataset) -> list[Task]:
@@ -19,10 +18,10 @@ def other_tasks(cfg: DictConfig, dataset: CloudDataset) -> list[Task]:
     tasks: list[Task] = []
     for name in cfg.other_nets or () if cfg.learn == "sampler" else ():
         try:
+            net, classes = read_net(name)
             known = accepted(cfg.task, {"num_classes": len(dataset.class_names)})
-            tasks.append(build_as(Task, cfg.task, "task", net=load_net(name), **known))
+            tasks.append(build_as(Task, cfg.task, "task", net=net, **known))
             if tasks[-1].requires_same_classes:
-                classes = weights.read(weights.of_task_net(name))["classes"]
                 check_classes(classes, dataset, name)
         except UserError as error:
             raise UserError(f"other_nets: {error}") from None
