@@ -20,11 +20,16 @@ def test_submodular_reaches_result_of_all_points(net, rng):
 
 def test_submodular_leaves_net_as_it_is(net, rng):
     net.train()
+    net.pool.eval()
+    modes = [module.training for module in net.modules()]
     before = {name: value.clone() for name, value in net.state_dict().items()}
     sampler = SubmodularSampler(4, net)
     sampler(torch.randn(2, 40, 3, generator=rng))
     assert all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
-    assert all(module.training for module in net.modules())
+    net.point_features = None
+    with pytest.raises(TypeError):
+        sampler(torch.randn(2, 40, 3, generator=rng))
+    assert [module.training for module in net.modules()] == modes
     assert not sampler.learned
     assert not sampler.state_dict()
 

@@ -83,10 +83,13 @@ class TaskNetSampler(Sampler):
     def _chosen(self, points: Tensor, m: int) -> tuple[Tensor, Tensor]:
         net = self._net[0]
         like = next(net.parameters(), points)
-        parts, training = [], net.training
+        modes = {module: module.training for module in net.modules()}
+        batches = points.split(max(1, BATCH_POINTS // points.shape[1]))
         net.eval()
-        for part in points.split(max(1, BATCH_POINTS // points.shape[1])):
-            parts.append(self.choose(self.net.point_features(part.to(like)), m))
-        net.train(training)
+        try:
+            parts = [self.choose(self.net.point_features(part.to(like)), m) for part in batches]
+        finally:
+            for module, mode in modes.items():
+                module.training = mode
         rows, counts = zip(*parts, strict=True)
         return torch.cat(rows).to(points.device), torch.cat(counts).to(points.device)
