@@ -33,6 +33,9 @@ def test_factory_first_weights_of_sampler_depend_on_seed_and_not_on_task_net():
 
     assert torch.equal(first(), first("task/net=dgcnn"))
     assert not torch.equal(first(), first("seed=1"))
+
+
+def test_factory_refuses_start_of_a_baseline_outside_of_the_clouds():
     cfg = compose(["+baselines.fps.start=5000", "m=8"])  # not only when a trained run is tested
     with pytest.raises(UserError, match=r"baselines\.fps: start must be less than .* N=48"):
         make_experiment(cfg, small_dataset(), {})
