@@ -60,13 +60,8 @@ def check_strategy(cfg: DictConfig) -> None:
     """Check how several devices work together; Lightning checks the devices.
 
     Raises:
-        UserError: a strategy or a synchronisation that this program does not support.
+        UserError: a strategy that this program does not support.
     """
-    if cfg.trainer.get("sync_batchnorm"):
-        raise UserError(
-            "trainer.sync_batchnorm must be false: the nets pool and normalise in one step, each "
-            "process over its share of the batch. Leave it out."
-        )
     strategy = cfg.trainer.get("strategy", "auto")
     if is_distributed(cfg) and strategy not in STRATEGIES:
         raise UserError(

@@ -6,7 +6,6 @@ class behind the group, which checks it; it has a line in ``INSIDE`` where it af
 than its group.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from enum import Flag, auto
 from functools import cache
@@ -14,14 +13,22 @@ from typing import Any, Literal, get_args
 
 from hydra.core.config_store import ConfigStore
 
+from mops_lightning.config.limits import (
+    ABOVE_ZERO,
+    NOT_NEGATIVE,
+    TRAINER,
+    Limits,
+    number,
+    one_of,
+    whole,
+)
+
 Learn = Literal["task", "sampler", "joint", "nothing"]
 LEARN = get_args(Learn)
 """The choices of ``learn``."""
 RECIPE_OF_TASK_NETS = ("train_points", "all_points_from", "ema_span")
 """Settings of ``recipe`` that also serve a task net trained on an index sampler's points."""
 WITH_SAMPLER = ("sampler", "joint", "nothing")
-PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
-"""Allowed values of ``trainer.precision``; Lightning has more."""
 
 
 class Affects(Flag):
@@ -36,47 +43,6 @@ class Affects(Flag):
     TRAINING = auto()
     SCORES = auto()
     RESULTS = TRAINING | SCORES
-
-
-@dataclass(frozen=True)
-class Limits:
-    """The values that a setting takes.
-
-    Attributes:
-        allowed: in words, behind "must be".
-        fits: whether a value is one of them.
-        choices: all of them, if they have names.
-    """
-
-    allowed: str
-    fits: Callable[[Any], bool]
-    choices: tuple[str, ...] = ()
-
-
-def whole(minimum: int) -> Limits:
-    """Allow whole numbers of at least ``minimum``."""
-    return Limits(
-        f"a whole number of at least {minimum}", lambda x: type(x) is int and x >= minimum
-    )
-
-
-def number(allowed: str, fits: Callable[[float], bool]) -> Limits:
-    """Allow finite numbers in a range."""
-    return Limits(
-        f"a number {allowed}",
-        lambda x: isinstance(x, int | float) and abs(x) < float("inf") and fits(x),
-    )
-
-
-def one_of(*choices: str, others: tuple[Any, ...] = ()) -> Limits:
-    """Allow named choices, and ``others`` that are other spellings of them."""
-    return Limits(
-        f"one of {', '.join(choices)}", lambda x: x in choices or x in others, choices=choices
-    )
-
-
-NOT_NEGATIVE = number("of at least 0", lambda x: x >= 0)
-ABOVE_ZERO = number("above 0", lambda x: x > 0)
 
 
 @dataclass(frozen=True)
@@ -325,24 +291,8 @@ INSIDE: dict[str, dict[str, Any]] = {
     "epochs.task": {"limits": whole(1)},
     "epochs.sampler": {"limits": whole(0)},
     "epochs.joint": {"limits": whole(0)},
-    "trainer.max_epochs": {"limits": whole(0)},
-    # A run that is shortened in these ways tests or trains nothing that anybody wants to know.
-    "trainer.fast_dev_run": {"limits": Limits("false; try epochs.sampler=1", lambda x: not x)},
-    "trainer.overfit_batches": {"limits": Limits("0; give fewer clouds", lambda x: not x)},
-    "trainer.max_steps": {
-        "limits": Limits(
-            "-1 or a whole number of at least 1", lambda x: x == -1 or whole(1).fits(x)
-        )
-    },
-    # Lightning uses these only when training begins, after pretraining.
-    "trainer.gradient_clip_val": {
-        "limits": Limits("null or a number above 0", lambda x: x is None or ABOVE_ZERO.fits(x))
-    },
-    "trainer.accumulate_grad_batches": {"limits": whole(1)},
     "logger.flush_logs_every_n_steps": {"limits": whole(1)},
-    "trainer.limit_train_batches": {"limits": ABOVE_ZERO},
-    "trainer.limit_test_batches": {"limits": ABOVE_ZERO},
-    "trainer.precision": {"limits": one_of(*PRECISIONS, others=("32", 32, None))},
+    **{f"trainer.{name}": {"limits": limits} for name, limits in TRAINER.items()},
     "trainer._target_": _NOTHING,
     "trainer.accelerator": _NOTHING,
     "trainer.devices": _NOTHING,

@@ -79,10 +79,10 @@ def check(cfg: DictConfig) -> None:
             "trainer.max_epochs must be a whole number of at least 1, got "
             f"{cfg.trainer.max_epochs}."
         )
-    if cfg.refine and not declared["refine"].counts(cfg.learn):
+    if (fewest := cfg.trainer.get("min_epochs") or 0) > cfg.trainer.max_epochs:
         raise UserError(
-            f"refine must be 0 with learn={cfg.learn}, which samples nothing, got {cfg.refine}. "
-            "Leave it out, or test a sampler."
+            f"trainer.min_epochs must be at most trainer.max_epochs={cfg.trainer.max_epochs}, got "
+            f"{fewest}."
         )
     distributed.check_strategy(cfg)
 
