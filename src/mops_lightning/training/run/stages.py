@@ -17,7 +17,7 @@ from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records.metric_info import foreign_metrics
 from mops_lightning.records.readout_names import parse_metric_name
 from mops_lightning.records.run_record import Evaluated, RunRecord
-from mops_lightning.training.checkpoint import CHECKPOINT, Diverged, check_finite, read_sealed
+from mops_lightning.training.checkpoint import Diverged, check_finite
 from mops_lightning.training.evaluation import KEY, OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
@@ -87,7 +87,9 @@ def load_trained(
     try:
         content = weights.load_into(module, weights.of_run(trained.place))
         if task_net and has_weights and not trained.trained_task_net:
-            _load_trained_task(experiment.task, trained)
+            if "task_weights" not in record.files:
+                raise UserError("it comes without its task net. Give weights=FILE.")
+            weights.load_into(experiment.task, weights.of_run(trained.place, "task_weights"))
     except UserError as error:
         raise UserError(f"{KEY}: {name} cannot be loaded: {error}") from None
     return Evaluated(
@@ -100,28 +102,6 @@ def load_trained(
         dataset=record.config["names"]["dataset"],
         weights_sha256=content["sha256"],
     )
-
-
-def _load_trained_task(task: nn.Module, trained: TrainedRun) -> None:
-    """Load the task net from a jointly trained run's weights, or from the run's checkpoint."""
-    place = trained.place
-    if "task_weights" in trained.record.files:
-        weights.load_into(task, weights.of_run(place, "task_weights"))
-        return
-    if place.is_file():
-        raise UserError(f"the model {place.stem} comes without its task net. Give weights=FILE.")
-    path = place / "checkpoints" / CHECKPOINT
-    if not path.is_file():
-        raise UserError(
-            f"{path}, which contains the run's task net, does not exist. Give weights=FILE."
-        )
-    state = read_sealed(path)["state_dict"]
-    own = {
-        key.removeprefix("task."): value for key, value in state.items() if key.startswith("task.")
-    }
-    if weights.digest(own) != trained.record.task_weights_sha256:
-        raise UserError(f"{path} does not belong to the run in its folder. Give weights=FILE.")
-    weights.fit_state(task, own, path)
 
 
 def warm_start(parts: Parts, record: RunRecord) -> None:
@@ -260,7 +240,7 @@ def save(parts: Parts, record: RunRecord) -> None:
     if not parts.trains:
         return
     files = {weights.FILE: task if cfg.learn == "task" else sampler}
-    if cfg.learn == "joint":
+    if cfg.learn != "task" and parts.has_task_weights:
         files[f"task_{weights.FILE}"] = task
     for name, module in files.items():
         assert module is not None  # only learn=task has no sampler
