@@ -2,9 +2,8 @@
 
 from typing import Any, ClassVar
 
-import torch
 from torch import Tensor
-from torchmetrics import Metric, MetricCollection
+from torchmetrics import MeanMetric, Metric, MetricCollection
 
 from mops_lightning.metrics.info import DEFAULT_ORDER
 
@@ -28,25 +27,15 @@ class TableMetric(Metric):
     full_state_update = False
 
 
-class MeanOverClouds(TableMetric):
+class MeanOverClouds(TableMetric, MeanMetric):  # type: ignore[misc]  # it types attributes None
     """Mean over clouds or pairs of one number each; ``update`` passes the numbers to ``add``."""
 
-    total: Tensor
-    clouds: Tensor
-
     def __init__(self, **extra: Any) -> None:
-        super().__init__(**extra)
-        self.add_state("total", default=torch.tensor(0.0), dist_reduce_fx="sum")
-        self.add_state("clouds", default=torch.tensor(0), dist_reduce_fx="sum")
+        super().__init__(nan_strategy="disable", **extra)
 
     def add(self, values: Tensor) -> None:
         """Add one number per cloud, ``(B,)``."""
-        self.total += values.sum()
-        self.clouds += len(values)
-
-    def compute(self) -> Tensor:
-        """Return the mean over all clouds so far."""
-        return self.total / self.clouds
+        MeanMetric.update(self, values)
 
 
 def collection(*metrics: TableMetric) -> MetricCollection:

@@ -5,13 +5,12 @@ samples count. It returns ``(B,)`` numbers by size, or None if the metric is und
 """
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torchmetrics import MeanMetric
 
-from mops_lightning.metrics.base import TableMetric
+from mops_lightning.metrics.base import MeanOverClouds
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.readout import match, unique_count
 from mops_lightning.types import SampleOutput
@@ -22,7 +21,7 @@ NONZERO_THRESHOLD = 0.01
 BySize = dict[int, Tensor]
 
 
-class SetMetric(TableMetric, MeanMetric):  # type: ignore[misc]  # MeanMetric types them None
+class SetMetric(MeanOverClouds):
     """Mean over clouds of a number that ``measure`` gives for each.
 
     Attributes:
@@ -32,9 +31,6 @@ class SetMetric(TableMetric, MeanMetric):  # type: ignore[misc]  # MeanMetric ty
     group: ClassVar[str]
     higher_is_better: bool | None = None  # type: ignore[assignment]
     summary_order = None
-
-    def __init__(self, **extra: Any) -> None:
-        super().__init__(nan_strategy="disable", **extra)
 
     @staticmethod
     def measure(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize | None:
