@@ -2,9 +2,14 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
+from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.ops.rigid import Motion
 from mops_lightning.seeding import generator
-from mops_lightning.tasks.registration import Pairs
+from mops_lightning.tasks.registration import Registration
+
+
+def pairs(**settings):
+    return Registration(PCRNet(feature_channels=(8, 8)), **settings).make_batch
 
 
 def generators(number, key=0):
@@ -25,7 +30,7 @@ def moved(batch, points):
 
 def test_pairs_target_is_moved_source(rng):
     points = clouds(rng)
-    batch = Pairs()(points, generators(6))
+    batch = pairs()(points, generators(6))
     source, target = restored(batch)
     torch.testing.assert_close(source, points)
     torch.testing.assert_close(target, moved(batch, source), atol=1e-5, rtol=0)
@@ -35,10 +40,10 @@ def test_pairs_target_is_moved_source(rng):
 
 def test_pairs_depend_on_own_generator_only(rng):
     points = clouds(rng)
-    pairs = Pairs(resample=20)
-    together = pairs(points, generators(6))
+    make = pairs(resample=20)
+    together = make(points, generators(6))
     for i in range(6):
-        alone = pairs(points[i : i + 1], generators(6)[i : i + 1])
+        alone = make(points[i : i + 1], generators(6)[i : i + 1])
         for name in ("quaternion", "translation"):
             assert torch.equal(getattr(alone, name)[0], getattr(together, name)[i])
         torch.testing.assert_close(alone.points[0], together.points[i])
@@ -53,7 +58,7 @@ def rows_of(cloud, points):
 
 def test_pairs_resample_draws_different_points(rng):
     points = clouds(rng, points=60)
-    batch = Pairs(resample=20)(points, generators(6))
+    batch = pairs(resample=20)(points, generators(6))
     source, target = restored(batch)
     assert source.shape == target.shape == (6, 20, 3)
     for i in range(6):
@@ -65,6 +70,6 @@ def test_pairs_resample_draws_different_points(rng):
 
 def test_pairs_resample_out_of_range_raises(rng):
     with pytest.raises(UserError, match=r"^resample must be .*got 0"):
-        Pairs(resample=0)
+        pairs(resample=0)
     with pytest.raises(UserError, match=r"^resample must be at most the 50 .*got 51"):
-        Pairs(resample=51)(clouds(rng), generators(6))
+        pairs(resample=51)(clouds(rng), generators(6))

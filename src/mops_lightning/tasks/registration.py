@@ -1,7 +1,6 @@
 """Registration of sampled clouds (paper section "Registration-oriented Downsampling")."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -33,59 +32,6 @@ TRANSLATION = 1.0
 """Largest translation along each axis, in units of the coordinates."""
 
 
-@dataclass(frozen=True)
-class Pairs:
-    """Converts clouds to pairs of source and target.
-
-    The target is the source under a random motion, with uniform angles about the fixed axes x, y
-    and z and a uniform translation (paper section "Registration-oriented Downsampling").
-
-    Attributes:
-        resample: number of points of source and target, drawn independently from the shape, so that
-            both have different points of one surface; None uses all points in both.
-
-    Raises:
-        UserError: ``resample`` is below 1.
-    """
-
-    resample: int | None = None
-
-    def __post_init__(self) -> None:
-        """Check the arguments."""
-        if self.resample is not None and self.resample < 1:
-            raise UserError(f"resample must be None or at least 1, got {self.resample}.")
-
-    def __call__(self, points: Tensor, generators: Sequence[Generator]) -> PairBatch:
-        """Convert every cloud to a pair.
-
-        Args:
-            points: ``(B, N, 3)``.
-            generators: B generators; each determines the pair of its cloud.
-
-        Returns:
-            B pairs.
-
-        Raises:
-            UserError: ``resample`` is larger than N.
-        """
-        n_points = points.shape[1]
-        if self.resample is not None and self.resample > n_points:
-            raise UserError(
-                f"resample must be at most the {n_points} points of a shape, got {self.resample} "
-                "(task.resample and dataset.n_points on the command line)."
-            )
-        motion = random_motion(ROTATION, TRANSLATION, generators)
-        source = target = points
-        if self.resample is not None:
-            source, target = (self._drawn(points, generators) for _ in range(2))
-        target = motion.apply(target)
-        return pair_batch(source, target, motion)
-
-    def _drawn(self, points: Tensor, generators: Sequence[Generator]) -> Tensor:
-        rows = [torch.randperm(points.shape[1], generator=g)[: self.resample] for g in generators]
-        return gather_points(points, torch.stack(rows))
-
-
 def pair_batch(source: Tensor, target: Tensor, motion: Motion) -> PairBatch:
     """Combine sources and targets into a batch, with every centroid at the origin.
 
@@ -102,16 +48,18 @@ def pair_batch(source: Tensor, target: Tensor, motion: Motion) -> PairBatch:
 class Registration(Task):
     """Estimates the rigid motion between two clouds from sampled points of both.
 
-    Each cloud's centroid is subtracted before sampling; the predicted and scored translation
-    applies to the original clouds.
+    Every cloud becomes a pair. The target is the source under a random motion, with uniform angles
+    about the fixed axes x, y and z and a uniform translation (paper section "Registration-oriented
+    Downsampling"). Each cloud's centroid is subtracted before sampling; the predicted and scored
+    translation applies to the original clouds.
 
     Args:
         net: maps sources ``(B, M, 3)`` and targets ``(B, M, 3)`` to a ``Motion``.
-        resample: number of points of source and target, drawn independently; None uses all points
-            of a cloud in both. See ``Pairs``.
+        resample: number of points of source and target, drawn independently from the shape, so that
+            both have different points of one surface; None uses all points in both.
 
     Raises:
-        UserError: an argument is out of range.
+        UserError: ``resample`` is below 1.
     """
 
     score = RotationError.name
@@ -121,7 +69,35 @@ class Registration(Task):
 
     def __init__(self, net: nn.Module, resample: int | None = None) -> None:
         super().__init__(net)
-        self.make_batch = Pairs(resample)
+        if resample is not None and resample < 1:
+            raise UserError(f"resample must be None or at least 1, got {resample}.")
+        self.resample = resample
+
+    def make_batch(self, points: Tensor, generators: Sequence[Generator]) -> PairBatch:
+        """Convert every cloud to a pair.
+
+        Args:
+            points: ``(B, N, 3)``.
+            generators: B generators; each determines the pair of its cloud.
+
+        Raises:
+            UserError: ``resample`` is larger than N.
+        """
+        n_points = points.shape[1]
+        if self.resample is not None and self.resample > n_points:
+            raise UserError(
+                f"resample must be at most the {n_points} points of a shape, got {self.resample} "
+                "(task.resample and dataset.n_points on the command line)."
+            )
+        motion = random_motion(ROTATION, TRANSLATION, generators)
+        source = target = points
+        if self.resample is not None:
+            source, target = (self._drawn(points, generators) for _ in range(2))
+        return pair_batch(source, motion.apply(target), motion)
+
+    def _drawn(self, points: Tensor, generators: Sequence[Generator]) -> Tensor:
+        rows = [torch.randperm(points.shape[1], generator=g)[: self.resample] for g in generators]
+        return gather_points(points, torch.stack(rows))
 
     def predict(self, batch: PairBatch, points: Tensor) -> Motion:
         """Return the motions between the centred clouds from ``(2B, M, 3)`` points of both."""

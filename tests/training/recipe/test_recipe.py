@@ -12,10 +12,11 @@ from mops_lightning.config.build import build
 from mops_lightning.config.compose import compose
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
+from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.points import gather_points
 from mops_lightning.tasks.classification import Classification
-from mops_lightning.tasks.registration import Pairs
+from mops_lightning.tasks.registration import Registration
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.distillation import feature_distance, pooled_features
 from mops_lightning.training.recipe.moving_average import MovingAverage
@@ -130,7 +131,9 @@ def test_draw_points_returns_distinct_rows_new_in_every_draw():
 
 def test_draw_points_keeps_the_rows_of_a_pair():
     points = torch.randn(3, POINTS, 3)
-    pairs = Pairs()(points, [torch.Generator().manual_seed(i) for i in range(3)])
+    pairs = Registration(PCRNet()).make_batch(
+        points, [torch.Generator().manual_seed(i) for i in range(3)]
+    )
     drawn = draw_points(pairs, 10)
     source, target = drawn.chunk(2)
     full_source, full_target = pairs.points.chunk(2)
