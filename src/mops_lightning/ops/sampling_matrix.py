@@ -85,35 +85,11 @@ class SamplingMatrix(NamedTuple):
         Returns:
             Sparse ``(B, N, M)``, coalesced; without gradients.
         """
-        batch, number, m = self.keys.shape[0], self.keys.shape[1], self.m
-        coordinates, values = [], []
-        with torch.no_grad():
-            peak = torch.full((batch, m), -1.0, dtype=self.keys.dtype, device=self.keys.device)
-            peak_row = torch.zeros((batch, m), dtype=torch.int64, device=self.keys.device)
-            for cloud, rows, columns, block in self._blocks():
-                high, at = block.max(1)
-                better = high > peak[cloud, columns]
-                peak[cloud, columns] = torch.where(better, high, peak[cloud, columns])
-                peak_row[cloud, columns] = torch.where(
-                    better, at + rows.start, peak_row[cloud, columns]
-                )
-                column, row = (block >= threshold).nonzero(as_tuple=True)
-                values.append(block[column, row])
-                batch_index = torch.full_like(row, cloud)
-                coordinates.append(
-                    torch.stack([batch_index, row + rows.start, column + columns.start])
-                )
-            cloud_index, column_index = (peak < threshold).nonzero(as_tuple=True)
-            values.append(peak[cloud_index, column_index])
-            coordinates.append(
-                torch.stack([cloud_index, peak_row[cloud_index, column_index], column_index])
-            )
-            index, value = torch.cat(coordinates, 1), torch.cat(values)
-            column = index[0] * m + index[2]
-            total = value.new_zeros(batch * m).index_add_(0, column, value)
-            return torch.sparse_coo_tensor(
-                index, value / total[column], (batch, number, m), check_invariants=True
-            ).coalesce()
+        with torch.no_grad(), full_precision(self.keys.device.type):
+            columns = self._columns()
+            kept = (columns >= threshold).scatter_(2, columns.argmax(2, keepdim=True), True)
+            values = columns.where(kept, 0.0)
+            return (values / values.sum(2, keepdim=True)).mT.to_sparse()
 
     def leftmost(self, m: int) -> "SamplingMatrix":
         """Return the matrix of the first ``m`` columns, as FMOPS-Net takes them.
