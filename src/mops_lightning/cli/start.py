@@ -175,7 +175,7 @@ def check_paths(cfg: DictConfig) -> None:
         except (OSError, RuntimeError, ValueError) as error:
             # Python: no such user, a null byte.
             reason = error.strerror if isinstance(error, OSError) else str(error)
-            raise UserError(f"{name}: {_short(value)}: {str(reason).rstrip('.')}.") from None
+            raise UserError(f"{name}: {value[:100]}: {str(reason).rstrip('.')}.") from None
 
 
 def _check_missing(name: str, value: str) -> None:
@@ -188,7 +188,3 @@ def _check_missing(name: str, value: str) -> None:
         raise UserError(f"{name}: {error}") from None
     if not found:
         raise UserError(f"{name}: {MISSING[name].format(value)}")
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= 100 else f"{text[:60]} ... ({len(text)} characters)"

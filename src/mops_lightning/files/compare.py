@@ -3,8 +3,6 @@
 The result is a table and a page with the clouds in 3-D.
 """
 
-import csv
-import io
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -13,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError, cKDTree
@@ -25,7 +24,7 @@ from mops_lightning.files.options import Options
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.report.page import render
 from mops_lightning.report.text import Grid, markdown
-from mops_lightning.viz.figures import INPUT, MAX_INPUT_POINTS
+from mops_lightning.viz.figures import INPUT, thinned
 from mops_lightning.zoo.names import UNTRAINED
 
 Points = NDArray[np.float64]
@@ -219,15 +218,13 @@ def _grid(compared: FileResult) -> Grid:
 
 
 def _csv(results: Sequence[FileResult]) -> str:
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["file", "points", "m", "method", *COLUMNS])
-    for compared in results:
-        for result in compared.results:
-            values = [getattr(result, name) for name in COLUMNS]  # None is left empty
-            number = len(compared.points)
-            writer.writerow([compared.path, number, compared.m, result.method, *values])
-    return out.getvalue()
+    rows = [
+        {"file": one.path, "points": len(one.points), "m": one.m, "method": result.method}
+        | {name: getattr(result, name) for name in COLUMNS}
+        for one in results
+        for result in one.results
+    ]
+    return pd.DataFrame(rows).to_csv(index=False, lineterminator="\n")
 
 
 def _clouds(compared: FileResult) -> dict[str, Any]:
@@ -235,8 +232,7 @@ def _clouds(compared: FileResult) -> dict[str, Any]:
     points = compared.points
     centred = points - points.mean(0)
     turned = centred[:, [0, 2, 1]] * [1, 1, -1] / (np.abs(centred).max() or 1.0)  # z up to y up
-    step = -(-len(points) // MAX_INPUT_POINTS)
-    sets = {INPUT: turned[::step], **{r.method: turned[r.rows] for r in compared.results}}
+    sets = {INPUT: thinned(turned), **{r.method: turned[r.rows] for r in compared.results}}
     shown = (INPUT, compared.results[-1].method)  # the trained sampler, if there is one
     return {
         "name": f"{compared.path.name}, {compared.m:,} points",

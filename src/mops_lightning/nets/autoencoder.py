@@ -9,11 +9,7 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, check_at_least
-from mops_lightning.nets.layers import (
-    PointMLP,
-    check_channels,
-    linear_norm_relu,
-)
+from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
 from mops_lightning.nets.max_pool import PointMaxPool
 
 DECODER_CHANNELS = (256, 256)

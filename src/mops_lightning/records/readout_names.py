@@ -36,7 +36,7 @@ def size_prefix(m: int | None) -> str:
     return "" if m is None else f"m{m}/"
 
 
-def parse_metric_name(name: str, stage: str = "test") -> MetricName | None:
+def parse_metric_name(name: str) -> MetricName | None:
     """Split a name such as ``test/m32/generated/accuracy`` or ``test/generated/accuracy``.
 
     Returns:
@@ -46,6 +46,6 @@ def parse_metric_name(name: str, stage: str = "test") -> MetricName | None:
     m = None
     if len(parts) == 3 and parts[0][:1] == "m" and parts[0][1:].isdecimal():
         m = int(parts.pop(0)[1:])
-    if first != stage or len(parts) != 2 or parts[0] in ("loss", "matrix"):
+    if first != "test" or len(parts) != 2 or parts[0] in ("loss", "matrix"):
         return None
     return MetricName(m, parts[0], parts[1])

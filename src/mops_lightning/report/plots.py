@@ -77,7 +77,9 @@ def heat_maps(table: Table) -> Figure:
     planes, scale = table.group.planes, table.metric.scale
     names = sorted(planes, key=sort_key)
     means = table.values["mean"] * scale
-    norm = _colour_scale(means.min(), means.max())
+    low, high = means.min(), means.max()
+    # On a linear scale, one large value would hide the differences of all others.
+    norm = LogNorm(low, high) if 0 < LOG_SCALE_RATIO * low < high else Normalize(low, high)
     width = max(len(table.readouts(name)) for name in names)
     figure = new_figure(3.6 * width + 1, 3.2 * len(names))
     panels = figure.subplots(len(names), width, squeeze=False)
@@ -89,12 +91,6 @@ def heat_maps(table: Table) -> Figure:
             axis.set(xlabel=across, ylabel=down, title=f"{name}, {readout}")
     figure.colorbar(image, ax=panels, label=table.metric.title)
     return figure
-
-
-def _colour_scale(low: float, high: float) -> Normalize:
-    """Return a logarithmic scale if one value would hide the differences of all others."""
-    logarithmic = low > 0 and high > LOG_SCALE_RATIO * low
-    return LogNorm(low, high) if logarithmic else Normalize(low, high)
 
 
 def _heat_map(axis: Any, plane: pd.DataFrame, norm: Normalize) -> Any:

@@ -36,7 +36,7 @@ CLOUDS = "clouds.npz"
 INPUT = "input"
 TITLES = "titles"
 MAX_INPUT_POINTS = 8192
-"""Most input points saved of a cloud; all samples are saved."""
+"""Most input points drawn or saved of a cloud: more are indistinguishable. All samples are."""
 
 
 def new_figure(width: float, height: float, layout: Any = "constrained") -> Figure:
@@ -206,6 +206,11 @@ def frame_cloud(axes: Axes3D, cloud: np.ndarray) -> None:
     axes.view_init(elev=18, azim=-60)
 
 
+def thinned(points: Any) -> Any:
+    """Return every k-th point of clouds ``(..., N, 3)`` above ``MAX_INPUT_POINTS``."""
+    return points[..., :: -(-points.shape[-2] // MAX_INPUT_POINTS), :]
+
+
 def save_clouds(
     path: Path, points: Tensor, sampled: Mapping[str, Tensor], titles: Sequence[str]
 ) -> None:
@@ -217,8 +222,7 @@ def save_clouds(
         sampled: ``(K, M, 3)`` by readout.
         titles: one per cloud.
     """
-    thinned = points[:, :: -(-points.shape[1] // MAX_INPUT_POINTS)]
-    clouds = {INPUT: thinned, **sampled}
+    clouds = {INPUT: thinned(points), **sampled}
     arrays = {name: cloud.detach().cpu().float().numpy() for name, cloud in clouds.items()}
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **{TITLES: np.array(titles)}, **arrays)

@@ -8,13 +8,17 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
-from mops_lightning.viz.figures import cloud_axes, draw_cloud, frame_cloud, new_figure, upright
+from mops_lightning.viz.figures import (
+    cloud_axes,
+    draw_cloud,
+    frame_cloud,
+    new_figure,
+    thinned,
+    upright,
+)
 
 SOURCE_COLOUR, TARGET_COLOUR = (0.12, 0.47, 0.86), (0.84, 0.3, 0.05)
 SAMPLE_SIZE = 14
-
-MAX_POINTS = 8192
-"""Most points drawn of a cloud: more are indistinguishable and take minutes."""
 
 
 class RegistrationResult(NamedTuple):
@@ -108,17 +112,17 @@ def reconstruction_grid(
         shown = title if row % 2 == 1 or row == 0 else ""
         return cloud_axes(figure, rows, columns, row, column, shown, label)
 
-    for number, cloud in enumerate(map(_thinned, upright(points))):
+    for number, cloud in enumerate(map(thinned, upright(points))):
         above, under = 2 * number, 2 * number + 1
         _draw_depth(cell(above, 0, "input", titles[number]), cloud, cloud)
-        from_full = _thinned(upright(full)[number])
+        from_full = thinned(upright(full)[number])
         _draw_depth(cell(under, 0, "from all points", ""), from_full, cloud)
         for column, (name, result) in enumerate(results.items(), start=1):
             samples = upright(result.samples)[number]
             axes = cell(above, column, name, f"{len(samples)} points")
             draw_cloud(axes, cloud, samples, name, size=16)
             axes = cell(under, column, f"from {name}", f"NRE {result.ratios[number]:.2f}")
-            _draw_depth(axes, _thinned(upright(result.points)[number]), cloud)
+            _draw_depth(axes, thinned(upright(result.points)[number]), cloud)
     return figure
 
 
@@ -146,8 +150,3 @@ def _draw_depth(axes: Axes3D, drawn: np.ndarray, cloud: np.ndarray) -> None:
     """Draw points coloured by depth, framed as ``cloud``."""
     axes.scatter(*drawn.T, s=2, c=drawn[:, 1], cmap="viridis", depthshade=False)
     frame_cloud(axes, cloud)
-
-
-def _thinned(cloud: np.ndarray) -> np.ndarray:
-    """Keep every k-th point of clouds above ``MAX_POINTS``."""
-    return cloud[:: -(-len(cloud) // MAX_POINTS)]

@@ -45,7 +45,7 @@ from mops_lightning.training.evaluation import OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.run.other_nets import other_tasks
-from mops_lightning.training.run.trainer import device_name, make_trainer
+from mops_lightning.training.run.trainer import make_trainer
 
 STANDARD = (8, 16, 32, 64, 128, 256, 512)
 """The sizes of the paper's tables."""
@@ -150,7 +150,8 @@ def build_parts(
     learned = experiment.sampler is not None and experiment.sampler.learned
     if cfg.learn == "nothing" and learned and not cfg.evaluate:
         raise UserError("learn=nothing needs a trained sampler: give its run with evaluate=RUN.")
-    record.device = device_name(trainer)
+    root = trainer.strategy.root_device
+    record.device = torch.cuda.get_device_name(root) if root.type == "cuda" else root.type
     return parts
 
 

@@ -3,12 +3,11 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import AcquireReturnProxy, FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mops_lightning.config import distributed
@@ -51,7 +50,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, train: Train) -> Path |
                 "processes. Run the same command once with learn=task trainer=auto and without "
                 "the launcher, or give weights=FILE."
             )
-        with _locked(folder, cfg.names.net):
+        with _lock(folder, cfg.names.net):
             if not (folder / FILE).is_file():  # otherwise another process trained it meanwhile
                 epochs = cfg.epochs.task
                 print(
@@ -118,9 +117,8 @@ def add_to_cache(parts: Parts) -> None:
             shutil.copyfile(parts.folder / FILE, temporary)
 
 
-@contextmanager
-def _locked(folder: Path, net: str) -> Iterator[None]:
-    """Hold the lock of a cache folder, so that one process at a time trains the net in it.
+def _lock(folder: Path, net: str) -> AcquireReturnProxy:
+    """Lock a cache folder, so that one process at a time trains the net in it.
 
     The lock is a file next to the folder. A process that is killed releases it.
     """
@@ -128,11 +126,7 @@ def _locked(folder: Path, net: str) -> Iterator[None]:
     path = folder.parent / f"{folder.name}.lock"
     lock = FileLock(path)
     try:
-        lock.acquire(timeout=0)
+        return lock.acquire(timeout=0)
     except Timeout:
         print(f"Waiting for another process that trains {net} ({path})", flush=True)
-        lock.acquire(poll_interval=0.5)
-    try:
-        yield
-    finally:
-        lock.release()
+        return lock.acquire(poll_interval=0.5)

@@ -163,12 +163,6 @@ def _silence_lightning() -> None:
         warnings.filterwarnings("ignore", message=message)
 
 
-def device_name(trainer: L.Trainer) -> str:
-    """Return the GPU's name, or the kind of device."""
-    root = trainer.strategy.root_device
-    return torch.cuda.get_device_name(root) if root.type == "cuda" else root.type
-
-
 def log_test(
     trainer: L.Trainer, config: dict[str, Any], metrics: dict[str, float], scores: dict[str, float]
 ) -> None:
