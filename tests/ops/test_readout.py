@@ -1,3 +1,5 @@
+import re
+
 import pytest
 import torch
 from scipy.spatial import cKDTree
@@ -59,17 +61,18 @@ def test_complete_of_coincident_points_is_distinct():
 
 
 @pytest.mark.parametrize(
-    ("indices", "points", "words"),
+    ("indices", "points"),
     [
-        (torch.zeros(1, 2), torch.zeros(1, 3, 3), r"indices must be int64 .*got float32"),
-        (torch.tensor([0, 1]), torch.zeros(1, 3, 3), r"indices must .*\(B, M\).*\(2,\)"),
-        (torch.tensor([[0, 1]]), torch.zeros(3, 3), r"points must have shape .*got \(3, 3\)"),
-        (torch.zeros(1, 4).long(), torch.zeros(1, 3, 3), r"N=3.*M=4"),
-        (torch.tensor([[0, 1]]), torch.zeros(2, 3, 3), r"points must .*B=1.*got \(2, 3, 3\)"),
+        (torch.zeros(1, 2), torch.zeros(1, 3, 3)),
+        (torch.tensor([0, 1]), torch.zeros(1, 3, 3)),
+        (torch.tensor([[0, 1]]), torch.zeros(3, 3)),
+        (torch.zeros(1, 4).long(), torch.zeros(1, 3, 3)),
+        (torch.tensor([[0, 1]]), torch.zeros(2, 3, 3)),
     ],
 )
-def test_complete_wrong_arguments_raise(indices, points, words):
-    with pytest.raises(UserError, match=words):
+def test_complete_wrong_arguments_raise(indices, points):
+    shapes = f"{indices.dtype} {tuple(indices.shape)} and {tuple(points.shape)}."
+    with pytest.raises(UserError, match=rf"indices must be int64 .*got {re.escape(shapes)}"):
         complete(indices, points)
 
 

@@ -94,20 +94,11 @@ def complete(indices: Tensor, points: Tensor, weight: Tensor | None = None) -> T
         >>> complete(torch.tensor([[1, 1]]), points)
         tensor([[1, 2]])
     """
-    if indices.ndim != 2 or indices.dtype != torch.int64:
+    fits = indices.ndim == 2 and points.ndim == 3 and len(points) == len(indices)
+    if not fits or indices.dtype != torch.int64 or indices.shape[1] > points.shape[1]:
         raise UserError(
-            "indices must be int64 of shape (B, M), got "
-            f"{str(indices.dtype).removeprefix('torch.')} of shape {tuple(indices.shape)}."
-        )
-    if points.ndim != 3 or len(points) != len(indices):
-        raise UserError(
-            f"points must have shape (B, N, 3) with B={len(indices)} as in indices, "
-            f"got {tuple(points.shape)}."
-        )
-    if indices.shape[1] > points.shape[1]:
-        raise UserError(
-            f"indices must have at most as many columns as there are points, N={points.shape[1]}, "
-            f"got M={indices.shape[1]}."
+            "indices must be int64 (B, M) and points (B, N, 3), with the same B and M ≤ N, got "
+            f"{indices.dtype} {tuple(indices.shape)} and {tuple(points.shape)}."
         )
     first = _is_first(indices)
     # A stable sort moves first occurrences to the front and keeps their order.

@@ -45,25 +45,21 @@ def select_points(
         raise UserError(f"points must be floating point, got {tensor.dtype}. Try points.float().")
     if weight is not None and not isinstance(weight, str):
         weight = check_weight(weight, tuple(tensor.shape[:-1])).to(tensor.device)
+    one = tensor.ndim == 2
+    if tensor.ndim not in (2, 3) or tensor.shape[-1] != 3 or (batch is not None and not one):
+        wanted = "(N, 3) or (B, N, 3)" if batch is None else "(P, 3) with batch"
+        raise UserError(f"points must have shape {wanted}, got {tuple(tensor.shape)}.")
     if batch is not None:
-        _check_shape(tensor, 2, "(P, 3) with batch")
         result = _flat(select, tensor, m, as_tensor("batch", batch), weight)
-    elif tensor.ndim == 2:
-        _check_shape(tensor, 2, "(N, 3) or (B, N, 3)")
+    elif one:
         alone = weight[None] if isinstance(weight, Tensor) else weight
         chosen, rows = _selected(select, tensor[None], m, alone)
         result = chosen[0], None if rows is None else rows[0]
     else:
-        _check_shape(tensor, 3, "(N, 3) or (B, N, 3)")
         result = _selected(select, tensor, m, weight)
     if not isinstance(points, np.ndarray):
         return result
     return result[0].numpy(), None if result[1] is None else result[1].numpy()
-
-
-def _check_shape(points: Tensor, ndim: int, wanted: str) -> None:
-    if points.ndim != ndim or points.shape[-1] != 3:
-        raise UserError(f"points must have shape {wanted}, got {tuple(points.shape)}.")
 
 
 def _flat(select: Select, points: Tensor, m: int, batch: Tensor, weight: Weight) -> Sample:
