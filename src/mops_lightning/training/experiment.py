@@ -79,7 +79,11 @@ class Experiment(L.LightningModule):
         test_logger: bool | None = None,
     ) -> None:
         super().__init__()
-        _check_learn(learn, task, sampler)
+        if sampler is None and learn != "task":
+            raise UserError(f"learn={learn} needs a sampler; only learn=task works without one.")
+        learned = sampler is not None and sampler.learned
+        if learn in ("task", "joint") or (learn == "sampler" and learned):
+            task.check_differentiable(f"learn={learn}")
         self.task: Task = task
         self.sampler = None if learn == "task" else sampler
         self.baselines = nn.ModuleDict({} if learn == "task" else dict(baselines or {}))
@@ -333,22 +337,3 @@ class Experiment(L.LightningModule):
         updated = self.scores.update_sets(points, outputs, self.sampler.nested, prefixes)
         for name, metric in updated.items():
             self.log(f"{stage}{name}", metric, batch_size=len(points), logger=logger)
-
-
-def _check_learn(learn: Learn, task: Task, sampler: Sampler | None) -> None:
-    """Reject what cannot be trained.
-
-    Raises:
-        UserError: the sampler that ``learn`` needs is missing, or the task net lets no gradient
-            through.
-    """
-    if sampler is None and learn != "task":
-        raise UserError(f"learn={learn} needs a sampler; only learn=task works without one.")
-    learned = sampler is not None and sampler.learned
-    learns = learn in ("task", "joint") or (learn == "sampler" and learned)
-    if learns and not getattr(task.net, "differentiable", True):
-        raise UserError(
-            f"learn={learn}: {type(task.net).__name__} has no weights and lets no gradient "
-            "through. Train under another task/net and test with evaluate=RUN, or choose a "
-            "sampler that needs no training, such as sampler=fps."
-        )
