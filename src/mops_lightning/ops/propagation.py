@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import load_npz
 from mops_lightning.ops.nearest import k_nearest, nearest
-from mops_lightning.ops.points import as_tensor, cloud_sizes, gather_points
+from mops_lightning.ops.points import as_tensor, cloud_sizes
 
 CLOSE = 1e-8
 """Squared distance in the unit sphere below which a point has nearly all of the weight."""
@@ -216,11 +216,8 @@ def interpolate(values: Tensor, points: Tensor, queries: Tensor, k: int = 3) -> 
     Returns:
         ``(B, N, C)``.
     """
-    with torch.no_grad():
-        rows = k_nearest(queries, points, min(k, points.shape[1]))[1]
-    shape, flat = rows.shape[1:], rows.flatten(1)
-    near = gather_points(points, flat).unflatten(1, shape)
-    weights = 1 / ((near - queries[:, :, None]).square().sum(3, keepdim=True) + CLOSE)
+    squared, rows = k_nearest(queries, points, min(k, points.shape[1]))
+    weights = 1 / (squared + CLOSE)
     weights = weights / weights.sum(2, keepdim=True)
     clouds, m, channels = values.shape
     places = rows + torch.arange(clouds, device=rows.device)[:, None, None] * m
@@ -229,7 +226,7 @@ def interpolate(values: Tensor, points: Tensor, queries: Tensor, k: int = 3) -> 
         places.flatten(0, 1),
         values.flatten(0, 1),
         mode="sum",
-        per_sample_weights=weights.flatten(0, 1)[..., 0].to(values),
+        per_sample_weights=weights.flatten(0, 1).to(values),
     )
     return mean.view(clouds, -1, channels)
 
