@@ -164,7 +164,7 @@ def test_cloud_folder_invalid_argument_raises(folder, settings, message):
 def test_cloud_folder_without_cloud_raises(tmp_path):
     with pytest.raises(UserError, match=r"^root: no file in .*\.ply"):
         cloud_folder(tmp_path)
-    with pytest.raises(UserError, match=r"^root: no file in .*none or its subfolders"):
+    with pytest.raises(UserError, match=r"^root: no file in or below .*none ends in"):
         cloud_folder(tmp_path / "none")
 
 

@@ -100,7 +100,7 @@ def test_command_line_run_named_in_several_ways(run, tmp_path):
 def test_command_line_without_evaluate_is_unchanged():
     assert command_line(["m=8", "evaluate=null"]) == ["m=8", "evaluate=null"]
     assert command_line(["--help"]) == ["--help"]
-    with pytest.raises(UserError, match=r"^evaluate=: no run is given\. Give a run's folder or a "):
+    with pytest.raises(UserError, match=r"^evaluate=: no run is given\. Give a run's folder or "):
         command_line(["task=registration", "evaluate="])
 
 

@@ -141,9 +141,7 @@ def list_files(folder: Path, suffixes: Sequence[str]) -> list[PurePosixPath]:
     )
     names = [name for name in names if not any(part.startswith(".") for part in name.parts)]
     if not names:
-        raise UserError(
-            f"root: no file in {folder} or its subfolders ends in {', '.join(suffixes)}."
-        )
+        raise UserError(f"root: no file in or below {folder} ends in {', '.join(suffixes)}.")
     return names
 
 
@@ -218,9 +216,7 @@ def random_crops(
             if (drawn != drawn[0]).any():
                 break
         else:
-            raise BadCloudError(
-                f"{path}: the {n_points} points of a crop coincide. Clean the file."
-            )
+            raise BadCloudError(f"{path}: the {n_points} points of a crop coincide. Clean it.")
         # Before float32, which has too few digits for coordinates of a map.
         crops[place], chosen[place] = drawn - drawn.mean(0), rows
     return crops, chosen

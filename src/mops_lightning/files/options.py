@@ -5,7 +5,6 @@ from pathlib import Path
 
 from mops_lightning.data.formats.table import Area
 from mops_lightning.errors import UserError
-from mops_lightning.records.readout_names import GENERATED_READOUTS
 from mops_lightning.zoo.names import UNTRAINED
 
 
@@ -49,9 +48,7 @@ class Options:
     def __post_init__(self) -> None:
         """Reject values out of range and options that exclude each other."""
         if self.weights is None and self.method is None:
-            raise UserError(
-                f"give --method {'|'.join(UNTRAINED)}, or --weights MODEL of a trained sampler."
-            )
+            raise UserError(f"give --method {'|'.join(UNTRAINED)}, or --weights MODEL.")
         if self.weights is not None and self.method is not None:
             raise UserError(f"give --weights or --method {self.method}, not both.")
         if (self.m is not None and self.m < 1) or (self.m is None and self.method):
@@ -60,10 +57,6 @@ class Options:
             raise UserError(f"--surface must be at least 1, got {self.surface}.")
         if not 0 <= self.seed < 2**63:
             raise UserError(f"--seed must be from 0 to 2**63 - 1, got {self.seed}.")
-        if self.readout not in GENERATED_READOUTS:
-            raise UserError(
-                f"--readout must be one of {', '.join(GENERATED_READOUTS)}, got {self.readout}."
-            )
         if self.keep_attributes and self.weights and self.readout == "generated":
             raise UserError(
                 "--keep-attributes: generated points are new and have no attributes. Use "
@@ -88,9 +81,7 @@ class Options:
         if self.weight is not None and self.tile is not None:
             raise UserError("--weight needs the whole cloud at once: leave --tile out.")
         if self.chunk is not None and self.map is not None:
-            raise UserError(
-                "--map needs the whole cloud in memory: use mops-lightning propagate after --chunk."
-            )
+            raise UserError("--map needs the whole cloud in memory: use propagate after --chunk.")
         if self.area is not None and self.map is not None:
             raise UserError("--map has a row for every point of IN: no --bounds or level with it.")
         if self.chunk is not None and self.chunk < 1:

@@ -289,9 +289,7 @@ def check_points(points: Tensor, at_least: int = 1, finite: bool = True) -> None
     if points.shape[0] == 0 or points.shape[1] == 0:
         raise UserError(f"points must have at least one cloud and one point, got shape {shape}.")
     if points.shape[1] < at_least:
-        raise UserError(
-            f"m must be at most the number of points N={points.shape[1]}, got m={at_least}."
-        )
+        raise UserError(f"m must be at most the number of points N={shape[1]}, got m={at_least}.")
     if finite and not bool(torch.isfinite(points).all()):
         raise UserError("points must be finite, got NaN or infinity.")
 

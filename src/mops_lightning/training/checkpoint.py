@@ -112,15 +112,11 @@ def _named(name: str, identity: dict[str, str]) -> Checkpoint:
     if path.is_dir():
         path = path / "checkpoints" / CHECKPOINT
     if not path.is_file():
-        raise UserError(
-            f"ckpt_path: no checkpoint {path}. Give a run's folder, a .ckpt file, or last."
-        )
+        raise UserError(f"ckpt_path: no checkpoint {path}. Give a run's folder, a file, or last.")
     try:
         checkpoint = Checkpoint.read(path)
     except UserError as error:
-        raise UserError(
-            f"ckpt_path: {error} Give another one, or leave ckpt_path out to start a new run."
-        ) from None
+        raise UserError(f"ckpt_path: {error} Give another one, or leave it out.") from None
     different = _different(checkpoint.identity, identity)
     if different:
         key = different[0]

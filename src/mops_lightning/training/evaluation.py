@@ -71,9 +71,7 @@ class TrainedRun:
                 card = model_file.read_card(place)
                 return cls(name, place, run_record.from_plain(card["record"]))
             if not place.is_dir():
-                raise UserError(
-                    f"no folder {place}. Give a model, or the folder of a run, with result.json."
-                )
+                raise UserError(f"no folder {place}. Give a model, or the folder of a run.")
             record = run_record.read(place)
         except UserError as error:
             raise UserError(f"{KEY}: {error}") from None
@@ -170,9 +168,7 @@ def _run_named(argument: str) -> str | None:
         raise UserError(f"{argument}: {KEY} takes one run. Start one evaluation for each.")
     value = override.value()
     if value == "":
-        raise UserError(
-            f"{argument}: no run is given. Give a run's folder or a model, or leave it out."
-        )
+        raise UserError(f"{argument}: no run is given. Give a run's folder or a model.")
     return None if value is None else str(value)
 
 

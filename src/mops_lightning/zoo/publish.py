@@ -136,9 +136,7 @@ def _task_net(name: str | None, record: RunRecord, folder: Path) -> str | None:
     if name is not None:
         path = names.find_model(name)
         if path is None:
-            raise UserError(
-                f"--task-net: no model {name!r}. `mops-lightning models` lists all of them."
-            )
+            raise UserError(f"--task-net: no model {name!r}. `mops-lightning models` lists all.")
         card = model_file.read_card(path)
         if card["record"]["config"]["learn"] != "task":
             raise UserError(f"--task-net: {name} is a sampler. Give the model of a task net.")

@@ -72,9 +72,7 @@ def read(path: str | Path) -> dict[str, Any]:
         raise damaged(path, "sha256 differs")
     for name, value in state.items():
         if value.element_size() == 1 and value.dtype != torch.bool:
-            raise Damaged(
-                f"{path}: {name} is quantised ({value.dtype}). Give weights in 16 or 32 bits."
-            )
+            raise Damaged(f"{path}: {name} is quantised ({value.dtype}). Give it in 16 or 32 bits.")
     if wrong := first_nonfinite(state):
         raise damaged(path, f"{wrong} is not finite, because the training diverged")
     trained = header.get("record", header)

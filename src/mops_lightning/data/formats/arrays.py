@@ -62,9 +62,7 @@ def read_npz(path: Path) -> Table:
     if chosen is None and len(arrays) == 1:
         (chosen,) = arrays
     if chosen is None:
-        raise BadCloudError(
-            f"{path} has no array named points, got {', '.join(arrays) or 'no arrays'}."
-        )
+        raise BadCloudError(f"{path} has no array named points, got {', '.join(arrays) or 'none'}.")
     table = from_array(arrays.pop(chosen), path)
     columns: dict[str, Column] = dict(table.columns)
     for name, array in arrays.items():
@@ -111,7 +109,5 @@ def locate_kitti(path: Path) -> CloudFile:
     """
     length = path.stat().st_size
     if not length or length % KITTI.itemsize:
-        raise BadCloudError(
-            f"{path} is not a KITTI scan: {length} bytes are not rows of four float32 numbers."
-        )
+        raise BadCloudError(f"{path} is not a KITTI scan: {length} bytes are no rows of 4 float32.")
     return binary_file(path, length // KITTI.itemsize, KITTI)

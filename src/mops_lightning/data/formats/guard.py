@@ -36,9 +36,7 @@ def naming_file(path: Path) -> Iterator[None]:
     except (UserError, KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
     except MemoryError as error:
-        raise BadCloudError(
-            f"{path} is broken or too large for the memory: {one_line(error)}."
-        ) from None
+        raise BadCloudError(f"{path} is broken, or too large: {one_line(error)}.") from None
     except BaseException as error:  # a panic in lazrs is not an Exception
         raise BadCloudError(f"{path} is broken: {one_line(error)}.") from None
 

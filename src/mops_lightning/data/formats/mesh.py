@@ -87,9 +87,7 @@ def parse_mesh(data: bytes, path: Path) -> "Trimesh":
         raise BadCloudError(f"{path} has no faces, so there is no surface to sample.")
     announced = _announced_faces(data, kind)
     if len(faces) < announced:
-        raise BadCloudError(
-            f"{path} is broken: its header announces {announced} faces, but it has {len(faces)}."
-        )
+        raise BadCloudError(f"{path} is broken: it has {len(faces)} of {announced} faces.")
     if not np.isfinite(area):
         raise BadCloudError(f"{path} is broken: its vertices are not all finite numbers.")
     if area <= FLAT * extent**2:

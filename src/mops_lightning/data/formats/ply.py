@@ -82,9 +82,7 @@ def _parse(path: Path) -> Table | None:
     columns = _columns(vertex["data"])
     number, declared = len(next(iter(columns.values()))), vertex["length"]
     if number < declared:
-        raise BadCloudError(
-            f"{path} is broken: its header declares {declared} points, it holds {number}."
-        )
+        raise BadCloudError(f"{path} is broken: its header says {declared} points, not {number}.")
     return from_columns(columns, path)
 
 
@@ -143,9 +141,7 @@ def locate(path: Path) -> CloudFile:
         raise WholeOnlyError(f"{path}: --chunk needs binary PLY with a complete header.")
     first, *others = (elements[start] for start in begin)
     if first[1] != "vertex":
-        raise WholeOnlyError(
-            f"{path}: --chunk needs PLY whose vertices come before other elements."
-        )
+        raise WholeOnlyError(f"{path}: --chunk needs PLY with its vertices before all else.")
     if any(other[1] == "face" and other[2] != "0" for other in others):
         raise WholeOnlyError(f"{path} is a mesh: --chunk needs a cloud.")
     fields = elements[1 : begin[1] if others else None]

@@ -43,9 +43,7 @@ def local(source: str, area: Area | None) -> Iterator[Path]:
     if not name.lower().endswith(".laz"):
         raise UserError(f"{source} must be a .copc.laz file: download others, and give their path.")
     if area is None:
-        raise UserError(
-            f"{source}: give --bounds, --level or --resolution. To read all of it, download it."
-        )
+        raise UserError(f"{source}: give --bounds, --level or --resolution, or download all of it.")
     with TemporaryDirectory() as folder:
         path = Path(folder) / name
         try:

@@ -295,9 +295,7 @@ def column_names(array: NDArray[Any], path: Path) -> list[str]:
             raise BadCloudError(f"{path} must hold one row of fields per point, got {shape}.")
         return list(array.dtype.names)
     if len(shape) != 2 or shape[1] < 3 or kind not in "fiu":
-        raise BadCloudError(
-            f"{path} must hold rows of x, y, z, got {array.dtype} of shape {shape}."
-        )
+        raise BadCloudError(f"{path} must hold rows of x, y, z, got {array.dtype} {shape}.")
     return ["x", "y", "z", *(f"column_{place}" for place in range(3, shape[1]))]
 
 

@@ -64,9 +64,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, train: Train) -> Path |
                 try:
                     train(own, folder, dataset)
                 except (KeyboardInterrupt, Interrupted):
-                    raise Interrupted(
-                        "The task net was being trained; the same command resumes its training."
-                    ) from None
+                    raise Interrupted("The same command resumes the task net's training.") from None
     return folder / FILE
 
 
