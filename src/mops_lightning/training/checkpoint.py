@@ -76,7 +76,7 @@ class Checkpoint:
         """Read what identifies a checkpoint.
 
         Raises:
-            UserError: the file cannot be opened, or is no checkpoint as it was written.
+            UserError: the file is no checkpoint as it was written.
         """
         content = read_sealed(path)
         written_by = content[CHECKPOINT_KEY]
@@ -161,13 +161,10 @@ def read_sealed(path: Path) -> Any:
     refused, not executed.
 
     Raises:
-        UserError: the file cannot be opened.
+        OSError: the file cannot be opened.
         Damaged: it is not a checkpoint, or was changed.
     """
-    try:
-        written = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}.") from None
+    written = path.read_bytes()
     content, seal = written[:-SEAL_BYTES], written[-SEAL_BYTES:]
     if hashlib.sha256(content).digest() != seal:
         raise weights.damaged(path, "expected a checkpoint as this program wrote it")

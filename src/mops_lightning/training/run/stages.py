@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import nn
 
 from mops_lightning.data.clouds import CloudDataset
@@ -147,7 +146,7 @@ def fit(parts: Parts, record: RunRecord) -> None:
         part=parts.part,
     )
     validation = parts.score_loader(parts.held_out) if len(parts.held_out.labels) else None
-    with _errors_of_lightning():
+    with _interruptible():
         trainer.fit(experiment, loader, validation, ckpt_path=resumed)
     check_finite(dict(experiment.state_dict()), trainer.global_step, trainer.strategy)
     callbacks: Any = trainer.callbacks  # type: ignore[attr-defined]
@@ -178,7 +177,7 @@ def test(parts: Parts, record: RunRecord) -> None:
     """Score all test clouds."""
     experiment, trainer = parts.experiment, parts.trainer
     loader = parts.score_loader(parts.dataset.test)
-    with _errors_of_lightning():
+    with _interruptible():
         trainer.test(experiment, loader, verbose=False)
     if (tested := trainer.num_test_batches[0]) < len(loader):
         record.partial.append(f"tested on {tested} of {len(loader)} batches")
@@ -196,17 +195,12 @@ def test(parts: Parts, record: RunRecord) -> None:
 
 
 @contextmanager
-def _errors_of_lightning() -> Iterator[None]:
-    """Raise ``Interrupted`` for Ctrl-C, ``UserError`` for callbacks that monitor no metric."""
+def _interruptible() -> Iterator[None]:
+    """Raise ``Interrupted`` for Ctrl-C, which Lightning turns into ``SystemExit``."""
     try:
         yield
     except SystemExit:
         raise Interrupted("Resume with the same command and ckpt_path=last.") from None
-    except (RuntimeError, MisconfigurationException) as error:
-        text = str(error)
-        if not (text.startswith("Early stopping conditioned on metric") or "monitor=" in text):
-            raise
-        raise UserError(f"callbacks: {' '.join(text.split())}") from None
 
 
 def _check_scores(parts: Parts, metrics: dict[str, float]) -> None:
