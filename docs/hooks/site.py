@@ -18,7 +18,6 @@ MAX_BYTES = 1_000_000
 """Larger files are not copied; a link to one becomes plain text."""
 
 IN_MODULES = (
-    "mops_lightning.transforms.Downsample",
     "mops_lightning.config.compose.compose",
     "mops_lightning.training.run.run.run",
     "mops_lightning.zoo.publish.add",

@@ -109,7 +109,7 @@ def test_joint_training_starts_from_cached_task_net(main_job):
     assert after["sha256"] != weights.read(before)["sha256"]
 
 
-def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
+def test_registration_trains_jointly_and_is_evaluated_on_other_pairs(tmp_path):
     settings = ["learn=joint", "sampler=fmops", "sampler.m_max=16", "pictures=1"]
     status, out, err = call([*TINY_WITH_PICTURES, *SMALL_PCRNET, *settings], tmp_path)
     assert status == 0, err
@@ -122,13 +122,10 @@ def test_registration_trains_jointly_and_is_evaluated_under_icp(tmp_path):
     pictures = {f"{name}.png" for name in ("comparison", "clouds", "matrix", "pairs")}
     assert {path.name for path in (run / "pictures").iterdir()} == {"clouds.npz", *pictures}
     assert (run / "task_weights.safetensors").is_file()
-    arguments = [f"evaluate={run}", "task/net=icp", "task.resample=48", "pictures=0"]
+    arguments = [f"evaluate={run}", "task.resample=48", "pictures=0"]
     status, out, err = call(arguments, tmp_path)
     assert status == 0, err
-    assert "registration by icp" in out
-    status, _, err = call(["task=registration", "task/net=icp", "weights=null", *TINY], tmp_path)
-    assert status == 2
-    assert "learn=sampler: ICP has no weights" in err
+    assert "registration by pcrnet" in out
 
 
 @pytest.mark.parametrize(

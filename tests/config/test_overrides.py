@@ -11,7 +11,7 @@ from mops_lightning.errors import UserError
         ("m=8", "m", "m"),
         ("++sampler.alpha=3", "sampler.alpha", "sampler.alpha"),
         ("~task.resample", "task.resample", "task.resample"),
-        ("task/net=icp", "task/net", "task.net"),
+        ("task/net=pcrnet", "task/net", "task.net"),
         ("optimizer@pretrain=x", "optimizer@pretrain", "pretrain"),
         ("m=4,8", "m", "m"),
         ("out=it's (1), = ~", "out", "out"),

@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 import torch
 
+import mops_lightning
+
 DOCS = Path(__file__).parents[2] / "docs"
 
 
@@ -29,6 +31,15 @@ def test_points_are_selected_with_the_task_net():
     names: dict[str, Any] = {}
     exec(example("In Python", "selection.md"), names)
     assert names["rows"].shape == (8, 64)
+
+
+def test_node_attributes_follow_in_pytorch_geometric():
+    data = pytest.importorskip("torch_geometric.data").Data(pos=torch.rand(300, 3))
+    data.row = torch.arange(300)
+    names: dict[str, Any] = {"data": data, "mops_lightning": mops_lightning}
+    exec(example("PyTorch Geometric"), names)
+    assert torch.equal(data.pos[names["data"].row], names["data"].pos)
+    assert len(names["data"].pos) == 100
 
 
 def test_pointnet2_layer_runs_with_one_import_replaced():

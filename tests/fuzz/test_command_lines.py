@@ -27,7 +27,7 @@ GROUPS = {
         *("fps", "random", "voxel", "poisson", "serial"),
     ),
     "task": ("classification", "registration", "reconstruction"),
-    "task/net": ("pointnet", "pcrnet", "icp", "autoencoder", "foldingnet", "atlasnet"),
+    "task/net": ("pointnet", "pcrnet", "autoencoder", "foldingnet", "atlasnet"),
     "optimizer": ("one_cycle", "exponential", "step_decay", "one_cycle_snet", "muon"),
     "logger": ("none", "csv"),
     "trainer": ("auto", "cpu"),

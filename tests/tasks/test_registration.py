@@ -1,12 +1,9 @@
-import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mops_lightning import FPSSampler, MOPSNet
+from mops_lightning import FPSSampler
 from mops_lightning.data.loader import CloudLoader
-from mops_lightning.errors import UserError
 from mops_lightning.metrics.registration import RotationError
-from mops_lightning.nets.icp import ICP
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.ops.rigid import Motion, identity_motion
 from mops_lightning.tasks.base import figures_of
@@ -75,22 +72,6 @@ def test_test_samples_sources_and_targets_in_one_call():
     loader = CloudLoader(small_dataset(test=4).test, 4, make_batch=module.task.make_batch)
     quiet_trainer(1).test(module, loader, verbose=False)
     assert sampler.shapes == [(8, 40, 3)]
-
-
-def test_icp_tests_but_never_trains():
-    icp = task(ICP())
-    with pytest.raises(UserError, match=r"learn=sampler: ICP has no weights .*evaluate=RUN"):
-        Experiment(icp, MOPSNet(8))
-    with pytest.raises(UserError, match="learn=task: ICP has no weights"):
-        Experiment(icp, learn="task")
-    with pytest.raises(UserError, match="learn=joint: ICP has no weights"):
-        Experiment(icp, FPSSampler(8), learn="joint")
-    module = Experiment(icp, FPSSampler(8))
-    assert not module.trainable
-    run = quiet_trainer(1)
-    data = CloudLoader(small_dataset().test, 4, make_batch=icp.make_batch)
-    run.test(module, data, verbose=False)
-    assert run.callback_metrics["test/full/rotation_error_deg"] < 60
 
 
 def test_figures_show_every_readout_and_its_error(rng):

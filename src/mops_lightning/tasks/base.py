@@ -66,19 +66,6 @@ class Task(nn.Module):
             )
         self.net = net
 
-    def check_differentiable(self, why: str) -> None:
-        """Check that gradients flow through the net; ``why`` they must, for the error.
-
-        Raises:
-            UserError: they do not.
-        """
-        if not getattr(self.net, "differentiable", True):
-            raise UserError(
-                f"{why}: {type(self.net).__name__} has no weights and lets no gradient through. "
-                "Train under another task/net and test with evaluate=RUN, or choose a sampler that "
-                "needs no training, such as sampler=fps."
-            )
-
     def predict(self, batch: Any, points: Tensor) -> Any:
         """Return the net's output for sampled points, as ``disagreement`` compares it.
 

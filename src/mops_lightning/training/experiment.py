@@ -81,9 +81,6 @@ class Experiment(L.LightningModule):
         super().__init__()
         if sampler is None and learn != "task":
             raise UserError(f"learn={learn} needs a sampler; only learn=task works without one.")
-        learned = sampler is not None and sampler.learned
-        if learn in ("task", "joint") or (learn == "sampler" and learned):
-            task.check_differentiable(f"learn={learn}")
         self.task: Task = task
         self.sampler = None if learn == "task" else sampler
         self.baselines = nn.ModuleDict({} if learn == "task" else dict(baselines or {}))

@@ -85,10 +85,6 @@ def test_diverged_training_fails_without_weights(tmp_path):
             ["task/net=pointnet"],
             r"task\.net must take \(source, target\).*PointNetVanilla.*\(points\)",
         ),
-        (
-            ["task/net=icp", "sampler=fps", "weights=pointnet.modelnet40"],
-            r"weights: icp.*got pointnet",
-        ),
         (["task.net=null"], r"task.net cannot be removed"),
         (["task.resample=0"], r"task.resample must be .*got 0"),
         (["task.resample=16", "m=24"], r"task.resample"),

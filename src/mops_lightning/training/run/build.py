@@ -88,7 +88,7 @@ class Parts:
 
     @property
     def has_task_weights(self) -> bool:
-        """Whether the task net has weights; ICP has none."""
+        """Whether the task net has weights."""
         return any(True for _ in self.experiment.task.parameters())
 
     @property
