@@ -1,8 +1,5 @@
 """The procedural dataset: content, reproducibility, difficulty, cache and errors."""
 
-import os
-import select
-import sys
 from typing import Any
 
 import numpy as np
@@ -48,13 +45,6 @@ def test_shapes_are_labelled_and_in_unit_sphere(dataset):
         largest = clouds.points.norm(dim=-1).amax(1)
         assert torch.allclose(largest, torch.ones(()), atol=1e-6)
         assert clouds.points.mean(1).abs().max() < 1e-6
-
-
-def test_shapes_table_has_top_above_centre():
-    points = shapes(n_points=2000, train_per_class=10, test_per_class=1, classes=["table"])
-    for cloud in points.train.points:
-        upper = (cloud[:, 1] > cloud[:, 1].mean()).float().mean()
-        assert upper > 0.5  # the top has most of the surface
 
 
 def test_shapes_points_are_uniform_by_area(monkeypatch):
@@ -235,24 +225,6 @@ def test_shapes_print_nothing_without_terminal(capfd, monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     shapes(**SMALL)
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals are a Unix thing")
-def test_shapes_progress_on_terminal_is_erased(monkeypatch):
-    monkeypatch.setenv("TERM", "xterm")
-    ours, theirs = os.openpty()
-    with open(theirs, "w") as terminal:  # noqa: PTH123
-        monkeypatch.setattr(sys, "stderr", terminal)
-        shapes(**SMALL)
-        terminal.flush()
-        shown = ""
-        # A terminal returns what was written in parts, with a delay.
-        while select.select([ours], [], [], 1.0)[0]:
-            shown += os.read(ours, 65536).decode()
-        monkeypatch.undo()
-    os.close(ours)
-    assert "Making shapes" in shown
-    assert "\x1b[2K" in shown.split("Making shapes")[-1]  # the line is erased at the end
 
 
 @pytest.mark.parametrize("name", BUILDERS)

@@ -84,24 +84,6 @@ def test_page_clouds_can_be_selected(shown):
     assert {url.split(":")[0] for url in requests} <= {"file", "data", "blob"}
 
 
-def test_page_is_dark_where_the_browser_is(shown):
-    page, errors, _ = shown
-
-    def brightness(name, part="body"):
-        found = page.locator(part).first.evaluate(f"one => getComputedStyle(one).{name}")
-        return sum(map(int, found.removeprefix("rgb(").removesuffix(")").split(",")))
-
-    legend = "#view .legendtext"
-    assert brightness("backgroundColor") > 700 > 200 > brightness("color")
-    assert brightness("fill", legend) < 200
-    page.emulate_media(color_scheme="dark")
-    assert brightness("backgroundColor") < 200 < 500 < brightness("color")
-    page.wait_for_function(
-        f"getComputedStyle(document.querySelector('{legend}')).fill.startsWith('rgb(2')"
-    )
-    assert errors == []
-
-
 def test_page_planes_have_table_and_plot(tmp_path, opened):
     put_planes(tmp_path)
     main([str(tmp_path)])

@@ -38,11 +38,3 @@ def test_curves_show_values_by_size(tmp_path):
     assert len(third) == 1  # no run has completed sets of MOPS-Net
     grids = [axes.xaxis.get_gridlines()[0].get_visible() for axes in figure.axes]
     assert grids == [True, True, True]
-
-
-def test_curves_over_many_corruptions_turn_the_labels_of_all_panels(tmp_path):
-    for i in range(1, 10):
-        put_cell(tmp_path, f"a{i}", "fps", {"sampled": i}, test_corruption=f"shear-{i}")
-    (figure,) = plots(build_report(tmp_path)).values()
-    for axes in figure.axes:
-        assert {label.get_rotation() for label in axes.get_xticklabels()} == {90}

@@ -87,14 +87,6 @@ def test_save_figure_png_has_a_palette_near_the_colours(tmp_path):
     assert all(np.abs(drawn - colour).max(1).min() < 0.02 for colour in colours.reshape(-1, 3))
 
 
-def test_save_figure_svg_has_no_date(tmp_path):
-    figure = new_figure(4, 4)
-    figure.subplots()
-    text = save_figure(figure, tmp_path / "a.svg").read_text()
-    assert text.startswith("<?xml")
-    assert "dc:date" not in text
-
-
 def test_save_clouds_large_thins_input_and_keeps_samples(tmp_path, rng):
     points = torch.rand(2, 20_000, 3, generator=rng)
     save_clouds(tmp_path / "clouds.npz", points, {"generated": points[:, :4096]}, ["a", "b"])
