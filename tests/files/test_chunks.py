@@ -13,6 +13,7 @@ from tests.support.downsample import call, refused
 @pytest.mark.parametrize("readout", ["generated", "matched"])
 def test_chunks_equal_whole_file(suffix, readout, folder, tmp_path):
     points = np.random.default_rng(1).normal(size=(500, 3)).astype(np.float32).astype(float)
+    points[200:] = points[np.arange(300) % 100]  # of equal points, the first one is matched
     if suffix != ".laz":  # it holds whole numbers, NaN is none
         points[100:160] = np.nan
     source = tmp_path / f"in{suffix}"

@@ -4,22 +4,16 @@ import pytest
 from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
 from mops_lightning.files import compare
-from mops_lightning.files.compare import (
-    compare_file,
-    coverage,
-    ground_error,
-    options_by_method,
-    write_comparison,
-)
+from mops_lightning.files.compare import compare_file, ground_error, options_by_method
 
 
 def test_coverage_by_hand():
-    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [10, 0, 0]])
-    chamfer, hausdorff, density = coverage(points, points[[0, 3]])
-    assert chamfer == pytest.approx(3 / 4)
-    assert hausdorff == 2
-    assert density == pytest.approx(0.5)  # 3 points and 1 point
-    assert coverage(points, points) == (0, 0, 0)
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [10, 0, 0]])
+    chamfer, hausdorff, density = compare.coverage(points, points[[0, 4]])
+    assert chamfer == pytest.approx(6 / 5)
+    assert hausdorff == 3
+    assert density == pytest.approx(1.5 / 2.5)  # 4 points and 1 point
+    assert compare.coverage(points, points) == (0, 0, 0)
 
 
 def test_ground_error_of_plane_step_and_few_points():
@@ -52,7 +46,7 @@ def test_compare_measures_the_ground_of_airborne_scans_only(tmp_path):
     found = [compare_file(tmp_path / name, 60, methods, 0) for name in ("air.las", "one.ply")]
     assert found[0].results[0].ground == pytest.approx(0, abs=1e-6)
     assert found[1].results[0].ground is None
-    table = write_comparison(found, tmp_path)
+    table = compare.write_comparison(found, tmp_path)
     assert table.count("| ground |") == 1
     empty = [line.split(",")[7] == "" for line in (tmp_path / "table.csv").read_text().split()]
     assert empty == [False, False, True]

@@ -43,15 +43,12 @@ def test_balanced_tiles_partition_into_equal_parts(number, size):
     assert len(tiles) == -(-number // size)
 
 
-def test_balanced_tiles_do_not_overlap():
+def test_balanced_tiles_do_not_overlap_and_cut_equal_points():
     points = np.random.default_rng(0).uniform(size=(512, 3)) * [8, 1, 1]
     ends = sorted(
         (points[tile, 0].min(), points[tile, 0].max()) for tile in balanced_tiles(points, 64)
     )
     assert all(first[1] <= second[0] for first, second in pairwise(ends))
-
-
-def test_balanced_tiles_equal_points_are_cut():
     assert sorted(map(len, balanced_tiles(np.ones((10, 3)), 4))) == [3, 3, 4]
 
 
@@ -108,13 +105,15 @@ def test_sample_by_tiles_keeps_points_in_proportion():
     assert abs((kept[:, 0] < 431_010).mean() - near) < 0.03
 
 
-def test_sample_by_tiles_samples_a_tile_as_the_sampler_does():
-    points = street(256)
-    centred = points - points.mean(0)
-    sphere = torch.from_numpy((centred / np.linalg.norm(centred, axis=1).max()).astype("f4"))
-    rows = FPSSampler(40)(sphere[None]).indices[0]
-    kept = sample_by_tiles(points, 256, 40, FPSSampler(40))
-    assert kept.tolist() == rows.sort().values.tolist()
+def test_sample_by_tiles_samples_every_tile_as_the_sampler_does(sampler):
+    points = street(512)
+    for one in (sampler, FPSSampler(64)):
+        expected: set[int] = set()
+        for tile in balanced_tiles(points, 256):
+            centred = points[tile] - points[tile].mean(0)
+            sphere = torch.from_numpy(centred / np.linalg.norm(centred, axis=1).max()).float()
+            expected.update(tile[one.select("completed", sphere[None], 40)[1][0].numpy()])
+        assert expected.issuperset(sample_by_tiles(points, 256, 64, one))
 
 
 def test_sample_by_tiles_all_points_and_too_many(sampler):

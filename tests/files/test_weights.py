@@ -45,7 +45,8 @@ def test_splat_is_pruned_by_opacity_with_all_properties(method, splat, tmp_path)
 def test_completed_set_is_filled_up_by_weight(folder, tmp_path):
     np.savez(
         tmp_path / "a.npz",
-        points=np.random.default_rng(0).normal(size=(300, 3)),
+        # Without the weights, all matches would be the points near the origin.
+        points=(np.random.default_rng(0).normal(size=(150, 2, 3)) * [[0.01], [1]]).reshape(-1, 3),
         score=np.arange(300) % 2,
     )
     settings = ["--weights", folder, "--m", 40, "--weight", "score", "--keep-attributes"]

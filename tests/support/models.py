@@ -28,6 +28,7 @@ def write_run(folder, node=NODE, learn="sampler", **fields):
         "trainer": {"max_epochs": 3},
     }
     metrics = {"test/m8/generated/accuracy": 0.5, "test/m8/fps/accuracy": 0.25}
+    metrics["test/m16/generated/accuracy"] = 0.75
     content = {
         "config": config,
         "metrics": metrics,

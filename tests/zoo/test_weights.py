@@ -76,7 +76,7 @@ def test_half_precision_tensors_are_cast_to_the_modules_dtype(saved):
 @pytest.mark.parametrize(
     "changes",
     [{"config": [1]}, {"metrics": "absent"}, {"classes": 5}, {"classes": [1]}, {"sha256": "absent"},
-     {"schema": "mops_lightning/weights/1"}, {"more": 1}],
+     {"sha256": "0" * 64}, {"schema": "mops_lightning/weights/1"}, {"more": 1}],
     ids=str,
 )  # fmt: skip
 def test_read_other_headers_are_refused(saved, changes):
