@@ -57,7 +57,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         temporary.replace(path)
     except OSError as error:
         # An error of a full disk names no file, others name the temporary one.
-        if error.filename in (None, str(temporary)):
+        if error.errno and error.filename in (None, str(temporary)):  # numpy gives no number
             error.filename = str(path)
         raise
     finally:

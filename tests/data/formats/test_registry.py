@@ -168,6 +168,6 @@ def test_pipe_and_endless_device_are_no_files(tmp_path):
 @pytest.mark.parametrize("suffix", WRITERS)
 def test_full_disk_is_one_error(suffix, tmp_path):
     random = np.random.default_rng(0).normal(size=(3000, 3))
-    with pytest.raises(UserError, match=rf"a{suffix}|Io|File too large"), full_disk():
+    with pytest.raises(UserError, match=rf"write .*a{suffix} \((?!.*None)"), full_disk():
         write(tmp_path / f"a{suffix}", Table(random))
     assert not list(tmp_path.iterdir())
