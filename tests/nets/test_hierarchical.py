@@ -17,6 +17,7 @@ from mops_lightning import (
     SNet,
     VoxelSampler,
 )
+from mops_lightning.errors import UserError
 from mops_lightning.nets.hierarchical import HierarchicalNet, Stage, carried
 from mops_lightning.types import Batch
 
@@ -65,6 +66,8 @@ def test_points_without_matrix_carry_the_feature_of_the_nearest_point(rng):
     near = torch.cdist(output.points, points).argmin(2)
     expected = features[torch.arange(2)[:, None], near]
     torch.testing.assert_close(carried(output, points, features), expected)
+    with pytest.raises(UserError, match=r"task\.net\.points .* 4 points .* SNet returns 5"):
+        Stage(SNet(m=5), 5, features.shape[2], 10, 4)(points[:, :4], features[:, :4])
 
 
 def test_losses_of_stages_are_part_of_the_step(rng):

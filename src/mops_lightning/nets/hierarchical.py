@@ -50,8 +50,18 @@ class Stage(nn.Module):
         """The sampler's losses in the last training step."""
 
     def forward(self, points: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Map ``(B, N, 3)`` points and ``(B, N, channels_in)`` features to m of each."""
+        """Map ``(B, N, 3)`` points and ``(B, N, channels_in)`` features to m of each.
+
+        Raises:
+            UserError: the stage's sampler returns m points only, and N is below m.
+        """
         n = points.shape[1]
+        if n < self.m and not getattr(self.sampler, "flexible", True):
+            raise UserError(
+                f"task.net.points must be at most the {n} points that the net is given, because "
+                f"its {type(self.sampler).__name__} returns {self.m} points only. Lower it, or "
+                "choose sampler@task.net.sampler=fps."
+            )
         output: SampleOutput = self.sampler(points, min(self.m, n))
         self.losses = output.losses
         centres = output.points

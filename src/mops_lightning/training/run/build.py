@@ -207,11 +207,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
 
 
 def _numbers(cfg: DictConfig, dataset: CloudDataset) -> tuple[dict[str, int], dict[str, int]]:
-    """Return the numbers of classes or parts that the task and its net take.
-
-    Raises:
-        UserError: one takes classes and the other parts, or the data have no parts.
-    """
+    """Return the numbers of classes or parts that the task and its net take, or refuse them."""
     offered = {"num_classes": len(dataset.class_names), "num_parts": len(dataset.part_names)}
     of_task, of_net = accepted(cfg.task, offered), accepted(cfg.task.net, offered)
     if of_task and of_net and not of_task.keys() & of_net.keys():

@@ -18,6 +18,8 @@ def other_tasks(cfg: DictConfig, dataset: CloudDataset) -> list[Task]:
     tasks: list[Task] = []
     for name in cfg.other_nets or () if cfg.learn == "sampler" else ():
         try:
+            if accepted(cfg.task, {"num_parts": 0}):
+                raise UserError("no file can name a net of segmentation. Leave other_nets out.")
             net, classes = read_net(name)
             known = accepted(cfg.task, {"num_classes": len(dataset.class_names)})
             tasks.append(build_as(Task, cfg.task, "task", net=net, **known))
