@@ -1,6 +1,7 @@
 """Tiles: cut, sampled, and thinned where they meet."""
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -112,7 +113,8 @@ def test_sample_by_tiles_samples_every_tile_as_the_sampler_does(sampler):
         for tile in balanced_tiles(points, 256):
             centred = points[tile] - points[tile].mean(0)
             sphere = torch.from_numpy(centred / np.linalg.norm(centred, axis=1).max()).float()
-            expected.update(tile[one.select("completed", sphere[None], 40)[1][0].numpy()])
+            rows: Any = one.select("completed", sphere[None], 40)[1]
+            expected.update(tile[rows[0].numpy()])
         assert expected.issuperset(sample_by_tiles(points, 256, 64, one))
 
 

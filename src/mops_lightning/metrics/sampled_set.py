@@ -29,7 +29,7 @@ class SetMetric(MeanOverClouds):
     """
 
     group: ClassVar[str]
-    higher_is_better: bool | None = None  # type: ignore[assignment]
+    higher_is_better: bool | None = None
     summary_order = None
 
     @staticmethod
