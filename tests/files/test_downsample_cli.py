@@ -23,7 +23,7 @@ GENERATED = ["--weights", "weights.safetensors", "--readout", "generated"]
         ([*GENERATED, "--keep-attributes"], "no attributes"),
         (["--m", 500, "--method", "fps"], "holds 299 points, fewer than --m 500"),
         ([*FPS, "--chunk", 4], "--chunk must be at least --m 5, got 4"),
-        ([*FPS, "--chunk", 9, "--map", "map.npz"], "use mops-lightning propagate after --chunk"),
+        ([*FPS, "--chunk", 9, "--map", "map.npz"], "use propagate after --chunk"),
         (["--weights", "weights.safetensors", "--chunk", 0], "--chunk must be at least 1, got 0"),
         (["--m", 9, "--method", "fps", "--tile", 1], "--tile must be at least 2"),
         (["--weights", "weights.safetensors", "--tile", 64], "--tile needs --m"),

@@ -138,7 +138,7 @@ HEAD = (
         ("a.npy", b"no", "a.npy is broken"),
         ("a.bin", b"12345678" * 3, "not a KITTI scan"),
         ("a.txt", b"1 2 abc\n3 4 5\n", "a.txt is broken"),
-        ("a.ply", ASCII.encode() + b"1 2 3\n", "declares 2 points"),
+        ("a.ply", ASCII.encode() + b"1 2 3\n", "says 2 points"),
         ("a.pcd", b"VERSION 7", "no DATA line"),
         ("a.pcd", HEAD.encode() + b"DATA binary\n123", "a.pcd is broken"),
         ("a.pcd", HEAD.encode() + b"DATA binary_compressed\n\x03\0\0\0\x80\x02\0\0123", "broken"),
