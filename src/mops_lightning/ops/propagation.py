@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional as F
@@ -280,8 +281,7 @@ def read_map(path: Path) -> PropagationMap:
     rows: Any = arrays.get("rows")
     m: Any = arrays.get("m")
     kinds = {array.dtype.kind for array in (rows, m) if array is not None}
-    sizes = rows is not None and m is not None and rows.ndim == 2 and rows.shape[1] and m.ndim == 0
-    if not sizes or kinds != {"i"} or m < 1:
+    if rows is None or m is None or kinds != {"i"} or not _sizes_fit(rows, m):
         raise UserError(
             f"{path} is no map: it must hold whole numbers, rows (N, k) and m of at least 1, got "
             f"{', '.join(arrays) or 'no arrays'}. Write it by downsample --map."
@@ -290,3 +290,7 @@ def read_map(path: Path) -> PropagationMap:
     if weights.shape != rows.shape or not (np.isfinite(weights).all() and (weights >= 0).all()):
         raise UserError(f"{path}: weights must be finite, at least 0, and of shape {rows.shape}.")
     return PropagationMap(torch.from_numpy(rows), torch.from_numpy(weights), int(m))
+
+
+def _sizes_fit(rows: NDArray[Any], m: NDArray[Any]) -> bool:
+    return rows.ndim == 2 and rows.shape[1] > 0 and m.ndim == 0 and bool(m >= 1)
