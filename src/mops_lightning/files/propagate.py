@@ -71,7 +71,8 @@ def propagate_file(
     if missing is not None:
         hint = did_you_mean(missing, sample.columns)
         raise UserError(f"--field: {small} has no column {missing!r}.{hint}")
-    if not 1 <= k <= (most := len(sample.points)):
+    most = len(sample.points)
+    if not 1 <= k <= most:
         raise UserError(f"--k must be from 1 to the {most} points of {small}, got {k}.")
     carried = {name: sample.columns[name] for name in fields}
     map_part = mapper(sample.points, k)

@@ -127,7 +127,8 @@ def _search(points: Tensor, sampled: Tensor, k: int, tree: Any = None) -> tuple[
             f"points and sampled must have the same number of coordinates, got {points.shape[1]} "
             f"and {sampled.shape[1]}."
         )
-    if not 1 <= k <= (most := len(sampled)):
+    most = len(sampled)
+    if not 1 <= k <= most:
         raise UserError(f"k must be from 1 to the number of sampled points, {most}, got {k}.")
     if not (bool(torch.isfinite(points).all()) and bool(torch.isfinite(sampled).all())):
         raise UserError("points and sampled must be finite, got NaN or infinity.")

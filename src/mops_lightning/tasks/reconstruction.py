@@ -96,10 +96,11 @@ class Reconstruction(Task):
         self, built: Tensor, clouds: Tensor, block: int | None, rounds: int
     ) -> Distances:
         """Return distances by cloud; that of the earth mover by one process per thread of torch."""
-        emd = None
+        # Before the other distance: gradients are summed in this order.
+        chamfer, emd = chamfer_distance(built, clouds), None
         if self.emd:
             emd = earth_movers_distance(built, clouds, block, rounds, torch.get_num_threads())
-        return Distances(chamfer_distance(built, clouds), emd)
+        return Distances(chamfer, emd)
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return mean distances and, except in training, which has no reference, NRE."""
