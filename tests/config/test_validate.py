@@ -29,7 +29,7 @@ WITH_ROOT = ("meshes", "hdf5", "clouds", "own_scans", "mesh_sequence")
 """Choices whose files the user must name."""
 FROM_CODE = {
     *("params", "optimizer", "total_steps"),  # of optimizers and schedules
-    *("net", "num_classes", "attributes"),  # of tasks, nets and samplers
+    *("net", "num_classes", "num_parts"),  # of tasks, nets and samplers
     *("m", "seed"),  # of baselines
     *("save_dir", "checkpoint", "score", "batch", "titles", "folder"),  # of loggers and callbacks
 }
