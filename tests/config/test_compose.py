@@ -62,7 +62,6 @@ LATE = "+trainer.val_check_interval=100"
         (["names={}"], "names={}: names follow from the chosen groups"),
         (["+names.foo=3"], "names follow from the chosen groups"),
         (["sampler@baselines.x=null"], "sampler@baselines.x=null: choose one"),
-        (["hydra/job_logging=[[1]]"], "hydra/job_logging=[[1]]: choose one"),
         (["--shell-completion"], "Expecting one subcommand from"),
         (["--shell-completion", "install=sh"], "No completion plugin for"),
         (["pretrain_from=nowhere"], "pretrain_from: no file or model 'nowhere'"),
