@@ -19,11 +19,11 @@ from mops_lightning.zoo.names import UNTRAINED
 
 DOWNSAMPLE = """Downsample clouds and meshes from files.
 
-IN is a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt .off .obj .stl .glb), a folder of them,
-or a pattern such as 'county/*.laz'. OUT is a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt) or
-a folder. Clouds are normalised to the unit sphere, as in training, sampled by a trained sampler
-(--weights) or an untrained method (--method), and mapped back. Meshes are first sampled on their
-surface."""
+IN is a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt .off .obj .stl .glb), a folder of them, a
+pattern such as 'county/*.laz', or the web address of a COPC file, of which an area is read. OUT is
+a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt) or a folder. Clouds are normalised to the unit
+sphere, as in training, sampled by a trained sampler (--weights) or an untrained method (--method),
+and mapped back. Meshes are first sampled on their surface."""
 
 PROPAGATE = """Carry labels, colours or scores from a sample to all points of a cloud.
 
@@ -64,7 +64,7 @@ def downsample(arguments: list[str], prog: str = "mops-lightning downsample") ->
 
 
 def _downsample_arguments(add: Add) -> None:
-    add("source", metavar="IN", type=Path, help="a file, a folder, or a pattern of files")
+    add("source", metavar="IN", help="a file, a folder, a pattern, or the address of a COPC file")
     add("target", metavar="OUT", type=Path, help="a file or a folder")
     add("--m", type=int, help="number of points to keep; default: as the weights were trained for")
     add("--weights", help=WEIGHTS)
@@ -131,10 +131,17 @@ def _downsample_arguments(add: Add) -> None:
 def _downsample(chosen: argparse.Namespace) -> int:
     """Do what the arguments say and return the exit status."""
     options = _options(chosen)
-    from mops_lightning.files.batch import file_pairs, is_many, process_file, process_folder
+    from mops_lightning.data.formats.remote import local
     from mops_lightning.files.downsample import load_sampler
 
     load_sampler(options)  # reports its mistakes before any file is read
+    with local(chosen.source, options.area) as chosen.source:
+        return _downsample_files(chosen, options)
+
+
+def _downsample_files(chosen: argparse.Namespace, options: Options) -> int:
+    from mops_lightning.files.batch import file_pairs, is_many, process_file, process_folder
+
     if chosen.cluster:  # workers may have a different working directory
         chosen.source = chosen.source.absolute()
     pairs = file_pairs(chosen.source, chosen.target)
@@ -171,6 +178,8 @@ def _options(chosen: argparse.Namespace) -> Options:
         raise UserError(f"--workers must be at least 1, got {chosen.workers}.")
     if chosen.cluster == "":
         raise UserError("--cluster must be the address of a Dask scheduler, got ''.")
+    if chosen.cluster and "://" in chosen.source:
+        raise UserError("--cluster: the workers do not see a copy from the web. Download the file.")
     if chosen.cluster and chosen.chunk is None:
         raise UserError("--cluster distributes the chunks of a file: give --chunk as well.")
     chosen.area = Area.parse(chosen.bounds, chosen.level, chosen.resolution)

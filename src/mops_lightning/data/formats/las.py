@@ -26,6 +26,9 @@ from mops_lightning.errors import UserError
 COPC = "copc"
 """The user of the records that index the points of a COPC file."""
 
+GAP = 2**16
+"""Bytes that are read with their neighbours rather than left out."""
+
 POINTS_PER_BYTE = 1024
 """Largest number of points per byte of a file, which may be compressed."""
 
@@ -124,6 +127,21 @@ def _parse_rows(path: Path, rows: range) -> Table:
 def _count_in_nodes(path: Path, area: Area) -> int:
     with _laspy(path).CopcReader.open(path) as reader:
         return sum(node.point_count for node in _nodes(reader, area))
+
+
+def ranges_of_bytes(path: Path, area: Area) -> list[tuple[int, int]]:
+    """Return where the octree's cells that overlap an area are in a file: starts and ends.
+
+    Cells with little between them are joined: an answer of a server takes as long as ``GAP`` bytes.
+    """
+    joined: list[tuple[int, int]] = []
+    with _laspy(path).CopcReader.open(path) as reader:
+        for node in _nodes(reader, area):
+            start, stop = node.offset, node.offset + node.byte_size
+            if joined and start - joined[-1][1] < GAP:
+                start = joined.pop()[0]
+            joined.append((start, stop))
+    return joined
 
 
 def _parse_nodes(area: Area, path: Path, rows: range) -> Table:
