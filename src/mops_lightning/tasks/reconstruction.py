@@ -43,9 +43,9 @@ class Reconstruction(Task):
 
     Args:
         net: maps ``(B, M, 3)`` points and a number n to ``(B, n, 3)``.
-        exact_up_to: largest number of points for the exact distance in scores.
-        emd: False leaves the earth mover's distance out of the loss and of the scores. A training
-            step then takes a half (auto-encoder) to a fifth (sampler) of the time.
+        exact_up_to: largest number of points for the exact distance in scores. None leaves the
+            earth mover's distance out of the loss and of the scores. A training step then takes a
+            half (auto-encoder) to a fifth (sampler) of the time.
     """
 
     score = NormalizedChamfer.name
@@ -53,10 +53,9 @@ class Reconstruction(Task):
     net_takes = ("points", "n_points")
     maps_pooled = "from_pooled"
 
-    def __init__(self, net: nn.Module, exact_up_to: int = 2048, emd: bool = True) -> None:
+    def __init__(self, net: nn.Module, exact_up_to: int | None = 2048) -> None:
         super().__init__(net)
         self.exact_up_to = exact_up_to
-        self.emd = emd
 
     def predict(self, batch: Batch, points: Tensor) -> Tensor:
         """Return reconstructions ``(B, N, 3)`` of the clouds from ``(B, M, 3)`` points."""
@@ -83,7 +82,7 @@ class Reconstruction(Task):
     def scores(self, batch: Batch, samples: Mapping[K, Tensor]) -> dict[K, TaskOutput]:
         """Return the distances of reconstructions from samples and, as targets, from all points."""
         clouds = batch.points
-        block = None if clouds.shape[1] <= self.exact_up_to else SCORED_BLOCK
+        block = None if clouds.shape[1] <= (self.exact_up_to or 0) else SCORED_BLOCK
 
         def scored(points: Tensor) -> Distances:
             return self._distances(self.predict(batch, points), clouds, block, SCORED_ROUNDS)
@@ -98,7 +97,7 @@ class Reconstruction(Task):
         """Return distances by cloud; that of the earth mover by one process per thread of torch."""
         # Before the other distance: gradients are summed in this order.
         chamfer, emd = chamfer_distance(built, clouds), None
-        if self.emd:
+        if self.exact_up_to is not None:
             emd = earth_movers_distance(built, clouds, block, rounds, torch.get_num_threads())
         return Distances(chamfer, emd)
 
@@ -107,7 +106,7 @@ class Reconstruction(Task):
         metrics: list[TableMetric] = [MeanChamfer()]
         if not training:
             metrics += [NormalizedChamfer(), NormalizedChamferOfMeans()]
-        if self.emd:
+        if self.exact_up_to is not None:
             metrics.append(MeanEMD())
             if not training:
                 metrics += [NormalizedEMD(), NormalizedEMDOfMeans()]
