@@ -111,6 +111,7 @@ def cloud_folder(
         folder, names, n_points, crop, crops, seed, cache, label
     )
     numbers = np.unique(np.concatenate(labels_of)) if labels_of else np.empty(0, np.int64)
+    parts_of = [torch.from_numpy(np.searchsorted(numbers, of_file)) for of_file in labels_of]
     clouds = {}
     for split in SPLITS:
         rows = [row for row, of_file in enumerate(splits) if of_file == split]
@@ -119,9 +120,7 @@ def cloud_folder(
             torch.cat([crops_of[row] for row in rows]),
             labels.repeat_interleave(crops),
             torch.tensor(rows).repeat_interleave(crops) if crops > 1 else None,
-            torch.from_numpy(np.searchsorted(numbers, np.concatenate([labels_of[r] for r in rows])))
-            if labels_of
-            else None,
+            torch.cat([parts_of[row] for row in rows]) if parts_of else None,
         )
     if crop != "surface":
         dataset = make_dataset("clouds", clouds, chosen, None, folder)

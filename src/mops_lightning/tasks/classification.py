@@ -11,6 +11,12 @@ from mops_lightning.tasks.base import Task
 from mops_lightning.types import Batch, TaskOutput
 
 
+def divergence(found: Tensor, reference: Tensor) -> Tensor:
+    """Return KL(reference ‖ found) over the last dimension of logits ``(..., C)``: ``(...)``."""
+    expected = reference.log_softmax(-1)
+    return (expected.exp() * (expected - found.log_softmax(-1))).sum(-1)
+
+
 class Classification(Task):
     """Classifies clouds from their sampled points.
 
@@ -41,8 +47,7 @@ class Classification(Task):
 
     def disagreement(self, found: Tensor, reference: Tensor) -> Tensor:
         """Return the Kullback-Leibler divergence KL(reference ‖ found) of the classes."""
-        expected = reference.log_softmax(1)
-        return (expected.exp() * (expected - found.log_softmax(1))).sum(1)
+        return divergence(found, reference)
 
     def step(self, batch: Batch, points: Tensor) -> TaskOutput:
         """Classify one batch.

@@ -12,6 +12,7 @@ from mops_lightning.metrics.base import collection
 from mops_lightning.metrics.segmentation import MeanIoU, PointAccuracy
 from mops_lightning.ops.propagation import interpolate
 from mops_lightning.tasks.base import Task, figures_of
+from mops_lightning.tasks.classification import divergence
 from mops_lightning.types import Batch, TaskOutput
 
 if TYPE_CHECKING:
@@ -52,8 +53,7 @@ class Segmentation(Task):
 
     def disagreement(self, found: Tensor, reference: Tensor) -> Tensor:
         """Return KL(reference ‖ found), the mean over the points of a cloud."""
-        expected = reference.log_softmax(2)
-        return (expected.exp() * (expected - found.log_softmax(2))).sum(2).mean(1)
+        return divergence(found, reference).mean(1)
 
     def step(self, batch: Batch, points: Tensor) -> TaskOutput:
         """Segment one batch.

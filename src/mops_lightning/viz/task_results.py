@@ -136,11 +136,12 @@ def part_grid(points: Tensor, parts: Mapping[str, Tensor], titles: Sequence[str]
     """
     figure = new_figure(2.4 * len(parts), 2.4 * len(points), "tight")
     most = max(int(numbers.max()) for numbers in parts.values())
-    for row, cloud in enumerate(upright(points)):
+    for row, cloud in enumerate(map(thinned, upright(points))):
         for column, (name, numbers) in enumerate(parts.items()):
             title, label = name if row == 0 else "", titles[row] if column == 0 else ""
             axes = cloud_axes(figure, len(points), len(parts), row, column, title, label)
-            colours: Any = {"c": numbers[row].cpu(), "cmap": "tab20", "vmin": 0, "vmax": most}
+            drawn = thinned(numbers[row, :, None].cpu())[:, 0]
+            colours: Any = {"c": drawn, "cmap": "tab20", "vmin": 0, "vmax": most}
             axes.scatter(*cloud.T, s=2, depthshade=False, **colours)
             frame_cloud(axes, cloud)
     return figure
