@@ -46,7 +46,7 @@ LIMITS: list[tuple[type[Sampler], dict[str, Any]]] = [
 """The smallest and largest allowed arguments."""
 START = "start must be at least 0, farthest, or null.* got"
 STARTS: tuple[Any, ...] = (-1, "nearest", "", True, 1.0, [0], np.array([1, 2]))
-WIDTH = "anchor_width must be between 0 and 100, got"
+WIDTH = "anchor_width must be above 0 and at most 100, got"
 WIDTHS = (0.0, -1.0, nan, 1e30)
 INVALID: list[tuple[type[Sampler], dict[str, Any], str]] = [
     *((FPSSampler, {"start": start}, START) for start in STARTS),

@@ -58,7 +58,7 @@ def _add(arguments: list[str], prog: str) -> list[str]:
     name, own = chosen.name, os.environ.get(names.VARIABLE)
     folder = chosen.folder or (names.folders()[0] if own else None)
     if folder is None:
-        raise UserError(f"give --folder FOLDER, or set ${names.VARIABLE} to one with models.")
+        raise UserError(f"give --folder FOLDER, or set ${names.VARIABLE} to a folder of models.")
     path = publish.add(
         chosen.run.expanduser(),
         name,

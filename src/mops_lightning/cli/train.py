@@ -46,7 +46,9 @@ def _run() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         if "${" in str(Path.cwd()):
-            raise UserError("the current path contains ${, which Hydra resolves. Use another.")
+            raise UserError(
+                "the current folder's path contains ${, which Hydra resolves. Use another."
+            )
         sys.argv[1:] = flags_first(sys.argv[1:])
         check_overrides(sys.argv[1:])
         if any(key(argument) == "evaluate" for argument in sys.argv[1:]):

@@ -78,7 +78,9 @@ def with_home(argument: str) -> str:
     try:
         return f"{argument.partition('=')[0]}={quote(str(Path(str(value)).expanduser()))}"
     except RuntimeError:
-        raise UserError(f"{argument}: no user has this name. For a folder: ./{value}") from None
+        raise UserError(
+            f"{argument}: no user has this name. For a folder, write ./{value}"
+        ) from None
 
 
 def quote(text: str) -> str:

@@ -82,7 +82,9 @@ class MOPSNet(Sampler):
         if anchors not in (None, "fps"):
             raise UserError(f"anchors must be fps or null, got {anchors!r}.")
         if not 0 < anchor_width <= MAX_WIDTH:
-            raise UserError(f"anchor_width must be between 0 and {MAX_WIDTH}, got {anchor_width}.")
+            raise UserError(
+                f"anchor_width must be above 0 and at most {MAX_WIDTH}, got {anchor_width}."
+            )
         if anchors is None and anchor_width != DEFAULT_WIDTH:
             raise UserError(
                 f"anchor_width has no effect without anchors=fps, got {anchor_width}. Add "

@@ -109,5 +109,7 @@ def locate_kitti(path: Path) -> CloudFile:
     """
     length = path.stat().st_size
     if not length or length % KITTI.itemsize:
-        raise BadCloudError(f"{path} is not a KITTI scan: {length} bytes are no rows of 4 float32.")
+        raise BadCloudError(
+            f"{path} is not a KITTI scan: {length} bytes are not rows of 4 float32."
+        )
     return binary_file(path, length // KITTI.itemsize, KITTI)

@@ -273,5 +273,7 @@ def _laspy(path: Path) -> Any:
     try:
         import laspy
     except ModuleNotFoundError:
-        raise UserError(f"{path}: it needs laspy: pip install 'mops-lightning[las]'.") from None
+        raise UserError(
+            f"{path}: LAS and LAZ need laspy: pip install 'mops-lightning[las]'."
+        ) from None
     return laspy
