@@ -102,7 +102,7 @@ def test_callback_with_an_unknown_metric_ends_in_one_line(name, tmp_path):
 
 def test_current_folder_that_is_an_interpolation_ends_in_one_line(tmp_path):
     (tmp_path / "${m}").mkdir()
-    assert "the current path contains ${" in refused(TINY, tmp_path / "${m}")
+    assert "path of the current folder contains ${" in refused(TINY, tmp_path / "${m}")
 
 
 def test_check_overrides_takes_names():

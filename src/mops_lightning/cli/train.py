@@ -47,7 +47,7 @@ def _run() -> None:
     try:
         if "${" in str(Path.cwd()):
             raise UserError(
-                "the current folder's path contains ${, which Hydra resolves. Use another."
+                "the path of the current folder contains ${, which Hydra resolves. Use another."
             )
         sys.argv[1:] = flags_first(sys.argv[1:])
         check_overrides(sys.argv[1:])
