@@ -22,7 +22,6 @@ from .samplers.samplenet import ProgressiveSampleNet as ProgressiveSampleNet
 from .samplers.samplenet import SampleNet as SampleNet
 from .samplers.serial import SerialSampler as SerialSampler
 from .samplers.snet import SNet as SNet
-from .samplers.submodular import SubmodularSampler as SubmodularSampler
 from .samplers.voxel import VoxelSampler as VoxelSampler
 from .types import SampleOutput as SampleOutput
 from .zoo.downsample import downsample as downsample

@@ -55,7 +55,7 @@ def test_second_run_in_folder_writes_nothing(tmp_path):
     ("settings", "said"),
     [
         (["sampler=fps", "recipe.distillation=5"], "with sampler=fps, which is not trained"),
-        (["sampler=submodular", "optimizer.lr=0.1"], "with sampler=submodular, which is not"),
+        (["sampler=critical", "optimizer.lr=0.1"], "with sampler=critical, which is not"),
         (["sampler=voxel", "baselines.fps=null"], "with sampler=voxel, which is not trained"),
         (["learn=nothing", "sampler=fps", "recipe.ema_span=0.1"], "with learn=nothing"),
         (["learn=task", "recipe.ema_span=0.1"], "with learn=task"),

@@ -1,4 +1,4 @@
-"""Examples of docs/api.md and docs/selection.md, run as written."""
+"""Examples of docs/api.md, run as written."""
 
 import re
 from pathlib import Path
@@ -12,9 +12,10 @@ import mops_lightning
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-def example(title, page="api.md"):
+def example(title):
     """Return the first Python block below a title."""
-    text = re.search(rf"#+ {title}\n.*?```python\n(.*?)```", (DOCS / page).read_text(), flags=re.S)
+    page = (DOCS / "api.md").read_text()
+    text = re.search(rf"#+ {title}\n.*?```python\n(.*?)```", page, flags=re.S)
     assert text is not None
     return text[1]
 
@@ -25,12 +26,6 @@ def test_labels_come_back_to_all_points():
     labels, points = names["labels"], names["points"]
     assert (labels.shape, labels.dtype) == ((4096,), torch.bool)
     assert ((points[:, 0] > 0.5) == labels).float().mean() > 0.9
-
-
-def test_points_are_selected_with_the_task_net():
-    names: dict[str, Any] = {}
-    exec(example("In Python", "selection.md"), names)
-    assert names["rows"].shape == (8, 64)
 
 
 def test_node_attributes_follow_in_pytorch_geometric():

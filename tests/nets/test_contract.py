@@ -76,7 +76,7 @@ def test_number_of_points_is_variable(name, n, rng):
     torch.testing.assert_close(net(points), net(points, n))
 
 
-@pytest.mark.parametrize("name", [*NETS, "pointnet"])
+@pytest.mark.parametrize("name", NETS)
 def test_result_follows_from_maxima_of_point_features(name, rng):
     net: Any = ALL[name](50).eval()
     points = torch.randn(2, 40, 3, generator=rng)

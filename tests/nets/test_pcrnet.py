@@ -35,13 +35,6 @@ def test_pcrnet_is_independent_of_order_and_batch(iterations, rng):
     assert module(source[:, :20], target).translation.shape == (4, 3)
 
 
-def test_pcrnet_motion_follows_from_maxima_of_point_features(rng):
-    module = net()
-    source, target = torch.randn(2, 4, 60, 3, generator=rng)
-    pooled = [module.point_features(cloud).amax(1) for cloud in (source, target)]
-    torch.testing.assert_close(module.from_pooled_pair(*pooled), module(source, target))
-
-
 def homogeneous(motion):
     """The 4×4 matrices of motions, by SciPy."""
     matrices = np.tile(np.eye(4), (len(motion.quaternion), 1, 1))

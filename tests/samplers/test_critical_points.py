@@ -1,6 +1,9 @@
+from typing import Any
+
 import pytest
 import torch
 
+from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.critical_points import CriticalSampler
 from mops_lightning.samplers.ordering import seeded_order
@@ -19,6 +22,41 @@ def test_critical_equals_plain_ranking(rng):
         number = min(20, sum(value > 0 for value in contribution))
         want = sorted(range(60), key=lambda row: -contribution[row])
         assert chosen[:number] == want[:number]
+
+
+def test_critical_leaves_net_as_it_is(rng):
+    net: Any = PointNetVanilla(3)
+    net.pool.eval()
+    modes = [module.training for module in net.modules()]
+    before = {name: value.clone() for name, value in net.state_dict().items()}
+    sampler = CriticalSampler(4, net)
+    sampler(torch.randn(2, 40, 3, generator=rng))
+    assert all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
+    net.point_features = None
+    with pytest.raises(TypeError):
+        sampler(torch.randn(2, 40, 3, generator=rng))
+    assert [module.training for module in net.modules()] == modes
+    assert not sampler.learned
+    assert not sampler.state_dict()
+
+
+def test_critical_large_batch_equals_small_ones(rng, monkeypatch):
+    net, points = PointNetVanilla(3), torch.randn(5, 40, 3, generator=rng)
+    whole = CriticalSampler(6, net)(points).indices
+    monkeypatch.setattr("mops_lightning.samplers.critical_points.BATCH_POINTS", 80)
+    assert torch.equal(CriticalSampler(6, net)(points).indices, whole)
+
+
+@pytest.mark.parametrize(
+    ("net", "words"),
+    [
+        (None, "net must be the task net.*CriticalSampler"),
+        (torch.nn.Linear(3, 3), "net must have features of single points.*got Linear"),
+    ],
+)
+def test_critical_unsuitable_net_raises(net, words):
+    with pytest.raises(UserError, match=words):
+        CriticalSampler(4, net)
 
 
 class FirstAxis(torch.nn.Module):

@@ -17,7 +17,6 @@ from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.samplers.serial import SerialSampler
 from mops_lightning.samplers.snet import SNet
-from mops_lightning.samplers.submodular import SubmodularSampler
 from mops_lightning.samplers.voxel import VoxelSampler
 
 SMALL: dict[str, Any] = {"feature_channels": (8, 6), "head_channels": (12, 10)}
@@ -38,7 +37,6 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "voxel": lambda m: VoxelSampler(m),
     "poisson": lambda m, **kw: PoissonSampler(m, **kw),
     "serial": lambda m: SerialSampler(m),
-    "submodular": lambda m, **kw: SubmodularSampler(m, PointNetVanilla(3), **kw),
     "critical": lambda m, **kw: CriticalSampler(m, PointNetVanilla(3), **kw),
     "gumbel": lambda m: GumbelSampler(m, feature_channels=(8, 6)),
     "mops": lambda m: MOPSNet(m, **MOPS_LAYERS),

@@ -79,7 +79,7 @@ def test_evaluation_same_group_keeps_settings_and_another_drops_them(run, tmp_pa
 
 
 @pytest.mark.parametrize(
-    "given", ["baselines={}", "baselines={fps: null}", "+sampler@baselines.own=submodular"]
+    "given", ["baselines={}", "baselines={fps: null}", "+sampler@baselines.own=critical"]
 )
 def test_evaluation_repeats_removed_and_added_baselines(given, tmp_path):
     run = write_run(tmp_path / "run", [*OVERRIDES, given])

@@ -42,15 +42,6 @@ def test_train_frozen_parts_stay_in_evaluation_mode():
     assert experiment("joint").train().task.training
 
 
-def test_test_refine_adds_readout():
-    data = small_dataset()
-    run = quiet_trainer(2)
-    module = experiment(refine=1)
-    run.test(module, CloudLoader(data.test, 4), verbose=False)
-    assert "test/refined/accuracy" in run.callback_metrics
-    assert module.score_name == "test/generated/accuracy"
-
-
 def test_learn_without_sampler_or_optimizer_raises():
     with pytest.raises(UserError, match="needs a sampler"):
         experiment("joint", sampler=None)

@@ -4,28 +4,23 @@ import torch
 from mops_lightning.metrics.base import collection
 from mops_lightning.metrics.classification import Accuracy
 from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.readout import complete
 from mops_lightning.training.readouts import readouts
 from mops_lightning.training.scores import Scores
 from tests.support.samplers import SAMPLERS
 
 
-@pytest.mark.parametrize("name", ["fps", "mops"])
+@pytest.mark.parametrize("name", ["mops", "fmops"])
 @torch.no_grad()
-def test_readouts_refine_starts_from_distinct_rows(name, rng):
-    sampler = SAMPLERS[name](8)
+def test_readouts_of_each_size_are_its_own_matches_completed(name, rng):
+    sampler = SAMPLERS[name](8).eval()
     points = torch.randn(3, 60, 3, generator=rng)
-    started = {}
-
-    def refine(rows):
-        started.update(rows)
-        return {m: 59 - one for m, one in rows.items()}
-
-    outputs = sampler.eval().sample_sizes(points, (8,))
-    samples = readouts(points, outputs, sampler, refine)[8]
-    *names, last = samples
-    assert last == "refined"
-    assert torch.equal(gather_points(points, started[8]), samples[names[-1]])
-    assert torch.equal(samples["refined"], gather_points(points, 59 - started[8]))
+    outputs = sampler.sample_sizes(points, (4, 8) if name == "fmops" else (8,))
+    for m, samples in readouts(points, outputs, sampler).items():
+        rows = torch.cdist(outputs[m].points, points).argmin(2)
+        assert torch.equal(samples["generated"], outputs[m].points)
+        assert torch.equal(samples["matched"], gather_points(points, rows))
+        assert torch.equal(samples["completed"], gather_points(points, complete(rows, points)))
 
 
 def test_scores_loss_of_nan_is_nan():

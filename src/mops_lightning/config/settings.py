@@ -210,14 +210,6 @@ class RunSettings:
         Affects.SCORES,
         nullable=True,
     )
-    refine: int = setting(
-        0,
-        "passes of local search with the task net (readout refined; slow); 0: off",
-        Affects.SCORES,
-        limits=whole(0),
-        learn=WITH_SAMPLER,
-        compare=False,  # the readout has its own rows in reports
-    )
     pictures: int = setting(
         4, "number of test clouds in the pictures; 0 for none", Affects.NOTHING, limits=whole(0)
     )

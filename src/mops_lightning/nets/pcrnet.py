@@ -90,17 +90,5 @@ class PCRNet(nn.Module):
         """
         return self.pool.values(self.features(points))
 
-    @property
-    def pools_points(self) -> bool:
-        """Whether the motion follows from ``point_features``: with one iteration."""
-        return self.iterations == 1
-
-    def from_pooled_pair(self, of_source: Tensor, of_target: Tensor) -> Motion:
-        """Map maxima of ``point_features`` of sources and targets, ``(B, C)`` each, to the motion.
-
-        Only where ``pools_points``.
-        """
-        return self._step(of_source, of_target, of_source)
-
     def _global(self, points: Tensor) -> Tensor:
         return self.pool(self.features(points))

@@ -48,10 +48,6 @@ class PointNetVanilla(nn.Module):
         """Return the features ``(B, N, 1024)`` before the maximum over points."""
         return self.pool.values(self.features(points))
 
-    def from_pooled(self, pooled: Tensor) -> Tensor:
-        """Map the maxima ``(B, 1024)`` to logits."""
-        return self.head(pooled)
-
 
 class TransformNet(nn.Module):
     """Predicts a square matrix for every cloud, the identity before training.

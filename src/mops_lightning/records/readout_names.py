@@ -7,7 +7,7 @@ GENERATED_READOUTS = ("generated", "matched", "completed")
 INDEX_READOUT = "sampled"
 """The only readout of samplers that choose input points."""
 REFINED = "refined"
-"""The completed or sampled points, improved by local search with the task net."""
+"""Points improved by local search with the task net, in records from before it was removed."""
 FULL = "full"
 """The cloud before sampling, as a reference."""
 SOFT_PROJECTED = "soft_projected"

@@ -1,18 +1,29 @@
 """Critical points: the points that win the task net's max-pooling."""
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from mops_lightning.samplers.task_net import TaskNetSampler
+from mops_lightning.errors import UserError
+from mops_lightning.ops.fps import farthest_point_fill
+from mops_lightning.ops.points import gather_points
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.ordering import seeded_order
+from mops_lightning.types import PointFeatureNet, SampleOutput
+
+BATCH_POINTS = 32768
+"""Number of points whose features are in memory together; at least one cloud."""
 
 
-class CriticalSampler(TaskNetSampler):
+class CriticalSampler(Sampler):
     """Choose the points that contribute most to the task net's max-pooled features.
 
     Nezhadarya et al., "Adaptive Hierarchical Down-Sampling for Point Cloud Classification", CVPR
     2020, section "Critical Points Layer". A point is critical if it has the largest value in at
     least one channel; its contribution is the sum of the values in these channels. Points are
     chosen in descending order of their contribution. Flexible and nested.
+
+    There is nothing to train and there are no weights to save: the net is not part of the module,
+    so ``parameters``, ``state_dict`` and ``to`` leave it out.
 
     Differences from the publication: there, the layer is inside a classifier that is trained with
     it, and works on that classifier's intermediate features; here, it selects input points by the
@@ -21,11 +32,11 @@ class CriticalSampler(TaskNetSampler):
 
     Args:
         m: largest number of points to return.
-        net: the task net, see ``TaskNetSampler``.
-        seed: breaks ties.
+        net: the task net; it is used in evaluation mode and without gradients.
+        seed: breaks ties, as for ``FPSSampler``.
 
     Raises:
-        UserError: ``net`` is missing or unsuitable.
+        UserError: ``net`` is missing, or has no features of single points under a maximum.
 
     Examples:
         >>> import torch
@@ -36,9 +47,68 @@ class CriticalSampler(TaskNetSampler):
         torch.Size([2, 8])
     """
 
-    def choose(self, features: Tensor, m: int) -> tuple[Tensor, Tensor]:
-        """Choose the points with the largest contributions; see ``TaskNetSampler.choose``."""
-        largest, winners = features.max(1)
-        contribution = torch.zeros_like(features[..., 0]).scatter_add_(1, winners, largest)
-        order = contribution.argsort(dim=1, descending=True, stable=True)
-        return order[:, :m], (contribution > 0).sum(1).clamp(1, m)
+    flexible = True
+    nested = True
+
+    def __init__(self, m: int, net: nn.Module | None = None, seed: int = 0) -> None:
+        super().__init__(m)
+        if net is None:
+            raise UserError(
+                "net must be the task net: CriticalSampler selects points by the net's features "
+                "and has no weights. In Python: CriticalSampler(m, net=task.net)."
+            )
+        if not isinstance(net, PointFeatureNet):
+            raise UserError(
+                "net must have features of single points under a maximum (point_features), as "
+                f"CriticalSampler needs them, got {type(net).__name__}. Choose another sampler, or "
+                "a task net such as PointNet, PCRNet or the auto-encoder."
+            )
+        self._net = (net,)  # in a tuple, torch does not register it as a submodule
+        self.seed = seed
+
+    @property
+    def net(self) -> PointFeatureNet:
+        """The task net."""
+        net = self._net[0]
+        assert isinstance(net, PointFeatureNet)
+        return net
+
+    def sample(self, points: Tensor, m: int) -> SampleOutput:
+        """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice."""
+        order = seeded_order(points, self.seed)
+        ordered = gather_points(points.detach(), order)
+        filled = farthest_point_fill(ordered, *self._chosen(ordered, m))
+        indices = order.gather(1, filled)
+        return SampleOutput(gather_points(points, indices), indices, {})
+
+    @torch.no_grad()
+    def _chosen(self, points: Tensor, m: int) -> tuple[Tensor, Tensor]:
+        net = self._net[0]
+        like = next(net.parameters(), points)
+        modes = {module: module.training for module in net.modules()}
+        batches = points.split(max(1, BATCH_POINTS // points.shape[1]))
+        net.eval()
+        try:
+            parts = [critical_points(self.net.point_features(part.to(like)), m) for part in batches]
+        finally:
+            for module, mode in modes.items():
+                module.training = mode
+        rows, counts = zip(*parts, strict=True)
+        return torch.cat(rows).to(points.device), torch.cat(counts).to(points.device)
+
+
+def critical_points(features: Tensor, m: int) -> tuple[Tensor, Tensor]:
+    """Choose the points with the largest contributions to the maxima of the channels.
+
+    Args:
+        features: ``(B, N, C)``, non-negative.
+        m: largest number of points to choose.
+
+    Returns:
+        ``(B, m)`` int64 rows in the order of choice, and ``(B,)`` int64 how many of them count,
+        at least one.
+    """
+    largest, winners = features.max(1)
+    contribution = torch.zeros_like(features[..., 0]).scatter_add_(1, winners, largest)
+    order = contribution.argsort(dim=1, descending=True, stable=True)
+    return order[:, :m], (contribution > 0).sum(1).clamp(1, m)

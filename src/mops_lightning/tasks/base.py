@@ -20,8 +20,8 @@ K = TypeVar("K")
 class Task(nn.Module):
     """Base of all tasks: owns the task net, its losses and its metrics.
 
-    A task implements ``step`` and ``metrics``, and, for distillation and the refined readout,
-    ``predict`` and ``disagreement``. ``scores`` calls ``step`` by default.
+    A task implements ``step`` and ``metrics``, and, for distillation, ``predict`` and
+    ``disagreement``. ``scores`` calls ``step`` by default.
 
     Args:
         net: the task net; its call signature is task-specific, see ``net_takes``.
@@ -48,10 +48,6 @@ class Task(nn.Module):
 
     clouds_per_prediction: int = 1
     """Number of clouds that a prediction needs; ``points`` contains all first ones, and so on."""
-
-    maps_pooled: str | None = None
-    """Name of the net's method that maps pooled features to the prediction, for tasks whose
-    prediction follows from them, as the refined readout needs it."""
 
     def __init__(self, net: nn.Module) -> None:
         super().__init__()

@@ -30,7 +30,6 @@ class Classification(Task):
 
     score = Accuracy.name
     requires_same_classes = True
-    maps_pooled = "from_pooled"
 
     def __init__(self, net: nn.Module, num_classes: int) -> None:
         super().__init__(net)

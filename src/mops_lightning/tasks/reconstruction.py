@@ -51,7 +51,6 @@ class Reconstruction(Task):
     score = NormalizedChamfer.name
     full_score = NormalizedChamfer.full_cloud_metric
     net_takes = ("points", "n_points")
-    maps_pooled = "from_pooled"
 
     def __init__(self, net: nn.Module, exact_up_to: int | None = 2048) -> None:
         super().__init__(net)

@@ -65,7 +65,6 @@ class Registration(Task):
     score = RotationError.name
     net_takes = ("source", "target")
     clouds_per_prediction = 2
-    maps_pooled = "from_pooled_pair"
 
     def __init__(self, net: nn.Module, resample: int | None = None) -> None:
         super().__init__(net)

@@ -5,7 +5,6 @@ Per batch: loader, ``sampler.sample_sizes``, ``readouts``, ``task.step``, losses
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from itertools import product
 from typing import Any
 
@@ -18,11 +17,10 @@ from torch.optim.lr_scheduler import LRScheduler
 from mops_lightning.config.settings import Learn
 from mops_lightning.errors import UserError
 from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
-from mops_lightning.records.readout_names import FULL, REFINED, SOFT_PROJECTED, size_prefix
+from mops_lightning.records.readout_names import FULL, SOFT_PROJECTED, size_prefix
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
-from mops_lightning.tasks.refinement import Refinement
 from mops_lightning.training.checkpoint import CHECKPOINT_KEY, SAVED, check_finite
 from mops_lightning.training.readouts import names_of_readouts, readouts
 from mops_lightning.training.recipe.distillation import Distillation, Targets
@@ -50,14 +48,13 @@ class Experiment(L.LightningModule):
             several, the metrics are named ``test/m32/generated/accuracy`` and so on.
         recipe: how the sampler is trained beyond its own losses; None: by these alone.
         task_lr_scale: with ``learn="joint"``, the task net's learning rate over the sampler's.
-        refine: passes of the refined readout in tests; 0: without this readout.
         other_tasks: the task with further frozen nets, under which the sampler is trained, too.
         test_logger: False keeps test metrics from the loggers and from ``trainer.test``'s result;
             None: they go to a logger if there is one.
         m: the size that is validated and gives the run's score; None: the sampler's.
 
     Raises:
-        UserError: task and sampler do not allow ``learn``; see ``Refinement``.
+        UserError: task and sampler do not allow ``learn``.
     """
 
     def __init__(
@@ -74,7 +71,6 @@ class Experiment(L.LightningModule):
         m: int | None = None,
         task_lr_scale: float = 1.0,
         recipe: Recipe | None = None,
-        refine: int = 0,
         other_tasks: Sequence[Task] = (),
         test_logger: bool | None = None,
     ) -> None:
@@ -104,8 +100,6 @@ class Experiment(L.LightningModule):
         self.main_readout, *others = names_of_readouts(self.sampler)
         score = task.full_score or task.score if self.sampler is None else task.score
         self.score_name = f"test/{self.prefixes.get(self.m, '')}{self.main_readout}/{score}"
-        self.refinement = Refinement(task, refine) if refine and self.sampler is not None else None
-        others += [] if self.refinement is None else [REFINED]
         names = dict.fromkeys([self.main_readout, *others, *self.baselines, FULL])
         self.scores = Scores(task.metrics, names, self.prefixes.values())
         self.train_scores = task.metrics(training=True)
@@ -283,8 +277,7 @@ class Experiment(L.LightningModule):
         """Score the learned readouts and the baselines at every size, and the full clouds."""
         with full_precision(self.device.type):
             outputs = self._sample(batch.points, self.sizes)
-            refine = None if self.refinement is None else partial(self.refinement, batch)
-            samples = readouts(batch.points, outputs, self.sampler, refine)
+            samples = readouts(batch.points, outputs, self.sampler)
             for name, baseline in self.baselines.items():
                 assert isinstance(baseline, Sampler)
                 sampled = baseline.sample_sizes(batch.points, self.sizes)

@@ -1,12 +1,12 @@
 """Readouts: the point sets that a user may take as the sampled set."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from torch import Tensor
 
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.readout import complete, match
-from mops_lightning.records.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT, REFINED
+from mops_lightning.records.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.types import SampleOutput
 
@@ -19,10 +19,7 @@ def names_of_readouts(sampler: Sampler | None) -> tuple[str, ...]:
 
 
 def readouts(
-    points: Tensor,
-    outputs: Mapping[int, SampleOutput],
-    sampler: Sampler | None,
-    refine: Callable[[Mapping[int, Tensor]], Mapping[int, Tensor]] | None = None,
+    points: Tensor, outputs: Mapping[int, SampleOutput], sampler: Sampler | None
 ) -> dict[int, dict[str, Tensor]]:
     """Return every readout at every size.
 
@@ -31,15 +28,13 @@ def readouts(
         outputs: what ``sampler.sample_sizes`` returned for them, by size.
         sampler: says whether it generates points and whether its sizes are nested; None for
             outputs that are the clouds themselves.
-        refine: improves rows ``(B, m)`` of the clouds, by size; see ``tasks.refinement``.
 
     Returns:
         By size m, then by readout, the points ``(B, m, 3)``: ``generated``, ``matched`` and
         ``completed`` of a sampler that generates points, ``sampled`` of one that selects them,
-        ``full`` without a sampler. With ``refine`` also ``refined``, from the last of these.
+        ``full`` without a sampler.
     """
     samples: dict[int, dict[str, Tensor]] = {}
-    rows: dict[int, Tensor] = {}
     names = names_of_readouts(sampler)
     generates = sampler is not None and sampler.generates
     # Points are matched one by one, so matching the largest nested set matches all smaller ones.
@@ -49,12 +44,7 @@ def readouts(
         sets = [output.points]
         if generates:
             matched = match(output.points, points) if largest is None else largest[:, :m]
-            rows[m] = complete(matched, points)
-            sets += [gather_points(points, matched), gather_points(points, rows[m])]
-        elif output.indices is not None:
-            rows[m] = output.indices
+            completed = complete(matched, points)
+            sets += [gather_points(points, matched), gather_points(points, completed)]
         samples[m] = dict(zip(names, sets, strict=True))
-    if refine is not None and rows:
-        for m, refined in refine(rows).items():
-            samples[m][REFINED] = gather_points(points, refined)
     return samples

@@ -8,20 +8,20 @@ from mops_lightning import FMOPSNet, FPSSampler, MOPSNet
 from mops_lightning.config.compose import compose
 from mops_lightning.data.corruptions import corrupt
 from mops_lightning.errors import UserError
-from mops_lightning.samplers.submodular import SubmodularSampler
+from mops_lightning.samplers.critical_points import CriticalSampler
 from mops_lightning.seeding import generator
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.run.build import augmentation, make_experiment, sizes_to_test, split
 from tests.support.training import small_dataset
 
-BASELINE = "+baselines.submodular._target_=mops_lightning.samplers.submodular.SubmodularSampler"
+BASELINE = "+baselines.critical._target_=mops_lightning.samplers.critical_points.CriticalSampler"
 
 
 def test_factory_gives_task_net_to_samplers_that_need_it():
-    for overrides in (["sampler=submodular", "sizes=[4,16]"], ["m=16", BASELINE]):
+    for overrides in (["sampler=critical", "sizes=[4,16]"], ["m=16", BASELINE]):
         made: Any = make_experiment(compose([*overrides, "m=8"]), small_dataset(), {})
-        sampler = made.baselines["submodular"] if len(made.baselines) else made.sampler
-        assert isinstance(sampler, SubmodularSampler)
+        sampler = made.baselines["critical"] if len(made.baselines) else made.sampler
+        assert isinstance(sampler, CriticalSampler)
         assert sampler.net is made.task.net
         assert not any(name.startswith(("sampler.net", "baselines")) for name in made.state_dict())
 

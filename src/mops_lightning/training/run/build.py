@@ -199,7 +199,6 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         sizes=sizes,
         m=cfg.m,
         task_lr_scale=cfg.task_lr_scale,
-        refine=cfg.refine,
         other_tasks=other_tasks(cfg, dataset) if sampler is not None and sampler.learned else (),
         test_logger=False,  # stages.test logs them, as one table
         recipe=_in_force(build_as(Recipe, cfg.recipe, "recipe"), sampler, cfg.learn),
