@@ -3,6 +3,7 @@
 import signal
 
 import pytest
+import torch
 
 from mops_lightning.records import run_record
 from mops_lightning.training.experiment import Experiment
@@ -46,11 +47,14 @@ def test_stopped_run_resumed_by_same_command_gives_same_weights(
     )
     monkeypatch.setattr(Experiment, "on_test_start", lambda _: stop_at("test"))
     command, number = [*SHORT, "out=stopped"], len(stops)
+    done = [6 if place == "test" else place + 1 for place in stops]
     for stop in range(number):
         status, _, err = call([*command, f"hydra.run.dir=stopped/{stop}"], tmp_path)
         assert (status, "Traceback" in err) == (130, False), err
         assert "ckpt_path=" in err
         assert run_record.read(tmp_path / "stopped" / str(stop)).status == "interrupted"
+        kept = tmp_path / "stopped" / str(stop) / "checkpoints" / "last.ckpt"
+        assert torch.load(kept, weights_only=True)["global_step"] == done[stop]
         command = [*SHORT, "out=stopped", "ckpt_path=last"]
     status, out, err = call([*command, f"hydra.run.dir=stopped/{number}"], tmp_path)
     assert (status, "Warm start" in out) == (0, False), err

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,13 @@ def test_run_cell_interrupted_resumes_to_same_result(start, tmp_path):
     assert start(*longer) == score
     resumed = str(run_record.read(tmp_path / "cell").resumed_from)
     assert resumed.endswith(f"{ASIDE}/1/checkpoints/last.ckpt")
+    # Of two checkpoints the newer one counts.
+    (tmp_path / "cell" / "checkpoints").mkdir(exist_ok=True)
+    shutil.copy(resumed, tmp_path / "cell" / "checkpoints")
+    path.write_text(json.dumps({**again.plain(), "status": "interrupted", "score": None}))
+    assert start(*longer) == score
+    resumed = str(run_record.read(tmp_path / "cell").resumed_from)
+    assert resumed.endswith(f"{ASIDE}/3/checkpoints/last.ckpt")
 
 
 class Killed(BaseException):

@@ -26,8 +26,8 @@ def batch(rng, number=4, points=48):
 def test_step_loss_is_chamfer_plus_emd(rng):
     given = batch(rng, points=32)  # a single block
     module = Reconstruction(AutoEncoder(32, 8, (8, 8))).eval()
-    losses = module.step(given, given.points).losses
-    built = module.net(given.points)
+    losses = module.step(given, given.points[:, :8]).losses
+    built = module.net(given.points[:, :8])
     assert set(losses) == {"chamfer", "emd"}
     torch.testing.assert_close(losses["chamfer"], chamfer_distance(built, given.points).mean())
     torch.testing.assert_close(losses["emd"], earth_movers_distance(built, given.points).mean())

@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 import torch
 
-from mops_lightning import FMOPSNet, FPSSampler, MOPSNet
+from mops_lightning import FMOPSNet, FPSSampler, MOPSNet, RandomSampler
 from mops_lightning.config.compose import compose
 from mops_lightning.data.corruptions import corrupt
 from mops_lightning.errors import UserError
@@ -33,6 +33,14 @@ def test_factory_first_weights_of_sampler_depend_on_seed_and_not_on_task_net():
 
     assert torch.equal(first(), first("task/net=dgcnn"))
     assert not torch.equal(first(), first("seed=1"))
+
+
+def test_factory_baseline_has_the_seed_of_the_run_or_its_own():
+    points = small_dataset().test.points[:2]
+    for seed in ("seed=3", "+baselines.random.seed=3"):
+        made: Any = make_experiment(compose([seed, "m=8"]), small_dataset(), {})
+        chosen = made.baselines["random"](points).points
+        assert torch.equal(chosen, RandomSampler(8, seed=3)(points).points)
 
 
 def test_factory_refuses_start_of_a_baseline_outside_of_the_clouds():

@@ -7,10 +7,12 @@ import pytest
 from mops_lightning.config.compose import compose
 from mops_lightning.config.overrides import readable
 from mops_lightning.errors import UserError
+from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.records import run_record
 from mops_lightning.training.evaluation import command_line
 from mops_lightning.training.run.run import run
 from mops_lightning.zoo import publish
+from mops_lightning.zoo.load import load_net
 from tests.support.command_line import job, refused, runs
 
 
@@ -135,6 +137,7 @@ def test_evaluate_joint_run_uses_its_task_net(tmp_path):
     record = job(tmp_path / "run", "learn=joint")
     again = evaluated((tmp_path / "run", record), tmp_path)
     assert again.metrics == record.metrics
+    assert type(load_net(tmp_path / "run")) is PointNetVanilla
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 import json
 
+import numpy as np
 import pytest
 import torch
 from filelock import FileLock
@@ -9,8 +10,10 @@ from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.training.run.pretrain import cache_folder
+from mops_lightning.training.run.run import run
 from mops_lightning.zoo import weights
-from tests.support.command_line import SMALL_PCRNET, TINY, call, job, start
+from tests.support.command_line import SMALL_PCRNET, TINY, TINY_ANY_DATA, call, job, start
+from tests.support.hdf5 import write_file
 
 
 def train(folder, *arguments):
@@ -68,6 +71,20 @@ def test_resume_other_weights_raises(tmp_path):
     for weights_, checkpoint in ((given, anew), ("weights=auto", begun)):
         with pytest.raises(UserError, match=r"from a run with other settings \(weights"):
             train(tmp_path, *task, weights_, f"ckpt_path={checkpoint}")
+
+
+def test_resume_on_changed_clouds_raises(tmp_path):
+    def trained(seed, *more):
+        for split in ("train", "test"):
+            points = np.random.default_rng(seed).random((4, 64, 3), np.float32)
+            write_file(tmp_path / f"{split}.h5", data=points, label=np.arange(4) % 2)
+        data = ["dataset=hdf5", f"dataset.root={tmp_path}", f"cache={tmp_path}/cache"]
+        given = [*TINY_ANY_DATA, *SMALL_PCRNET, "learn=task", *data, *more]
+        run(compose(given), tmp_path / str(seed), given)
+
+    trained(0)
+    with pytest.raises(UserError, match=r"from a run with other settings \(dataset"):
+        trained(1, f"ckpt_path={tmp_path}/0")
 
 
 def test_diverged_training_fails_without_weights(tmp_path):
@@ -139,6 +156,7 @@ def test_resume_with_fewer_epochs_than_done_raises(tmp_path):
     same = train(tmp_path, *task, "trainer.max_epochs=3", checkpoint)
     longer = train(tmp_path, *task, "trainer.max_epochs=4", checkpoint)
     assert [one.lengthened for one in (same, longer)] == [False, True]
+    assert len(files(tmp_path, "cache/weights/*/weights.safetensors")) == 1  # not of the longer one
 
 
 def test_resumed_pretraining_does_not_warn_about_its_folder(tmp_path, capsys, recwarn):
