@@ -45,7 +45,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and a message, and exit."""
-        super().error(printable(message))
+        super().error(as_line(message))
 
 
 class Interrupted(Exception):
@@ -100,6 +100,12 @@ def printable(text: str) -> str:
     )
 
 
+def as_line(text: str) -> str:
+    """Return the text of an error on one printable line, long words without their middle."""
+    short = re.sub(r"(\S{200})\S{100,}(\S{100})", r"\1…\2", text)
+    return printable(short.replace("\n", "\\n"))
+
+
 def file_error(error: OSError) -> str:
     """Return one line about a file or folder that cannot be read or written."""
     name = f"{error.filename}: " if error.filename else ""
@@ -140,7 +146,7 @@ def end(name: str, message: str, status: int) -> NoReturn:
     Raises:
         SystemExit: always, with ``status``.
     """
-    print(printable(f"{name}: {message}"), file=sys.stderr)
+    print(as_line(f"{name}: {message}"), file=sys.stderr)
     sys.exit(status)
 
 

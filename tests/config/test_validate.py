@@ -129,6 +129,7 @@ def test_rates_of_rival_samplers_fall_at_the_published_number_of_clouds():
         (["test_noise_std=inf"], "test_noise_std must be a number of at least 0"),
         (["trainer.precision=bf16"], "precision must be one of .*Did you mean 'bf16-mixed'"),
         (["dataset=meshes"], "dataset.root must be set"),
+        (["dataset=hdf5", "dataset.root=nan"], "dataset.root must be a text, got nan"),
         (["sampler=own"], "sampler._target_ must be set: give sampler._target_=MODULE.CLASS"),
         (["sampler._target_=mops_lightning.samplers.mops.MOPSNett"], "cannot import"),
         (["sampler._target_=mops_lightning"], "'mops_lightning' is neither a class nor a function"),

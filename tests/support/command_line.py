@@ -84,6 +84,7 @@ def refused(arguments, folder):
     status, out, err = call(arguments, folder)
     assert (status, err.count("\n")) == (2, 1), out + err
     assert err.startswith("mops_lightning: ")
+    assert len(err) < 1000
     return err
 
 

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from mops_lightning.cli.start import line_about_run
 from mops_lightning.config import settings
 from mops_lightning.config.settings import Affects
-from mops_lightning.errors import USER_ERROR, Interrupted, UserError, end, one_line
+from mops_lightning.errors import USER_ERROR, Interrupted, UserError, as_line, end, one_line
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
@@ -90,7 +90,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
         if text is None:
             log.exception(f"{folder} failed")
         else:
-            log.error(f"{folder} failed: {text}")
+            log.error(as_line(f"{folder} failed: {text}"))
         with suppress(OSError):  # the disk may be full
             (folder / FAILED).write_text(f"{text or one_line(error)}\n")
     return math.nan

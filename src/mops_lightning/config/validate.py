@@ -74,6 +74,7 @@ def check(cfg: DictConfig) -> None:
     for name, setting in declared.items():
         if setting.counts(plain["learn"]):
             _check_node(plain.get(name), name)
+    _check_finite(plain)
     if cfg.learn != "nothing" and cfg.trainer.max_epochs < 1:
         raise UserError(
             "trainer.max_epochs must be a whole number of at least 1, got "
@@ -111,13 +112,17 @@ def _check_table(value: Any, name: str) -> None:
 
 
 def _check_limits(config: dict[str, Any]) -> None:
-    """Refuse values outside of limits, NaN, infinity and whole numbers beyond 64 bits."""
+    """Refuse values outside of limits."""
     values = dotted(config)
     for path in (*settings.declared(), *settings.INSIDE):
         limits, value = settings.of(path).limits, values.get(path, MISSING)
         if limits and value != MISSING and not limits.fits(value):
             raise refusal(path, value)
-    for path, value in values.items():
+
+
+def _check_finite(config: dict[str, Any]) -> None:
+    """Refuse NaN, infinity and whole numbers beyond 64 bits."""
+    for path, value in dotted(config).items():
         for number in value if isinstance(value, list) else [value]:
             limit = 2**63 if isinstance(number, int) else float("inf")
             if isinstance(number, int | float) and not abs(number) < limit:  # NaN neither
@@ -141,9 +146,9 @@ def _check_node(node: Any, where: str) -> None:
     """Compare every ``_target_`` below ``node`` with its constructor's signature."""
     if not isinstance(node, dict):
         return
-    if node.get("_target_") == MISSING:
+    if node.get("_target_", "") in (None, MISSING):
         raise UserError(f"{where}._target_ must be set: give {where}._target_=MODULE.CLASS.")
-    if node.get("_target_") is not None:
+    if "_target_" in node:
         parameters = signature(str(node["_target_"]), where)
         takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
         for key in node:
@@ -179,9 +184,10 @@ def misfit(value: Any, annotation: Any) -> str | None:
         Such as "a whole number or null"; None where the value fits. A wrong text of several fixed
         ones fits: the constructor names the nearest right one.
     """
-    if get_origin(annotation) in (Union, UnionType):  # rates of torch's optimizers may be tensors
-        parts = (one for one in get_args(annotation) if getattr(one, "__name__", "") != "Tensor")
-        annotation = Union[tuple(parts)]  # noqa: UP007
+    if get_origin(annotation) in (Union, UnionType):  # no setting is a tensor or a Path
+        parts = [(one, getattr(one, "__name__", "")) for one in get_args(annotation)]
+        plain = tuple(one for one, name in parts if name not in ("Tensor", "Path"))
+        annotation = Union[plain]  # noqa: UP007
     if annotation is Parameter.empty:
         return None
     try:

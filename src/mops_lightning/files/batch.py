@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from rich.progress import track
 
 from mops_lightning.data.formats.registry import READABLE, WRITERS
-from mops_lightning.errors import UserError, one_line, printable
+from mops_lightning.errors import UserError, as_line, one_line, printable
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.filesystem import is_temporary
@@ -188,7 +188,7 @@ def process_folder(
         done["skipped"] = len(pairs) - len(todo)
     for source, error in sorted(failures.items()):
         name = "" if str(source) in str(error) else f"{source}: "
-        print(printable(f"failed: {name}{error}"), file=sys.stderr)
+        print(as_line(f"failed: {name}{error}"), file=sys.stderr)
     counts = ", ".join(f"{number} {state}" for state, number in done.items())
     left = f"; {dropped:,} points without finite coordinates left out" if dropped else ""
     print(printable(f"{len(pairs)} files: {counts}{left}; in {target}"))
