@@ -17,7 +17,7 @@ from mops_lightning.records.run_record import dotted
 
 ROOT = Path(__file__).parents[2] / "sweeps"
 SWEEPS = sorted(path.stem for path in ROOT.glob("*.yaml"))
-ON_SHAPES = ("ablation",)
+ON_SHAPES = ("ablation", "segmentation")
 """Sweeps that use the procedural shapes without the overlay."""
 TESTS_ONLY = ("noise", "corruptions")
 """Sweeps that test a trained run."""
@@ -96,7 +96,7 @@ def test_sweep_neighbours_differ_in_what_is_swept(name):
             assert not {path for path in different - followers if not path.startswith(allowed)}
 
 
-@pytest.mark.parametrize(("name", "number"), [("modelnet40", 49), ("ablation", 18)])
+@pytest.mark.parametrize(("name", "number"), [("modelnet40", 49), ("ablation", 18), ("segmentation", 19)])
 def test_cells_of_several_grids_have_folders_of_their_own(name, number):
     several = grids(composed(name))
     cells = [cell for grid in several for cell in BasicSweeper.split_arguments(grid, None)[0]]
