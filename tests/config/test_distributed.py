@@ -18,7 +18,7 @@ from tests.support.command_line import SMALL_PCRNET, TINY, call, call_anew
         ((15, 99, 0, 2), "Try batch_size=16"),
         ((4, 99, 0, 4), "Try batch_size=8"),
         ((8, 3, 0, 4), "devices=3"),
-        ((8, 9, 1, 2), "val_fraction holds out 1 of the training clouds, fewer than the 2 devices"),
+        ((8, 9, 1, 2), "2 devices are too many for 1 held-out clouds"),
     ],
 )
 def test_check_shares_indivisible_sizes_raise(numbers, said):

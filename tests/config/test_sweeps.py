@@ -96,7 +96,9 @@ def test_sweep_neighbours_differ_in_what_is_swept(name):
             assert not {path for path in different - followers if not path.startswith(allowed)}
 
 
-@pytest.mark.parametrize(("name", "number"), [("modelnet40", 49), ("ablation", 18), ("segmentation", 19)])
+@pytest.mark.parametrize(
+    ("name", "number"), [("modelnet40", 49), ("ablation", 18), ("segmentation", 19)]
+)
 def test_cells_of_several_grids_have_folders_of_their_own(name, number):
     several = grids(composed(name))
     cells = [cell for grid in several for cell in BasicSweeper.split_arguments(grid, None)[0]]

@@ -104,7 +104,7 @@ def test_rates_of_rival_samplers_fall_at_the_published_number_of_clouds():
         (["baselines.fps=3"], "baselines.fps must be null or settings .*, got 3"),
         (["~weights"], "weights cannot be removed"),
         (["batch_size=1"], "batch_size must be a whole number of at least 2"),
-        (["trainer=ddp", "trainer.strategy=fsdp"], "trainer.strategy: several devices work with"),
+        (["trainer=ddp", "trainer.strategy=fsdp"], "trainer.strategy must be one of auto, ddp"),
         (["trainer=ddp", "+trainer.sync_batchnorm=true"], "trainer.sync_batchnorm must be false"),
         (["+sampler.alpha.x=3"], r"sampler\.alpha must be a number, got {'x': 3}"),
         (["+trainer.gradient_clip_val=-1"], "gradient_clip_val must be null or a number above 0"),

@@ -14,9 +14,6 @@ from mops_lightning.errors import UserError
 RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "SLURM_PROCID")
 """Environment variables with a process's rank: Lightning's own, torchrun's and SLURM's."""
 
-STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true")
-"""Lightning's strategies that start every process as this program."""
-
 
 def is_distributed(cfg: DictConfig) -> bool:
     """Return whether the settings request more than one device."""
@@ -56,20 +53,6 @@ def started_together(cfg: DictConfig) -> bool:
     return is_distributed(cfg) and _number("WORLD_SIZE") + _number("SLURM_NTASKS") > 1
 
 
-def check_strategy(cfg: DictConfig) -> None:
-    """Check how several devices work together; Lightning checks the devices.
-
-    Raises:
-        UserError: a strategy that this program does not support.
-    """
-    strategy = cfg.trainer.get("strategy", "auto")
-    if is_distributed(cfg) and strategy not in STRATEGIES:
-        raise UserError(
-            f"trainer.strategy: several devices work with {', '.join(STRATEGIES)}, got "
-            f"{strategy!r}. Try trainer=ddp."
-        )
-
-
 def check_multirun(cfg: DictConfig) -> None:
     """Reject a sweep whose runs request several devices each.
 
@@ -95,16 +78,12 @@ def check_shares(batch_size: int, test_clouds: int, held_out: int, processes: in
     Raises:
         UserError: a process would have no clouds, too few, or fewer than another one.
     """
-    if test_clouds < processes:
-        raise UserError(
-            f"trainer.devices: {processes} devices are too many for {test_clouds} test clouds. "
-            f"Try trainer.devices={test_clouds}."
-        )
-    if 0 < held_out < processes:
-        raise UserError(
-            f"val_fraction holds out {held_out} of the training clouds, fewer than the {processes} "
-            "devices. Try val_fraction=0, or a larger one."
-        )
+    for name, clouds in (("test", test_clouds), ("held-out", held_out or processes)):
+        if clouds < processes:
+            raise UserError(
+                f"trainer.devices: {processes} devices are too many for {clouds} {name} clouds. "
+                f"Try trainer.devices={clouds}."
+            )
     if processes > 1 and (batch_size % processes or batch_size < 2 * processes):
         near = max(round(batch_size / processes), 2) * processes
         raise UserError(

@@ -11,7 +11,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import msgspec
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from mops_lightning.config import distributed, settings
+from mops_lightning.config import settings
 from mops_lightning.config.build import signature
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.records.run_record import dotted
@@ -85,7 +85,6 @@ def check(cfg: DictConfig) -> None:
             f"trainer.min_epochs must be at most trainer.max_epochs={cfg.trainer.max_epochs}, got "
             f"{fewest}."
         )
-    distributed.check_strategy(cfg)
 
 
 def refusal(path: str, value: Any) -> UserError:

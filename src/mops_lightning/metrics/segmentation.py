@@ -1,18 +1,13 @@
-"""How well the points of all test clouds are assigned to parts."""
+"""How well the points of all test clouds are assigned to parts, which are the classes here."""
 
-from typing import Any
-
-from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
+from torchmetrics.classification import MulticlassJaccardIndex
 
 from mops_lightning.metrics.base import TableMetric
+from mops_lightning.metrics.classification import Accuracy
 
 
 class MeanIoU(TableMetric, MulticlassJaccardIndex):
-    """Mean over parts of intersection over union, over the points of all clouds.
-
-    Args:
-        num_parts: number of parts.
-    """
+    """Mean over parts of intersection over union, over the points of all clouds."""
 
     name = "mean_iou"
     label = "mean IoU"
@@ -20,21 +15,9 @@ class MeanIoU(TableMetric, MulticlassJaccardIndex):
     scale = 100.0
     summary_order = 1
 
-    def __init__(self, num_parts: int, **extra: Any) -> None:
-        super().__init__(num_parts, **extra)
 
-
-class PointAccuracy(TableMetric, MulticlassAccuracy):
-    """Fraction of points that are assigned to their part.
-
-    Args:
-        num_parts: number of parts.
-    """
+class PointAccuracy(Accuracy):
+    """Fraction of points that are assigned to their part."""
 
     name = "point_accuracy"
-    unit = "%"
-    scale = 100.0
     summary_order = 2
-
-    def __init__(self, num_parts: int, **extra: Any) -> None:
-        super().__init__(num_parts, average="micro", **extra)

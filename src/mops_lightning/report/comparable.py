@@ -46,8 +46,8 @@ class Group:
 def groups(found: list[RunRecord], mixed: bool = False) -> list[Group]:
     """Split records of tests of samplers into groups that tables may show.
 
-    A table has one task, data set and task net. A net without weights, such as ICP, may be in one
-    table with a trained net, and tests of the same samplers under several nets are in one table.
+    A table has one task, data set and task net. A net without weights may be in one table with
+    a trained net, and tests of the same samplers under several nets are in one table.
 
     Args:
         found: completed records.

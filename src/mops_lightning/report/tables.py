@@ -246,7 +246,7 @@ def _row(record: RunRecord, readout: str, net: str) -> str:
         return f"{own}{WITH_NET}"
     if readout in (*READOUTS, FULL):
         return own
-    prefix = own.removesuffix(sampler_row(record))  # such as "icp on "
+    prefix = own.removesuffix(sampler_row(record))  # such as "dgcnn on "
     return prefix + baseline_name(record.config, readout)
 
 
@@ -288,7 +288,7 @@ def over_seeds(metric: MetricInfo, mean: float, std: float | None = None) -> str
 def sort_key(row: str) -> tuple[int, str]:
     """Return a key that sorts rows as the paper's tables do."""
     plain = row.removesuffix(WITH_NET)
-    _, other_net, sampler = plain.rpartition(" on ")  # such as "icp on mops fast"
+    _, other_net, sampler = plain.rpartition(" on ")  # such as "dgcnn on mops fast"
     name = sampler.split()[0]  # without its recipe
     number = ORDER.index(name) if name in ORDER else len(ORDER)
     return number + len(ORDER) * bool(other_net) * 2, row
