@@ -68,7 +68,7 @@ TRAINER = {
     "limit_test_batches": ABOVE_ZERO,
     "deterministic": Limits("true, false or warn", lambda x: x in (True, False, None, "warn")),
     "precision": one_of(*PRECISIONS, others=("32", 32, None)),
-    # Strategies that start every process as this program.
+    # Those that start every process as this program.
     "strategy": one_of("auto", "ddp", "ddp_find_unused_parameters_true"),
     # Each process pools and normalises its share of a batch in one step.
     "sync_batchnorm": Limits("false", lambda x: not x),

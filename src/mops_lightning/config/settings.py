@@ -288,7 +288,7 @@ INSIDE: dict[str, dict[str, Any]] = {
     "trainer._target_": _NOTHING,
     "trainer.accelerator": _NOTHING,
     "trainer.devices": _NOTHING,
-    "trainer.strategy": _NOTHING,
+    "trainer.strategy": {**_NOTHING, "limits": TRAINER["strategy"]},
 }
 """Settings inside groups: how they differ from their group."""
 
