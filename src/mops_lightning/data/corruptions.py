@@ -24,7 +24,7 @@ Corruption = Callable[[Tensor, float, torch.Generator], Tensor]
 """Corrupts a cloud ``(N, 3)`` at a level; the number of points returned depends on both only."""
 
 
-def corrupt(clouds: Clouds, spec: str | None) -> Clouds:
+def corrupt(clouds: Clouds, spec: str) -> Clouds:
     """Corrupt every cloud of a split.
 
     The draw depends on the position of a cloud in the split only, so that every method is tested on
@@ -33,13 +33,11 @@ def corrupt(clouds: Clouds, spec: str | None) -> Clouds:
 
     Args:
         clouds: a split, in the unit sphere.
-        spec: kind and severity, such as ``shear-3``, of ``KINDS`` and 1 to 5; None: no corruption.
+        spec: kind and severity, such as ``shear-3``, of ``KINDS`` and 1 to 5.
 
     Raises:
         UserError: there is no such kind or severity.
     """
-    if spec is None:
-        return clouds
     apply, level = parse(spec)
     points = [apply(cloud, level, generator(STREAM, s)) for s, cloud in enumerate(clouds.points)]
     stacked = torch.stack(points)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.data.formats.guard import reading
-from mops_lightning.data.formats.mesh import sample_mesh
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write, load_npz
 from mops_lightning.ops.points import UnitSphere
@@ -51,6 +50,8 @@ def sample_surface(
 
     def sample() -> list[NDArray[np.float32]]:
         random = np.random.default_rng([seed, int(digest[:16], 16)])
+        from mops_lightning.data.formats.mesh import sample_mesh  # imports the readers
+
         points, _ = sample_mesh(path, data, n_points, random)
         return [UnitSphere.around(points).normalise(points).numpy()]
 
@@ -58,9 +59,7 @@ def sample_surface(
 
 
 def cached(
-    path: Path | None,
-    kinds: Sequence[Kind],
-    make: Callable[[], list[NDArray[Any]]],
+    path: Path | None, kinds: Sequence[Kind], make: Callable[[], list[NDArray[Any]]]
 ) -> list[NDArray[Any]]:
     """Return clouds, and perhaps their parts, from a cache file, or make them and write the file.
 

@@ -6,7 +6,6 @@ from mops_lightning.config.build import accepted, build_as
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.tasks.base import Task
-from mops_lightning.zoo.load import read_net
 
 
 def other_tasks(cfg: DictConfig, dataset: CloudDataset) -> list[Task]:
@@ -17,6 +16,8 @@ def other_tasks(cfg: DictConfig, dataset: CloudDataset) -> list[Task]:
     """
     tasks: list[Task] = []
     for name in cfg.other_nets or () if cfg.learn == "sampler" else ():
+        from mops_lightning.zoo.load import read_net  # imports every net
+
         try:
             if accepted(cfg.task, {"num_parts": 0}):
                 raise UserError("no file can name a net of segmentation. Leave other_nets out.")

@@ -13,7 +13,6 @@ from mops_lightning.config import distributed
 from mops_lightning.config.build import build_as
 from mops_lightning.config.validate import check
 from mops_lightning.data.clouds import CloudDataset, noisy, scale_warning
-from mops_lightning.data.corruptions import corrupt
 from mops_lightning.errors import Interrupted, UserError, closed_outputs
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
@@ -171,5 +170,9 @@ def _load_data(cfg: DictConfig) -> CloudDataset:
     dataset: CloudDataset = build_as(CloudDataset, cfg.dataset, "dataset")
     if warning := scale_warning(dataset):
         print(warning, file=sys.stderr)
-    test = noisy(corrupt(dataset.test, cfg.test_corruption), cfg.test_noise_std)
-    return replace(dataset, test=test)
+    test = dataset.test
+    if cfg.test_corruption:
+        from mops_lightning.data.corruptions import corrupt
+
+        test = corrupt(test, cfg.test_corruption)
+    return replace(dataset, test=noisy(test, cfg.test_noise_std))
