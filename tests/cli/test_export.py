@@ -4,6 +4,7 @@ import torch
 from mops_lightning import load
 from mops_lightning.cli.models import export
 from tests.support.captured import captured, refused
+from tests.support.full_disk import full_disk
 
 
 def test_export_of_a_model_writes_a_file_that_runs_at_any_size(tmp_path):
@@ -37,3 +38,11 @@ def test_export_mistakes_are_one_line(arguments, words, tmp_path, monkeypatch):
     assert err.startswith("mops-lightning export: ")
     assert words in err
     assert [path.name for path in tmp_path.iterdir()] == ["old.onnx"]
+
+
+def test_export_on_a_full_disk_is_one_line(tmp_path):
+    target = tmp_path / "net.pt2"
+    with full_disk():
+        err = refused(export, ["mops.modelnet40-m32", target], "mops-lightning export")
+    assert f"{target}: File too large. Free some space" in err
+    assert not list(tmp_path.iterdir())

@@ -183,7 +183,5 @@ def export(arguments: list[str], prog: str) -> None:
         from mops_lightning.zoo.load import load
 
         difference = files.export(load(chosen.sampler), chosen.target, chosen.m)
-        size = chosen.target.stat().st_size / 1e6
-        print(
-            f"{chosen.target}: {size:.2f} MB; largest difference from the sampler {difference:.1e}"
-        )
+        told = f"largest difference from the sampler {difference:.1e}"
+        print(f"{chosen.target}: {_megabytes(chosen.target)} MB; {told}")

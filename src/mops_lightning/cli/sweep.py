@@ -242,7 +242,7 @@ class SweepSummary(Callback):
                 states[cell] = _state(cell)
         found = set(states.values())
         numbers = sorted(Counter(states.values()).items())
-        counts = ", ".join(f"{count} {state}" for state, count in numbers)
+        counts = ", ".join(f"{count} {state}" for state, count in numbers) or "no values to sweep"
         print(f"{len(states)} cells: {counts}; in {folder}")
         if "completed" in found:
             options = ["--mixed"] if self.mixed else []

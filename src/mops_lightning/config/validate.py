@@ -58,7 +58,6 @@ def check(cfg: DictConfig) -> None:
         raise refusal("learn", cfg.learn)
     # Resolved once: OmegaConf parses an interpolation each time it is read.
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
-    _check_limits(plain)
     if plain["test_corruption"] is not None:
         from mops_lightning.data import corruptions  # imports torch, which --help does without
 
@@ -74,7 +73,7 @@ def check(cfg: DictConfig) -> None:
     for name, setting in declared.items():
         if setting.counts(plain["learn"]):
             _check_node(plain.get(name), name)
-    _check_finite(plain)
+    _check_limits(plain)
     if cfg.learn != "nothing" and cfg.trainer.max_epochs < 1:
         raise UserError(
             "trainer.max_epochs must be a whole number of at least 1, got "
@@ -111,17 +110,13 @@ def _check_table(value: Any, name: str) -> None:
 
 
 def _check_limits(config: dict[str, Any]) -> None:
-    """Refuse values outside of limits."""
+    """Refuse values outside of limits, NaN, infinity and whole numbers beyond 64 bits."""
     values = dotted(config)
     for path in (*settings.declared(), *settings.INSIDE):
         limits, value = settings.of(path).limits, values.get(path, MISSING)
         if limits and value != MISSING and not limits.fits(value):
             raise refusal(path, value)
-
-
-def _check_finite(config: dict[str, Any]) -> None:
-    """Refuse NaN, infinity and whole numbers beyond 64 bits."""
-    for path, value in dotted(config).items():
+    for path, value in values.items():
         for number in value if isinstance(value, list) else [value]:
             limit = 2**63 if isinstance(number, int) else float("inf")
             if isinstance(number, int | float) and not abs(number) < limit:  # NaN neither

@@ -1,5 +1,6 @@
 """Export of learned samplers as plain layers: torch.export (.pt2) and ONNX (.onnx)."""
 
+import io
 import logging
 import warnings
 from collections.abc import Callable, Iterable
@@ -134,7 +135,9 @@ def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
     with torch.no_grad(), atomic_write(path) as temporary:
         program = torch.export.export(net, (example,), dynamic_shapes=dynamic)
         if path.suffix == ".pt2":
-            torch.export.save(program, temporary)
+            packed = io.BytesIO()  # on a full disk, torch would abort the process
+            torch.export.save(program, packed)
+            temporary.write_bytes(packed.getvalue())
             exported: Callable[[Tensor], Tensor] = torch.export.load(temporary).module()
         else:
             exported = _to_onnx(program, temporary)
