@@ -83,7 +83,7 @@ def test_curvature_is_computed_unless_it_is_a_column(tmp_path):
         ("labl", ["--method", "fps"], "has no column 'labl'. Did you mean 'label'?"),
         ("low", ["--method", "fps"], "must be finite and at least 0, got -1.0 in row 0"),
         ("hole", ["--method", "fps"], "must be finite and at least 0, got nan in row 2"),
-        ("", ["--method", "fps"], "has no column ''"),
+        ("", ["--method", "fps"], "no column ''. Allowed: curvature, few, hole, label, low."),
         ("few", ["--method", "fps"], "4 points have a weight above 0, fewer than m=5"),
         ("label", ["--method", "voxel"], "--weight: VoxelSampler takes no weights. Use fps"),
         ("label", ["--weights", "MODEL", "--readout", "matched"], "matched readout takes no"),
@@ -92,7 +92,7 @@ def test_curvature_is_computed_unless_it_is_a_column(tmp_path):
 )
 def test_weight_that_cannot_be_used_ends_in_one_line(field, arguments, said, folder, tmp_path):
     label = np.arange(50.0)
-    columns = {"label": label, "low": label - 1, "few": label * (label < 5)}
+    columns = {"label": label, "low": label - 1, "few": label * (label < 5), "curvature": label}
     hole = np.where(label == 2, np.nan, label)
     np.savez(tmp_path / "a.npz", allow_pickle=False, points=np.eye(50)[:, :3], hole=hole, **columns)
     arguments = [folder if argument == "MODEL" else argument for argument in arguments]

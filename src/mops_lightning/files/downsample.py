@@ -139,7 +139,7 @@ def weights_of(table: Table, field: str, source: Path) -> NDArray[np.float64]:
     if values is None and field == CURVATURE:
         return curvature(table.points)
     if values is None:
-        hint = did_you_mean(field, [*table.columns, CURVATURE])
+        hint = did_you_mean(field, {*table.columns, CURVATURE})
         raise BadCloudError(f"--weight: {source} has no column {field!r}.{hint}")
     values = values.astype(np.float64)
     if field == "opacity" and table.columns.keys() >= SPLAT:
