@@ -82,7 +82,7 @@ dataset=modelnet40: epochs.task=30 epochs.sampler=8
 dataset=modelnet40 task=reconstruction: epochs.task=200 epochs.sampler=60
 dataset=shapenet_core task=reconstruction: epochs.task=100 epochs.sampler=30
 dataset=clouds dataset.root=x task=reconstruction: epochs.task=100 epochs.sampler=30
-experiment=own_scans dataset.root=x: epochs.task=60 epochs.sampler=30
+experiment=own_scans dataset.root=x: epochs.task=60 epochs.sampler=90
 experiment=reconstruction_paper: epochs.task=400 epochs.sampler=250
 experiment=classification_paper: sampler.tau_min=0.1 sampler.alpha=30.0 optimizer.lr=0.0005
 experiment=classification_paper: optimizer.schedule.end_lr=1e-05 trainer.max_epochs=250
