@@ -66,6 +66,7 @@ LATE = "+trainer.val_check_interval=100"
         (["--shell-completion", "install=sh"], "No completion plugin for"),
         (["pretrain_from=nowhere"], "pretrain_from: no file or model 'nowhere'"),
         (["weights=nowhere.pt", *TINY_WITH_PICTURES], "weights: no file nowhere.pt"),
+        (["-m", "seed=range(0,1e9)"], "seed=range(0,1e9): more than 100,000 values."),
         (["task='\n'"], r"task=\n: no such choice. Allowed: classification, "),
         (["seed=" + "n" * 5000], "a whole number of at least 0, got 'nn"),
         ([*TINY, "recipe._target_=null"], "recipe._target_ must be set: give recipe._target_="),

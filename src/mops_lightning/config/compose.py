@@ -91,6 +91,8 @@ def check_overrides(arguments: Sequence[str]) -> None:
         if override is None:
             continue
         value: Any = override.value()
+        if override.is_range_sweep() and abs(value.stop - value.start) > 1e5 * abs(value.step):
+            raise UserError(f"{argument}: more than 100,000 values. Give fewer.")
         if override.is_delete():
             declared = settings.declared().get(group)
             if declared is not None and declared.group and not declared.nullable:
