@@ -144,6 +144,7 @@ class RunRecord:
         train_clouds: number of training clouds.
         test_clouds: number of test clouds.
         class_names: of the data.
+        part_names: of the data; empty without parts.
         dataset_facts: what the data set tells, such as the number of skipped meshes.
         parameters: their numbers by part: ``task``, ``sampler``.
         processes: that trained together.
@@ -181,6 +182,7 @@ class RunRecord:
     train_clouds: int | None = None
     test_clouds: int | None = None
     class_names: list[str] | None = None
+    part_names: list[str] | None = None
     dataset_facts: dict[str, Any] = field(default_factory=dict)
     parameters: dict[str, int] = field(default_factory=dict)
     processes: int | None = None

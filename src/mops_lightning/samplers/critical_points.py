@@ -60,8 +60,8 @@ class CriticalSampler(Sampler):
         if not isinstance(net, PointFeatureNet):
             raise UserError(
                 "net must have features of single points under a maximum (point_features), as "
-                f"CriticalSampler needs them, got {type(net).__name__}. Choose another sampler, or "
-                "a task net such as PointNet, PCRNet or the auto-encoder."
+                f"CriticalSampler needs them, got {type(net).__name__}. Choose another sampler; "
+                "PointNet, PCRNet and the auto-encoder have them, no segmentation net has."
             )
         self._net = (net,)  # in a tuple, torch does not register it as a submodule
         self.seed = seed

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from functools import singledispatch
 from inspect import signature
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from torch import Generator, Tensor, nn
 from torchmetrics import MetricCollection
@@ -36,8 +36,8 @@ class Task(nn.Module):
     full_score: str | None = None
     """Name of the metric that scores the task net on full clouds; None: ``score``."""
 
-    requires_same_classes: bool = False
-    """Whether the net's outputs are the classes of the data it was trained on."""
+    output_names: Literal["class_names", "part_names"] | None = None
+    """Field of the data that names the net's outputs; None: a net fits data of other classes."""
 
     make_batch: Callable[[Tensor, list[Generator]], Any] | None = None
     """Converts clouds ``(B, N, 3)``, given one random generator per cloud, to the batch that

@@ -29,7 +29,7 @@ class Classification(Task):
     """
 
     score = Accuracy.name
-    requires_same_classes = True
+    output_names = "class_names"
 
     def __init__(self, net: nn.Module, num_classes: int) -> None:
         super().__init__(net)

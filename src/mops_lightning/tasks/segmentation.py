@@ -35,7 +35,7 @@ class Segmentation(Task):
     """
 
     score = MeanIoU.name
-    requires_same_classes = True
+    output_names = "part_names"
 
     def __init__(self, net: nn.Module, num_parts: int, k: int = 3) -> None:
         super().__init__(net)

@@ -34,7 +34,7 @@ def save(
         module: the module whose ``state_dict`` is written.
         config: the run's configuration as plain data.
         metrics: test metrics by name.
-        classes: class names in the order of the outputs of a classifier.
+        classes: names of classes or parts in the order of the outputs of a task net.
     """
     header = {
         "schema": model_file.WEIGHTS,

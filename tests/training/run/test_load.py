@@ -164,6 +164,17 @@ def test_another_task_net_is_used_with_its_own_classes_only(trained, tmp_path):
         job(tmp_path / "swapped", *swapped, other)
 
 
+def test_net_of_other_parts_raises(tmp_path):
+    task = ["task=segmentation", "task.net.points=[16,8]"]
+    made = job(tmp_path / "cups", *task, "learn=task", "dataset.classes=[cup]")
+    lamps = "dataset.classes=[lamp]"
+    message = "3 parts, which are not the 3 parts of the data: vessel, handle, saucer .*label"
+    with pytest.raises(UserError, match=message):
+        job(tmp_path / "lamps", *task, lamps, "sampler=fps", f"weights={tmp_path}/cups")
+    with pytest.raises(UserError, match=message):
+        evaluated((tmp_path / "cups", made), tmp_path, lamps)
+
+
 def test_trained_run_not_evaluable_raises(trained, tmp_path):
     with pytest.raises(UserError, match="no folder"):
         command_line([f"evaluate={tmp_path}/none"])

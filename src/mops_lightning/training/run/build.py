@@ -129,6 +129,7 @@ def build_parts(
     record.dataset_fingerprint = dataset.fingerprint
     record.train_clouds, record.test_clouds = len(dataset.train.labels), len(dataset.test.labels)
     record.class_names = list(dataset.class_names)
+    record.part_names = list(dataset.part_names)
     record.dataset_facts = dataset.notes
     record.resumed_from = None if resumed is None else str(resumed.path)
     record.lengthened = resumed is not None and cfg.trainer.max_epochs > resumed.planned

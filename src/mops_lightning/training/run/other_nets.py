@@ -24,35 +24,37 @@ def other_tasks(cfg: DictConfig, dataset: CloudDataset) -> list[Task]:
             net, classes = read_net(name)
             known = accepted(cfg.task, {"num_classes": len(dataset.class_names)})
             tasks.append(build_as(Task, cfg.task, "task", net=net, **known))
-            if tasks[-1].requires_same_classes:
-                check_classes(classes, dataset, name)
+            check_names(classes, tasks[-1], dataset, name)
         except UserError as error:
             raise UserError(f"other_nets: {error}") from None
     return tasks
 
 
-def check_classes(names: list[str] | None, dataset: CloudDataset, what: str) -> None:
-    """Reject a net whose class numbers differ from the data's.
+def check_names(names: list[str] | None, task: Task, dataset: CloudDataset, what: str) -> None:
+    """Reject a net whose outputs are other classes or parts than the data's.
 
     Args:
-        names: the classes that the net was trained on; None if unknown.
+        names: the classes or parts that the net was trained on; None if unknown.
+        task: of the net.
         dataset: the data.
         what: the file or folder of the net.
 
     Raises:
         UserError: they differ, or are unknown.
     """
-    classes = list(dataset.class_names)
+    if task.output_names is None:
+        return
+    own = list(getattr(dataset, task.output_names))
+    kind = "classes" if task.output_names == "class_names" else "parts"
     if names is None:
         raise UserError(
-            f"{what} does not name the classes of its net, so it can be used with its own data "
-            "only."
+            f"{what} does not name the {kind} of its net, so it can be used with its own data only."
         )
-    if list(names) != classes:
-        missing = [name for name in names if name not in classes] or list(names)
+    if list(names) != own:
+        missing = [name for name in names if name not in own] or list(names)
         raise UserError(
-            f"{what}: its net has {len(names)} classes, which are not the {len(classes)} classes "
-            f"of the data: {', '.join(missing[:3])} ... instead of {', '.join(classes[:3])} .... "
-            "Give a task net of these classes with weights=auto, or data of its classes with "
-            "dataset.classes."
+            f"{what}: its net has {len(names)} {kind}, which are not the {len(own)} {kind} "
+            f"of the data: {', '.join(missing[:3])} ... instead of {', '.join(own[:3])} .... "
+            f"Give a task net of these {kind} with weights=auto, or data of its {kind} with "
+            "dataset.classes or dataset.label."
         )

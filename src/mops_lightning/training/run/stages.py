@@ -23,7 +23,7 @@ from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.recipe.warm_start import warm_start_sampler
 from mops_lightning.training.run.build import Parts, augmentation
 from mops_lightning.training.run.callbacks import CPUTime
-from mops_lightning.training.run.other_nets import check_classes
+from mops_lightning.training.run.other_nets import check_names
 from mops_lightning.training.run.trainer import log_test
 from mops_lightning.viz.figures import CLOUDS
 from mops_lightning.zoo import weights
@@ -52,8 +52,8 @@ def load_weights(parts: Parts, record: RunRecord, task_weights: Path | None) -> 
         except UserError as error:
             raise UserError(f"{setting}: {error}") from None
         record.weights_loaded = content["sha256"]
-        if task.requires_same_classes and content.get("classes"):
-            check_classes(content["classes"], parts.dataset, f"{setting}: {task_weights}")
+        if content.get("classes"):
+            check_names(content["classes"], task, parts.dataset, f"{setting}: {task_weights}")
     if parts.trained is not None:
         of_run = parts.cfg.weights == OF_RUN
         record.evaluated = load_trained(parts.trained, of_run, parts.experiment, parts.dataset)
@@ -78,8 +78,9 @@ def load_trained(
     """
     record, name = trained.record, trained.name
     own_data = record.dataset_fingerprint == dataset.fingerprint
-    if experiment.task.requires_same_classes and task_net and not own_data:
-        check_classes(record.class_names, dataset, f"{KEY}: {name}")
+    if task_net and not own_data:
+        outputs = getattr(record, str(experiment.task.output_names), None)
+        check_names(outputs, experiment.task, dataset, f"{KEY}: {name}")
     module = experiment.task if trained.trained_task_net else experiment.sampler
     assert module is not None  # learn=nothing builds a sampler
     has_weights = any(True for _ in experiment.task.parameters())
@@ -238,6 +239,7 @@ def save(parts: Parts, record: RunRecord) -> None:
         files[f"task_{weights.FILE}"] = task
     for name, module in files.items():
         assert module is not None  # only learn=task has no sampler
-        classes = parts.dataset.class_names if module is task and task.requires_same_classes else ()
-        weights.save(parts.folder / name, module, record.config, record.metrics, classes)
+        outputs = task.output_names if module is task else None
+        names = getattr(parts.dataset, outputs) if outputs else ()
+        weights.save(parts.folder / name, module, record.config, record.metrics, names)
         record.files[Path(name).stem] = name
