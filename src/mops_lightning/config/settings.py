@@ -214,9 +214,7 @@ class RunSettings:
         4, "number of test clouds in the pictures; 0 for none", Affects.NOTHING, limits=whole(0)
     )
     out: str = setting(
-        "outputs",
-        "folder for runs; every run makes its own folder in it",
-        Affects.NOTHING,
+        "outputs", "folder for runs; every run makes its own folder in it", Affects.NOTHING
     )
     cache: str = setting(
         "${oc.env:MOPS_CACHE,'~/.cache/mops_lightning'}",

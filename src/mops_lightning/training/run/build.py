@@ -138,10 +138,7 @@ def build_parts(
     trainer = make_trainer(cfg, folder, dataset, experiment, len(train.labels))
     parts = Parts(cfg, folder, dataset, train, held_out, experiment, trainer, resumed, trained)
     distributed.check_shares(
-        cfg.batch_size,
-        len(dataset.test.labels),
-        len(held_out.labels),
-        trainer.world_size,
+        cfg.batch_size, record.test_clouds, len(held_out.labels), trainer.world_size
     )
     if not parts.has_task_weights and cfg.weights not in (None, "auto", OF_RUN):
         raise UserError(
