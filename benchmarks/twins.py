@@ -48,8 +48,8 @@ def _convolutions(stack: nn.Sequential) -> nn.Sequential:
 
 def plain_farthest_point_sample(points: Tensor, m: int) -> Tensor:
     """Return the rows ``(m,)`` of a farthest point sample of ``(N, 3)``, starting with row 0."""
-    rows = torch.zeros(m, dtype=torch.int64)
-    distance = torch.full((len(points),), torch.inf)
+    rows = torch.zeros(m, dtype=torch.int64, device=points.device)
+    distance = torch.full((len(points),), torch.inf, device=points.device)
     for place in range(1, m):
         away = (points - points[rows[place - 1]]).square().sum(1)
         distance = torch.minimum(distance, away)
