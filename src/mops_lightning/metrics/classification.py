@@ -21,7 +21,8 @@ class Accuracy(TableMetric, MulticlassAccuracy):
     averaging: ClassVar[Literal["micro", "macro"]] = "micro"
 
     def __init__(self, num_classes: int, **extra: Any) -> None:
-        super().__init__(num_classes, average=self.averaging, **extra)
+        # Checking the labels in every step would wait for a GPU; the data sets have checked them.
+        super().__init__(num_classes, average=self.averaging, validate_args=False, **extra)
 
 
 class MeanClassAccuracy(Accuracy):
