@@ -56,11 +56,10 @@ class Distillation:
             batch: whose points the prediction is of.
             seen: ``(B, N, 3)`` the points that the step sees, whose features are pooled.
         """
-        compares_features = self.recipe.feature_distillation > 0
         return [
             Targets(
                 self._prediction(number, batch) if self.predicts else None,
-                pooled_features(task.net, seen) if compares_features else None,
+                pooled_features(task.net, seen) if self.recipe.feature_distillation else None,
             )
             for number, task in enumerate(self.tasks)
         ]
