@@ -165,7 +165,7 @@ def test_distillation_targets_are_whole_clouds_and_features_of_seen_points(augme
     ((_, seen, output),) = sampler.samples
     (call,) = calls
     assert (seen.shape[1], call.clouds.shape[1]) == (20, 40)
-    assert (module.distillation.tables == []) == (augment is not None)
+    assert (module.distillation.table is None) == (augment is not None)
     with torch.no_grad():
         apart = (module.task.net(output.points) - module.task.net(call.clouds)).square().mean()
         found, wanted = (points.relu().amax(1) for points in (output.points, seen))
@@ -187,12 +187,42 @@ def test_losses_under_several_nets_are_means_and_scores_of_the_first(calls):
         assert not any(net.weight.requires_grad for net in nets)
         assert not any(one.training for one in module.other_tasks)
     one, two, both = logged.values()
-    for name in ("task", "distillation", "feature_distillation"):
+    for name in ("task", "feature_distillation"):
         values = [found[f"train/loss/{name}"] for found in (one, two, both)]
         assert values[2] == pytest.approx((values[0] + values[1]) / 2, rel=1e-4)
     assert one["train/loss/task"] != pytest.approx(two["train/loss/task"], rel=0.1)
     own = [name for name in one if "/loss/" not in name and "loss" not in name]
     assert [both[name] for name in own] == [one[name] for name in own]
+
+
+def test_nets_drawn_in_a_step_are_compared_with_predictions_of_the_first(calls):
+    used = []
+
+    class NotedTask(ComparedTask):
+        def step(self, batch, points):
+            result = super().step(batch, points)
+            if points.requires_grad:
+                used.append((self, points.detach(), batch.points))
+            return result
+
+    tasks = [NotedTask(Fingerprint()) for _ in range(4)]
+    for number, task in enumerate(tasks):
+        torch.nn.init.constant_(task.net.weight, 1 + number)
+    recipe = Recipe(distillation=3.0, nets_per_step=2)
+    _, logged = fitted(
+        noting(MOPSNet, 8, **MOPS), epochs=2, task=tasks[0], others=tasks[1:], recipe=recipe
+    )
+    steps = [used[i : i + 3] for i in range(0, len(used), 3)]
+    drawn = [[tasks.index(task) for task, *_ in step] for step in steps]
+    assert len(drawn) == 8
+    assert all(step[0] == 0 and len(set(step)) == 3 for step in drawn)
+    assert {number for step in drawn for number in step} == {0, 1, 2, 3}
+    with torch.no_grad():
+        apart = [
+            (task.net(points) - tasks[0].net(clouds)).square().mean()
+            for task, points, clouds in steps[-1]
+        ]
+    assert logged["train/loss/distillation"] == pytest.approx(float(sum(apart)), rel=1e-4)
 
 
 class InTests(MeanFingerprint):

@@ -231,7 +231,7 @@ class Experiment(L.LightningModule):
     ) -> dict[str, Tensor]:
         """Return the loss terms at one size: the task's, distillation and the sampler's own.
 
-        The first two are means over the task nets. The task's target is the whole batch, also
+        The first two are means over the step's task nets. The task's target is the whole batch, also
         where the sampler has seen a part of its points.
         """
         soft = sampled.soft_projected
@@ -241,7 +241,11 @@ class Experiment(L.LightningModule):
             inputs.append(straight_through(sampled, seen, completed))
         terms: dict[str, Tensor] = {}
         tasks: list[Any] = [self.task, *self.other_tasks]
-        for points, (number, task) in product(inputs, enumerate(tasks)):
+        numbers = range(len(tasks))
+        if drawn := self.recipe.nets_per_step:
+            numbers = [0, *(torch.randperm(len(self.other_tasks))[:drawn] + 1).tolist()]
+        for points, number in product(inputs, numbers):
+            task = tasks[number]
             result = task.step(batch, points)
             if points is inputs[0] and task is self.task:
                 self.train_scores.update(result.predictions, result.targets)
@@ -249,7 +253,7 @@ class Experiment(L.LightningModule):
             if self.distillation is not None and targets is not None:
                 losses |= self.distillation.losses(number, points, result.output, targets)
             for name, value in losses.items():
-                terms[name] = terms.get(name, 0) + value / (len(inputs) * len(tasks))
+                terms[name] = terms.get(name, 0) + value / (len(inputs) * len(numbers))
         return {**terms, **sampled.losses}
 
     def _log_training(self, losses: dict[str, Tensor], readout: str, clouds: int) -> None:

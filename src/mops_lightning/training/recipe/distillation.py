@@ -24,7 +24,7 @@ class Distillation:
     """The recipe's two distillation losses of one experiment, for each of its frozen task nets.
 
     Args:
-        tasks: with one task net each.
+        tasks: with one task net each; all are compared with the first one's predictions.
         recipe: for the weights of the losses.
     """
 
@@ -32,7 +32,7 @@ class Distillation:
         self.tasks = tasks
         self.recipe = recipe
         self.predicts = recipe.distillation > 0
-        self.tables: list[Tensor] = []
+        self.table: Tensor | None = None
 
     def start(self, loader: Any, device: torch.device) -> None:
         """Compute the predictions for all points of every training cloud, if they stay the same.
@@ -46,7 +46,7 @@ class Distillation:
         """
         fixed = isinstance(loader, CloudLoader) and loader.keeps_clouds
         if self.predicts and fixed:
-            self.tables = [full_predictions(task, loader, device) for task in self.tasks]
+            self.table = full_predictions(self.tasks[0], loader, device)
 
     @torch.no_grad()
     def targets(self, batch: Batch, seen: Tensor) -> list[Targets]:
@@ -56,18 +56,17 @@ class Distillation:
             batch: whose points the prediction is of.
             seen: ``(B, N, 3)`` the points that the step sees, whose features are pooled.
         """
+        prediction = self._prediction(batch) if self.predicts else None
+        pooled = self.recipe.feature_distillation
         return [
-            Targets(
-                self._prediction(number, batch) if self.predicts else None,
-                pooled_features(task.net, seen) if self.recipe.feature_distillation else None,
-            )
-            for number, task in enumerate(self.tasks)
+            Targets(prediction, pooled_features(task.net, seen) if pooled else None)
+            for task in self.tasks
         ]
 
-    def _prediction(self, number: int, batch: Batch) -> Any:
-        if not self.tables or batch.rows is None:
-            return self.tasks[number].predict(batch, batch.points)
-        return self.tables[number][batch.rows]
+    def _prediction(self, batch: Batch) -> Any:
+        if self.table is None or batch.rows is None:
+            return self.tasks[0].predict(batch, batch.points)
+        return self.table[batch.rows]
 
     def losses(
         self, number: int, points: Tensor, output: Any, targets: list[Targets]

@@ -42,6 +42,8 @@ class Recipe:
             average is validated, tested and saved. None: the last weights are.
         straight_through_set: the points of ``straight_through``, ``matched`` or ``completed``. The
             farthest points of a completed set have no gradients.
+        nets_per_step: how many of ``other_nets``, drawn anew, a step computes its losses under,
+            besides the run's own net; None: all.
 
     Raises:
         UserError: an attribute is out of range.
@@ -56,10 +58,11 @@ class Recipe:
     straight_through: float | None = None
     ema_span: float | None = None
     straight_through_set: Literal["matched", "completed"] = "matched"
+    nets_per_step: int | None = None
 
     def __post_init__(self) -> None:
         """Check the attributes."""
-        for name in ("train_points", "task_points"):
+        for name in ("train_points", "task_points", "nets_per_step"):
             points = getattr(self, name)
             if points is not None and points < 1:
                 raise UserError(f"{name} must be at least 1 or null, got {points}.")
