@@ -88,7 +88,7 @@ class MOPSNet(Sampler):
         if anchors is None and anchor_width != DEFAULT_WIDTH:
             raise UserError(
                 f"anchor_width has no effect without anchors=fps, got {anchor_width}. Add "
-                "anchors=fps, or leave anchor_width out."
+                f"anchors=fps, or set anchor_width={DEFAULT_WIDTH}."
             )
         if not 0 <= threshold < 1:
             raise UserError(f"threshold must be at least 0 and below 1, got {threshold}.")
