@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.kept_choices import keep_choices
+
 if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(2)
 
@@ -22,20 +24,25 @@ if "OMP_NUM_THREADS" not in os.environ:
 # the time of tests that compose.
 gc.freeze()
 gc.set_threshold(50_000, 20, 50)
+keep_choices()
 
 
 SLOW_FILES = (
-    *("training/run/test_tensorboard", "docs/test_notebooks", "cli/test_train"),
+    *("training/run/test_tensorboard", "config/test_sweeps", "config/test_validate"),
+    *("docs/test_notebooks", "cli/test_train"),
     *("cli/test_launchers", "config/test_distributed", "samplers/test_memory"),
     *("files/test_engine", "training/test_checkpoint", "training/run/test_pretrain"),
     *("cli/test_resume", "docs/test_site", "report/test_page", "fuzz/test_command_lines"),
     *("test_wheel", "training/test_precision", "training/run/test_load", "zoo/test_export"),
     *("training/recipe/test_warm_start", "cli/test_sweep", "files/test_batch", "zoo/test_models"),
     *("docs/test_extend", "docs/test_own_network", "hydra_plugins/test_grid_sweeper"),
-    *("config/test_sweeps", "samplers/test_contract", "training/run/test_run"),
+    *("samplers/test_contract", "training/run/test_run"),
     *("training/run/test_build", "training/test_evaluation", "tasks/test_contract"),
 )
-"""Files of few tests that take long. They begin first, or one process would end alone with one."""
+"""Files of few tests that take long. They begin first, or one process would end alone with one.
+
+Only the first file needs compiled loops: the others begin when it has written them to disk.
+"""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

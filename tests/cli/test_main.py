@@ -48,7 +48,8 @@ def test_version_is_that_of_the_package(tmp_path):
 
 
 def test_waiting_threads_soon_sleep(tmp_path):
-    arguments = ["sampler=fps", "m=0"]  # imports torch, then ends
+    # Imports torch, then ends.
+    arguments = ["downsample", "nowhere", "out", "--method=fps", "--m=4"]
     _, _, err = call_anew(arguments, tmp_path, OMP_DISPLAY_ENV="VERBOSE")
     if "GOMP_SPINCOUNT" not in err:
         pytest.skip("torch uses another OpenMP library")

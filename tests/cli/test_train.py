@@ -7,14 +7,14 @@ import pytest
 from mops_lightning.cli.train import flags_first
 from mops_lightning.records import run_record
 from mops_lightning.zoo import weights
-from tests.support.command_line import SMALL_PCRNET, TINY, TINY_WITH_PICTURES, call, call_anew, runs
+from tests.support.command_line import SMALL_PCRNET, TINY, TINY_WITH_PICTURES, call, runs
 
 
 @pytest.fixture(scope="module")
 def main_job(tmp_path_factory):
     """The main job, small, once: its folder, its run's folder and what it printed."""
     folder = tmp_path_factory.mktemp("main")
-    status, out, err = call_anew(TINY_WITH_PICTURES, folder)
+    status, out, err = call(TINY_WITH_PICTURES, folder)
     assert status == 0, err
     (run,) = runs(folder)
     return folder, run, out, err

@@ -58,6 +58,7 @@ LATE = "+trainer.val_check_interval=100"
         ([*TINY, "sampler._target_=collections.Counter"], "must return a Sampler, got Counter."),
         (["sampler={a:1}"], "sampler.a: no such setting. Did you mean 'sampler.m'"),
         (["task/net={a:1}"], "task/net={a:1}: choose one with task/net=NAME"),
+        (["hydra/job_logging=[[1]]"], "choose one with hydra/job_logging=NAME"),
         ([*TINY, "logger=tensorboard", "+logger.foo=1"], "takes no setting 'foo'"),
         (["names={}"], "names={}: names follow from the chosen groups"),
         (["+names.foo=3"], "names follow from the chosen groups"),

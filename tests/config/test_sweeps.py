@@ -85,7 +85,7 @@ def test_sweep_neighbours_differ_in_what_is_swept(name):
         first = {key: several[0] for key, several in values.items()}
         for key in (key for key, several in values.items() if len(several) > 1):
             one, other = (
-                settings_of(composed(name, [f"{k}={v}" for k, v in {**first, key: value}.items()]))
+                settings_of(name, tuple(f"{k}={v}" for k, v in {**first, key: value}.items()))
                 for value in values[key][:2]
             )
             different = {path for path in {**one, **other} if one.get(path) != other.get(path)}
@@ -114,6 +114,8 @@ def texts(override):
     return [override.get_value_element_as_str()]
 
 
-def settings_of(cfg):
+@cache
+def settings_of(name, overrides):
+    cfg = composed(name, overrides)
     plain = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
     return dotted(OmegaConf.to_container(plain, resolve=True))

@@ -39,7 +39,7 @@ def test_dead_worker_is_reported_and_second_run_completes(folder, tmp_path, monk
     assert err.count("its process died") == 2
     assert "2 files: 2 failed" in out
     monkeypatch.undo()
-    assert call(folder / "in", tmp_path, *settings, "--workers", 2)[0] == 0
+    assert call(folder / "in", tmp_path, *settings)[0] == 0
 
 
 def die(*_):

@@ -7,7 +7,10 @@ import torch
 
 from mops_lightning import FPSSampler, GumbelSampler, RandomSampler, VoxelSampler
 from mops_lightning.data.loader import CloudLoader
+from mops_lightning.metrics.base import collection
+from mops_lightning.metrics.classification import Accuracy
 from mops_lightning.training.experiment import Experiment
+from mops_lightning.training.scores import Scores
 from tests.support.plain import plain_farthest
 from tests.support.recording import Fingerprint, RecordingTask, numbered_clouds
 from tests.support.samplers import SAMPLERS
@@ -139,3 +142,8 @@ def test_loss_of_each_size_is_that_of_main_readout(sampler):
     assert_distinct(want.values())
     got = {name: float(v) for name, v in trainer.callback_metrics.items() if "/loss/" in name}
     assert got == pytest.approx(want, rel=1e-4)
+
+
+def test_scores_loss_of_nan_is_nan():
+    made = Scores(lambda: collection(Accuracy(3)), ("generated",), ())
+    assert made.update_loss("test/loss/x", torch.tensor(torch.nan), 2).compute().isnan()

@@ -103,7 +103,9 @@ def check_overrides(arguments: Sequence[str]) -> None:
             continue
         if name == "hydra.verbose" and type(value) in (int, float, dict, type(None)):
             raise UserError(f"{argument}: give true, false, or a list of loggers.")
-        if group not in (*groups, "hydra"):
+        if group not in (*groups, "hydra") and not (
+            group.startswith("hydra/") and isinstance(value, list | dict)
+        ):
             continue
         values = [value]
         if override.is_sweep_override():

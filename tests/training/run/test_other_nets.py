@@ -43,3 +43,8 @@ def test_sampler_trained_under_several_nets(tmp_path):
 def test_other_nets_that_cannot_be_used_raise(tmp_path, given, words):
     with pytest.raises(UserError, match=f"^other_nets{words}"):
         job(tmp_path / "run", f"other_nets={given}")
+
+
+def test_nets_per_step_without_other_nets_raises(tmp_path):
+    with pytest.raises(UserError, match=r"nets_per_step=2 has no effect without other_nets"):
+        job(tmp_path / "run", "recipe.nets_per_step=2")

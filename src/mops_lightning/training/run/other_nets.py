@@ -12,8 +12,14 @@ def other_tasks(cfg: DictConfig, dataset: CloudDataset) -> list[Task]:
     """Build the run's task with each net of ``other_nets``.
 
     Raises:
-        UserError: a file holds no task net, or one of another task or of other classes.
+        UserError: a file holds no task net, or one of another task or of other classes; or
+            ``recipe.nets_per_step`` has nothing to draw from.
     """
+    if cfg.recipe.nets_per_step and not cfg.other_nets:
+        raise UserError(
+            f"recipe.nets_per_step={cfg.recipe.nets_per_step} has no effect without other_nets. "
+            "Give other_nets=[NAME,...], or leave it out."
+        )
     tasks: list[Task] = []
     for name in cfg.other_nets or () if cfg.learn == "sampler" else ():
         from mops_lightning.zoo.load import read_net  # imports every net
