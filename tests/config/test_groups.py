@@ -68,8 +68,8 @@ task=registration: epochs.task=30 epochs.sampler=20
 task=registration sampler=fmops: sampler.alpha=1.0 sampler.tau_min=0.1 sampler.anchors=fps
 task=registration sampler=fmops: sampler.m_max=64 recipe.train_points=256 recipe.warm_start=True
 task=registration sampler=fmops: weights=auto pretrain_from=pcrnet.modelnet40 optimizer.lr=0.005
-task=registration sampler=fmops recipe=paper: sampler.anchors=None sampler.m_max=64 optimizer.lr=0.001
-task=registration sampler=fmops optimizer=muon: optimizer.lr=0.002
+task=registration sampler=fmops recipe=paper: sampler.anchors=None sampler.m_max=64
+task=registration sampler=fmops recipe=paper: optimizer.lr=0.001
 task=reconstruction: sampler.alpha=0.2 sampler.tau_min=0.5
 task=reconstruction sampler=fmops: sampler.alpha=0.2 sampler.tau_min=0.5
 sampler=snet: optimizer.lr=0.01 pretrain.lr=0.001
