@@ -207,7 +207,7 @@ def test_nets_drawn_in_a_step_are_compared_with_predictions_of_the_first(calls):
 
     tasks = [NotedTask(Fingerprint()) for _ in range(4)]
     for number, task in enumerate(tasks):
-        torch.nn.init.constant_(task.net.weight, 1 + number)
+        torch.nn.init.constant_(next(task.net.parameters()), 1 + number)
     recipe = Recipe(distillation=3.0, nets_per_step=2)
     _, logged = fitted(
         noting(MOPSNet, 8, **MOPS), epochs=2, task=tasks[0], others=tasks[1:], recipe=recipe

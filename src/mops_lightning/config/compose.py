@@ -200,18 +200,13 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     with suppress(UserError):  # the class of a user's own file may not be importable
         if target and name in signature(str(target), node):
             return f"{key}: {target} accepts it, but no file sets it. Write +{key}=..."
-    choices = _choices_with(node, name)
+    files = sorted(conf_dir().joinpath(node).glob("*.yaml")) if node in groups else []
+    choices = [f"{node}={file.stem}" for file in files if name in (OmegaConf.load(file) or {})]
     if choices:
         return f"{key}: no such setting here. It belongs to {' and '.join(choices)}."
     leaves = dotted(OmegaConf.to_container(cfg, resolve=False))
     known = {*settings.declared(), *(one for one in leaves if "._" not in one)} - {key}
     return f"{key}: no such setting.{did_you_mean(key, known)} --cfg job shows all of them."
-
-
-def _choices_with(group: str, name: str) -> list[str]:
-    """Return the choices of a group, such as ``dataset=clouds``, whose files set a key."""
-    files = sorted(conf_dir().joinpath(group).glob("*.yaml")) if group in _groups() else []
-    return [f"{group}={file.stem}" for file in files if name in (OmegaConf.load(file) or {})]
 
 
 def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:

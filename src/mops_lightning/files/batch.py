@@ -212,16 +212,10 @@ def _results(
                 try:
                     yield pair, future.result()
                 except BrokenProcessPool:
-                    yield pair, _death(pair[0])
+                    died = "its process died, perhaps for lack of memory"
+                    again = "Run the same command again with fewer --workers."
+                    yield pair, UserError(f"{pair[0]}: {died}. {again}")
         except BaseException:  # interrupted
             for process in active_children():
                 process.terminate()
             raise
-
-
-def _death(source: Path) -> UserError:
-    """Return the error of a file that was not done because a process died."""
-    return UserError(
-        f"{source}: its process died, perhaps for lack of memory. Run the same command again with "
-        "fewer --workers."
-    )

@@ -8,6 +8,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from operator import call
 from typing import Any
 
 from rich.progress import track
@@ -128,16 +129,8 @@ class DaskEngine(Engine):
 
     def _results(self, function: Callable[[range], Any], row_ranges: list[range]) -> Iterator[Any]:
         # A task, not scattered data: Dask repeats it when the worker that holds it dies.
-        shared = self.client.submit(_same, function, pure=False)
+        shared = self.client.submit(lambda: function, pure=False)
         functions = [shared] * len(row_ranges)
-        futures = self.client.map(_call, functions, row_ranges, pure=False)[::-1]
+        futures = self.client.map(call, functions, row_ranges, pure=False)[::-1]
         while futures:
             yield futures.pop().result()  # workers forget a result that nothing refers to
-
-
-def _same(value: Any) -> Any:
-    return value
-
-
-def _call(function: Callable[[range], Any], rows: range) -> Any:
-    return function(rows)

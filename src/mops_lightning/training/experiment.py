@@ -231,8 +231,8 @@ class Experiment(L.LightningModule):
     ) -> dict[str, Tensor]:
         """Return the loss terms at one size: the task's, distillation and the sampler's own.
 
-        The first two are means over the step's task nets. The task's target is the whole batch, also
-        where the sampler has seen a part of its points.
+        The first two are means over the step's task nets. The task's target is the whole batch,
+        also where the sampler has seen a part of its points.
         """
         soft = sampled.soft_projected
         inputs = [sampled.points if soft is None else soft]
@@ -241,7 +241,7 @@ class Experiment(L.LightningModule):
             inputs.append(straight_through(sampled, seen, completed))
         terms: dict[str, Tensor] = {}
         tasks: list[Any] = [self.task, *self.other_tasks]
-        numbers = range(len(tasks))
+        numbers = list(range(len(tasks)))
         if drawn := self.recipe.nets_per_step:
             numbers = [0, *(torch.randperm(len(self.other_tasks))[:drawn] + 1).tolist()]
         for points, number in product(inputs, numbers):
