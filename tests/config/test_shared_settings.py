@@ -30,7 +30,7 @@ def test_table_settings_fill_in_defaults_of_constructors():
     new = plain("sampler=fmops", "task=registration", "task.net.iterations=1")
     old = plain("sampler=fmops", "task=registration", "task.net.iterations=1")
     for node, names in (
-        (old["sampler"], ["overlap", "threshold", "rho_channels"]),
+        (old["sampler"], ["overlap", "threshold", "feature_channels"]),
         (old["task"]["net"], ["iterations", "feature_channels"]),
         (old["optimizer"]["schedule"], ["warmup"]),
         (old["augment"]["sampler"], ["jitter"]),
