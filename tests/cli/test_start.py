@@ -63,6 +63,7 @@ def test_second_run_in_folder_writes_nothing(tmp_path):
         (["learn=task", "sizes=[8,16]"], "with learn=task"),
         (["learn=task", "pretrain.lr=0.1"], "with learn=task"),
         (["learn=joint", "recipe.distillation=1"], "without learn=sampler"),
+        (["learn=joint", "recipe.nets_per_step=1"], "without learn=sampler"),
         (["learn=joint", "sampler=fps", "recipe.warm_start=false"], "with sampler=fps, which"),
         (["sampler=fps", "recipe.ema_span=0.1"], "with sampler=fps, which"),
         (["task_lr_scale=0.1"], "with learn=sampler"),

@@ -160,7 +160,7 @@ def test_evaluation_record_chooses_no_folder_to_write_and_no_part_of_training(pa
     "argument",
     [
         *("task_lr_scale=3", "trainer.max_epochs=5", "optimizer=exponential", "++optimizer.lr=1"),
-        *("learn=sampler", "experiment=own_scans"),
+        *("learn=sampler", "experiment=own_scans", "other_nets=null"),
     ],
 )
 def test_evaluation_setting_without_effect_raises(run, argument):

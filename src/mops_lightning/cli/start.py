@@ -41,6 +41,7 @@ NEEDS = {
     "trainer.gradient_clip_algorithm": "trainer.gradient_clip_val",
     "recipe.distillation": "learn=sampler",
     "recipe.feature_distillation": "learn=sampler",
+    "recipe.nets_per_step": "learn=sampler",
 }
 """Settings without effect unless another one is set, or has the value behind ``=``."""
 OF_TRAINED = ("recipe.", "optimizer.", "baselines.", "other_nets")

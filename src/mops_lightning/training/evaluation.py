@@ -32,12 +32,12 @@ NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 OF_SAMPLER = (
     *("learn", "experiment", "optimizer", "task_lr_scale", "recipe", "trainer.max_epochs"),
-    *("epochs.sampler", "augment.sampler"),
+    *("epochs.sampler", "augment.sampler", "other_nets"),
 )
 """Settings of the training of a sampler."""
 OF_TRAINING = (
     *OF_SAMPLER,
-    *("pretrain", "val_fraction", "augment", "epochs", "ckpt_path"),
+    *("pretrain", "pretrain_from", "val_fraction", "augment", "epochs", "ckpt_path"),
     *("trainer.gradient_clip_algorithm", "trainer.accumulate_grad_batches"),
 )
 """Settings of any training."""

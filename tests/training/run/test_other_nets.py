@@ -45,6 +45,7 @@ def test_other_nets_that_cannot_be_used_raise(tmp_path, given, words):
         job(tmp_path / "run", f"other_nets={given}")
 
 
-def test_nets_per_step_without_other_nets_raises(tmp_path):
-    with pytest.raises(UserError, match=r"nets_per_step=2 has no effect without other_nets"):
-        job(tmp_path / "run", "recipe.nets_per_step=2")
+@pytest.mark.parametrize("given", [(), ("other_nets=[pointnet.modelnet40]",)])
+def test_more_nets_per_step_than_other_nets_raise(tmp_path, given):
+    with pytest.raises(UserError, match=f"nets_per_step=2: there are {len(given)} other"):
+        job(tmp_path / "run", "recipe.nets_per_step=2", *given)

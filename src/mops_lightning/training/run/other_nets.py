@@ -13,12 +13,12 @@ def other_tasks(cfg: DictConfig, dataset: CloudDataset) -> list[Task]:
 
     Raises:
         UserError: a file holds no task net, or one of another task or of other classes; or
-            ``recipe.nets_per_step`` has nothing to draw from.
+            ``recipe.nets_per_step`` is more than there are.
     """
-    if cfg.recipe.nets_per_step and not cfg.other_nets:
+    drawn, given = cfg.recipe.nets_per_step or 0, len(cfg.other_nets or ())
+    if drawn > given:
         raise UserError(
-            f"recipe.nets_per_step={cfg.recipe.nets_per_step} has no effect without other_nets. "
-            "Give other_nets=[NAME,...], or leave it out."
+            f"recipe.nets_per_step={drawn}: there are {given} other_nets. Give more, or null."
         )
     tasks: list[Task] = []
     for name in cfg.other_nets or () if cfg.learn == "sampler" else ():
