@@ -98,7 +98,7 @@ def test_equal_cells_are_named(tmp_path):
         put_cell(tmp_path, f"a{alpha}", "mops", values, of={"alpha": alpha})
         put_cell(tmp_path, f"b{alpha}", "snet", {"generated": float(alpha)}, of={"alpha": alpha})
     text = table(tmp_path)
-    assert "All 3 cells of mops are equal: the settings that differ changed nothing." in text
+    assert "All 3 cells of mops are equal: the settings that differ changed no figure." in text
     assert "cells of snet" not in text
 
 

@@ -138,7 +138,7 @@ def _unchanged_lines(table: Table) -> list[str]:
         if shown.nunique().max() == 1 and shown.count().min() > 1:
             lines.append(
                 f"All {shown.count().max()} cells of {name} are equal: the settings that differ "
-                "changed nothing."
+                "changed no figure."
             )
     return lines
 
