@@ -228,14 +228,14 @@ def _plane(table: Table, name: str) -> Grid:
 
 
 def _costs(table: Table) -> dict[str, str]:
-    """Return the seconds of training of every row by size, over all its runs, per seed."""
+    """Return the seconds of training of every row by size: of all its trainings, for one seed."""
     if table.group.column != "m":
         return {}
-    rows = [(sampler_row(one), one.seed) for one in table.group.records]
-    runs = pd.DataFrame(rows, columns=["row", "seed"])
-    runs["seconds"] = training_time(table.group.records)[1]
-    by_row = runs.dropna().groupby("row")
-    costs = by_row["seconds"].sum() / by_row["seed"].nunique()
+    records = table.group.records
+    trained = [one.config["sampler"].get("m_max", one.config["m"]) for one in records]
+    runs = pd.DataFrame({"row": map(sampler_row, records), "m": trained})
+    runs["seconds"] = training_time(records)[1]
+    costs = runs.dropna().groupby(["row", "m"])["seconds"].mean().groupby("row").sum()
     return costs.map("{:,.0f} s".format).to_dict()
 
 
