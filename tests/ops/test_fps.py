@@ -18,6 +18,17 @@ def test_fps_equals_double_loop(n, m, dtype, rng):
         assert chosen == plain_farthest(cloud, [first], m)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (37, 37), (1024, 512), (10_000, 40), (20_000, 9)])
+@pytest.mark.parametrize("grid", [False, True])  # a grid has many ties and copies
+def test_fps_on_a_gpu_is_that_of_a_cpu(n, m, grid, rng):
+    points = torch.randn(3, n, 3, generator=rng)
+    points = (4 * points).round() if grid else points
+    start = torch.randint(n, (3,), generator=rng)
+    on_gpu = farthest_point_sample(points.cuda(), m, start.cuda()).cpu()
+    assert torch.equal(on_gpu, farthest_point_sample(points, m, start))
+
+
 @pytest.mark.usefixtures("farthest_form")
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (20, 20), (75, 30), (3000, 9)])
 def test_fps_multiplies_distances_by_weights(n, m, rng):

@@ -1,5 +1,7 @@
 """Farthest point sampling (Eldar et al., IEEE TIP 1997), from a start point or a given subset."""
 
+from contextlib import suppress
+
 import torch
 from torch import Tensor
 
@@ -96,6 +98,11 @@ def _farthest(
         relative = weight.double() / weight.double().amax(1, keepdim=True)
         factors = relative.square().clamp_min(LEAST_FACTOR)
     rows = compiled.farthest(points, steps, distances, factors)
+    if rows is None and factors is None and points.is_cuda and not torch.compiler.is_compiling():
+        with suppress(ImportError):  # a build of torch without Triton
+            from mops_lightning.ops import triton_fps
+
+            rows = triton_fps.farthest(points, distances, steps)
     return farthest_in_steps(points, distances, steps, factors) if rows is None else rows
 
 
