@@ -23,7 +23,7 @@ from tests.support.fuzz_seeds import changed_content, changed_glb, json_bytes, s
 FILES = int(os.environ.get("MOPS_FUZZ", "12"))
 KINDS = (
     "bin", "checkpoint", "glb", "glb content", "hdf5", "las", "laz", "names", "npy", "npz", "obj",
-    "off", "pcd", "pcd ascii", "pcd compressed", "pictured clouds", "ply",
+    "off", "pcd", "pcd ascii", "pictured clouds", "ply",
     "ply ascii", "ply mesh", "record", "record content", "stl", "weights",
     "weights content", "xyz",
 )  # fmt: skip

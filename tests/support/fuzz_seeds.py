@@ -40,8 +40,7 @@ def seeds(folder):
     in_ascii = {"file_type": "ply", "encoding": "ascii"}
     made["ply ascii"] = (".ply", [one.export(**in_ascii) for one in (PointCloud(points), BOX)])
     made["ply mesh"] = (".ply", [BOX.export(file_type="ply"), made["ply"][1][0]])
-    made["pcd ascii"] = (".pcd", [_pcd(points, "ascii")])
-    made["pcd compressed"] = (".pcd", [_pcd(points, "binary_compressed")])
+    made["pcd ascii"] = (".pcd", [_pcd(points)])
     for suffix in (".las", ".laz"):
         made[suffix[1:]] = (suffix, [_las(folder / f"a{suffix}", form) for form in (3, 6, 7)])
     for suffix in (".off", ".obj", ".stl", ".glb"):
@@ -84,18 +83,12 @@ def _bytes(content):
     return content.encode() if isinstance(content, str) else content
 
 
-def _pcd(points, kind):
+def _pcd(points):
     head = (
         "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
-        f"WIDTH {len(points)}\nHEIGHT 1\nPOINTS {len(points)}\nDATA {kind}\n"
+        f"WIDTH {len(points)}\nHEIGHT 1\nPOINTS {len(points)}\nDATA ascii\n"
     )
-    if kind == "ascii":
-        return (head + "\n".join(" ".join(map(str, row)) for row in points)).encode()
-    plain = points.T.astype("<f4").tobytes()
-    packed = b"".join(
-        bytes([len(plain[i : i + 32]) - 1]) + plain[i : i + 32] for i in range(0, len(plain), 32)
-    )
-    return head.encode() + np.array([len(packed), len(plain)], "<u4").tobytes() + packed
+    return (head + "\n".join(" ".join(map(str, row)) for row in points)).encode()
 
 
 def _las(path, form):

@@ -1,4 +1,4 @@
-"""PCD files of the Point Cloud Library, version 0.7: ascii, binary and binary_compressed."""
+"""PCD files of the Point Cloud Library, version 0.7: ascii and binary."""
 
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ def read(path: Path) -> Table:
             for place, (name, (kind, size, count)) in enumerate(zip(names, kinds, strict=True))
         ]
     )
-    array = _body(data[start:], header["DATA"][0], layout, number)
+    array = _body(path, data[start:], header["DATA"][0], layout, number)
     columns: dict[str, Column] = {}
     for name in layout.names or ():
         values = array[name][:, 0] if layout[name].shape == (1,) else array[name]
@@ -80,7 +80,7 @@ def _header(data: bytes) -> tuple[dict[str, list[str]], int]:
     return header, start
 
 
-def _body(body: bytes, kind: str, layout: np.dtype[Any], number: int) -> NDArray[Any]:
+def _body(path: Path, body: bytes, kind: str, layout: np.dtype[Any], number: int) -> NDArray[Any]:
     if kind == "ascii":
         if number > len(body):
             raise ValueError(f"{len(body)} bytes are not {number} points")
@@ -88,49 +88,7 @@ def _body(body: bytes, kind: str, layout: np.dtype[Any], number: int) -> NDArray
         return unstructured_to_structured(numbers, layout)
     if kind == "binary":
         return np.frombuffer(body, layout, number)
-    if kind != "binary_compressed":
-        raise ValueError(f"DATA {kind} is not ascii, binary or binary_compressed")
-    packed, unpacked_size = np.frombuffer(body, "<u4", 2)
-    if unpacked_size < number * layout.itemsize:
-        raise ValueError(f"{unpacked_size} bytes are not {number} points")
-    unpacked = decompress_lzf(body[8 : 8 + int(packed)], int(unpacked_size))
-    array, place = np.empty(number, layout), 0
-    for name in layout.names or ():  # one field after the other
-        size = layout[name].itemsize * number
-        column = np.frombuffer(unpacked[place : place + size], layout[name].base)
-        array[name] = column.reshape(number, *layout[name].shape)
-        place += size
-    return array
-
-
-def decompress_lzf(data: bytes, size: int) -> bytes:
-    """Decompress data of Marc Lehmann's liblzf to ``size`` bytes.
-
-    Raises:
-        ValueError: the data are damaged, or decompress to another number of bytes.
-    """
-    out = bytearray()
-    place = 0
-    while place < len(data) and len(out) <= size:
-        control = data[place]
-        place += 1
-        if control < 32:  # control + 1 literal bytes
-            out += data[place : place + control + 1]
-            place += control + 1
-            continue
-        length = control >> 5
-        if length == 7:
-            length += data[place]
-            place += 1
-        start = len(out) - ((control & 31) << 8) - data[place] - 1
-        place += 1
-        length += 2
-        if start < 0:
-            raise ValueError("compressed data refer to bytes before their start")
-        piece = bytes(out[start : start + length])
-        if len(piece) < length:  # the source overlaps the bytes that the copy appends
-            piece = (piece * (length // max(len(piece), 1) + 1))[:length]
-        out += piece
-    if len(out) != size:
-        raise ValueError(f"compressed data give {len(out)} bytes, expected {size}")
-    return bytes(out)
+    raise BadCloudError(
+        f"{path} has DATA {kind}, which is not ascii or binary. Convert it by PCL's "
+        f"pcl_convert_pcd_ascii_binary {path} OUT.pcd 1."
+    )
