@@ -85,7 +85,7 @@ def test_setting_without_effect_is_refused(settings, said):
     "settings",
     [
         "sampler=fps recipe=paper recipe.task_points=[8,64] epochs.joint=3 pictures=0",
-        "sampler=fps trainer.max_epochs=1 pretrain.lr=0.1 augment.sampler.jitter=0.1",
+        "sampler=fps trainer.max_epochs=1 pretrain.lr=0.1 +augment.sampler.jitter=0.1",
         "sampler=fps learn=joint optimizer.lr=0.1 task_lr_scale=0.1",
         "sampler=fps learn=joint recipe.train_points=64 recipe.ema_span=0.1",
         "sampler=gumbel recipe.ema_span=0.1 optimizer.lr=0.1 baselines.fps=null",

@@ -57,6 +57,20 @@ def test_augmentation_jitter_is_clipped(rng, monkeypatch):
     assert clipped.abs().max() == pytest.approx(0.2)
 
 
+def test_augmentation_stretches_and_shifts_every_axis_of_a_cloud(rng):
+    points = clouds(300).points
+    changed = Augmentation(stretch=1.5, shift=0.2)(points, rng)
+    scale = (changed[:, 1] - changed[:, 0]) / (points[:, 1] - points[:, 0])
+    offset = changed[:, 0] - scale * points[:, 0]
+    torch.testing.assert_close(
+        changed, points * scale[:, None] + offset[:, None], atol=1e-3, rtol=0
+    )
+    for drawn, low, high in ((scale, 1 / 1.5, 1.5), (offset, -0.2, 0.2)):
+        assert low - 1e-3 < drawn.min() < low + 0.05
+        assert high - 0.05 < drawn.max() < high + 1e-3
+        assert drawn.mean().item() == pytest.approx((low + high) / 2, abs=0.05)
+
+
 def test_augmentation_equals_written_out_formulas():
     points = clouds(300).points
     rng = torch.Generator().manual_seed(3)

@@ -15,6 +15,7 @@ from hydra.core.config_store import ConfigStore
 
 from mops_lightning.config.limits import (
     ABOVE_ZERO,
+    AUGMENTATION,
     NOT_NEGATIVE,
     TRAINER,
     Limits,
@@ -275,8 +276,11 @@ INSIDE: dict[str, dict[str, Any]] = {
     "recipe.task_points": {"learn": None},
     "optimizer.lr": {"limits": ABOVE_ZERO},
     "pretrain.lr": {"limits": ABOVE_ZERO},
-    "augment.task.jitter": {"limits": NOT_NEGATIVE},
-    "augment.sampler.jitter": {"limits": NOT_NEGATIVE},
+    **{
+        f"augment.{part}.{name}": {"limits": limits}
+        for part in ("task", "sampler")
+        for name, limits in AUGMENTATION.items()
+    },
     # Before trainer.max_epochs, so that an error names the setting that it takes its value from.
     "epochs.task": {"limits": whole(1)},
     "epochs.sampler": {"limits": whole(0)},

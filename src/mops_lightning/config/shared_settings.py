@@ -26,6 +26,8 @@ def effective(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
     for name, node in config.items():
         if settings.of(name).per_learn and isinstance(node, dict):
             node = node.get("task" if learn == "task" else "sampler")
+            if node is None:  # no augmentation
+                continue
         flat |= dotted(node, name)
     return {path: value for path, value in flat.items() if settings.of(path).counts(learn)}
 

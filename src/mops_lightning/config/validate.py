@@ -67,9 +67,9 @@ def check(cfg: DictConfig) -> None:
         if key not in settings.LEARN:
             raise UserError(f"epochs.{key}: no such setting.{did_you_mean(key, settings.LEARN)}")
     for key, node in plain["augment"].items():
-        if key not in ("task", "sampler") or not isinstance(node, dict):
+        if key not in ("task", "sampler") or not isinstance(node, dict | None):
             raise UserError(f"augment has settings of task and sampler, got {key}: {node!r}.")
-        _check_node({**node, "_target_": AUGMENTATION}, f"augment.{key}")
+        _check_node({**(node or {}), "_target_": AUGMENTATION}, f"augment.{key}")
     for name, setting in declared.items():
         if setting.counts(plain["learn"]):
             _check_node(plain.get(name), name)

@@ -26,6 +26,8 @@ class Augmentation:
             ``z``; true means y.
         jitter: standard deviation of the noise added to every coordinate, which is clipped at five
             standard deviations.
+        stretch: every axis of a cloud is scaled by a factor drawn between 1/stretch and stretch.
+        shift: largest shift of a cloud along every axis.
 
     Raises:
         UserError: an argument is out of range.
@@ -33,10 +35,13 @@ class Augmentation:
 
     rotate_up: bool | Literal["x", "y", "z"] = False
     jitter: float = 0.0
+    stretch: float = 1.0
+    shift: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the arguments."""
-        check_at_least(0, jitter=self.jitter)
+        check_at_least(0, jitter=self.jitter, shift=self.shift)
+        check_at_least(1, stretch=self.stretch)
         if self.rotate_up not in (True, False, *AXES):
             raise UserError(
                 "rotate_up must be true, false, x, y or z (the vertical axis), got "
@@ -46,7 +51,7 @@ class Augmentation:
     @property
     def active(self) -> bool:
         """Whether clouds are changed at all."""
-        return bool(self.rotate_up) or self.jitter > 0
+        return bool(self.rotate_up) or self.jitter > 0 or self.stretch > 1 or self.shift > 0
 
     def __call__(self, points: Tensor, rng: Generator) -> Tensor:
         """Return the augmented ``(B, N, 3)`` points."""
@@ -62,6 +67,11 @@ class Augmentation:
             most = JITTER_CLIP * self.jitter
             noise = torch.randn(points.shape, generator=rng).mul_(self.jitter)
             points = points + noise.clamp_(-most, most)
+        if self.stretch > 1 or self.shift:
+            scale, offset = torch.rand(2, len(points), 1, 3, generator=rng)
+            least = 1 / self.stretch
+            points = points * (least + (self.stretch - least) * scale)
+            points = points + self.shift * (2 * offset - 1)
         return points
 
 

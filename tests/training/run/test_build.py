@@ -111,7 +111,7 @@ def test_split_holds_out_whole_sources():
 
 
 def test_augmentation_of_joint_training_is_that_of_the_sampler():
-    changed = ["augment.task.jitter=0.01", "augment.sampler.jitter=0.02"]
+    changed = ["augment.task.jitter=0.01", "+augment.sampler.jitter=0.02"]
     found = {
         learn: augmentation(compose([*changed, f"learn={learn}"])).jitter
         for learn in ("task", "sampler", "joint")

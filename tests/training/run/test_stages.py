@@ -45,8 +45,8 @@ def clouds_of(calls):
     ("learn", "changes", "readouts", "tested"),
     [
         # Tested are 3 readouts, 1 baseline (of a task of one's own) and the full clouds.
-        ("sampler", ["augment.sampler.jitter=0.1", "test_noise_std=0.1"], 3, 5),
-        ("task", ["augment.task.rotate_up=true"], 1, 1),
+        ("sampler", ["+augment.sampler.jitter=0.1", "test_noise_std=0.1"], 3, 5),
+        ("task", ["augment.task={rotate_up: true}"], 1, 1),
     ],
 )
 def test_run_phases_see_disjoint_complete_clouds(learn, changes, readouts, tested, calls, tmp_path):
@@ -104,4 +104,4 @@ def assert_only_these_changed(changes, calls, held_out):
     }
     for phase, (seen, original) in phases.items():
         differ = not torch.equal(clouds_of(seen), original)
-        assert differ == any(change.startswith(phase) for change in changes), phase
+        assert differ == any(change.lstrip("+").startswith(phase) for change in changes), phase

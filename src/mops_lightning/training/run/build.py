@@ -228,7 +228,7 @@ def _numbers(cfg: DictConfig, dataset: CloudDataset) -> tuple[dict[str, int], di
 
 def augmentation(cfg: DictConfig) -> Augmentation:
     """Return the augmentation of this run; joint training has the sampler's."""
-    return Augmentation(**(cfg.augment.task if cfg.learn == "task" else cfg.augment.sampler))
+    return Augmentation(**(cfg.augment["task" if cfg.learn == "task" else "sampler"] or {}))
 
 
 def split(clouds: Clouds, fraction: float, seed: int) -> tuple[Clouds, Clouds]:
