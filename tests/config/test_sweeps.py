@@ -93,11 +93,19 @@ def test_sweep_neighbours_differ_in_what_is_swept(name):
             allowed = ("sampler.", "optimizer.", "names.sampler") if key == "sampler" else (key,)
             followers = {f"sampler.{key}"} if key in ("m", "seed") else set()
             followers |= {f"dataset.{key}"} if key == "seed" else set()
+            followers |= {"task.net.sampler.m"} if key == "task.net.points" else set()
             assert not {path for path in different - followers if not path.startswith(allowed)}
 
 
 @pytest.mark.parametrize(
-    ("name", "number"), [("modelnet40", 49), ("ablation", 18), ("segmentation", 19)]
+    ("name", "number"),
+    [
+        ("modelnet40", 49),
+        ("ablation", 18),
+        ("segmentation", 19),
+        ("registration", 23),
+        ("hierarchical", 6),
+    ],
 )
 def test_cells_of_several_grids_have_folders_of_their_own(name, number):
     several = grids(composed(name))
