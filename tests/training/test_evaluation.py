@@ -84,6 +84,8 @@ def test_evaluation_same_group_keeps_settings_and_another_drops_them(run, tmp_pa
 def test_evaluation_repeats_removed_and_added_baselines(given, tmp_path):
     run = write_run(tmp_path / "run", [*OVERRIDES, given])
     assert evaluated(run).baselines == compose([*OVERRIDES, given]).baselines
+    start = "+baselines.fps.start=farthest"
+    assert evaluated(run, start).baselines.fps == compose([*OVERRIDES, start]).baselines.fps
 
 
 def test_command_line_run_named_in_several_ways(run, tmp_path):

@@ -319,7 +319,9 @@ def _restore(merged: DictConfig, cfg: DictConfig, path: str) -> None:
     """Set a setting that the user gave to the user's value, or remove it as the user did."""
     source, name = _node_of(cfg, path)
     target, _ = _node_of(merged, path)
-    if name in source:
+    if source and not target:  # of a baseline that the run did not have
+        _restore(merged, cfg, path.rpartition(".")[0])
+    elif name in source:
         OmegaConf.update(merged, path, source._get_node(name), merge=False)
     elif name in target:
         del target[name]
