@@ -73,3 +73,18 @@ def test_nets_grid_reconstruction_shows_paper(tmp_path):
     ]
     assert found[3][3:] == ["0.00123", "0.05", "4.1", "12.69 / 209.13 / 2.9"]
     assert found[5][-1] == "1.25 / 18.8 / 12"
+
+
+def test_nets_grid_names_samplers_inside_and_shows_no_figure_of_another_net(tmp_path):
+    fps = {"_target_": "mops_lightning.samplers.fps.FPSSampler", "m": 16}
+    mops = {"_target_": "mops_lightning.samplers.mops.MOPSNet", "m": 16, "anchors": None}
+    for sampler in (fps, mops, {**mops, "anchors": "fps"}):
+        name = f"{sampler['_target_']}-{sampler.get('anchors')}"
+        given = (tmp_path, name, {"accuracy": 0.5}, "classification", "hierarchical")
+        put_net(*given, sampler=sampler)
+    assert rows(table(tmp_path)) == [
+        ["net", "sampler", "sampler.anchors", "points", "accuracy (%)", "MB"],
+        ["hierarchical", "fps", "", "1024", "50.00", "4.1"],
+        ["hierarchical", "mops", "fps", "1024", "50.00", "4.1"],
+        ["hierarchical", "mops", "none", "1024", "50.00", "4.1"],
+    ]

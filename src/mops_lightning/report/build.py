@@ -266,7 +266,8 @@ def _published(table: Table, full_clouds: bool = False) -> dict[str, Any]:
         return {}
     metric = table.full_metric if full_clouds else table.metric
     joint = trained_with(table.group.records[0]) == "joint"
-    return paper.published(table.names["task"], table.names["dataset"], metric.name, joint)
+    names = table.names
+    return paper.published(names["task"], table.net, names["dataset"], metric.name, joint)
 
 
 def _provenance(found: list[RunRecord], net: str) -> list[str]:

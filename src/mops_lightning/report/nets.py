@@ -17,7 +17,12 @@ from mops_lightning.report.comparable import Group
 from mops_lightning.report.tables import over_seeds
 from mops_lightning.report.text import PAPER, Grid
 
-HIDDEN = ("_target_", "n_points")
+CLASS = "_target_"
+
+NAMES = {"points": "points after stages"}
+"""Settings of a net whose names have another meaning in the table."""
+
+HIDDEN = ("n_points", "sampler.m", "sampler.m_max", "sampler.seed")
 """Settings of a net that get no column; the number of points has its own."""
 
 
@@ -79,6 +84,15 @@ def _row(records: list[RunRecord], keys: list[str], metrics: list[MetricInfo]) -
 
 
 def _net(record: RunRecord) -> dict[str, Any]:
+    """Return the settings of a net; of a sampler inside it, the name and dotted settings."""
+    net = {NAMES.get(key, key): value for key, value in _arguments(record).items() if key != CLASS}
+    for key, part in [item for item in net.items() if isinstance(item[1], dict)]:
+        own = {f"{key}.{name}": "none" if value is None else value for name, value in part.items()}
+        net |= {key: own.pop(f"{key}.{CLASS}").split(".")[-2], **own}
+    return net
+
+
+def _arguments(record: RunRecord) -> dict[str, Any]:
     return record.config["task"].get("net") or {}
 
 
@@ -103,8 +117,9 @@ def _paper(record: RunRecord) -> str:
     names, points = record.config["names"], _points(record)
     values = None
     if names["task"] == "reconstruction":
-        values = paper.net(names["net"], _net(record).get("pieces"), points)
+        values = paper.net(names["net"], _arguments(record).get("pieces"), points)
     if values:
         return " / ".join(f"{value:g}" for value in values)
-    published = paper.published(names["task"], names["dataset"], score([record])).get("full")
-    return "" if published is None else f"{published:.2f}"
+    metric = score([record])
+    theirs = paper.published(names["task"], names["net"], names["dataset"], metric).get("full")
+    return "" if theirs is None else f"{theirs:.2f}"

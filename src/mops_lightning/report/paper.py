@@ -12,8 +12,10 @@ def published_tables() -> dict[str, dict[str, Any]]:
     return json.loads(files("mops_lightning.report").joinpath("paper.json").read_text())
 
 
-def published(task: str, dataset: str, metric: str, joint: bool = False) -> dict[str, Any]:
-    """Return the paper's table for a task, dataset and metric; empty if it has none.
+def published(
+    task: str, net: str, dataset: str, metric: str, joint: bool = False
+) -> dict[str, Any]:
+    """Return the paper's table for a task, its net, dataset and metric; empty if it has none.
 
     Returns:
         ``rows``: sampler → size → values of generated, matched and completed sets, or one value;
@@ -21,7 +23,8 @@ def published(task: str, dataset: str, metric: str, joint: bool = False) -> dict
     """
     wanted = (task, dataset, metric, joint)
     for one in published_tables().values():
-        if (one["task"], one.get("dataset"), one.get("metric"), one.get("joint", False)) == wanted:
+        of_table = (one["task"], one.get("dataset"), one.get("metric"), one.get("joint", False))
+        if of_table == wanted and one.get("net", net) == net:
             return one
     return {}
 
