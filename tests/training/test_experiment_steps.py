@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from mops_lightning import FMOPSNet, MOPSNet, ProgressiveSampleNet, SampleNet, complete, match
+from mops_lightning import FMOPSNet, MOPSNet, ProgressiveSampleNet, SampleNet, match
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.metrics.base import collection
 from mops_lightning.ops.nearest import k_nearest
@@ -110,16 +110,13 @@ def test_losses_over_sizes_are_summed_or_averaged(how, make, name, loss, calls):
     assert logged[f"train/{readout}/fingerprint"] == pytest.approx(float(prints), abs=1e-4)
 
 
-@pytest.mark.parametrize("chosen", ["matched", "completed"])
-def test_straight_through_losses_are_means_over_generated_and_chosen_points(chosen, calls):
-    recipe = Recipe(straight_through=0.0, straight_through_set=chosen)
+def test_straight_through_losses_are_means_over_generated_and_matched_points(calls):
+    recipe = Recipe(straight_through=0.0)
     one_step = {"limit_train_batches": 1, "limit_val_batches": 0}
     module, logged = fitted(noting(MOPSNet, 8, **MOPS), recipe=recipe, **one_step)
     generated, matched = (call.points for call in calls)
     clouds = calls[0].clouds
-    rows = match(generated, clouds)
-    rows = complete(rows, clouds) if chosen == "completed" else rows
-    torch.testing.assert_close(matched, gather_points(clouds, rows))
+    torch.testing.assert_close(matched, gather_points(clouds, match(generated, clouds)))
     losses = [float(module.task.net(points).square().mean()) for points in (generated, matched)]
     assert logged["train/loss/task"] == pytest.approx(sum(losses) / 2, rel=1e-4)
     assert abs(losses[0] - losses[1]) > 0.1

@@ -237,8 +237,7 @@ class Experiment(L.LightningModule):
         soft = sampled.soft_projected
         inputs = [sampled.points if soft is None else soft]
         if self.recipe.sees_matched(self._progress):
-            completed = self.recipe.straight_through_set == "completed"
-            inputs.append(straight_through(sampled, seen, completed))
+            inputs.append(straight_through(sampled.points, seen))
         terms: dict[str, Tensor] = {}
         tasks: list[Any] = [self.task, *self.other_tasks]
         numbers = list(range(len(tasks)))

@@ -7,21 +7,20 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from mops_lightning import MOPSNet, complete
+from mops_lightning import MOPSNet
 from mops_lightning.config.build import build
 from mops_lightning.config.compose import compose
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import PointNetVanilla
-from mops_lightning.ops.points import gather_points
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.tasks.registration import Registration
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.distillation import feature_distance, pooled_features
 from mops_lightning.training.recipe.moving_average import MovingAverage
 from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through
-from mops_lightning.types import Batch, SampleOutput
+from mops_lightning.types import Batch
 from tests.support.recording import Fingerprint, RecordingTask, noting
 from tests.support.training import quiet_trainer, small_dataset
 
@@ -73,7 +72,6 @@ def composed():
         ("task_points", 0),
         ("all_points_from", 1.5),
         ("straight_through", -0.1),
-        ("straight_through_set", "generated"),
         ("ema_span", float("nan")),
         ("distillation", -1.0),
         ("distillation", float("inf")),
@@ -87,12 +85,10 @@ def test_recipe_value_out_of_range_raises(composed, name, value):
         build(OmegaConf.merge(composed, {name: value}), "recipe")
 
 
-def test_recipe_accepts_limits_but_no_set_without_straight_through():
+def test_recipe_accepts_limits():
     for share in (0.0, 1.0):
         Recipe(all_points_from=share, straight_through=share, ema_span=share)
     Recipe(train_points=1, task_points=1)
-    with pytest.raises(UserError, match="straight_through_set has no effect without"):
-        Recipe(straight_through_set="completed")
 
 
 def test_shares_of_the_training_include_their_first_step():
@@ -144,27 +140,11 @@ def test_draw_points_keeps_the_rows_of_a_pair():
 def test_straight_through_has_matched_values_and_gradients_of_generated():
     points = torch.randn(2, POINTS, 3)
     generated = (points[:, :5] + 1e-3).requires_grad_()
-    found = straight_through(SampleOutput(generated, None, {}), points)
+    found = straight_through(generated, points)
     torch.testing.assert_close(found, points[:, :5])
     weight = torch.randn_like(found)
     (found * weight).sum().backward()
     torch.testing.assert_close(generated.grad, weight)
-
-
-def test_straight_through_completed_set_gives_gradients_to_its_matched_points():
-    points = torch.randn(2, POINTS, 3)
-    rows = torch.tensor([[3, 7, 3, 9], [5, 5, 5, 2]])
-    generated = (gather_points(points, rows) + 1e-3).requires_grad_()
-    found = straight_through(SampleOutput(generated, None, {}), points, completed=True)
-    expected = complete(rows, points)
-    torch.testing.assert_close(found, gather_points(points, expected))
-    weight = torch.randn_like(found)
-    (found * weight).sum().backward()
-    gradients = torch.zeros_like(generated)
-    for cloud, kept in enumerate(([3, 7, 9], [5, 2])):
-        for place, row in enumerate(kept):
-            gradients[cloud, rows[cloud].tolist().index(row)] = weight[cloud, place]
-    torch.testing.assert_close(generated.grad, gradients)
 
 
 def test_moving_average_ends_with_the_average_of_all_steps():

@@ -1,20 +1,17 @@
 """Additions to the published training of a sampler."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.ops.points import gather_points
-from mops_lightning.ops.readout import complete, match
-from mops_lightning.types import Batch, PairBatch, SampleOutput
+from mops_lightning.ops.readout import match
+from mops_lightning.types import Batch, PairBatch
 
 POINTS_PER_SAMPLE = 2
 """A training step sees at least this many times the number of sampled points."""
-
-STRAIGHT_THROUGH_SETS = ("matched", "completed")
 
 
 @dataclass(frozen=True)
@@ -36,12 +33,10 @@ class Recipe:
         feature_distillation: weight of the distance between the frozen task net's max-pooled
             features of the sample and of the points that the step sees.
             Only with ``learn="sampler"`` and a net with ``point_features``.
-        straight_through: share after which the task net also sees points of the cloud, whose
-            gradients go to the generated ones; None: never.
+        straight_through: share after which the task net also sees matched points, whose gradients
+            go to the generated ones; None: never.
         ema_span: time constant of an exponential moving average of the weights, as a share; the
             average is validated, tested and saved. None: the last weights are.
-        straight_through_set: the points of ``straight_through``, ``matched`` or ``completed``. The
-            farthest points of a completed set have no gradients.
         nets_per_step: how many of ``other_nets``, drawn anew, a step computes its losses under,
             besides the run's own net; None: all.
 
@@ -57,7 +52,6 @@ class Recipe:
     feature_distillation: float = 0.0
     straight_through: float | None = None
     ema_span: float | None = None
-    straight_through_set: Literal["matched", "completed"] = "matched"
     nets_per_step: int | None = None
 
     def __post_init__(self) -> None:
@@ -73,16 +67,6 @@ class Recipe:
         check_at_least(
             0, distillation=self.distillation, feature_distillation=self.feature_distillation
         )
-        if self.straight_through_set not in STRAIGHT_THROUGH_SETS:
-            raise UserError(
-                f"straight_through_set must be one of {', '.join(STRAIGHT_THROUGH_SETS)}, got "
-                f"{self.straight_through_set!r}."
-            )
-        if self.straight_through is None and self.straight_through_set != "matched":
-            raise UserError(
-                "straight_through_set has no effect without straight_through, got "
-                f"{self.straight_through_set}. Set straight_through, such as 0.8, or leave it out."
-            )
 
     def points_at(self, progress: float, available: int, largest: int) -> int:
         """Return how many points of a cloud a step sees.
@@ -100,7 +84,7 @@ class Recipe:
         return min(available, max(self.train_points, POINTS_PER_SAMPLE * largest))
 
     def sees_matched(self, progress: float) -> bool:
-        """Return whether the task net also sees points of the cloud."""
+        """Return whether the task net also sees matched points."""
         return reached(self.straight_through, progress)
 
 
@@ -127,25 +111,15 @@ def draw_points(batch: Batch | PairBatch, n: int) -> Tensor:
     return gather_points(points, rows)
 
 
-def straight_through(sampled: SampleOutput, points: Tensor, completed: bool = False) -> Tensor:
-    """Return points of the clouds with the gradients of the generated ones.
+def straight_through(generated: Tensor, points: Tensor) -> Tensor:
+    """Return the matched points with the gradients of the generated ones.
 
     Args:
-        sampled: generated points ``(B, M, 3)``.
+        generated: ``(B, M, 3)``.
         points: ``(B, N, 3)`` the clouds.
-        completed: the completed set in place of the matched one.
 
     Returns:
-        ``(B, M, 3)``. Of generated points with the same match, the first one has the gradients of
-        a completed set; the farthest points of this set have none.
+        ``(B, M, 3)``.
     """
-    generated = sampled.points
-    rows = match(generated, points)
-    if not completed:
-        return generated + (gather_points(points, rows) - generated).detach()
-    filled = complete(rows, points)
-    same = filled[:, :, None] == rows[:, None, :]
-    generated = gather_points(generated, same.byte().argmax(2))
-    chosen = gather_points(points, filled)
-    moving = generated + (chosen - generated).detach()
-    return torch.where(same.any(2, keepdim=True), moving, chosen)
+    matched = gather_points(points, match(generated, points))
+    return generated + (matched - generated).detach()
