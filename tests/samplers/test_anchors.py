@@ -11,7 +11,7 @@ from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.anchors import SPACING_POINTS
 from mops_lightning.samplers.base import stream_sample
 from mops_lightning.training.recipe.warm_start import copy_tensors
-from mops_lightning.zoo.export import plain_net
+from mops_lightning.zoo.export import GeneratedPoints
 
 
 def small(kind=MOPSNet, m=6, moved=False, **settings):
@@ -139,4 +139,4 @@ def test_anchors_refuse_chunks_and_export(rng):
     with pytest.raises(UserError, match=r"needs all points .* chunks.*without anchors=fps"):
         stream_sample(net, lambda: torch.randn(50, 3, generator=rng).split(20))
     with pytest.raises(UserError, match="MOPSNet with anchors=fps cannot be exported"):
-        plain_net(net)
+        GeneratedPoints(net)

@@ -6,7 +6,7 @@ import torch
 
 from mops_lightning import FMOPSNet, FPSSampler, MOPSNet, SampleNet, SNet, load
 from mops_lightning.errors import UserError
-from mops_lightning.zoo.export import export, plain_net
+from mops_lightning.zoo.export import export
 
 SMALL: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
 SIZES = ((1, 12), (4, 100), (2, 257))
@@ -27,14 +27,15 @@ def clouds(number, points):
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_plain_net_equals_the_sampler(sampler, m):
+def test_exported_program_equals_the_sampler_at_any_size(sampler, m, tmp_path):
     sampler(clouds(4, 50)).points.sum()  # running statistics
     sampler.eval()
-    net = plain_net(sampler, m)
+    export(sampler, tmp_path / "net.pt2", m)
+    program = torch.export.load(tmp_path / "net.pt2").module()
     with torch.no_grad():
         for shape in SIZES:
             points = clouds(*shape)
-            assert torch.allclose(net(points), sampler(points, m).points, atol=1e-5)
+            assert torch.allclose(program(points), sampler(points, m).points, atol=1e-5)
 
 
 def test_onnx_file_equals_the_model_at_any_size(tmp_path):

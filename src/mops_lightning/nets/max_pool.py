@@ -37,8 +37,9 @@ class PointMaxPool(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, N, channels_in)`` to ``(B, channels_out)`` in the dtype of the weights."""
-        if features.shape[1] <= PLAIN_MAX_POINTS:
-            return self.values(features).amax(1)  # faster than finding the winners of few points
+        # Faster than finding the winners of few points; and exported for any number of clouds.
+        if torch.compiler.is_exporting() or features.shape[1] <= PLAIN_MAX_POINTS:
+            return self.values(features).amax(1)
         if self.norm is None:
             increasing = torch.zeros_like(self.linear.bias, dtype=torch.bool)
             return F.relu(self._extremes(features, increasing) + self.linear.bias)

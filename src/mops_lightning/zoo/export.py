@@ -1,4 +1,4 @@
-"""Export of learned samplers as plain layers: torch.export (.pt2) and ONNX (.onnx)."""
+"""Export of learned samplers: torch.export (.pt2) and ONNX (.onnx)."""
 
 import io
 import logging
@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
@@ -24,66 +23,10 @@ CHECKED = ((1, 1), (3, 2), (2, 7))
 """Numbers of clouds, and of points as multiples of m, at which a file is compared."""
 
 
-class PlainMOPSNet(nn.Module):
-    """MOPS-Net in evaluation as one softmax attention over the points, without blocks.
+class GeneratedPoints(nn.Module):
+    """A learned sampler as a net from points to generated points.
 
-    Maps ``(B, N, 3)`` points in the unit sphere to ``(B, m, 3)`` generated points.
-
-    Args:
-        sampler: trained.
-        m: number of points.
-    """
-
-    def __init__(self, sampler: MOPSNet, m: int) -> None:
-        super().__init__()
-        norm = sampler.rho_first[0]
-        assert isinstance(norm, nn.BatchNorm1d)
-        self.features = plain_layers(sampler.features.mlp.layers)
-        self.rho_local = fuse_linear_bn_eval(sampler.rho_local, norm)
-        self.rho_global = fuse_linear_bn_eval(sampler.rho_global, norm)
-        self.rho_global.register_parameter("bias", None)  # the shift applies to the sum once
-        self.rho = plain_layers(sampler.rho)
-        self.register_buffer("queries", sampler.queries.weight.detach()[:m] / sampler.tau_min)
-
-    def forward(self, points: Tensor) -> Tensor:
-        """Return the generated points."""
-        local = self.features(points)
-        hidden = self.rho_local(local) + self.rho_global(local.amax(1, keepdim=True))
-        keys = self.rho(hidden.relu())
-        return (self.queries @ keys.mT).softmax(2) @ points
-
-
-class PlainSNet(nn.Module):
-    """S-Net or SampleNet in evaluation; arguments and shapes as for ``PlainMOPSNet``."""
-
-    def __init__(self, sampler: SNet, m: int) -> None:
-        super().__init__()
-        last = [sampler.pool.linear, *([sampler.pool.norm] if sampler.pool.norm else [])]
-        self.features = plain_layers([*sampler.features.layers, *last])
-        self.head = plain_layers(sampler.head)
-        self.m = m
-
-    def forward(self, points: Tensor) -> Tensor:
-        """Return the generated points."""
-        pooled = self.features(points).amax(1).relu()
-        return self.head(pooled).unflatten(1, (-1, 3))[:, : self.m]
-
-
-def plain_layers(layers: Iterable[nn.Module]) -> nn.Sequential:
-    """Return linear layers and ReLUs, with BatchNorm fused into the linear layer before it."""
-    plain: list[nn.Module] = []
-    for layer in layers:
-        if isinstance(layer, nn.BatchNorm1d):
-            before = plain[-1]
-            assert isinstance(before, nn.Linear)
-            plain[-1] = fuse_linear_bn_eval(before, layer)
-        else:
-            plain.append(nn.ReLU() if isinstance(layer, nn.ReLU) else layer)
-    return nn.Sequential(*plain)
-
-
-def plain_net(sampler: Sampler, m: int | None = None) -> nn.Module:
-    """Return a learned sampler as plain layers.
+    Maps ``(B, N, 3)`` points in the unit sphere to ``(B, m, 3)``.
 
     Args:
         sampler: trained, in eval mode.
@@ -92,21 +35,26 @@ def plain_net(sampler: Sampler, m: int | None = None) -> nn.Module:
     Raises:
         UserError: the sampler has no weights, selects input points, or does not return m points.
     """
-    m = sampler.m if m is None else m
-    sampler.check_m(m)
-    if isinstance(sampler, MOPSNet) and not sampler.streams:
-        raise UserError(
-            f"{type(sampler).__name__} with anchors=fps cannot be exported, as its farthest points "
-            "are found one by one. Export one without anchors."
-        )
-    if isinstance(sampler, MOPSNet) and sampler.generates:
-        return PlainMOPSNet(sampler, m).eval()
-    if isinstance(sampler, SNet) and sampler.generates:
-        return PlainSNet(sampler, m).eval()
-    raise UserError(
-        f"{type(sampler).__name__} cannot be exported. MOPS-Net, FMOPS-Net, S-Net and SampleNet "
-        "can."
-    )
+
+    def __init__(self, sampler: Sampler, m: int | None = None) -> None:
+        super().__init__()
+        self.m = sampler.m if m is None else m
+        sampler.check_m(self.m)
+        if isinstance(sampler, MOPSNet) and not sampler.streams:
+            raise UserError(
+                f"{type(sampler).__name__} with anchors=fps cannot be exported, as its farthest "
+                "points are found one by one. Export one without anchors."
+            )
+        if not isinstance(sampler, MOPSNet | SNet):
+            raise UserError(
+                f"{type(sampler).__name__} cannot be exported. MOPS-Net, FMOPS-Net, S-Net and "
+                "SampleNet can."
+            )
+        self.sampler = sampler
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Return the generated points."""
+        return self.sampler.sample(points, self.m).points
 
 
 def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
@@ -129,7 +77,8 @@ def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
     """
     if path.suffix not in SUFFIXES:
         raise UserError(f"OUT must end in {' or '.join(SUFFIXES)}, got {path}.")
-    net, m = plain_net(sampler, m), m or sampler.m
+    net = GeneratedPoints(sampler, m)
+    m = net.m
     example = torch.rand(2, 2 * m + 3, 3, generator=torch.Generator().manual_seed(0))
     dynamic = ({0: torch.export.Dim("batch"), 1: torch.export.Dim("points")},)
     with torch.no_grad(), atomic_write(path) as temporary:
