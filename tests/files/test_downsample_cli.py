@@ -23,6 +23,7 @@ GENERATED = ["--weights", "weights.safetensors", "--readout", "generated"]
         ([*GENERATED, "--keep-attributes"], "no attributes"),
         (["--m", 500, "--method", "fps"], "holds 299 points, fewer than --m 500"),
         ([*FPS, "--chunk", 4], "--chunk must be at least --m 5, got 4"),
+        ([*FPS, "--chunk", 9, "--map", "map.npz"], "use propagate after --chunk"),
         (["--weights", "weights.safetensors", "--chunk", 0], "--chunk must be at least 1, got 0"),
         (["--m", 9, "--method", "fps", "--tile", 1], "--tile must be at least 2"),
         (["--weights", "weights.safetensors", "--tile", 64], "--tile needs --m"),
@@ -41,6 +42,7 @@ GENERATED = ["--weights", "weights.safetensors", "--readout", "generated"]
         ([*FPS, "--level", 1, "--resolution", 0.5], "--level or --resolution, not both"),
         ([*FPS, "--resolution", 0], "--resolution must be a number above 0"),
         ([*FPS, "--resolution", 1], "in/a.ply: --level and --resolution need a COPC file"),
+        ([*FPS, "--level", 1, "--map", "map.npz"], "--map has a row for every point"),
     ],
 )
 def test_mistake_ends_in_one_line(arguments, said, folder, tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""The subcommand ``propagate``."""
+"""The map of a downsampled file, and the subcommand ``propagate``."""
 
 from typing import Any
 
@@ -14,6 +14,8 @@ from mops_lightning.files import propagate as module
 from mops_lightning.files.cli import propagate as main
 from mops_lightning.ops import propagation
 from tests.support.captured import captured, refused
+from tests.support.downsample import call as downsample
+from tests.support.downsample import refused as not_downsampled
 
 
 def call(*arguments):
@@ -41,6 +43,61 @@ def scan(tmp_path):
 
 def nearest(points, sampled):
     return np.linalg.norm(points[:, None] - sampled, axis=2).argmin(1)
+
+
+def test_map_leads_from_sample_to_all_points(scan, tmp_path):
+    map_, small = tmp_path / "map.npz", tmp_path / "small.ply"
+    arguments = ["--m", 30, "--method", "fps", "--map", map_, "--keep-attributes"]
+    status, _, err = downsample(scan, small, *arguments)
+    assert (status, err) == (0, "")
+    points, sample = contents(scan).points, contents(small)
+    labels = np.arange(30) + 2**60
+    carried = mops_lightning.propagate(labels, map_, fill=-1)
+    assert len(carried) == 500
+    finite = np.isfinite(points).all(1)
+    np.testing.assert_array_equal(carried[~finite], -1)
+    expected = labels[nearest(points[finite], sample.points)]
+    np.testing.assert_array_equal(carried[finite], expected)
+    assert (np.load(map_)["rows"][sample.columns["intensity"], 0] >= 0).all()
+
+
+def test_map_with_several_rows_averages_scores(scan, tmp_path):
+    map_, small = tmp_path / "new" / "map.npz", tmp_path / "small.npz"
+    arguments = ["--m", 30, "--method", "random", "--map", map_, "--map-k", 4]
+    assert downsample(scan, small, *arguments)[0] == 0
+    points = contents(scan).finite().points
+    sampled = contents(small).points
+    distances = np.linalg.norm(points[:, None] - sampled, axis=2)
+    rows = distances.argsort(1)[:, :4]
+    inverse = np.maximum(np.take_along_axis(distances, rows, 1), 1e-12) ** -2
+    scores = np.random.default_rng(2).random(30)
+    expected = (scores[rows] * inverse).sum(1) / inverse.sum(1)
+    carried = mops_lightning.propagate(scores, map_, fill=np.nan)
+    np.testing.assert_allclose(carried[np.isfinite(carried)], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--map", "map.txt"], "--map must end in .npz, got map.txt"),
+        (["--map", "big.ply.npz", "--map-k", 0], "--map-k must be from 1 to --m, got 0"),
+        (["--map", "map.npz", "--map-k", 9], "--map-k must be from 1 to --m, got 9"),
+        (["--map-k", 3], "--map-k 3 has no effect without --map"),
+        (["--map", "old.npz"], "old.npz exists. Give another --map, or --overwrite"),
+        (
+            ["--map", "map.npz", "--chunk", 60],
+            "--map needs the whole cloud in memory: use",
+        ),
+        (["--map", "small.npz"], "--map must differ from IN and OUT"),
+    ],
+)
+def test_wrong_map_of_downsample_gets_one_line(arguments, said, scan, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "old.npz").touch()
+    settings = ["--m", 8, "--method", "fps"]
+    assert said in not_downsampled("big.ply", "small.npz", *settings, *arguments)
+    said = not_downsampled(tmp_path, "out", *settings, "--map", "map.npz")
+    assert "--map is the map of one file" in said
 
 
 @pytest.mark.parametrize("source", [".ply", ".las", ".laz", ".npy", ".npz", ".xyz"])

@@ -92,21 +92,45 @@ def test_gradients_flow_to_features(rng):
     assert torch.autograd.gradcheck(lambda features: propagate(features, made), values)
 
 
+ROWS = np.zeros((5, 2), np.int32)
+
+
 @pytest.mark.parametrize(
-    ("map_", "said"),
+    ("arrays", "said"),
     [
+        ({"m": np.array(3)}, r"is no map: .*rows \(N, k\) and m of at least 1, got m"),
+        ({"rows": ROWS}, "is no map"),
+        ({"rows": ROWS / 2, "m": np.array(3)}, "must hold whole numbers"),
+        ({"rows": ROWS[0], "m": np.array(3)}, "is no map"),
+        ({"rows": ROWS[:, :0], "m": np.array(3)}, "is no map"),
+        ({"rows": ROWS, "m": np.array([3, 3])}, "is no map"),
+        ({"rows": ROWS, "m": np.array(-3)}, "m of at least 1"),
+        ({"rows": ROWS[:, :1] + 3, "m": np.array(3)}, "rows must be from -1 to 2, got 3 to 3"),
+        ({"rows": ROWS[:, :1] - 2, "m": np.array(3)}, "rows must be from -1 to 2, got -2"),
         (
-            PropagationMap(torch.tensor([[3]]), torch.ones(1, 1), 3),
-            "rows must be from 0 to 2, got 3",
+            {"rows": ROWS[:, :1] - 1, "m": np.array(3)},
+            "5 points have no finite coordinates.* fill=0",
         ),
-        (PropagationMap(torch.tensor([[-1]]), torch.ones(1, 1), 3), "from 0 to 2, got -1"),
-        (PropagationMap(torch.tensor([[0]]), torch.ones(1, 1), 4), r"shape \(4,\), got \(3,\)"),
-        ({"rows": 3}, "map must be a PropagationMap, got dict"),
+        ({"rows": ROWS[:, :1], "m": np.array(4)}, r"each of 4 sampled points, shape \(4,\), got"),
+        ({"rows": ROWS, "m": np.array(3)}, "weights must be finite"),
+        ({"rows": ROWS, "m": np.array(3), "weights": ROWS * np.nan}, "weights must be finite"),
     ],
 )
-def test_wrong_map_gets_one_line(map_, said):
-    with pytest.raises(UserError, match=said):
-        propagate(np.arange(3), map_)
+def test_bad_map_gets_one_line(arrays, said, tmp_path):
+    np.savez(tmp_path / "map.npz", **arrays)
+    with pytest.raises(UserError, match=said) as error:
+        propagate(np.arange(3), tmp_path / "map.npz")
+    assert "\n" not in str(error.value)
+
+
+def test_missing_or_broken_map_gets_one_line(tmp_path):
+    with pytest.raises(UserError, match=r"no file .*map.npz\. Write it by downsample --map"):
+        propagate(np.arange(3), tmp_path / "map.npz")
+    (tmp_path / "map.npz").write_bytes(b"PK" * 40)
+    with pytest.raises(UserError, match=r"map.npz is broken"):
+        propagate(np.arange(3), tmp_path / "map.npz")
+    with pytest.raises(UserError, match="map must be a PropagationMap or a file, got dict"):
+        propagate(np.arange(3), {"rows": 3})
 
 
 POINTS = torch.rand(6, 3)

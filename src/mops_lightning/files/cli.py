@@ -98,6 +98,14 @@ def _downsample_arguments(add: Add) -> None:
         help="distribute the chunks of every file over the workers of this Dask scheduler",
     )
     add(
+        "--map",
+        type=Path,
+        metavar="FILE.npz",
+        help="write for every point of IN the row of its nearest point of OUT, to carry labels "
+        "back by mops_lightning.propagate",
+    )
+    add("--map-k", type=int, default=1, help="rows per point in --map, with weights 1/d^2")
+    add(
         "--weight",
         metavar="FIELD",
         help="prefer points by this column of IN, such as opacity or intensity, or by 'curvature', "
@@ -140,6 +148,8 @@ def _downsample_files(chosen: argparse.Namespace, options: Options) -> int:
     is_folder = is_many(chosen.source)
     if not is_folder and pairs[0][1].exists() and not chosen.overwrite:
         raise UserError(f"{pairs[0][1]} exists. Give another OUT, or --overwrite.")
+    if chosen.map is not None:
+        _check_map(chosen, is_folder, pairs[0])
     # Of a run that was killed.
     remove_temporary(chosen.target if is_folder else pairs[0][1].parent, below=is_folder)
     with _engine(chosen, not is_folder) as engine:
@@ -149,6 +159,16 @@ def _downsample_files(chosen: argparse.Namespace, options: Options) -> int:
         workers, overwrite = chosen.workers, chosen.overwrite
         failed = process_folder(pairs, options, chosen.target, workers, overwrite, engine)
         return 1 if failed else 0
+
+
+def _check_map(chosen: argparse.Namespace, is_folder: bool, files: tuple[Path, Path]) -> None:
+    """Reject a map of several files, and one that would replace another file."""
+    if is_folder:
+        raise UserError(f"--map is the map of one file, but IN is {chosen.source}.")
+    if realpath(chosen.map) in map(realpath, files):
+        raise UserError(f"--map must differ from IN and OUT, got {chosen.map}.")
+    if chosen.map.exists() and not chosen.overwrite:
+        raise UserError(f"{chosen.map} exists. Give another --map, or --overwrite.")
 
 
 def _options(chosen: argparse.Namespace) -> Options:

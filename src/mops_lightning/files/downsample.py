@@ -15,6 +15,7 @@ from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.files.chunks import Outcome, draw, sample_by_chunks
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
+from mops_lightning.files.propagate import write_map
 from mops_lightning.files.tiles import sample_by_tiles
 from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.weights import CURVATURE, check_positive, check_weight, curvature
@@ -101,6 +102,8 @@ def downsample_file(
         finite = whole.finite()
         table, number = _sample_table(source, finite, sampler, m, options), len(finite.points)
         outcome = Outcome(m, number, len(whole.points) - number)
+        if options.map is not None:
+            write_map(options.map, whole.points, table.points, options.map_k)
     write(target, table)  # last, so that a file that exists is complete
     return outcome
 

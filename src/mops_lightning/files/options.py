@@ -1,6 +1,7 @@
 """Options of ``downsample``, checked."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from mops_lightning.data.formats.table import Area
 from mops_lightning.errors import UserError
@@ -21,6 +22,8 @@ class Options:
         seed: of random choices.
         chunk: number of points in memory; see ``draws``. None: the whole file.
         tile: most points of a tile; None: no tiles.
+        map: file to write for ``mops_lightning.propagate``; None: no file.
+        map_k: number of sampled points per point in this file.
         weight: a column with a weight per point, or ``curvature``; None: all points are equal.
         area: the part of the file to sample; None: all of it.
 
@@ -37,6 +40,8 @@ class Options:
     seed: int = 0
     chunk: int | None = None
     tile: int | None = None
+    map: Path | None = None
+    map_k: int = 1
     weight: str | None = None
     area: Area | None = None
 
@@ -57,6 +62,12 @@ class Options:
                 "--keep-attributes: generated points are new and have no attributes. Use "
                 "--readout completed or matched."
             )
+        if self.map is not None and self.map.suffix.lower() != ".npz":
+            raise UserError(f"--map must end in .npz, got {self.map}.")
+        if self.map_k < 1 or (self.m is not None and self.map_k > self.m):
+            raise UserError(f"--map-k must be from 1 to --m, got {self.map_k}.")
+        if self.map is None and self.map_k != 1:
+            raise UserError(f"--map-k {self.map_k} has no effect without --map FILE.npz.")
         self._check_parts()
 
     def _check_parts(self) -> None:
@@ -69,6 +80,10 @@ class Options:
             raise UserError(f"--tile keeps different input points: no --readout {self.readout}.")
         if self.weight is not None and self.tile is not None:
             raise UserError("--weight needs the whole cloud at once: leave --tile out.")
+        if self.chunk is not None and self.map is not None:
+            raise UserError("--map needs the whole cloud in memory: use propagate after --chunk.")
+        if self.area is not None and self.map is not None:
+            raise UserError("--map has a row for every point of IN: no --bounds or level with it.")
         if self.chunk is not None and self.chunk < 1:
             raise UserError(f"--chunk must be at least 1, got {self.chunk}.")
         if self.draws and self.m is not None and self.m > (self.chunk or 0):

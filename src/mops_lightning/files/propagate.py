@@ -1,10 +1,12 @@
-"""The way back in files: columns of a sample for all points."""
+"""The way back in files: the map of a downsampled file, and columns of a sample for all points."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mops_lightning.data.formats.guard import (
     BadCloudError,
@@ -16,7 +18,30 @@ from mops_lightning.data.formats.registry import READERS, open_cloud_file, write
 from mops_lightning.data.formats.table import PART, Column, Table, TableParts
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.files.engine import with_progress
-from mops_lightning.ops.propagation import mapper, propagate
+from mops_lightning.filesystem import atomic_write
+from mops_lightning.ops.propagation import mapper, propagate, propagation_map
+
+Points = NDArray[np.float64]
+
+
+def write_map(path: Path, points: Points, sampled: Points, k: int) -> None:
+    """Write a map that ``mops_lightning.propagate`` reads.
+
+    Args:
+        path: the .npz file.
+        points: ``(N, 3)``; points that are not finite get row −1.
+        sampled: ``(m, 3)``.
+        k: number of sampled points per point, at most m.
+    """
+    finite = np.isfinite(points).all(1)
+    found = propagation_map(points[finite], sampled, k)
+    arrays: dict[str, Any] = {"rows": np.full((len(points), k), -1, np.int32), "m": len(sampled)}
+    arrays["rows"][finite] = found.rows.numpy()
+    if k > 1:  # the weight of one point is 1
+        arrays["weights"] = np.zeros((len(points), k), np.float32)
+        arrays["weights"][finite] = found.weights.numpy()
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def propagate_file(

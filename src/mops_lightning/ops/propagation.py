@@ -6,15 +6,19 @@ caller asks for it, so that a label stays a label.
 """
 
 from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
+from mops_lightning.filesystem import load_npz
 from mops_lightning.ops.nearest import k_nearest, nearest
 from mops_lightning.ops.points import as_tensor, cloud_sizes
 
@@ -26,7 +30,8 @@ class PropagationMap(NamedTuple):
     """The nearest sampled points of every point.
 
     Attributes:
-        rows: ``(N, k)`` or ``(B, N, k)`` int64, rows of the sampled points, the nearest first.
+        rows: ``(N, k)`` or ``(B, N, k)`` int64, rows of the sampled points, the nearest first; −1
+            for points of a file without finite coordinates.
         weights: of the rows, floating point; their sum is 1.
         m: number of sampled points, of every cloud where rows are ``(B, N, k)``.
     """
@@ -144,7 +149,7 @@ def _search(points: Tensor, sampled: Tensor, k: int, tree: Any = None) -> tuple[
     return rows, weights.to(torch.promote_types(dtype, torch.float32))
 
 
-def propagate(values: Any, map: PropagationMap, mean: bool = False) -> Any:
+def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> Any:
     """Carry values of the sampled points to all points.
 
     With one sampled point per point, values are copied. With several, floats are averaged by the
@@ -153,15 +158,16 @@ def propagate(values: Any, map: PropagationMap, mean: bool = False) -> Any:
     Args:
         values: ``(m, ...)``, or ``(B, m, ...)`` for maps of ``(B, N, k)``: one row per sampled
             point, in the order of the sample; a tensor or an array.
-        map: from ``propagation_map``.
+        map: from ``propagation_map``, or the file that ``downsample --map`` writes.
         mean: average whole numbers too, such as colours, and round them.
+        fill: value of the points of a file without finite coordinates.
 
     Returns:
         ``(N, ...)`` or ``(B, N, ...)``, of the type and dtype of ``values``, on their device.
         Gradients flow to floating-point values.
 
     Raises:
-        UserError: map and values do not fit.
+        UserError: map and values do not fit, or ``fill`` is missing.
 
     Examples:
         >>> import torch
@@ -170,17 +176,27 @@ def propagate(values: Any, map: PropagationMap, mean: bool = False) -> Any:
         >>> propagate(torch.tensor([7, 8]), propagation_map(line, line[[0, 2]]))
         tensor([7, 7, 8])
     """
+    if isinstance(map, str | PathLike):
+        map = read_map(Path(map))
     if not isinstance(map, PropagationMap):
-        raise UserError(f"map must be a PropagationMap, got {type(map).__name__}.")
+        raise UserError(f"map must be a PropagationMap or a file, got {type(map).__name__}.")
     numbers = as_tensor("values", values)
     rows, leading = _rows(map, numbers).to(numbers.device), map.rows.ndim - 1
-    table = numbers.reshape(-1, *numbers.shape[leading:])
+    missing = rows[:, 0] < 0
+    if fill is None and bool(missing.any()):
+        raise UserError(
+            f"map: {int(missing.sum())} points have no finite coordinates. Give their value, such "
+            "as fill=0."
+        )
+    rows, table = rows.clamp_min(0), numbers.reshape(-1, *numbers.shape[leading:])
     weights = map.weights.to(numbers.device).reshape(rows.shape)
     if rows.shape[1] == 1:
         result = table[rows[:, 0]]
     else:
         averaged = mean or numbers.is_floating_point()
         result = (_mean if averaged else _vote)(table, rows, weights)
+    if bool(missing.any()):
+        result[missing] = fill
     result = result.reshape(*map.rows.shape[:-1], *numbers.shape[leading:])
     return result if isinstance(values, Tensor) else result.numpy()
 
@@ -224,9 +240,9 @@ def _rows(map: PropagationMap, values: Tensor) -> Tensor:
             f"{(*clouds, map.m)}, got {tuple(values.shape)}."
         )
     rows = map.rows.long()
-    if rows.numel() and not (int(rows.min()) >= 0 and int(rows.max()) < map.m):
+    if rows.numel() and not (int(rows.min()) >= -1 and int(rows.max()) < map.m):
         raise UserError(
-            f"map: rows must be from 0 to {map.m - 1}, got {int(rows.min())} to {int(rows.max())}."
+            f"map: rows must be from -1 to {map.m - 1}, got {int(rows.min())} to {int(rows.max())}."
         )
     if clouds:
         rows = rows + map.m * torch.arange(clouds[0], device=rows.device)[:, None, None]
@@ -252,3 +268,30 @@ def _vote(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     ]
     winner = torch.stack(votes, 1).argmax(1, keepdim=True)
     return codes.gather(1, winner).to(table.dtype).reshape(-1, *table.shape[1:])
+
+
+def read_map(path: Path) -> PropagationMap:
+    """Read the file that ``downsample --map`` writes.
+
+    Raises:
+        UserError: the file is missing, broken, or not a map.
+    """
+    if not path.is_file():
+        raise UserError(f"map: no file {path}. Write it by downsample --map {path}.")
+    arrays = load_npz(path)
+    rows: Any = arrays.get("rows")
+    m: Any = arrays.get("m")
+    kinds = {array.dtype.kind for array in (rows, m) if array is not None}
+    if rows is None or m is None or kinds != {"i"} or not _sizes_fit(rows, m):
+        raise UserError(
+            f"{path} is no map: it must hold whole numbers, rows (N, k) and m of at least 1, got "
+            f"{', '.join(arrays) or 'no arrays'}. Write it by downsample --map."
+        )
+    weights = arrays.get("weights", np.ones((len(rows), 1), np.float32))  # may lack for k = 1
+    if weights.shape != rows.shape or not (np.isfinite(weights).all() and (weights >= 0).all()):
+        raise UserError(f"{path}: weights must be finite, at least 0, and of shape {rows.shape}.")
+    return PropagationMap(torch.from_numpy(rows), torch.from_numpy(weights), int(m))
+
+
+def _sizes_fit(rows: NDArray[Any], m: NDArray[Any]) -> bool:
+    return rows.ndim == 2 and rows.shape[1] > 0 and m.ndim == 0 and bool(m >= 1)
