@@ -37,7 +37,7 @@ class PointMaxPool(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, N, channels_in)`` to ``(B, channels_out)`` in the dtype of the weights."""
-        # Faster than finding the winners of few points; and exported for any number of clouds.
+        # The plain layers are faster for few points, and can be exported for any number of clouds.
         if torch.compiler.is_exporting() or features.shape[1] <= PLAIN_MAX_POINTS:
             return self.values(features).amax(1)
         if self.norm is None:

@@ -10,14 +10,12 @@ from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL
-from mops_lightning.records.run_record import RunRecord
+from mops_lightning.records.run_record import RunRecord, dotted
 from mops_lightning.report import paper
 from mops_lightning.report.collect import score, seed, training_time
 from mops_lightning.report.comparable import Group
 from mops_lightning.report.tables import over_seeds
 from mops_lightning.report.text import PAPER, Grid
-
-CLASS = "_target_"
 
 NAMES = {"points": "points after stages"}
 """Settings of a net whose names have another meaning in the table."""
@@ -84,11 +82,14 @@ def _row(records: list[RunRecord], keys: list[str], metrics: list[MetricInfo]) -
 
 
 def _net(record: RunRecord) -> dict[str, Any]:
-    """Return the settings of a net; of a sampler inside it, the name and dotted settings."""
-    net = {NAMES.get(key, key): value for key, value in _arguments(record).items() if key != CLASS}
-    for key, part in [item for item in net.items() if isinstance(item[1], dict)]:
-        own = {f"{key}.{name}": "none" if value is None else value for name, value in part.items()}
-        net |= {key: own.pop(f"{key}.{CLASS}").split(".")[-2], **own}
+    """Return the dotted settings of a net; of a sampler inside it, also the name of its module."""
+    net: dict[str, Any] = {}
+    for key, value in dotted(_arguments(record)).items():
+        part, _, name = key.rpartition(".")
+        if name == "_target_":
+            net |= {part: str(value).split(".")[-2:][0]} if part else {}
+        else:
+            net[NAMES.get(key, key)] = "none" if part and value is None else value
     return net
 
 
