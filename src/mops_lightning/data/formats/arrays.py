@@ -4,18 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mops_lightning.data.formats import table as tables
 from mops_lightning.data.formats.guard import BadCloudError, WholeOnlyError
-from mops_lightning.data.formats.table import (
-    CloudFile,
-    Column,
-    Table,
-    binary_file,
-    column_names,
-    compact_coordinates,
-    from_array,
-    split_array,
-    unique_names,
-)
 from mops_lightning.filesystem import load_npz
 
 POINTS = ("points", "xyz", "pos")
@@ -25,33 +15,33 @@ KITTI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
 """A row of a laser scan; its file has no header."""
 
 
-def read_npy(path: Path) -> Table:
+def read_npy(path: Path) -> tables.Table:
     """Read one array: ``(N, K)`` numbers, x, y and z first, or ``(N,)`` rows of named fields."""
-    return from_array(np.load(path, allow_pickle=False), path)
+    return tables.from_array(np.load(path, allow_pickle=False), path)
 
 
-def write_npy(path: Path, table: Table) -> None:
+def write_npy(path: Path, table: tables.Table) -> None:
     """Write ``(N, 3 + columns)`` float64."""
     with path.open("wb") as file:
         np.save(file, np.column_stack([table.points, *table.columns.values()]))
 
 
-def locate_npy(path: Path) -> CloudFile:
+def locate_npy(path: Path) -> tables.CloudFile:
     """Find the rows of an .npy file.
 
     Raises:
         BadCloudError: the array does not hold points, or not one after the other.
     """
     array = np.load(path, mmap_mode="r", allow_pickle=False)
-    names, kind = column_names(array, path), array.dtype
+    names, kind = tables.column_names(array, path), array.dtype
     if kind.names is None:
         if not array.flags.c_contiguous:
             raise WholeOnlyError(f"{path}: --chunk needs an array in C order, got Fortran order.")
         kind = np.dtype([(name, kind) for name in names])
-    return binary_file(path, array.shape[0], kind, array.offset)
+    return tables.binary_file(path, array.shape[0], kind, array.offset)
 
 
-def read_npz(path: Path) -> Table:
+def read_npz(path: Path) -> tables.Table:
     """Read the array named as in ``POINTS``, or the only one; the rest are attributes.
 
     Raises:
@@ -63,35 +53,35 @@ def read_npz(path: Path) -> Table:
         (chosen,) = arrays
     if chosen is None:
         raise BadCloudError(f"{path} has no array named points, got {', '.join(arrays) or 'none'}.")
-    table = from_array(arrays.pop(chosen), path)
-    columns: dict[str, Column] = dict(table.columns)
+    table = tables.from_array(arrays.pop(chosen), path)
+    columns: dict[str, tables.Column] = dict(table.columns)
     for name, array in arrays.items():
         numbers = array.dtype.kind in "fiub" and array.ndim in (1, 2)
         if numbers and len(array) == len(table.points):
-            columns |= split_array(name, array)
-    return Table(table.points, columns)
+            columns |= tables.split_array(name, array)
+    return tables.Table(table.points, columns)
 
 
-def write_npz(path: Path, table: Table) -> None:
+def write_npz(path: Path, table: tables.Table) -> None:
     """Write ``points`` and one array for every column."""
-    named = unique_names(table)
+    named = tables.unique_names(table)
     with path.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, points=table.points, **named)
 
 
-def read_kitti(path: Path) -> Table:
+def read_kitti(path: Path) -> tables.Table:
     """Read a laser scan."""
     scan = locate_kitti(path)
     return scan.parse(path, range(scan.number))
 
 
-def write_kitti(path: Path, table: Table) -> None:
+def write_kitti(path: Path, table: tables.Table) -> None:
     """Write a laser scan; without an ``intensity`` column the intensity is 0.
 
     Raises:
         BadCloudError: float32 would move the points.
     """
-    points = compact_coordinates(table)
+    points = tables.compact_coordinates(table)
     if points.dtype != np.float32:
         raise BadCloudError(
             f"{path}: .bin holds float32, which would move these points, far from the origin, by "
@@ -101,7 +91,7 @@ def write_kitti(path: Path, table: Table) -> None:
     path.write_bytes(np.column_stack([points, intensity]).astype("<f4").tobytes())
 
 
-def locate_kitti(path: Path) -> CloudFile:
+def locate_kitti(path: Path) -> tables.CloudFile:
     """Find the rows of a laser scan.
 
     Raises:
@@ -112,4 +102,4 @@ def locate_kitti(path: Path) -> CloudFile:
         raise BadCloudError(
             f"{path} is not a KITTI scan: {length} bytes are not rows of 4 float32."
         )
-    return binary_file(path, length // KITTI.itemsize, KITTI)
+    return tables.binary_file(path, length // KITTI.itemsize, KITTI)

@@ -10,17 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from mops_lightning.data.formats import table as tables
 from mops_lightning.data.formats.guard import BadCloudError, ends_early
 from mops_lightning.data.formats.isolated import isolated
-from mops_lightning.data.formats.table import (
-    Area,
-    CloudFile,
-    Column,
-    Table,
-    TableParts,
-    split_array,
-    unique_names,
-)
 from mops_lightning.errors import UserError
 
 COPC = "copc"
@@ -36,7 +28,7 @@ RECORD, EXTENDED_RECORD = 54, 60
 """Least numbers of bytes of the records before and after the points."""
 
 
-def read(path: Path) -> Table:
+def read(path: Path) -> tables.Table:
     """Read all points with all their dimensions; coordinates are scaled and shifted.
 
     Raises:
@@ -45,17 +37,17 @@ def read(path: Path) -> Table:
     return isolated(_parse, path)
 
 
-def locate(path: Path) -> CloudFile:
+def locate(path: Path) -> tables.CloudFile:
     """Open a file to read ranges of its rows.
 
     Raises:
         UserError: laspy is not installed, or the file is broken.
     """
     header = isolated(_parse_header, path)
-    return CloudFile(path, header.point_count, partial(isolated, _parse_rows), header)
+    return tables.CloudFile(path, header.point_count, partial(isolated, _parse_rows), header)
 
 
-def locate_area(file: CloudFile, area: Area) -> CloudFile:
+def locate_area(file: tables.CloudFile, area: tables.Area) -> tables.CloudFile:
     """Return the part of a file in an area.
 
     The rows of a COPC file are then those of the cells of its octree that overlap the area.
@@ -74,7 +66,7 @@ def locate_area(file: CloudFile, area: Area) -> CloudFile:
         return replace(file, area=area)
     number = isolated(_count_in_nodes, file.path, area)
     parse = partial(isolated, partial(_parse_nodes, area))
-    return CloudFile(
+    return tables.CloudFile(
         file.path, number, parse, file.header, replace(area, level=None, resolution=None)
     )
 
@@ -103,7 +95,7 @@ def _check_records(path: Path) -> None:
         )
 
 
-def _parse(path: Path) -> Table:
+def _parse(path: Path) -> tables.Table:
     declared = _parse_header(path).point_count
     with _laspy(path).open(path) as file:
         table = _table(file.read_points(declared), file.header)
@@ -112,7 +104,7 @@ def _parse(path: Path) -> Table:
     return table
 
 
-def _parse_rows(path: Path, rows: range) -> Table:
+def _parse_rows(path: Path, rows: range) -> tables.Table:
     """Read a range of rows.
 
     Raises:
@@ -124,12 +116,12 @@ def _parse_rows(path: Path, rows: range) -> Table:
         return _table_near(path, file.read_points(len(rows)), file.header)
 
 
-def _count_in_nodes(path: Path, area: Area) -> int:
+def _count_in_nodes(path: Path, area: tables.Area) -> int:
     with _laspy(path).CopcReader.open(path) as reader:
         return sum(node.point_count for node in _nodes(reader, area))
 
 
-def ranges_of_bytes(path: Path, area: Area) -> list[tuple[int, int]]:
+def ranges_of_bytes(path: Path, area: tables.Area) -> list[tuple[int, int]]:
     """Return where the octree's cells that overlap an area are in a file: starts and ends.
 
     Cells with little between them are joined: an answer of a server takes as long as ``GAP`` bytes.
@@ -144,7 +136,7 @@ def ranges_of_bytes(path: Path, area: Area) -> list[tuple[int, int]]:
     return joined
 
 
-def _parse_nodes(area: Area, path: Path, rows: range) -> Table:
+def _parse_nodes(area: tables.Area, path: Path, rows: range) -> tables.Table:
     """Read a range of the rows of the octree's cells that overlap an area.
 
     Raises:
@@ -162,7 +154,7 @@ def _parse_nodes(area: Area, path: Path, rows: range) -> Table:
     return table.take(np.arange(len(table.points))[rows.start - first : rows.stop - first])
 
 
-def _nodes(reader: Any, area: Area) -> list[Any]:
+def _nodes(reader: Any, area: tables.Area) -> list[Any]:
     """Return the cells of a COPC file's octree that overlap an area, in the order of the file."""
     from laspy.copc import Bounds, load_octree_for_query
 
@@ -177,7 +169,7 @@ def _nodes(reader: Any, area: Area) -> list[Any]:
     return sorted((n for n in nodes if n.point_count), key=lambda node: node.offset)
 
 
-def _table_near(path: Path, cloud: Any, header: Any) -> Table:
+def _table_near(path: Path, cloud: Any, header: Any) -> tables.Table:
     """Make a table of points, none of which is far outside of the header's bounds."""
     table = _table(cloud, None)
     low, high = np.asarray(header.mins), np.asarray(header.maxs)
@@ -187,44 +179,44 @@ def _table_near(path: Path, cloud: Any, header: Any) -> Table:
     return table
 
 
-def _table(cloud: Any, header: Any) -> Table:
+def _table(cloud: Any, header: Any) -> tables.Table:
     """Make a table of laspy's points; an array of k numbers per point becomes k columns."""
     points = np.stack([np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"], 1)
     names = [name for name in cloud.point_format.dimension_names if name not in "XYZ"]
-    columns: dict[str, Column] = {}
+    columns: dict[str, tables.Column] = {}
     for name in names:
-        columns |= split_array(name, np.asarray(cloud[name]))
-    return Table(points, columns, header)
+        columns |= tables.split_array(name, np.asarray(cloud[name]))
+    return tables.Table(points, columns, header)
 
 
-def write(path: Path, table: Table) -> None:
+def write(path: Path, table: tables.Table) -> None:
     """Write a LAS or LAZ file like the one that was read, or one of plain coordinates."""
-    write_parts(path, TableParts.whole(table))
+    write_parts(path, tables.TableParts.whole(table))
 
 
-def write_parts(path: Path, table: TableParts) -> None:
+def write_parts(path: Path, table: tables.TableParts) -> None:
     """Write a LAS or LAZ file part by part."""
     laspy = _laspy(path)
     header = _header(laspy, table)
-    dimensions = _add_dimensions(laspy, header, Table(table.corners, table.columns))
+    dimensions = _add_dimensions(laspy, header, tables.Table(table.corners, table.columns))
     form = {"header": header, "do_compress": path.suffix.lower() == ".laz", "closefd": False}
     # Opened here, because laspy leaves its file open when the disk is full.
     with path.open("wb+") as stream, laspy.open(stream, mode="w", **form) as file:
         for part in table.parts:
             points = laspy.ScaleAwarePointRecord.zeros(len(part.points), header=header)
             points.x, points.y, points.z = part.points.T
-            for name, column in unique_names(part).items():
+            for name, column in tables.unique_names(part).items():
                 points[dimensions[name]] = column
             file.write_points(points)
         if header.evlrs:
             file.write_evlrs(header.evlrs)
 
 
-def _add_dimensions(laspy: Any, header: Any, table: Table) -> dict[str, str]:
+def _add_dimensions(laspy: Any, header: Any, table: tables.Table) -> dict[str, str]:
     """Add what a header lacks for a table, and return the dimension of every column."""
     known = set(header.point_format.dimension_names)
     dimensions = {}
-    for name, column in unique_names(table).items():
+    for name, column in tables.unique_names(table).items():
         if name in known and _holds(laspy, header, name, column):
             dimensions[name] = name
             continue
@@ -235,7 +227,7 @@ def _add_dimensions(laspy: Any, header: Any, table: Table) -> dict[str, str]:
     return dimensions
 
 
-def _header(laspy: Any, table: TableParts) -> Any:
+def _header(laspy: Any, table: tables.TableParts) -> Any:
     """Return a header like the one of the file that was read.
 
     Without the index of COPC files, which does not fit other points, and without arrays of numbers,
@@ -259,7 +251,7 @@ def _header(laspy: Any, table: TableParts) -> Any:
     return header
 
 
-def _holds(laspy: Any, header: Any, name: str, column: Column) -> bool:
+def _holds(laspy: Any, header: Any, name: str, column: tables.Column) -> bool:
     """Return whether the type of a dimension of LAS holds the numbers of a column exactly."""
     points = laspy.ScaleAwarePointRecord.zeros(len(column), header=header)
     with suppress(OverflowError, TypeError, ValueError), np.errstate(all="ignore"):

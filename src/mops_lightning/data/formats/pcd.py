@@ -7,20 +7,13 @@ import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 
+from mops_lightning.data.formats import table as tables
 from mops_lightning.data.formats.guard import BadCloudError
-from mops_lightning.data.formats.table import (
-    Column,
-    Table,
-    from_columns,
-    split_array,
-    to_columns,
-    to_rows,
-)
 
 KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
-def read(path: Path) -> Table:
+def read(path: Path) -> tables.Table:
     """Read a PCD file; a field with a COUNT of k becomes k columns."""
     data = path.read_bytes()
     header, start = _header(data)
@@ -37,18 +30,18 @@ def read(path: Path) -> Table:
         ]
     )
     array = _body(path, data[start:], header["DATA"][0], layout, number)
-    columns: dict[str, Column] = {}
+    columns: dict[str, tables.Column] = {}
     for name in layout.names or ():
         values = array[name][:, 0] if layout[name].shape == (1,) else array[name]
-        columns |= {} if name.startswith("_") else split_array(name, values)
-    return from_columns(columns, path)
+        columns |= {} if name.startswith("_") else tables.split_array(name, values)
+    return tables.from_columns(columns, path)
 
 
-def write(path: Path, table: Table) -> None:
+def write(path: Path, table: tables.Table) -> None:
     """Write a binary PCD file: coordinates as float32, or double where that would lose digits."""
-    columns = to_columns(table)
+    columns = tables.to_columns(table)
     kinds = {"f": "F", "i": "I", "u": "U", "b": "U"}
-    rows = to_rows(columns)
+    rows = tables.to_rows(columns)
     header = {
         "VERSION": "0.7",
         "FIELDS": " ".join(columns),

@@ -7,18 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from mops_lightning.data.formats import table as tables
 from mops_lightning.data.formats.guard import BadCloudError, WholeOnlyError
 from mops_lightning.data.formats.isolated import isolated
-from mops_lightning.data.formats.table import (
-    CloudFile,
-    Column,
-    Table,
-    TableParts,
-    binary_file,
-    from_columns,
-    to_rows,
-    unique_names,
-)
 
 KINDS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -59,7 +50,7 @@ def plain_header(data: bytes) -> bytes:
     return "\n".join([*map(" ".join, lines), "end_header\n"]).encode() + data[end:]
 
 
-def read(path: Path) -> Table | None:
+def read(path: Path) -> tables.Table | None:
     """Read the vertices with all their properties; None for a mesh, which has faces as well.
 
     Raises:
@@ -68,7 +59,7 @@ def read(path: Path) -> Table | None:
     return isolated(_parse, path)
 
 
-def _parse(path: Path) -> Table | None:
+def _parse(path: Path) -> tables.Table | None:
     from trimesh.exchange.ply import load_ply
 
     with np.errstate(all="ignore"):
@@ -83,10 +74,10 @@ def _parse(path: Path) -> Table | None:
     number, declared = len(next(iter(columns.values()))), vertex["length"]
     if number < declared:
         raise BadCloudError(f"{path} is broken: its header says {declared} points, not {number}.")
-    return from_columns(columns, path)
+    return tables.from_columns(columns, path)
 
 
-def _columns(data: Any) -> dict[str, Column]:
+def _columns(data: Any) -> dict[str, tables.Column]:
     """Return the columns of trimesh's rows, or of its arrays ``(N, 1)`` from an ascii file."""
     if not isinstance(data, dict):
         return {name: data[name] for name in data.dtype.names}
@@ -94,14 +85,14 @@ def _columns(data: Any) -> dict[str, Column]:
     return {name: column.ravel() for name, column in columns.items() if column.size == len(column)}
 
 
-def write(path: Path, table: Table) -> None:
+def write(path: Path, table: tables.Table) -> None:
     """Write binary PLY: float coordinates, or double where float would lose digits."""
-    write_parts(path, TableParts.whole(table))
+    write_parts(path, tables.TableParts.whole(table))
 
 
-def write_parts(path: Path, table: TableParts) -> None:
+def write_parts(path: Path, table: tables.TableParts) -> None:
     """Write binary PLY part by part."""
-    examples = unique_names(Table(table.corners, table.columns))
+    examples = tables.unique_names(tables.Table(table.corners, table.columns))
     kinds = dict.fromkeys("xyz", table.coordinates.newbyteorder("<").str)
     kinds |= {name: _ply_kind(column) for name, column in examples.items()}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {table.number}"]
@@ -109,12 +100,12 @@ def write_parts(path: Path, table: TableParts) -> None:
     with path.open("wb") as file:
         file.write("\n".join([*lines, "end_header\n"]).encode())
         for part in table.parts:
-            columns = dict(zip("xyz", part.points.T, strict=True)) | unique_names(part)
+            columns = dict(zip("xyz", part.points.T, strict=True)) | tables.unique_names(part)
             rows = {name: column.astype(kinds[name]) for name, column in columns.items()}
-            file.write(to_rows(rows).tobytes())
+            file.write(tables.to_rows(rows).tobytes())
 
 
-def _ply_kind(column: Column) -> str:
+def _ply_kind(column: tables.Column) -> str:
     """Return the data type that holds a column: PLY has no integers of 64 bits."""
     kind, size = column.dtype.kind, column.dtype.itemsize
     if kind in "iu" and size == 8:
@@ -125,7 +116,7 @@ def _ply_kind(column: Column) -> str:
     return "<u1" if kind == "b" else column.dtype.newbyteorder("<").str
 
 
-def locate(path: Path) -> CloudFile:
+def locate(path: Path) -> tables.CloudFile:
     """Find the vertices of a binary PLY file.
 
     Raises:
@@ -148,4 +139,4 @@ def locate(path: Path) -> CloudFile:
     if any(field[1] not in KINDS for field in fields):
         raise WholeOnlyError(f"{path}: --chunk needs vertices without lists.")
     kind = np.dtype([(name, order[form[1]] + KINDS[typed]) for _, typed, name in fields])
-    return binary_file(path, int(first[2]), kind, offset)
+    return tables.binary_file(path, int(first[2]), kind, offset)

@@ -5,18 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from mops_lightning.data.formats import table as tables
 from mops_lightning.data.formats.guard import BadCloudError
-from mops_lightning.data.formats.table import (
-    Column,
-    Table,
-    from_array,
-    from_columns,
-    to_columns,
-    to_rows,
-)
 
 
-def read(path: Path) -> Table:
+def read(path: Path) -> tables.Table:
     """Read rows of numbers separated by spaces, commas or semicolons, with or without a header.
 
     Raises:
@@ -45,20 +38,22 @@ def read(path: Path) -> Table:
         words = [word.strip() for word in line.strip().lstrip("#/ ").split(separator)]
         if len(words) == array.shape[1] and {"x", "y", "z"} <= {word.lower() for word in words}:
             first = {word: words.index(word) for word in words}  # a name may be there twice
-            return from_columns({word: array[:, place] for word, place in first.items()}, path)
-    return from_array(array, path)
+            return tables.from_columns(
+                {word: array[:, place] for word, place in first.items()}, path
+            )
+    return tables.from_array(array, path)
 
 
-def write(path: Path, table: Table) -> None:
+def write(path: Path, table: tables.Table) -> None:
     """Write ``x y z`` and the columns, separated by spaces, without loss of digits."""
-    columns = to_columns(table)
+    columns = tables.to_columns(table)
     unnamed = all(name.startswith("column_") for name in list(columns)[3:])
     header = "" if unnamed else " ".join(columns)
     formats = [_number_format(column) for column in columns.values()]
-    np.savetxt(path, to_rows(columns), fmt=formats, header=header, comments="# ")
+    np.savetxt(path, tables.to_rows(columns), fmt=formats, header=header, comments="# ")
 
 
-def _number_format(column: Column) -> str:
+def _number_format(column: tables.Column) -> str:
     """Return the shortest ``%`` format that keeps every number of a column."""
     if column.dtype.kind != "f":
         return "%d"
