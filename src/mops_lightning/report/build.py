@@ -10,18 +10,7 @@ import pandas as pd
 from mops_lightning.records.readout_names import FULL, parse_metric_name
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import OF_TEST_CLOUDS
-from mops_lightning.report import paper
-from mops_lightning.report.collect import (
-    Found,
-    collect,
-    epochs,
-    sampler_row,
-    score,
-    seed,
-    tested_metrics,
-    trained_with,
-    training_time,
-)
+from mops_lightning.report import collect, paper
 from mops_lightning.report.comparable import Group, commit, groups, net_groups, weightless
 from mops_lightning.report.nets import nets_grid
 from mops_lightning.report.tables import Table, make_table, sort_key
@@ -48,7 +37,7 @@ class Report:
         remarks: how the runs were made, and which have no result.
     """
 
-    found: Found
+    found: collect.Found
     tables: list[Table]
     grids: list[Grid]
     remarks: list[str]
@@ -65,17 +54,17 @@ def build_report(folder: Path, metrics: Iterable[str] = (), mixed: bool = False)
     Raises:
         UserError: there is no record, or no record has a metric.
     """
-    found = collect(folder)
+    found = collect.collect(folder)
     chosen = list(metrics)
     scored = [record for record in found.done if record.config["learn"] != "task"]
     parts = groups(scored, mixed) if scored else net_groups(found.done, mixed)
-    measured = tested_metrics(scored)
+    measured = collect.tested_metrics(scored)
     tables = [
         make_table(part, metric, _net(part))
         for part in parts
-        for metric in chosen or [score(part.records)]
+        for metric in chosen or [collect.score(part.records)]
         # A metric of one task only has tables for it; make_table refuses an unknown one.
-        if scored and (metric not in measured or metric in tested_metrics(part.records))
+        if scored and (metric not in measured or metric in collect.tested_metrics(part.records))
     ]
     grids = [grid for table in tables for grid in _grids(table)]
     if not scored:
@@ -145,9 +134,9 @@ def _unchanged_lines(table: Table) -> list[str]:
 
 def _by_column(table: Table) -> Grid:
     """Return the scores of all samplers by size or by another setting, beside the paper's."""
-    names, by_size = table.names, table.group.column == "m"
+    names, by_size, records = table.names, table.group.column == "m", table.group.records
     published = _published(table) if by_size else {}
-    samplers = {sampler_row(one): one.config["names"]["sampler"] for one in table.group.records}
+    samplers = {collect.sampler_row(one): one.config["names"]["sampler"] for one in records}
     cells, columns, costs = table.cells(["row"]), table.columns(), _costs(table)
     rows: list[list] = []
     below: list[str] = []
@@ -173,7 +162,7 @@ def _by_column(table: Table) -> Grid:
     )
     head = ["sampled by", *(f"{table.group.column}={one}" for one in columns)]
     if costs:
-        head.append(training_time(table.group.records)[0])
+        head.append(collect.training_time(records)[0])
     if not by_size and len(columns) > MAX_COLUMNS:
         head = [table.group.column, *(row[0] for row in rows)]
         rows = [list(line) for line in zip(columns, *(row[1:] for row in rows), strict=True)]
@@ -233,8 +222,8 @@ def _costs(table: Table) -> dict[str, str]:
         return {}
     records = table.group.records
     trained = [one.config["sampler"].get("m_max", one.config["m"]) for one in records]
-    runs = pd.DataFrame({"row": map(sampler_row, records), "m": trained})
-    runs["seconds"] = training_time(records)[1]
+    runs = pd.DataFrame({"row": map(collect.sampler_row, records), "m": trained})
+    runs["seconds"] = collect.training_time(records)[1]
     costs = runs.dropna().groupby(["row", "m"])["seconds"].mean().groupby("row").sum()
     return costs.map("{:,.0f} s".format).to_dict()
 
@@ -244,16 +233,18 @@ def _full_lines(table: Table) -> list[str]:
     metric, theirs = table.full_metric, _published(table, full_clouds=True)
     label = f"{metric.title} " if table.metric.full_cloud_metric else ""
     lines = []
-    for record in sorted(table.group.records, key=lambda one: (sampler_row(one), -one.config["m"])):
+    for record in sorted(
+        table.group.records, key=lambda one: (collect.sampler_row(one), -one.config["m"])
+    ):
         figure = record.metrics.get(f"test/{FULL}/{metric.name}")
         if figure is None:
             continue
         net = record.config["names"]["net"]
         after = ""
-        if trained_with(record) == "joint":
+        if collect.trained_with(record) == "joint":
             several = any(parts.m for parts in map(parse_metric_name, record.metrics) if parts)
             size = "" if several else f", m={record.config['m']}"
-            after = f" after joint training with {sampler_row(record)}{size}"
+            after = f" after joint training with {collect.sampler_row(record)}{size}"
         published = net == table.net and "full" in theirs
         compared = f" (the paper: {theirs['full']:.2f})" if published else ""
         lines.append(f"{net} on all points{after}: {label}{metric.format(figure)}{compared}.")
@@ -265,7 +256,7 @@ def _published(table: Table, full_clouds: bool = False) -> dict[str, Any]:
     if any(one.config.get(key) for one in table.group.records for key in OF_TEST_CLOUDS):
         return {}
     metric = table.full_metric if full_clouds else table.metric
-    joint = trained_with(table.group.records[0]) == "joint"
+    joint = collect.trained_with(table.group.records[0]) == "joint"
     names = table.names
     return paper.published(names["task"], table.net, names["dataset"], metric.name, joint)
 
@@ -293,27 +284,27 @@ def _provenance(found: list[RunRecord], net: str) -> list[str]:
 
 def _kind(record: RunRecord, net: str) -> str:
     names = record.config["names"]
-    kind = names["net"] if record.config["learn"] == "task" else sampler_row(record)
+    kind = names["net"] if record.config["learn"] == "task" else collect.sampler_row(record)
     if names["net"] not in (net, kind):
         kind += f" under {names['net']}"
-    joint = trained_with(record) == "joint" and "fit" in record.seconds
+    joint = collect.trained_with(record) == "joint" and "fit" in record.seconds
     return f"{kind}, jointly trained" if joint else kind
 
 
 def _way(record: RunRecord) -> str:
     length = "nothing to train"
-    if (number := epochs(record)) is not None:
+    if (number := collect.epochs(record)) is not None:
         evaluated = "" if "fit" in record.seconds else "evaluated after "
         length = f"{evaluated}{number} {'epoch' if number == 1 else 'epochs'}"
     threads = "thread" if record.threads == 1 else "threads"
     changes = " with changes" if record.git["dirty"] else ""
     return (
-        f"{length}, seed {seed(record)}, {record.device}, {record.threads} {threads}, "
+        f"{length}, seed {collect.seed(record)}, {record.device}, {record.threads} {threads}, "
         f"commit {commit(record)}{changes}"
     )
 
 
-def _without_result(found: Found) -> list[str]:
+def _without_result(found: collect.Found) -> list[str]:
     """Return a line for each run without a full result, and their number."""
     if not found.undone:
         return []

@@ -10,16 +10,8 @@ import torch
 from torch import Tensor, nn
 from torchmetrics import MetricCollection
 
+from mops_lightning.metrics import reconstruction
 from mops_lightning.metrics.base import TableMetric, collection
-from mops_lightning.metrics.reconstruction import (
-    Distances,
-    MeanChamfer,
-    MeanEMD,
-    NormalizedChamfer,
-    NormalizedChamferOfMeans,
-    NormalizedEMD,
-    NormalizedEMDOfMeans,
-)
 from mops_lightning.ops.emd import earth_movers_distance
 from mops_lightning.ops.nearest import chamfer_distance
 from mops_lightning.tasks.base import K, Task, figures_of
@@ -48,8 +40,8 @@ class Reconstruction(Task):
             half (auto-encoder) to a fifth (sampler) of the time.
     """
 
-    score = NormalizedChamfer.name
-    full_score = NormalizedChamfer.full_cloud_metric
+    score = reconstruction.NormalizedChamfer.name
+    full_score = reconstruction.NormalizedChamfer.full_cloud_metric
     net_takes = ("points", "n_points")
 
     def __init__(self, net: nn.Module, exact_up_to: int | None = 2048) -> None:
@@ -83,7 +75,7 @@ class Reconstruction(Task):
         clouds = batch.points
         block = None if clouds.shape[1] <= (self.exact_up_to or 0) else SCORED_BLOCK
 
-        def scored(points: Tensor) -> Distances:
+        def scored(points: Tensor) -> reconstruction.Distances:
             return self._distances(self.predict(batch, points), clouds, block, SCORED_ROUNDS)
 
         full = scored(clouds)
@@ -92,27 +84,28 @@ class Reconstruction(Task):
 
     def _distances(
         self, built: Tensor, clouds: Tensor, block: int | None, rounds: int
-    ) -> Distances:
+    ) -> reconstruction.Distances:
         """Return distances by cloud; that of the earth mover by one process per thread of torch."""
         # Before the other distance: gradients are summed in this order.
         chamfer, emd = chamfer_distance(built, clouds), None
         if self.exact_up_to is not None:
             emd = earth_movers_distance(built, clouds, block, rounds, torch.get_num_threads())
-        return Distances(chamfer, emd)
+        return reconstruction.Distances(chamfer, emd)
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return mean distances and, except in training, which has no reference, NRE."""
-        metrics: list[TableMetric] = [MeanChamfer()]
+        metrics: list[TableMetric] = [reconstruction.MeanChamfer()]
         if not training:
-            metrics += [NormalizedChamfer(), NormalizedChamferOfMeans()]
+            ratios = reconstruction.NormalizedChamfer(), reconstruction.NormalizedChamferOfMeans()
+            metrics += ratios
         if self.exact_up_to is not None:
-            metrics.append(MeanEMD())
+            metrics.append(reconstruction.MeanEMD())
             if not training:
-                metrics += [NormalizedEMD(), NormalizedEMDOfMeans()]
+                metrics += [reconstruction.NormalizedEMD(), reconstruction.NormalizedEMDOfMeans()]
         return collection(*metrics)
 
 
-def _means(distances: Distances) -> dict[str, Tensor]:
+def _means(distances: reconstruction.Distances) -> dict[str, Tensor]:
     """Return the loss terms: means over the clouds, by the name of the distance."""
     return {k: v.mean() for k, v in distances._asdict().items() if v is not None}
 

@@ -8,15 +8,9 @@ from torch import Generator, Tensor, nn
 from torchmetrics import MetricCollection
 
 from mops_lightning.errors import UserError
+from mops_lightning.metrics import registration
 from mops_lightning.metrics.base import collection
-from mops_lightning.metrics.registration import (
-    DoubledRotationError,
-    RotationError,
-    RotationErrorP90,
-    RotationRecall5,
-    RotationRecall10,
-    TranslationError,
-)
+from mops_lightning.metrics.registration import RotationError
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.rigid import Motion, identity_motion, quaternion_to_matrix, random_motion
 from mops_lightning.tasks.base import Task, figures_of
@@ -137,11 +131,11 @@ class Registration(Task):
         """Return rotation errors in degrees, recalls in [0, 1] and the translation error."""
         return collection(
             RotationError(),
-            RotationErrorP90(),
-            DoubledRotationError(),
-            RotationRecall5(),
-            RotationRecall10(),
-            TranslationError(),
+            registration.RotationErrorP90(),
+            registration.DoubledRotationError(),
+            registration.RotationRecall5(),
+            registration.RotationRecall10(),
+            registration.TranslationError(),
         )
 
 

@@ -4,18 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
-from mops_lightning.viz.figures import (
-    cloud_axes,
-    draw_cloud,
-    frame_cloud,
-    new_figure,
-    thinned,
-    upright,
-)
+from mops_lightning.viz import figures
 
 SOURCE_COLOUR, TARGET_COLOUR = (0.12, 0.47, 0.86), (0.84, 0.3, 0.05)
 SAMPLE_SIZE = 14
@@ -54,27 +48,27 @@ def pair_grid(
         titles: one per pair.
     """
     columns = {"before (centred)": None, **{f"by {name}": aligned[name] for name in aligned}}
-    figure = new_figure(2.8 * len(columns), 2.8 * len(source), "tight")
+    figure = figures.new_figure(2.8 * len(columns), 2.8 * len(source), "tight")
     for row in range(len(source)):
         for column, (head, result) in enumerate(columns.items()):
             label = f"{titles[row]}, {before[row]:.1f}° apart"
             if result is not None:
                 label = f"rotation error {result.errors[row]:.1f}°"
             title = head if row == 0 else ""
-            axes = cloud_axes(figure, len(source), len(columns), row, column, title, label)
+            axes = figures.cloud_axes(figure, len(source), len(columns), row, column, title, label)
             moved = (source if result is None else result.source)[row]
             _draw_pair(axes, moved, target[row], s=1.5, alpha=0.35)
             if result is not None and result.source_points.shape[1] < source.shape[1]:
                 samples = result.source_points[row], result.target_points[row]
                 _draw_pair(axes, *samples, s=SAMPLE_SIZE, edgecolors="black", linewidths=0.4)
-            frame_cloud(axes, np.concatenate([upright(moved), upright(target[row])]))
+            figures.frame_cloud(axes, figures.upright(torch.cat([moved, target[row]])))
     figure.supxlabel("source blue, target orange, sampled points ringed", fontsize=9)
     return figure
 
 
 def _draw_pair(axes: Axes3D, source: Tensor, target: Tensor, **style: Any) -> None:
     for points, colour in ((source, SOURCE_COLOUR), (target, TARGET_COLOUR)):
-        axes.scatter(*upright(points).T, color=colour, depthshade=False, **style)
+        axes.scatter(*figures.upright(points).T, color=colour, depthshade=False, **style)
 
 
 class ReconstructionResult(NamedTuple):
@@ -105,24 +99,24 @@ def reconstruction_grid(
         titles: one per cloud.
     """
     columns, rows = 1 + len(results), 2 * len(points)
-    figure = new_figure(2.4 * columns, 2.4 * rows, "tight")
+    figure = figures.new_figure(2.4 * columns, 2.4 * rows, "tight")
 
     def cell(row: int, column: int, title: str, label: str) -> Axes3D:
         # Titles of later clouds would repeat the titles of the first row.
         shown = title if row % 2 == 1 or row == 0 else ""
-        return cloud_axes(figure, rows, columns, row, column, shown, label)
+        return figures.cloud_axes(figure, rows, columns, row, column, shown, label)
 
-    for number, cloud in enumerate(map(thinned, upright(points))):
+    for number, cloud in enumerate(map(figures.thinned, figures.upright(points))):
         above, under = 2 * number, 2 * number + 1
         _draw_depth(cell(above, 0, "input", titles[number]), cloud, cloud)
-        from_full = thinned(upright(full)[number])
+        from_full = figures.thinned(figures.upright(full)[number])
         _draw_depth(cell(under, 0, "from all points", ""), from_full, cloud)
         for column, (name, result) in enumerate(results.items(), start=1):
-            samples = upright(result.samples)[number]
+            samples = figures.upright(result.samples)[number]
             axes = cell(above, column, name, f"{len(samples)} points")
-            draw_cloud(axes, cloud, samples, name, size=16)
+            figures.draw_cloud(axes, cloud, samples, name, size=16)
             axes = cell(under, column, f"from {name}", f"NRE {result.ratios[number]:.2f}")
-            _draw_depth(axes, thinned(upright(result.points)[number]), cloud)
+            _draw_depth(axes, figures.thinned(figures.upright(result.points)[number]), cloud)
     return figure
 
 
@@ -134,20 +128,20 @@ def part_grid(points: Tensor, parts: Mapping[str, Tensor], titles: Sequence[str]
         parts: ``(K, N)`` part numbers by the name of a column.
         titles: one per cloud.
     """
-    figure = new_figure(2.4 * len(parts), 2.4 * len(points), "tight")
+    figure = figures.new_figure(2.4 * len(parts), 2.4 * len(points), "tight")
     most = max(int(numbers.max()) for numbers in parts.values())
-    for row, cloud in enumerate(map(thinned, upright(points))):
+    for row, cloud in enumerate(map(figures.thinned, figures.upright(points))):
         for column, (name, numbers) in enumerate(parts.items()):
             title, label = name if row == 0 else "", titles[row] if column == 0 else ""
-            axes = cloud_axes(figure, len(points), len(parts), row, column, title, label)
-            drawn = thinned(numbers[row, :, None].cpu())[:, 0]
+            axes = figures.cloud_axes(figure, len(points), len(parts), row, column, title, label)
+            drawn = figures.thinned(numbers[row, :, None].cpu())[:, 0]
             colours: Any = {"c": drawn, "cmap": "tab20", "vmin": 0, "vmax": most}
             axes.scatter(*cloud.T, s=2, depthshade=False, **colours)
-            frame_cloud(axes, cloud)
+            figures.frame_cloud(axes, cloud)
     return figure
 
 
 def _draw_depth(axes: Axes3D, drawn: np.ndarray, cloud: np.ndarray) -> None:
     """Draw points coloured by depth, framed as ``cloud``."""
     axes.scatter(*drawn.T, s=2, c=drawn[:, 1], cmap="viridis", depthshade=False)
-    frame_cloud(axes, cloud)
+    figures.frame_cloud(axes, cloud)

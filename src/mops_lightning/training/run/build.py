@@ -35,12 +35,7 @@ from mops_lightning.records.run_record import RunRecord
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed, generator
 from mops_lightning.tasks.base import Task
-from mops_lightning.training.checkpoint import (
-    CHECKPOINT,
-    Checkpoint,
-    checkpoint_identity,
-    find_checkpoint,
-)
+from mops_lightning.training import checkpoint
 from mops_lightning.training.evaluation import OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
@@ -78,7 +73,7 @@ class Parts:
     held_out: Clouds
     experiment: Experiment
     trainer: L.Trainer
-    resumed: Checkpoint | None
+    resumed: checkpoint.Checkpoint | None
     trained: TrainedRun | None
 
     @property
@@ -94,7 +89,7 @@ class Parts:
     @property
     def last_checkpoint(self) -> Path | None:
         """The newest checkpoint of this run, or the one that it was resumed from."""
-        own = self.folder / "checkpoints" / CHECKPOINT
+        own = self.folder / "checkpoints" / checkpoint.CHECKPOINT
         if own.is_file():
             return own
         return self.resumed.path if self.resumed else None
@@ -122,10 +117,10 @@ def build_parts(
     Raises:
         UserError: settings that do not fit each other, the data or the checkpoint to resume.
     """
-    identity = checkpoint_identity(record.config, dataset.fingerprint)
+    identity = checkpoint.checkpoint_identity(record.config, dataset.fingerprint)
     resumed = None
     if cfg.ckpt_path is not None:
-        resumed = find_checkpoint(cfg.ckpt_path, Path(cfg.out), identity)
+        resumed = checkpoint.find_checkpoint(cfg.ckpt_path, Path(cfg.out), identity)
     record.dataset_fingerprint = dataset.fingerprint
     record.train_clouds, record.test_clouds = len(dataset.train.labels), len(dataset.test.labels)
     record.class_names = list(dataset.class_names)

@@ -18,14 +18,7 @@ from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.tasks.base import Task, figures_of
 from mops_lightning.training.readouts import readouts
-from mops_lightning.viz.figures import (
-    CLOUDS,
-    cloud_grid,
-    comparison,
-    matrix_figure,
-    save_clouds,
-    save_figure,
-)
+from mops_lightning.viz import figures as drawing
 
 DENSE_PIXELS = 2**20
 """Most entries of S that are drawn: 1,024 points by 1,024 columns."""
@@ -72,9 +65,9 @@ class CloudVisualization(Callback):
         task: Any = module.task
         titles = cloud_titles(task, self.titles)
         if folder is not None and samples:
-            save_clouds(folder / CLOUDS, batch.points, samples, titles)
+            drawing.save_clouds(folder / drawing.CLOUDS, batch.points, samples, titles)
         for name, figure in figures.items():
-            path = folder and save_figure(figure, folder / f"{name}.png")
+            path = folder and drawing.save_figure(figure, folder / f"{name}.png")
             if board is None:
                 continue
             if path is None:
@@ -107,11 +100,11 @@ class CloudVisualization(Callback):
         if scores is not None:
             main = {**methods, module.main_readout: samples[module.main_readout]}
             figures["comparison"] = self._comparison(module, points, main, scores)
-        figures["clouds"] = cloud_grid(points, samples, titles)
+        figures["clouds"] = drawing.cloud_grid(points, samples, titles)
         matrix = output.matrix
         if matrix is not None and points.shape[1] * matrix.m <= DENSE_PIXELS:
             first = matrix.first_cloud()
-            figures["matrix"] = matrix_figure(first.dense()[0], first.gram()[0], titles[0])
+            figures["matrix"] = drawing.matrix_figure(first.dense()[0], first.gram()[0], titles[0])
         return figures, samples
 
     def _comparison(
@@ -132,7 +125,7 @@ class CloudVisualization(Callback):
             value = "" if score is None else f": {info.format(float(score))} {info.unit}"
             captions[name] = labels.get(name, name) + value
         drawn = {name: chosen[shown] for name, chosen in samples.items()}
-        return comparison(points[shown], drawn, captions)
+        return drawing.comparison(points[shown], drawn, captions)
 
 
 def cloud_titles(task: Task, titles: Sequence[str]) -> list[str]:
