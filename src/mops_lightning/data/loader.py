@@ -82,6 +82,7 @@ MakeBatch = Callable[[Tensor, list[Generator]], Any]
 """Function that converts clouds for a task, given one random generator per cloud."""
 
 
+@dataclass(eq=False, repr=False)
 class CloudLoader:
     """Iterable over the batches of a split, as ``Batch`` or as converted by the task.
 
@@ -102,30 +103,20 @@ class CloudLoader:
             ``shuffle``, all shares have the same size; otherwise none is empty.
     """
 
-    def __init__(
-        self,
-        clouds: Clouds,
-        batch_size: int,
-        shuffle: bool = False,
-        augment: Augmentation | None = None,
-        make_batch: MakeBatch | None = None,
-        drop_last: bool = False,
-        seed: int = 0,
-        part: tuple[int, int] = (0, 1),
-    ) -> None:
-        self.clouds = clouds
-        self.batch_size = batch_size
-        self.shuffle = shuffle
-        self.augment = augment
-        self.make_batch = make_batch
-        self.seed = seed
-        self.part = part
-        number = len(clouds.points)
-        full = number // batch_size
-        self.batches = full if drop_last and full else -(-number // batch_size)
-        self.epoch = 0
-        self.position = 0
-        self.resume_at = 0
+    clouds: Clouds
+    batch_size: int
+    shuffle: bool = False
+    augment: Augmentation | None = None
+    make_batch: MakeBatch | None = None
+    drop_last: bool = False
+    seed: int = 0
+    part: tuple[int, int] = (0, 1)
+
+    def __post_init__(self) -> None:
+        """Start before the first batch."""
+        full, rest = divmod(len(self.clouds.points), self.batch_size)
+        self.batches = full if self.drop_last and full else full + bool(rest)
+        self.epoch = self.position = self.resume_at = 0
 
     def __len__(self) -> int:
         return self.batches
