@@ -24,7 +24,6 @@ from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.points import UnitSphere, largest_distance
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.fused import FusedMOPSNet
 
 
 class Nearest(NamedTuple):
@@ -90,8 +89,9 @@ def sample_by_chunks(
     check_size(source, number, m, options.area)
     centre = summed / number
     sphere = UnitSphere(centre, max(over("radius", _radius, centre)) or 1.0)
-    global_ = reduce(torch.maximum, over("global feature", _global, sphere, net))
-    sums: Partial = reduce(Partial.merge, over("sampling", _sum, sphere, net, global_, m))
+    global_ = reduce(torch.maximum, over("global feature", _of_normalised, sphere, net.global_part))
+    sum_part = partial(net.sum_part, global_=global_, m=m)
+    sums: Partial = reduce(Partial.merge, over("sampling", _of_normalised, sphere, sum_part))
     generated = sums.result()
     outcome = Outcome(m, number, 0 if options.area else file.number - number)
     if options.readout == "generated":
@@ -164,16 +164,11 @@ def _radius(cloud: CloudFile, centre: NDArray[np.float64], rows: range) -> float
     return largest_distance(cloud.read(rows).points, centre)
 
 
-def _global(cloud: CloudFile, sphere: UnitSphere, net: FusedMOPSNet, rows: range) -> Tensor | None:
+def _of_normalised(
+    cloud: CloudFile, sphere: UnitSphere, function: Callable[[Tensor], Any], rows: range
+) -> Any:
     points = sphere.normalise(cloud.read(rows).points)
-    return net.global_part(points) if len(points) else None
-
-
-def _sum(
-    cloud: CloudFile, sphere: UnitSphere, net: FusedMOPSNet, global_: Tensor, m: int, rows: range
-) -> Partial | None:
-    points = sphere.normalise(cloud.read(rows).points)
-    return net.sum_part(points, global_, m) if len(points) else None
+    return function(points) if len(points) else None
 
 
 def _nearest(

@@ -36,14 +36,8 @@ def page(report: Report, folder: Path, plots: Sequence[Path]) -> str:
         plots: SVG files.
     """
     clouds, damaged = _clouds(report, folder)
-    return render(
-        folder.resolve().name,
-        report.grids,
-        clouds,
-        [*report.remarks, *damaged],
-        "How the runs were made",
-        plots,
-    )
+    name, remarks = folder.resolve().name, [*report.remarks, *damaged]
+    return render(name, report.grids, clouds, remarks, "How the runs were made", plots)
 
 
 def render(
