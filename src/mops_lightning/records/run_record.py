@@ -1,7 +1,6 @@
 """``result.json``: what every run leaves behind, failed ones too."""
 
 import json
-import math
 import os
 import platform
 import subprocess
@@ -306,14 +305,9 @@ def dotted(tree: Any, prefix: str = "") -> dict[str, Any]:
     return leaves
 
 
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+def _finite(plain: dict[str, Any]) -> dict[str, Any]:
+    """Return plain data as JSON holds it, with None for NaN and infinity."""
+    return json.loads(json.dumps(plain), parse_constant=lambda name: None)
 
 
 def environment() -> dict[str, Any]:
