@@ -91,7 +91,7 @@ def test_rates_of_rival_samplers_fall_at_the_published_number_of_clouds():
         (["augment.sampler=3"], "augment has settings of task and sampler, got sampler: 3"),
         (["+augment.all=1"], "augment has settings of task and sampler, got all: 1"),
         (["+augment.task.jiter=0"], "Did you mean 'jitter'"),
-        (["augment.task.jitter=-1"], r"augment\.task\.jitter must be a number of at least 0"),
+        (["augment.task.jitter=-1"], r"augment\.task\.jitter must be at least 0"),
         (["+augment.sampler.jitter=null"], r"sampler\.jitter must be a number, got None"),
         (["augment.task.rotate_up=3"], "rotate_up must be true or false or a text, got 3"),
         (["pretrain=foo"], "pretrain must be settings, got 'foo'"),

@@ -42,13 +42,7 @@ def one_of(*choices: str, others: tuple[Any, ...] = ()) -> Limits:
     )
 
 
-NOT_NEGATIVE = number("of at least 0", lambda x: x >= 0)
 ABOVE_ZERO = number("above 0", lambda x: x > 0)
-AUGMENTATION = {
-    "jitter": NOT_NEGATIVE,
-    "stretch": number("of at least 1", lambda x: x >= 1),
-    "shift": NOT_NEGATIVE,
-}
 
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 """Allowed values of ``trainer.precision``; Lightning has more."""

@@ -13,16 +13,7 @@ from typing import Any, Literal, get_args
 
 from hydra.core.config_store import ConfigStore
 
-from mops_lightning.config.limits import (
-    ABOVE_ZERO,
-    AUGMENTATION,
-    NOT_NEGATIVE,
-    TRAINER,
-    Limits,
-    number,
-    one_of,
-    whole,
-)
+from mops_lightning.config.limits import ABOVE_ZERO, TRAINER, Limits, number, one_of, whole
 
 Learn = Literal["task", "sampler", "joint", "nothing"]
 LEARN = get_args(Learn)
@@ -203,7 +194,7 @@ class RunSettings:
         0.0,
         "standard deviation of Gaussian noise on all coordinates of test clouds (0.1 is 10 %)",
         Affects.SCORES,
-        limits=NOT_NEGATIVE,
+        limits=number("of at least 0", lambda x: x >= 0),
     )
     test_corruption: str | None = setting(
         None,
@@ -276,11 +267,6 @@ INSIDE: dict[str, dict[str, Any]] = {
     "recipe.task_points": {"learn": None},
     "optimizer.lr": {"limits": ABOVE_ZERO},
     "pretrain.lr": {"limits": ABOVE_ZERO},
-    **{
-        f"augment.{part}.{name}": {"limits": limits}
-        for part in ("task", "sampler")
-        for name, limits in AUGMENTATION.items()
-    },
     # Before trainer.max_epochs, so that an error names the setting that it takes its value from.
     "epochs.task": {"limits": whole(1)},
     "epochs.sampler": {"limits": whole(0)},

@@ -12,7 +12,7 @@ import msgspec
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from mops_lightning.config import settings
-from mops_lightning.config.build import signature
+from mops_lightning.config.build import build, signature
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.records.run_record import dotted
 
@@ -69,7 +69,9 @@ def check(cfg: DictConfig) -> None:
     for key, node in plain["augment"].items():
         if key not in ("task", "sampler") or not isinstance(node, dict | None):
             raise UserError(f"augment has settings of task and sampler, got {key}: {node!r}.")
-        _check_node({**(node or {}), "_target_": AUGMENTATION}, f"augment.{key}")
+        described = {**(node or {}), "_target_": AUGMENTATION}
+        _check_node(described, f"augment.{key}")
+        build(OmegaConf.create(described), f"augment.{key}")  # the class checks its values
     for name, setting in declared.items():
         if setting.counts(plain["learn"]):
             _check_node(plain.get(name), name)
