@@ -6,24 +6,15 @@ from typing import Any
 import pytest
 import torch
 
-from mops_lightning import (
-    FMOPSNet,
-    FPSSampler,
-    GumbelSampler,
-    MOPSNet,
-    RandomSampler,
-    SampleNet,
-    SerialSampler,
-    SNet,
-    VoxelSampler,
-)
+import mops_lightning as mops
 from mops_lightning.errors import UserError
 from mops_lightning.nets.hierarchical import HierarchicalNet, Stage, carried
 from mops_lightning.types import Batch
 
 SAMPLERS: tuple[Any, ...] = (
-    *(FPSSampler, RandomSampler, SerialSampler, VoxelSampler, SNet, SampleNet, GumbelSampler),
-    *(MOPSNet, partial(MOPSNet, anchors="fps"), lambda m: FMOPSNet(m_max=m)),
+    *(mops.FPSSampler, mops.RandomSampler, mops.SerialSampler, mops.VoxelSampler),
+    *(mops.SNet, mops.SampleNet, mops.GumbelSampler, mops.MOPSNet),
+    *(partial(mops.MOPSNet, anchors="fps"), lambda m: mops.FMOPSNet(m_max=m)),
 )
 
 
@@ -38,7 +29,7 @@ def test_stages_train_any_sampler(sampler, rng):
         assert all(p.grad is not None for p in stage.sampler.parameters())
 
 
-@pytest.mark.parametrize("sampler", [FPSSampler, MOPSNet])
+@pytest.mark.parametrize("sampler", [mops.FPSSampler, mops.MOPSNet])
 def test_stage_equals_maximum_over_explicit_edges(sampler, rng):
     stage = Stage(sampler(m=7), 7, 6, 10, 4).eval()
     points, features = (torch.randn(2, 30, c, generator=rng) for c in (3, 6))
@@ -62,19 +53,19 @@ def test_stage_equals_maximum_over_explicit_edges(sampler, rng):
 
 def test_points_without_matrix_carry_the_feature_of_the_nearest_point(rng):
     points, features = (torch.randn(2, 30, c, generator=rng) for c in (3, 6))
-    output = SNet(m=5).eval()(points)
+    output = mops.SNet(m=5).eval()(points)
     near = torch.cdist(output.points, points).argmin(2)
     expected = features[torch.arange(2)[:, None], near]
     torch.testing.assert_close(carried(output, points, features), expected)
     with pytest.raises(UserError, match=r"task\.net\.points .* 4 points .* SNet returns 5"):
-        Stage(SNet(m=5), 5, features.shape[2], 10, 4)(points[:, :4], features[:, :4])
+        Stage(mops.SNet(m=5), 5, features.shape[2], 10, 4)(points[:, :4], features[:, :4])
 
 
 def test_losses_of_stages_are_part_of_the_step(rng):
     from mops_lightning.tasks.classification import Classification
 
     torch.manual_seed(0)
-    net = HierarchicalNet(5, partial(MOPSNet, alpha=2.0), (20, 8), (8, 16, 16), 4)
+    net = HierarchicalNet(5, partial(mops.MOPSNet, alpha=2.0), (20, 8), (8, 16, 16), 4)
     task = Classification(net, 5)
     points = torch.randn(4, 40, 3, generator=rng)
     batch = Batch(points, torch.tensor([0, 1, 2, 3]))

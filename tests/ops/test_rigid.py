@@ -3,15 +3,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mops_lightning.ops.rigid import (
-    identity_motion,
-    quaternion_conjugate,
-    quaternion_from_euler,
-    quaternion_multiply,
-    quaternion_to_matrix,
-    random_motion,
-    rotation_angle,
-)
+from mops_lightning.ops import rigid
 from mops_lightning.seeding import generator
 from tests.support.rigid import motion
 
@@ -36,21 +28,21 @@ def same_rotation(got, want, tolerance=1e-12):
 
 def test_quaternion_to_matrix_equals_scipy():
     given = rotations()
-    got = quaternion_to_matrix(quaternions(given))
+    got = rigid.quaternion_to_matrix(quaternions(given))
     torch.testing.assert_close(got, torch.from_numpy(given.as_matrix()), atol=1e-12, rtol=0)
 
 
 def test_multiply_and_conjugate_equal_scipy():
     first, second = rotations(seed=1), rotations(seed=2)
-    product = quaternion_multiply(quaternions(first), quaternions(second))
+    product = rigid.quaternion_multiply(quaternions(first), quaternions(second))
     same_rotation(product, quaternions(first * second))
-    same_rotation(quaternion_conjugate(quaternions(first)), quaternions(first.inv()))
+    same_rotation(rigid.quaternion_conjugate(quaternions(first)), quaternions(first.inv()))
 
 
 def test_quaternion_from_euler_uses_fixed_axes_xyz():
     angles = np.random.default_rng(3).uniform(-np.pi, np.pi, (100, 3))
     want = Rotation.from_euler("xyz", angles)
-    same_rotation(quaternion_from_euler(torch.from_numpy(angles)), quaternions(want))
+    same_rotation(rigid.quaternion_from_euler(torch.from_numpy(angles)), quaternions(want))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -60,13 +52,13 @@ def test_rotation_angle_equals_scipy(dtype):
     for angle in (0.0, 1e-6, 1e-4, 1.0, np.pi - 1e-6, np.pi):
         pairs.append((first, first * Rotation.from_rotvec([0, 0, angle])))
     for a, b in pairs:
-        got = rotation_angle(quaternions(a).to(dtype), quaternions(b).to(dtype))
+        got = rigid.rotation_angle(quaternions(a).to(dtype), quaternions(b).to(dtype))
         want = torch.from_numpy((a.inv() * b).magnitude()).to(dtype)
         assert torch.isfinite(got).all()
         tolerance = 1e-7 if dtype == torch.float64 else 2e-6
         torch.testing.assert_close(got, want, atol=tolerance, rtol=0)
     a, b = quaternions(first), quaternions(rotations(seed=2))  # any sign and norm
-    torch.testing.assert_close(rotation_angle(-3 * a, b), rotation_angle(a, b))
+    torch.testing.assert_close(rigid.rotation_angle(-3 * a, b), rigid.rotation_angle(a, b))
 
 
 def test_motion_composition_and_identity(rng):
@@ -75,12 +67,12 @@ def test_motion_composition_and_identity(rng):
     moved = first.apply(points)
     twice = second.after(first).apply(points)
     torch.testing.assert_close(twice, second.apply(moved), atol=1e-5, rtol=0)
-    torch.testing.assert_close(identity_motion(points).apply(points), points)
+    torch.testing.assert_close(rigid.identity_motion(points).apply(points), points)
     torch.testing.assert_close(moved.diff(dim=1).norm(dim=2), points.diff(dim=1).norm(dim=2))
 
 
 def test_random_motion_covers_its_range():
-    drawn = random_motion(45.0, 0.5, [generator(i) for i in range(2000)])
+    drawn = rigid.random_motion(45.0, 0.5, [generator(i) for i in range(2000)])
     assert drawn.translation.abs().max() <= 0.5
     assert drawn.translation.abs().max() > 0.49
     angles = Rotation.from_quat(np.roll(drawn.quaternion.numpy(), -1, 1)).as_euler("xyz", True)
@@ -88,5 +80,5 @@ def test_random_motion_covers_its_range():
     assert (np.abs(angles).max(0) > 44).all()
     # The mean error of always predicting the identity is about 42.8 degrees.
     still = torch.tensor([1.0, 0.0, 0.0, 0.0])
-    mean = torch.rad2deg(rotation_angle(drawn.quaternion, still.expand(2000, 4))).mean()
+    mean = torch.rad2deg(rigid.rotation_angle(drawn.quaternion, still.expand(2000, 4))).mean()
     assert 41.5 < mean < 44

@@ -15,14 +15,9 @@ from mops_lightning.ops.points import gather_points
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.schedules import exponential
+from tests.support import recording
 from tests.support.losses import simplification_loss, subset_loss
-from tests.support.recording import (
-    Fingerprint,
-    MeanFingerprint,
-    RecordingTask,
-    noting,
-    numbered_clouds,
-)
+from tests.support.recording import Fingerprint, RecordingTask, noting, numbered_clouds
 from tests.support.training import quiet_trainer
 
 MOPS: dict[str, Any] = {"feature_channels": (8, 6), "rho_channels": (12, 10), "alpha": 2.0}
@@ -222,7 +217,7 @@ def test_nets_drawn_in_a_step_are_compared_with_predictions_of_the_first(calls):
     assert logged["train/loss/distillation"] == pytest.approx(float(sum(apart)), rel=1e-4)
 
 
-class InTests(MeanFingerprint):
+class InTests(recording.MeanFingerprint):
     """Nothing that training computes."""
 
     name = "in_tests"
@@ -230,7 +225,7 @@ class InTests(MeanFingerprint):
 
 class WithMoreInTests(RecordingTask):
     def metrics(self, training=False):
-        return collection(MeanFingerprint(), *([] if training else [InTests()]))
+        return collection(recording.MeanFingerprint(), *([] if training else [InTests()]))
 
 
 def test_training_logs_means_over_clouds_of_uneven_batches():

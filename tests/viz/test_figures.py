@@ -6,33 +6,23 @@ from PIL import Image
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
-from mops_lightning.viz.figures import (
-    COLOURS,
-    MAX_INPUT_POINTS,
-    cloud_grid,
-    comparison,
-    load_clouds,
-    matrix_figure,
-    new_figure,
-    save_clouds,
-    save_figure,
-)
+from mops_lightning.viz import figures
 from mops_lightning.viz.task_results import ReconstructionResult, reconstruction_grid
 
 
 def pixels(figure, tmp_path):
-    return matplotlib.image.imread(save_figure(figure, tmp_path / "figure.png"))[..., :3]
+    return matplotlib.image.imread(figures.save_figure(figure, tmp_path / "figure.png"))[..., :3]
 
 
 def marked(image, name):
     """The number of pixels in the colour of a readout."""
-    return (np.abs(image - np.array(COLOURS[name]) / 255).max(2) < 0.02).sum()
+    return (np.abs(image - np.array(figures.COLOURS[name]) / 255).max(2) < 0.02).sum()
 
 
 def test_cloud_grid_draws_readout_in_its_colour(tmp_path, rng):
     points = torch.rand(2, 300, 3, generator=rng)
     readouts = dict.fromkeys(("generated", "matched", "completed"), points[:, :20])
-    figure = cloud_grid(points, readouts, ["chair", "vase"])
+    figure = figures.cloud_grid(points, readouts, ["chair", "vase"])
     image = pixels(figure, tmp_path)
     width = image.shape[1] // 4
     for column, name in enumerate(readouts, start=1):
@@ -45,7 +35,7 @@ def test_cloud_grid_draws_readout_in_its_colour(tmp_path, rng):
 def test_matrix_figure_shows_ideal_matrix_as_diagonal_and_every_large_entry(number):
     dense = torch.zeros(number, 4)
     dense[torch.tensor([number // 2, 3, number - 1, 7]), torch.arange(4)] = 1.0
-    figure = matrix_figure(dense, dense.T @ dense, "chair")
+    figure = figures.matrix_figure(dense, dense.T @ dense, "chair")
     left, right = (axes.images[0] for axes in figure.axes[:2])
     drawn = np.asarray(left.get_array())
     assert drawn.max(0).tolist() == [1.0] * 4
@@ -59,7 +49,7 @@ def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, rng):
     far = points[points[:, 0] < -0.3][:100]
     pixel_counts = []
     for cloud in (points, far):
-        image = pixels(cloud_grid(cloud[None], {"matched": far[None]}, [""]), tmp_path)
+        image = pixels(figures.cloud_grid(cloud[None], {"matched": far[None]}, [""]), tmp_path)
         pixel_counts.append(marked(image, "matched"))
     # Without the hiding cloud the frame is tighter, hence markers cover more pixels.
     assert pixel_counts[0] > 0.2 * pixel_counts[1]
@@ -68,7 +58,7 @@ def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, rng):
 def test_comparison_draws_every_sample_and_whole_cloud(tmp_path, rng):
     points = torch.rand(300, 3, generator=rng)
     captions = {"fps": "fps: 78.75 %", "generated": "MOPSNet: 96.25 %", "full": "all points"}
-    figure = comparison(points, {"fps": points[:20], "generated": points[:20]}, captions)
+    figure = figures.comparison(points, {"fps": points[:20], "generated": points[:20]}, captions)
     assert [axes.get_title() for axes in figure.axes] == list(captions.values())
     image = pixels(figure, tmp_path)
     width = image.shape[1] // 3
@@ -77,10 +67,10 @@ def test_comparison_draws_every_sample_and_whole_cloud(tmp_path, rng):
 
 
 def test_save_figure_png_has_a_palette_near_the_colours(tmp_path):
-    figure = new_figure(4, 4)
+    figure = figures.new_figure(4, 4)
     colours = np.random.default_rng(0).random((4, 4, 3))
     figure.subplots().imshow(colours, interpolation="nearest")
-    with Image.open(save_figure(figure, tmp_path / "a.png", dpi=100)) as image:
+    with Image.open(figures.save_figure(figure, tmp_path / "a.png", dpi=100)) as image:
         assert image.size == (400, 400)
         assert image.mode == "P"
         drawn = np.asarray(image.convert("RGB")).reshape(-1, 3) / 255
@@ -89,11 +79,12 @@ def test_save_figure_png_has_a_palette_near_the_colours(tmp_path):
 
 def test_save_clouds_large_thins_input_and_keeps_samples(tmp_path, rng):
     points = torch.rand(2, 20_000, 3, generator=rng)
-    save_clouds(tmp_path / "clouds.npz", points, {"generated": points[:, :4096]}, ["a", "b"])
-    titles, arrays = load_clouds(tmp_path / "clouds.npz")
+    path, samples = tmp_path / "clouds.npz", {"generated": points[:, :4096]}
+    figures.save_clouds(path, points, samples, ["a", "b"])
+    titles, arrays = figures.load_clouds(path)
     assert titles == ["a", "b"]
     assert list(arrays) == ["input", "generated"]
-    assert arrays["input"].shape[1] <= MAX_INPUT_POINTS
+    assert arrays["input"].shape[1] <= figures.MAX_INPUT_POINTS
     assert torch.equal(torch.from_numpy(arrays["generated"]), points[:, :4096])
 
 
@@ -115,7 +106,7 @@ DAMAGES: dict[str, dict[str, np.ndarray]] = {
 def test_load_clouds_damaged_file_is_refused(tmp_path, rng, damage):
     path = tmp_path / "clouds.npz"
     points = torch.rand(2, 50, 3, generator=rng)
-    save_clouds(path, points, {"generated": points[:, :4]}, ["a", "b"])
+    figures.save_clouds(path, points, {"generated": points[:, :4]}, ["a", "b"])
     arrays = {**np.load(path), **DAMAGES[damage]}
     if damage == "no samples":
         del arrays["generated"]
@@ -123,13 +114,14 @@ def test_load_clouds_damaged_file_is_refused(tmp_path, rng, damage):
     if damage in ("cut", "text"):
         path.write_bytes(path.read_bytes()[:-200] if damage == "cut" else b"text")
     with pytest.raises(UserError, match=r"clouds\.npz: cannot read saved clouds: .+\.$"):
-        load_clouds(path)
+        figures.load_clouds(path)
 
 
 def test_reconstruction_grid_thins_large_clouds_only(rng):
-    points = torch.rand(1, 2 * MAX_INPUT_POINTS, 3, generator=rng)
+    points = torch.rand(1, 2 * figures.MAX_INPUT_POINTS, 3, generator=rng)
     result = ReconstructionResult(points[:, :8], points[:, :100], [1.5])
     figure = reconstruction_grid(points, points, {"fps": result}, ["chair"])
     counts = [[len(np.asarray(c.get_offsets())) for c in axes.collections] for axes in figure.axes]
-    assert counts == [[MAX_INPUT_POINTS], [MAX_INPUT_POINTS], [MAX_INPUT_POINTS, 8], [100]]
+    most = figures.MAX_INPUT_POINTS
+    assert counts == [[most], [most], [most, 8], [100]]
     assert figure.axes[3].texts[0].get_text() == "NRE 1.50"
