@@ -13,7 +13,7 @@ from mops_lightning.nets.autoencoder import AutoEncoder, PointEncoder
 from mops_lightning.nets.dgcnn import DGCNN
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.hierarchical import HierarchicalNet
-from mops_lightning.nets.layers import PointFeatures
+from mops_lightning.nets.layers import PointFeatures, PointMLP
 from mops_lightning.nets.pcrnet import PCRNet
 from mops_lightning.nets.pointnet import PointNetTransform, PointNetVanilla, TransformNet
 from mops_lightning.samplers.fps import FPSSampler
@@ -104,7 +104,7 @@ def test_autoencoder_has_published_size():
 
 
 def test_point_features_global_is_maximum_of_local(rng):
-    local, global_ = PointFeatures((8, 6)).eval()(torch.randn(2, 30, 3, generator=rng))
+    local, global_ = PointFeatures(PointMLP([3, 8, 6])).eval()(torch.randn(2, 30, 3, generator=rng))
     assert local.shape == (2, 30, 6)
     torch.testing.assert_close(global_, local.max(1).values)
 

@@ -85,12 +85,12 @@ class PointFeatures(nn.Module):
     """Local and global features of a cloud (paper section "Feature Extraction").
 
     Args:
-        channels: sizes of the pointwise layers after the coordinates.
+        mlp: layers from coordinates to local features.
     """
 
-    def __init__(self, channels: Sequence[int] = (64, 64, 64, 128, 128)) -> None:
+    def __init__(self, mlp: PointMLP) -> None:
         super().__init__()
-        self.mlp = PointMLP([3, *channels])
+        self.mlp = mlp
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Map ``(B, N, 3)`` points to local features ``(B, N, C)`` and their maxima ``(B, C)``."""

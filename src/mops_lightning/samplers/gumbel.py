@@ -58,7 +58,7 @@ class GumbelSampler(Sampler):
         check_channels("feature_channels", feature_channels)
         self.tau_min = tau_min
         self.training_tau = 1.0
-        self.features = PointFeatures(feature_channels)
+        self.features = PointFeatures(PointMLP([3, *feature_channels]))
         self.keys = PointMLP([2 * feature_channels[-1], *KEY_CHANNELS])
         self.queries = nn.Linear(KEY_CHANNELS[-1], m, bias=False)
 

@@ -48,7 +48,7 @@ def test_sampler_of_another_size_continues_from_a_run(tmp_path):
 
 
 def test_copy_pointwise_layers_copies_until_shapes_differ():
-    source, target = PointMLP([3, 8, 8, 16, 32]), PointFeatures([8, 8, 16, 16])
+    source, target = PointMLP([3, 8, 8, 16, 32]), PointFeatures(PointMLP([3, 8, 8, 16, 16]))
     source(POINTS)  # moves the running statistics
     before = copy.deepcopy(target.state_dict())
     assert copy_pointwise_layers(nn.Sequential(nn.Linear(3, 3), source), target, POINTS) == 3
