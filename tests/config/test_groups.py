@@ -120,7 +120,7 @@ def test_length_follows_from_what_is_learned(task):
     ("setting", "spellings"),
     [
         ("weights", "auto pcrnet.modelnet40 models/pcrnet.modelnet40.safetensors null"),
-        ("recipe.warm_start", "true fmops.pairs-m64 models/fmops.pairs-m64.safetensors"),
+        ("recipe.warm_start", "true fmops.airplane-m256 models/fmops.airplane-m256.safetensors"),
     ],
 )
 def test_spelling_of_weights_changes_nothing_else(sampler, setting, spellings):

@@ -58,8 +58,8 @@ def test_taken_name_is_refused_unless_overwritten_and_sampler_as_task_net(run, t
     with pytest.raises(UserError, match=r"exists.*--overwrite"):
         publish.add(run, "fmops.mine", tmp_path)
     publish.add(run, "fmops.mine", tmp_path, overwrite=True)
-    with pytest.raises(UserError, match=r"--task-net: fmops\.pairs-m64 is a sampler"):
-        publish.add(run, "fmops.other", tmp_path, task_net="fmops.pairs-m64")
+    with pytest.raises(UserError, match=r"--task-net: fmops\.airplane-m256 is a sampler"):
+        publish.add(run, "fmops.other", tmp_path, task_net="fmops.airplane-m256")
 
 
 @pytest.mark.parametrize(
