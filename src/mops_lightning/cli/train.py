@@ -7,18 +7,9 @@ import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mops_lightning import errors
 from mops_lightning.config.compose import check_overrides, conf_dir, explain
 from mops_lightning.config.overrides import key, readable, with_home, with_own_classes
-from mops_lightning.errors import (
-    INTERRUPTED,
-    USER_ERROR,
-    Interrupted,
-    UserError,
-    did_you_mean,
-    end,
-    end_in_one_line,
-    quiet_on_closed_pipe,
-)
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -31,8 +22,8 @@ def main() -> None:
     """Run one job or a sweep; a user's mistake ends in one line and exit status 2."""
     try:
         _run()
-    except (KeyboardInterrupt, Interrupted) as stop:
-        end(NAME, f"interrupted. {stop}".rstrip(), INTERRUPTED)
+    except (KeyboardInterrupt, errors.Interrupted) as stop:
+        errors.end(NAME, f"interrupted. {stop}".rstrip(), errors.INTERRUPTED)
 
 
 def _run() -> None:
@@ -46,7 +37,7 @@ def _run() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         if "${" in str(Path.cwd()):
-            raise UserError(
+            raise errors.UserError(
                 "the path of the current folder contains ${, which Hydra resolves. Use another."
             )
         sys.argv[1:] = flags_first(sys.argv[1:])
@@ -64,11 +55,12 @@ def _run() -> None:
             raise
         of_hydra = HydraException | OmegaConfBaseException | YAMLError | UnicodeDecodeError
         if isinstance(error, of_hydra):
-            end(NAME, explain(error, sys.argv[1:]), USER_ERROR)
+            errors.end(NAME, explain(error, sys.argv[1:]), errors.USER_ERROR)
         *_, (frame, _) = traceback.walk_tb(error.__traceback__)
         if type(error) is ValueError and frame.f_globals["__name__"].startswith("hydra."):
-            end(NAME, " ".join(str(error).split()), USER_ERROR)  # flags that exclude each other
-        end_in_one_line(NAME, error)
+            message = " ".join(str(error).split())  # flags that exclude each other
+            errors.end(NAME, message, errors.USER_ERROR)
+        errors.end_in_one_line(NAME, error)
 
 
 def flags_first(arguments: list[str]) -> list[str]:
@@ -91,13 +83,13 @@ def flags_first(arguments: list[str]) -> list[str]:
     try:
         read, unknown = parser.parse_known_intermixed_args(arguments)
     except argparse.ArgumentError as error:
-        raise UserError(f"{error.argument_name}: {error.message}.") from None
+        raise errors.UserError(f"{error.argument_name}: {error.message}.") from None
     known = [action.option_strings[0] for action in parser._actions if action.option_strings]
     for flag in unknown:
-        hint = did_you_mean(flag.split("=")[0], known)
-        raise UserError(f"no flag {flag!r}.{hint} Settings are KEY=VALUE, without dashes.")
+        hint = errors.did_you_mean(flag.split("=")[0], known)
+        raise errors.UserError(f"no flag {flag!r}.{hint} Settings are KEY=VALUE, without dashes.")
     if read.experimental_rerun:
-        raise UserError(
+        raise errors.UserError(
             "--experimental-rerun is not available, because the pickle that it reads can run code. "
             "Repeat the run with the overrides in its result.json."
         )
@@ -129,7 +121,7 @@ def _job(cfg: "DictConfig") -> float | None:
     swept = hydra_cfg.mode == RunMode.MULTIRUN
     folder = Path(os.path.relpath(hydra_cfg.runtime.output_dir))
     overrides = list(hydra_cfg.overrides.task)
-    with quiet_on_closed_pipe():
+    with errors.quiet_on_closed_pipe():
         try:
             if swept:
                 distributed.check_multirun(cfg)
@@ -137,9 +129,9 @@ def _job(cfg: "DictConfig") -> float | None:
             return run(cfg, folder, overrides, claimed=True).score
         except BrokenPipeError:
             raise
-        except Interrupted as stop:
+        except errors.Interrupted as stop:
             if distributed.is_worker_rank(cfg):
-                sys.exit(INTERRUPTED)  # rank 0 prints the message
+                sys.exit(errors.INTERRUPTED)  # rank 0 prints the message
             # Hydra passes this on like any other error.
             again = "Run the same command with hydra.sweep.dir={} to continue the sweep."
             text = again.format(os.path.relpath(hydra_cfg.sweep.dir)) if swept else str(stop)
@@ -148,4 +140,4 @@ def _job(cfg: "DictConfig") -> float | None:
             line = line_about_run(error, overrides)
             if line is None:
                 raise
-            end(NAME, line, USER_ERROR)
+            errors.end(NAME, line, errors.USER_ERROR)

@@ -274,32 +274,27 @@ def _compare(chosen: argparse.Namespace) -> None:
     for name in chosen.methods:
         if name not in UNTRAINED:
             raise UserError(f"--methods: unknown {name!r}.{did_you_mean(name, UNTRAINED)}")
-    from mops_lightning.files.compare import (
-        FILES,
-        compare_file,
-        options_by_method,
-        write_comparison,
-    )
+    from mops_lightning.files import compare as comparison
     from mops_lightning.files.downsample import load_sampler
 
     if chosen.out.exists() and not chosen.out.is_dir():
         raise UserError(f"--out must be a folder, got the file {chosen.out}.")
     found = {path.name for path in chosen.out.glob("[!.]*")}
-    if other := sorted(found.difference(FILES)):
+    if other := sorted(found.difference(comparison.FILES)):
         raise UserError(f"--out: {chosen.out} has other files, such as {other[0]}. Give a new one.")
     if found and not chosen.overwrite:
         raise UserError(f"--out: {chosen.out / max(found)} exists. Give another, or --overwrite.")
     by_size = {
-        m: options_by_method(m, chosen.methods, chosen.weights, chosen.tile, chosen.seed)
+        m: comparison.options_by_method(m, chosen.methods, chosen.weights, chosen.tile, chosen.seed)
         for m in chosen.m
     }
     for methods in by_size.values():
         for options in methods.values():
             load_sampler(options)  # reports its mistakes before any file is read
     results = [
-        compare_file(path, m, methods, chosen.seed)
+        comparison.compare_file(path, m, methods, chosen.seed)
         for path in chosen.files
         for m, methods in by_size.items()
     ]
-    print(write_comparison(results, chosen.out))
-    print(f"files in {chosen.out}/: {', '.join(FILES)}")
+    print(comparison.write_comparison(results, chosen.out))
+    print(f"files in {chosen.out}/: {', '.join(comparison.FILES)}")

@@ -8,12 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.data.formats.guard import (
-    BadCloudError,
-    WholeOnlyError,
-    check_coordinates,
-    reading,
-)
+from mops_lightning.data.formats import guard
 from mops_lightning.data.formats.registry import READERS, open_cloud_file, write
 from mops_lightning.data.formats.table import PART, Column, Table, TableParts
 from mops_lightning.errors import UserError, did_you_mean
@@ -92,11 +87,11 @@ def propagate_file(
 def _read(path: Path) -> Table:
     """Read a cloud; a mesh has no points that could be matched."""
     if path.suffix.lower() not in READERS:
-        raise BadCloudError(f"{path} must end in {', '.join(READERS)}.")
-    with reading(path):
+        raise guard.BadCloudError(f"{path} must end in {', '.join(READERS)}.")
+    with guard.reading(path):
         table = READERS[path.suffix.lower()](path)
     if table is None or not len(table.finite().points):
-        raise BadCloudError(f"{path} must be a cloud of at least one point.")
+        raise guard.BadCloudError(f"{path} must be a cloud of at least one point.")
     return table
 
 
@@ -104,7 +99,7 @@ def _tables(path: Path) -> Callable[[str], Iterable[Table]]:
     """Return a function of a title that reads a file's finite points, in parts if possible."""
     try:
         file = open_cloud_file(path)
-    except WholeOnlyError:  # for example ascii PLY
+    except guard.WholeOnlyError:  # for example ascii PLY
         whole = _read(path).finite()
         return lambda title: [whole]
     ranges = file.row_ranges(PART)
@@ -132,12 +127,12 @@ def _measure(path: Path, tables: Iterable[Table]) -> TableParts:
             first, columns = table, dict(table.columns)
         for name, column in table.columns.items():
             columns[name] = np.concatenate([columns[name], _extremes(column)])
-        check_coordinates(path, table.points)
+        guard.check_coordinates(path, table.points)
         number += len(table.points)
         low, high = np.minimum(low, table.points.min(0)), np.maximum(high, table.points.max(0))
         lost = max(lost, float(np.abs(table.points.astype(np.float32) - table.points).max()))
     if first is None:
-        raise BadCloudError(f"{path} holds no points.")
+        raise guard.BadCloudError(f"{path} holds no points.")
     single = lost <= 1e-6 * float((high - low).max())
     kind = np.dtype(np.float32 if single else np.float64)
     return TableParts([], number, np.stack([low, high]), kind, columns, first.header)
