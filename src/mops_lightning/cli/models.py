@@ -59,14 +59,8 @@ def _add(arguments: list[str], prog: str) -> list[str]:
     folder = chosen.folder or (names.folders()[0] if own else None)
     if folder is None:
         raise UserError(f"give --folder FOLDER, or set ${names.VARIABLE} to a folder of models.")
-    path = publish.add(
-        chosen.run.expanduser(),
-        name,
-        folder,
-        task_net=chosen.task_net,
-        notes=chosen.notes,
-        overwrite=chosen.overwrite,
-    )
+    options = {key: getattr(chosen, key) for key in ("task_net", "notes", "overwrite")}
+    path = publish.add(chosen.run, name, folder, **options)
     card = model_file.read_card(path)
     record = card["record"]
     lines = [
@@ -90,16 +84,8 @@ def _table() -> list[str]:
         except UserError as error:
             unreadable.append(f"Not listed: {error}")
             continue
-        rows.append(
-            (
-                name,
-                card["record"]["config"]["names"]["task"],
-                _sizes(card),
-                _figures(card),
-                card["licence"].partition(";")[0],
-                _megabytes(path),
-            )
-        )
+        task, licence = card["record"]["config"]["names"]["task"], card["licence"].partition(";")[0]
+        rows.append((name, task, _sizes(card), _figures(card), licence, _megabytes(path)))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()

@@ -31,31 +31,21 @@ def main(arguments: list[str] | None = None, prog: str = "mops-lightning report"
         prog: what the user typed to start this command.
     """
     with one_line_endings(prog):
-        chosen = make_parser(prog).parse_args(arguments)
+        parser = Parser(prog, DESCRIPTION)
+        add = parser.add_argument
+        add("folder", type=Path, help="folder of a run, of a sweep, or of several")
+        add("--metric", nargs="+", default=[], help="names of metrics; default: the task's score")
+        mixed = "allow runs of different commits or settings in one table"
+        add("--mixed", action="store_true", help=mixed)
+        records = "also write all records to one file (.jsonl)"
+        add("--records", type=Path, metavar="FILE", help=records)
+        chosen = parser.parse_args(arguments)
         report = build_report(chosen.folder, chosen.metric, chosen.mixed)
         written = write(report, chosen.folder)
         if chosen.records:
             run_record.write_many(chosen.records, report.found.done)
         print(markdown(report.grids, report.remarks))
         print(f"files in {chosen.folder}/: {', '.join(written)}")
-
-
-def make_parser(prog: str) -> Parser:
-    """Return the parser of this command's arguments."""
-    parser = Parser(prog, DESCRIPTION)
-    parser.add_argument("folder", type=Path, help="folder of a run, of a sweep, or of several")
-    parser.add_argument(
-        "--metric", nargs="+", default=[], help="names of metrics; default: the task's score"
-    )
-    parser.add_argument(
-        "--mixed",
-        action="store_true",
-        help="allow runs of different commits or settings in one table",
-    )
-    parser.add_argument(
-        "--records", type=Path, metavar="FILE", help="also write all records to one file (.jsonl)"
-    )
-    return parser
 
 
 def write(report: Report, folder: Path) -> list[str]:

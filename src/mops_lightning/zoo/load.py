@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from functools import cache, partial
+from functools import cache
 from inspect import signature
 from pathlib import Path
 from typing import Any, TypeVar
@@ -144,7 +144,15 @@ def _build(
     if not isinstance(node, dict):
         raise UserError(f"{path}: {part} must be a group of settings, got {node!r:.99}.")
     arguments = {name: value for name, value in node.items() if name != "_target_"}
-    make = partial(_built, cls, arguments, path)
+
+    def make() -> M:
+        try:
+            return cls(**arguments)
+        except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: sizes over 64 bits
+            reason = str(error).partition("\n")[0]
+            name = f"{cls.__module__}.{cls.__qualname__}"
+            raise UserError(f"{path}: cannot build {name}: {reason}") from None
+
     with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
         # Without memory first: a small file can describe a large net.
         with torch.device("meta"), _at_most(len(state)):
@@ -153,15 +161,6 @@ def _build(
         module = make()
     fit_state(module, state, path, hint)
     return module.eval()
-
-
-def _built(cls: type[M], arguments: dict[str, Any], path: Path) -> M:
-    try:
-        return cls(**arguments)
-    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: sizes beyond 64 bits
-        reason = str(error).partition("\n")[0]
-        name = f"{cls.__module__}.{cls.__qualname__}"
-        raise UserError(f"{path}: cannot build {name}: {reason}") from None
 
 
 @contextmanager
