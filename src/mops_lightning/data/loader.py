@@ -48,11 +48,6 @@ class Augmentation:
                 f"{self.rotate_up!r}."
             )
 
-    @property
-    def active(self) -> bool:
-        """Whether clouds are changed at all."""
-        return bool(self.rotate_up) or self.jitter > 0 or self.stretch > 1 or self.shift > 0
-
     def __call__(self, points: Tensor, rng: Generator) -> Tensor:
         """Return the augmented ``(B, N, 3)`` points."""
         if self.rotate_up:
@@ -124,7 +119,7 @@ class CloudLoader:
     @property
     def keeps_clouds(self) -> bool:
         """Whether the clouds are the same in every epoch, neither augmented nor converted."""
-        return self.make_batch is None and not (self.augment and self.augment.active)
+        return self.make_batch is None and self.augment in (None, Augmentation())
 
     def set_epoch(self, epoch: int) -> None:
         """Start ``epoch`` from its first batch, unless it is the current epoch."""

@@ -31,11 +31,6 @@ class MetricName(NamedTuple):
     metric: str
 
 
-def size_prefix(m: int | None) -> str:
-    """Return ``m32/`` for 32, and an empty string for None."""
-    return "" if m is None else f"m{m}/"
-
-
 def parse_metric_name(name: str) -> MetricName | None:
     """Split a name such as ``test/m32/generated/accuracy`` or ``test/generated/accuracy``.
 

@@ -17,14 +17,14 @@ from torch.optim.lr_scheduler import LRScheduler
 from mops_lightning.config.settings import Learn
 from mops_lightning.errors import UserError
 from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
-from mops_lightning.records.readout_names import FULL, SOFT_PROJECTED, size_prefix
+from mops_lightning.records.readout_names import FULL, SOFT_PROJECTED
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
 from mops_lightning.training.checkpoint import CHECKPOINT_KEY, SAVED, check_finite
 from mops_lightning.training.readouts import names_of_readouts, readouts
 from mops_lightning.training.recipe.distillation import Distillation, Targets
-from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through
+from mops_lightning.training.recipe.recipe import Recipe, draw_points, reached, straight_through
 from mops_lightning.training.scores import Scores
 from mops_lightning.types import Batch, SampleOutput
 
@@ -96,7 +96,7 @@ class Experiment(L.LightningModule):
             module.requires_grad_(False)
         self.m: int = m or (self.sampler.m if self.sampler is not None else 0)
         self.sizes = tuple(sizes or (self.m,))
-        self.prefixes = {m: size_prefix(m) if len(self.sizes) > 1 else "" for m in self.sizes}
+        self.prefixes = {m: f"m{m}/" if len(self.sizes) > 1 else "" for m in self.sizes}
         self.main_readout, *others = names_of_readouts(self.sampler)
         score = task.full_score or task.score if self.sampler is None else task.score
         self.score_name = f"test/{self.prefixes.get(self.m, '')}{self.main_readout}/{score}"
@@ -122,11 +122,6 @@ class Experiment(L.LightningModule):
         if self.learn == "nothing" and self.sampler is not None:
             frozen.append(self.sampler)
         return frozen
-
-    @property
-    def trainable(self) -> bool:
-        """Whether any parameter learns; an index sampler under a frozen net has none."""
-        return any(p.requires_grad for p in self.parameters())
 
     def configure_optimizers(self) -> Any:
         """Build the optimizer of what learns, and its schedule over all steps of the run."""
@@ -236,7 +231,7 @@ class Experiment(L.LightningModule):
         """
         soft = sampled.soft_projected
         inputs = [sampled.points if soft is None else soft]
-        if self.recipe.sees_matched(self._progress):
+        if reached(self.recipe.straight_through, self._progress):
             inputs.append(straight_through(sampled.points, seen))
         terms: dict[str, Tensor] = {}
         tasks: list[Any] = [self.task, *self.other_tasks]

@@ -92,10 +92,8 @@ def test_recipe_accepts_limits():
 
 
 def test_shares_of_the_training_include_their_first_step():
-    recipe = Recipe(train_points=64, all_points_from=0.5, straight_through=0.25)
+    recipe = Recipe(train_points=64, all_points_from=0.5)
     assert [recipe.points_at(progress, 1024, 8) for progress in (0.49, 0.5)] == [64, 1024]
-    assert [recipe.sees_matched(progress) for progress in (0.24, 0.25)] == [False, True]
-    assert not Recipe().sees_matched(1.0)
 
 
 def test_training_sees_drawn_points_then_all_and_validation_always_all():

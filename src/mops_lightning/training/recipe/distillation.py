@@ -56,17 +56,16 @@ class Distillation:
             batch: whose points the prediction is of.
             seen: ``(B, N, 3)`` the points that the step sees, whose features are pooled.
         """
-        prediction = self._prediction(batch) if self.predicts else None
+        prediction = None
+        if self.table is not None and batch.rows is not None:
+            prediction = self.table[batch.rows]
+        elif self.predicts:
+            prediction = self.tasks[0].predict(batch, batch.points)
         pooled = self.recipe.feature_distillation
         return [
             Targets(prediction, pooled_features(task.net, seen) if pooled else None)
             for task in self.tasks
         ]
-
-    def _prediction(self, batch: Batch) -> Any:
-        if self.table is None or batch.rows is None:
-            return self.tasks[0].predict(batch, batch.points)
-        return self.table[batch.rows]
 
     def losses(
         self, number: int, points: Tensor, output: Any, targets: list[Targets]

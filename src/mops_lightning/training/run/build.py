@@ -78,8 +78,9 @@ class Parts:
 
     @property
     def trains(self) -> bool:
-        """Whether anything is trained."""
-        return self.experiment.trainable and self.trained is None
+        """Whether anything is trained; an index sampler under a frozen net has no parameters."""
+        learns = any(p.requires_grad for p in self.experiment.parameters())
+        return learns and self.trained is None
 
     @property
     def has_task_weights(self) -> bool:
