@@ -53,9 +53,12 @@ def file_pairs(source: Path, target: Path) -> list[FilePair]:
     if is_many(source):
         base, pattern = (source, "**/*") if source.is_dir() else (source.parent, source.name)
         inputs = _inputs(base, pattern, target)
-        return _distinct(
-            [(path, _output(path, target / path.relative_to(base))) for path in inputs]
-        )
+        pairs = [(path, _output(path, target / path.relative_to(base))) for path in inputs]
+        targets = Counter(path for _, path in pairs)
+        if twice := next((path for path, number in targets.items() if number > 1), None):
+            both = " and ".join(str(path) for path, output in pairs if output == twice)
+            raise UserError(f"{both} have the same output {twice}. Rename one.")
+        return pairs
     if target.is_dir():
         target = _output(source, target / source.name)
     if target.suffix.lower() not in WRITERS:
@@ -88,16 +91,6 @@ def _inputs(folder: Path, pattern: str, target: Path) -> list[Path]:
     if not files:
         raise UserError(f"{folder / pattern}: no file ends in {', '.join(READABLE)}.")
     return files
-
-
-def _distinct(pairs: list[FilePair]) -> list[FilePair]:
-    """Reject two input files with the same output file."""
-    targets = Counter(path for _, path in pairs)
-    twice = next((path for path, number in targets.items() if number > 1), None)
-    if twice:
-        both = " and ".join(str(source) for source, target in pairs if target == twice)
-        raise UserError(f"{both} have the same output {twice}. Rename one.")
-    return pairs
 
 
 def attempt(

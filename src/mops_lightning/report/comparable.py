@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import pandas as pd
@@ -116,20 +115,19 @@ def _by_content(found: list[Group], what: str, name: str) -> list[Group]:
     as with procedural data and nets that are trained first, if every sampler was run with every
     seed.
     """
+
+    def start_of_digest(record: RunRecord) -> tuple[str, ...] | None:
+        digest = getattr(record, name)
+        return (digest[:12],) if digest else None
+
     result = []
     for group in found:
         several_nets = name == "task_weights_sha256" and (group.column == "net" or group.joint)
         if several_nets or _agree(group.records, name):
             result.append(group)
         else:
-            result += _split([group], what, partial(_digest, name))
+            result += _split([group], what, start_of_digest)
     return result
-
-
-def _digest(name: str, record: RunRecord) -> tuple[str, ...] | None:
-    """Return the start of a digest that names data or weights; None if it is not known."""
-    digest = getattr(record, name)
-    return (digest[:12],) if digest else None
 
 
 def _agree(found: list[RunRecord], name: str) -> bool:

@@ -129,11 +129,8 @@ class Registration(Task):
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return rotation errors in degrees, recalls in [0, 1] and the translation error."""
-        errors = (
-            RotationError(),
-            registration.RotationErrorP90(),
-            registration.DoubledRotationError(),
-        )
+        doubled = registration.DoubledRotationError()
+        errors = RotationError(), registration.RotationErrorP90(), doubled
         recalls = registration.RotationRecall5(), registration.RotationRecall10()
         return collection(*errors, *recalls, registration.TranslationError())
 
