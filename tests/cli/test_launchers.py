@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from tests.support.command_line import TINY, call
+from tests.support.command_line import TINY, done
 
 LAUNCHERS = {
     "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "m=4,8"],
@@ -19,8 +19,7 @@ def test_cells_run_side_by_side(name, tmp_path):
     sizes = [4, 8] if name == "joblib" else [4]
     fixed = [*TINY, "sampler=random", "weights=null", "hydra.sweep.dir=cells"]
     command = ["-m", *fixed, *LAUNCHERS[name]]
-    status, out, err = call(command, tmp_path)
-    assert status == 0, out + err
+    out = done(command, tmp_path)
     assert f"{len(sizes)} cells: {len(sizes)} completed; in cells" in out
     places = [tmp_path / "cells" / str(cell) / "result.json" for cell in range(len(sizes))]
     found = [json.loads(path.read_text()) for path in places]
@@ -35,8 +34,7 @@ def test_optuna_searches_and_keeps_every_trial(tmp_path):
     search = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "sampler.alpha=interval(0.1,30)"]
     settings = [*TINY, "weights=null", "hydra.sweep.dir=trials"]
     command = ["-m", *search, *settings, "hydra.sweeper.direction=maximize"]
-    status, out, err = call(command, tmp_path)
-    assert status == 0, out + err
+    out = done(command, tmp_path)
     assert "Best parameters: {'sampler.alpha': " in out
     found = [json.loads((tmp_path / "trials" / cell / "result.json").read_text()) for cell in "01"]
     alphas = {record["config"]["sampler"]["alpha"] for record in found}

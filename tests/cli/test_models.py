@@ -4,7 +4,7 @@ import pytest
 
 from mops_lightning.cli.models import main
 from mops_lightning.zoo import model_file, names
-from tests.support.captured import captured, refused
+from tests.support.captured import captured, done, refused
 from tests.support.full_disk import full_disk
 from tests.support.models import rewrite, write_run
 
@@ -16,8 +16,7 @@ def call(*arguments):
 
 
 def test_models_lists_name_task_sizes_figures_licence_and_size():
-    status, out, err = call()
-    assert (status, err) == (0, "")
+    out = done(main, [], COMMAND)
     lines = {line.split()[0]: " ".join(line.split()) for line in out.splitlines()[1:]}
     assert set(lines) == set(names.available())
     assert lines["fmops.modelnet40-m512"].startswith(
@@ -29,8 +28,7 @@ def test_models_lists_name_task_sizes_figures_licence_and_size():
 
 @pytest.mark.parametrize("name", names.available())
 def test_models_shows_the_card_of_every_model(name):
-    status, out, _ = call(name)
-    assert status == 0
+    out = done(main, [name], COMMAND)
     shown = dict(line.split(maxsplit=1) for line in out.splitlines())
     assert shown["name"] == name
     for key in ("input", "data", "recipe", "commit", "licence", "test", "sha256"):
@@ -42,8 +40,8 @@ def test_models_add_publishes_a_run(tmp_path, monkeypatch):
     status, _, err = call("add", tmp_path / "run", "fmops.mine")
     assert status == 2
     assert "--folder" in err
-    status, out, _ = call("add", tmp_path / "run", "fmops.mine", "--folder", tmp_path / "models")
-    assert status == 0
+    arguments = ["add", tmp_path / "run", "fmops.mine", "--folder", tmp_path / "models"]
+    out = done(main, arguments, COMMAND)
     assert "evaluate=fmops.mine also needs weights=FILE" in out
     assert f"set {names.VARIABLE}={tmp_path}/models" in out
     monkeypatch.setenv(names.VARIABLE, str(tmp_path / "models"))
@@ -54,8 +52,7 @@ def test_models_add_publishes_a_run(tmp_path, monkeypatch):
 def test_models_lists_readable_files_next_to_a_damaged_one(tmp_path, monkeypatch):
     (tmp_path / "fmops.damaged.safetensors").write_bytes(b"none")
     monkeypatch.setenv(names.VARIABLE, str(tmp_path))
-    status, out, _ = call()
-    assert status == 0
+    out = done(main, [], COMMAND)
     assert "pointnet.modelnet40" in out
     assert out.splitlines()[-1].startswith(f"Not listed: {tmp_path}/fmops.damaged.safetensors is")
     write_run(tmp_path / "run")
@@ -72,8 +69,7 @@ def test_models_shows_a_foreign_card_escaped_and_on_its_lines(tmp_path, monkeypa
     rewrite(tmp_path / "fmops.mine.safetensors", **odd, record=record)
     monkeypatch.setenv(names.VARIABLE, str(tmp_path))
     for arguments in ((), ("fmops.mine",)):
-        status, out, err = call(*arguments)
-        assert (status, err) == (0, "")
+        out = done(main, arguments, COMMAND)
         assert "\\x1b[31m" in out
         assert "\\x1b]0,title\\x07 \\ud800" in out
     assert "one two" in out

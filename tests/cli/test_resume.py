@@ -8,7 +8,7 @@ import torch
 from mops_lightning.records import run_record
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.zoo import weights
-from tests.support.command_line import TINY, call
+from tests.support.command_line import TINY, call, done
 
 SHORT = [*TINY, "trainer.max_epochs=3", "weights=null", "baselines={}"]
 """Epochs of two steps; the default recipe, with a moving average of the weights."""
@@ -24,8 +24,7 @@ def ended(folder):
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unbroken")
-    status, _, err = call([*SHORT, "hydra.run.dir=run"], folder)
-    assert status == 0, err
+    done([*SHORT, "hydra.run.dir=run"], folder)
     return ended(folder / "run")
 
 

@@ -14,7 +14,7 @@ from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE, FAILED
 from mops_lightning.zoo import model_file, names
-from tests.support.command_line import TINY, call
+from tests.support.command_line import TINY, done
 
 
 @pytest.fixture
@@ -51,12 +51,10 @@ def test_run_cell_other_settings_keeps_result(start, tmp_path, caplog):
 
 def test_sweep_of_evaluations_started_again_is_skipped(tmp_path):
     more = ["sampler=snet", "val_fraction=0.25", "weights=null", "hydra.run.dir=trained"]
-    status, _, err = call([*TINY, *more], tmp_path)
-    assert status == 0, err
+    done([*TINY, *more], tmp_path)
     sweep = ["-m", "evaluate=trained", "pictures=0", "logger=none", "hydra.sweep.dir=sweep"]
     for _ in range(2):
-        status, out, err = call([*sweep, "test_corruption=null,shear-3"], tmp_path)
-        assert status == 0, err
+        out = done([*sweep, "test_corruption=null,shear-3"], tmp_path)
         assert "2 cells: 2 completed" in out
     assert out.count("already completed") == 2
 
@@ -173,8 +171,7 @@ def test_sweep_with_cell_in_another_process_exits_with_zero(tmp_path):
     cell = tmp_path / "sweep" / "0"
     cell.mkdir(parents=True)
     with FileLock(cell / ".lock"):
-        status, out, err = call(["-m", *TINY, "m=4", "hydra.sweep.dir=sweep"], tmp_path)
-    assert status == 0, err
+        out = done(["-m", *TINY, "m=4", "hydra.sweep.dir=sweep"], tmp_path)
     assert "1 cells: 1 left to another process; in sweep" in out
 
 
@@ -193,12 +190,10 @@ def test_sweep_ends_in_models_whose_cards_name_each_other(tmp_path, monkeypatch)
         "{learn: task, weights: null}, {sampler: mops, weights: Own/pointnet/weights.safetensors}"
     )
     grid = ["hydra/sweeper=grid", f"hydra.sweeper.grids=[{grids}]"]
-    status, out, err = call([*sweep, subdir, *grid], tmp_path)
-    assert status == 0, err
+    out = done([*sweep, subdir, *grid], tmp_path)
     assert "2 models in Own/models" in out
     monkeypatch.setenv("MOPS_MODELS", str(tmp_path / "Own/models"))
     card = model_file.read_card(names.available()["own.mops-m8"])
     assert card["record"]["files"]["task_weights"].startswith("own.pointnet@sha256:")
-    status, out, err = call(["evaluate=own.mops-m8", "pictures=0", "logger=none"], tmp_path)
-    assert status == 0, err
+    out = done(["evaluate=own.mops-m8", "pictures=0", "logger=none"], tmp_path)
     assert card["figures"]["values"]["completed"] in out

@@ -7,7 +7,7 @@ import pytest
 from mops_lightning.cli.train import flags_first
 from mops_lightning.records import run_record
 from mops_lightning.zoo import weights
-from tests.support.command_line import SMALL_PCRNET, TINY, TINY_WITH_PICTURES, call, runs
+from tests.support.command_line import SMALL_PCRNET, TINY, TINY_WITH_PICTURES, call, done, runs
 
 
 @pytest.fixture(scope="module")
@@ -70,8 +70,7 @@ def test_main_job_writes_weights_pictures_and_curves(main_job):
 
 def test_second_run_uses_cached_task_net(main_job):
     folder, *_ = main_job
-    status, out, err = call([*TINY_WITH_PICTURES, "sampler=fps", "m=4"], folder)
-    assert status == 0, err
+    out = done([*TINY_WITH_PICTURES, "sampler=fps", "m=4"], folder)
     assert "training it first" not in out
     record = run_record.read(runs(folder)[-1 if "fps" in str(runs(folder)[-1]) else 0])
     assert record.status == "completed"
@@ -93,15 +92,13 @@ def test_sweep_with_failed_cell_completes_the_rest(main_job):
     states = {record["config"]["m"]: record["status"] for record in found}
     assert states == {4: "completed", 65: "failed", 8: "completed"}
     # Only the cells of this start count, not what an earlier one has left.
-    status, out, err = call(["-m", *TINY, "sampler=random", "m=4", *fixed], folder)
-    assert status == 0, out + err
+    out = done(["-m", *TINY, "sampler=random", "m=4", *fixed], folder)
     assert "1 cells: 1 completed; in sweep/cells" in out
 
 
 def test_joint_training_starts_from_cached_task_net(main_job):
     folder, *_ = main_job
-    status, out, err = call([*TINY, "learn=joint", "out=joint"], folder)
-    assert status == 0, err
+    out = done([*TINY, "learn=joint", "out=joint"], folder)
     assert "training it first" not in out
     (path,) = (folder / "joint").rglob("result.json")
     before = next((folder / "cache" / "weights").rglob("weights.safetensors"))
@@ -111,8 +108,7 @@ def test_joint_training_starts_from_cached_task_net(main_job):
 
 def test_registration_trains_jointly_and_is_evaluated_on_other_pairs(tmp_path):
     settings = ["learn=joint", "sampler=fmops", "sampler.m_max=16", "pictures=1"]
-    status, out, err = call([*TINY_WITH_PICTURES, *SMALL_PCRNET, *settings], tmp_path)
-    assert status == 0, err
+    out = done([*TINY_WITH_PICTURES, *SMALL_PCRNET, *settings], tmp_path)
     assert "training it first" in out
     assert "registration by pcrnet, shapes, rotation error (°), test" in out
     (run,) = runs(tmp_path)
@@ -123,8 +119,7 @@ def test_registration_trains_jointly_and_is_evaluated_on_other_pairs(tmp_path):
     assert {path.name for path in (run / "pictures").iterdir()} == {"clouds.npz", *pictures}
     assert (run / "task_weights.safetensors").is_file()
     arguments = [f"evaluate={run}", "task.resample=48", "pictures=0"]
-    status, out, err = call(arguments, tmp_path)
-    assert status == 0, err
+    out = done(arguments, tmp_path)
     assert "registration by pcrnet" in out
 
 

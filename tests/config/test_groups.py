@@ -11,7 +11,7 @@ from mops_lightning.cli.main import COMMANDS
 from mops_lightning.config.compose import compose, conf_dir
 from mops_lightning.config.settings import declared
 from mops_lightning.records.run_record import dotted, read
-from tests.support.command_line import TINY, TINY_ANY_DATA, call, runs
+from tests.support.command_line import TINY, TINY_ANY_DATA, call, done, runs
 
 composed = cache(lambda chosen: compose(chosen.split()))
 """What several tests read and none changes."""
@@ -165,8 +165,7 @@ def test_user_files_need_no_specialised_file(tmp_path):
         (tmp_path / "own" / f"{name}.yaml").write_text(text)
     chosen = ["sampler=mine", "task=ours", "dataset=blobs"]
     tiny = [one for one in TINY if not one.startswith("dataset.")]
-    status, _, err = call(["--config-dir", "own", *chosen, *tiny], tmp_path)
-    assert status == 0, err
+    done(["--config-dir", "own", *chosen, *tiny], tmp_path)
     (run,) = runs(tmp_path)
     assert run.relative_to(tmp_path / "outputs").as_posix().startswith("ours/blobs/mine-m8/")
 
@@ -205,8 +204,7 @@ def test_own_scans_needs_a_folder_and_gives_a_sampler_for_tiles(files, tmp_path)
         np.save(tmp_path / "scans" / f"{seed}.npy", points)
     chosen = ["experiment=own_scans", "dataset.root=scans", "dataset.crops=4", "sizes=[8]"]
     chosen.append("trainer.check_val_every_n_epoch=1")
-    status, _, err = call([*chosen, *TINY_ANY_DATA, "sampler.m_max=16"], tmp_path)
-    assert status == 0, err
+    done([*chosen, *TINY_ANY_DATA, "sampler.m_max=16"], tmp_path)
     (run,) = runs(tmp_path)
     record = read(run)
     assert ("val/completed/nre_cd" in record.validation) == (files == 4)

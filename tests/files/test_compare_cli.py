@@ -10,7 +10,7 @@ from mops_lightning.files.cli import compare as main
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
 from mops_lightning.zoo.names import UNTRAINED
-from tests.support.captured import captured, refused
+from tests.support.captured import captured, done, refused
 
 
 def call(*arguments):
@@ -33,8 +33,7 @@ def folder(tmp_path_factory):
 
 def test_compare_writes_table_and_page(folder, tmp_path):
     arguments = [folder / "one.ply", folder / "two.pcd", "--m", 60, 90, "--out", tmp_path]
-    status, out, err = call(*arguments, "--weights", folder, "--tile", 128)
-    assert (status, err) == (0, "")
+    out = done(main, [*arguments, "--weights", folder, "--tile", 128])
     assert "one.ply: 60 of 700 points" in out
     assert "two.pcd: 90 of 700 points" in out
     with (tmp_path / "table.csv").open() as file:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mops_lightning.data.formats.registry import read
-from tests.support.downsample import call, refused
+from tests.support.downsample import call, done, refused
 
 
 @pytest.mark.parametrize(
@@ -12,8 +12,7 @@ from tests.support.downsample import call, refused
 )
 def test_untrained_method_keeps_rows_of_the_file(method, folder, tmp_path):
     source, target = folder / "in" / "a.ply", tmp_path / "out.npz"
-    status, out, err = call(source, target, "--method", *method, "--m", 20, "--keep-attributes")
-    assert (status, err) == (0, "")
+    out = done(source, target, "--method", *method, "--m", 20, "--keep-attributes")
     assert "20 of 299 points (1 more without finite coordinates left out)" in out
     kept, whole = read(target, 9, 0), read(source, 9, 0)
     rows = kept.columns["label"].astype(int)

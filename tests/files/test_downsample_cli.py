@@ -4,7 +4,7 @@ import pytest
 
 from mops_lightning.data.formats.registry import read
 from mops_lightning.filesystem import TEMPORARY
-from tests.support.downsample import call, refused
+from tests.support.downsample import call, done, refused
 
 FPS = ["--m", 5, "--method", "fps"]
 GENERATED = ["--weights", "weights.safetensors", "--readout", "generated"]
@@ -71,8 +71,7 @@ def test_folder_removes_what_a_killed_run_left(folder, tmp_path):
 
 def test_real_scans_keep_attributes(real_data, tmp_path):
     scans = real_data("scans")
-    status, out, err = call(scans, tmp_path, "--method", "random", "--m", 100, "--keep-attributes")
-    assert (status, err) == (0, "")
+    done(scans, tmp_path, "--method", "random", "--m", 100, "--keep-attributes")
     fragment = read(tmp_path / "fragment.pcd", 9, 0)
     assert len(fragment.points) == 100
     assert "normal_x" in fragment.columns

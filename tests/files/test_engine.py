@@ -18,7 +18,7 @@ from mops_lightning.files.engine import DaskEngine, Engine, dask_engine
 from mops_lightning.files.options import Options
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.zoo import weights
-from tests.support.downsample import call, refused
+from tests.support.downsample import call, done, refused
 
 
 @contextmanager
@@ -77,8 +77,8 @@ class Watched(Engine):
         self.engine, self.watch = engine, watch
 
     def map(self, title, function, row_ranges):
-        for done, result in enumerate(self.engine.map(title, function, row_ranges)):
-            self.watch(title, done)
+        for number, result in enumerate(self.engine.map(title, function, row_ranges)):
+            self.watch(title, number)
             yield result
 
 
@@ -103,8 +103,7 @@ def test_running_scheduler_equals_one_process(readout, client, scan, tmp_path):
     settings = ["--weights", scan[0].parent, "--chunk", 500, "--readout", *readout]
     assert call(scan[0], tmp_path / "one.npz", *settings)[0] == 0
     settings += ["--cluster", client.scheduler.address]
-    status, out, err = call(scan[0], tmp_path / "two.npz", *settings)
-    assert (status, err) == (0, "")
+    out = done(scan[0], tmp_path / "two.npz", *settings)
     assert "24 of 2,780 points (220 more without finite coordinates left out)" in out
     one, two = (read(tmp_path / f"{name}.npz", 9, 0) for name in ("one", "two"))
     # Threads differ between the two, and with them the order of sums.

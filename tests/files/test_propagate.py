@@ -13,7 +13,7 @@ from mops_lightning.data.formats.table import Table
 from mops_lightning.files import propagate as module
 from mops_lightning.files.cli import propagate as main
 from mops_lightning.ops import propagation
-from tests.support.captured import captured, refused
+from tests.support.captured import captured, done, refused
 from tests.support.downsample import call as downsample
 from tests.support.downsample import refused as not_downsampled
 
@@ -113,8 +113,7 @@ def test_labels_reach_all_points(source, target, tmp_path):
     columns["score"] = random.random(20)
     WRITERS[".npz"](small, Table(points[:20], columns))
     fields = [word for name in columns for word in ("--field", name)]
-    status, said, err = call(small, big, out, *fields)
-    assert (status, err) == (0, "")
+    said = done(main, [small, big, out, *fields])
     assert "label, classification, score of 200 points" in said
     made = contents(out)
     np.testing.assert_allclose(made.points, points, atol=1e-6)
@@ -131,8 +130,7 @@ def test_labels_reach_all_points(source, target, tmp_path):
 def test_points_without_coordinates_are_left_out_and_columns_kept(scan, tmp_path):
     sample = contents(scan).take(np.arange(0, 90, 3))
     WRITERS[".ply"](tmp_path / "small.ply", Table(sample.points, {"label": np.arange(30)}))
-    status, out, err = call(tmp_path / "small.ply", scan, "--field", "label")
-    assert (status, err) == (0, "")
+    done(main, [tmp_path / "small.ply", scan, "--field", "label"])
     made = contents(tmp_path / "big_propagated.ply")
     whole = contents(scan).finite()
     np.testing.assert_array_equal(made.points, whole.points)

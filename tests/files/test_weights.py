@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mops_lightning.data.formats.registry import read
-from tests.support.downsample import call
+from tests.support.downsample import call, done
 
 SPLAT = [
     "x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)),
@@ -30,8 +30,7 @@ def splat(tmp_path_factory):
 def test_splat_is_pruned_by_opacity_with_all_properties(method, splat, tmp_path):
     path, rows = splat
     settings = ["--method", method, "--m", 150, "--weight", "opacity", "--keep-attributes"]
-    status, _, err = call(path, tmp_path / "small.ply", *settings)
-    assert (status, err) == (0, "")
+    done(path, tmp_path / "small.ply", *settings)
     content = (tmp_path / "small.ply").read_bytes()
     header, data = content.split(b"end_header\n", 1)
     source = path.read_bytes().split(b"end_header\n", 1)[0]

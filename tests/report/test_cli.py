@@ -7,7 +7,7 @@ from mops_lightning.metrics.base import collection
 from mops_lightning.metrics.classification import Accuracy
 from mops_lightning.report.cli import main
 from mops_lightning.tasks.classification import Classification
-from tests.support.command_line import TINY, call, runs
+from tests.support.command_line import TINY, done, runs
 from tests.support.reports import put, put_planes, rows
 
 
@@ -36,8 +36,7 @@ def test_user_metric_appears_in_closing_table_and_report(tmp_path, capsys):
     """Its class declares unit and label; nothing else names it."""
     target = "task._target_=tests.report.test_cli.DoubtfulClassification"
     arguments = [*TINY, "task=classification", target, "sampler=fps", "weights=null"]
-    status, out, err = call(arguments, tmp_path)
-    assert status == 0, err
+    out = done(arguments, tmp_path)
     closing = [line for line in out.splitlines() if "sampled by" in line]
     assert "wrong answers (‰)" in closing[0]
     assert closing[0].index("wrong answers") < closing[0].index("accuracy (%)")

@@ -17,6 +17,13 @@ def captured(main, arguments, *more):
     return status, out.getvalue(), err.getvalue()
 
 
+def done(main, arguments, *more):
+    """What a command that succeeds prints."""
+    status, out, err = captured(main, arguments, *more)
+    assert (status, err) == (0, ""), out + err
+    return out
+
+
 def refused(main, arguments, *more):
     """The line in which a command with a mistake ends."""
     status, out, err = captured(main, arguments, *more)

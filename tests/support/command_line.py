@@ -79,6 +79,13 @@ def call(arguments, folder):
     return status, out.getvalue(), err.getvalue()
 
 
+def done(arguments, folder):
+    """What a command line that succeeds prints."""
+    status, out, err = call(arguments, folder)
+    assert status == 0, out + err
+    return out
+
+
 def refused(arguments, folder):
     """The line in which a command line with a mistake ends."""
     status, out, err = call(arguments, folder)

@@ -8,5 +8,9 @@ def call(*arguments):
     return captured.captured(main, arguments)
 
 
+def done(*arguments):
+    return captured.done(main, arguments)
+
+
 def refused(*arguments):
     return captured.refused(main, arguments)

@@ -3,7 +3,7 @@
 import pytest
 
 from mops_lightning.records import run_record
-from tests.support.command_line import call, job
+from tests.support.command_line import done, job
 
 NETS = {"classification": "pointnet", "registration": "pcrnet", "reconstruction": "foldingnet"}
 
@@ -25,6 +25,5 @@ def test_train_mixed_precision_is_close(task, tmp_path):
 def test_evaluate_precision_does_not_change_metrics(tmp_path):
     trained = job(tmp_path / "run")
     half = ["evaluate=run", "trainer.precision=bf16-mixed", "hydra.run.dir=half"]
-    status, _, err = call(half, tmp_path)
-    assert status == 0, err
+    done(half, tmp_path)
     assert run_record.read(tmp_path / "half").metrics == trained.metrics

@@ -13,7 +13,7 @@ from mops_lightning.data.formats.remote import local
 from mops_lightning.data.formats.table import Area, Table
 from mops_lightning.errors import UserError
 from tests.support.copc import write_copc
-from tests.support.downsample import call
+from tests.support.downsample import call, done
 
 COARSE = Area(level=1)
 
@@ -65,8 +65,7 @@ def test_area_of_remote_file_equals_local_file(options, server, tmp_path):
     options = [*options, "--method", "random", "--m", 50, "--keep-attributes"]
     sent.clear()
     remote = f"{address}/fine/scan.copc.laz?key=1"
-    status, out, err = call(remote, tmp_path / "a.laz", *options)
-    assert (status, err) == (0, "")
+    out = done(remote, tmp_path / "a.laz", *options)
     size = (folder / "scan.copc.laz").stat().st_size
     assert sum(sent) < 0.25 * size
     assert f"of {size / 1e6:,.1f} MB" in out

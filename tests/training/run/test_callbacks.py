@@ -6,7 +6,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.training.run.callbacks import STANDARD, EpochLines, build_callbacks
-from tests.support.command_line import TINY, call, runs
+from tests.support.command_line import TINY, done, runs
 
 STOPPING = [
     "+callbacks.early._target_=lightning.pytorch.callbacks.EarlyStopping",
@@ -41,8 +41,7 @@ def test_node_of_no_callback_is_refused(target, tmp_path):
 def test_early_stopping_ends_the_run_but_not_the_pretraining(tmp_path):
     settings = ["trainer.max_epochs=3", "epochs.task=2", "callbacks.checkpoint=null"]
     tiny = [one for one in TINY if "epochs" not in one]
-    status, out, err = call([*tiny, *settings, *STOPPING], tmp_path)
-    assert status == 0, err
+    out = done([*tiny, *settings, *STOPPING], tmp_path)
     assert out.count("epoch 2/2") == 1
     assert out.count("epoch 1/3") == 1
     assert "epoch 2/3" not in out
