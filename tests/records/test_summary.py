@@ -24,18 +24,11 @@ def cells(text):
 
 
 def test_one_size_gives_column_per_metric_and_rows_of_baselines_readouts_full():
-    metrics = {
-        "test/full/accuracy": 0.875,
-        "test/refined/accuracy": 0.75,
-        "test/matched/accuracy": 0.625,
-        "test/fps/accuracy": 0.25,
-        "test/generated/accuracy": 0.5,
-        "test/generated/subset_distance": 0.1,
-        "test/random/accuracy": 0.125,
-        "test/completed/unique_points": 32.0,
-        "test/matrix/nonzero_percent": 3.0,
-        "test/loss/cross_entropy": 1.0,
-    }
+    accuracies = {"full": 0.875, "refined": 0.75, "matched": 0.625, "fps": 0.25, "generated": 0.5}
+    accuracies["random"] = 0.125
+    metrics = {f"test/{readout}/accuracy": value for readout, value in accuracies.items()}
+    metrics |= {"test/generated/subset_distance": 0.1, "test/completed/unique_points": 32.0}
+    metrics |= {"test/matrix/nonzero_percent": 3.0, "test/loss/cross_entropy": 1.0}
     text = printed(metrics, "test/generated/accuracy")
     assert "m=32" in text
     assert cells(text) == [

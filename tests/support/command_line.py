@@ -39,16 +39,10 @@ TINY_WITH_PICTURES = [*TINY, "pictures=2", "logger=tensorboard"]
 
 def start(arguments, folder, **extra):
     """Begin in a new process."""
-    environment = {**os.environ, **variables(folder), **extra}
-    environment.pop("HYDRA_FULL_ERROR", None)
-    return subprocess.Popen(
-        [sys.executable, "-m", "mops_lightning", *arguments],
-        cwd=folder,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    env = {**os.environ, **variables(folder), **extra}
+    env.pop("HYDRA_FULL_ERROR", None)
+    command, pipe = [sys.executable, "-m", "mops_lightning", *arguments], subprocess.PIPE
+    return subprocess.Popen(command, cwd=folder, env=env, stdout=pipe, stderr=pipe, text=True)
 
 
 def call_anew(arguments, folder, **extra):

@@ -11,15 +11,9 @@ from mops_lightning.data.clouds import CloudDataset, Clouds
 
 def quiet_trainer(epochs: int, **extra: Any) -> L.Trainer:
     """A CPU trainer that writes and prints nothing."""
-    return L.Trainer(
-        **{"enable_checkpointing": False, **extra},
-        max_epochs=epochs,
-        accelerator="cpu",
-        logger=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-    )
+    quiet = dict.fromkeys(("enable_progress_bar", "enable_model_summary", "logger"), False)
+    settings = {"enable_checkpointing": False, "num_sanity_val_steps": 0, **quiet, **extra}
+    return L.Trainer(max_epochs=epochs, accelerator="cpu", **settings)
 
 
 def small_dataset(train: int = 24, test: int = 10, points: int = 48) -> CloudDataset:

@@ -94,12 +94,8 @@ def test_test_scores_each_readout_from_its_own_points(sampler, calls):
     want = {f"test/{name}": value for name, value in want.items()}
     # A sampler and the baseline of its kind return the same points; voxels share no match; what
     # Gumbel subset sampling generates in the test are input points.
-    same = {
-        FPSSampler: ("fps",),
-        RandomSampler: ("random",),
-        VoxelSampler: ("voxel", "completed"),
-        GumbelSampler: ("matched",),
-    }
+    same: dict[type, tuple[str, ...]] = {FPSSampler: ("fps",), RandomSampler: ("random",)}
+    same |= {VoxelSampler: ("voxel", "completed"), GumbelSampler: ("matched",)}
     twins = same.get(type(sampler), ())
     assert_distinct(v for name, v in want.items() if name.rsplit("/")[-1] not in twins)
     assert got == pytest.approx(want, abs=1e-4)

@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 import torch
 
@@ -25,14 +27,8 @@ def test_exponential_spans_first_to_last_rate_and_step_decay_stops_at_floor():
 
 def test_one_cycle_equals_torch():
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
-    reference = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer,
-        max_lr=1.0,
-        total_steps=51,
-        pct_start=0.3,
-        cycle_momentum=False,
-        final_div_factor=400,
-    )
+    form: dict[str, Any] = {"pct_start": 0.3, "cycle_momentum": False, "final_div_factor": 400}
+    reference = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1.0, 51, **form)
     want = []
     for _ in range(51):
         want.append(optimizer.param_groups[0]["lr"])
