@@ -1,8 +1,4 @@
-"""Published samplers to compare with, written from the formulas of their papers.
-
-They are samplers of one's own (docs/extend.md), built by ``sampler=lightn`` with
-``--config-dir sweeps`` in a checkout's folder.
-"""
+"""LighTN, a published sampler to compare with, written from the formulas of its paper."""
 
 from collections.abc import Sequence
 from typing import Any
