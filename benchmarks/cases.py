@@ -303,7 +303,7 @@ def _rows(
     """Time the calls in turn; return one row for each, per cloud."""
     rows = []
     for name, timing in interleaved(calls, rounds).items():
-        row = {kind: name, **names, **_seconds(timing, clouds)}
+        row = {kind: name, **names, **seconds(timing, clouds)}
         operations = flops(calls[name])
         if operations:
             reached = operations / timing.median / peak["flops"]
@@ -312,7 +312,8 @@ def _rows(
     return rows
 
 
-def _seconds(timing: Timing, clouds: int) -> Row:
+def seconds(timing: Timing, clouds: int) -> Row:
+    """Return the time per cloud as columns of a row."""
     spread = (timing.high - timing.low) / clouds
     return {"seconds": timing.median / clouds, "spread": spread, "rounds": timing.rounds}
 

@@ -6,19 +6,21 @@ import time
 from pathlib import Path
 from typing import Any
 
+import cases
 import libraries
 import measure
 import torch
-from cases import ALL
+from inside import inside
 from measure import ceiling, machine
 
 from mops_lightning.filesystem import atomic_write
 
+ALL = {"inside": inside, **cases.ALL}
 COLUMNS = {
     "seconds": lambda value: f"{1000 * value:.3g} ms",
     "spread": lambda value: f"{1000 * value:.2g} ms",
     "share_of_ceiling": lambda value: f"{100 * value:.0f} %",
-    "peak_bytes": lambda value: f"{value / 1e9:.2f} GB",
+    "peak_bytes": lambda value: f"{value / 1e9:.2f} GB" if value > 1e8 else f"{value / 1e6:.2g} MB",
 }
 
 
