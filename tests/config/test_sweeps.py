@@ -104,7 +104,7 @@ def test_sweep_neighbours_differ_in_what_is_swept(name):
         ("ablation", 18),
         ("segmentation", 19),
         ("registration", 23),
-        ("hierarchical", 6),
+        ("hierarchical", 10),
     ],
 )
 def test_cells_of_several_grids_have_folders_of_their_own(name, number):
