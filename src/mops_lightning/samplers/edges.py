@@ -6,7 +6,7 @@ Extraction"). EdgeConv is of Wang et al., "Dynamic Graph CNN", TOG 2019.
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +17,7 @@ from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.ops.precision import pointwise_autocast
 
 Extractor = Literal["pointwise", "edgeconv"]
-EXTRACTORS = ("pointwise", "edgeconv")
+EXTRACTORS = get_args(Extractor)
 
 
 class EdgeMLP(PointMLP):
@@ -55,8 +55,8 @@ class EdgeMLP(PointMLP):
         layers = list(self.layers)
         for edge in self.edges:
             linear, norm, relu = layers[:3]
-            # A·x_i − B·x_i and the maximum of B·x_j
-            edges = linear(rows) - edge(rows) + max_of_rows(edge(rows[:, chosen]), neighbours)
+            mapped = edge(rows)  # B·x
+            edges = linear(rows) - mapped + max_of_rows(mapped[:, chosen], neighbours)
             rows = relu(norm(edges.flatten(0, 1))).unflatten(0, rows.shape[:2])
             layers = layers[3:]
         with pointwise_autocast(rows.device.type):
