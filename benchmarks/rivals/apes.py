@@ -75,8 +75,7 @@ class APES(Selector):
         # The published keys are those of f_j − f_i: the part of f_i is cancelled by the softmax.
         near = k_nearest(points.detach(), points.detach(), min(self.k, points.shape[1]))[1]
         weights = logits.gather(2, near).softmax(2)
-        neighbours = gather_points(points, near.flatten(1)).unflatten(1, near.shape[1:])
-        return weights.std(2), (weights[..., None] * neighbours).sum(2)
+        return weights.std(2), (weights[..., None] * gather_points(points, near)).sum(2)
 
     def select_rows(self, points: Tensor, m: int) -> SampleOutput:
         """Select points; in training, add means that have the gradient."""

@@ -122,8 +122,7 @@ class CSNet(Selector):
         distances, near = k_nearest(chosen.detach(), points.detach(), self.k)
         logits = degrees.gather(1, near.flatten(1)).view_as(near)
         weights = (logits - distances / distances.mean(2, keepdim=True)).softmax(2)
-        neighbours = gather_points(points, near.flatten(1)).unflatten(1, near.shape[1:])
-        mean = (weights[..., None] * neighbours).sum(2)
+        mean = (weights[..., None] * gather_points(points, near)).sum(2)
         sampling = {"coverage": self.alpha * soft_coverage(points, degrees, self.width)}
         return SampleOutput(chosen, rows, sampling, soft_projected=chosen + mean - mean.detach())
 

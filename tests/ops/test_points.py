@@ -11,6 +11,8 @@ def test_gather_points_equals_double_loop(rng):
     for b in range(2):
         for j in range(5):
             assert torch.equal(gathered[b, j], points[b, indices[b, j]])
+    nested = indices[:, :4].unflatten(1, (2, 2))
+    assert torch.equal(gather_points(points, nested), gathered[:, :4].unflatten(1, (2, 2)))
     assert torch.autograd.gradcheck(lambda p: gather_points(p, indices), (points,))
 
 

@@ -67,8 +67,7 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
         raise UserError(f"k must be from 1 to the number of points N={points.shape[1]}, got {k}.")
     with torch.no_grad():
         indices = _search(queries, points, k)
-    neighbours = gather_points(points, indices.flatten(1)).unflatten(1, indices.shape[1:])
-    return (queries[:, :, None] - neighbours).square().sum(3), indices
+    return (queries[:, :, None] - gather_points(points, indices)).square().sum(3), indices
 
 
 def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:

@@ -53,12 +53,14 @@ def gather_points(points: Tensor, indices: Tensor) -> Tensor:
 
     Args:
         points: ``(B, N, C)``.
-        indices: ``(B, M)`` int64, rows of ``points``.
+        indices: ``(B, M)`` or ``(B, M, k)`` int64, rows of ``points``.
 
     Returns:
-        ``(B, M, C)``; gradients flow to ``points``.
+        ``(B, M, C)`` or ``(B, M, k, C)``; gradients flow to ``points``.
     """
-    return points.gather(1, indices[..., None].expand(-1, -1, points.shape[2]))
+    channels = points.shape[2]
+    rows = indices.flatten(1)[..., None].expand(-1, -1, channels)
+    return points.gather(1, rows).view(*indices.shape, channels)
 
 
 def normalize_unit_sphere(points: Tensor) -> Tensor:

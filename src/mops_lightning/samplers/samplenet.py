@@ -34,8 +34,7 @@ def soft_projection(queries: Tensor, points: Tensor, k: int, sigma: Tensor | flo
     distances, indices = k_nearest(queries, points, k)
     # Softmax is shift-invariant; the shift keeps the nearest logit finite for tiny σ.
     weights = ((distances[..., :1] - distances) / sigma).softmax(2)
-    neighbours = gather_points(points, indices.flatten(1)).unflatten(1, indices.shape[1:])
-    return (weights[..., None] * neighbours).sum(2)
+    return (weights[..., None] * gather_points(points, indices)).sum(2)
 
 
 class SampleNet(SNet):
