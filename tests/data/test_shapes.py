@@ -13,8 +13,12 @@ from mops_lightning.data.shapes import ASYMMETRIC, BUILDERS, shapes
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
 
-SMALL: dict[str, Any] = {"n_points": 64, "train_per_class": 2, "test_per_class": 1}
-SMALL |= {"classes": ["cup", "stool"]}
+SMALL: dict[str, Any] = {
+    "n_points": 64,
+    "train_per_class": 2,
+    "test_per_class": 1,
+    "classes": ["cup", "stool"],
+}
 
 
 @pytest.fixture(scope="module")
@@ -107,9 +111,14 @@ def test_shapes_keep_global_random_state():
 
 
 def test_shapes_fingerprint_depends_on_arguments():
-    others = {"n_points": 65, "train_per_class": 3, "test_per_class": 2, "seed": 1}
-    variants: list[dict[str, Any]] = [{}, {"classes": ["cup", "vase"]}]
-    variants += [{name: value} for name, value in others.items()]
+    variants: list[dict[str, Any]] = [
+        {},
+        {"n_points": 65},
+        {"train_per_class": 3},
+        {"test_per_class": 2},
+        {"classes": ["cup", "vase"]},
+        {"seed": 1},
+    ]
     prints = [shapes(**{**SMALL, **variant}).fingerprint for variant in variants]
     assert len(set(prints)) == len(variants)
     assert all(len(text) == 64 for text in prints)

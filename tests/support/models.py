@@ -19,14 +19,26 @@ def write_run(folder, node=NODE, learn="sampler", **fields):
     """Write a completed run of an untrained FMOPS-Net; return the net."""
     torch.manual_seed(0)
     net = FMOPSNet(16).eval()
-    config = {"learn": learn, "m": 8, "names": NAMES, "sampler": node, "dataset": {"n_points": 64}}
-    config |= {"trainer": {"max_epochs": 3}}
+    config = {
+        "learn": learn,
+        "m": 8,
+        "names": NAMES,
+        "sampler": node,
+        "dataset": {"n_points": 64},
+        "trainer": {"max_epochs": 3},
+    }
     metrics = {"test/m8/generated/accuracy": 0.5, "test/m8/fps/accuracy": 0.25}
     metrics["test/m16/generated/accuracy"] = 0.75
-    content = {"metrics": metrics, "score": 0.5, "score_name": "test/m8/generated/accuracy"}
-    content |= {"files": {"weights": "weights.safetensors"}, **fields}
+    content = {
+        "config": config,
+        "metrics": metrics,
+        "score": 0.5,
+        "files": {"weights": "weights.safetensors"},
+        "score_name": "test/m8/generated/accuracy",
+        **fields,
+    }
     folder.mkdir(parents=True)
-    run_record.write(folder, record(config, **content))
+    run_record.write(folder, record(**content))
     weights.save(folder / "weights.safetensors", net, config, metrics)
     return net
 

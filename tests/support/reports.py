@@ -16,8 +16,13 @@ def table(folder, *metrics, mixed=False):
 
 def put(folder, sampler, m, metrics, task="classification", net="pointnet", **changes):
     names = {"task": task, "net": net, "dataset": "modelnet40", "sampler": sampler}
-    config = {"m": m, "names": names, "task": changes.pop("settings", {})}
-    config |= {"sampler": changes.pop("of", {}), **changes.pop("config", {})}
+    config = {
+        "m": m,
+        "names": names,
+        "task": changes.pop("settings", {}),
+        "sampler": changes.pop("of", {}),
+        **changes.pop("config", {}),
+    }
     score = {"score_name": next(iter(metrics))}
     changes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **score, **changes}
     made = record(config=config, metrics=metrics, **changes)
@@ -42,8 +47,12 @@ def rows(text):
 def put_cell(folder, name, sampler, values, seed=0, cost=0.5, **settings):
     """A run of a sweep, whose settings beside the size are given dotted."""
     names = {"task": "reconstruction", "net": "autoencoder", "dataset": "shapes"}
-    config = {"names": {**names, "sampler": sampler}, "task": {"exact_up_to": 2048}}
-    config |= {"sampler": {"m": 32, **settings.pop("of", {})}, **settings}
+    config = {
+        "names": {**names, "sampler": sampler},
+        "task": {"exact_up_to": 2048},
+        "sampler": {"m": 32, **settings.pop("of", {})},
+        **settings,
+    }
     metrics = {f"test/{readout}/nre_cd": value for readout, value in values.items()}
     seconds = {"total": 1.0, "fit": cost}
     score = {"score_name": "test/generated/nre_cd", "dataset_fingerprint": "d"}
@@ -76,9 +85,12 @@ def put_pairs(folder, sampler, m, value, net="pcrnet", **changes):
 
 def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):
     metrics = {f"test/full/{metric}": value for metric, value in metrics.items()}
-    names = {"task": task, "net": net, "dataset": "modelnet40", "sampler": "mops"}
-    own = {"net": {"_target_": net, "n_points": points, **settings}}
-    config = {"learn": "task", "names": names, "task": own, "dataset": {"n_points": points}}
+    config = {
+        "learn": "task",
+        "names": {"task": task, "net": net, "dataset": "modelnet40", "sampler": "mops"},
+        "task": {"net": {"_target_": net, "n_points": points, **settings}},
+        "dataset": {"n_points": points},
+    }
     size = {"task": 1_025_000}
     made = record(config, metrics=metrics, parameters=size, score_name=next(iter(metrics)))
     return run_record.write(folder / f"{name}-{points}", made)

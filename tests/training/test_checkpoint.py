@@ -47,9 +47,14 @@ class Setting(NamedTuple):
 
 
 SETTINGS = [
-    *(Setting("sampler", fast=True, steps=1), Setting("joint", accumulated=2)),
-    *(Setting("task", steps=1), Setting("sampler", fast=True), Setting("joint", steps=1)),
-    *(Setting("sampler"), Setting("task"), Setting("sampler", steps=1)),
+    Setting("sampler", fast=True, steps=1),
+    Setting("joint", accumulated=2),
+    Setting("task", steps=1),
+    Setting("sampler", fast=True),
+    Setting("joint", steps=1),
+    Setting("sampler"),
+    Setting("task"),
+    Setting("sampler", steps=1),
 ]
 
 
@@ -119,8 +124,12 @@ def attempt(setting: Setting, path: Path, *callbacks: Callback) -> Any:
     )
     average = [MovingAverage(0.3)] if fast else []
     callbacks = (*average, *callbacks, last_checkpoint(path), StopBetweenSteps(path))
-    more = {"enable_checkpointing": True, "accumulate_grad_batches": accumulated}
-    trainer = quiet_trainer(EPOCHS, callbacks=list(callbacks), **more)
+    trainer = quiet_trainer(
+        EPOCHS,
+        callbacks=list(callbacks),
+        enable_checkpointing=True,
+        accumulate_grad_batches=accumulated,
+    )
     data = small_dataset(train=CLOUDS, test=3, points=24)
     augment = Augmentation(rotate_up=True, jitter=0.01)
     test = CloudLoader(data.test, 3)

@@ -59,8 +59,14 @@ def _add(arguments: list[str], prog: str) -> list[str]:
     folder = chosen.folder or (names.folders()[0] if own else None)
     if folder is None:
         raise UserError(f"give --folder FOLDER, or set ${names.VARIABLE} to a folder of models.")
-    options = {key: getattr(chosen, key) for key in ("task_net", "notes", "overwrite")}
-    path = publish.add(chosen.run, name, folder, **options)
+    path = publish.add(
+        chosen.run,
+        name,
+        folder,
+        task_net=chosen.task_net,
+        notes=chosen.notes,
+        overwrite=chosen.overwrite,
+    )
     card = model_file.read_card(path)
     record = card["record"]
     lines = [
@@ -84,7 +90,8 @@ def _table() -> list[str]:
         except UserError as error:
             unreadable.append(f"Not listed: {error}")
             continue
-        task, licence = card["record"]["config"]["names"]["task"], card["licence"].partition(";")[0]
+        task = card["record"]["config"]["names"]["task"]
+        licence = card["licence"].partition(";")[0]
         rows.append((name, task, _sizes(card), _figures(card), licence, _megabytes(path)))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [

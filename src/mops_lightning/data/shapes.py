@@ -106,8 +106,14 @@ def shapes(
     chosen = choose_classes(wanted, tuple(BUILDERS))
     labelled = set(chosen) <= set(PARTS)
     part_names = tuple(dict.fromkeys(sum((PARTS[name] for name in chosen), ()))) if labelled else ()
-    settings = {"dataset": "shapes", "version": GENERATOR_VERSION, "n_points": n_points}
-    settings |= {"per_class": counts, "classes": chosen, "seed": seed}
+    settings = {
+        "dataset": "shapes",
+        "version": GENERATOR_VERSION,
+        "n_points": n_points,
+        "per_class": counts,
+        "classes": chosen,
+        "seed": seed,
+    }
     fingerprint = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
     path = None
     if cache is not None:

@@ -31,8 +31,13 @@ MAX_DEPTH = 50
 FAILED = ".failed"
 """File in a cell's folder that says why its last start failed, with or without a record."""
 PACKAGES = (
-    *("mops-lightning", "torch", "lightning", "hydra-core"),
-    *("torchmetrics", "trimesh", "numpy"),
+    "mops-lightning",
+    "torch",
+    "lightning",
+    "hydra-core",
+    "torchmetrics",
+    "trimesh",
+    "numpy",
 )
 """Packages whose versions are recorded."""
 

@@ -96,8 +96,8 @@ class Reconstruction(Task):
         """Return mean distances and, except in training, which has no reference, NRE."""
         metrics: list[TableMetric] = [reconstruction.MeanChamfer()]
         if not training:
-            ratios = reconstruction.NormalizedChamfer(), reconstruction.NormalizedChamferOfMeans()
-            metrics += ratios
+            metrics.append(reconstruction.NormalizedChamfer())
+            metrics.append(reconstruction.NormalizedChamferOfMeans())
         if self.exact_up_to is not None:
             metrics.append(reconstruction.MeanEMD())
             if not training:

@@ -129,10 +129,14 @@ class Registration(Task):
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return rotation errors in degrees, recalls in [0, 1] and the translation error."""
-        doubled = registration.DoubledRotationError()
-        errors = RotationError(), registration.RotationErrorP90(), doubled
-        recalls = registration.RotationRecall5(), registration.RotationRecall10()
-        return collection(*errors, *recalls, registration.TranslationError())
+        return collection(
+            RotationError(),
+            registration.RotationErrorP90(),
+            registration.DoubledRotationError(),
+            registration.RotationRecall5(),
+            registration.RotationRecall10(),
+            registration.TranslationError(),
+        )
 
 
 def quaternion_distance(predicted: Tensor, true: Tensor) -> Tensor:
@@ -165,9 +169,11 @@ def quaternion_loss(predicted: Motion, true: Motion) -> dict[str, Tensor]:
         The terms ``quaternion`` and ``translation``, scalars. The paper does not mention the L2
         distance between translations, but without it they would not be trained.
     """
-    turn = quaternion_distance(predicted.quaternion, true.quaternion)
     shift = torch.linalg.vector_norm(predicted.translation - true.translation, dim=1).mean()
-    return {"quaternion": turn, "translation": shift}
+    return {
+        "quaternion": quaternion_distance(predicted.quaternion, true.quaternion),
+        "translation": shift,
+    }
 
 
 @figures_of.register(Registration)

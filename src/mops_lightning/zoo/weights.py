@@ -36,12 +36,17 @@ def save(
         metrics: test metrics by name.
         classes: names of classes or parts in the order of the outputs of a task net.
     """
-    content = {"config": config, "metrics": metrics, "classes": list(classes)}
+    header = {
+        "schema": model_file.WEIGHTS,
+        "config": config,
+        "metrics": metrics,
+        "classes": list(classes),
+    }
     state = {
         name: value.detach().cpu().clone(memory_format=torch.contiguous_format)
         for name, value in module.state_dict().items()
     }
-    model_file.write(path, {"schema": model_file.WEIGHTS, **content}, state)
+    model_file.write(path, header, state)
 
 
 def read(path: str | Path) -> dict[str, Any]:
@@ -70,8 +75,14 @@ def read(path: str | Path) -> dict[str, Any]:
             raise Damaged(f"{path}: {name} is quantised ({value.dtype}). Give it in 16 or 32 bits.")
     if wrong := first_nonfinite(state):
         raise damaged(path, f"{wrong} is not finite, because the training diverged")
-    content = {key: header.get("record", header)[key] for key in ("config", "metrics")}
-    return {**content, "classes": header["classes"], "sha256": header["sha256"], "state": state}
+    trained = header.get("record", header)
+    return {
+        "config": trained["config"],
+        "metrics": trained["metrics"],
+        "classes": header["classes"],
+        "sha256": header["sha256"],
+        "state": state,
+    }
 
 
 def of_run(run: Path, kind: str = "weights") -> Path:

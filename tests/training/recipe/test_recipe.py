@@ -19,7 +19,7 @@ from mops_lightning.tasks.registration import Registration
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.distillation import feature_distance, pooled_features
 from mops_lightning.training.recipe.moving_average import MovingAverage
-from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through
+from mops_lightning.training.recipe.recipe import Recipe, draw_points, reached, straight_through
 from mops_lightning.types import Batch
 from tests.support.recording import Fingerprint, RecordingTask, noting
 from tests.support.training import quiet_trainer, small_dataset
@@ -94,6 +94,8 @@ def test_recipe_accepts_limits():
 def test_shares_of_the_training_include_their_first_step():
     recipe = Recipe(train_points=64, all_points_from=0.5)
     assert [recipe.points_at(progress, 1024, 8) for progress in (0.49, 0.5)] == [64, 1024]
+    assert [reached(0.25, progress) for progress in (0.24, 0.25)] == [False, True]
+    assert not reached(Recipe().straight_through, 1.0)
 
 
 def test_training_sees_drawn_points_then_all_and_validation_always_all():

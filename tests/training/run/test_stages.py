@@ -18,9 +18,14 @@ SETTINGS = [
     "task._target_=tests.support.recording.RecordingTask",
     "task.net._target_=tests.support.recording.Fingerprint",
     "dataset._target_=tests.support.recording.numbered_clouds",
-    *(f"dataset.train_per_class={TRAIN}", f"dataset.test_per_class={TEST}"),
-    *(f"val_fraction={HELD_OUT / TRAIN}", f"trainer.max_epochs={EPOCHS}", f"batch_size={BATCH}"),
-    *("weights=null", "recipe=paper", "seed=3"),
+    f"dataset.train_per_class={TRAIN}",
+    f"dataset.test_per_class={TEST}",
+    f"val_fraction={HELD_OUT / TRAIN}",
+    f"trainer.max_epochs={EPOCHS}",
+    f"batch_size={BATCH}",
+    "weights=null",
+    "recipe=paper",
+    "seed=3",
 ]
 
 

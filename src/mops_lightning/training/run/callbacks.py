@@ -65,7 +65,7 @@ class StopBetweenSteps(Checkpoint):
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Restore the signal handlers; stop if a signal came in the last step."""
-        self.on_exception(trainer)
+        self._restore()
         self._stop_if_asked(trainer, save=False)
 
     def _stop_if_asked(self, trainer: L.Trainer, save: bool) -> None:
@@ -76,6 +76,9 @@ class StopBetweenSteps(Checkpoint):
 
     def on_exception(self, trainer: L.Trainer, *args: Any) -> None:
         """Restore the signal handlers."""
+        self._restore()
+
+    def _restore(self) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
         self._before.clear()
