@@ -105,6 +105,7 @@ def test_sweep_neighbours_differ_in_what_is_swept(name):
         ("segmentation", 19),
         ("registration", 23),
         ("hierarchical", 10),
+        ("features", 4),
     ],
 )
 def test_cells_of_several_grids_have_folders_of_their_own(name, number):
