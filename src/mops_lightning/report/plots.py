@@ -37,11 +37,16 @@ def curves(table: Table) -> Figure:
     """Draw a metric against the size or another setting, one panel for each readout.
 
     Samplers that choose input points are dashed and the same in all panels. Error bars are
-    standard deviations over seeds.
+    standard deviations over seeds. Panels of many columns are wide, so they are below each other.
     """
-    figure = new_figure(4.2 * len(GENERATED_READOUTS), 3.4)
-    panels = figure.subplots(1, len(GENERATED_READOUTS), sharey=True)
     columns = sorted(table.columns())
+    readouts = len(GENERATED_READOUTS)
+    if wide := len(columns) > MAX_COLUMNS:
+        figure = new_figure(0.16 * len(columns) + 2, 2.2 * readouts + 1)
+        panels = figure.subplots(readouts, 1, sharex=True)
+    else:
+        figure = new_figure(4.2 * readouts, 3.4)
+        panels = figure.subplots(1, readouts, sharey=True)
     for axis, readout in zip(panels, GENERATED_READOUTS, strict=True):
         for number, name in enumerate(table.rows()):
             dashed = INDEX_READOUT in table.readouts(name)
@@ -60,14 +65,16 @@ def curves(table: Table) -> Figure:
                 capsize=2,
             )
         axis.set_title(readout)
-        axis.set_xlabel(table.group.column)
         axis.set_xticks(
             range(len(columns)), [one if isinstance(one, str) else f"{one:g}" for one in columns]
         )
-        if len(columns) > MAX_COLUMNS:
-            axis.tick_params(axis="x", rotation=90, labelsize=5)
+        if wide:
+            axis.tick_params(axis="x", rotation=90)
         axis.grid(alpha=0.3)
-    panels[0].set_ylabel(table.metric.title)
+    for axis in panels[-1:] if wide else panels:
+        axis.set_xlabel(table.group.column)
+    for axis in panels if wide else panels[:1]:
+        axis.set_ylabel(table.metric.title)
     panels[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
