@@ -39,10 +39,11 @@ def test_nets_of_differing_settings_share_a_table_if_mixed(tmp_path):
     put_net(tmp_path, "first", {DEGREES: 6.5}, "registration", iterations=1)
     path = put_net(tmp_path, "second", {DEGREES: 6.0}, "registration", iterations=8)
     edited(path, config={**json.loads(path.read_text())["config"], "batch_size": 7})
+    put_net(tmp_path, "third", {DEGREES: 6.2}, "registration", iterations=8)
     text = table(tmp_path)
     assert text.count("No sampler was tested") == 2
     assert "(batch_size=7)" in text
-    assert [row[3] for row in rows(table(tmp_path, mixed=True))[1:]] == ["6.50", "6.00"]
+    assert [row[4] for row in rows(table(tmp_path, mixed=True))[1:]] == ["6.00", "6.50", "6.20"]
 
 
 def test_nets_of_two_tasks_have_tables_of_their_own(tmp_path):

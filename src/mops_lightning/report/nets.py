@@ -1,6 +1,6 @@
 """A table of task nets: their results on full clouds, their sizes and costs."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import pandas as pd
@@ -11,9 +11,8 @@ from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.records.run_record import RunRecord, dotted
-from mops_lightning.report import paper
+from mops_lightning.report import comparable, paper
 from mops_lightning.report.collect import score, seed, training_time
-from mops_lightning.report.comparable import Group
 from mops_lightning.report.tables import over_seeds
 from mops_lightning.report.text import PAPER, Grid
 
@@ -24,12 +23,12 @@ HIDDEN = ("n_points", "sampler.m", "sampler.m_max", "sampler.seed")
 """Settings of a net that get no column; the number of points has its own."""
 
 
-def nets_grid(group: Group, metrics: Sequence[str] = ()) -> Grid:
+def nets_grid(group: comparable.Group, metrics: Sequence[str] = ()) -> Grid:
     """Return a table with a row for each net, sorted by number of points and settings.
 
     Sizes are of float32 parameters, in MB of a million bytes. Values of several seeds are means ±
-    standard deviations; of two runs of a net and a seed, the later one counts. The last column has
-    the paper's values for the same net, if there are any.
+    standard deviations; of two runs of a net and a seed with the same settings, the later one
+    counts. The last column has the paper's values for the same net, if there are any.
 
     Args:
         group: completed records of runs with ``learn=task``.
@@ -40,15 +39,20 @@ def nets_grid(group: Group, metrics: Sequence[str] = ()) -> Grid:
     """
     found = sorted(group.records, key=lambda record: record.started)
     names, infos = found[0].config["names"], _metrics(found, metrics)
-    settings = pd.DataFrame(map(_net, found)).drop(columns=[*HIDDEN], errors="ignore")
+    shown = _settings(found)
+    settings = pd.DataFrame(shown).drop(columns=[*HIDDEN], errors="ignore")
     keys = [key for key in sorted(settings) if settings[key].dropna().map(str).nunique() > 1]
     runs = settings[keys].apply(_sortable).assign(points=[_points(one) for one in found])
-    runs = runs.assign(net=[one.config["names"]["net"] for one in found], record=found)
+    runs = runs.assign(net=[one.config["names"]["net"] for one in found])
+    runs = runs.assign(record=found, settings=shown)
     place = ["points", *keys, "net"]
     runs["seed"] = [seed(one) for one in found]
     last = runs.groupby([*place, "seed"], sort=False, dropna=False).tail(1)
     nets = last.sort_values(place, na_position="first").groupby(place, sort=False, dropna=False)
-    lines = [_row([*records], keys, infos) for _, records in nets["record"]]
+    lines = [
+        _row([*of_net["record"]], map(of_net["settings"].iloc[0].get, keys), infos)
+        for _, of_net in nets
+    ]
     titles = (info.title for info in infos)
     head = ["net", *keys, "points", *titles, "MB", training_time(found)[0], PAPER]
     table = pd.DataFrame(lines, columns=head)
@@ -64,10 +68,10 @@ def _sortable(values: pd.Series) -> pd.Series:
     return values if is_numeric_dtype(values) else values.map(str, na_action="ignore")
 
 
-def _row(records: list[RunRecord], keys: list[str], metrics: list[MetricInfo]) -> list[str]:
+def _row(records: list[RunRecord], settings: Iterable[Any], metrics: list[MetricInfo]) -> list[str]:
     """Return the cells of one net, over all its seeds."""
     first = records[0]
-    label = [first.config["names"]["net"], *map(_net(first).get, keys), _points(first)]
+    label = [first.config["names"]["net"], *settings, _points(first)]
     texts = ["" if value is None else str(value) for value in label]
     for metric in metrics:
         values = pd.Series([one.metrics.get(f"test/{FULL}/{metric.name}") for one in records])
@@ -79,6 +83,29 @@ def _row(records: list[RunRecord], keys: list[str], metrics: list[MetricInfo]) -
     cost = pd.Series(training_time(records)[1], dtype=float).mean()
     texts.append("" if size is None else f"{4e-6 * size:.1f}")
     return [*texts, "" if pd.isna(cost) else f"{cost:,.0f} s", _paper(first)]
+
+
+def _settings(found: list[RunRecord]) -> list[dict[str, Any]]:
+    """Return for every record the settings of its net, and those that tell trainings apart.
+
+    These are settings that all runs of one net and one seed have, with different values.
+    """
+    same: dict[tuple[str, ...], list[RunRecord]] = {}
+    nets = [_net(record) for record in found]
+    for record, net in zip(found, nets, strict=True):
+        key = record.config["names"]["net"], net, _points(record), seed(record)
+        same.setdefault(tuple(map(str, key)), []).append(record)
+    trainings = sorted(
+        key
+        for key in {key for runs in same.values() for key in comparable.varying(runs)}
+        if all(comparable.value(record, key) is not None for record in found)
+    )
+    for record, net in zip(found, nets, strict=True):
+        for key in trainings:
+            name = key.removesuffix("._target_")
+            text = comparable.value(record, key)
+            net[name] = text if name == key else text.rpartition(".")[2]
+    return nets
 
 
 def _net(record: RunRecord) -> dict[str, Any]:
