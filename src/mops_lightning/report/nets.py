@@ -93,8 +93,8 @@ def _settings(found: list[RunRecord]) -> list[dict[str, Any]]:
     same: dict[tuple[str, ...], list[RunRecord]] = {}
     nets = [_net(record) for record in found]
     for record, net in zip(found, nets, strict=True):
-        key = record.config["names"]["net"], net, _points(record), seed(record)
-        same.setdefault(tuple(map(str, key)), []).append(record)
+        place = record.config["names"]["net"], net, _points(record), seed(record)
+        same.setdefault(tuple(map(str, place)), []).append(record)
     trainings = sorted(
         key
         for key in {key for runs in same.values() for key in comparable.varying(runs)}
