@@ -222,7 +222,7 @@ class Experiment(L.LightningModule):
         return total
 
     def _losses(
-        self, batch: Batch, seen: Tensor, sampled: SampleOutput, targets: list[Targets] | None
+        self, batch: Batch, seen: Tensor, sampled: SampleOutput, targets: Targets | None
     ) -> dict[str, Tensor]:
         """Return the loss terms at one size: the task's, distillation and the sampler's own.
 

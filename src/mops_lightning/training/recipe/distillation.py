@@ -1,7 +1,8 @@
 """Losses that compare the frozen task net's outputs for a sample and for the whole cloud."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,11 +14,19 @@ from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.types import Batch, PointFeatureNet
 
 
-class Targets(NamedTuple):
-    """Outputs of the frozen task net for all points; None for outputs that are not compared."""
+@dataclass(frozen=True)
+class Targets:
+    """What the samples of a step are compared with.
+
+    Attributes:
+        prediction: the first task net's for all points; None if it is not compared.
+        seen: ``(B, N, 3)`` the points that the step sees, whose features are pooled.
+        features: task net → its pooled features; only nets that the step has drawn have any.
+    """
 
     prediction: Any
-    features: Tensor | None
+    seen: Tensor
+    features: dict[int, Tensor] = field(default_factory=dict)
 
 
 class Distillation:
@@ -49,26 +58,22 @@ class Distillation:
             self.table = full_predictions(self.tasks[0], loader, device)
 
     @torch.no_grad()
-    def targets(self, batch: Batch, seen: Tensor) -> list[Targets]:
-        """Return what samples are compared with, by task net.
+    def targets(self, batch: Batch, seen: Tensor) -> Targets:
+        """Return what samples are compared with.
 
         Args:
             batch: whose points the prediction is of.
-            seen: ``(B, N, 3)`` the points that the step sees, whose features are pooled.
+            seen: see ``Targets``.
         """
         prediction = None
         if self.table is not None and batch.rows is not None:
             prediction = self.table[batch.rows]
         elif self.predicts:
             prediction = self.tasks[0].predict(batch, batch.points)
-        pooled = self.recipe.feature_distillation
-        return [
-            Targets(prediction, pooled_features(task.net, seen) if pooled else None)
-            for task in self.tasks
-        ]
+        return Targets(prediction, seen)
 
     def losses(
-        self, number: int, points: Tensor, output: Any, targets: list[Targets]
+        self, number: int, points: Tensor, output: Any, targets: Targets
     ) -> dict[str, Tensor]:
         """Return the weighted losses of a sample under one task net.
 
@@ -78,12 +83,15 @@ class Distillation:
             output: the task net's output for it.
             targets: see ``targets``.
         """
-        losses, task, target = {}, self.tasks[number], targets[number]
-        if target.prediction is not None:
-            apart = task.disagreement(output, target.prediction).mean()
+        losses, task = {}, self.tasks[number]
+        if targets.prediction is not None:
+            apart = task.disagreement(output, targets.prediction).mean()
             losses["distillation"] = self.recipe.distillation * apart
-        if target.features is not None:
-            apart = feature_distance(pooled_features(task.net, points), target.features)
+        if self.recipe.feature_distillation:
+            if number not in targets.features:
+                with torch.no_grad():
+                    targets.features[number] = pooled_features(task.net, targets.seen)
+            apart = feature_distance(pooled_features(task.net, points), targets.features[number])
             losses["feature_distillation"] = self.recipe.feature_distillation * apart
         return losses
 
