@@ -10,12 +10,13 @@ import cases
 import libraries
 import measure
 import torch
+from features import features
 from inside import inside
 from measure import ceiling, machine
 
 from mops_lightning.filesystem import atomic_write
 
-ALL = {"inside": inside, **cases.ALL}
+ALL = {"inside": inside, "features": features, **cases.ALL}
 COLUMNS = {
     "seconds": lambda value: f"{1000 * value:.3g} ms",
     "spread": lambda value: f"{1000 * value:.2g} ms",
