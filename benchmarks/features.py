@@ -54,7 +54,9 @@ def features(_peak: dict[str, float], rounds: int) -> list[Row]:
     for step in (sample, learn):
         calls = {f"{kind}": partial(step, build(*kind), points) for kind in kinds}
         for kind, timing in zip(kinds, interleaved(calls, rounds).values(), strict=True):
-            setup = f"from features import *\nsampler, points = build(*{kind}), cloud(1024, {CLOUDS})"
+            setup = (
+                f"from features import *\nsampler, points = build(*{kind}), cloud(1024, {CLOUDS})"
+            )
             memory, _ = peak_memory(setup, f"{step.__name__}(sampler, points)")
             row = {"sampler": kind[0], "features": kind[1], "step": step.__name__}
             rows.append({**row, **seconds(timing, CLOUDS), "peak_bytes": memory / CLOUDS})

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import check_at_least
-from mops_lightning.nets.layers import PointMLP, max_of_rows
+from mops_lightning.nets.layers import PointMLP
+from mops_lightning.ops.maxima import max_of_rows
 from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.ops.points import gather_points
 from mops_lightning.types import SampleOutput

@@ -9,8 +9,6 @@ from mops_lightning.errors import UserError
 from mops_lightning.samplers.edges import EdgeMLP
 from mops_lightning.zoo.export import GeneratedPoints
 
-NETS = [MOPSNet, FMOPSNet, SNet, SampleNet]
-
 
 def plain_edge_mlp(net: EdgeMLP, points: Tensor) -> Tensor:
     """All edges (x_i, x_j − x_i) as one tensor, one cloud at a time."""
@@ -40,14 +38,13 @@ def test_edge_layers_equal_the_plain_twin(n: int, k: int, references: int) -> No
         x = points.clone().requires_grad_()
         result = forward(x)
         weights = torch.linspace(-1, 1, result.numel()).view_as(result)
-        grads.append(
-            [result, *torch.autograd.grad((result * weights).sum(), [x, *net.parameters()])]
-        )
+        total = (result * weights).sum()
+        grads.append([result, *torch.autograd.grad(total, [x, *net.parameters()])])
     for ours, twin in zip(*grads, strict=True):
         torch.testing.assert_close(ours, twin, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("net", NETS)
+@pytest.mark.parametrize("net", [MOPSNet, FMOPSNet, SNet, SampleNet])
 def test_samplers_train_with_edge_features(net: type) -> None:
     torch.manual_seed(0)
     sampler = net(8, features="edgeconv")

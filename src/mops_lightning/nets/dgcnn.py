@@ -10,9 +10,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mops_lightning.errors import check_at_least
-from mops_lightning.nets.layers import check_channels, max_of_rows
+from mops_lightning.nets.layers import check_channels
 from mops_lightning.nets.max_pool import PointMaxPool
 from mops_lightning.nets.pointnet import classifier_head
+from mops_lightning.ops.maxima import max_of_rows
 
 
 class EdgeConv(nn.Module):

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError, check_at_least
-from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu, max_of_rows
+from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
+from mops_lightning.ops.maxima import max_of_rows
 from mops_lightning.ops.nearest import k_nearest, nearest
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.propagation import interpolate

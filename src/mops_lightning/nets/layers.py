@@ -7,9 +7,7 @@ Layers process ``(B·N, C)`` rows: on a CPU, BatchNorm over rows is 1.6 times fa
 from collections.abc import Sequence
 from itertools import pairwise
 
-import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops.precision import pointwise_autocast, pointwise_autocast_dtype
@@ -96,19 +94,3 @@ class PointFeatures(nn.Module):
         """Map ``(B, N, 3)`` points to local features ``(B, N, C)`` and their maxima ``(B, C)``."""
         local = self.mlp(points)
         return local, local.amax(1)
-
-
-def max_of_rows(features: Tensor, rows: Tensor) -> Tensor:
-    """Return the maximum of every channel over selected rows, without the tensor of all of them.
-
-    Args:
-        features: ``(B, N, C)``.
-        rows: ``(B, M, k)`` int64.
-
-    Returns:
-        ``(B, M, C)``; gradients flow to the winning rows.
-    """
-    clouds, n, channels = features.shape
-    places = rows + torch.arange(clouds, device=rows.device)[:, None, None] * n
-    best = F.embedding_bag(places.flatten(0, 1), features.flatten(0, 1), mode="max")
-    return best.view(clouds, -1, channels)

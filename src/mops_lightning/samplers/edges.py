@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.nets.layers import PointMLP, max_of_rows
+from mops_lightning.nets.layers import PointMLP
+from mops_lightning.ops.maxima import max_of_rows
 from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.ops.precision import pointwise_autocast
 
