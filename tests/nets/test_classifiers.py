@@ -6,7 +6,8 @@ import torch
 
 from mops_lightning.nets.dgcnn import DGCNN
 from mops_lightning.nets.pointnet import TransformNet
-from mops_lightning.ops import maxima
+from mops_lightning.ops import compiled
+from mops_lightning.ops.maxima import max_of_rows
 
 
 def test_transform_net_starts_at_identity(rng):
@@ -30,12 +31,12 @@ def test_dgcnn_neighbours_are_found_in_the_space_of_features(rng):
 
 
 def test_max_of_rows_equals_maximum_of_gathered_rows(rng, monkeypatch):
-    monkeypatch.setattr(maxima, "THREADS_MIN_RESULTS", 1)
+    monkeypatch.setattr(compiled, "THREADS_MIN_WORK", 1)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
     features = torch.randn(2, 20, 6, generator=rng, requires_grad=True)
     rows = torch.randint(20, (2, 9, 4), generator=rng)
     gathered = features[torch.arange(2)[:, None, None], rows].amax(2)
-    found = maxima.max_of_rows(features, rows)
+    found = max_of_rows(features, rows)
     torch.testing.assert_close(found, gathered)
     weight = torch.randn(found.shape, generator=rng)
     expected = torch.autograd.grad((gathered * weight).sum(), features)

@@ -1,8 +1,9 @@
-"""Farthest and nearest points on a CPU, by the compiled loops in ``ops.kernels``.
+"""Farthest points, nearest points and largest features on a CPU, by compiled loops.
 
-The first call of ``farthest`` compiles for 5 s, the first call of ``nearest`` for 1 to 4 s, once
-per dtype; later processes read the compiled form from a file. Both functions return None where the
-torch form must be used: on other devices, and for points that are not finite.
+The loops are in ``ops.kernels`` and ``ops.kernel_winners``. The first call of ``farthest`` compiles
+for 5 s, the first call of the others for 1 to 4 s, once per dtype; later processes read the
+compiled form from a file. All functions return None where the torch form must be used: on other
+devices, and for points that are not finite.
 """
 
 from collections.abc import Callable, Iterable
@@ -14,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.ops import kernels
+from mops_lightning.ops import kernel_winners, kernels
 from mops_lightning.ops.points import distance_dtype
 
 FARTHEST_LEAF, NEAREST_LEAF = 1024, 256
@@ -25,7 +26,7 @@ SPARSE = 100
 """Points per chosen point from which a tree with four times as large leaves is faster."""
 
 THREADS_MIN_WORK = 2**22
-"""Minimum number of distances in a batch, estimated, for using several threads."""
+"""Minimum number of distances or comparisons in a batch, estimated, for using several threads."""
 
 Array = NDArray[Any]
 
@@ -75,6 +76,24 @@ def nearest(queries: Tensor, points: Tensor) -> Tensor | None:
     clouds = zip(planes, flat, scratch, strict=True)
     work = NEAREST_LEAF * (points.shape[1] + queries.shape[1]) * len(points)
     return _rows(lambda cloud: kernels.nearest(*cloud, *fixed), clouds, work)
+
+
+def winners(features: Tensor, rows: Tensor) -> Tensor | None:
+    """Find the row with the largest feature in every channel.
+
+    Args:
+        features: ``(B, N, C)``.
+        rows: ``(B, M, k)`` int64, the rows to choose from.
+
+    Returns:
+        ``(B, M, C)`` int64, the first row in case of ties, or of a NaN.
+    """
+    if features.device.type != "cpu" or features.dtype.itemsize < 4 or not features.numel():
+        return None
+    arrays = [part.detach().contiguous().numpy() for part in (features, rows)]
+    clouds = zip(*arrays, strict=True)
+    work = rows.numel() * features.shape[2]
+    return _rows(lambda cloud: kernel_winners.winners(*cloud), clouds, work)
 
 
 def _planes(points: Tensor) -> Array:
