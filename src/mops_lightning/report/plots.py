@@ -37,7 +37,7 @@ def curves(table: Table) -> Figure:
     """Draw a metric against the size or another setting, one panel for each readout.
 
     Samplers that choose input points are dashed and the same in all panels. Error bars are
-    standard deviations over seeds. Panels of many columns are wide, so they are below each other.
+    standard deviations over seeds. Panels with many columns are wide, and stacked.
     """
     columns = sorted(table.columns())
     readouts = len(GENERATED_READOUTS)
@@ -64,17 +64,14 @@ def curves(table: Table) -> Figure:
                 markersize=3,
                 capsize=2,
             )
-        axis.set_title(readout)
+        axis.set(title=readout, xlabel=table.group.column, ylabel=table.metric.title)
         axis.set_xticks(
             range(len(columns)), [one if isinstance(one, str) else f"{one:g}" for one in columns]
         )
         if wide:
             axis.tick_params(axis="x", rotation=90)
         axis.grid(alpha=0.3)
-    for axis in panels[-1:] if wide else panels:
-        axis.set_xlabel(table.group.column)
-    for axis in panels if wide else panels[:1]:
-        axis.set_ylabel(table.metric.title)
+        axis.label_outer()
     panels[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
