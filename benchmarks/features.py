@@ -2,11 +2,10 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import torch
-from cases import Row, cloud, seconds
-from measure import interleaved, peak_memory
+from cases import Row
+from steps import by_step
 from torch import Tensor
 
 from mops_lightning.samplers.base import Sampler
@@ -20,13 +19,11 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "fmops, m_max=512": partial(FMOPSNet, 512),
     "snet, m=16": partial(SNet, 16),
 }
-CLOUDS = 32
 
 
-def build(name: str, features: str) -> Sampler:
+def build(sampler: str, features: str) -> Sampler:
     """Return a sampler with random weights."""
-    settings: dict[str, Any] = {"features": features}
-    return SAMPLERS[name](**settings)
+    return SAMPLERS[sampler](features=features)
 
 
 @torch.no_grad()
@@ -48,16 +45,7 @@ def features(_peak: dict[str, float], rounds: int) -> list[Row]:
 
     1,024 points in batches of 32; ``sample`` in evaluation, ``learn`` with all gradients.
     """
-    points = cloud(1024, CLOUDS)
-    kinds = [(name, extractor) for name in SAMPLERS for extractor in EXTRACTORS]
-    rows: list[Row] = []
-    for step in (sample, learn):
-        calls = {f"{kind}": partial(step, build(*kind), points) for kind in kinds}
-        for kind, timing in zip(kinds, interleaved(calls, rounds).values(), strict=True):
-            setup = (
-                f"from features import *\nsampler, points = build(*{kind}), cloud(1024, {CLOUDS})"
-            )
-            memory, _ = peak_memory(setup, f"{step.__name__}(sampler, points)")
-            row = {"sampler": kind[0], "features": kind[1], "step": step.__name__}
-            rows.append({**row, **seconds(timing, CLOUDS), "peak_bytes": memory / CLOUDS})
-    return rows
+    kinds = [
+        {"sampler": name, "features": extractor} for name in SAMPLERS for extractor in EXTRACTORS
+    ]
+    return by_step(build, kinds, (sample, learn), rounds)
