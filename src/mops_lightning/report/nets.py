@@ -86,9 +86,9 @@ def _row(records: list[RunRecord], settings: Iterable[Any], metrics: list[Metric
 
 
 def _settings(found: list[RunRecord]) -> list[dict[str, Any]]:
-    """Return for every record the settings of its net, and those that tell trainings apart.
+    """Return the settings of every record's net, and of its training where these distinguish runs.
 
-    These are settings that all runs of one net and one seed have, with different values.
+    Settings of the training differ between runs of one net and seed, and are set in every record.
     """
     same: dict[tuple[str, ...], list[RunRecord]] = {}
     nets = [_net(record) for record in found]

@@ -21,7 +21,7 @@ class Targets:
     Attributes:
         prediction: the first task net's for all points; None if it is not compared.
         seen: ``(B, N, 3)`` the points that the step sees, whose features are pooled.
-        features: task net → its pooled features; only nets that the step has drawn have any.
+        features: number of a task net → its pooled features, filled for the nets that are used.
     """
 
     prediction: Any
