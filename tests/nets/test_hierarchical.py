@@ -9,6 +9,7 @@ import torch
 import mops_lightning as mops
 from mops_lightning.errors import UserError
 from mops_lightning.nets.hierarchical import HierarchicalNet, Stage, carried
+from mops_lightning.tasks.classification import Classification
 from mops_lightning.types import Batch
 
 SAMPLERS: tuple[Any, ...] = (
@@ -38,7 +39,8 @@ def test_stage_equals_maximum_over_explicit_edges(sampler, rng):
     near = torch.cdist(centres, points).topk(4, largest=False).indices
     cloud = torch.arange(2)[:, None, None]
     offsets = points[cloud, near] - centres[:, :, None]
-    edges = stage.feature(features[cloud, near]) + stage.offset(offsets)
+    r = offsets.square().sum(3).mean((1, 2)).sqrt()[:, None, None, None]
+    edges = stage.feature(features[cloud, near]) + stage.offset(offsets / r)
     if output.indices is None:
         own = output.matrix.dense().mT @ features
     else:
@@ -49,6 +51,7 @@ def test_stage_equals_maximum_over_explicit_edges(sampler, rng):
     found_centres, found = stage(points, features)
     torch.testing.assert_close(found_centres, centres)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+    assert stage(torch.zeros_like(points), features)[1].isfinite().all()
 
 
 def test_points_without_matrix_carry_the_feature_of_the_nearest_point(rng):
@@ -62,8 +65,6 @@ def test_points_without_matrix_carry_the_feature_of_the_nearest_point(rng):
 
 
 def test_losses_of_stages_are_part_of_the_step(rng):
-    from mops_lightning.tasks.classification import Classification
-
     torch.manual_seed(0)
     net = HierarchicalNet(5, partial(mops.MOPSNet, alpha=2.0), (20, 8), (8, 16, 16), 4)
     task = Classification(net, 5)

@@ -23,9 +23,12 @@ from mops_lightning.types import SampleOutput
 class Stage(nn.Module):
     """Samples centres q_i and gathers the features of their neighbourhoods.
 
-    y_i = relu(BN(max_j (A·f_j + B·(p_j − q_i)) + C·c_i)) over the k points p_j nearest to q_i, then
-    y_i + MLP(y_i). f_j is the feature of p_j and c_i the feature of the centre, see ``carried``. As
-    the layer is linear, only A·f_j + B·p_j depends on j, so that no tensor of all edges is made.
+    y_i = relu(BN(max_j (A·f_j + B·(p_j − q_i)/r) + C·c_i)) over the k points p_j nearest to q_i,
+    then y_i + MLP(y_i). f_j is the feature of p_j and c_i the feature of the centre, see
+    ``carried``. r is the cloud's root mean square of the distances ‖p_j − q_i‖; undivided offsets
+    would be lost beside the features (PointNeXt, Qian et al., NeurIPS 2022, divides them by a fixed
+    radius). As the layer is linear, only A·f_j + B·p_j/r depends on j, so that no tensor of all
+    edges is made.
 
     Args:
         sampler: returns the centres.
@@ -67,9 +70,11 @@ class Stage(nn.Module):
         self.losses = output.losses
         centres = output.points
         with torch.no_grad():
-            rows = k_nearest(centres, points, min(self.k, n))[1]
-        edges = max_of_rows(self.feature(features) + self.offset(points), rows)
-        edges = edges - self.offset(centres) + self.centre(carried(output, points, features))
+            distances, rows = k_nearest(centres, points, min(self.k, n))
+            r = distances.mean((1, 2), keepdim=True).sqrt()
+            r = torch.where(r > 0, r, 1.0)  # points that all coincide
+        edges = max_of_rows(self.feature(features) + self.offset(points / r), rows)
+        edges = edges - self.offset(centres / r) + self.centre(carried(output, points, features))
         mixed = F.relu(self.norm(edges.flatten(0, 1))).unflatten(0, centres.shape[:2])
         return centres, mixed + self.mlp(mixed).to(mixed)
 
