@@ -103,7 +103,7 @@ def test_sweep_neighbours_differ_in_what_is_swept(name):
     [
         ("modelnet40", 49),
         ("ablation", 18),
-        ("segmentation", 19),
+        ("segmentation", 23),
         ("registration", 23),
         ("hierarchical", 11),
         ("features", 4),
