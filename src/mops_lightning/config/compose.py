@@ -234,7 +234,8 @@ def run_label(_root_: DictConfig) -> str:
     if _root_.evaluate:  # the size is in the run's record
         return f"{names.sampler}-evaluated"
     size = _root_.sampler.get("m_max", _root_.m)
-    return f"{names.sampler}-m{size}{'-joint' if _root_.learn == 'joint' else ''}"
+    anchored = "-anchored" if _root_.sampler.get("anchors") else ""
+    return f"{names.sampler}{anchored}-m{size}{'-joint' if _root_.learn == 'joint' else ''}"
 
 
 def run_level_keys() -> str:
