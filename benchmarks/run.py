@@ -10,13 +10,12 @@ import cases
 import libraries
 import measure
 import torch
-from features import features
 from inside import inside
 from measure import ceiling, machine
 
 from mops_lightning.filesystem import atomic_write
 
-ALL = {"inside": inside, "features": features, **cases.ALL}
+ALL = {"inside": inside, **cases.ALL}
 COLUMNS = {
     "seconds": lambda value: f"{1000 * value:.3g} ms",
     "spread": lambda value: f"{1000 * value:.2g} ms",

@@ -106,7 +106,6 @@ def test_sweep_neighbours_differ_in_what_is_swept(name):
         ("segmentation", 23),
         ("registration", 23),
         ("hierarchical", 11),
-        ("features", 4),
     ],
 )
 def test_cells_of_several_grids_have_folders_of_their_own(name, number):

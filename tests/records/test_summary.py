@@ -71,12 +71,10 @@ def test_task_net_alone_has_no_size():
     assert "m=32" not in text
 
 
-def test_sampler_is_named_as_in_reports():
+def test_sampler_with_anchors_is_named_as_in_reports():
     metrics = {"test/generated/accuracy": 0.5, "test/full/accuracy": 0.875}
-    text = printed(
-        metrics, "test/generated/accuracy", sampler={"anchors": "fps", "features": "edgeconv"}
-    )
-    assert cells(text)[1] == ["mops anchored edgeconv generated", "50.00"]
+    text = printed(metrics, "test/generated/accuracy", sampler={"anchors": "fps"})
+    assert cells(text)[1] == ["mops anchored generated", "50.00"]
 
 
 def test_fps_names_its_start():

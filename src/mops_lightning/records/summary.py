@@ -82,13 +82,11 @@ def results_table(record: RunRecord) -> tuple[str, Table]:
 def sampler_name(config: dict[str, Any]) -> str:
     """Return the name of a run's sampler, and for FPS the start point if it is set.
 
-    A MOPS-Net with anchors is ``mops anchored``, one with EdgeConv features ``mops edgeconv``, FPS
-    from the farthest point ``fps from farthest``.
+    A MOPS-Net with anchors is ``mops anchored``, FPS from the farthest point ``fps from farthest``.
     """
     sampler = config.get("sampler") or {}
     anchored = " anchored" if sampler.get("anchors") else ""
-    edges = " edgeconv" if sampler.get("features") == "edgeconv" else ""
-    return config["names"]["sampler"] + anchored + edges + _start(sampler)
+    return config["names"]["sampler"] + anchored + _start(sampler)
 
 
 def baseline_name(config: dict[str, Any], name: str) -> str:

@@ -242,7 +242,7 @@ class Sampler(nn.Module):
         """
         raise UserError(
             f"{type(self).__name__} needs all points of a cloud at once and cannot sample in "
-            "chunks. MOPS-Net and FMOPS-Net without anchors=fps and with features=pointwise can."
+            "chunks. MOPS-Net and FMOPS-Net without anchors=fps can."
         )
 
     @property

@@ -8,12 +8,11 @@ from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.losses.subset import overlap_losses, subset_losses
-from mops_lightning.nets.layers import PointFeatures, check_channels, linear_norm_relu
+from mops_lightning.nets.layers import PointFeatures, PointMLP, check_channels, linear_norm_relu
 from mops_lightning.ops.precision import pointwise_autocast, pointwise_autocast_dtype
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.anchors import FPSAnchors
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.edges import Extractor, feature_layers
 from mops_lightning.samplers.fused import FusedMOPSNet, fused_layer, fused_layers
 from mops_lightning.types import SampleOutput
 
@@ -45,8 +44,6 @@ class MOPSNet(Sampler):
             of the spacing of the farthest points. Only with anchors.
         overlap: weight of the penalty on columns of S that choose the same points
             (``losses.subset``); 0, as in the paper, for none.
-        features: ``edgeconv`` lets the first layers see the neighbours of every point (see
-            ``edges``); ``pointwise``, as in the paper, does not.
 
     Raises:
         UserError: an argument is out of range.
@@ -75,7 +72,6 @@ class MOPSNet(Sampler):
         anchors: Literal["fps"] | None = None,
         anchor_width: float = DEFAULT_WIDTH,
         overlap: float = 0.0,
-        features: Extractor = "pointwise",
     ) -> None:
         super().__init__(m)
         if not 0 < tau_min <= 1:
@@ -101,11 +97,9 @@ class MOPSNet(Sampler):
         self.threshold = threshold
         self.tau_min = tau_min
         self.training_tau = 1.0
-        self.pointwise = features == "pointwise"
-        # Farthest points and neighbours need all points at once.
-        self.streams = anchors is None and self.pointwise
+        self.streams = anchors is None  # farthest points need all points at once
         local = feature_channels[-1]
-        self.features = PointFeatures(feature_layers([3, *feature_channels], features))
+        self.features = PointFeatures(PointMLP([3, *feature_channels]))
         # The first layer of ρ acts on [local, global]. The product with the global feature is the
         # same for all points of a cloud, so it is computed once per cloud.
         self.rho_local = nn.Linear(local, rho_channels[0], bias=False)
@@ -137,7 +131,7 @@ class MOPSNet(Sampler):
 
     def _keys(self, points: Tensor) -> Tensor:
         """Return the inputs of the last layer of ρ ``(B, N, C)``."""
-        plain = self.training or torch.is_grad_enabled() or not self.pointwise
+        plain = self.training or torch.is_grad_enabled()
         plain |= torch.compiler.is_compiling()  # a graph has the weights as they are
         if not plain and pointwise_autocast_dtype() is None:
             return self._fused_keys(points)
@@ -151,8 +145,7 @@ class MOPSNet(Sampler):
         """Return the network for inference with BatchNorm fused, with copies of the weights.
 
         Raises:
-            UserError: the sampler has anchors or sees neighbours, which a part of a cloud does not
-                determine.
+            UserError: the sampler has anchors, which a part of a cloud does not determine.
         """
         if not self.streams:
             return super().fused()

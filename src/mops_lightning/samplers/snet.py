@@ -6,10 +6,9 @@ from torch import Tensor, nn
 
 from mops_lightning.errors import check_at_least
 from mops_lightning.losses.subset import simplification_losses
-from mops_lightning.nets.layers import check_channels, linear_norm_relu
+from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
 from mops_lightning.nets.max_pool import PointMaxPool
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.edges import Extractor, feature_layers
 from mops_lightning.types import SampleOutput
 
 
@@ -27,8 +26,6 @@ class SNet(Sampler):
         head_channels: sizes of the head's hidden layers, each with ReLU.
         head_norm: whether the hidden layers have BatchNorm.
         output_norm: whether the output layer has BatchNorm.
-        features: ``edgeconv`` lets the first layers see the neighbours of every point (see
-            ``edges``); ``pointwise``, as published, does not.
 
     Raises:
         UserError: an argument is out of range.
@@ -52,7 +49,6 @@ class SNet(Sampler):
         head_channels: Sequence[int] = (256, 256, 256),
         head_norm: bool = True,
         output_norm: bool = True,
-        features: Extractor = "pointwise",
     ) -> None:
         super().__init__(m)
         check_at_least(0, alpha=alpha, coverage=coverage, coverage_per_point=coverage_per_point)
@@ -61,7 +57,7 @@ class SNet(Sampler):
         self.alpha = alpha
         self.coverage = coverage
         self.coverage_per_point = coverage_per_point
-        self.features = feature_layers([3, *feature_channels[:-1]], features)
+        self.features = PointMLP([3, *feature_channels[:-1]])
         self.pool = PointMaxPool(feature_channels[-2], feature_channels[-1])
         layers: list[nn.Module] = list(
             linear_norm_relu([feature_channels[-1], *head_channels], head_norm)

@@ -12,9 +12,7 @@ from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
-from mops_lightning.samplers.anchors import FPSAnchors
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.edges import EdgeMLP
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.snet import SNet
 
@@ -42,10 +40,10 @@ class GeneratedPoints(nn.Module):
         super().__init__()
         self.m = sampler.m if m is None else m
         sampler.check_m(self.m)
-        if any(isinstance(module, FPSAnchors | EdgeMLP) for module in sampler.modules()):
+        if isinstance(sampler, MOPSNet) and not sampler.streams:
             raise UserError(
-                f"{type(sampler).__name__} with anchors=fps or features=edgeconv cannot be "
-                "exported, as both search all points. Export one without."
+                f"{type(sampler).__name__} with anchors=fps cannot be exported, as its farthest "
+                "points are found one by one. Export one without anchors."
             )
         if not isinstance(sampler, MOPSNet | SNet):
             raise UserError(
