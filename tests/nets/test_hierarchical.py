@@ -30,28 +30,39 @@ def test_stages_train_any_sampler(sampler, rng):
         assert all(p.grad is not None for p in stage.sampler.parameters())
 
 
-@pytest.mark.parametrize("sampler", [mops.FPSSampler, mops.MOPSNet])
-def test_stage_equals_maximum_over_explicit_edges(sampler, rng):
-    stage = Stage(sampler(m=7), 7, 6, 10, 4).eval()
-    points, features = (torch.randn(2, 30, c, generator=rng) for c in (3, 6))
+def plain_stage(stage, points, features):
+    """All edges (f_j, p_j − q_i) as one tensor."""
     output = stage.sampler(points)
     centres = output.points
-    near = torch.cdist(centres, points).topk(4, largest=False).indices
-    cloud = torch.arange(2)[:, None, None]
+    near = torch.cdist(centres, points).topk(stage.k, largest=False).indices
+    cloud = torch.arange(len(points))[:, None, None]
     offsets = points[cloud, near] - centres[:, :, None]
     r = offsets.square().sum(3).mean((1, 2)).sqrt()[:, None, None, None]
     edges = stage.feature(features[cloud, near]) + stage.offset(offsets / r)
     if output.indices is None:
         own = output.matrix.dense().mT @ features
     else:
-        own = features[torch.arange(2)[:, None], output.indices]
+        own = features[cloud[:, 0], output.indices]
     mixed = (edges + stage.centre(own)[:, :, None]).amax(2)
-    mixed = stage.norm(mixed.flatten(0, 1)).relu().unflatten(0, (2, 7))
-    expected = mixed + stage.mlp(mixed)
-    found_centres, found = stage(points, features)
-    torch.testing.assert_close(found_centres, centres)
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
-    assert stage(torch.zeros_like(points), features)[1].isfinite().all()
+    mixed = stage.norm(mixed.flatten(0, 1)).relu().unflatten(0, centres.shape[:2])
+    return centres, mixed + stage.mlp(mixed)
+
+
+@pytest.mark.parametrize("sampler", [mops.FPSSampler, mops.MOPSNet])
+def test_stage_equals_maximum_over_explicit_edges(sampler, rng):
+    stage = Stage(sampler(m=7), 7, 6, 10, 4).eval()
+    given = [torch.randn(2, 30, c, generator=rng).requires_grad_() for c in (3, 6)]
+    results = []
+    for forward in (stage, partial(plain_stage, stage)):
+        centres, found = forward(*given)
+        total = (found * torch.linspace(-1, 1, found.numel()).view_as(found)).sum()
+        results.append([centres, found, *torch.autograd.grad(total, [*given, stage.offset.weight])])
+    for ours, twin in zip(*results, strict=True):
+        torch.testing.assert_close(ours, twin, atol=1e-4, rtol=1e-3)
+    points = torch.zeros_like(given[0]).requires_grad_()
+    stage(points, given[1])[1].sum().backward()
+    assert points.grad is not None
+    assert points.grad.isfinite().all()
 
 
 def test_points_without_matrix_carry_the_feature_of_the_nearest_point(rng):

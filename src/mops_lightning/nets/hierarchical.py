@@ -69,10 +69,9 @@ class Stage(nn.Module):
         output: SampleOutput = self.sampler(points, min(self.m, n))
         self.losses = output.losses
         centres = output.points
-        with torch.no_grad():
-            distances, rows = k_nearest(centres, points, min(self.k, n))
-            r = distances.mean((1, 2), keepdim=True).sqrt()
-            r = torch.where(r > 0, r, 1.0)  # points that all coincide
+        distances, rows = k_nearest(centres, points, min(self.k, n))
+        mean = distances.mean((1, 2), keepdim=True)
+        r = torch.where(mean > 0, mean, 1.0).sqrt()  # all points may coincide
         edges = max_of_rows(self.feature(features) + self.offset(points / r), rows)
         edges = edges - self.offset(centres / r) + self.centre(carried(output, points, features))
         mixed = F.relu(self.norm(edges.flatten(0, 1))).unflatten(0, centres.shape[:2])
