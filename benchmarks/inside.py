@@ -5,8 +5,8 @@ from functools import partial
 from typing import Any
 
 import torch
-from cases import Row
-from steps import by_step
+from cases import Row, cloud, seconds
+from measure import interleaved, peak_memory
 from torch import Tensor, nn
 
 from mops_lightning.nets.hierarchical import HierarchicalNet
@@ -22,11 +22,12 @@ SAMPLERS: dict[str, Callable[..., nn.Module]] = {
     "mops anchored": partial(MOPSNet, anchors="fps"),
     "mops anchored, narrow": partial(MOPSNet, anchors="fps", **NARROW),
 }
+CLOUDS = 32
 
 
-def build(sampler: str, points: list[int]) -> HierarchicalNet:
+def build(name: str, sizes: list[int]) -> HierarchicalNet:
     """Return the net for 40 classes with random weights."""
-    return HierarchicalNet(40, SAMPLERS[sampler], points)
+    return HierarchicalNet(40, SAMPLERS[name], sizes)
 
 
 @torch.no_grad()
@@ -46,8 +47,14 @@ def inside(_peak: dict[str, float], rounds: int) -> list[Row]:
 
     1,024 points in batches of 32; ``classify`` in evaluation, ``learn`` with all gradients.
     """
-    kinds = [
-        {"sampler": "fps", "points": ALL_POINTS},
-        *({"sampler": name, "points": HALF} for name in SAMPLERS),
-    ]
-    return by_step(build, kinds, (classify, learn), rounds)
+    points = cloud(1024, CLOUDS)
+    kinds = [("fps", ALL_POINTS), *((name, HALF) for name in SAMPLERS)]
+    rows: list[Row] = []
+    for step in (classify, learn):
+        calls = {f"{kind}": partial(step, build(*kind), points) for kind in kinds}
+        for kind, timing in zip(kinds, interleaved(calls, rounds).values(), strict=True):
+            setup = f"from inside import *\nnet, points = build(*{kind}), cloud(1024, {CLOUDS})"
+            memory, _ = peak_memory(setup, f"{step.__name__}(net, points)")
+            row = {"sampler": kind[0], "points": str(kind[1])[1:-1], "step": step.__name__}
+            rows.append({**row, **seconds(timing, CLOUDS), "peak_bytes": memory / CLOUDS})
+    return rows
