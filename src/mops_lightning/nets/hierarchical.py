@@ -25,9 +25,9 @@ class Stage(nn.Module):
 
     y_i = relu(BN(max_j (A·f_j + B·(p_j − q_i)/r) + C·c_i)) over the k points p_j nearest to q_i,
     then y_i + MLP(y_i). f_j is the feature of p_j and c_i the feature of the centre, see
-    ``carried``. r is the cloud's root mean square of the distances ‖p_j − q_i‖; undivided offsets
-    would be lost beside the features (PointNeXt, Qian et al., NeurIPS 2022, divides them by a fixed
-    radius). As the layer is linear, only A·f_j + B·p_j/r depends on j, so that no tensor of all
+    ``carried``. r is the root mean square of the distances ‖p_j − q_i‖ of a cloud, so that offsets
+    are of one size in all stages; PointNeXt (Qian et al., NeurIPS 2022) divides them by a fixed
+    radius. As the layer is linear, only A·f_j + B·p_j/r depends on j, so that no tensor of all
     edges is made.
 
     Args:
