@@ -15,7 +15,7 @@ from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.attention import attend
 from mops_lightning.ops.fps import farthest_point_sample, fps
-from mops_lightning.ops.nearest import nearest
+from mops_lightning.ops.nearest import k_nearest, nearest, search_in_blocks
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.samplers.base import stream_sample
 from mops_lightning.samplers.fps import FPSSampler
@@ -271,6 +271,13 @@ def neighbours(peak: dict[str, float], rounds: int) -> list[Row]:
         shared = {name: int((call() == own).sum()) for name, call in others.items()}
         for row in _rows("search", calls | others, {"N": number, "m": m}, rounds, peak):
             rows.append({**row, "points as ours": shared.get(row["search"], m)})
+    for number, m, k in ((1024, 256, 16), (1024, 1024, 32), (40_960, 4096, 16)):
+        points, queries = cloud(number), cloud(m + 1)[:, :m]
+        several: Calls = {
+            f"{k} nearest": partial(k_nearest, queries, points, k),
+            f"{k} nearest, in torch": partial(search_in_blocks, queries, points, k),
+        }
+        rows += _rows("search", several, {"N": number, "m": m}, rounds, peak)
     return rows
 
 

@@ -8,6 +8,7 @@ import torch
 
 from mops_lightning.ops import compiled
 from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample
+from mops_lightning.ops.nearest import k_nearest, search_in_blocks
 from mops_lightning.ops.nearest import nearest as nearest_points
 from tests.support.clouds import cloud_of
 
@@ -40,6 +41,21 @@ def test_nearest_equals_torch_form(m, n, kind, dtype, rng, both):
     (fast, rows), (plain, expected) = both(nearest_points, queries, points)
     assert torch.equal(rows, expected)
     assert torch.equal(fast, plain)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("m", "n", "k"), [(1, 2, 2), (70, 9, 9), (30, 800, 16), (5, 130, 33)])
+def test_neighbours_equal_torch_form(m, n, k, kind, dtype, rng):
+    points, queries = cloud_of(kind, (2, n), dtype, rng), cloud_of(kind, (2, m), dtype, rng)
+    queries[:, : min(m, n) // 2] = points[:, : min(m, n) // 2]
+    rows = k_nearest(queries, points, k)[1]
+    total = torch.zeros(2, m, n, dtype=dtype)
+    for axis in range(3):
+        difference = points[:, None, :, axis] - queries[:, :, None, axis]
+        total.addcmul_(difference, difference)
+    assert torch.equal(rows, total.sort(stable=True)[1][..., :k])
+    assert torch.equal(total.gather(2, search_in_blocks(queries, points, k)), total.gather(2, rows))
 
 
 def test_nearest_of_centre_equals_torch_form(rng, both):

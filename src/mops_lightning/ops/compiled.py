@@ -1,9 +1,9 @@
 """Farthest points, nearest points and largest features on a CPU, by compiled loops.
 
-The loops are in ``ops.kernels`` and ``ops.kernel_winners``. The first call of ``farthest`` compiles
-for 5 s, the first call of the others for 1 to 4 s, once per dtype; later processes read the
-compiled form from a file. All functions return None where the torch form must be used: on other
-devices, and for points that are not finite.
+The loops are in ``ops.kernels``, ``ops.kernel_neighbours`` and ``ops.kernel_winners``. The first
+call of ``farthest`` compiles for 5 s, the first call of the others for 1 to 4 s, once per dtype;
+later processes read the compiled form from a file. All functions return None where the torch form
+must be used: on other devices, and for points that are not finite.
 """
 
 from collections.abc import Callable, Iterable
@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.ops import kernel_winners, kernels
+from mops_lightning.ops import kernel_neighbours, kernel_winners, kernels
 from mops_lightning.ops.points import distance_dtype
 
 FARTHEST_LEAF, NEAREST_LEAF = 1024, 256
@@ -76,6 +76,31 @@ def nearest(queries: Tensor, points: Tensor) -> Tensor | None:
     clouds = zip(planes, flat, scratch, strict=True)
     work = NEAREST_LEAF * (points.shape[1] + queries.shape[1]) * len(points)
     return _rows(lambda cloud: kernels.nearest(*cloud, *fixed), clouds, work)
+
+
+def neighbours(queries: Tensor, points: Tensor, k: int) -> Tensor | None:
+    """Find the k nearest points for every query.
+
+    Args:
+        queries: ``(B, M, C)``.
+        points: ``(B, N, C)``.
+        k: number of neighbours, at most N.
+
+    Returns:
+        ``(B, M, k)`` int64, nearest first, the lowest row in case of ties.
+    """
+    if points.device.type != "cpu" or not (points.numel() and queries.numel()):
+        return None
+    if not bool(points.isfinite().all() and queries.isfinite().all()):
+        return None
+    planes = _planes(points)
+    flat = queries.detach().to(distance_dtype(points)).contiguous().flatten(1).numpy()
+    integer, (n, channels) = _integer(planes), points.shape[1:]
+    best = np.full((len(points), k), np.iinfo(integer).max, integer)
+    scratch = np.empty((len(points), n), integer)
+    clouds = zip(planes, flat, best, scratch, strict=True)
+    work = n * queries.shape[1] * len(points)
+    return _rows(lambda cloud: kernel_neighbours.neighbours(*cloud, channels), clouds, work)
 
 
 def winners(features: Tensor, rows: Tensor) -> Tensor | None:

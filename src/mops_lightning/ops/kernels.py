@@ -16,20 +16,10 @@ does not notice that a cached function calls one that has changed in another fil
 
 import numpy as np
 
-from mops_lightning.ops.jit import intrinsic, jit, jit_cached
+from mops_lightning.ops.jit import jit, jit_cached, multiply_add
 
 FANOUT, PROBES = 8, 8
 """Maximum number of children of a node, and sampled coordinates per child for where to split."""
-
-
-@intrinsic
-def _multiply_add(typing, a, b, c):
-    """Return a·b + c, rounded once."""
-
-    def generate(context, builder, signature, arguments):
-        return builder.fma(*arguments)
-
-    return a(a, a, a), generate
 
 
 @jit
@@ -53,7 +43,7 @@ def _write_distances(planes, size, start, stop, point, out):
         else:
             for i in range(len(line)):
                 d = line[i] - at
-                out[i] = _multiply_add(d, d, out[i])
+                out[i] = multiply_add(d, d, out[i])
 
 
 @jit
@@ -65,7 +55,7 @@ def _distance_to_box(boxes, node, point):
     for axis in range(channels):
         d = max(boxes[first + axis] - point[axis], point[axis] - boxes[first + channels + axis])
         d = max(d, zero)
-        total = _multiply_add(d, d, total)
+        total = multiply_add(d, d, total)
     return total
 
 

@@ -57,7 +57,7 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
     Returns:
         Squared distances ``(B, M, k)``, ascending, through which gradients flow to queries and
-        points, and the indices ``(B, M, k)`` int64. For k > 1, ties are broken arbitrarily.
+        points, and the indices ``(B, M, k)`` int64, of ties the lowest index on a CPU.
 
     Raises:
         UserError: the shapes do not match, or k is out of range.
@@ -107,9 +107,14 @@ def _check_shapes(queries: Tensor, points: Tensor) -> None:
 
 def _search(queries: Tensor, points: Tensor, k: int) -> Tensor:
     """Return the ``(B, M, k)`` nearest rows."""
-    traced = torch.compiler.is_compiling()  # a graph cannot contain compiled loops
-    rows = compiled.nearest(queries, points) if k == 1 and not traced else None
-    return search_in_blocks(queries, points, k) if rows is None else rows[..., None]
+    if torch.compiler.is_compiling():  # a graph cannot contain compiled loops
+        return search_in_blocks(queries, points, k)
+    if k == 1:
+        rows = compiled.nearest(queries, points)
+        rows = None if rows is None else rows[..., None]
+    else:
+        rows = compiled.neighbours(queries, points, k)
+    return search_in_blocks(queries, points, k) if rows is None else rows
 
 
 def search_in_blocks(queries: Tensor, points: Tensor, k: int) -> Tensor:
