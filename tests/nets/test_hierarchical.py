@@ -43,7 +43,10 @@ def plain_stage(stage, points, features):
         own = output.matrix.dense().mT @ features
     else:
         own = features[cloud[:, 0], output.indices]
-    mixed = (edges + stage.centre(own)[:, :, None]).amax(2)
+    offsets = offsets / r
+    products = torch.einsum("bmki,bmkj->bmkij", offsets, offsets).mean(2).flatten(2)
+    moments = stage.moments(torch.cat([offsets.mean(2), products], 2))
+    mixed = (edges + (stage.centre(own) + moments)[:, :, None]).amax(2)
     mixed = stage.norm(mixed.flatten(0, 1)).relu().unflatten(0, centres.shape[:2])
     return centres, mixed + stage.mlp(mixed)
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from mops_lightning.data.loader import CloudLoader
+from mops_lightning.errors import UserError
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.hierarchical import HierarchicalSegmentation
@@ -18,6 +19,7 @@ from mops_lightning.tasks.reconstruction import Reconstruction
 from mops_lightning.tasks.registration import Registration
 from mops_lightning.tasks.segmentation import Segmentation
 from mops_lightning.training.experiment import Experiment
+from mops_lightning.types import Batch
 from tests.support.samplers import SAMPLERS
 from tests.support.training import changed, quiet_trainer, small_dataset, state
 
@@ -88,3 +90,13 @@ def test_disagreement_is_divergence_of_reference_from_prediction():
     expected = 0.9 * torch.tensor(0.9 / 0.5).log() + 0.1 * torch.tensor(0.1 / 0.5).log()
     apart = task.disagreement(found.log(), reference.log() + 3)  # logits, up to a constant
     torch.testing.assert_close(apart, expected[None])
+
+
+def test_smoothed_labels_give_every_class_a_share(rng):
+    task = Classification(PointNetVanilla(4), 4, label_smoothing=0.2).eval()
+    batch = Batch(torch.randn(3, 9, 3, generator=rng), torch.tensor([0, 2, 3]))
+    labels = 0.8 * torch.eye(4)[batch.labels] + 0.2 / 4
+    expected = -(labels * task.predict(batch, batch.points).log_softmax(1)).sum(1).mean()
+    torch.testing.assert_close(task.step(batch, batch.points).losses["cross_entropy"], expected)
+    with pytest.raises(UserError, match=r"label_smoothing must be in \[0, 1\), got 1"):
+        Classification(PointNetVanilla(4), 4, label_smoothing=1.0)

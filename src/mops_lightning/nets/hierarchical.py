@@ -23,12 +23,13 @@ from mops_lightning.types import SampleOutput
 class Stage(nn.Module):
     """Samples centres q_i and gathers the features of their neighbourhoods.
 
-    y_i = relu(BN(max_j (A·f_j + B·(p_j − q_i)/r) + C·c_i)) over the k points p_j nearest to q_i,
+    y_i = relu(BN(max_j (A·f_j + B·o_ij) + C·c_i + D·s_i)) over the k points p_j nearest to q_i,
     then y_i + MLP(y_i). f_j is the feature of p_j and c_i the feature of the centre, see
-    ``carried``. r is the root mean square of the distances ‖p_j − q_i‖ of a cloud, so that offsets
-    are of one size in all stages; PointNeXt (Qian et al., NeurIPS 2022) divides them by a fixed
-    radius. As the layer is linear, only A·f_j + B·p_j/r depends on j, so that no tensor of all
-    edges is made.
+    ``carried``. The offset o_ij is (p_j − q_i)/r, where r is the root mean square of the distances
+    ‖p_j − q_i‖ of a cloud, so that offsets are of one size in all stages; PointNeXt (Qian et al.,
+    NeurIPS 2022) divides them by a fixed radius. s_i, the means of o_ij and of the products of its
+    coordinates, describes the plane and the normal of the neighbourhood. As A and B are
+    linear, only A·f_j + B·p_j/r depends on j, so that no tensor of all edges' features is made.
 
     Args:
         sampler: returns the centres.
@@ -48,6 +49,7 @@ class Stage(nn.Module):
         self.feature = nn.Linear(channels_in, channels_out, bias=False)
         self.offset = nn.Linear(3, channels_out, bias=False)
         self.centre = nn.Linear(channels_in, channels_out, bias=False)
+        self.moments = nn.Linear(12, channels_out, bias=False)
         self.norm = nn.BatchNorm1d(channels_out)
         self.mlp = PointMLP([channels_out, channels_out])
         self.losses: dict[str, Tensor] = {}
@@ -74,8 +76,16 @@ class Stage(nn.Module):
         r = torch.where(mean > 0, mean, 1.0).sqrt()  # all points may coincide
         edges = max_of_rows(self.feature(features) + self.offset(points / r), rows)
         edges = edges - self.offset(centres / r) + self.centre(carried(output, points, features))
+        offsets = (gather_points(points, rows) - centres[:, :, None]) / r[..., None]
+        edges = edges + self.moments(moments(offsets))
         mixed = F.relu(self.norm(edges.flatten(0, 1))).unflatten(0, centres.shape[:2])
         return centres, mixed + self.mlp(mixed).to(mixed)
+
+
+def moments(offsets: Tensor) -> Tensor:
+    """Return the means of offsets ``(B, M, k, 3)`` and of the products o·oᵀ: ``(B, M, 12)``."""
+    products = offsets.mT @ offsets / offsets.shape[2]
+    return torch.cat([offsets.mean(2), products.flatten(2)], 2)
 
 
 def carried(output: SampleOutput, points: Tensor, features: Tensor) -> Tensor:
@@ -149,7 +159,7 @@ class Hierarchy(nn.Module):
 
 
 class HierarchicalNet(Hierarchy):
-    """A classifier: stages, then maximum and mean of the last features.
+    """A classifier: stages, the maximum of every stage's features and the mean of the last.
 
     The net has 0.15 million weights with its default sizes and 40 classes, without the samplers'.
 
@@ -159,6 +169,7 @@ class HierarchicalNet(Hierarchy):
         points: number of points after every stage.
         channels: channels of the features before the first stage and after every stage.
         k: number of neighbours.
+        hidden: channels between the pooled features and the logits.
         dropout: dropout probability.
 
     Raises:
@@ -172,18 +183,23 @@ class HierarchicalNet(Hierarchy):
         points: Sequence[int] = (512, 256, 128, 64),
         channels: Sequence[int] = (24, 32, 64, 96, 160),
         k: int = 16,
+        hidden: int = 96,
         dropout: float = 0.3,
     ) -> None:
         super().__init__(sampler, points, channels, k)
-        last = channels[-1]
+        check_at_least(1, hidden=hidden)
+        pooled = sum(channels[1:]) + channels[-1]
         self.head = nn.Sequential(
-            *linear_norm_relu([2 * last, last]), nn.Dropout(dropout), nn.Linear(last, num_classes)
+            *linear_norm_relu([pooled, hidden]),
+            nn.Dropout(dropout),
+            nn.Linear(hidden, num_classes),
         )
 
     def forward(self, points: Tensor) -> Tensor:
         """Map ``(B, N, 3)`` points to ``(B, num_classes)`` logits."""
-        _, features = self.levels(points)[-1]
-        return self.head(torch.cat([features.amax(1), features.mean(1)], 1))
+        stages = [features for _, features in self.levels(points)[1:]]
+        peaks = [features.amax(1) for features in stages]
+        return self.head(torch.cat([*peaks, stages[-1].mean(1)], 1))
 
 
 class HierarchicalSegmentation(Hierarchy):

@@ -23,22 +23,26 @@ class Classification(Task):
     Args:
         net: maps ``(B, M, 3)`` points to ``(B, num_classes)`` logits.
         num_classes: number of classes.
+        label_smoothing: share of a label that the cross entropy spreads over all classes.
 
     Raises:
-        UserError: there are fewer than two classes.
+        UserError: there are fewer than two classes, or ``label_smoothing`` is outside [0, 1).
     """
 
     score = Accuracy.name
     output_names = "class_names"
 
-    def __init__(self, net: nn.Module, num_classes: int) -> None:
+    def __init__(self, net: nn.Module, num_classes: int, label_smoothing: float = 0.0) -> None:
         super().__init__(net)
         if num_classes < 2:
             raise UserError(
                 f"num_classes must be at least 2, got {num_classes}. Give data of more classes "
                 "(dataset.classes)."
             )
+        if not 0 <= label_smoothing < 1:
+            raise UserError(f"label_smoothing must be in [0, 1), got {label_smoothing}.")
         self.num_classes = num_classes
+        self.label_smoothing = label_smoothing
 
     def predict(self, batch: Batch, points: Tensor) -> Tensor:
         """Return the logits ``(B, num_classes)`` of ``(B, M, 3)`` points."""
@@ -60,7 +64,8 @@ class Classification(Task):
             and labels.
         """
         logits = self.predict(batch, points)
-        losses = {"cross_entropy": F.cross_entropy(logits, batch.labels)}
+        loss = F.cross_entropy(logits, batch.labels, label_smoothing=self.label_smoothing)
+        losses = {"cross_entropy": loss}
         losses |= getattr(self.net, "losses", {})
         return TaskOutput(losses, logits, batch.labels, logits)
 
