@@ -139,11 +139,12 @@ def test_farthest_in_threads_equals_torch_form(threads, rng, both, monkeypatch):
     assert torch.equal(fast, plain)
 
 
-def test_compiled_forms_take_finite_points_only(rng):
+@pytest.mark.parametrize("k", [1, 3])
+def test_compiled_forms_take_finite_points_only(k, rng):
     points = torch.rand(1, 30, 3, generator=rng)
     start = torch.zeros(1, 30)
-    assert compiled.nearest(points[:, :5], points) is not None
+    assert compiled.nearest(points[:, :5], points, k) is not None
     assert compiled.farthest(points, 4, start) is not None
     points[0, 7, 0] = torch.nan
-    assert compiled.nearest(points[:, :5], points) is None
+    assert compiled.nearest(points[:, :5], points, k) is None
     assert compiled.farthest(points, 4, start) is None

@@ -1,9 +1,9 @@
 """Farthest points, nearest points and largest features on a CPU, by compiled loops.
 
-The loops are in ``ops.kernels``, ``ops.kernel_neighbours`` and ``ops.kernel_winners``. The first
-call of ``farthest`` compiles for 5 s, the first call of the others for 1 to 4 s, once per dtype;
-later processes read the compiled form from a file. All functions return None where the torch form
-must be used: on other devices, and for points that are not finite.
+The loops are in ``ops.kernels`` and ``ops.kernel_neighbours``. The first call of ``farthest``
+compiles for 5 s, the first call of the others for 1 to 4 s, once per dtype; later processes read
+the compiled form from a file. All functions return None where the torch form must be used: on other
+devices, and for points that are not finite.
 """
 
 from collections.abc import Callable, Iterable
@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.ops import kernel_neighbours, kernel_winners, kernels
+from mops_lightning.ops import kernel_neighbours, kernels
 from mops_lightning.ops.points import distance_dtype
 
 FARTHEST_LEAF, NEAREST_LEAF = 1024, 256
@@ -57,28 +57,7 @@ def farthest(
     return _rows(lambda cloud: kernels.farthest(*cloud, *fixed), clouds, work)
 
 
-def nearest(queries: Tensor, points: Tensor) -> Tensor | None:
-    """Find the nearest point for every query.
-
-    Args:
-        queries: ``(B, M, C)``.
-        points: ``(B, N, C)``.
-
-    Returns:
-        ``(B, M)`` int64, the lowest row in case of ties.
-    """
-    if points.device.type != "cpu" or not (points.numel() and queries.numel()):
-        return None
-    planes = _planes(points)
-    flat = queries.detach().to(distance_dtype(points)).contiguous().flatten(1).numpy()
-    scratch = np.empty((len(points), points.shape[1]), _integer(planes))
-    fixed = (points.shape[2], NEAREST_LEAF)
-    clouds = zip(planes, flat, scratch, strict=True)
-    work = NEAREST_LEAF * (points.shape[1] + queries.shape[1]) * len(points)
-    return _rows(lambda cloud: kernels.nearest(*cloud, *fixed), clouds, work)
-
-
-def neighbours(queries: Tensor, points: Tensor, k: int) -> Tensor | None:
+def nearest(queries: Tensor, points: Tensor, k: int) -> Tensor | None:
     """Find the k nearest points for every query.
 
     Args:
@@ -91,16 +70,20 @@ def neighbours(queries: Tensor, points: Tensor, k: int) -> Tensor | None:
     """
     if points.device.type != "cpu" or not (points.numel() and queries.numel()):
         return None
+    planes, (clouds, n, channels) = _planes(points), points.shape
+    flat = queries.detach().to(distance_dtype(points)).contiguous().flatten(1).numpy()
+    scratch = np.empty((clouds, n), _integer(planes))
+    if k == 1:
+        parts, fixed = zip(planes, flat, scratch, strict=True), (channels, NEAREST_LEAF)
+        work = NEAREST_LEAF * (n + queries.shape[1]) * clouds
+        rows = _rows(lambda cloud: kernels.nearest(*cloud, *fixed), parts, work)
+        return None if rows is None else rows[..., None]
     if not bool(points.isfinite().all() and queries.isfinite().all()):
         return None
-    planes = _planes(points)
-    flat = queries.detach().to(distance_dtype(points)).contiguous().flatten(1).numpy()
-    integer, (n, channels) = _integer(planes), points.shape[1:]
-    best = np.full((len(points), k), np.iinfo(integer).max, integer)
-    scratch = np.empty((len(points), n), integer)
-    clouds = zip(planes, flat, best, scratch, strict=True)
-    work = n * queries.shape[1] * len(points)
-    return _rows(lambda cloud: kernel_neighbours.neighbours(*cloud, channels), clouds, work)
+    best = np.full((clouds, k), np.iinfo(scratch.dtype).max, scratch.dtype)
+    several = zip(planes, flat, best, scratch, strict=True)
+    work = n * queries.shape[1] * clouds
+    return _rows(lambda cloud: kernel_neighbours.neighbours(*cloud, channels), several, work)
 
 
 def winners(features: Tensor, rows: Tensor) -> Tensor | None:
@@ -118,7 +101,7 @@ def winners(features: Tensor, rows: Tensor) -> Tensor | None:
     arrays = [part.detach().contiguous().numpy() for part in (features, rows)]
     clouds = zip(*arrays, strict=True)
     work = rows.numel() * features.shape[2]
-    return _rows(lambda cloud: kernel_winners.winners(*cloud), clouds, work)
+    return _rows(lambda cloud: kernel_neighbours.winners(*cloud), clouds, work)
 
 
 def _planes(points: Tensor) -> Array:

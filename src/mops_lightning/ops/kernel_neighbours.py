@@ -1,4 +1,4 @@
-"""The nearest rows, in loops that numba compiles; ``ops.compiled`` calls them."""
+"""Nearest rows and rows of largest features, in loops that numba compiles for ``ops.compiled``."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -60,4 +60,25 @@ def neighbours(planes, queries, best, scratch, channels):
         for j in candidates[:count]:
             if scratch[j] < best[-1]:
                 insert(best, out[i], scratch[j], j)
+    return out
+
+
+@jit_cached
+def winners(features, rows):
+    """Return for every line of rows the row with the largest feature in each channel."""
+    channels = features.shape[1]
+    out = np.empty((len(rows), channels), np.int64)
+    best = np.empty(channels, features.dtype)
+    winner = np.empty(channels, np.int32)  # narrow, which is faster
+    for i in range(len(rows)):
+        best[:] = features[rows[i, 0]]
+        winner[:] = 0
+        for j in range(1, rows.shape[1]):
+            line = features[rows[i, j]]
+            for c in range(channels):
+                larger = line[c] > best[c] or line[c] != line[c]  # NaN is passed on
+                best[c] = line[c] if larger else best[c]
+                winner[c] = j if larger else winner[c]
+        for c in range(channels):
+            out[i, c] = rows[i, winner[c]]
     return out

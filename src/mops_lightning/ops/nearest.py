@@ -107,13 +107,8 @@ def _check_shapes(queries: Tensor, points: Tensor) -> None:
 
 def _search(queries: Tensor, points: Tensor, k: int) -> Tensor:
     """Return the ``(B, M, k)`` nearest rows."""
-    if torch.compiler.is_compiling():  # a graph cannot contain compiled loops
-        return search_in_blocks(queries, points, k)
-    if k == 1:
-        rows = compiled.nearest(queries, points)
-        rows = None if rows is None else rows[..., None]
-    else:
-        rows = compiled.neighbours(queries, points, k)
+    traced = torch.compiler.is_compiling()  # a graph cannot contain compiled loops
+    rows = None if traced else compiled.nearest(queries, points, k)
     return search_in_blocks(queries, points, k) if rows is None else rows
 
 
