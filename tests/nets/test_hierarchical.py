@@ -14,7 +14,7 @@ from mops_lightning.types import Batch
 
 SAMPLERS: tuple[Any, ...] = (
     *(mops.FPSSampler, mops.RandomSampler, mops.SerialSampler, mops.VoxelSampler),
-    *(mops.SNet, mops.SampleNet, mops.GumbelSampler, mops.MOPSNet),
+    *(mops.SNet, mops.SampleNet, mops.GumbelSampler, mops.CriticalSampler, mops.MOPSNet),
     *(partial(mops.MOPSNet, anchors="fps"), lambda m: mops.FMOPSNet(m_max=m)),
 )
 

@@ -5,6 +5,7 @@ import torch
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.critical_points import CriticalSampler
 from mops_lightning.samplers.ordering import seeded_order
 from tests.support.plain import plain_farthest
@@ -56,7 +57,17 @@ def test_critical_large_batch_equals_small_ones(rng, monkeypatch):
 )
 def test_critical_unsuitable_net_raises(net, words):
     with pytest.raises(UserError, match=words):
-        CriticalSampler(4, net)
+        CriticalSampler(4, net)(torch.rand(1, 9, 3))
+
+
+def test_critical_by_features_equals_those_of_a_net(rng):
+    net = PointNetVanilla(3).eval()
+    points = torch.randn(3, 60, 3, generator=rng)
+    expected = CriticalSampler(20, net)(points)
+    found = CriticalSampler(20).by_features(points, net.point_features(points), 20)
+    assert torch.equal(found.points, expected.points)
+    assert found.indices is not None
+    assert torch.equal(gather_points(points, found.indices), found.points)
 
 
 class FirstAxis(torch.nn.Module):

@@ -28,8 +28,8 @@ class Stage(nn.Module):
     ``carried``. The offset o_ij is (p_j − q_i)/r, where r is the root mean square of the distances
     ‖p_j − q_i‖ of a cloud, so that offsets are of one size in all stages; PointNeXt (Qian et al.,
     NeurIPS 2022) divides them by a fixed radius. s_i, the means of o_ij and of the products of its
-    coordinates, describes the plane and the normal of the neighbourhood. As A and B are
-    linear, only A·f_j + B·p_j/r depends on j, so that no tensor of all edges' features is made.
+    coordinates, describes the plane of the neighbourhood. As A and B are linear, only A·f_j +
+    B·p_j/r depends on j, so that no tensor of all edges' features is made.
 
     Args:
         sampler: returns the centres.
@@ -68,7 +68,8 @@ class Stage(nn.Module):
                 f"its {type(self.sampler).__name__} returns {self.m} points only. Lower it, or "
                 "choose sampler@task.net.sampler=fps."
             )
-        output: SampleOutput = self.sampler(points, min(self.m, n))
+        of, m = getattr(self.sampler, "by_features", None), min(self.m, n)
+        output: SampleOutput = of(points, features, m) if of else self.sampler(points, m)
         self.losses = output.losses
         centres = output.points
         distances, rows = k_nearest(centres, points, min(self.k, n))

@@ -1,5 +1,7 @@
 """Critical points: the points that win the task net's max-pooling."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -26,17 +28,18 @@ class CriticalSampler(Sampler):
     so ``parameters``, ``state_dict`` and ``to`` leave it out.
 
     Differences from the publication: there, the layer is inside a classifier that is trained with
-    it, and works on that classifier's intermediate features; here, it selects input points by the
-    features of a task net that was trained without it. Where a cloud has fewer than m critical
-    points, the publication repeats points; here, farthest points follow.
+    it, and works on that classifier's intermediate features, as ``by_features`` does in a
+    hierarchical net; alone, it selects input points by the features of a task net that was trained
+    without it. Where a cloud has fewer than m critical points, the publication repeats points;
+    here, farthest points follow.
 
     Args:
         m: largest number of points to return.
-        net: the task net; it is used in evaluation mode and without gradients.
+        net: the task net; it is used in evaluation mode and without gradients. Inside a net, None.
         seed: breaks ties, as for ``FPSSampler``.
 
     Raises:
-        UserError: ``net`` is missing, or has no features of single points under a maximum.
+        UserError: ``net`` is missing in a call, or has no features of points under a maximum.
 
     Examples:
         >>> import torch
@@ -52,12 +55,7 @@ class CriticalSampler(Sampler):
 
     def __init__(self, m: int, net: nn.Module | None = None, seed: int = 0) -> None:
         super().__init__(m)
-        if net is None:
-            raise UserError(
-                "net must be the task net: CriticalSampler selects points by the net's features "
-                "and has no weights. In Python: CriticalSampler(m, net=task.net)."
-            )
-        if not isinstance(net, PointFeatureNet):
+        if not isinstance(net, PointFeatureNet | None):
             raise UserError(
                 "net must have features of single points under a maximum (point_features), as "
                 f"CriticalSampler needs them, got {type(net).__name__}. Choose another sampler; "
@@ -66,30 +64,30 @@ class CriticalSampler(Sampler):
         self._net = (net,)  # in a tuple, torch does not register it as a submodule
         self.seed = seed
 
-    @property
-    def net(self) -> PointFeatureNet:
-        """The task net."""
-        net = self._net[0]
-        assert isinstance(net, PointFeatureNet)
-        return net
-
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice."""
         order = seeded_order(points, self.seed)
-        ordered = gather_points(points.detach(), order)
-        filled = farthest_point_fill(ordered, *self._chosen(ordered, m))
-        indices = order.gather(1, filled)
-        return SampleOutput(gather_points(points, indices), indices, {})
+        return _filled(points, order, *self._chosen(gather_points(points.detach(), order), m))
+
+    def by_features(self, points: Tensor, features: Tensor, m: int) -> SampleOutput:
+        """Choose by the features ``(B, N, C)``, non-negative, that points have inside a net."""
+        order = seeded_order(points, self.seed)
+        return _filled(points, order, *critical_points(gather_points(features, order), m))
 
     @torch.no_grad()
     def _chosen(self, points: Tensor, m: int) -> tuple[Tensor, Tensor]:
-        net = self._net[0]
+        net: Any = self._net[0]
+        if net is None:
+            raise UserError(
+                "net must be the task net: CriticalSampler selects points by the net's features "
+                "and has no weights. In Python: CriticalSampler(m, net=task.net)."
+            )
         like = next(net.parameters(), points)
         modes = {module: module.training for module in net.modules()}
         batches = points.split(max(1, BATCH_POINTS // points.shape[1]))
         net.eval()
         try:
-            parts = [critical_points(self.net.point_features(part.to(like)), m) for part in batches]
+            parts = [critical_points(net.point_features(part.to(like)), m) for part in batches]
         finally:
             for module, mode in modes.items():
                 module.training = mode
@@ -97,6 +95,14 @@ class CriticalSampler(Sampler):
         return torch.cat(rows).to(points.device), torch.cat(counts).to(points.device)
 
 
+def _filled(points: Tensor, order: Tensor, rows: Tensor, counts: Tensor) -> SampleOutput:
+    """Return the first of the rows of reordered points, as many as count, and farthest points."""
+    filled = farthest_point_fill(gather_points(points.detach(), order), rows, counts)
+    indices = order.gather(1, filled)
+    return SampleOutput(gather_points(points, indices), indices, {})
+
+
+@torch.no_grad()
 def critical_points(features: Tensor, m: int) -> tuple[Tensor, Tensor]:
     """Choose the points with the largest contributions to the maxima of the channels.
 

@@ -22,7 +22,7 @@ def test_factory_gives_task_net_to_samplers_that_need_it():
         made: Any = make_experiment(compose([*overrides, "m=8"]), small_dataset(), {})
         sampler = made.baselines["critical"] if len(made.baselines) else made.sampler
         assert isinstance(sampler, CriticalSampler)
-        assert sampler.net is made.task.net
+        assert sampler._net == (made.task.net,)
         assert not any(name.startswith(("sampler.net", "baselines")) for name in made.state_dict())
 
 
