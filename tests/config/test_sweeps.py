@@ -105,7 +105,7 @@ def test_sweep_neighbours_differ_in_what_is_swept(name):
         ("ablation", 18),
         ("segmentation", 23),
         ("registration", 23),
-        ("hierarchical", 11),
+        ("hierarchical", 12),
     ],
 )
 def test_cells_of_several_grids_have_folders_of_their_own(name, number):
