@@ -271,13 +271,19 @@ def neighbours(peak: dict[str, float], rounds: int) -> list[Row]:
         shared = {name: int((call() == own).sum()) for name, call in others.items()}
         for row in _rows("search", calls | others, {"N": number, "m": m}, rounds, peak):
             rows.append({**row, "points as ours": shared.get(row["search"], m)})
+    return rows
+
+
+def several(peak: dict[str, float], rounds: int) -> list[Row]:
+    """The k nearest points, by compiled loops and in torch."""
+    rows: list[Row] = []
     for number, m, k in ((1024, 256, 16), (1024, 1024, 32), (40_960, 4096, 16)):
         points, queries = cloud(number), cloud(m + 1)[:, :m]
-        several: Calls = {
+        calls: Calls = {
             f"{k} nearest": partial(k_nearest, queries, points, k),
             f"{k} nearest, in torch": partial(search_in_blocks, queries, points, k),
         }
-        rows += _rows("search", several, {"N": number, "m": m}, rounds, peak)
+        rows += _rows("search", calls, {"N": number, "m": m}, rounds, peak)
     return rows
 
 
@@ -334,6 +340,7 @@ ALL: dict[str, Callable[[dict[str, float], int], list[Row]]] = {
     "completed": completed,
     "poisson": poisson,
     "neighbours": neighbours,
+    "several": several,
     "growth": growth,
     # Last, because they change the process's memory settings; also on the command line.
     "training": training,
