@@ -68,8 +68,8 @@ class Stage(nn.Module):
                 f"its {type(self.sampler).__name__} returns {self.m} points only. Lower it, or "
                 "choose sampler@task.net.sampler=fps."
             )
-        of, m = getattr(self.sampler, "by_features", None), min(self.m, n)
-        output: SampleOutput = of(points, features, m) if of else self.sampler(points, m)
+        choose, m = getattr(self.sampler, "by_features", None), min(self.m, n)
+        output: SampleOutput = choose(points, features, m) if choose else self.sampler(points, m)
         self.losses = output.losses
         centres = output.points
         distances, rows = k_nearest(centres, points, min(self.k, n))

@@ -70,7 +70,7 @@ class CriticalSampler(Sampler):
         return _filled(points, order, *self._chosen(gather_points(points.detach(), order), m))
 
     def by_features(self, points: Tensor, features: Tensor, m: int) -> SampleOutput:
-        """Choose by the features ``(B, N, C)``, non-negative, that points have inside a net."""
+        """Choose by non-negative features ``(B, N, C)`` that the points have inside a net."""
         order = seeded_order(points, self.seed)
         return _filled(points, order, *critical_points(gather_points(features, order), m))
 
@@ -96,7 +96,7 @@ class CriticalSampler(Sampler):
 
 
 def _filled(points: Tensor, order: Tensor, rows: Tensor, counts: Tensor) -> SampleOutput:
-    """Return the first of the rows of reordered points, as many as count, and farthest points."""
+    """Return the points in the first ``counts`` rows, then farthest points."""
     filled = farthest_point_fill(gather_points(points.detach(), order), rows, counts)
     indices = order.gather(1, filled)
     return SampleOutput(gather_points(points, indices), indices, {})
