@@ -91,7 +91,8 @@ def test_sweep_neighbours_differ_in_what_is_swept(name):
             )
             different = {path for path in {**one, **other} if one.get(path) != other.get(path)}
             # A sampler may have an optimizer of its own.
-            allowed = ("sampler.", "optimizer.", "names.sampler") if key == "sampler" else (key.split("@")[-1],)
+            placed = (key.split("@")[-1],)
+            allowed = ("sampler.", "optimizer.", "names.sampler") if key == "sampler" else placed
             followers = {f"sampler.{key}"} if key in ("m", "seed") else set()
             followers |= {"dataset.seed", "task.net.sampler.seed"} if key == "seed" else set()
             followers |= {"task.net.sampler.m"} if key == "task.net.points" else set()
