@@ -59,7 +59,6 @@ LATE = "+trainer.val_check_interval=100"
         ([*TINY, "logger=tensorboard", "+logger.foo=1"], "takes no setting 'foo'"),
         (["names={}"], "names={}: names follow from the chosen groups"),
         (["sampler@baselines.x=null"], "sampler@baselines.x=null: choose one"),
-        (["--shell-completion"], "Expecting one subcommand from"),
         (["--shell-completion", "install=sh"], "No completion plugin for"),
         (["pretrain_from=nowhere"], "pretrain_from: no file or model 'nowhere'"),
         (["weights=nowhere.pt", *TINY_WITH_PICTURES], "weights: no file nowhere.pt"),

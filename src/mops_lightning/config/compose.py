@@ -274,3 +274,4 @@ def selectable_groups() -> str:
 
 for resolver in (group_choices, run_label, run_level_keys, selectable_groups):
     OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
+OmegaConf.register_new_resolver("smaller", min, replace=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import torch
@@ -17,7 +18,7 @@ from mops_lightning.zoo.model_file import damaged as damaged
 from mops_lightning.zoo.model_file import digest as digest
 
 FILE = f"weights{model_file.SUFFIX}"
-OTHER_NET = "Check task, task/net and dataset.classes, or use weights=auto."
+OTHER_NET = "Check task, task/net, samplers inside it and dataset.classes, or use weights=auto."
 
 
 def save(
@@ -167,8 +168,8 @@ def fit_state(
         module.load_state_dict(state, strict=True, assign=assign)
     except RuntimeError as error:
         _, *differences = str(error).splitlines()
-        listed = " ".join(" ".join(differences).split())
-        raise UserError(f"{path} holds another net's weights: {listed[:300]} {hint}") from None
+        listed = shorten(" ".join(differences), 300)
+        raise UserError(f"{path} holds another net's weights: {listed} {hint}") from None
 
 
 def first_nonfinite(state: Any, name: str = "") -> str | None:
