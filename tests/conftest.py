@@ -20,8 +20,7 @@ from tests.support.kept_choices import keep_choices
 if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(2)
 
-# Composing makes many objects, and each full collection would search all of torch: a fifth of
-# the time of tests that compose.
+# Composing makes many objects, and each full collection would search all of torch.
 gc.freeze()
 gc.set_threshold(50_000, 20, 50)
 keep_choices()

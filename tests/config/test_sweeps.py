@@ -1,5 +1,6 @@
 """The files below sweeps/: each composes, and names every cell apart."""
 
+import pickle
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ from hydra_plugins.grid_sweeper import parsed
 from mops_lightning.config.compose import conf_dir
 from mops_lightning.config.validate import check
 from mops_lightning.records.run_record import dotted
-from tests.support.kept_choices import copied
 
 ROOT = Path(__file__).parents[2] / "sweeps"
 SWEEPS = sorted(path.stem for path in ROOT.glob("*.yaml"))
@@ -28,11 +28,11 @@ TESTS_ONLY = ("noise", "corruptions")
 def composed_once(name, overrides):
     path = [f"hydra.searchpath=[file://{conf_dir()}]"]
     with initialize_config_dir(str(ROOT), version_base="1.3"):
-        return compose(name, [*path, *overrides], return_hydra_config=True)
+        return pickle.dumps(compose(name, [*path, *overrides], return_hydra_config=True))
 
 
 def composed(name, overrides=()):
-    cfg = copied(composed_once(name, tuple(overrides)))
+    cfg = pickle.loads(composed_once(name, tuple(overrides)))
     HydraConfig.instance().set_config(cfg)
     return cfg
 
@@ -128,6 +128,5 @@ def texts(override):
 @cache
 def settings_of(name, overrides):
     cfg = composed(name, overrides)
-    OmegaConf.set_struct(cfg, False)
-    del cfg["hydra"]
-    return dotted(OmegaConf.to_container(cfg, resolve=True))
+    plain = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+    return dotted(OmegaConf.to_container(plain, resolve=True))
