@@ -272,6 +272,5 @@ def selectable_groups() -> str:
     return "\n".join(sorted(lines))
 
 
-for resolver in (group_choices, run_label, run_level_keys, selectable_groups):
+for resolver in (group_choices, run_label, run_level_keys, selectable_groups, min):
     OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
-OmegaConf.register_new_resolver("smaller", min, replace=True)
