@@ -5,7 +5,6 @@ import pytest
 from mops_lightning.config.compose import check_overrides
 from tests.support.command_line import TINY, TINY_WITH_PICTURES, refused
 
-PLACED = "sampler@task.net.sampler=fmops"
 LATE = "+trainer.val_check_interval=100"
 
 
@@ -31,7 +30,6 @@ LATE = "+trainer.val_check_interval=100"
         (["sampler=fps,null"], "sampler=fps,null: choose one"),
         (["sampler=[mops]"], "sampler=[mops]: choose one"),
         (["sampler={}"], "sampler={}: choose one"),
-        (["task/net=hierarchical", PLACED], f"{PLACED}: its file depends on the task and"),
         (["optimizer=[one_cycle,null]"], "choose one with optimizer=NAME"),
         (["=8"], "'=8' has no key. Settings are KEY=VALUE"),
         (["ckpt_path=nowhere.pt", *TINY_WITH_PICTURES], "ckpt_path: no checkpoint nowhere.pt"),

@@ -84,10 +84,7 @@ def test_map_with_several_rows_averages_scores(scan, tmp_path):
         (["--map", "map.npz", "--map-k", 9], "--map-k must be from 1 to --m, got 9"),
         (["--map-k", 3], "--map-k 3 has no effect without --map"),
         (["--map", "old.npz"], "old.npz exists. Give another --map, or --overwrite"),
-        (
-            ["--map", "map.npz", "--chunk", 60],
-            "--map needs the whole cloud in memory: use",
-        ),
+        (["--map", "map.npz", "--chunk", 60], "--map needs the whole cloud in memory: use"),
         (["--map", "small.npz"], "--map must differ from IN and OUT"),
     ],
 )

@@ -7,6 +7,8 @@ import pytest
 import torch
 
 import mops_lightning as mops
+from mops_lightning.config.build import build
+from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.nets.hierarchical import HierarchicalNet, Stage, carried
 from mops_lightning.tasks.classification import Classification
@@ -15,7 +17,7 @@ from mops_lightning.types import Batch
 SAMPLERS: tuple[Any, ...] = (
     *(mops.FPSSampler, mops.RandomSampler, mops.SerialSampler, mops.VoxelSampler),
     *(mops.SNet, mops.SampleNet, mops.GumbelSampler, mops.CriticalSampler, mops.MOPSNet),
-    *(partial(mops.MOPSNet, anchors="fps"), lambda m: mops.FMOPSNet(m_max=m)),
+    *(partial(mops.MOPSNet, anchors="fps"), partial(mops.FMOPSNet, num_sizes=1)),
 )
 
 
@@ -28,6 +30,17 @@ def test_stages_train_any_sampler(sampler, rng):
     for stage in net.stages:
         assert stage.sampler.m in (20, 8)
         assert all(p.grad is not None for p in stage.sampler.parameters())
+
+
+def test_fmops_by_name_draws_a_size_for_every_step(rng):
+    placed = "sampler@task.net.sampler=fmops"
+    node = compose(["task/net=hierarchical", placed, "task.net.points=[32,16,8,4]"]).task.net
+    net: Any = build(node, "task.net", num_classes=5)
+    points = torch.randn(4, 40, 3, generator=rng)
+    drawn = {tuple(p.shape[1] for p, _ in net.levels(points)[1:]) for _ in range(9)}
+    powers = torch.tensor(sorted(drawn)).log() / torch.tensor(list(node.points)).log()
+    assert 0.5 <= powers.min() < powers.max() <= 1  # 2 = 4^0.5 is the integer part of 4^0.75
+    assert [p.shape[1] for p, _ in net.eval().levels(points[:, :10])] == [10, 10, 10, 8, 4]
 
 
 def plain_stage(stage, points, features):

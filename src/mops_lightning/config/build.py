@@ -3,7 +3,7 @@
 import inspect
 import logging
 import re
-from functools import partial
+from functools import partial, update_wrapper
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -58,7 +58,7 @@ def build(node: Any, where: str = "", **extra: Any) -> Any:
             raise
         raise _with_path(known, node, where, tuple(extra)) from None
     if isinstance(node, DictConfig) and node.get("_partial_"):
-        return partial(_call, made, node, where)
+        return update_wrapper(partial(_call, made, node, where), made)
     return made
 
 

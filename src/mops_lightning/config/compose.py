@@ -150,12 +150,6 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
         texts.append(str(cause).strip())
         cause = cause.__cause__
     for text in texts:
-        if text.startswith("Error resolving interpolation"):
-            placed = next((part for part in arguments if "@" in key_of(part)), "this choice")
-            return (
-                f"{placed}: its file depends on the task and the recipe, so that it cannot be "
-                "chosen here. Choose a sampler of one size, or one that needs no training."
-            )
         if "Could not override '" in text:
             key = text.split("Could not override '")[1].split("'")[0]
             inside = re.search(r"is not in struct\s+full_key: (\S+)", "\n".join(texts))

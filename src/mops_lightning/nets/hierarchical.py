@@ -4,8 +4,10 @@ The paper's conclusion proposes its sampler in place of farthest point sampling 
 of which PointNet++ is the first (Qi et al., NeurIPS 2017).
 """
 
+import inspect
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -33,7 +35,9 @@ class Stage(nn.Module):
 
     Args:
         sampler: returns the centres.
-        m: number of centres; of clouds with fewer points, a flexible sampler returns all.
+        m: number of centres; of clouds with fewer points, a flexible sampler returns all. A sampler
+            trained for many sizes draws one in every training step, the largest of its
+            ``training_sizes``.
         channels_in: channels of f.
         channels_out: channels of the result.
         k: number of neighbours; all points if there are fewer.
@@ -43,7 +47,7 @@ class Stage(nn.Module):
         self, sampler: nn.Module, m: int, channels_in: int, channels_out: int, k: int
     ) -> None:
         super().__init__()
-        self.sampler = sampler
+        self.sampler: Any = sampler
         self.m = m
         self.k = k
         self.feature = nn.Linear(channels_in, channels_out, bias=False)
@@ -68,7 +72,8 @@ class Stage(nn.Module):
                 f"its {type(self.sampler).__name__} returns {self.m} points only. Lower it, or "
                 "choose sampler@task.net.sampler=fps."
             )
-        choose, m = getattr(self.sampler, "by_features", None), min(self.m, n)
+        sizes = self.sampler.training_sizes() if self.training else (self.m,)
+        choose, m = getattr(self.sampler, "by_features", None), min(max(sizes), n)
         output: SampleOutput = choose(points, features, m) if choose else self.sampler(points, m)
         self.losses = output.losses
         centres = output.points
@@ -111,7 +116,8 @@ class Hierarchy(nn.Module):
     """Stages that sample and look at neighbourhoods; base of the nets of this module.
 
     Args:
-        sampler: makes the sampler of a stage from its number of points, given as ``m``.
+        sampler: makes the sampler of a stage from its number of points, given as ``m_max`` if it
+            takes that, otherwise as ``m``.
         points: number of points after every stage.
         channels: channels of the features before the first stage and after every stage.
         k: number of neighbours.
@@ -138,9 +144,10 @@ class Hierarchy(nn.Module):
                 f"channels must have one number more than the {len(points)} of points, got "
                 f"{len(channels)}."
             )
+        size = "m_max" if "m_max" in inspect.signature(sampler).parameters else "m"
         self.stem = PointMLP([3, channels[0], channels[0]])
         self.stages = nn.ModuleList(
-            Stage(sampler(m=m), m, before, after, k)
+            Stage(sampler(**{size: m}), m, before, after, k)
             for m, (before, after) in zip(points, pairwise(channels), strict=True)
         )
 
@@ -166,7 +173,7 @@ class HierarchicalNet(Hierarchy):
 
     Args:
         num_classes: number of logits.
-        sampler: makes the sampler of a stage from its number of points, given as ``m``.
+        sampler: makes the sampler of a stage; see ``Hierarchy``.
         points: number of points after every stage.
         channels: channels of the features before the first stage and after every stage.
         k: number of neighbours.
