@@ -61,6 +61,7 @@ def test_second_run_in_folder_writes_nothing(tmp_path):
         (["learn=task", "recipe.ema_span=0.1"], "with learn=task"),
         (["learn=task", "sampler.alpha=3"], "with learn=task"),
         (["learn=task", "sizes=[8,16]"], "with learn=task"),
+        (["task/net=hierarchical", "task.net.sampler.m=5"], "beside task.net.points"),
         (["learn=task", "pretrain.lr=0.1"], "with learn=task"),
         (["learn=joint", "recipe.distillation=1"], "without learn=sampler"),
         (["learn=joint", "recipe.nets_per_step=1"], "without learn=sampler"),

@@ -110,7 +110,7 @@ def _why_without_effect(cfg: DictConfig, path: str, is_trained: Callable[[], boo
     if path in settings.declared() and setting.group:
         return ""  # a choice may change settings of other groups
     if not setting.counts(cfg.learn):
-        return f"with learn={cfg.learn}"
+        return f"with learn={cfg.learn}" if setting.learn else "beside task.net.points"
     name, _, value = NEEDS.get(path, "learn").partition("=")
     needed = OmegaConf.select(cfg, name)
     if not needed or (value and needed != value):

@@ -206,7 +206,7 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
 def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
     """Compose the groups that the command line chooses, without its other settings."""
     try:
-        return composed([part for part in arguments if key_of(part) in groups])
+        return composed([part for part in arguments if key_of(part).partition("@")[0] in groups])
     except Exception:  # the mistake may be among them
         return composed([])
 

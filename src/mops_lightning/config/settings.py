@@ -264,7 +264,7 @@ INSIDE: dict[str, dict[str, Any]] = {
     "sampler.m_max": {"compare": False},
     "sampler.seed": {"compare": False},
     "sampler.threshold": {"affects": Affects.SCORES},
-    **{f"task.net.sampler.{size}": _NOTHING for size in ("m", "m_max")},  # stages give their own
+    **{f"task.net.sampler.{size}": {**_NOTHING, "learn": ()} for size in ("m", "m_max")},
     "recipe.task_points": {"learn": None},
     "optimizer.lr": {"limits": ABOVE_ZERO},
     "pretrain.lr": {"limits": ABOVE_ZERO},
