@@ -173,7 +173,7 @@ def test_evaluation_setting_without_effect_raises(run, argument):
 
 def test_evaluation_sampler_for_a_task_net_alone_raises(tmp_path):
     run = write_run(tmp_path / "run", [*OVERRIDES, "learn=task"])
-    for argument in ("sampler=fps", "sampler.m_max=8", "++sampler.alpha=3", "weights=null"):
+    for argument in ("sampler=fps", "sampler.m_max=8", "++sampler.alpha=3", "weights=null", "m=8"):
         with pytest.raises(UserError, match=r"has no effect .* trained a task net alone\. To test"):
             evaluated(run, argument)
 

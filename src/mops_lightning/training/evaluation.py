@@ -188,7 +188,7 @@ def _check_given(arguments: list[str], trained: TrainedRun) -> None:
                 f"{argument}: has no effect with {KEY}, which trains nothing. Leave it out, or "
                 f"train with the settings of {trained.name} and without {KEY}."
             )
-        if trained.trained_task_net and (path == "weights" or _covers("sampler", path)):
+        if trained.trained_task_net and (path in ("m", "weights") or _covers("sampler", path)):
             raise UserError(
                 f"{argument}: has no effect with {KEY}={trained.name}, which trained a task net "
                 "alone. To test a sampler with it, evaluate the sampler's run with "
