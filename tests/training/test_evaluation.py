@@ -58,9 +58,9 @@ def test_evaluation_has_settings_of_its_run(run):
 
 
 def test_evaluation_of_another_default_keeps_the_value_of_its_run(tmp_path):
-    values = {"batch_size": 7, "sampler.alpha": 5.0, "dataset.test_per_class": 2, "augment": {}}
-    cfg = evaluated(write_run(tmp_path / "run", changes=values))
-    assert (cfg.batch_size, cfg.sampler.alpha, cfg.dataset.test_per_class) == (7, 5.0, 2)
+    values = {"batch_size": 7, "sampler.alpha": 5.0, "augment": {}, "names.net": "dgcnn"}
+    cfg = evaluated(write_run(tmp_path / "run", changes=values))  # the net by a sweep's file
+    assert (cfg.batch_size, cfg.sampler.alpha, cfg.names.net) == (7, 5.0, "dgcnn")
 
 
 def test_evaluation_setting_that_follows_another_follows_the_user(tmp_path):

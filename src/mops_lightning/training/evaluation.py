@@ -99,9 +99,9 @@ class TrainedRun:
         Raises:
             UserError: the record chooses a file by a path.
         """
-        used = self.record.config["names"]
-        groups = {group: used[group] for group in ("task", "dataset", "sampler")}
-        chosen = [f"{group}={choice}" for group, choice in groups.items()]
+        used = self.record.config["names"]  # a sweep's file may choose them
+        groups = {"task": "task", "net": "task/net", "dataset": "dataset", "sampler": "sampler"}
+        chosen = [f"{group}={used[name]}" for name, group in groups.items() if used[name]]
         for argument in self.record.overrides:
             key = overrides.key(argument)
             if ("/" in key or "@" in key) and _is_repeated(overrides.path(argument)):
