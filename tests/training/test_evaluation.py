@@ -58,9 +58,9 @@ def test_evaluation_has_settings_of_its_run(run):
 
 
 def test_evaluation_of_another_default_keeps_the_value_of_its_run(tmp_path):
-    values = {"batch_size": 7, "sampler.alpha": 5.0, "augment": {}, "names.net": "dgcnn"}
-    cfg = evaluated(write_run(tmp_path / "run", changes=values))  # the net by a sweep's file
-    assert (cfg.batch_size, cfg.sampler.alpha, cfg.names.net) == (7, 5.0, "dgcnn")
+    values = {"sampler.alpha": 5.0, "names.net": "hierarchical", "names.stages": "random"}
+    cfg = evaluated(write_run(tmp_path / "run", changes={**values, "augment": {}}))
+    assert (cfg.sampler.alpha, cfg.names.stages) == (5.0, "random")  # by a sweep's file
 
 
 def test_evaluation_setting_that_follows_another_follows_the_user(tmp_path):
@@ -173,7 +173,7 @@ def test_evaluation_setting_without_effect_raises(run, argument):
 
 def test_evaluation_sampler_for_a_task_net_alone_raises(tmp_path):
     run = write_run(tmp_path / "run", [*OVERRIDES, "learn=task"])
-    for argument in ("sampler=fps", "sampler.m_max=8", "++sampler.alpha=3", "weights=null", "m=8"):
+    for argument in ("sampler=fps", "sampler.m_max=8", "sizes=[8]", "weights=null", "m=8"):
         with pytest.raises(UserError, match=r"has no effect .* trained a task net alone\. To test"):
             evaluated(run, argument)
 

@@ -212,12 +212,14 @@ def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
 
 
 def group_choices() -> DictConfig:
-    """Return the names of the chosen task, task net, data set, sampler and recipe."""
+    """Return the names of the chosen files: task, task net, sampler of its stages, …."""
     from hydra.core.hydra_config import HydraConfig
 
     choices = HydraConfig.get().runtime.choices
-    # A node, so that interpolations find the names below it.
-    return OmegaConf.create({group.rpartition("/")[2]: choices.get(group) for group in NAMED})
+    names = {group.rpartition("/")[2]: choices.get(group) for group in NAMED}
+    if inside := choices.get("sampler@task.net.sampler"):
+        names["stages"] = inside
+    return OmegaConf.create(names)  # a node, so that interpolations find the names below it
 
 
 def run_label(_root_: DictConfig) -> str:

@@ -35,9 +35,8 @@ class Stage(nn.Module):
 
     Args:
         sampler: returns the centres.
-        m: number of centres; of clouds with fewer points, a flexible sampler returns all. A sampler
-            trained for many sizes draws one in every training step, the largest of its
-            ``training_sizes``.
+        m: number of centres; of clouds with fewer points, a flexible sampler returns all. Training
+            steps take the largest of the sampler's ``training_sizes``.
         channels_in: channels of f.
         channels_out: channels of the result.
         k: number of neighbours; all points if there are fewer.
@@ -217,12 +216,8 @@ class HierarchicalSegmentation(Hierarchy):
     features that these points have, and mapped by a pointwise layer, as in PointNet++.
 
     Args:
-        num_parts: number of logits of a point.
-        sampler: see ``HierarchicalNet``, as all other arguments.
-        points: number of points after every stage.
-        channels: channels of the features before the first stage and after every stage.
-        k: number of neighbours.
-        dropout: dropout probability.
+        num_parts: number of logits of a point. The other arguments are those of
+            ``HierarchicalNet``.
 
     Raises:
         UserError: an argument is out of range.

@@ -33,6 +33,7 @@ NAME = re.compile(r"[A-Za-z0-9_-]+")
 OF_SAMPLER = (
     *("learn", "experiment", "optimizer", "task_lr_scale", "recipe", "trainer.max_epochs"),
     *("epochs.sampler", "augment.sampler", "other_nets"),
+    *("task.net.sampler.m", "task.net.sampler.m_max"),
 )
 """Settings of the training of a sampler."""
 OF_TRAINING = (
@@ -101,7 +102,8 @@ class TrainedRun:
         """
         used = self.record.config["names"]  # a sweep's file may choose them
         groups = {"task": "task", "net": "task/net", "dataset": "dataset", "sampler": "sampler"}
-        chosen = [f"{group}={used[name]}" for name, group in groups.items() if used[name]]
+        groups["stages"] = "sampler@task.net.sampler"
+        chosen = [f"{group}={used[name]}" for name, group in groups.items() if used.get(name)]
         for argument in self.record.overrides:
             key = overrides.key(argument)
             if ("/" in key or "@" in key) and _is_repeated(overrides.path(argument)):
@@ -188,7 +190,8 @@ def _check_given(arguments: list[str], trained: TrainedRun) -> None:
                 f"{argument}: has no effect with {KEY}, which trains nothing. Leave it out, or "
                 f"train with the settings of {trained.name} and without {KEY}."
             )
-        if trained.trained_task_net and (path in ("m", "weights") or _covers("sampler", path)):
+        of_sampler = path in ("m", "sizes", "weights") or _covers("sampler", path)
+        if trained.trained_task_net and of_sampler:
             raise UserError(
                 f"{argument}: has no effect with {KEY}={trained.name}, which trained a task net "
                 "alone. To test a sampler with it, evaluate the sampler's run with "
