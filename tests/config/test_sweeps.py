@@ -94,7 +94,7 @@ def test_sweep_neighbours_differ_in_what_is_swept(name):
             )
             different = {path for path in {**one, **other} if one.get(path) != other.get(path)}
             # A sampler may have an optimizer of its own.
-            placed = (key.split("@")[-1],)
+            placed = (key.split("@")[-1], "names.stages")
             allowed = ("sampler.", "optimizer.", "names.sampler") if key == "sampler" else placed
             followers = {f"sampler.{key}", f"task.net.sampler.{key}", f"dataset.{key}"}
             assert not {path for path in different - followers if not path.startswith(allowed)}
