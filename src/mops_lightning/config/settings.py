@@ -265,6 +265,7 @@ INSIDE: dict[str, dict[str, Any]] = {
     "sampler.seed": {"compare": False},
     "sampler.threshold": {"affects": Affects.SCORES},
     **{f"task.net.sampler.{size}": {**_NOTHING, "learn": ()} for size in ("m", "m_max")},
+    "names.stages": _NOTHING,  # the class of the stages' sampler counts
     "recipe.task_points": {"learn": None},
     "optimizer.lr": {"limits": ABOVE_ZERO},
     "pretrain.lr": {"limits": ABOVE_ZERO},
@@ -274,9 +275,7 @@ INSIDE: dict[str, dict[str, Any]] = {
     "epochs.joint": {"limits": whole(0)},
     "logger.flush_logs_every_n_steps": {"limits": whole(1)},
     **{f"trainer.{name}": {"limits": limits} for name, limits in TRAINER.items()},
-    "trainer._target_": _NOTHING,
-    "trainer.accelerator": _NOTHING,
-    "trainer.devices": _NOTHING,
+    **{f"trainer.{name}": _NOTHING for name in ("_target_", "accelerator", "devices")},
     "trainer.strategy": {**_NOTHING, "limits": TRAINER["strategy"]},
 }
 """Settings inside groups: how they differ from their group."""
