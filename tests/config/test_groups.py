@@ -1,6 +1,5 @@
 """The groups of conf/: what one run's configuration shows, and what depends on several groups."""
 
-import re
 from functools import cache
 from typing import Any
 
@@ -44,7 +43,7 @@ def test_help_shows_every_key_and_choice(tmp_path):
 
 def test_no_default_is_computed_from_other_choices():
     for path in conf_dir().rglob("*.yaml"):
-        text = re.sub(r"(?m)^defaults:\n( .*\n)*", "", path.read_text())  # names of files there
+        text = path.read_text().replace("${task}_${oc.select:recipe,none}", "")  # a file's name
         assert not any(word in text for word in ("choose:", "model_for:", "oc.select")), path
 
 

@@ -22,6 +22,7 @@ ON_SHAPES = ("ablation", "segmentation")
 """Sweeps that use the procedural shapes without the overlay."""
 TESTS_ONLY = ("noise", "corruptions")
 """Sweeps that test a trained run."""
+PLACES = ("sampler", "task.net.sampler", "dataset")
 CELLS = "modelnet40=49 ablation=18 segmentation=23 registration=23 hierarchical=21"
 
 
@@ -94,9 +95,9 @@ def test_sweep_neighbours_differ_in_what_is_swept(name):
             )
             different = {path for path in {**one, **other} if one.get(path) != other.get(path)}
             # A sampler may have an optimizer of its own.
-            placed = (key.split("@")[-1], "names.stages")
+            placed = (key.split("@")[-1], *(["names.stages"] if "@" in key else []))
             allowed = ("sampler.", "optimizer.", "names.sampler") if key == "sampler" else placed
-            followers = {f"sampler.{key}", f"task.net.sampler.{key}", f"dataset.{key}"}
+            followers = {f"{place}.{key}" for place in PLACES[: {"m": 2, "seed": 3}.get(key, 0)]}
             assert not {path for path in different - followers if not path.startswith(allowed)}
 
 

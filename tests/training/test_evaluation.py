@@ -2,7 +2,8 @@
 
 import copy
 import json
-from functools import cache
+from functools import cache, reduce
+from operator import getitem
 from typing import Any
 
 import pytest
@@ -29,10 +30,7 @@ def write_run(folder, overrides=OVERRIDES, changes=None, more=()):
     config: Any = copy.deepcopy(composed(*overrides))
     for path, value in (changes or {}).items():
         *nodes, name = path.split(".")
-        node = config
-        for key in nodes:
-            node = node[key]
-        node[name] = value
+        reduce(getitem, nodes, config)[name] = value
     made = record(config, overrides=[*overrides, *more], files={"weights": "weights.safetensors"})
     (folder / "result.json").write_text(json.dumps(made.plain()))
     return folder
@@ -58,9 +56,10 @@ def test_evaluation_has_settings_of_its_run(run):
 
 
 def test_evaluation_of_another_default_keeps_the_value_of_its_run(tmp_path):
-    values = {"sampler.alpha": 5.0, "names.net": "hierarchical", "names.stages": "random"}
+    values: Any = {"batch_size": 7, "sampler.alpha": 5.0, "dataset.test_per_class": 2}
+    values |= {"names.net": "hierarchical", "names.stages": "random"}  # by a sweep's file
     cfg = evaluated(write_run(tmp_path / "run", changes={**values, "augment": {}}))
-    assert (cfg.sampler.alpha, cfg.names.stages) == (5.0, "random")  # by a sweep's file
+    assert [OmegaConf.select(cfg, path) for path in values] == list(values.values())
 
 
 def test_evaluation_setting_that_follows_another_follows_the_user(tmp_path):
@@ -162,7 +161,7 @@ def test_evaluation_record_chooses_no_folder_to_write_and_no_part_of_training(pa
     "argument",
     [
         *("task_lr_scale=3", "trainer.max_epochs=5", "optimizer=exponential", "++optimizer.lr=1"),
-        *("learn=sampler", "experiment=own_scans", "other_nets=null"),
+        *("learn=sampler", "experiment=own_scans", "other_nets=null", "task.net.sampler.m=8"),
     ],
 )
 def test_evaluation_setting_without_effect_raises(run, argument):
@@ -173,7 +172,8 @@ def test_evaluation_setting_without_effect_raises(run, argument):
 
 def test_evaluation_sampler_for_a_task_net_alone_raises(tmp_path):
     run = write_run(tmp_path / "run", [*OVERRIDES, "learn=task"])
-    for argument in ("sampler=fps", "sampler.m_max=8", "sizes=[8]", "weights=null", "m=8"):
+    known = ("sampler=fps", "sampler.m_max=8", "++sampler.alpha=3", "weights=null")
+    for argument in (*known, "m=8", "sizes=[8]"):
         with pytest.raises(UserError, match=r"has no effect .* trained a task net alone\. To test"):
             evaluated(run, argument)
 

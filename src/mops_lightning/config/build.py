@@ -58,6 +58,7 @@ def build(node: Any, where: str = "", **extra: Any) -> Any:
             raise
         raise _with_path(known, node, where, tuple(extra)) from None
     if isinstance(node, DictConfig) and node.get("_partial_"):
+        # Its signature says whether it takes m or m_max.
         return update_wrapper(partial(_call, made, node, where), made)
     return made
 

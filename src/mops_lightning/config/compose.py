@@ -22,8 +22,9 @@ from mops_lightning.config.validate import refusal
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.records.run_record import dotted
 
-NAMED = ("task", "task/net", "dataset", "sampler", "recipe")
-"""The groups whose choices are in ``names``."""
+NAMED = {name: name for name in ("task", "dataset", "sampler", "recipe")}
+NAMED |= {"net": "task/net", "stages": "sampler@task.net.sampler"}
+"""The groups whose choices are in ``names``, by name."""
 OTHERWISE = {
     "logger": " (logger=none for none)",
     "callbacks": " or leave single callbacks out with callbacks.NAME=null",
@@ -216,9 +217,9 @@ def group_choices() -> DictConfig:
     from hydra.core.hydra_config import HydraConfig
 
     choices = HydraConfig.get().runtime.choices
-    names = {group.rpartition("/")[2]: choices.get(group) for group in NAMED}
-    if inside := choices.get("sampler@task.net.sampler"):
-        names["stages"] = inside
+    names = {name: choices.get(group) for name, group in NAMED.items()}
+    if not names["stages"]:
+        del names["stages"]  # most nets have none
     return OmegaConf.create(names)  # a node, so that interpolations find the names below it
 
 

@@ -45,7 +45,7 @@ class Setting:
         help: its text in ``--help``.
         affects: what it changes.
         limits: the values it takes; None: all of its type.
-        learn: the values of ``learn`` with which it counts; None: with all.
+        learn: the values of ``learn`` with which it counts; None: with all; (): with none.
         group: whether it is a group of choices, which ``--help`` lists elsewhere.
         nullable: whether it may be removed or null.
         per_learn: whether it has one entry for learn=task and one for training a sampler.

@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mops_lightning.config import overrides, settings
 from mops_lightning.config.build import signature
+from mops_lightning.config.compose import NAMED
 from mops_lightning.config.settings import Affects
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
@@ -33,7 +34,6 @@ NAME = re.compile(r"[A-Za-z0-9_-]+")
 OF_SAMPLER = (
     *("learn", "experiment", "optimizer", "task_lr_scale", "recipe", "trainer.max_epochs"),
     *("epochs.sampler", "augment.sampler", "other_nets"),
-    *("task.net.sampler.m", "task.net.sampler.m_max"),
 )
 """Settings of the training of a sampler."""
 OF_TRAINING = (
@@ -101,8 +101,7 @@ class TrainedRun:
             UserError: the record chooses a file by a path.
         """
         used = self.record.config["names"]  # a sweep's file may choose them
-        groups = {"task": "task", "net": "task/net", "dataset": "dataset", "sampler": "sampler"}
-        groups["stages"] = "sampler@task.net.sampler"
+        groups = {name: group for name, group in NAMED.items() if name != "recipe"}
         chosen = [f"{group}={used[name]}" for name, group in groups.items() if used.get(name)]
         for argument in self.record.overrides:
             key = overrides.key(argument)
@@ -185,7 +184,7 @@ def _check_given(arguments: list[str], trained: TrainedRun) -> None:
     inert = OF_SAMPLER if "weights=auto" in arguments else OF_TRAINING
     for argument in arguments:
         path = overrides.path(argument)
-        if any(_covers(setting, path) for setting in inert):
+        if settings.of(path).learn == () or any(_covers(setting, path) for setting in inert):
             raise UserError(
                 f"{argument}: has no effect with {KEY}, which trains nothing. Leave it out, or "
                 f"train with the settings of {trained.name} and without {KEY}."
