@@ -213,7 +213,7 @@ def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
 
 
 def group_choices() -> DictConfig:
-    """Return the names of the chosen files: task, task net, sampler of its stages, …."""
+    """Return ``names``: the chosen task, task net, sampler of its stages, data set, ...."""
     from hydra.core.hydra_config import HydraConfig
 
     choices = HydraConfig.get().runtime.choices
