@@ -11,6 +11,9 @@ from torch import Tensor
 if TYPE_CHECKING:
     from mops_lightning.ops.sampling_matrix import SamplingMatrix
 
+UNKNOWN = -1
+"""The part number of a point whose part is not known."""
+
 
 class Batch(NamedTuple):
     """One batch of clouds.
@@ -19,7 +22,7 @@ class Batch(NamedTuple):
         points: ``(B, N, 3)``.
         labels: ``(B,)`` int64 class numbers.
         rows: ``(B,)`` int64 rows of the clouds in their split, or None.
-        parts: ``(B, N)`` int64 part numbers of the points, or None.
+        parts: ``(B, N)`` int64 part numbers of the points, or ``UNKNOWN``; or None.
     """
 
     points: Tensor

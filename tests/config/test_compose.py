@@ -61,6 +61,8 @@ LATE = "+trainer.val_check_interval=100"
         (["names={}"], "names={}: names follow from the chosen groups"),
         (["+names.foo=3"], "names follow from the chosen groups"),
         (["sampler@baselines.x=null"], "sampler@baselines.x=null: choose one"),
+        (["sampler@task.net.sampler=mops"], "The stages of task/net=hierarchical have one."),
+        (["task/net=hierarchical", "sampler@task.net.sampler=foo"], "task.net.sampler=foo: no"),
         (["--shell-completion"], "Expecting one subcommand from"),
         (["--shell-completion", "install=sh"], "No completion plugin for"),
         (["pretrain_from=nowhere"], "pretrain_from: no file or model 'nowhere'"),

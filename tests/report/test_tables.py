@@ -48,11 +48,10 @@ def test_later_of_two_equal_runs_counts(tmp_path):
 def test_best_is_bold_and_second_underlined(tmp_path):
     for name, value in (("mops", 0.8), ("snet", 0.7), ("samplenet", 0.8), ("gumbel", 0.6)):
         put(tmp_path, name, 32, {"test/generated/accuracy": value, "test/completed/accuracy": 0.5})
-    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.9, "test/refined/accuracy": 0.95})
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.9})
     text = table(tmp_path)
     lines = dict(line.strip("| ").split(" | ", 1) for line in text.splitlines() if ".00" in line)
     assert lines["fps"] == "**90.00**"  # competes with completed sets
-    assert lines["fps refined (with the task net)"] == "95.00"
     assert lines["mops"] == lines["samplenet"] == "**80.00** / <u>50.00</u>"
     assert lines["snet"] == "<u>70.00</u> / <u>50.00</u>"
     assert lines["gumbel"] == "60.00 / <u>50.00</u>"
@@ -100,18 +99,3 @@ def test_equal_cells_are_named(tmp_path):
     text = table(tmp_path)
     assert "All 3 cells of mops are equal: the settings that differ changed no figure." in text
     assert "cells of snet" not in text
-
-
-def test_cells_refined_samples_have_row_of_their_own(tmp_path):
-    metrics = {"test/full/accuracy": 0.9}
-    for m in (8, 32):
-        metrics |= {f"test/m{m}/{name}/accuracy": m / 100 for name in ("sampled", "refined")}
-    put(tmp_path, "fps", 32, metrics)
-    put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.3, "test/refined/accuracy": 0.7})
-    ours = [row for row in rows(table(tmp_path)) if "paper" not in row[0]]
-    assert ours[1:] == [
-        ["fps", "32.00", "8.00"],
-        ["fps refined (with the task net)", "32.00", "8.00"],
-        ["mops", "30.00", ""],
-        ["mops refined (with the task net)", "70.00", ""],
-    ]

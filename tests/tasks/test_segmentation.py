@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
+from torch.nn import functional as F
 
 from mops_lightning.data import cloud_folder as folder
 from mops_lightning.data.formats.registry import WRITERS
@@ -17,7 +18,7 @@ from mops_lightning.nets.hierarchical import HierarchicalSegmentation
 from mops_lightning.ops.propagation import interpolate
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.tasks.segmentation import Segmentation
-from mops_lightning.types import Batch
+from mops_lightning.types import UNKNOWN, Batch
 
 cloud_folder = partial(
     folder.cloud_folder, test_frames=None, crop="whole", crops=2, n_points=20, label="kind"
@@ -75,6 +76,19 @@ def test_all_points_are_scored_from_few(rng):
         Segmentation(Halves(), 1)
 
 
+def test_points_of_unknown_part_are_neither_learned_nor_scored(rng):
+    points, known = torch.randn(2, 99, 3, generator=rng), torch.rand(2, 99, generator=rng) > 0.3
+    task, parts = Segmentation(Halves(), 2), (points[..., 1] > 0).long()
+    batch = Batch(points, torch.zeros(2).long(), parts=parts.where(known, UNKNOWN))
+    found = task.step(batch, points)
+    loss = F.cross_entropy(task.predict(batch, points)[known], parts[known])
+    torch.testing.assert_close(found.losses["cross_entropy"], loss)
+    scores = task.metrics()(found.predictions, found.targets)
+    assert scores == task.metrics()(found.predictions[known], parts[known])
+    none = task.step(batch._replace(parts=torch.full_like(parts, UNKNOWN)), points)
+    assert none.losses["cross_entropy"] == 0
+
+
 def test_net_follows_order_of_points(rng):
     net = HierarchicalSegmentation(5, FPSSampler, (20, 8), (8, 16, 16), 4).eval()
     points = torch.randn(2, 40, 3, generator=rng)
@@ -113,16 +127,18 @@ def test_shapes_know_their_parts(tmp_path):
 def test_scans_have_parts_of_their_own(suffix, tmp_path, rng):
     for number, kinds in enumerate(([7, 2], [2, 40])):
         points = torch.rand(60, 3, generator=rng).double().numpy()
-        kind = np.where(points[:, 0] > 0.5, *kinds).astype(np.uint8)
+        kind = np.where(points[:, 0] > 0.5, *kinds).astype(np.int16)
+        kind[::4] = -1 - number
         WRITERS[suffix](tmp_path / f"scan{number}{suffix}", Table(points, {"kind": kind}))
     data = cloud_folder(tmp_path)
     assert data.part_names == ("2", "7", "40")
     splits: list[Any] = [data.train, data.test]
     for clouds in splits:
         for cloud, parts in zip(clouds.points, clouds.parts, strict=True):
-            low, high = parts.unique().tolist()
+            unknown, low, high = parts.unique().tolist()
+            assert unknown == UNKNOWN
             right = parts == high
-            sides = cloud[right, 0].mean() - cloud[~right, 0].mean()
+            sides = cloud[right, 0].mean() - cloud[parts == low, 0].mean()
             assert abs(sides) > 0.3
     unlabelled = cloud_folder(tmp_path, label=None)
     assert (unlabelled.train.parts, unlabelled.part_names) == (None, ())

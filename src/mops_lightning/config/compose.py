@@ -147,7 +147,9 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
             if not cause.options:
                 return f"no file {cause.missing_cfg_file} in --config-dir."
             group, _, choice = cause.missing_cfg_file.rpartition("/")
-            return f"{group}={choice}: no such choice.{did_you_mean(choice, cause.options or ())}"
+            asked = [key_of(one) for one in arguments if one.endswith(f"={choice}")]
+            key = next((one for one in asked if one.partition("@")[0] == group), group)
+            return f"{key}={choice}: no such choice.{did_you_mean(choice, cause.options or ())}"
         texts.append(str(cause).strip())
         cause = cause.__cause__
     for text in texts:
@@ -186,6 +188,8 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     groups = _groups()
     if key in groups:
         return f"{key}: its files are chosen by other groups. --cfg job shows what they set."
+    if key.startswith("sampler@"):
+        return f"{key}: no sampler is chosen there. The stages of task/net=hierarchical have one."
     if "/" in key or "@" in key:
         offered = [group for group in groups if _is_offered(group)]
         return f"{key}: no such group of choices.{did_you_mean(key, offered)}"

@@ -25,6 +25,7 @@ from mops_lightning.errors import UserError, check_at_least, did_you_mean
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.ops.points import normalize_unit_sphere
 from mops_lightning.seeding import derive_seed
+from mops_lightning.types import UNKNOWN
 
 Crop = Literal["nearest", "whole", "surface"]
 CROPS = ("nearest", "whole", "surface")
@@ -71,8 +72,8 @@ def cloud_folder(
             --tile``; ``whole`` random points of the cloud; ``surface`` random points on the
             surface of a mesh, uniform by area.
         crops: number of clouds per file; 1 for ``surface``.
-        label: column of the files that says to which part a point belongs, by a whole number; None:
-            the points have no parts. Not with ``surface``.
+        label: column of the files that says to which part a point belongs, by a whole number, below
+            0 if that is unknown; None: the points have no parts. Not with ``surface``.
 
     Returns:
         Float32 clouds ``(S, n_points, 3)`` in the unit sphere, with the centroid at the origin, and
@@ -111,7 +112,11 @@ def cloud_folder(
         folder, names, n_points, crop, crops, seed, cache, label
     )
     numbers = np.unique(np.concatenate(labels_of)) if labels_of else np.empty(0, np.int64)
-    parts_of = [torch.from_numpy(np.searchsorted(numbers, of_file)) for of_file in labels_of]
+    numbers = numbers[numbers >= 0]
+    parts_of = [
+        torch.from_numpy(np.where(of_file < 0, UNKNOWN, np.searchsorted(numbers, of_file)))
+        for of_file in labels_of
+    ]
     clouds = {}
     for split in SPLITS:
         rows = [row for row, of_file in enumerate(splits) if of_file == split]

@@ -24,7 +24,7 @@ class Clouds(NamedTuple):
         labels: ``(S,)`` int64, positions in ``CloudDataset.class_names``.
         sources: ``(S,)`` int64, the same number for clouds that must be in the same split, such as
             the crops of a file; None: no two must.
-        parts: ``(S, N)`` int64, positions in ``CloudDataset.part_names``, or None.
+        parts: ``(S, N)`` int64, positions in ``CloudDataset.part_names`` or ``UNKNOWN``, or None.
     """
 
     points: Tensor

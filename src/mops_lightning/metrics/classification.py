@@ -1,8 +1,8 @@
-"""Accuracy of predicted classes over all clouds of a test."""
+"""How well all clouds of a test are assigned to classes, or their points to parts."""
 
 from typing import Any, ClassVar, Literal
 
-from torchmetrics.classification import MulticlassAccuracy
+from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
 
 from mops_lightning.metrics.base import TableMetric
 
@@ -35,3 +35,20 @@ class MeanClassAccuracy(Accuracy):
     name = "mean_class_accuracy"
     summary_order = 2
     averaging = "macro"
+
+
+class MeanIoU(TableMetric, MulticlassJaccardIndex):
+    """Mean over parts of intersection over union, over the points of all clouds."""
+
+    name = "mean_iou"
+    label = "mean IoU"
+    unit = "%"
+    scale = 100.0
+    summary_order = 1
+
+
+class PointAccuracy(Accuracy):
+    """Fraction of points that are assigned to their part."""
+
+    name = "point_accuracy"
+    summary_order = 2

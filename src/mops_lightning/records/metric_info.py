@@ -46,18 +46,12 @@ def in_summary_order(infos: Iterable[MetricInfo]) -> list[MetricInfo]:
 @cache
 def _package_metrics() -> dict[str, MetricInfo]:
     # Imported here because they need torch.
-    from mops_lightning.metrics import (
-        classification,
-        reconstruction,
-        registration,
-        sampled_set,
-        segmentation,
-    )
+    from mops_lightning.metrics import classification, reconstruction, registration, sampled_set
     from mops_lightning.metrics.base import TableMetric
 
     return {
         value.name: MetricInfo.of(value.name, value)
-        for module in (classification, reconstruction, registration, segmentation, sampled_set)
+        for module in (classification, reconstruction, registration, sampled_set)
         for value in vars(module).values()
         if isinstance(value, type) and issubclass(value, TableMetric) and hasattr(value, "name")
     }

@@ -6,14 +6,12 @@ GENERATED_READOUTS = ("generated", "matched", "completed")
 """The sampler's output; its nearest input points; these made unique and completed by FPS."""
 INDEX_READOUT = "sampled"
 """The only readout of samplers that choose input points."""
-REFINED = "refined"
-"""Points improved by local search with the task net, in records from before it was removed."""
 FULL = "full"
 """The cloud before sampling, as a reference."""
 SOFT_PROJECTED = "soft_projected"
 """Input of SampleNet's task net in training; logged under ``train/`` only, never a result."""
 
-ROWS = (*GENERATED_READOUTS, INDEX_READOUT, REFINED, FULL)
+ROWS = (*GENERATED_READOUTS, INDEX_READOUT, FULL)
 """Readouts in the order of tables, after the baselines."""
 
 

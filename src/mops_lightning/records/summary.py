@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mops_lightning.records.metric_info import in_summary_order, metric_info
-from mops_lightning.records.readout_names import FULL, REFINED, ROWS, parse_metric_name
+from mops_lightning.records.readout_names import FULL, ROWS, parse_metric_name
 from mops_lightning.records.run_record import FILE, RunRecord
 
 OF_TEST_CLOUDS = ("test_noise_std", "test_corruption")
@@ -109,5 +109,4 @@ def _label(readout: str, config: dict[str, Any]) -> str:
         return "all points"
     if readout not in ROWS:
         return baseline_name(config, readout)
-    label = f"{sampler_name(config)} {readout}"
-    return f"{label} (with the task net)" if readout == REFINED else label
+    return f"{sampler_name(config)} {readout}"

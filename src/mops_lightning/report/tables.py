@@ -15,16 +15,12 @@ from mops_lightning.records.readout_names import (
     FULL,
     GENERATED_READOUTS,
     INDEX_READOUT,
-    REFINED,
     parse_metric_name,
 )
 from mops_lightning.records.run_record import Names, RunRecord
 from mops_lightning.records.summary import baseline_name
 from mops_lightning.report.collect import epochs, sampler_row, seed, trained_with
 from mops_lightning.report.comparable import Group, value
-
-WITH_NET = f" {REFINED} (with the task net)"
-"""End of the name of a row of refined samples."""
 
 READOUTS = (INDEX_READOUT, *GENERATED_READOUTS)
 """Readouts of a cell, in its order."""
@@ -193,11 +189,11 @@ def make_table(group: Group, metric: str, net: str) -> Table:
     if values.empty:
         known = set(long["metric"])
         raise UserError(f"--metric: no run has {metric!r}.{did_you_mean(metric, known)}")
-    values["own"] = values["readout"].isin([*READOUTS, REFINED])
+    values["own"] = values["readout"].isin(READOUTS)
     if group.settings:  # the run's own size only
         values = values[values["m"] == values["size"]]
     if group.planes:
-        values = values[values["own"] & (values["readout"] != REFINED)]
+        values = values[values["own"]]
     # Joint training gives each run its own task net, under which its baselines ran too.
     values = values[values["own"] | (values["learn"] != "joint")]
     values["readout"] = values["readout"].where(values["readout"].isin(READOUTS), INDEX_READOUT)
@@ -224,7 +220,6 @@ def _ranked(table: pd.DataFrame, metric: MetricInfo) -> pd.DataFrame:
         return table
     rivals = table["readout"].replace(INDEX_READOUT, GENERATED_READOUTS[-1])
     shown = pd.to_numeric(table["mean"].map(metric.format))
-    shown = shown.where(~table["row"].str.endswith(WITH_NET))
     places = [rivals, table["m"], table["column"], table["down"]]
     top = "max" if metric.higher_is_better else "min"
     best = shown.groupby(places).transform(top)
@@ -240,10 +235,8 @@ def _ranked(table: pd.DataFrame, metric: MetricInfo) -> pd.DataFrame:
 
 
 def _row(record: RunRecord, readout: str, net: str) -> str:
-    """Return the row of a value: a sampler, a baseline of its run, or refined samples."""
+    """Return the row of a value: a sampler or a baseline of its run."""
     own = row_name(record, net)
-    if readout == REFINED:
-        return f"{own}{WITH_NET}"
     if readout in (*READOUTS, FULL):
         return own
     prefix = own.removesuffix(sampler_row(record))  # such as "dgcnn on "
@@ -287,8 +280,7 @@ def over_seeds(metric: MetricInfo, mean: float, std: float | None = None) -> str
 
 def sort_key(row: str) -> tuple[int, str]:
     """Return a key that sorts rows as the paper's tables do."""
-    plain = row.removesuffix(WITH_NET)
-    _, other_net, sampler = plain.rpartition(" on ")  # such as "dgcnn on mops fast"
+    _, other_net, sampler = row.rpartition(" on ")  # such as "dgcnn on mops fast"
     name = sampler.split()[0]  # without its recipe
     number = ORDER.index(name) if name in ORDER else len(ORDER)
     return number + len(ORDER) * bool(other_net) * 2, row

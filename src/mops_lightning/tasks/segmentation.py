@@ -9,11 +9,11 @@ from torchmetrics import MetricCollection
 
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.metrics.base import collection
-from mops_lightning.metrics.segmentation import MeanIoU, PointAccuracy
+from mops_lightning.metrics.classification import MeanIoU, PointAccuracy
 from mops_lightning.ops.propagation import interpolate
 from mops_lightning.tasks.base import Task, figures_of
 from mops_lightning.tasks.classification import divergence
-from mops_lightning.types import Batch, TaskOutput
+from mops_lightning.types import UNKNOWN, Batch, TaskOutput
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,7 +23,7 @@ class Segmentation(Task):
     """Names the part of every point of a cloud, though the net sees the sampled points only.
 
     The logits of the sampled points are interpolated to all points of the cloud, see
-    ``ops.propagation.interpolate``. Loss and metrics are over all points.
+    ``ops.propagation.interpolate``. Loss and metrics are over all points whose part is known.
 
     Args:
         net: maps ``(B, M, 3)`` points to ``(B, M, num_parts)`` logits.
@@ -59,7 +59,7 @@ class Segmentation(Task):
         """Segment one batch.
 
         Args:
-            batch: the clouds and the parts ``(B, N)`` of their points.
+            batch: the clouds and the parts ``(B, N)`` of their points, ``UNKNOWN`` without one.
             points: ``(B, M, 3)`` sampled from the clouds.
 
         Returns:
@@ -72,13 +72,18 @@ class Segmentation(Task):
         if batch.parts is None:
             raise UserError("segmentation needs clouds whose points have parts, got none.")
         logits = self.predict(batch, points)
-        losses = {"cross_entropy": F.cross_entropy(logits.mT, batch.parts)}
+        # The mean of F.cross_entropy would be 0/0 for a batch without a known part.
+        total = F.cross_entropy(logits.mT, batch.parts, ignore_index=UNKNOWN, reduction="sum")
+        losses = {"cross_entropy": total / (batch.parts != UNKNOWN).sum().clamp(min=1)}
         losses |= getattr(self.net, "losses", {})
         return TaskOutput(losses, logits.argmax(2), batch.parts, logits)
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return mean intersection over union of the parts and accuracy, both in [0, 1]."""
-        return collection(MeanIoU(self.num_parts), PointAccuracy(self.num_parts))
+        return collection(
+            MeanIoU(self.num_parts, ignore_index=UNKNOWN),
+            PointAccuracy(self.num_parts, ignore_index=UNKNOWN),
+        )
 
 
 @figures_of.register(Segmentation)

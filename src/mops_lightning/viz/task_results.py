@@ -125,17 +125,17 @@ def part_grid(points: Tensor, parts: Mapping[str, Tensor], titles: Sequence[str]
 
     Args:
         points: ``(K, N, 3)``, y up.
-        parts: ``(K, N)`` part numbers by the name of a column.
+        parts: ``(K, N)`` part numbers, below 0 if unknown, by the name of a column.
         titles: one per cloud.
     """
     figure = figures.new_figure(2.4 * len(parts), 2.4 * len(points), "tight")
-    most = max(int(numbers.max()) for numbers in parts.values())
+    least, most = map(int, torch.stack(list(parts.values())).aminmax())
     for row, cloud in enumerate(map(figures.thinned, figures.upright(points))):
         for column, (name, numbers) in enumerate(parts.items()):
             title, label = name if row == 0 else "", titles[row] if column == 0 else ""
             axes = figures.cloud_axes(figure, len(points), len(parts), row, column, title, label)
             drawn = figures.thinned(numbers[row, :, None].cpu())[:, 0]
-            colours: Any = {"c": drawn, "cmap": "tab20", "vmin": 0, "vmax": most}
+            colours: Any = {"c": drawn, "cmap": "tab20", "vmin": min(least, 0), "vmax": most}
             axes.scatter(*cloud.T, s=2, depthshade=False, **colours)
             figures.frame_cloud(axes, cloud)
     return figure
