@@ -80,10 +80,8 @@ class Segmentation(Task):
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return mean intersection over union of the parts and accuracy, both in [0, 1]."""
-        return collection(
-            MeanIoU(self.num_parts, ignore_index=UNKNOWN),
-            PointAccuracy(self.num_parts, ignore_index=UNKNOWN),
-        )
+        kinds = (MeanIoU, PointAccuracy)
+        return collection(*(kind(self.num_parts, ignore_index=UNKNOWN) for kind in kinds))
 
 
 @figures_of.register(Segmentation)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
+from omegaconf import OmegaConf
 from torch import nn
 
 from mops_lightning.data.clouds import CloudDataset
@@ -15,7 +16,7 @@ from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records.metric_info import foreign_metrics
 from mops_lightning.records.readout_names import parse_metric_name
-from mops_lightning.records.run_record import Evaluated, RunRecord
+from mops_lightning.records.run_record import Evaluated, RunRecord, dotted
 from mops_lightning.training.checkpoint import Diverged, check_finite
 from mops_lightning.training.evaluation import KEY, OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
@@ -45,8 +46,7 @@ def load_weights(parts: Parts, record: RunRecord, task_weights: Path | None) -> 
     """
     task, cfg = parts.experiment.task, parts.cfg
     if task_weights is not None:
-        trains_from = cfg.learn == "task" and cfg.weights == "auto"
-        setting = "pretrain_from" if trains_from else "weights"
+        setting = "pretrain_from" if (cfg.learn, cfg.weights) == ("task", "auto") else "weights"
         try:
             content = weights.load_into(task, task_weights)
         except UserError as error:
@@ -54,6 +54,14 @@ def load_weights(parts: Parts, record: RunRecord, task_weights: Path | None) -> 
         record.weights_loaded = content["sha256"]
         if content.get("classes"):
             check_names(content["classes"], task, parts.dataset, f"{setting}: {task_weights}")
+        theirs, net = dotted(content["config"]), OmegaConf.to_container(cfg.task.net, resolve=True)
+        by_run = ("sampler.m", "sampler.m_max", "sampler.seed")  # stages have their own sizes
+        ours = [pair for pair in dotted(net, "task.net").items() if not pair[0].endswith(by_run)]
+        other = [f"{key}={theirs[key]}" for key, x in ours if theirs.get(key, x) != x]
+        if other and parts.trainer.is_global_zero:
+            print(
+                f"{setting}: {task_weights} was trained with {', '.join(other)}, unlike this run."
+            )
     if parts.trained is not None:
         of_run = parts.cfg.weights == OF_RUN
         record.evaluated = load_trained(parts.trained, of_run, parts.experiment, parts.dataset)
