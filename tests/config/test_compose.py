@@ -5,7 +5,7 @@ import pytest
 from mops_lightning.config.compose import check_overrides
 from tests.support.command_line import TINY, TINY_WITH_PICTURES, refused
 
-LATE = "+trainer.val_check_interval=100"
+LATE, NET = "+trainer.val_check_interval=100", "task/net=hierarchical"
 
 
 @pytest.mark.parametrize(
@@ -61,8 +61,10 @@ LATE = "+trainer.val_check_interval=100"
         (["names={}"], "names={}: names follow from the chosen groups"),
         (["+names.foo=3"], "names follow from the chosen groups"),
         (["sampler@baselines.x=null"], "sampler@baselines.x=null: choose one"),
-        (["sampler@task.net.sampler=mops"], "The stages of task/net=hierarchical have one."),
-        (["task/net=hierarchical", "sampler@task.net.sampler=foo"], "task.net.sampler=foo: no"),
+        (["sampler@task.net.sampler=mops"], "The stages of hierarchical nets have one."),
+        ([NET, "sampler@task.net.sampler=foo"], "task.net.sampler=foo: no such choice."),
+        ([NET, "task.net.sampler=fps"], "must be chosen by sampler@task.net.sampler=NAME, got"),
+        ([NET, "task.net.sampler.k=7"], "belongs to sampler@task.net.sampler=samplenet and"),
         (["--shell-completion"], "Expecting one subcommand from"),
         (["--shell-completion", "install=sh"], "No completion plugin for"),
         (["pretrain_from=nowhere"], "pretrain_from: no file or model 'nowhere'"),

@@ -198,14 +198,8 @@ def test_shapes_damaged_cache_or_one_of_other_shapes_is_replaced(tmp_path):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("n_points", 0),
-        ("n_points", "many"),
-        ("n_points", 10.5),
-        ("train_per_class", 0),
-        ("test_per_class", -1),
-        ("test_per_class", True),
-        ("seed", -1),
-        ("seed", None),
+        *(("n_points", 0), ("n_points", "many"), ("n_points", 10.5), ("train_per_class", 0)),
+        *(("test_per_class", -1), ("test_per_class", True), ("seed", -1), ("seed", None)),
         ("classes", ["cupp"]),
     ],
 )

@@ -189,7 +189,7 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     if key in groups:
         return f"{key}: its files are chosen by other groups. --cfg job shows what they set."
     if key.startswith("sampler@"):
-        return f"{key}: no sampler is chosen there. The stages of task/net=hierarchical have one."
+        return f"{key}: no sampler is chosen there. The stages of hierarchical nets have one."
     if "/" in key or "@" in key:
         offered = [group for group in groups if _is_offered(group)]
         return f"{key}: no such group of choices.{did_you_mean(key, offered)}"
@@ -199,8 +199,10 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     with suppress(UserError):  # the class of a user's own file may not be importable
         if target and name in signature(str(target), node):
             return f"{key}: {target} accepts it, but no file sets it. Write +{key}=..."
-    files = sorted(conf_dir().joinpath(node).glob("*.yaml")) if node in groups else []
-    choices = [f"{node}={file.stem}" for file in files if name in (OmegaConf.load(file) or {})]
+    group = node if node in groups else node.rpartition(".")[2]  # such as task.net.sampler
+    files = sorted(conf_dir().joinpath(group).glob("*.yaml")) if group in groups else []
+    at = "" if group == node else f"@{node}"
+    choices = [f"{group}{at}={one.stem}" for one in files if name in (OmegaConf.load(one) or {})]
     if choices:
         return f"{key}: no such setting here. It belongs to {' and '.join(choices)}."
     leaves = dotted(OmegaConf.to_container(cfg, resolve=False))

@@ -163,6 +163,8 @@ def _check_node(node: Any, where: str) -> None:
             built = isinstance(node[key], dict) and "_target_" in node[key]
             if name in parameters and not built:
                 wanted = misfit(node[key], parameters[name].annotation)
+                if wanted == "Callable" and name == "sampler":  # of the stages of a net
+                    wanted = f"chosen by sampler@{where}.sampler=NAME"
                 if wanted:
                     raise UserError(f"{where}.{name} must be {wanted}, got {node[key]!r}.")
     for key in node:

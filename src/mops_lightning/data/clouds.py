@@ -1,6 +1,7 @@
 """Data sets in memory: a training and a test split of clouds."""
 
 import hashlib
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +12,10 @@ from torch import Tensor
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.seeding import generator
+from mops_lightning.types import UNKNOWN
+
+MOST_PARTS = 1000
+"""A column of more different numbers says something else, such as the object of a point."""
 
 NOISE = 13
 """Random stream of the noise on test clouds."""
@@ -125,6 +130,25 @@ def make_dataset(
             digest.update(clouds.parts.numpy().data)
         kept.append(clouds)
     return CloudDataset(chosen, kept[0], kept[1], digest.hexdigest())
+
+
+def check_parts(dataset: CloudDataset) -> None:
+    """Refuse points without known parts, or with too many; print the parts that a split lacks."""
+    names = dataset.part_names
+    if not 2 <= len(names) <= MOST_PARTS:
+        found = f"only part {names[0]}" if len(names) == 1 else len(names) or "none"
+        raise UserError(
+            f"dataset: its points must belong to 2 to {MOST_PARTS} parts, got {found}. Give "
+            "dataset=shapes dataset.classes=parts, or your own clouds with dataset.label=COLUMN."
+        )
+    for split, parts in (("training", dataset.train.parts), ("test", dataset.test.parts)):
+        assert parts is not None
+        known = {*parts.unique().tolist()} - {UNKNOWN}
+        if not known:
+            raise UserError(f"dataset: no {split} point has a known part, a number of at least 0.")
+        missing = ", ".join(name for part, name in enumerate(names) if part not in known)
+        if missing:
+            print(f"dataset: no {split} point of part {missing:.200}.", file=sys.stderr)
 
 
 def noisy(clouds: Clouds, noise: float) -> Clouds:

@@ -30,14 +30,10 @@ MAX_DEPTH = 50
 """Deepest nesting of a record that is read."""
 FAILED = ".failed"
 """File in a cell's folder that says why its last start failed, with or without a record."""
+BY_RUN = ("n_points", "sampler.m", "sampler.m_max", "sampler.seed")
+"""Settings of a task net that follow the run's, or that its stages have for themselves."""
 PACKAGES = (
-    "mops-lightning",
-    "torch",
-    "lightning",
-    "hydra-core",
-    "torchmetrics",
-    "trimesh",
-    "numpy",
+    *("mops-lightning", "torch", "lightning", "hydra-core", "torchmetrics", "trimesh", "numpy"),
 )
 """Packages whose versions are recorded."""
 

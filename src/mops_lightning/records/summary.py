@@ -66,14 +66,12 @@ def results_table(record: RunRecord) -> tuple[str, Table]:
     for head, _ in columns.values():
         table.add_column(head, justify="right")
     for readout, row in rows.items():
-        values = {column: row.get(column) for column in columns}
-        if all(value is None for value in values.values()):
-            continue  # metrics of the sampled set only
         cells = [
-            "" if value is None else columns[column][1].format(value)
-            for column, value in values.items()
+            "" if (value := row.get(column)) is None else info.format(value)
+            for column, (_, info) in columns.items()
         ]
-        table.add_row(_label(readout, config), *cells)
+        if any(cells):  # others have metrics of the sampled set only
+            table.add_row(_label(readout, config), *cells)
     title = f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test"
     changed = [f"{name}={config[name]}" for name in OF_TEST_CLOUDS if config.get(name)]
     return ", ".join([title, *changed]), table
@@ -107,6 +105,5 @@ def _label(readout: str, config: dict[str, Any]) -> str:
     """Return the label of a readout's row."""
     if readout == FULL:
         return "all points"
-    if readout not in ROWS:
-        return baseline_name(config, readout)
-    return f"{sampler_name(config)} {readout}"
+    own = f"{sampler_name(config)} {readout}"
+    return own if readout in ROWS else baseline_name(config, readout)

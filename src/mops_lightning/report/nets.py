@@ -10,7 +10,7 @@ from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL
-from mops_lightning.records.run_record import RunRecord, dotted
+from mops_lightning.records.run_record import BY_RUN, RunRecord, dotted
 from mops_lightning.report import comparable, paper
 from mops_lightning.report.collect import score, seed, training_time
 from mops_lightning.report.tables import over_seeds
@@ -18,9 +18,6 @@ from mops_lightning.report.text import PAPER, Grid
 
 NAMES = {"points": "points after stages"}
 """Settings of a net whose names have another meaning in the table."""
-
-HIDDEN = ("n_points", "sampler.m", "sampler.m_max", "sampler.seed")
-"""Settings of a net that get no column; the number of points has its own."""
 
 
 def nets_grid(group: comparable.Group, metrics: Sequence[str] = ()) -> Grid:
@@ -40,7 +37,7 @@ def nets_grid(group: comparable.Group, metrics: Sequence[str] = ()) -> Grid:
     found = sorted(group.records, key=lambda record: record.started)
     names, infos = found[0].config["names"], _metrics(found, metrics)
     shown = _settings(found)
-    settings = pd.DataFrame(shown).drop(columns=[*HIDDEN], errors="ignore")
+    settings = pd.DataFrame(shown).drop(columns=[*BY_RUN], errors="ignore")
     keys = [key for key in sorted(settings) if settings[key].dropna().map(str).nunique() > 1]
     runs = settings[keys].apply(_sortable).assign(points=[_points(one) for one in found])
     runs = runs.assign(net=[one.config["names"]["net"] for one in found])
@@ -76,8 +73,7 @@ def _row(records: list[RunRecord], settings: Iterable[Any], metrics: list[Metric
     for metric in metrics:
         values = pd.Series([one.metrics.get(f"test/{FULL}/{metric.name}") for one in records])
         count = values.count()
-        std = values.std() if count > 1 else None
-        text = over_seeds(metric, values.mean(), std) if count else ""
+        text = over_seeds(metric, values.mean(), values.std()) if count else ""
         texts.append(text + (f" (n={count})" if count > 1 else ""))
     size = first.parameters.get("task")
     cost = pd.Series(training_time(records)[1], dtype=float).mean()

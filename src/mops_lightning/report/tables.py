@@ -127,11 +127,8 @@ class Table:
         by_readout = {one.readout: one for one in values.itertuples()}
         found: list[Any] = [by_readout[name] for name in READOUTS if name in by_readout]
         count = max(int(one.count_) for one in found)
-        parts = (Part(self._text(one.mean, one.std, one.count_), one.rank) for one in found)
+        parts = (Part(over_seeds(self.metric, one.mean, one.std), one.rank) for one in found)
         return Cell(tuple(parts), f" (n={count})" if count > 1 else "")
-
-    def _text(self, mean: float, std: float, count: int) -> str:
-        return over_seeds(self.metric, mean, std if count > 1 else None)
 
 
 def long_form(found: list[RunRecord], net: str, keys: Sequence[str] = ()) -> pd.DataFrame:
@@ -268,10 +265,10 @@ def net_labels(found: list[RunRecord]) -> list[str]:
     ]
 
 
-def over_seeds(metric: MetricInfo, mean: float, std: float | None = None) -> str:
-    """Return a value, or mean ± standard deviation of several, in the metric's unit."""
+def over_seeds(metric: MetricInfo, mean: float, std: float) -> str:
+    """Return mean ± standard deviation in the metric's unit; of one value, ``std`` is NaN."""
     text = metric.format(mean)
-    if std is None:
+    if pd.isna(std):
         return text
     # As many decimals as the mean has, at least two.
     places = len(text.partition(".")[2]) if "e" not in text else 0

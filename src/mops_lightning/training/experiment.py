@@ -22,10 +22,9 @@ from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
 from mops_lightning.training.checkpoint import CHECKPOINT_KEY, SAVED, check_finite
-from mops_lightning.training.readouts import names_of_readouts, readouts
 from mops_lightning.training.recipe.distillation import Distillation, Targets
 from mops_lightning.training.recipe.recipe import Recipe, draw_points, reached, straight_through
-from mops_lightning.training.scores import Scores
+from mops_lightning.training.scores import Scores, names_of_readouts, readouts
 from mops_lightning.types import Batch, SampleOutput
 
 TEST = "test/"

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from matplotlib import colormaps
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
@@ -129,13 +130,14 @@ def part_grid(points: Tensor, parts: Mapping[str, Tensor], titles: Sequence[str]
         titles: one per cloud.
     """
     figure = figures.new_figure(2.4 * len(parts), 2.4 * len(points), "tight")
-    least, most = map(int, torch.stack(list(parts.values())).aminmax())
+    most = max(int(numbers.max()) for numbers in parts.values())
+    colour = colormaps["tab20"].with_extremes(under="lightgrey")  # for points of unknown part
     for row, cloud in enumerate(map(figures.thinned, figures.upright(points))):
         for column, (name, numbers) in enumerate(parts.items()):
             title, label = name if row == 0 else "", titles[row] if column == 0 else ""
             axes = figures.cloud_axes(figure, len(points), len(parts), row, column, title, label)
             drawn = figures.thinned(numbers[row, :, None].cpu())[:, 0]
-            colours: Any = {"c": drawn, "cmap": "tab20", "vmin": min(least, 0), "vmax": most}
+            colours: Any = {"c": drawn, "cmap": colour, "vmin": 0, "vmax": most}
             axes.scatter(*cloud.T, s=2, depthshade=False, **colours)
             figures.frame_cloud(axes, cloud)
     return figure

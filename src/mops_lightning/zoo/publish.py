@@ -8,7 +8,7 @@ from typing import Any
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.records.metric_info import metric_info
-from mops_lightning.records.readout_names import ROWS, MetricName, parse_metric_name
+from mops_lightning.records.readout_names import FULL, ROWS, MetricName, parse_metric_name
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.zoo import model_file, names, weights
 
@@ -118,9 +118,8 @@ def card_figures(record: RunRecord) -> dict[str, Any]:
         raise UserError("the record of the run has no test score. Give a run that was tested.")
     main = parts[named]
     info = metric_info(main.metric, [record])
-    full = main.readout == ROWS[-1]
-    readouts = ROWS[-1:] if full else ROWS[:-1]
-    shown = {MetricName(main.m, readout, main.metric) for readout in readouts}
+    full = main.readout == FULL
+    shown = {MetricName(main.m, one, main.metric) for one in ROWS if (one == FULL) == full}
     return {
         "metric": info.title,
         "m": None if full else main.m or record.config["m"],

@@ -67,13 +67,20 @@ def test_factory_recipe_of_index_sampler_serves_a_task_net_that_learns(learn):
     assert made.recipe == expected
 
 
-def test_factory_segmentation_needs_data_with_parts():
+def test_factory_segmentation_needs_data_with_parts(capsys):
     cfg = compose(["task=segmentation", "m=8", "task.net.points=[16,8]"])
     made: Any = make_experiment(cfg, small_dataset(), {})
     assert made.task.num_parts == made.task.net.head[-1].out_features == 2
-    with pytest.raises(UserError, match=r"at least two parts, got none\. .* dataset\.label=COLUMN"):
+    with pytest.raises(UserError, match=r"2 to 1000 parts, got none\. .* dataset\.label=COLUMN"):
         make_experiment(cfg, replace(small_dataset(), part_names=()), {})
-    data = small_dataset()
+    data: Any = small_dataset()
+    with pytest.raises(UserError, match="2 to 1000 parts, got 1001"):
+        make_experiment(cfg, replace(data, part_names=("",) * 1001), {})
+    unknown = data.test._replace(parts=torch.full_like(data.test.parts, -1))
+    with pytest.raises(UserError, match="no test point has a known part"):
+        make_experiment(cfg, replace(data, test=unknown), {})
+    make_experiment(cfg, replace(data, test=unknown._replace(parts=unknown.parts + 1)), {})
+    assert f"no test point of part {data.part_names[1]}" in capsys.readouterr().err
     assert corrupt(data.test, "shear-1").parts is data.test.parts
     cfg = compose(["task=segmentation", "m=8", "test_corruption=cutout-1"])
     with pytest.raises(UserError, match=r"test_corruption=cutout-1 adds or removes points"):

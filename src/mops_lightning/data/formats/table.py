@@ -60,8 +60,10 @@ class Table:
             raise BadCloudError(f"{path} has no column {name!r}. Its columns: {known}.")
         with np.errstate(invalid="ignore"):  # NaN is no whole number, either
             whole = column.astype(np.int64)
-        if (whole != column).any():
-            raise BadCloudError(f"{path}: column {name!r} must hold whole numbers.")
+        if (wrong := column[whole != column]).size:
+            raise BadCloudError(
+                f"{path}: {name!r} must hold whole numbers (int64), got {wrong[0]}."
+            )
         return whole
 
     def without_attributes(self) -> "Table":

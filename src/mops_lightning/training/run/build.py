@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from mops_lightning.config import distributed
 from mops_lightning.config.build import accepted, build, build_as
 from mops_lightning.config.settings import RECIPE_OF_TASK_NETS
-from mops_lightning.data.clouds import CloudDataset, Clouds
+from mops_lightning.data.clouds import CloudDataset, Clouds, check_parts
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
@@ -208,17 +208,13 @@ def _numbers(cfg: DictConfig, dataset: CloudDataset) -> tuple[dict[str, int], di
             f"task/net={cfg.names.net} takes {', '.join(of_net)}, but task={cfg.names.task} gives "
             f"{', '.join(of_task)}. Choose a net of this task (docs/tasks.md)."
         )
-    if "num_parts" in of_task and len(dataset.part_names) < 2:
-        found = f"only part {dataset.part_names[0]}" if dataset.part_names else "none"
-        raise UserError(
-            f"dataset: its points must belong to at least two parts, got {found}. Give "
-            "dataset=shapes dataset.classes=parts, or your own clouds with dataset.label=COLUMN."
-        )
     if cfg.test_corruption and "num_parts" in of_task and dataset.test.parts is None:
         raise UserError(
             f"test_corruption={cfg.test_corruption} adds or removes points, whose parts nobody "
             "knows. Give jitter, rotation, scaling, shear or distortion."
         )
+    if "num_parts" in of_task:
+        check_parts(dataset)
     return of_task, of_net
 
 
@@ -235,9 +231,7 @@ def split(clouds: Clouds, fraction: float, seed: int) -> tuple[Clouds, Clouds]:
     Returns:
         The clouds to train on and the held-out clouds, each in their original order.
     """
-    sources = clouds.sources
-    if sources is None:
-        sources = torch.arange(len(clouds.labels))
+    sources = torch.arange(len(clouds.labels)) if clouds.sources is None else clouds.sources
     names = sources.unique()
     order = torch.randperm(len(names), generator=generator(seed, 2))
     chosen = torch.isin(sources, names[order[: round(len(names) * fraction)]])

@@ -16,7 +16,7 @@ from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records.metric_info import foreign_metrics
 from mops_lightning.records.readout_names import parse_metric_name
-from mops_lightning.records.run_record import Evaluated, RunRecord, dotted
+from mops_lightning.records.run_record import BY_RUN, Evaluated, RunRecord, dotted
 from mops_lightning.training.checkpoint import Diverged, check_finite
 from mops_lightning.training.evaluation import KEY, OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
@@ -55,13 +55,10 @@ def load_weights(parts: Parts, record: RunRecord, task_weights: Path | None) -> 
         if content.get("classes"):
             check_names(content["classes"], task, parts.dataset, f"{setting}: {task_weights}")
         theirs, net = dotted(content["config"]), OmegaConf.to_container(cfg.task.net, resolve=True)
-        by_run = ("sampler.m", "sampler.m_max", "sampler.seed")  # stages have their own sizes
-        ours = [pair for pair in dotted(net, "task.net").items() if not pair[0].endswith(by_run)]
-        other = [f"{key}={theirs[key]}" for key, x in ours if theirs.get(key, x) != x]
+        ours = {f"task.net.{key}": x for key, x in dotted(net).items() if key not in BY_RUN}
+        other = [f"{key}={theirs[key]}" for key, x in ours.items() if theirs.get(key, x) != x]
         if other and parts.trainer.is_global_zero:
-            print(
-                f"{setting}: {task_weights} was trained with {', '.join(other)}, unlike this run."
-            )
+            print(f"{setting}: {task_weights} was trained with {', '.join(other)}, not as here.")
     if parts.trained is not None:
         of_run = parts.cfg.weights == OF_RUN
         record.evaluated = load_trained(parts.trained, of_run, parts.experiment, parts.dataset)
