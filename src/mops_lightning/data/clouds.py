@@ -145,9 +145,7 @@ def check_parts(dataset: CloudDataset) -> None:
         assert parts is not None
         known = {*parts.unique().tolist()} - {UNKNOWN}
         if not known:
-            raise UserError(
-                f"dataset.label: no {split} point has a known part, a number from 0 on."
-            )
+            raise UserError(f"dataset.label: no {split} point has a known part, from 0 on.")
         missing = ", ".join(name for part, name in enumerate(names) if part not in known)
         if missing:
             print(f"dataset: no {split} point of part {missing:.200}.", file=sys.stderr)
