@@ -149,5 +149,5 @@ def test_scans_have_parts_of_their_own(suffix, tmp_path, rng):
         cloud_folder(tmp_path, crop="surface", crops=1)
     write = Table(np.eye(3)[np.arange(60) % 3], {"kind": np.full(60, 0.5)})
     WRITERS[suffix](tmp_path / f"scan2{suffix}", write)
-    with pytest.raises(UserError, match=r"'kind' must hold whole numbers .int64., got 0\.5\."):
+    with pytest.raises(UserError, match=r"'kind' must hold whole int64 numbers, got 0\.5\."):
         cloud_folder(tmp_path)

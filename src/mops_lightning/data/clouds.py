@@ -14,9 +14,6 @@ from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.seeding import generator
 from mops_lightning.types import UNKNOWN
 
-MOST_PARTS = 1000
-"""A column of more different numbers says something else, such as the object of a point."""
-
 NOISE = 13
 """Random stream of the noise on test clouds."""
 
@@ -134,11 +131,11 @@ def make_dataset(
 
 def check_parts(dataset: CloudDataset) -> None:
     """Refuse points without known parts, or with too many; print the parts that a split lacks."""
-    names = dataset.part_names
-    if not 2 <= len(names) <= MOST_PARTS:
+    names, most = dataset.part_names, 1000  # more numbers tell objects or points apart, not parts
+    if not 2 <= len(names) <= most:
         found = f"only part {names[0]}" if len(names) == 1 else len(names) or "none"
         raise UserError(
-            f"dataset: its points must belong to 2 to {MOST_PARTS} parts, got {found}. Give "
+            f"dataset: its points must belong to 2 to {most} parts, got {found}. Give "
             "dataset=shapes dataset.classes=parts, or your own clouds with dataset.label=COLUMN."
         )
     for split, parts in (("training", dataset.train.parts), ("test", dataset.test.parts)):

@@ -7,9 +7,10 @@ Points are sorted into a tree of boxes, and far boxes are skipped, as in QuickFP
 TCAD 2023). The distance to a box is never above the distance to a point in it, because both are
 computed by the same operations in the same order, each of which is monotonic.
 
-Arrays have one dimension, which halves the time of compilation. Coordinates of C channels and N
-points are ``(C·N,)``, one channel after the other. All functions are in this file, because numba
-does not notice that a cached function calls one that has changed in another file.
+Arrays have one dimension, which halves the time of compilation, and loops copy them: slices take
+seconds to compile. Coordinates of C channels and N points are ``(C·N,)``, one channel after the
+other. All functions are in this file, because numba does not notice that a cached function calls
+one that has changed in another file.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -161,7 +162,8 @@ def _move(line, places, moved):
     """Move values to their places."""
     for i in range(len(line)):
         moved[places[i]] = line[i]
-    line[:] = moved[: len(line)]
+    for i in range(len(line)):
+        line[i] = moved[i]
 
 
 @jit
@@ -214,8 +216,8 @@ def farthest(planes, distances, factors, steps, channels, leaf):
     known = len(nodes) // 4
     left, new = np.empty(size, planes.dtype), np.empty(size, planes.dtype)
     bits, new_bits = left.view(distances.dtype), new.view(distances.dtype)
-    bits[:] = distances[rows]
-    new_bits[:] = bits
+    for i in range(size):
+        bits[i] = new_bits[i] = distances[rows[i]]
     if len(factors):
         factors = factors[rows]
     # The largest distance of every node, and the place of the point to choose of it.
@@ -233,7 +235,8 @@ def farthest(planes, distances, factors, steps, channels, leaf):
         latest = peaks[0]
         chosen[step] = rows[latest]
         left[latest] = -1
-        point[:] = planes[latest::size]
+        for axis in range(channels):
+            point[axis] = planes[axis * size + latest]
         stack[0], depth = 0, 1
         while depth:
             depth -= 1
@@ -307,7 +310,8 @@ def nearest(planes, queries, scratch, channels, leaf):
     distances, point = scratch.view(planes.dtype), np.empty(channels, planes.dtype)
     bounds, stack = np.empty(known + FANOUT, planes.dtype), np.empty(known + FANOUT, np.int64)
     for query in range(len(nearest_rows)):
-        point[:] = queries[query * channels : (query + 1) * channels]
+        for axis in range(channels):
+            point[axis] = queries[query * channels + axis]
         best, row = planes.dtype.type(np.inf), np.int64(size)
         stack[0], bounds[0], depth = 0, 0, 1
         while depth:

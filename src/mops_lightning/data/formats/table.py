@@ -61,9 +61,7 @@ class Table:
         with np.errstate(invalid="ignore"):  # NaN is no whole number, either
             whole = column.astype(np.int64)
         if (wrong := column[whole != column]).size:
-            raise BadCloudError(
-                f"{path}: {name!r} must hold whole numbers (int64), got {wrong[0]}."
-            )
+            raise BadCloudError(f"{path}: {name!r} must hold whole int64 numbers, got {wrong[0]}.")
         return whole
 
     def without_attributes(self) -> "Table":
