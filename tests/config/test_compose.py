@@ -61,6 +61,7 @@ LATE, NET = "+trainer.val_check_interval=100", "task/net=hierarchical"
         (["names={}"], "names={}: names follow from the chosen groups"),
         (["+names.foo=3"], "names follow from the chosen groups"),
         (["sampler@baselines.x=null"], "sampler@baselines.x=null: choose one"),
+        (["sampler@baselines.x=fps"], "no sampler is chosen there. Write +sampler@baselines.x=..."),
         (["sampler@task.net.sampler=mops"], "The stages of hierarchical nets have one."),
         ([NET, "sampler@task.net.sampler=foo"], "task.net.sampler=foo: no such choice."),
         ([NET, "task.net.sampler=fps"], "must be chosen by sampler@task.net.sampler=NAME, got"),

@@ -189,7 +189,9 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     if key in groups:
         return f"{key}: its files are chosen by other groups. --cfg job shows what they set."
     if key.startswith("sampler@"):
-        return f"{key}: no sampler is chosen there. The stages of hierarchical nets have one."
+        hint = "The stages of hierarchical nets have one."
+        hint = f"Write +{key}=..." if "@baselines." in key else hint
+        return f"{key}: no sampler is chosen there. {hint}"
     if "/" in key or "@" in key:
         offered = [group for group in groups if _is_offered(group)]
         return f"{key}: no such group of choices.{did_you_mean(key, offered)}"
@@ -199,9 +201,9 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     with suppress(UserError):  # the class of a user's own file may not be importable
         if target and name in signature(str(target), node):
             return f"{key}: {target} accepts it, but no file sets it. Write +{key}=..."
-    group = node if node in groups else node.rpartition(".")[2]  # such as task.net.sampler
+    group = node.rpartition(".")[2]  # of task.net.sampler, too
     files = sorted(conf_dir().joinpath(group).glob("*.yaml")) if group in groups else []
-    at = "" if group == node else f"@{node}"
+    at = f"@{node}" if "." in node else ""
     choices = [f"{group}{at}={one.stem}" for one in files if name in (OmegaConf.load(one) or {})]
     if choices:
         return f"{key}: no such setting here. It belongs to {' and '.join(choices)}."

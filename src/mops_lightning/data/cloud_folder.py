@@ -113,10 +113,7 @@ def cloud_folder(
     )
     numbers = np.unique(np.concatenate(labels_of)) if labels_of else np.empty(0, np.int64)
     numbers = numbers[numbers >= 0]
-    parts_of = [
-        torch.from_numpy(np.where(of_file < 0, UNKNOWN, np.searchsorted(numbers, of_file)))
-        for of_file in labels_of
-    ]
+    parts_of = [np.where(one < 0, UNKNOWN, np.searchsorted(numbers, one)) for one in labels_of]
     clouds = {}
     for split in SPLITS:
         rows = [row for row, of_file in enumerate(splits) if of_file == split]
@@ -125,7 +122,7 @@ def cloud_folder(
             torch.cat([crops_of[row] for row in rows]),
             labels.repeat_interleave(crops),
             torch.tensor(rows).repeat_interleave(crops) if crops > 1 else None,
-            torch.cat([parts_of[row] for row in rows]) if parts_of else None,
+            torch.from_numpy(np.concatenate([parts_of[row] for row in rows])) if parts_of else None,
         )
     if crop != "surface":
         dataset = make_dataset("clouds", clouds, chosen, None, folder)

@@ -14,6 +14,8 @@ from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.seeding import generator
 from mops_lightning.types import UNKNOWN
 
+MOST_PARTS = 1000
+"""A column of more different numbers tells objects or points apart, not parts."""
 NOISE = 13
 """Random stream of the noise on test clouds."""
 
@@ -131,19 +133,19 @@ def make_dataset(
 
 def check_parts(dataset: CloudDataset) -> None:
     """Refuse points without known parts, or with too many; print the parts that a split lacks."""
-    names, most = dataset.part_names, 1000  # more numbers tell objects or points apart, not parts
-    if not 2 <= len(names) <= most:
+    names = dataset.part_names
+    if not 2 <= len(names) <= MOST_PARTS:
         found = f"only part {names[0]}" if len(names) == 1 else len(names) or "none"
         raise UserError(
-            f"dataset: its points must belong to 2 to {most} parts, got {found}. Give "
+            f"dataset: its points must belong to 2 to {MOST_PARTS} parts, got {found}. Give "
             "dataset=shapes dataset.classes=parts, or your own clouds with dataset.label=COLUMN."
         )
     for split, parts in (("training", dataset.train.parts), ("test", dataset.test.parts)):
         assert parts is not None
-        known = {*parts.unique().tolist()} - {UNKNOWN}
-        if not known:
-            raise UserError(f"dataset.label: no {split} point has a known part, from 0 on.")
-        missing = ", ".join(name for part, name in enumerate(names) if part not in known)
+        counts = torch.bincount(parts[parts != UNKNOWN], minlength=len(names)).tolist()
+        if not any(counts):
+            raise UserError(f"dataset.label: no {split} point has a known part, 0 or more.")
+        missing = ", ".join(name for name, count in zip(names, counts, strict=True) if not count)
         if missing:
             print(f"dataset: no {split} point of part {missing:.200}.", file=sys.stderr)
 

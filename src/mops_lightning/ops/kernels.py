@@ -7,10 +7,10 @@ Points are sorted into a tree of boxes, and far boxes are skipped, as in QuickFP
 TCAD 2023). The distance to a box is never above the distance to a point in it, because both are
 computed by the same operations in the same order, each of which is monotonic.
 
-Arrays have one dimension, which halves the time of compilation, and loops copy them: slices take
-seconds to compile. Coordinates of C channels and N points are ``(C·N,)``, one channel after the
-other. All functions are in this file, because numba does not notice that a cached function calls
-one that has changed in another file.
+Arrays have one dimension, which halves the time of compilation, and are copied in loops, because
+the assignment of a slice takes seconds to compile. Coordinates of C channels and N points are
+``(C·N,)``, one channel after the other. All functions are in this file, because numba does not
+notice that a cached function calls one that has changed in another file.
 """
 
 # mypy: disable-error-code="no-untyped-def"

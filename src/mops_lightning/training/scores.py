@@ -1,4 +1,4 @@
-"""What an experiment's validation and test score, the readouts of its sampler, and by what."""
+"""The readouts of a sampler, and the metrics by which validation and test score them."""
 
 from collections.abc import Callable, Iterable, Mapping
 
