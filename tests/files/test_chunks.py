@@ -19,7 +19,6 @@ def test_chunks_equal_whole_file(suffix, readout, folder, tmp_path):
     source = tmp_path / f"in{suffix}"
     WRITERS[suffix](source, Table(points, {"intensity": np.arange(500, dtype=np.uint16)}))
     settings = ["--weights", folder, "--readout", readout]
-    settings += ["--keep-attributes"] if readout == "matched" else []
     assert call(source, tmp_path / "whole.npz", *settings)[0] == 0
     out = done(source, tmp_path / "parts.npz", *settings, "--chunk", 60)
     assert ("40 of 500 points" if suffix == ".laz" else "40 of 440 points (60 more") in out
@@ -50,7 +49,7 @@ def test_other_methods_sample_random_points_of_all_parts(settings, folder, tmp_p
     np.save(tmp_path / "all.npy", np.column_stack([points, np.arange(500)]))
     np.save(tmp_path / "drawn.npy", np.column_stack([points, np.arange(500)])[drawn])
     settings = [folder if one == "FOLDER" else one for one in settings]
-    settings += ["--m", 30, "--seed", 3, "--keep-attributes"]
+    settings += ["--m", 30, "--seed", 3]
     assert call(tmp_path / "drawn.npy", tmp_path / "want.npy", *settings)[0] == 0
     status, out, _ = call(tmp_path / "all.npy", tmp_path / "out.npy", *settings, "--chunk", 200)
     assert (status, "30 of 440 points (60 more without" in out) == (0, True)

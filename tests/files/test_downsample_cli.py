@@ -20,7 +20,6 @@ GENERATED = ["--weights", "weights.safetensors", "--readout", "generated"]
         (["--m", 41, "--weights", "weights.safetensors"], "trained for up to 40 points, got 41"),
         (["--weights", "task.pt"], "holds a task net"),
         (["--weights", "nowhere.pt"], "--weights: no file nowhere.pt"),
-        ([*GENERATED, "--keep-attributes"], "no attributes"),
         (["--m", 500, "--method", "fps"], "holds 299 points, fewer than --m 500"),
         ([*FPS, "--chunk", 4], "--chunk must be at least --m 5, got 4"),
         ([*FPS, "--chunk", 9, "--map", "map.npz"], "use propagate after --chunk"),
@@ -71,7 +70,7 @@ def test_folder_removes_what_a_killed_run_left(folder, tmp_path):
 
 def test_real_scans_keep_attributes(real_data, tmp_path):
     scans = real_data("scans")
-    done(scans, tmp_path, "--method", "random", "--m", 100, "--keep-attributes")
+    done(scans, tmp_path, "--method", "random", "--m", 100)
     fragment = read(tmp_path / "fragment.pcd", 9, 0)
     assert len(fragment.points) == 100
     assert "normal_x" in fragment.columns

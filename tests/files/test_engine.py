@@ -58,8 +58,7 @@ def scan(tmp_path_factory):
 
 
 def options(readout, size=300):
-    keep_attributes = readout == "matched"
-    return Options(24, "weights", None, readout, keep_attributes, chunk=size)
+    return Options(24, "weights", readout=readout, chunk=size)
 
 
 def same(one: Table, other: Table) -> None:
@@ -98,9 +97,9 @@ def test_killed_worker_leaves_result_unchanged(client, scan):
     same(again, whole)
 
 
-@pytest.mark.parametrize("readout", [["generated"], ["matched", "--keep-attributes"]])
+@pytest.mark.parametrize("readout", ["generated", "matched"])
 def test_running_scheduler_equals_one_process(readout, client, scan, tmp_path):
-    settings = ["--weights", scan[0].parent, "--chunk", 500, "--readout", *readout]
+    settings = ["--weights", scan[0].parent, "--chunk", 500, "--readout", readout]
     assert call(scan[0], tmp_path / "one.npz", *settings)[0] == 0
     settings += ["--cluster", client.scheduler.address]
     out = done(scan[0], tmp_path / "two.npz", *settings)

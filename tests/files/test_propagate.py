@@ -47,7 +47,7 @@ def nearest(points, sampled):
 
 def test_map_leads_from_sample_to_all_points(scan, tmp_path):
     map_, small = tmp_path / "map.npz", tmp_path / "small.ply"
-    arguments = ["--m", 30, "--method", "fps", "--map", map_, "--keep-attributes"]
+    arguments = ["--m", 30, "--method", "fps", "--map", map_]
     status, _, err = downsample(scan, small, *arguments)
     assert (status, err) == (0, "")
     points, sample = contents(scan).points, contents(small)

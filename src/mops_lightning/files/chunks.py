@@ -98,7 +98,7 @@ def sample_by_chunks(
         return Table(sphere.restore(generated)), outcome
     matched: Nearest = reduce(Nearest.merge, over("matching", _nearest, sphere, generated))
     kept = replace(matched.table, header=file.header)
-    return kept if options.keep_attributes else kept.without_attributes(), outcome
+    return kept.without_attributes() if options.coordinates_only else kept, outcome
 
 
 def draw(source: Path, options: Options, engine: Engine) -> tuple[Table, int, int]:
@@ -148,8 +148,8 @@ class Drawn(NamedTuple):
 def _draw(cloud: CloudFile, options: Options, rows: range) -> Drawn:
     table = cloud.read(rows)
     check_coordinates(cloud.path, table.points)
-    needed = options.keep_attributes or options.weight is not None
-    table = table if needed else table.without_attributes()
+    if options.coordinates_only and options.weight is None:
+        table = table.without_attributes()
     keys = np.random.default_rng([options.seed, rows.start]).random(len(table.points))
     return Drawn(keys, table, len(keys)).lowest(options.chunk)
 

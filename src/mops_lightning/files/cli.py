@@ -75,7 +75,11 @@ def _downsample_arguments(add: Add) -> None:
         help="of a trained sampler: the points that it generates, the input points nearest to "
         "them, or these without duplicates, completed to m by farthest point sampling (default)",
     )
-    add("--keep-attributes", action="store_true", help="keep colours, normals, intensities, ...")
+    add(
+        "--coordinates-only",
+        action="store_true",
+        help="leave out colours, normals, intensities and the like, which are kept by default",
+    )
     add("--surface", type=int, help="points to sample from a mesh first; default: 10000 or 8m")
     add("--workers", type=int, default=1, help="processes that share a folder's files")
     add(

@@ -120,7 +120,7 @@ def _sample_table(source: Path, finite: Table, sampler: Sampler, m: int, options
     if rows is None:
         return Table(points, {}, finite.header)
     kept = finite.take(rows)
-    return kept if options.keep_attributes else kept.without_attributes()
+    return kept.without_attributes() if options.coordinates_only else kept
 
 
 def weights_of(table: Table, field: str, source: Path) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ class Options:
         weights: of a trained sampler: a model, a weights file, or the folder of its run.
         method: one of ``zoo.names.UNTRAINED``, instead of weights.
         readout: of a trained sampler: generated, matched or completed.
-        keep_attributes: keep colours, normals and the like of the kept points.
+        coordinates_only: leave out colours, normals and the like of the kept points.
         surface: number of points to sample from a mesh's surface first.
         seed: of random choices.
         chunk: number of points in memory; see ``draws``. None: the whole file.
@@ -35,7 +35,7 @@ class Options:
     weights: str | None = None
     method: str | None = None
     readout: str = "completed"
-    keep_attributes: bool = False
+    coordinates_only: bool = False
     surface: int | None = None
     seed: int = 0
     chunk: int | None = None
@@ -57,11 +57,6 @@ class Options:
             raise UserError(f"--surface must be at least 1, got {self.surface}.")
         if not 0 <= self.seed < 2**63:
             raise UserError(f"--seed must be from 0 to 2**63 - 1, got {self.seed}.")
-        if self.keep_attributes and self.weights and self.readout == "generated":
-            raise UserError(
-                "--keep-attributes: generated points are new and have no attributes. Use "
-                "--readout completed or matched."
-            )
         if self.map is not None and self.map.suffix.lower() != ".npz":
             raise UserError(f"--map must end in .npz, got {self.map}.")
         if self.map_k < 1 or (self.m is not None and self.map_k > self.m):

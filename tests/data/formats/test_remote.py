@@ -62,7 +62,7 @@ def server(tmp_path_factory):
 @pytest.mark.parametrize("options", [["--level", 1], ["--bounds", "10,10,20,20"]])
 def test_area_of_remote_file_equals_local_file(options, server, tmp_path):
     address, folder, sent = server
-    options = [*options, "--method", "random", "--m", 50, "--keep-attributes"]
+    options = [*options, "--method", "random", "--m", 50]
     sent.clear()
     remote = f"{address}/fine/scan.copc.laz?key=1"
     out = done(remote, tmp_path / "a.laz", *options)
