@@ -23,7 +23,9 @@ ON_SHAPES = ("ablation", "segmentation")
 TESTS_ONLY = ("noise", "corruptions")
 """Sweeps that test a trained run."""
 PLACES = ("sampler", "task.net.sampler", "dataset")
-CELLS = "modelnet40=49 ablation=18 segmentation=23 registration=23 hierarchical=24"
+CELLS = (
+    "modelnet40=49 modelnet40_trials=37 ablation=18 segmentation=23 registration=23 hierarchical=24"
+)
 
 
 @cache
@@ -59,7 +61,8 @@ def test_sweep_cells_are_valid_and_named_by_swept_settings(name):
     for swept in (one for grid in grids(cfg) for one in grid if one.is_sweep_override()):
         key = swept.get_key_element()
         known_as = "names.sampler" if key == "sampler" else key
-        assert known_as in raw["subdir"] or "run_label" in raw["subdir"]
+        names_all = "run_label" in raw["subdir"] or "override_dirname" in raw["subdir"]
+        assert names_all or known_as in raw["subdir"]
     assert "${" not in f"{cfg.hydra.sweep.dir}/{cfg.hydra.sweep.subdir}"
     assert cfg.hydra.mode.name == "MULTIRUN"
     assert (cfg.names.dataset == "shapes") == (name in (*ON_SHAPES, *TESTS_ONLY))
