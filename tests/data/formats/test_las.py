@@ -1,12 +1,15 @@
 """LAS and LAZ files."""
 
 import io
+import itertools
 import struct
 
 import laspy
+import lazrs
 import numpy as np
 import pytest
 
+from mops_lightning.data.formats.las import chunks
 from mops_lightning.data.formats.registry import WRITERS, open_cloud_file, read, write
 from mops_lightning.data.formats.table import Area, Table
 from mops_lightning.errors import UserError
@@ -216,3 +219,74 @@ def test_box_outside_of_las_or_file_without_levels_says_so(scan, tmp_path):
         WRITERS[suffix](tmp_path / f"a{suffix}", Table(np.eye(3)))
         with pytest.raises(UserError, match="need a COPC file"):
             read(tmp_path / f"a{suffix}", 9, 0, Area(level=1))
+
+
+@pytest.mark.parametrize("form", [3, 6])
+@pytest.mark.parametrize("sizes", [[70, 300, 1, 29], [400]])
+def test_laz_with_chunks_of_any_size_is_read_by_rows(form, sizes, tmp_path):
+    path = tmp_path / "a.laz"
+    write_variable_chunks(path, form, sizes)
+    whole = laspy.read(path)
+
+    file = open_cloud_file(path)
+    rows = [np.arange(start, stop) for start, stop in itertools.pairwise([0, 50, 90, 371, 400])]
+    tables = [file.read(range(part[0], part[-1] + 1)) for part in rows]
+
+    found = np.concatenate([table.columns["intensity"] for table in tables])
+    np.testing.assert_array_equal(found, np.arange(400))
+    np.testing.assert_array_equal(np.concatenate([t.points for t in tables]), whole.xyz)
+
+
+@pytest.mark.parametrize("rows", [range(0, 400), range(3, 5), range(250, 400), range(370, 371)])
+def test_large_chunk_is_decompressed_in_steps(rows, tmp_path, monkeypatch):
+    monkeypatch.setattr(chunks, "LARGEST", 80)
+    monkeypatch.setattr(chunks, "STEP", 17)
+    path = tmp_path / "a.laz"
+    write_variable_chunks(path, 6, [70, 300, 30])
+    with laspy.open(path) as file:
+        header = file.header
+        record = header.vlrs.get("LasZipVlr")[0].record_data
+
+    found = chunks.read_rows(path, header.offset_to_point_data, record, 30, 400, rows)
+
+    intensities = found.view(header.point_format.dtype())["intensity"]
+    assert intensities.tolist() == list(rows)
+
+
+def write_variable_chunks(path, form, sizes):
+    """Write a LAZ file whose chunks have the given numbers of points, and rows as intensities."""
+    header = laspy.LasHeader(point_format=form, version="1.4")
+    record = laspy.ScaleAwarePointRecord.zeros(sum(sizes), header=header)
+    record.x, record.y, record.z = np.random.default_rng(0).random((3, len(record))) * 9
+    record.intensity = np.arange(len(record))
+    header.update(record)
+    header.are_points_compressed = True
+    laz = lazrs.LazVlr.new_for_compression(form, 0, True)
+    header.vlrs.append(laspy.vlrs.known.LasZipVlr(laz.record_data()))
+    with path.open("wb") as stream:
+        header.write_to(stream)
+        compressor = lazrs.LasZipCompressor(stream, laz)
+        for start, number in zip(np.cumsum([0, *sizes]), sizes, strict=False):
+            part = record.array[start : start + number]
+            compressor.compress_many(np.frombuffer(part.tobytes(), np.uint8))
+            compressor.finish_current_chunk()
+        compressor.done()
+
+
+def test_copc_by_blocks_of_rows_equals_whole_file(scan):
+    whole, file = laspy.read(scan), open_cloud_file(scan)
+
+    tables = [file.read(rows) for rows in file.row_ranges(700)]
+
+    np.testing.assert_array_equal(np.concatenate([t.points for t in tables]), whole.xyz)
+    intensities = np.concatenate([t.columns["intensity"] for t in tables])
+    np.testing.assert_array_equal(intensities, whole.intensity)
+
+
+def test_real_copc_file_is_read_by_blocks(real_data):
+    path = real_data("airborne") / "lone-star.copc.laz"
+    whole, file = laspy.read(path), open_cloud_file(path)
+
+    tables = [file.read(rows) for rows in file.row_ranges(100_000)]
+
+    np.testing.assert_array_equal(np.concatenate([t.points for t in tables]), whole.xyz)

@@ -13,6 +13,7 @@ import numpy as np
 from mops_lightning.data.formats import table as tables
 from mops_lightning.data.formats.guard import BadCloudError, ends_early
 from mops_lightning.data.formats.isolated import isolated
+from mops_lightning.data.formats.las.chunks import read_rows
 from mops_lightning.errors import UserError
 
 COPC = "copc"
@@ -111,9 +112,18 @@ def _parse_rows(path: Path, rows: range) -> tables.Table:
         BadCloudError: points are far outside of the header's bounds: a damaged LAZ file may give
             any numbers.
     """
-    with _laspy(path).open(path, read_evlrs=False) as file:
-        file.seek(rows.start)
-        return _table_near(path, file.read_points(len(rows)), file.header)
+    laspy = _laspy(path)
+    with laspy.open(path, read_evlrs=False) as file:
+        header = file.header
+        if not header.are_points_compressed:
+            file.seek(rows.start)
+            return _table_near(path, file.read_points(len(rows)), header)
+        form, record = header.point_format, header.vlrs.get("LasZipVlr")[0].record_data
+    first, total = header.offset_to_point_data, header.point_count
+    points = read_rows(path, first, record, form.size, total, rows)
+    packed = laspy.PackedPointRecord.from_buffer(points, form)
+    cloud = laspy.ScaleAwarePointRecord(packed.array, form, header.scales, header.offsets)
+    return _table_near(path, cloud, header)
 
 
 def _count_in_nodes(path: Path, area: tables.Area) -> int:
