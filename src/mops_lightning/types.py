@@ -67,7 +67,7 @@ class SampleOutput(NamedTuple):
         losses: the sampler's own weighted loss terms, to add to the task loss.
         matrix: the sampling matrix S that generated the points, or None.
         soft_projected: ``(B, M, 3)`` points on which the task net is trained in place of
-            ``points``, or None; only in training, never a test result.
+            ``points``, or None; only in training. See ``Sampler.project`` for the readout.
 
     Examples:
         >>> import torch

@@ -65,6 +65,18 @@ def test_samplenet_projects_in_training_only(rng):
     assert net.eval()(points).soft_projected is None
 
 
+def test_samplenet_projection_in_evaluation_equals_double_loop_with_learned_temperature(rng):
+    net = SampleNet(6, k=4)
+    torch.nn.init.constant_(net.temperature, 0.3)
+    points = torch.randn(2, 20, 3, generator=rng)
+    points[:, 10:] = points[:, :10]  # duplicates tie
+    generated = net.eval()(points).points
+
+    projected = net.project(generated, points)
+
+    torch.testing.assert_close(projected, plain_projection(generated, points, 4, 0.3**2))
+
+
 def test_samplenet_gamma_replaces_alpha():
     assert SampleNet(6, alpha=30.0).alpha == 30
     assert SampleNet(6, alpha=30.0, gamma=5e-5).alpha == 5e-5

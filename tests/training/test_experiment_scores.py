@@ -1,5 +1,6 @@
 """Which points every score is computed from, through Lightning's trainer and by their outcome."""
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -9,6 +10,7 @@ from mops_lightning import FPSSampler, GumbelSampler, RandomSampler, VoxelSample
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.metrics.base import collection
 from mops_lightning.metrics.classification import Accuracy
+from mops_lightning.samplers.samplenet import SampleNet
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.scores import Scores
 from tests.support.plain import plain_farthest
@@ -49,7 +51,22 @@ def expected_points(sampler, cloud, m):
     squares = (sampled.points[0][:, None] - cloud).square().sum(2)
     rows = squares.argmin(1).tolist()
     filled = plain_farthest(cloud, dict.fromkeys(rows), m)
-    return {"generated": sampled.points[0], "matched": cloud[rows], "completed": cloud[filled]}
+    sets = {"generated": sampled.points[0], "matched": cloud[rows], "completed": cloud[filled]}
+    if isinstance(sampler, SampleNet):
+        sets["projected"] = torch.stack(
+            [plain_projected(q, cloud, sampler) for q in sets["generated"]]
+        )
+    return sets
+
+
+def plain_projected(query, cloud, sampler):
+    """The mean of the k points nearest to a query, weighted by the learned temperature."""
+    squares = (query - cloud).square().sum(1).tolist()
+    nearest = sorted(range(len(cloud)), key=squares.__getitem__)[: sampler.k]
+    scale = float(sampler.temperature) ** 2
+    weights = [math.exp((squares[nearest[0]] - squares[row]) / scale) for row in nearest]
+    total = sum(weights)
+    return sum(weight / total * cloud[row] for weight, row in zip(weights, nearest, strict=True))
 
 
 def expected_scores(module, clouds, sizes, baselines=BASELINES):

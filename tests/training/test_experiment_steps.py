@@ -65,9 +65,11 @@ def test_task_net_of_samplenet_gets_projected_points_in_training_only(kind, call
             assert (call.points - output.points[:, :m]).abs().max() > 0.1
     (scored,) = [output for training, _, output in sampler.samples if not training]
     assert scored.soft_projected is None
-    generated, matched, _ = (call.points for call in calls if not call.training)
+    generated, matched, _, projected = (call.points for call in calls if not call.training)
     assert torch.equal(generated, scored.points)
     assert not torch.equal(generated, matched)
+    assert not torch.equal(projected, generated)
+    assert not torch.equal(projected, matched)
 
 
 PROGRESSIVE = partial(noting, ProgressiveSampleNet, 16, **SNET)
@@ -100,7 +102,7 @@ def test_losses_over_sizes_are_summed_or_averaged(how, make, name, loss, calls):
     assert logged["train/mean_loss"] == pytest.approx(logged["train/loss/total"], rel=1e-4)
     assert logged["loss"] == pytest.approx(logged["train/loss/total"], rel=1e-4)
     assert logged.get("train/tau") == (1.0 if isinstance(sampler, FMOPSNet) else None)
-    readout = "soft_projected" if isinstance(sampler, SampleNet) else "generated"
+    readout = "projected" if isinstance(sampler, SampleNet) else "generated"
     prints = torch.stack([module.task.net(call.points).detach() for call in calls]).mean()
     assert logged[f"train/{readout}/fingerprint"] == pytest.approx(float(prints), abs=1e-4)
 

@@ -2,16 +2,22 @@
 
 from typing import NamedTuple
 
-GENERATED_READOUTS = ("generated", "matched", "completed")
-"""The sampler's output; its nearest input points; these made unique and completed by FPS."""
+GENERATED = "generated"
+"""The sampler's output."""
+MATCHED = "matched"
+"""The nearest input points of the generated points."""
+COMPLETED = "completed"
+"""The matched points, made unique and completed by farthest points."""
+GENERATED_READOUTS = (GENERATED, MATCHED, COMPLETED)
+"""The readouts of every sampler that generates points."""
+PROJECTED = "projected"
+"""SampleNet's soft projection of the generated points: what its task net is trained on."""
 INDEX_READOUT = "sampled"
 """The only readout of samplers that choose input points."""
 FULL = "full"
 """The cloud before sampling, as a reference."""
-SOFT_PROJECTED = "soft_projected"
-"""Input of SampleNet's task net in training; logged under ``train/`` only, never a result."""
 
-ROWS = (*GENERATED_READOUTS, INDEX_READOUT, FULL)
+ROWS = (*GENERATED_READOUTS, PROJECTED, INDEX_READOUT, FULL)
 """Readouts in the order of tables, after the baselines."""
 
 

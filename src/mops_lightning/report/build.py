@@ -7,7 +7,12 @@ from typing import Any
 
 import pandas as pd
 
-from mops_lightning.records.readout_names import FULL, parse_metric_name
+from mops_lightning.records.readout_names import (
+    FULL,
+    GENERATED_READOUTS,
+    PROJECTED,
+    parse_metric_name,
+)
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import OF_TEST_CLOUDS
 from mops_lightning.report import collect, paper
@@ -15,9 +20,6 @@ from mops_lightning.report.comparable import Group, commit, groups, net_groups, 
 from mops_lightning.report.nets import nets_grid
 from mops_lightning.report.tables import Table, make_table, sort_key
 from mops_lightning.report.text import PAPER, Grid
-
-SETS = "generated / matched / completed sets, or one figure for samplers that choose input points."
-"""The content of a cell, for titles."""
 
 MAX_COLUMNS = 8
 """Most values of a setting that a table shows side by side; more are below each other."""
@@ -132,6 +134,14 @@ def _unchanged_lines(table: Table) -> list[str]:
     return lines
 
 
+def _sets(table: Table) -> str:
+    """Return the content of a cell, for titles."""
+    order = " / ".join(GENERATED_READOUTS)
+    if PROJECTED in set(table.values["readout"]):
+        order += f" (SampleNet: / {PROJECTED})"
+    return f"{order} sets, or one figure for samplers that choose input points."
+
+
 def _by_column(table: Table) -> Grid:
     """Return the scores of all samplers by size or by another setting, beside the paper's."""
     names, by_size, records = table.names, table.group.column == "m", table.group.records
@@ -158,7 +168,7 @@ def _by_column(table: Table) -> Grid:
     size = "" if by_size else f", m={table.sizes},"
     title = (
         f"Test {table.metric.title}: {names['task']} on {names['dataset']}{size} "
-        f"under {table.net}; {SETS}"
+        f"under {table.net}; {_sets(table)}"
     )
     head = ["sampled by", *(f"{table.group.column}={one}" for one in columns)]
     if costs:
@@ -185,7 +195,7 @@ def _by_net(table: Table) -> Grid:
     means = tested.mean().map(metric.format).to_dict()
     title = (
         f"Test {table.metric.title} of the same samples under several task nets: {names['task']} "
-        f"on {names['dataset']}; {SETS}"
+        f"on {names['dataset']}; {_sets(table)}"
     )
     rows.append(["", label, *(means.get(name, "") for name in columns)])
     return Grid(title, ["m", "sampled by", *columns], rows)
@@ -209,7 +219,7 @@ def _plane(table: Table, name: str) -> Grid:
         spreads.append(f"{readout} {ends}{times}")
     title = (
         f"Test {table.metric.title} of {name}: {names['task']} on {names['dataset']}, "
-        f"m={table.sizes}, under {table.net}; generated / matched / completed sets."
+        f"m={table.sizes}, under {table.net}; {' / '.join(table.readouts(name))} sets."
     )
     corner = f"{down.split('.')[-1]} \\ {across.split('.')[-1]}"
     head = [corner, *(f"{one:g}" for one in cells.columns)]

@@ -8,7 +8,7 @@ from matplotlib import colormaps
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from mops_lightning.records.readout_names import GENERATED_READOUTS, INDEX_READOUT
+from mops_lightning.records.readout_names import GENERATED_READOUTS, INDEX_READOUT, PROJECTED
 from mops_lightning.report.build import MAX_COLUMNS, Report
 from mops_lightning.report.tables import Table, sort_key
 from mops_lightning.viz.figures import new_figure
@@ -40,14 +40,16 @@ def curves(table: Table) -> Figure:
     standard deviations over seeds. Panels with many columns are wide, and stacked.
     """
     columns = sorted(table.columns())
-    readouts = len(GENERATED_READOUTS)
+    readouts = list(GENERATED_READOUTS)
+    if PROJECTED in set(table.values["readout"]):
+        readouts.append(PROJECTED)
     if wide := len(columns) > MAX_COLUMNS:
-        figure = new_figure(0.16 * len(columns) + 2, 2.2 * readouts + 1)
-        panels = figure.subplots(readouts, 1, sharex=True)
+        figure = new_figure(0.16 * len(columns) + 2, 2.2 * len(readouts) + 1)
+        panels = figure.subplots(len(readouts), 1, sharex=True)
     else:
-        figure = new_figure(4.2 * readouts, 3.4)
-        panels = figure.subplots(1, readouts, sharey=True)
-    for axis, readout in zip(panels, GENERATED_READOUTS, strict=True):
+        figure = new_figure(4.2 * len(readouts), 3.4)
+        panels = figure.subplots(1, len(readouts), sharey=True)
+    for axis, readout in zip(panels, readouts, strict=True):
         for number, name in enumerate(table.rows()):
             dashed = INDEX_READOUT in table.readouts(name)
             values = table.of(name, INDEX_READOUT if dashed else readout).sort_values("column")

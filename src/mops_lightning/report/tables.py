@@ -12,9 +12,12 @@ from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import (
+    COMPLETED,
     FULL,
+    GENERATED,
     GENERATED_READOUTS,
     INDEX_READOUT,
+    PROJECTED,
     parse_metric_name,
 )
 from mops_lightning.records.run_record import Names, RunRecord
@@ -22,7 +25,7 @@ from mops_lightning.records.summary import baseline_name
 from mops_lightning.report.collect import epochs, sampler_row, seed, trained_with
 from mops_lightning.report.comparable import Group, value
 
-READOUTS = (INDEX_READOUT, *GENERATED_READOUTS)
+READOUTS = (INDEX_READOUT, *GENERATED_READOUTS, PROJECTED)
 """Readouts of a cell, in its order."""
 
 ORDER = (
@@ -111,7 +114,7 @@ class Table:
     def readouts(self, row: str) -> list[str]:
         """Return the readouts of a row, in their order."""
         present = set(self.values.loc[self.values["row"] == row, "readout"])
-        return [name for name in (*GENERATED_READOUTS, INDEX_READOUT) if name in present]
+        return [name for name in READOUTS if name in present]
 
     def of(self, row: str, readout: str) -> pd.DataFrame:
         """Return the values of a row and a readout."""
@@ -208,14 +211,15 @@ def make_table(group: Group, metric: str, net: str) -> Table:
 def _ranked(table: pd.DataFrame, metric: MetricInfo) -> pd.DataFrame:
     """Add the rank of each value among the rows of its column, and whether it is level.
 
-    Points chosen from the input compete with completed sets. Equal texts have equal ranks. A value
+    Points chosen from the input compete with completed sets, projected points with generated
+    ones. Equal texts have equal ranks. A value
     is level with the best, and has its rank, if it is less than two standard deviations away: the
     larger of the two deviations over seeds.
     """
     table["rank"], table["level"] = 0, False
     if metric.higher_is_better is None:
         return table
-    rivals = table["readout"].replace(INDEX_READOUT, GENERATED_READOUTS[-1])
+    rivals = table["readout"].replace({INDEX_READOUT: COMPLETED, PROJECTED: GENERATED})
     shown = pd.to_numeric(table["mean"].map(metric.format))
     places = [rivals, table["m"], table["column"], table["down"]]
     top = "max" if metric.higher_is_better else "min"

@@ -55,6 +55,9 @@ class Sampler(nn.Module):
     """Whether the points are generated, so that matched and completed sets differ from them;
     otherwise they are input points, returned with their indices."""
 
+    projects: bool = False
+    """Whether generated points have a soft projection onto the cloud (``project``), a readout."""
+
     nested: bool = False
     """Whether the sample of a smaller size is the first part of the sample of a larger one."""
 
@@ -226,6 +229,15 @@ class Sampler(nn.Module):
             Scalar terms by size and name; empty for a sampler without losses.
         """
         return {}
+
+    def project(self, generated: Tensor, points: Tensor) -> Tensor:
+        """Return the soft projection ``(B, M, 3)`` of generated points ``(B, M, 3)``.
+
+        Args:
+            generated: the points that the sampler generated for ``points``.
+            points: ``(B, N, 3)`` the clouds.
+        """
+        raise NotImplementedError  # see projects
 
     def training_sizes(self) -> tuple[int, ...]:
         """Return the sizes of the next training step; random ones use torch's global generator."""

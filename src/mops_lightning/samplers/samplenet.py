@@ -38,12 +38,13 @@ def soft_projection(queries: Tensor, points: Tensor, k: int, sigma: Tensor | flo
 
 
 class SampleNet(SNet):
-    """S-Net with a soft projection of its points onto the cloud during training.
+    """S-Net with a soft projection of its points onto the cloud.
 
     Lang, Manor and Avidan, "SampleNet: Differentiable Point Cloud Sampling", CVPR 2020.
 
-    In training, the task net receives the projected points. In evaluation nothing is projected: the
-    generated points are S-Net's, matched and completed as usual.
+    In training, the task net receives the projected points. In evaluation they are a readout,
+    ``projected``, beside the generated points (the publication's simplified points), which are
+    S-Net's, and the matched and completed points.
 
     Args:
         m: number of points to generate.
@@ -64,6 +65,8 @@ class SampleNet(SNet):
         >>> output.points.shape, output.soft_projected.shape  # (B, m, 3)
         (torch.Size([2, 8, 3]), torch.Size([2, 8, 3]))
     """
+
+    projects = True
 
     def __init__(
         self,
@@ -97,8 +100,15 @@ class SampleNet(SNet):
         output = super().sample(points, m)
         if not self.training:
             return output
-        projected = soft_projection(output.points, points, self.k, self.sigma)
-        return output._replace(soft_projected=projected)
+        return output._replace(soft_projected=self.project(output.points, points))
+
+    def project(self, generated: Tensor, points: Tensor) -> Tensor:
+        """Return the soft projection of generated points; see ``Sampler.project``.
+
+        Raises:
+            UserError: there are fewer than k points.
+        """
+        return soft_projection(generated, points, self.k, self.sigma)
 
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]

@@ -17,14 +17,15 @@ from torch.optim.lr_scheduler import LRScheduler
 from mops_lightning.config.settings import Learn
 from mops_lightning.errors import UserError
 from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
-from mops_lightning.records.readout_names import FULL, SOFT_PROJECTED
+from mops_lightning.records.readout_names import FULL, PROJECTED
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
 from mops_lightning.training.checkpoint import CHECKPOINT_KEY, SAVED, check_finite
+from mops_lightning.training.readouts import names_of_readouts, readouts
 from mops_lightning.training.recipe.distillation import Distillation, Targets
-from mops_lightning.training.recipe.recipe import Recipe, draw_points, reached, straight_through
-from mops_lightning.training.scores import Scores, names_of_readouts, readouts
+from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through
+from mops_lightning.training.scores import Scores
 from mops_lightning.types import Batch, SampleOutput
 
 TEST = "test/"
@@ -216,7 +217,7 @@ class Experiment(L.LightningModule):
             total = torch.stack(list(losses.values())).sum()
         check_finite({"the loss": total}, self.global_step, self.trainer.strategy)
         soft = outputs[sizes[0]].soft_projected
-        readout = self.main_readout if soft is None else SOFT_PROJECTED
+        readout = self.main_readout if soft is None else PROJECTED
         self._log_training({**losses, "total": total}, readout, len(batch.points))
         return total
 
@@ -230,7 +231,7 @@ class Experiment(L.LightningModule):
         """
         soft = sampled.soft_projected
         inputs = [sampled.points if soft is None else soft]
-        if reached(self.recipe.straight_through, self._progress):
+        if self.recipe.sees_matched(self._progress):
             inputs.append(straight_through(sampled.points, seen))
         terms: dict[str, Tensor] = {}
         tasks: list[Any] = [self.task, *self.other_tasks]

@@ -24,6 +24,7 @@ COLOURS = {
     "generated": (31, 119, 220),
     "matched": (214, 39, 40),
     "completed": (255, 140, 0),
+    "projected": (128, 60, 170),
     "sampled": (44, 140, 60),
 }
 """RGB, 0 to 255. Blue, red and orange as in the paper; green for index samplers."""

@@ -83,6 +83,10 @@ class Recipe:
             return available
         return min(available, max(self.train_points, POINTS_PER_SAMPLE * largest))
 
+    def sees_matched(self, progress: float) -> bool:
+        """Return whether the task net also sees matched points."""
+        return reached(self.straight_through, progress)
+
 
 def reached(share: float | None, progress: float) -> bool:
     """Return whether training has come to a share of its steps; never for None."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.tasks.base import Task, figures_of
-from mops_lightning.training.scores import readouts
+from mops_lightning.training.readouts import readouts
 from mops_lightning.viz import figures as drawing
 
 DENSE_PIXELS = 2**20
