@@ -14,7 +14,8 @@ from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE, FAILED
 from mops_lightning.zoo import model_file, names
-from tests.support.command_line import TINY, done
+from tests.support.command_line import TINY, call, done
+from tests.support.reports import rows
 
 
 @pytest.fixture
@@ -197,3 +198,29 @@ def test_sweep_ends_in_models_whose_cards_name_each_other(tmp_path, monkeypatch)
     assert card["record"]["files"]["task_weights"].startswith("own.pointnet@sha256:")
     out = done(["evaluate=own.mops-m8", "pictures=0", "logger=none"], tmp_path)
     assert card["figures"]["values"]["completed"] in out
+
+
+def test_sweep_over_nine_values_ends_in_a_table_of_nine_rows(tmp_path):
+    levels = [f"{number / 100:g}" for number in range(9)]
+    sweep = ["-m", "sampler=fps", "learn=nothing", "weights=null", *TINY, "hydra.sweep.dir=nine"]
+
+    out = done([*sweep, f"test_noise_std={','.join(levels)}"], tmp_path)
+
+    assert "9 cells: 9 completed" in out
+    found = [row[0] for row in rows((tmp_path / "nine" / "table.md").read_text())]
+    assert [float(text) for text in found[1:]] == [float(level) for level in levels]
+
+
+def test_sweep_whose_report_fails_ends_with_an_exit_status(tmp_path, monkeypatch):
+    sweep = ["-m", "sampler=fps", "learn=nothing", "weights=null", *TINY, "hydra.sweep.dir=sweep"]
+    (tmp_path / "sweep").mkdir()
+    (tmp_path / "sweep" / "table.md").write_text("my own notes")
+    status, out, err = call([*sweep, "seed=0,1"], tmp_path)
+    assert (status, "2 cells: 2 completed" in out) == (2, True)
+    assert "table.md: was not written by report" in err
+
+    (tmp_path / "sweep" / "table.md").unlink()
+    monkeypatch.setattr("mops_lightning.report.cli.markdown", None)  # a bug of the program
+    status, out, err = call([*sweep, "seed=0,1"], tmp_path)
+    assert status == 1
+    assert "the end of the sweep failed" in out + err

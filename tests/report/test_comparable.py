@@ -185,3 +185,19 @@ def test_same_samples_under_several_nets_have_column_per_net(tmp_path):
         ["8", "fmops", "72.00", "32.00", "52.00"],
         ["", "all points", "90.00", "90.00", "90.00"],
     ]
+
+
+@pytest.mark.parametrize("columns", [3, 9, 12])
+def test_any_number_of_noise_levels_gives_a_table_of_all(tmp_path, columns):
+    levels = [round(0.01 * number, 2) for number in range(columns)]
+    for level in levels:
+        metrics = {"test/generated/accuracy": 0.9 - level, "test/full/accuracy": 0.95 - level}
+        put(tmp_path / f"{level}", "mops", 32, metrics, config={"test_noise_std": level})
+
+    found = rows(table(tmp_path))
+
+    by_level = found if columns > 8 else [list(line) for line in zip(*found, strict=True)]
+    named = [line[0].removeprefix("test_noise_std=") for line in by_level[1:]]
+    assert [float(text) for text in named] == levels
+    assert by_level[0][1:] == ["mops", "all points"]
+    assert by_level[-1][1:] == [f"{90 - 100 * levels[-1]:.2f}", f"{95 - 100 * levels[-1]:.2f}"]

@@ -1,6 +1,6 @@
 import shutil
 
-from tests.support.records import evaluated
+from tests.support.records import NAMES, evaluated
 from tests.support.reports import edited, put, put_cell, rows, table
 
 
@@ -99,3 +99,101 @@ def test_equal_cells_are_named(tmp_path):
     text = table(tmp_path)
     assert "All 3 cells of mops are equal: the settings that differ changed no figure." in text
     assert "cells of snet" not in text
+
+
+def test_values_within_two_deviations_of_a_spread_best_are_level(tmp_path):
+    """The best has a deviation of 0.1, the second of one seed has none: 0.15 away is level."""
+    for seed, value in enumerate((0.9, 1.0, 1.1)):
+        put_cell(tmp_path, f"mops{seed}", "mops", {"generated": value}, seed=seed)
+    put_cell(tmp_path, "fmops", "fmops", {"generated": 1.15})
+    put_cell(tmp_path, "snet", "snet", {"generated": 1.25})
+
+    text = table(tmp_path)
+
+    assert "| mops | **1 ± 0.10** (n=3)" in text
+    assert "| fmops | **1.15** |" in text
+    assert "| snet | <u>1.25</u> |" in text
+    assert "those level with it" in text
+
+
+def test_value_with_a_spread_of_its_own_is_level_with_a_best_of_one_seed(tmp_path):
+    put_cell(tmp_path, "mops", "mops", {"generated": 1.0})
+    for seed, value in enumerate((1.05, 1.15, 1.25)):
+        put_cell(tmp_path, f"fmops{seed}", "fmops", {"generated": value}, seed=seed)
+
+    text = table(tmp_path)
+
+    assert "| mops | **1** |" in text
+    assert "| fmops | **1.15 ± 0.10** (n=3)" in text
+
+
+def test_nets_for_different_largest_sizes_have_rows_of_their_own(tmp_path):
+    for largest, value in ((128, 0.8), (512, 0.7)):
+        metrics = {f"test/m{m}/generated/accuracy": value for m in (8, 32)}
+        of = {"m_max": largest, "alpha": 1}
+        put(tmp_path / f"{largest}", "fmops", 32, metrics, of=of, config={"weights": "auto"})
+    put(tmp_path / "other size", "mops", 32, {"test/generated/accuracy": 0.9}, of={"m": 32})
+    put(tmp_path / "other size", "mops", 8, {"test/generated/accuracy": 0.5}, of={"m": 8})
+
+    found = [row for row in rows(table(tmp_path)) if "paper" not in row[0]]
+
+    assert found == [
+        ["sampled by", "m=32", "m=8"],
+        ["mops", "90.00", "50.00"],
+        ["fmops m_max=128", "80.00", "80.00"],
+        ["fmops m_max=512", "70.00", "70.00"],
+    ]
+
+
+def test_mixed_table_keeps_samplers_apart_that_would_share_a_cell(tmp_path):
+    """One row has another alpha for another size, which is a choice; the other has two for one."""
+    for name, sampler, m, alpha in (
+        ("a", "mops", 8, 1.0),
+        ("b", "mops", 32, 10.0),
+        ("c", "snet", 8, 1.0),
+        ("d", "snet", 8, 10.0),
+    ):
+        metrics = {"test/generated/accuracy": alpha / 20}
+        put(tmp_path / name, sampler, m, metrics, of={"alpha": alpha, "m": m})
+
+    found = [row for row in rows(table(tmp_path, mixed=True)) if "paper" not in row[0]]
+
+    assert found[1:] == [
+        ["snet alpha=1.0", "", "5.00"],
+        ["snet alpha=10.0", "", "50.00"],
+        ["mops", "50.00", "5.00"],
+    ]
+
+
+def test_cell_with_a_run_of_a_changed_checkout_is_marked(tmp_path):
+    for name, sampler, is_dirty in (("a", "mops", True), ("b", "fps", False)):
+        metrics = {"test/sampled/accuracy": 0.5}
+        put(tmp_path / name, sampler, 8, metrics, git={"commit": "c" * 40, "dirty": is_dirty})
+
+    text = table(tmp_path)
+
+    assert ["mops", "50.00 †"] in rows(text)
+    assert ["fps", "50.00"] in rows(text)
+    assert "† With a run whose checkout had changes that no commit has." in text
+
+
+OWN = {"names": {**NAMES, "dataset": "modelnet40", "sampler": "own"}}
+
+
+def test_own_samplers_have_rows_named_by_their_classes(tmp_path):
+    for name, target, value in (("a", "mine.Corners", 0.5), ("b", "mine.Edges", 0.6)):
+        metrics = {"test/sampled/accuracy": value}
+        put(tmp_path / name, "own", 8, metrics, of={"_target_": target}, config=OWN)
+
+    found = rows(table(tmp_path, mixed=True))
+
+    assert found[1:] == [["Corners", "50.00"], ["Edges", "60.00"]]
+
+
+def test_own_task_and_net_are_named_in_titles(tmp_path):
+    names = {**NAMES, "task": "own", "net": "own", "dataset": "own"}
+    settings = {"_target_": "mine.Counting", "net": {"_target_": "mine.Counter"}}
+    config = {"names": names, "dataset": {"_target_": "mine.boxes"}}
+    put(tmp_path, "fps", 8, {"test/sampled/accuracy": 0.5}, settings=settings, config=config)
+
+    assert "Test accuracy (%): Counting on boxes under Counter;" in table(tmp_path)

@@ -26,6 +26,7 @@ def record(config=None, **changes):
             "seed": 0,
             "started": "2026-01-01T00:00:00+00:00",
             **environment(),
+            "git": {"commit": "0123456789" * 4, "dirty": False},
             "device": "cpu",
             **changes,
         }

@@ -19,7 +19,15 @@ from omegaconf import DictConfig, OmegaConf
 from mops_lightning.cli.start import line_about_run
 from mops_lightning.config import settings
 from mops_lightning.config.settings import Affects
-from mops_lightning.errors import USER_ERROR, Interrupted, UserError, as_line, end, one_line
+from mops_lightning.errors import (
+    USER_ERROR,
+    Interrupted,
+    UserError,
+    as_line,
+    end,
+    one_line,
+    one_line_endings,
+)
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
@@ -229,10 +237,27 @@ class SweepSummary(Callback):
             end("mops_lightning", f"out: cannot write to {folder}: {error.strerror}.", USER_ERROR)
 
     def on_multirun_end(self, config: DictConfig, **extra: Any) -> None:
-        """Count the cells of this start by state, and write the report."""
-        from mops_lightning.report import cli as report
+        """Count the cells of this start by state, and write the report.
 
+        Raises:
+            SystemExit: with 1 if a cell failed or the report did. Hydra turns any other exception
+                of a callback into a warning, and ends with 0.
+        """
         folder = Path(os.path.relpath(config.hydra.sweep.dir))
+        try:
+            with one_line_endings("mops_lightning"):
+                states = self._states(folder)
+                self._report(folder, states)
+        except Exception:
+            log.exception("the runs are done, but the end of the sweep failed")
+            raise SystemExit(1) from None
+        found = set(states.values())
+        if found - {"completed", ELSEWHERE} or not found:
+            print(f"To repeat the rest: the same command with hydra.sweep.dir={folder}")
+            raise SystemExit(1)
+
+    def _states(self, folder: Path) -> dict[Path, str]:
+        """Return the states of the cells of this start, and print their numbers."""
         begun = (folder / BEGUN).stat().st_mtime_ns
         states: dict[Path, str] = {}
         # Hydra writes this into every cell that it starts.
@@ -240,15 +265,18 @@ class SweepSummary(Callback):
             cell = path.parents[1]
             if path.stat().st_mtime_ns >= begun:
                 states[cell] = _state(cell)
-        found = set(states.values())
         numbers = sorted(Counter(states.values()).items())
         counts = ", ".join(f"{count} {state}" for state, count in numbers) or "no values to sweep"
         print(f"{len(states)} cells: {counts}; in {folder}")
-        if "completed" in found:
+        return states
+
+    def _report(self, folder: Path, states: dict[Path, str]) -> None:
+        """Write the report of all cells below a folder, and the models of this start's cells."""
+        from mops_lightning.report import cli as report
+
+        completed = [cell for cell, state in states.items() if state == "completed"]
+        if completed:
             options = ["--mixed"] if self.mixed else []
             report.main([str(folder), *options], "python -m mops_lightning report")
         if self.models:
-            _add_models([cell for cell, state in states.items() if state == "completed"], folder)
-        if found - {"completed", ELSEWHERE} or not found:
-            print(f"To repeat the rest: the same command with hydra.sweep.dir={folder}")
-            raise SystemExit(1)
+            _add_models(completed, folder)

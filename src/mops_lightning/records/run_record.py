@@ -19,6 +19,7 @@ import msgspec
 from mops_lightning.errors import UserError, printable
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.metrics.info import MetricInfo
+from mops_lightning.records.digest import digest_of
 
 SCHEMA: Literal["mops_lightning/result/2"] = "mops_lightning/result/2"
 FILE = "result.json"
@@ -151,6 +152,7 @@ class RunRecord:
         lengthened: whether it continued with another number of epochs than planned.
         evaluated: the run that was tested; None: this one.
         folder: of the run, relative to the file that holds the record.
+        digest: of the other fields, as the program wrote them; None in records of earlier versions.
     """
 
     schema: Literal["mops_lightning/result/2"] = SCHEMA
@@ -189,6 +191,7 @@ class RunRecord:
     lengthened: bool = False
     evaluated: Evaluated | None = None
     folder: str = "."
+    digest: str | None = None
 
     @classmethod
     def begin(cls, config: dict[str, Any], overrides: list[str], seed: int) -> "RunRecord":
@@ -208,6 +211,11 @@ class RunRecord:
     def plain(self) -> dict[str, Any]:
         """Return the record as plain data, as ``result.json`` holds it."""
         return asdict(self)
+
+    @property
+    def is_edited(self) -> bool:
+        """Whether the record was changed after it was written; False for one without a digest."""
+        return self.digest is not None and self.digest != digest_of(_finite(self.plain()))
 
 
 def from_plain(plain: Any) -> RunRecord:
@@ -232,8 +240,8 @@ def write(folder: Path, record: RunRecord) -> Path:
     Raises:
         ValueError: the record does not fit its types: a bug in this program.
     """
-    plain = _finite(record.plain())
-    from_plain(plain)
+    plain = from_plain(_finite(record.plain())).plain()
+    plain["digest"] = digest_of(plain)
     path = folder / FILE
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n")

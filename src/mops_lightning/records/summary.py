@@ -8,7 +8,10 @@ from rich.table import Table
 
 from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL, ROWS, parse_metric_name
-from mops_lightning.records.run_record import FILE, RunRecord
+from mops_lightning.records.run_record import FILE, Names, RunRecord
+
+OWN = "own"
+"""Name of a group whose class the user names on the command line."""
 
 OF_TEST_CLOUDS = ("test_noise_std", "test_corruption")
 """Settings that change the test clouds; in reports, their values give the columns of a table."""
@@ -42,7 +45,8 @@ def results_table(record: RunRecord) -> tuple[str, Table]:
     Baselines come first, full clouds last; the latter hold for every size.
     """
     config = record.config
-    names, score = config["names"], parse_metric_name(record.score_name)
+    names = shown_names(config)
+    score = parse_metric_name(record.score_name)
     by_size = score.metric if score and score.m else None
     rows: dict[str, dict[str, float | None]] = {}
     for name, value in record.metrics.items():
@@ -77,6 +81,27 @@ def results_table(record: RunRecord) -> tuple[str, Table]:
     return ", ".join([title, *changed]), table
 
 
+def shown_names(config: dict[str, Any]) -> Names:
+    """Return the names of a run's groups for titles and rows.
+
+    A group whose class the user named on the command line is shown by this class, so that two
+    classes have two names.
+    """
+    task = config["task"]
+    nodes = {
+        "task": task,
+        "net": task.get("net"),
+        "dataset": config["dataset"],
+        "sampler": config.get("sampler"),
+    }
+    names: Any = dict(config["names"])
+    for group, node in nodes.items():
+        target = (node or {}).get("_target_")
+        if target and names[group] == OWN:
+            names[group] = str(target).rpartition(".")[2]
+    return names
+
+
 def sampler_name(config: dict[str, Any]) -> str:
     """Return the name of a run's sampler, and for FPS the start point if it is set.
 
@@ -84,7 +109,7 @@ def sampler_name(config: dict[str, Any]) -> str:
     """
     sampler = config.get("sampler") or {}
     anchored = " anchored" if sampler.get("anchors") else ""
-    return config["names"]["sampler"] + anchored + _start(sampler)
+    return shown_names(config)["sampler"] + anchored + _start(sampler)
 
 
 def baseline_name(config: dict[str, Any], name: str) -> str:

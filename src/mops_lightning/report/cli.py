@@ -6,9 +6,12 @@ from mops_lightning.errors import Parser, one_line_endings
 from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.records import run_record
 from mops_lightning.report.build import Report, build_report
-from mops_lightning.report.tables import NOT_IN_CSV, long_form
+from mops_lightning.report.long_form import NOT_IN_CSV, long_form
+from mops_lightning.report.ownership import MARK, check_records_file, check_replaceable
+from mops_lightning.report.rows import RowNames
 from mops_lightning.report.text import latex, markdown
 
+TABLE = "table.md"
 PAGE = "report.html"
 
 ESCAPED = "backslashreplace"
@@ -40,6 +43,8 @@ def main(arguments: list[str] | None = None, prog: str = "mops-lightning report"
         records = "also write all records to one file (.jsonl)"
         add("--records", type=Path, metavar="FILE", help=records)
         chosen = parser.parse_args(arguments)
+        if chosen.records:
+            check_records_file(chosen.records)
         report = build_report(chosen.folder, chosen.metric, chosen.mixed)
         written = write(report, chosen.folder)
         if chosen.records:
@@ -49,28 +54,44 @@ def main(arguments: list[str] | None = None, prog: str = "mops-lightning report"
 
 
 def write(report: Report, folder: Path) -> list[str]:
-    """Write all files of a report into its folder and return their names."""
+    """Write all files of a report into its folder and return their names.
+
+    Raises:
+        UserError: the folder has a file of such a name that no report has written.
+    """
     from mops_lightning.report.page import page
     from mops_lightning.report.plots import plots
     from mops_lightning.viz.figures import save_figure
 
+    figures = plots(report)
+    pictures = [f"{name}{suffix}" for name in figures for suffix in (".png", ".svg")]
+    names = [TABLE, "table.tex", "table.csv", PAGE, *pictures]
+    check_replaceable(folder, names)
     remove_temporary(folder, below=False)
-    keys = {key for table in report.tables for key in table.group.settings}
-    net = report.tables[0].net if report.tables else ""
-    long = long_form(report.found.done, net, sorted(keys)).drop(columns=[*NOT_IN_CSV])
     texts = {
-        "table.md": markdown(report.grids, report.remarks),
+        TABLE: markdown(report.grids, report.remarks),
         "table.tex": latex(report.grids, report.remarks),
-        "table.csv": long.to_csv(index=False, lineterminator="\n"),
+        "table.csv": _csv(report),
     }
     for name, text in texts.items():
-        with atomic_write(folder / name) as temporary:
-            temporary.write_text(text, errors=ESCAPED)
-    drawn = [
-        save_figure(figure, folder / f"{name}{suffix}", dpi=150)
-        for name, figure in plots(report).items()
-        for suffix in (".png", ".svg")
-    ]
-    with atomic_write(folder / PAGE) as temporary:
-        temporary.write_text(page(report, folder, drawn[1::2]), errors=ESCAPED)
-    return [*texts, PAGE, *(path.name for path in drawn)]
+        _write_text(folder / name, text)
+    for name, figure in figures.items():
+        for suffix in (".png", ".svg"):
+            save_figure(figure, folder / f"{name}{suffix}", dpi=150, software=MARK)
+    drawn = [folder / f"{name}.svg" for name in figures]
+    _write_text(folder / PAGE, page(report, folder, drawn))
+    return names
+
+
+def _csv(report: Report) -> str:
+    """Return every figure of every run as comma-separated values."""
+    settings = sorted({key for table in report.tables for key in table.group.settings})
+    net = report.tables[0].net if report.tables else ""
+    rows = RowNames(report.found.done, net, settings)
+    long = long_form(report.found.done, rows, settings)
+    return long.drop(columns=[*NOT_IN_CSV]).to_csv(index=False, lineterminator="\n")
+
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, errors=ESCAPED)

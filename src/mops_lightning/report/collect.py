@@ -7,8 +7,8 @@ from typing import Any
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.records.readout_names import FULL, parse_metric_name
-from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
-from mops_lightning.records.summary import sampler_name
+from mops_lightning.records.run_record import ASIDE, FAILED, Names, RunRecord
+from mops_lightning.records.summary import sampler_name, shown_names
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,11 @@ def _records(folder: Path) -> list[tuple[Path, RunRecord | str]]:
 def _lines(path: Path) -> list[str]:
     """Return the lines of a regular file; other files give none."""
     return path.read_text(errors="replace").splitlines() if path.is_file() else []
+
+
+def names(record: RunRecord) -> Names:
+    """Return the names of a record's groups, as titles and rows show them."""
+    return shown_names(record.config)
 
 
 def trained_with(record: RunRecord) -> str:

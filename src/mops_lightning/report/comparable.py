@@ -10,6 +10,7 @@ import pandas as pd
 from mops_lightning.config.shared_settings import table_settings, with_defaults
 from mops_lightning.records.run_record import RunRecord, dotted
 from mops_lightning.records.summary import OF_TEST_CLOUDS
+from mops_lightning.report import collect
 from mops_lightning.report.collect import epochs, recorded_recipe, sampler_row, seed, trained_with
 
 
@@ -55,7 +56,7 @@ def groups(found: list[RunRecord], mixed: bool = False) -> list[Group]:
     result = []
     for group in _split([Group(found)], "task", _task):
         trained = [record for record in group.records if not weightless(record)]
-        nets = {(record.config["names"]["net"], record.task_weights_sha256) for record in trained}
+        nets = {(collect.names(record)["net"], record.task_weights_sha256) for record in trained}
         if len(nets) > 1 and not group.joint and all(one.evaluated for one in group.records):
             result.append(replace(group, column="net"))
         else:
@@ -98,14 +99,27 @@ def _split(
         for record in group.records:
             parts.setdefault(key(record), []).append(record)
         shared = parts.pop(None, [])
-        for own in parts:
-            differing = [text for i, text in enumerate(own) if len({one[i] for one in parts}) > 1]
-            about = " ".join(filter(None, [what, *differing])) if differing else ""
-            about = "; ".join(filter(None, [group.about, about]))
-            result.append(replace(group, records=[*parts[own], *shared], about=about))
+        for part, records in parts.items():
+            about = _about(group, what, _differing(part, list(parts)))
+            result.append(replace(group, records=[*records, *shared], about=about))
         if not parts:
             result.append(group)
     return result
+
+
+def _differing(part: tuple[str, ...], parts: list[tuple[str, ...]]) -> list[str]:
+    """Return the texts of a key at the places where keys differ."""
+    places = zip(*parts, strict=True)
+    return [text for text, texts in zip(part, places, strict=True) if len(set(texts)) > 1]
+
+
+def _about(group: Group, what: str, differing: list[str]) -> str:
+    """Return how a part of a group differs from the other groups."""
+    if not differing:
+        return group.about
+    texts = [text for text in (what, *differing) if text]
+    about = " ".join(texts)
+    return f"{group.about}; {about}" if group.about else about
 
 
 def _by_content(found: list[Group], what: str, name: str) -> list[Group]:
@@ -132,7 +146,7 @@ def _by_content(found: list[Group], what: str, name: str) -> list[Group]:
 
 def _agree(found: list[RunRecord], name: str) -> bool:
     """Return whether runs have the same value of a field, or one for each seed of all samplers."""
-    rows = [(one.config["names"]["sampler"], seed(one), getattr(one, name)) for one in found]
+    rows = [(collect.names(one)["sampler"], seed(one), getattr(one, name)) for one in found]
     runs = pd.DataFrame(rows, columns=["sampler", "seed", "value"]).dropna()
     if runs["value"].nunique() <= 1:
         return True
@@ -205,11 +219,11 @@ def weightless(record: RunRecord) -> bool:
 
 
 def _row(record: RunRecord) -> tuple[str, str]:
-    return sampler_row(record), record.config["names"]["net"]
+    return sampler_row(record), collect.names(record)["net"]
 
 
 def _task(record: RunRecord) -> tuple[str, ...]:
-    names = record.config["names"]
+    names = collect.names(record)
     return names["task"], names["dataset"], f"resample={record.config['task'].get('resample')}"
 
 
@@ -219,7 +233,7 @@ def _trained(record: RunRecord) -> tuple[str, ...] | None:
         return None
     task, learned = record.config["task"], trained_with(record)
     settings = f"task.net={json.dumps(with_defaults(task.get('net')), sort_keys=True)}"
-    return record.config["names"]["net"], settings, f"learn={learned}"
+    return collect.names(record)["net"], settings, f"learn={learned}"
 
 
 def commit(record: RunRecord) -> str:

@@ -11,9 +11,9 @@ from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.records.run_record import BY_RUN, RunRecord, dotted
-from mops_lightning.report import comparable, paper
+from mops_lightning.report import collect, comparable, paper
 from mops_lightning.report.collect import score, seed, training_time
-from mops_lightning.report.tables import over_seeds
+from mops_lightning.report.tables import DIRTY, dirty_line, over_seeds
 from mops_lightning.report.text import PAPER, Grid
 
 NAMES = {"points": "points after stages"}
@@ -35,12 +35,12 @@ def nets_grid(group: comparable.Group, metrics: Sequence[str] = ()) -> Grid:
         UserError: no record has a metric.
     """
     found = sorted(group.records, key=lambda record: record.started)
-    names, infos = found[0].config["names"], _metrics(found, metrics)
+    names, infos = collect.names(found[0]), _metrics(found, metrics)
     shown = _settings(found)
     settings = pd.DataFrame(shown).drop(columns=[*BY_RUN], errors="ignore")
     keys = [key for key in sorted(settings) if settings[key].dropna().map(str).nunique() > 1]
     runs = settings[keys].apply(_sortable).assign(points=[_points(one) for one in found])
-    runs = runs.assign(net=[one.config["names"]["net"] for one in found])
+    runs = runs.assign(net=[collect.names(one)["net"] for one in found])
     runs = runs.assign(record=found, settings=shown)
     place = ["points", *keys, "net"]
     runs["seed"] = [seed(one) for one in found]
@@ -57,7 +57,8 @@ def nets_grid(group: comparable.Group, metrics: Sequence[str] = ()) -> Grid:
     table = table.drop(columns=[name for name in head[-2:] if not any(table[name])])
     title = f"No sampler was tested; {names['task']} on {names['dataset']} from all points."
     title += f" ({group.about})" if group.about else ""
-    return Grid(title, list(table), table.to_numpy().tolist())
+    below = dirty_line(any(record.git["dirty"] for record in found))
+    return Grid(title, list(table), table.to_numpy().tolist(), below)
 
 
 def _sortable(values: pd.Series) -> pd.Series:
@@ -68,13 +69,17 @@ def _sortable(values: pd.Series) -> pd.Series:
 def _row(records: list[RunRecord], settings: Iterable[Any], metrics: list[MetricInfo]) -> list[str]:
     """Return the cells of one net, over all its seeds."""
     first = records[0]
-    label = [first.config["names"]["net"], *settings, _points(first)]
+    label = [collect.names(first)["net"], *settings, _points(first)]
     texts = ["" if value is None else str(value) for value in label]
     for metric in metrics:
         values = pd.Series([one.metrics.get(f"test/{FULL}/{metric.name}") for one in records])
         count = values.count()
         text = over_seeds(metric, values.mean(), values.std()) if count else ""
-        texts.append(text + (f" (n={count})" if count > 1 else ""))
+        if count > 1:
+            text += f" (n={count})"
+        if count and any(record.git["dirty"] for record in records):
+            text += f" {DIRTY}"
+        texts.append(text)
     size = first.parameters.get("task")
     cost = pd.Series(training_time(records)[1], dtype=float).mean()
     texts.append("" if size is None else f"{4e-6 * size:.1f}")
@@ -89,7 +94,7 @@ def _settings(found: list[RunRecord]) -> list[dict[str, Any]]:
     same: dict[tuple[str, ...], list[RunRecord]] = {}
     nets = [_net(record) for record in found]
     for record, net in zip(found, nets, strict=True):
-        place = record.config["names"]["net"], net, _points(record), seed(record)
+        place = collect.names(record)["net"], net, _points(record), seed(record)
         same.setdefault(tuple(map(str, place)), []).append(record)
     trainings = sorted(
         key
@@ -138,7 +143,7 @@ def _metrics(found: list[RunRecord], requested: Sequence[str]) -> list[MetricInf
 
 
 def _paper(record: RunRecord) -> str:
-    names, points = record.config["names"], _points(record)
+    names, points = collect.names(record), _points(record)
     values = None
     if names["task"] == "reconstruction":
         values = paper.net(names["net"], _arguments(record).get("pieces"), points)

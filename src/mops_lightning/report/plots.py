@@ -9,8 +9,10 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from mops_lightning.records.readout_names import GENERATED_READOUTS, INDEX_READOUT, PROJECTED
-from mops_lightning.report.build import MAX_COLUMNS, Report
-from mops_lightning.report.tables import Table, sort_key
+from mops_lightning.report.build import Report
+from mops_lightning.report.grids import MAX_COLUMNS
+from mops_lightning.report.rows import sort_key
+from mops_lightning.report.tables import Table
 from mops_lightning.viz.figures import new_figure
 
 COLOURS = (*(f"C{i}" for i in range(10)), *(colormaps["Dark2"](i) for i in range(8)))
@@ -80,7 +82,8 @@ def curves(table: Table) -> Figure:
 
 def heat_maps(table: Table) -> Figure:
     """Draw the planes of all samplers, a row each and a column per readout, on one colour scale."""
-    planes, scale = table.group.planes, table.metric.scale
+    planes = table.planes
+    scale = table.metric.scale
     names = sorted(planes, key=sort_key)
     means = table.values["mean"] * scale
     low, high = means.min(), means.max()

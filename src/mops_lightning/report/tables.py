@@ -1,42 +1,28 @@
-"""The long form of records, and tables of one metric from it."""
+"""Tables of one metric."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.metric_info import metric_info
-from mops_lightning.records.readout_names import (
-    COMPLETED,
-    FULL,
-    GENERATED,
-    GENERATED_READOUTS,
-    INDEX_READOUT,
-    PROJECTED,
-    parse_metric_name,
-)
-from mops_lightning.records.run_record import Names, RunRecord
-from mops_lightning.records.summary import baseline_name
-from mops_lightning.report.collect import epochs, sampler_row, seed, trained_with
-from mops_lightning.report.comparable import Group, value
+from mops_lightning.records.readout_names import FULL, INDEX_READOUT
+from mops_lightning.records.run_record import Names
+from mops_lightning.records.summary import shown_names
+from mops_lightning.report.collect import sampler_row
+from mops_lightning.report.comparable import Group
+from mops_lightning.report.long_form import long_form
+from mops_lightning.report.ranks import ranked
+from mops_lightning.report.rows import READOUTS, RowNames, sort_key
 
-READOUTS = (INDEX_READOUT, *GENERATED_READOUTS, PROJECTED)
-"""Readouts of a cell, in its order."""
+PLACE = ["row", "m", "column", "down"]
+"""The columns of values that say which cell a value is in."""
 
-ORDER = (
-    *("random", "serial", "voxel", "fps", "poisson", "critical", "submodular", "gumbel", "snet"),
-    *("samplenet", "samplenet_progressive", "mops", "fmops"),
-)
-"""Samplers in the order of the paper's tables; others follow by name."""
-
-
-NOT_IN_CSV = ("row", "size", "started")
-"""Further columns of the long form: the row of a value, the run's own size, and its start."""
+DIRTY = "†"
+"""Mark of a cell with a run whose checkout had changes."""
 
 
 class Part(NamedTuple):
@@ -74,8 +60,10 @@ class Table:
         metric: its name, unit and label.
         group: the records.
         net: the task net of the table; other nets are named in rows.
+        row_names: the rows of the records.
         values: one row for every cell and readout: ``row``, ``m``, ``column``, and for heat maps
-            ``down``; ``readout``, ``mean`` and ``std`` over seeds, and their ``count``.
+            ``down``; ``readout``, ``mean`` and ``std`` over seeds, their ``count_``, ``rank``,
+            ``level``, and ``dirty``: whether a checkout had changes.
         full: the long form of all metrics on full clouds, with ``column``.
         hidden: folders of runs that are not shown, because a later run has the same place.
     """
@@ -83,6 +71,7 @@ class Table:
     metric: MetricInfo
     group: Group
     net: str
+    row_names: RowNames
     values: pd.DataFrame
     full: pd.DataFrame
     hidden: list[str]
@@ -90,12 +79,18 @@ class Table:
     @property
     def names(self) -> Names:
         """The names that the records share: of task and dataset."""
-        return self.group.records[0].config["names"]
+        return shown_names(self.group.records[0].config)
 
     @property
     def sizes(self) -> str:
         """The sizes of the runs."""
-        return "/".join(map(str, sorted({one.config["m"] for one in self.group.records})))
+        sizes = {record.config["m"] for record in self.group.records}
+        return "/".join(str(m) for m in sorted(sizes))
+
+    @property
+    def planes(self) -> dict[str, list[str]]:
+        """Row → the two settings of its heat map; empty for tables by column."""
+        return _planes(self.group, self.row_names)
 
     @property
     def full_metric(self) -> MetricInfo:
@@ -127,46 +122,14 @@ class Table:
         return cells.unstack("column", fill_value="")
 
     def _cell(self, values: pd.DataFrame) -> Cell:
-        by_readout = {one.readout: one for one in values.itertuples()}
-        found: list[Any] = [by_readout[name] for name in READOUTS if name in by_readout]
-        count = max(int(one.count_) for one in found)
-        parts = (Part(over_seeds(self.metric, one.mean, one.std), one.rank) for one in found)
-        return Cell(tuple(parts), f" (n={count})" if count > 1 else "")
-
-
-def long_form(found: list[RunRecord], net: str, keys: Sequence[str] = ()) -> pd.DataFrame:
-    """Return one row for every test value of every record: the columns of ``table.csv``, and more.
-
-    Args:
-        found: completed records.
-        net: the table's task net.
-        keys: settings that get a column, dotted.
-    """
-    rows = []
-    for record, label in zip(found, net_labels(found), strict=True):
-        facts = {
-            "folder": record.folder,
-            "sampler": row_name(record, net),
-            "learn": trained_with(record),
-            "seed": seed(record),
-            "epochs": epochs(record) or 0,
-            **{key: value(record, key) for key in keys},
-            "net": label,
-            "commit": record.git["commit"],
-            "device": record.device,
-            "size": record.config["m"],
-            "started": record.started,
-        }
-        for name, figure in record.metrics.items():
-            parts = parse_metric_name(name)
-            if parts is not None and figure is not None:
-                m = record.config["m"] if parts.m is None else parts.m
-                tested = {"m": m, "readout": parts.readout, "metric": parts.metric}
-                row = _row(record, parts.readout, net)
-                rows.append({**facts, **tested, "value": figure, "row": row})
-    first = ["folder", "sampler", "learn", "seed", "epochs", "m", "readout", "metric", "value"]
-    columns = [*first, *keys, "net", "commit", "device", *NOT_IN_CSV]
-    return pd.DataFrame(rows, columns=columns)
+        by_readout = {value.readout: value for value in values.itertuples()}
+        present: list[Any] = [by_readout[name] for name in READOUTS if name in by_readout]
+        parts = [Part(over_seeds(self.metric, one.mean, one.std), one.rank) for one in present]
+        seeds = max(int(one.count_) for one in present)
+        suffix = f" (n={seeds})" if seeds > 1 else ""
+        if values["dirty"].any():
+            suffix += f" {DIRTY}"
+        return Cell(tuple(parts), suffix)
 
 
 def make_table(group: Group, metric: str, net: str) -> Table:
@@ -180,93 +143,83 @@ def make_table(group: Group, metric: str, net: str) -> Table:
     Raises:
         UserError: no record has the metric.
     """
-    long = long_form(group.records, net, group.settings)
-    long["down"], long["column"] = 0.0, 0.0 if group.planes else long[group.column].fillna("none")
-    for name, pair in group.planes.items():
-        own = long["sampler"] == name
-        long.loc[own, ["down", "column"]] = long.loc[own, pair].to_numpy(float)
+    rows = RowNames(group.records, net, group.settings)
+    long = _placed(long_form(group.records, rows, group.settings), group, rows)
+    values = _tested(long, metric, group)
+    later = _replaced_later(values)
+    info = metric_info(metric, group.records)
+    return Table(
+        metric=info,
+        group=group,
+        net=net,
+        row_names=rows,
+        values=ranked(_over_seeds(values[~later]), info),
+        full=long[long["readout"] == FULL],
+        hidden=sorted(set(values.loc[later & values["own"], "folder"])),
+    )
+
+
+def _planes(group: Group, rows: RowNames) -> dict[str, list[str]]:
+    """Return the two settings of every row's heat map."""
+    if not group.planes:
+        return {}
+    return {rows.of(record): group.planes[sampler_row(record)] for record in group.records}
+
+
+def _placed(long: pd.DataFrame, group: Group, rows: RowNames) -> pd.DataFrame:
+    """Add the place of every value in the layout of the group's table: ``column`` and ``down``."""
+    long["down"] = 0.0
+    if not group.planes:
+        long["column"] = long[group.column].fillna("none")
+        return long
+    long["column"] = 0.0
+    for name, (down, across) in _planes(group, rows).items():
+        in_row = long["sampler"] == name
+        long.loc[in_row, "down"] = long.loc[in_row, down].to_numpy(float)
+        long.loc[in_row, "column"] = long.loc[in_row, across].to_numpy(float)
+    return long
+
+
+def _tested(long: pd.DataFrame, metric: str, group: Group) -> pd.DataFrame:
+    """Return the values of a metric that the table shows, the earlier run first.
+
+    ``own`` says whether a value is of the run's own sampler, not of a baseline. A baseline counts
+    where no run tested the same sampler.
+
+    Raises:
+        UserError: there is none.
+    """
     values = long[(long["metric"] == metric) & (long["readout"] != FULL)].copy()
     if values.empty:
-        known = set(long["metric"])
-        raise UserError(f"--metric: no run has {metric!r}.{did_you_mean(metric, known)}")
+        raise UserError(
+            f"--metric: no run has {metric!r}.{did_you_mean(metric, set(long['metric']))}"
+        )
     values["own"] = values["readout"].isin(READOUTS)
-    if group.settings:  # the run's own size only
-        values = values[values["m"] == values["size"]]
+    if group.settings:
+        at_own_size = values["m"] == values["size"]
+        values = values[at_own_size]
     if group.planes:
         values = values[values["own"]]
     # Joint training gives each run its own task net, under which its baselines ran too.
     values = values[values["own"] | (values["learn"] != "joint")]
-    values["readout"] = values["readout"].where(values["readout"].isin(READOUTS), INDEX_READOUT)
-    place = ["row", "m", "column", "down"]
-    tested = values.groupby(place, dropna=False)["own"].transform("any")
-    values = values[values["own"] | ~tested].sort_values("started", kind="stable")
-    later = values["folder"] != values.groupby([*place, "seed"])["folder"].transform("last")
-    hidden = sorted(set(values.loc[later & values["own"], "folder"]))
-    over = values[~later].groupby([*place, "readout"], sort=False)["value"]
-    table = over.agg(mean="mean", std="std", count_="count").reset_index()
-    info = metric_info(metric, group.records)
-    return Table(info, group, net, _ranked(table, info), long[long["readout"] == FULL], hidden)
+    values["readout"] = values["readout"].where(values["own"], INDEX_READOUT)
+    has_own_run = values.groupby(PLACE, dropna=False)["own"].transform("any")
+    values = values[values["own"] | ~has_own_run]
+    return values.sort_values("started", kind="stable")
 
 
-def _ranked(table: pd.DataFrame, metric: MetricInfo) -> pd.DataFrame:
-    """Add the rank of each value among the rows of its column, and whether it is level.
-
-    Points chosen from the input compete with completed sets, projected points with generated
-    ones. Equal texts have equal ranks. A value
-    is level with the best, and has its rank, if it is less than two standard deviations away: the
-    larger of the two deviations over seeds.
-    """
-    table["rank"], table["level"] = 0, False
-    if metric.higher_is_better is None:
-        return table
-    rivals = table["readout"].replace({INDEX_READOUT: COMPLETED, PROJECTED: GENERATED})
-    shown = pd.to_numeric(table["mean"].map(metric.format))
-    places = [rivals, table["m"], table["column"], table["down"]]
-    top = "max" if metric.higher_is_better else "min"
-    best = shown.groupby(places).transform(top)
-    deviation = metric.scale * table["std"].fillna(0.0)
-    of_best = deviation.where(shown == best).groupby(places).transform("max")
-    near = (shown - best).abs() < 2 * np.maximum(deviation, of_best)
-    second = shown.where((shown != best) & ~near).groupby(places).transform(top)
-    several = shown.groupby(places).transform("count") > 1
-    table["level"] = several & near & (shown != best)
-    table.loc[several & (shown == second), "rank"] = 2
-    table.loc[several & ((shown == best) | near), "rank"] = 1
-    return table
+def _replaced_later(values: pd.DataFrame) -> pd.Series:
+    """Return which values a later run replaces: one with the same place and seed."""
+    latest = values.groupby([*PLACE, "seed"])["folder"].transform("last")
+    return values["folder"] != latest
 
 
-def _row(record: RunRecord, readout: str, net: str) -> str:
-    """Return the row of a value: a sampler or a baseline of its run."""
-    own = row_name(record, net)
-    if readout in (*READOUTS, FULL):
-        return own
-    prefix = own.removesuffix(sampler_row(record))  # such as "dgcnn on "
-    return prefix + baseline_name(record.config, readout)
-
-
-def row_name(record: RunRecord, net: str) -> str:
-    """Return the row of a record's own results; it names a net that is not the table's."""
-    own, sampler = record.config["names"]["net"], sampler_row(record)
-    return sampler if net in ("", own) else f"{own} on {sampler}"
-
-
-def net_labels(found: list[RunRecord]) -> list[str]:
-    """Return a name for the task net of each record, other names for other weights."""
-    labels: list[str] = []
-    digests: dict[str, set[str | None]] = {}
-    for record in found:
-        name, given = record.config["names"]["net"], record.config.get("weights")
-        if record.evaluated and given == "run":
-            name += " of the training"
-        elif given not in (None, "auto", "run"):
-            file = Path(str(given).partition("@")[0]).name
-            name = file if file.startswith(name) else f"{name} ({file})"
-        labels.append(name)
-        digests.setdefault(name, set()).add(record.task_weights_sha256)
-    return [
-        f"{label} {str(record.task_weights_sha256)[:8]}" if len(digests[label]) > 1 else label
-        for label, record in zip(labels, found, strict=True)
-    ]
+def _over_seeds(values: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for every cell and readout: mean, deviation and number over seeds."""
+    cells = values.groupby([*PLACE, "readout"], sort=False)
+    table = cells["value"].agg(mean="mean", std="std", count_="count")
+    table["dirty"] = cells["dirty"].any()
+    return table.reset_index()
 
 
 def over_seeds(metric: MetricInfo, mean: float, std: float) -> str:
@@ -279,9 +232,8 @@ def over_seeds(metric: MetricInfo, mean: float, std: float) -> str:
     return f"{text} ± {metric.scale * std:.{max(places, 2)}f}"
 
 
-def sort_key(row: str) -> tuple[int, str]:
-    """Return a key that sorts rows as the paper's tables do."""
-    _, other_net, sampler = row.rpartition(" on ")  # such as "dgcnn on mops fast"
-    name = sampler.split()[0]  # without its recipe
-    number = ORDER.index(name) if name in ORDER else len(ORDER)
-    return number + len(ORDER) * bool(other_net) * 2, row
+def dirty_line(is_dirty: bool) -> list[str]:
+    """Return a line that says what the mark of a changed checkout means, if a cell has it."""
+    if not is_dirty:
+        return []
+    return [f"{DIRTY} With a run whose checkout had changes that no commit has."]

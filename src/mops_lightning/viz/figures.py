@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 from torch.nn.functional import adaptive_max_pool1d
 
@@ -68,7 +69,7 @@ def cloud_axes(
     return axes
 
 
-def save_figure(figure: Figure, path: Path, dpi: float = 110) -> Path:
+def save_figure(figure: Figure, path: Path, dpi: float = 110, software: str = "") -> Path:
     """Write a figure as PNG or SVG, completely or not at all.
 
     A PNG gets a palette of 256 colours, which makes it several times smaller.
@@ -77,15 +78,21 @@ def save_figure(figure: Figure, path: Path, dpi: float = 110) -> Path:
         figure: what to write.
         path: the file; its suffix gives the format.
         dpi: resolution of a PNG, and of the images in an SVG.
+        software: what wrote it, for the metadata; empty: none in a PNG, matplotlib's in an SVG.
     """
     buffer = io.BytesIO()
     if path.suffix == ".svg":
-        figure.savefig(buffer, format="svg", dpi=dpi, metadata={"Date": None})
+        creator = {"Creator": software} if software else {}
+        figure.savefig(buffer, format="svg", dpi=dpi, metadata={"Date": None, **creator})
     else:
         figure.savefig(buffer, format="png", dpi=dpi)
         image = Image.open(buffer).convert("RGB")
         buffer = io.BytesIO()
-        image.quantize(256, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
+        palette = image.quantize(256, dither=Image.Dither.NONE)
+        metadata = PngInfo()
+        if software:
+            metadata.add_text("Software", software)
+        palette.save(buffer, "PNG", optimize=True, pnginfo=metadata)
     with atomic_write(path) as temporary:
         temporary.write_bytes(buffer.getvalue())
     return path

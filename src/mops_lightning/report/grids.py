@@ -1,0 +1,246 @@
+"""From a table's values to its texts: by size, by another setting, as planes of two, or by net."""
+
+from typing import Any
+
+import pandas as pd
+
+from mops_lightning.records.readout_names import (
+    FULL,
+    GENERATED_READOUTS,
+    PROJECTED,
+    parse_metric_name,
+)
+from mops_lightning.records.run_record import RunRecord
+from mops_lightning.records.summary import OF_TEST_CLOUDS
+from mops_lightning.report import collect, paper
+from mops_lightning.report.rows import sort_key
+from mops_lightning.report.tables import Table, dirty_line
+from mops_lightning.report.text import PAPER, Grid
+
+MAX_COLUMNS = 8
+"""Most values of a setting that a table shows side by side; more are below each other."""
+
+
+def grids(table: Table) -> list[Grid]:
+    """Return the texts of a table, with the values of full clouds."""
+    if table.group.planes:
+        planes = [_plane(table, row) for row in sorted(table.planes, key=sort_key)]
+        planes[-1].below += _full_lines(table)
+    elif table.group.column == "net":
+        planes = [_by_net(table)]
+    else:
+        planes = [_by_column(table)]
+    planes[-1].below += [
+        *_level_line(table),
+        *_unchanged_lines(table),
+        *dirty_line(table.values["dirty"].any()),
+    ]
+    if table.group.about:
+        for grid in planes:
+            grid.title += f" ({table.group.about})"
+    return planes
+
+
+def _level_line(table: Table) -> list[str]:
+    """Return a line that says what bold means, if a value is bold and not the best."""
+    if not table.values["level"].any():
+        return []
+    return [
+        "Bold: the best value, and those level with it, less than two standard deviations over "
+        "seeds away."
+    ]
+
+
+def _unchanged_lines(table: Table) -> list[str]:
+    """Return a line for each sampler whose cells are equal, though its settings differ."""
+    if not table.group.settings:
+        return []
+    lines = []
+    for row in table.rows():
+        values = table.values[table.values["row"] == row]
+        shown = values["mean"].map(table.metric.format).groupby(values["readout"])
+        if shown.nunique().max() == 1 and shown.count().min() > 1:
+            lines.append(
+                f"All {shown.count().max()} cells of {row} are equal: the settings that differ "
+                "changed no figure."
+            )
+    return lines
+
+
+def _sets(table: Table) -> str:
+    """Return the content of a cell, for titles."""
+    order = " / ".join(GENERATED_READOUTS)
+    if PROJECTED in set(table.values["readout"]):
+        order += f" (SampleNet: / {PROJECTED})"
+    return f"{order} sets, or one figure for samplers that choose input points."
+
+
+def _by_column(table: Table) -> Grid:
+    """Return the scores of all samplers by size or by another setting, beside the paper's."""
+    group = table.group
+    is_by_size = group.column == "m"
+    cells = table.cells(["row"])
+    columns = table.columns()
+    costs = _costs(table)
+    published = _published(table) if is_by_size else {}
+    rows: list[list] = []
+    below: list[str] = []
+    for row in table.rows():
+        line = [row, *cells.loc[row, columns]]
+        theirs = _paper_cells(published, _sampler_of(table, row), columns)
+        if costs:
+            line.append(costs.get(row, ""))
+            theirs = theirs and [*theirs, ""]
+        rows.append(line)
+        if theirs:
+            rows.append([PAPER, *theirs])
+            below = [published["note"]] if "note" in published else []
+    if is_by_size:
+        below += _full_lines(table)
+    else:
+        rows.append(["all points", *_full_cells(table, columns)])
+    if not is_by_size and len(columns) > MAX_COLUMNS:
+        head = [group.column, *(row[0] for row in rows)]
+        values = zip(*(row[1:] for row in rows), strict=True)
+        rows = [[str(column), *line] for column, line in zip(columns, values, strict=True)]
+    else:
+        head = ["sampled by", *(f"{group.column}={column}" for column in columns)]
+        if costs:
+            head.append(collect.training_time(group.records)[0])
+    size = "" if is_by_size else f", m={table.sizes},"
+    title = (
+        f"Test {table.metric.title}: {table.names['task']} on {table.names['dataset']}{size} "
+        f"under {table.net}; {_sets(table)}"
+    )
+    return Grid(title, head, rows, below)
+
+
+def _sampler_of(table: Table, row: str) -> str:
+    """Return the name of a row's sampler in the paper's tables, whose net is the table's."""
+    for record in table.group.records:
+        names = collect.names(record)
+        if table.row_names.of(record) == row and names["net"] == table.net:
+            return names["sampler"]
+    return row.partition(" from ")[0]  # a baseline, or a row of another net
+
+
+def _paper_cells(published: dict[str, Any], sampler: str, columns: list[Any]) -> list[str]:
+    """Return the paper's values of a sampler by size; empty if it has none of them."""
+    theirs = published.get("rows", {}).get(sampler, {})
+    cells = [theirs.get(str(column), []) for column in columns]
+    if not any(cells):
+        return []
+    return [" / ".join(f"{value:.2f}" for value in cell) for cell in cells]
+
+
+def _full_cells(table: Table, columns: list[Any]) -> list[str]:
+    """Return the values of full clouds by column."""
+    full = table.full[table.full["metric"] == table.metric.name]
+    texts = full.groupby("column")["value"].last().map(table.metric.format).to_dict()
+    return [texts.get(column, "") for column in columns]
+
+
+def _by_net(table: Table) -> Grid:
+    """Return the scores of the same samples under several nets: size and sampler by net."""
+    cells = table.cells(["m", "row"])
+    columns = sorted(cells.columns, key=lambda label: ("of the training" not in label, label))
+    places = sorted(cells.index, key=lambda place: (-place[0], sort_key(place[1])))
+    rows: list[list] = [[str(m), row, *cells.loc[(m, row), columns]] for m, row in places]
+    metric = table.full_metric
+    label = f"all points ({metric.title})" if table.metric.full_cloud_metric else "all points"
+    full = table.full[table.full["metric"] == metric.name]
+    # Figures differ by seed where data depend on it; equal ones are of the same data.
+    tested = full.drop_duplicates(["net", "value"]).groupby("net")["value"]
+    means = tested.mean().map(metric.format).to_dict()
+    rows.append(["", label, *(means.get(net, "") for net in columns)])
+    title = (
+        f"Test {table.metric.title} of the same samples under several task nets: "
+        f"{table.names['task']} on {table.names['dataset']}; {_sets(table)}"
+    )
+    return Grid(title, ["m", "sampled by", *columns], rows)
+
+
+def _plane(table: Table, row: str) -> Grid:
+    """Return the grid of a sampler: rows are one setting's values, columns the other's.
+
+    Below it is the range of its values by readout, a measure of sensitivity.
+    """
+    down, across = (key.rpartition(".")[2] for key in table.planes[row])
+    cells = table.cells(["row", "down"]).loc[row].sort_index().sort_index(axis=1)
+    cells = cells.loc[:, (cells != "").any()]
+    lines = [[f"{left:g}", *line] for left, line in zip(cells.index, cells.to_numpy(), strict=True)]
+    spreads = [_spread(table, row, readout) for readout in table.readouts(row)]
+    title = (
+        f"Test {table.metric.title} of {row}: {table.names['task']} on {table.names['dataset']}, "
+        f"m={table.sizes}, under {table.net}; {' / '.join(table.readouts(row))} sets."
+    )
+    head = [f"{down} \\ {across}", *(f"{value:g}" for value in cells.columns)]
+    return Grid(title, head, lines, [f"Spread over the plane of {row}: {', '.join(spreads)}."])
+
+
+def _spread(table: Table, row: str, readout: str) -> str:
+    """Return the range of a plane's values as text."""
+    means = table.of(row, readout)["mean"]
+    low, high = means.min(), means.max()
+    ends = f"{readout} {table.metric.format(low)} to {table.metric.format(high)}"
+    return f"{ends} (factor {high / low:.3g})" if low > 0 else ends
+
+
+def _costs(table: Table) -> dict[str, str]:
+    """Return the seconds of training of every row by size: of all its trainings, for one seed."""
+    if table.group.column != "m":
+        return {}
+    records = table.group.records
+    runs = pd.DataFrame(
+        {
+            "row": [table.row_names.of(record) for record in records],
+            "m": [record.config["sampler"].get("m_max", record.config["m"]) for record in records],
+            "seconds": collect.training_time(records)[1],
+        }
+    )
+    costs = runs.dropna().groupby(["row", "m"])["seconds"].mean().groupby("row").sum()
+    return costs.map("{:,.0f} s".format).to_dict()
+
+
+def _full_lines(table: Table) -> list[str]:
+    """Return a line for each task net with its value on full clouds."""
+    metric = table.full_metric
+    label = f"{metric.title} " if table.metric.full_cloud_metric else ""
+    theirs = _published(table, full_clouds=True)
+    lines = []
+    for record in sorted(table.group.records, key=_by_row_and_size):
+        figure = record.metrics.get(f"test/{FULL}/{metric.name}")
+        if figure is None:
+            continue
+        net = collect.names(record)["net"]
+        is_published = net == table.net and "full" in theirs
+        compared = f" (the paper: {theirs['full']:.2f})" if is_published else ""
+        lines.append(
+            f"{net} on all points{_after_joint(record)}: {label}{metric.format(figure)}{compared}."
+        )
+    return list(dict.fromkeys(lines))
+
+
+def _by_row_and_size(record: RunRecord) -> tuple[str, int]:
+    return collect.sampler_row(record), -record.config["m"]
+
+
+def _after_joint(record: RunRecord) -> str:
+    """Return the sampler that a net was trained with, as a part of a sentence; empty if alone."""
+    if collect.trained_with(record) != "joint":
+        return ""
+    tested = [parse_metric_name(name) for name in record.metrics]
+    has_sizes = any(name.m for name in tested if name)
+    size = "" if has_sizes else f", m={record.config['m']}"
+    return f" after joint training with {collect.sampler_row(record)}{size}"
+
+
+def _published(table: Table, full_clouds: bool = False) -> dict[str, Any]:
+    """Return the paper's table; empty if it has none, and for test clouds that were changed."""
+    records = table.group.records
+    if any(record.config.get(key) for record in records for key in OF_TEST_CLOUDS):
+        return {}
+    metric = table.full_metric if full_clouds else table.metric
+    joint = collect.trained_with(records[0]) == "joint"
+    names = table.names
+    return paper.published(names["task"], table.net, names["dataset"], metric.name, joint)

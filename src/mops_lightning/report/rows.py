@@ -1,0 +1,157 @@
+"""The rows of tables: their names and their order."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mops_lightning.records.readout_names import (
+    FULL,
+    GENERATED_READOUTS,
+    INDEX_READOUT,
+    PROJECTED,
+    parse_metric_name,
+)
+from mops_lightning.records.run_record import RunRecord, dotted
+from mops_lightning.records.summary import baseline_name
+from mops_lightning.report import collect
+
+READOUTS = (INDEX_READOUT, *GENERATED_READOUTS, PROJECTED)
+"""Readouts of a cell, in its order."""
+
+ORDER = (
+    "random",
+    "serial",
+    "voxel",
+    "fps",
+    "poisson",
+    "critical",
+    "submodular",
+    "gumbel",
+    "snet",
+    "samplenet",
+    "samplenet_progressive",
+    "mops",
+    "fmops",
+)
+"""Samplers in the order of the paper's tables; others follow by name."""
+
+NOT_IN_NAMES = ("m", "seed")
+"""Arguments of a sampler that do not give it a row of its own: its runs are cells of one row."""
+
+
+class RowNames:
+    """The names of a table's rows.
+
+    A row is a sampler with its recipe. If two runs of it would share a cell though their samplers
+    differ, the arguments in which they differ are part of the name: an FMOPS-Net for up to 128
+    points and one for up to 512 are ``fmops m_max=128`` and ``fmops m_max=512``.
+
+    Args:
+        records: of the table, each with a folder of its own.
+        net: the table's task net; results under other nets get separate rows. Empty: of all nets.
+        columns: dotted settings that have columns of their own.
+    """
+
+    def __init__(self, records: Sequence[RunRecord], net: str, columns: Sequence[str] = ()) -> None:
+        self.net = net
+        self._names: dict[str, str] = {}
+        rows: dict[str, list[RunRecord]] = defaultdict(list)
+        for record in records:
+            rows[_on_net(record, net)].append(record)
+        for name, of_row in rows.items():
+            keys = _telling_apart(of_row, columns)
+            for record in of_row:
+                self._names[record.folder] = " ".join([name, *_texts(record, keys)])
+
+    def of(self, record: RunRecord) -> str:
+        """Return the row of a record's own results."""
+        return self._names[record.folder]
+
+    def of_readout(self, record: RunRecord, readout: str) -> str:
+        """Return the row of a value: its run's sampler, or a baseline of the run."""
+        if readout in (*READOUTS, FULL):
+            return self.of(record)
+        prefix = _on_net(record, self.net).removesuffix(collect.sampler_row(record))  # "dgcnn on "
+        return prefix + baseline_name(record.config, readout)
+
+
+def _on_net(record: RunRecord, net: str) -> str:
+    """Return a record's sampler, with its task net unless it is the table's."""
+    own = collect.names(record)["net"]
+    sampler = collect.sampler_row(record)
+    if net in ("", own):
+        return sampler
+    return f"{own} on {sampler}"
+
+
+def _telling_apart(records: Sequence[RunRecord], columns: Sequence[str]) -> list[str]:
+    """Return the arguments of a row's samplers in which runs for one cell differ."""
+    cells: dict[Any, list[dict[str, Any]]] = defaultdict(list)
+    for record in records:
+        settings = dotted(record.config["sampler"])
+        place = tuple(repr(settings.get(key.removeprefix("sampler."))) for key in columns)
+        for m in _sizes(record):
+            cells[place, m].append(settings)
+    found = set()
+    for several in cells.values():
+        for key in {key for settings in several for key in settings}:
+            if len({repr(settings.get(key)) for settings in several}) > 1:
+                found.add(key)
+    own = {key.removeprefix("sampler.") for key in columns}
+    return sorted(found - own - set(NOT_IN_NAMES))
+
+
+def _sizes(record: RunRecord) -> set[int]:
+    """Return the sizes that a run tested its sampler at."""
+    names = [parse_metric_name(name) for name in record.metrics]
+    return {
+        record.config["m"] if name.m is None else name.m
+        for name in names
+        if name and name.readout in READOUTS
+    }
+
+
+def _texts(record: RunRecord, keys: Sequence[str]) -> list[str]:
+    """Return arguments of a record's sampler as parts of a name; a class is its last name."""
+    settings = dotted(record.config["sampler"])
+    texts = []
+    for key in keys:
+        if key == "_target_":
+            texts.append(str(settings.get(key)).rpartition(".")[2])
+        else:
+            texts.append(f"{key}={settings.get(key)}")
+    return texts
+
+
+def net_labels(found: Sequence[RunRecord]) -> list[str]:
+    """Return a name for the task net of each record, other names for other weights."""
+    labels: list[str] = []
+    digests: dict[str, set[str | None]] = defaultdict(set)
+    for record in found:
+        label = _net_label(record)
+        labels.append(label)
+        digests[label].add(record.task_weights_sha256)
+    return [
+        f"{label} {str(record.task_weights_sha256)[:8]}" if len(digests[label]) > 1 else label
+        for label, record in zip(labels, found, strict=True)
+    ]
+
+
+def _net_label(record: RunRecord) -> str:
+    name = collect.names(record)["net"]
+    given = record.config.get("weights")
+    if record.evaluated and given == "run":
+        return f"{name} of the training"
+    if given in (None, "auto", "run"):
+        return name
+    file = Path(str(given).partition("@")[0]).name
+    return file if file.startswith(name) else f"{name} ({file})"
+
+
+def sort_key(row: str) -> tuple[bool, int, str]:
+    """Return a key that sorts rows as the paper's tables do, rows of other nets last."""
+    _, other_net, sampler = row.rpartition(" on ")  # such as "dgcnn on mops fast"
+    name = sampler.split()[0]  # without its recipe
+    place = ORDER.index(name) if name in ORDER else len(ORDER)
+    return bool(other_net), place, row
