@@ -7,7 +7,7 @@ WORKERS ?= 3
 # Examples of each kind that `make fuzz` tries.
 EXAMPLES ?= 1000
 
-.PHONY: setup run test fuzz mutants check site clean
+.PHONY: setup run test fuzz mutants check shape site clean
 
 setup: .venv/.installed
 
@@ -42,6 +42,10 @@ check: setup site
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/hadolint docker/*.Dockerfile
+
+# How densely the code is written. Prints, never fails.
+shape: setup
+	$(BIN)/python -m tests.support.shape
 
 clean:
 	rm -rf .venv build dist mutants
