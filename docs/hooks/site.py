@@ -14,6 +14,9 @@ import mops_lightning
 ROOT = Path(__file__).parents[2]
 DOCS = "docs/"
 HOME = "README.md"
+PAGES = (HOME, "CONTRIBUTING.md", "CHANGELOG.md", "MAINTAINING.md", "SECURITY.md")
+"""Pages at the top of the repository."""
+
 MAX_BYTES = 1_000_000
 """Larger files are not copied; a link to one becomes plain text."""
 
@@ -31,7 +34,7 @@ FENCE = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages from outside docs/, the reference, and every file that a page links to."""
-    outside = [ROOT / HOME, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
+    outside = [ROOT / name for name in PAGES]
     outside += [ROOT / "benchmarks" / HOME, *ROOT.glob("results/*/*.md")]
     outside += ROOT.glob("results/*/*/*.md")
     pages = [path for path in outside if path.is_file()]
