@@ -1,5 +1,4 @@
 from functools import partial
-from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -8,8 +7,6 @@ import torch
 from trimesh.creation import box
 
 from mops_lightning.data import cloud_folder as module
-from mops_lightning.data.cloud_folder import random_crops
-from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
@@ -166,80 +163,3 @@ def test_cloud_folder_without_cloud_raises(tmp_path):
         cloud_folder(tmp_path)
     with pytest.raises(UserError, match=r"^root: no file in or below .*none ends in"):
         cloud_folder(tmp_path / "none")
-
-
-PATH = Path("scan.ply")
-FAR = np.array([431_000.0, 5_412_000.0, 120.0])
-
-
-def cloud(number=2000, side=10.0):
-    return np.random.default_rng(0).uniform(0, side, (number, 3)) + FAR
-
-
-def draw(points, crop="nearest", n_points=50, number=6, seed=1):
-    rng = np.random.default_rng(seed)
-    return random_crops(points, n_points, number, crop, rng, PATH)[0]
-
-
-def test_random_crops_nearest_is_a_ball_around_a_point():
-    points = cloud()
-    crops = draw(points)
-    assert crops.shape == (6, 50, 3)
-    assert np.abs(crops.mean(1)).max() < 1e-5
-    first = points[np.random.default_rng(1).integers(len(points))]
-    distances = np.sort(np.linalg.norm(points - first, axis=1))[:50]
-    near = points[np.linalg.norm(points - first, axis=1) <= distances[-1]]
-    assert np.allclose(crops[0], near - near.mean(0), atol=1e-5)
-
-
-def test_random_crops_whole():
-    points = cloud()
-    whole = draw(points, "whole", n_points=1000, number=2)
-    assert np.ptp(whole, axis=1).min() > 9
-    assert not np.array_equal(whole[0], whole[1])
-    assert len(np.unique(whole[0], axis=0)) == 1000
-
-
-def test_random_crops_of_coincident_points_raises():
-    with pytest.raises(BadCloudError, match="the 50 points of a crop coincide"):
-        draw(np.ones((60, 3)), "whole")
-
-
-def paths(*names):
-    return [PurePosixPath(name) for name in names]
-
-
-def test_split_by_folder_first_or_second_folder():
-    names = paths("train/a.ply", "chair/test/b.ply", "train/chair/deep/c.ply")
-    assert module.split_by_folder(names) == ["train", "test", "train"]
-    assert [module.class_of(name) for name in names] == ["cloud", "chair", "chair"]
-    assert module.split_by_folder(paths("a.ply", "chair/b.ply")) is None
-    with pytest.raises(UserError, match=r"chair/b\.ply is neither in train/ nor in test/"):
-        module.split_by_folder(paths("train/a.ply", "chair/b.ply"))
-
-
-def test_split_by_share_depends_on_the_seed():
-    names = paths(*(f"a/{i}.ply" for i in range(10)))
-    first, again, other = (module.split_by_share(names, 0.3, seed) for seed in (0, 0, 1))
-    assert first == again != other
-
-
-def test_by_number_sorts_digits_that_are_no_numbers():
-    names = ["f_10", "f_9", "1²", "²"]
-    ordered = sorted((PurePath(f"{name}.ply") for name in names), key=module.by_number)
-    assert [path.stem for path in ordered] == ["1²", "f_9", "f_10", "²"]
-
-
-FRAMES = paths(*(f"crane/{i}.ply" for i in range(12)), *(f"samba/{i}.ply" for i in range(10)))
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ((0.2, 10), r"^gap must .*, got 10: crane has 12 frame.*2 of them.* below 10, or"),
-        ((0.99, 2), r"crane has 12 frame.*12 of them.* smaller test_share"),
-    ],
-)
-def test_split_by_time_invalid_argument_raises(settings, message):
-    with pytest.raises(UserError, match=message):
-        module.split_by_time(FRAMES, *settings)

@@ -1,12 +1,11 @@
 """Data sets of files: scans, clouds of single objects, meshes and sequences of meshes."""
 
 import hashlib
-import re
 import sys
 import zlib
-from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path, PurePath, PurePosixPath
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -17,7 +16,16 @@ from rich.progress import track
 from torch import Tensor
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, make_dataset
-from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.data.crops import CROPS, Crop, random_crops
+from mops_lightning.data.file_splits import (
+    SPLITS,
+    SourceFile,
+    class_of,
+    list_files,
+    split_by_folder,
+    split_by_share,
+    split_by_time,
+)
 from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
 from mops_lightning.data.formats.registry import READABLE, read
 from mops_lightning.data.surfaces import VERSION, sample_surface
@@ -27,13 +35,25 @@ from mops_lightning.ops.points import normalize_unit_sphere
 from mops_lightning.seeding import derive_seed
 from mops_lightning.types import UNKNOWN
 
-Crop = Literal["nearest", "whole", "surface"]
-CROPS = ("nearest", "whole", "surface")
+CONSEQUENCE = {"train": "never learned", "test": "never scored"}
+"""What happens to a class without files in a split."""
 
-SPLITS = ("train", "test")
 
-DRAWS = 50
-"""Crops that are drawn before a file is rejected because all points of a crop coincide."""
+@dataclass(frozen=True)
+class Content:
+    """What was read from one file.
+
+    Attributes:
+        file: the file.
+        clouds: ``(crops, n_points, 3)`` float32, in the unit sphere.
+        numbers: ``(crops, n_points)`` int64, the part number of every point; None without parts.
+        digest: sha256 of a mesh file; empty for other files.
+    """
+
+    file: SourceFile
+    clouds: Tensor
+    numbers: NDArray[np.int64] | None = None
+    digest: str = ""
 
 
 def cloud_folder(
@@ -96,135 +116,138 @@ def cloud_folder(
         raise UserError(f"crops must be 1 with crop=surface, got {crops}.")
     if crop == "surface" and label is not None:
         raise UserError(f"label must be null with crop=surface, got {label!r}.")
+
     folder = Path(root).expanduser()
     suffixes = MESHES if crop == "surface" else READABLE
     names = list_files(folder, suffixes)
-    chosen = choose_classes(classes, sorted(set(map(class_of, names))))
-    names = [name for name in names if class_of(name) in chosen]
-    if test_frames is not None:
-        splits = split_by_time(names, test_share, gap)
-        names = [name for name, split in zip(names, splits, strict=True) if split]
-        splits = [split for split in splits if split]
+    class_names = choose_classes(classes, sorted({class_of(name) for name in names}))
+    names = [name for name in names if class_of(name) in class_names]
+    if test_frames == "last":
+        files = [file for file in split_by_time(names, test_share, gap) if file.split]
     else:
-        splits = split_by_folder(names) or split_by_share(names, test_share, seed)
-    notes = _notes(folder, names, splits, chosen)
-    crops_of, digests, labels_of = _read_files(
-        folder, names, n_points, crop, crops, seed, cache, label
-    )
-    numbers = np.unique(np.concatenate(labels_of)) if labels_of else np.empty(0, np.int64)
-    numbers = numbers[numbers >= 0]
-    parts_of = [np.where(one < 0, UNKNOWN, np.searchsorted(numbers, one)) for one in labels_of]
-    clouds = {}
-    for split in SPLITS:
-        rows = [row for row, of_file in enumerate(splits) if of_file == split]
-        labels = torch.tensor([chosen.index(class_of(names[row])) for row in rows])
-        clouds[split] = Clouds(
-            torch.cat([crops_of[row] for row in rows]),
-            labels.repeat_interleave(crops),
-            torch.tensor(rows).repeat_interleave(crops) if crops > 1 else None,
-            torch.from_numpy(np.concatenate([parts_of[row] for row in rows])) if parts_of else None,
-        )
-    if crop != "surface":
-        dataset = make_dataset("clouds", clouds, chosen, None, folder)
-        return replace(dataset, notes=notes, part_names=tuple(map(str, numbers.tolist())))
-    digest = hashlib.sha256(repr(("meshes", VERSION, n_points, seed, chosen)).encode())
-    for path, split, of_file in zip(names, splits, digests, strict=True):
-        digest.update(repr((split, str(path), of_file)).encode())
-    return CloudDataset(chosen, clouds["train"], clouds["test"], digest.hexdigest(), notes)
+        files = split_by_folder(names) or split_by_share(names, test_share, seed)
+    notes = _notes(folder, files, class_names)
+    if crop == "surface":
+        contents = _read_meshes(folder, files, n_points, seed, cache)
+        splits = _clouds_of_splits(contents, class_names, crops)
+        fingerprint = _fingerprint_of_meshes(contents, n_points, seed, class_names)
+        return CloudDataset(class_names, splits["train"], splits["test"], fingerprint, notes)
+    contents = _read_clouds(folder, files, n_points, crop, crops, seed, label)
+    numbers = _known_numbers(contents)
+    splits = _clouds_of_splits(contents, class_names, crops, numbers)
+    dataset = make_dataset("clouds", splits, class_names, None, folder)
+    part_names = tuple(str(number) for number in numbers.tolist())
+    return replace(dataset, notes=notes, part_names=part_names)
 
 
-def list_files(folder: Path, suffixes: Sequence[str]) -> list[PurePosixPath]:
-    """Return the relative paths of the files with these suffixes below a folder, sorted."""
-    names = sorted(
-        PurePosixPath(path.relative_to(folder).as_posix())
-        for path in folder.rglob("*")
-        if path.suffix.lower() in suffixes and path.is_file()
-    )
-    names = [name for name in names if not any(part.startswith(".") for part in name.parts)]
-    if not names:
-        raise UserError(f"root: no file in or below {folder} ends in {', '.join(suffixes)}.")
-    return names
+def _read_meshes(
+    folder: Path, files: Sequence[SourceFile], n_points: int, seed: int, cache: str | Path | None
+) -> list[Content]:
+    """Sample the surface of every mesh."""
+    kept = None
+    if cache:
+        kept = Path(cache).expanduser()
+        remove_temporary(kept, below=False)
+    contents = []
+    for file in _with_progress(files):
+        digest, cloud = sample_surface(folder / file.name, n_points, seed, kept)
+        contents.append(Content(file, cloud[None], digest=digest))
+    return contents
 
 
-def _read_files(
+def _read_clouds(
     folder: Path,
-    names: list[PurePosixPath],
+    files: Sequence[SourceFile],
     n_points: int,
     crop: Crop,
     crops: int,
     seed: int,
-    cache: str | Path | None,
     label: str | None,
-) -> tuple[list[Tensor], list[str], list[NDArray[np.int64]]]:
-    """Sample the surfaces of meshes, or draw crops of clouds.
-
-    Returns:
-        The clouds of every file, ``(crops, n_points, 3)``, the sha256 of every mesh's file, and the
-        labels of every cloud file's points, ``(crops, n_points)``, if ``label`` names them.
-    """
-    kept = Path(cache).expanduser() if cache else None
-    if kept is not None:
-        remove_temporary(kept, below=False)
-    console = Console(stderr=True)
-    clouds, digests, labels = [], [], []
-    for name in track(names, "Reading files", console=console, disable=not console.is_terminal):
-        path = folder / name
-        if crop == "surface":
-            digest, cloud = sample_surface(path, n_points, seed, kept)
-            clouds.append(cloud[None])
-            digests.append(digest)
-            continue
-        rng = np.random.default_rng(derive_seed(seed, zlib.crc32(str(name).encode())))
+) -> list[Content]:
+    """Draw crops of every cloud."""
+    contents = []
+    for file in _with_progress(files):
+        path = folder / file.name
+        rng = np.random.default_rng(derive_seed(seed, zlib.crc32(str(file.name).encode())))
         table = read(path, max(10_000, 8 * n_points), seed).finite()
-        drawn, rows = random_crops(table.points, n_points, crops, crop, rng, path)
-        clouds.append(normalize_unit_sphere(torch.from_numpy(drawn)))
+        drawn = random_crops(table.points, n_points, crops, crop, rng, path)
+        numbers = None
         if label is not None:
-            labels.append(table.whole_numbers(label, path)[rows])
-    return clouds, digests, labels
+            numbers = table.whole_numbers(label, path)[drawn.rows]
+        clouds = normalize_unit_sphere(torch.from_numpy(drawn.points))
+        contents.append(Content(file, clouds, numbers))
+    return contents
 
 
-def random_crops(
-    points: NDArray[np.float64],
-    n_points: int,
-    number: int,
-    crop: Crop,
-    rng: np.random.Generator,
-    path: Path,
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Draw crops of a cloud ``(N, 3)``: ``(number, n_points, 3)``, each with its centroid at 0.
+def _with_progress(files: Sequence[SourceFile]) -> Iterable[SourceFile]:
+    """Show on a terminal how many files have been read."""
+    console = Console(stderr=True)
+    return track(files, "Reading files", console=console, disable=not console.is_terminal)
 
-    Returns:
-        The crops, and the rows ``(number, n_points)`` of their points.
 
-    Raises:
-        BadCloudError: the cloud has fewer than ``n_points`` points, or they coincide.
+def _known_numbers(contents: Sequence[Content]) -> NDArray[np.int64]:
+    """Return the part numbers of all files in ascending order, without unknown ones."""
+    found: set[int] = set()
+    for content in contents:
+        if content.numbers is not None:
+            found.update(np.unique(content.numbers).tolist())
+    return np.array(sorted(number for number in found if number >= 0), np.int64)
+
+
+def _clouds_of_splits(
+    contents: Sequence[Content],
+    class_names: Sequence[str],
+    crops: int,
+    numbers: NDArray[np.int64] | None = None,
+) -> dict[str, Clouds]:
+    """Put the clouds of the files together, split by split.
+
+    Args:
+        contents: what was read.
+        class_names: in the order of the labels.
+        crops: number of clouds per file.
+        numbers: of the parts, in the order of their positions; None: there are no parts.
     """
-    if len(points) < n_points:
-        raise BadCloudError(
-            f"{path} has {len(points)} points, fewer than dataset.n_points={n_points}. Lower "
-            "dataset.n_points, or remove the file."
+    splits = {}
+    for split in SPLITS:
+        members = [
+            (row, content) for row, content in enumerate(contents) if content.file.split == split
+        ]
+        labels = torch.tensor([class_names.index(one.file.class_name) for _, one in members])
+        sources = None
+        if crops > 1:
+            sources = torch.tensor([row for row, _ in members]).repeat_interleave(crops)
+        parts = [_parts(one.numbers, numbers) for _, one in members if one.numbers is not None]
+        splits[split] = Clouds(
+            torch.cat([one.clouds for _, one in members]),
+            labels.repeat_interleave(crops),
+            sources,
+            torch.cat(parts) if parts else None,
         )
-    crops = np.empty((number, n_points, 3), np.float32)
-    chosen = np.empty((number, n_points), np.int64)
-    for place in range(number):
-        for _ in range(DRAWS):
-            if crop == "nearest":
-                distance = np.square(points - points[rng.integers(len(points))]).sum(1)
-                rows = np.sort(np.argpartition(distance, n_points - 1)[:n_points])
-            else:
-                rows = rng.choice(len(points), n_points, replace=False)
-            drawn = points[rows]
-            if (drawn != drawn[0]).any():
-                break
-        else:
-            raise BadCloudError(f"{path}: the {n_points} points of a crop coincide. Clean it.")
-        # Before float32, which has too few digits for coordinates of a map.
-        crops[place], chosen[place] = drawn - drawn.mean(0), rows
-    return crops, chosen
+    return splits
+
+
+def _parts(found: NDArray[np.int64], numbers: NDArray[np.int64] | None) -> Tensor:
+    """Return the position of every part number among the known ones, or ``UNKNOWN``."""
+    assert numbers is not None
+    positions = np.searchsorted(numbers, found)
+    return torch.from_numpy(np.where(found < 0, UNKNOWN, positions))
+
+
+def _fingerprint_of_meshes(
+    contents: Sequence[Content], n_points: int, seed: int, class_names: tuple[str, ...]
+) -> str:
+    """Hash the files and the arguments, so that the sampled points need not be read."""
+    settings = ("meshes", VERSION, n_points, seed, class_names)
+    digest = hashlib.sha256(repr(settings).encode())
+    for content in contents:
+        entry = (content.file.split, str(content.file.name), content.digest)
+        digest.update(repr(entry).encode())
+    return digest.hexdigest()
 
 
 def _notes(
-    folder: Path, names: list[PurePosixPath], splits: list[str], classes: tuple[str, ...]
+    folder: Path, files: Sequence[SourceFile], class_names: tuple[str, ...]
 ) -> dict[str, Any]:
     """Return facts for the run record; print which classes are missing in a split.
 
@@ -232,100 +255,20 @@ def _notes(
         UserError: a split has no file.
     """
     notes: dict[str, Any] = {}
-    for split, consequence in zip(SPLITS, ("never learned", "never scored"), strict=True):
-        found = {
-            class_of(name) for name, of_file in zip(names, splits, strict=True) if of_file == split
-        }
-        missing = [name for name in classes if name not in found]
-        if not found:
+    for split in SPLITS:
+        members = [file for file in files if file.split == split]
+        if not members:
             raise UserError(
-                f"root: {folder} has no {split} file of {', '.join(classes)}: give at least two "
-                "files, because a file is in one split only."
+                f"root: {folder} has no {split} file of {', '.join(class_names)}: give at least "
+                "two files, because a file is in one split only."
             )
-        notes[f"{split}_files"] = splits.count(split)
+        notes[f"{split}_files"] = len(members)
+        found = {file.class_name for file in members}
+        missing = [name for name in class_names if name not in found]
         if missing:
             notes[f"classes_without_{split}_files"] = missing
             print(
-                f"{folder}: no {split} file of {', '.join(missing)}: {consequence}.",
+                f"{folder}: no {split} file of {', '.join(missing)}: {CONSEQUENCE[split]}.",
                 file=sys.stderr,
             )
     return notes
-
-
-def split_by_time(names: Sequence[PurePosixPath], test_share: float, gap: int) -> list[str]:
-    """Test the last frames of every sequence; arguments as in ``cloud_folder``.
-
-    Returns:
-        A split per file: ``train``, ``test``, or an empty one for files in the gap.
-
-    Raises:
-        UserError: ``gap`` leaves a sequence no training frame.
-    """
-    splits = [""] * len(names)
-    for sequence in sorted({class_of(name) for name in names}):
-        members = [i for i, name in enumerate(names) if class_of(name) == sequence]
-        members.sort(key=lambda i: (names[i].parent.parts, by_number(names[i])))
-        n_test = max(round(len(members) * test_share), 1)
-        before = len(members) - n_test
-        if gap >= before:
-            raise UserError(
-                f"gap must leave training frames, got {gap}: {sequence} has {len(members)} "
-                f"frame(s), {n_test} of them for the test. Use a gap below {before}, or a smaller "
-                "test_share."
-            )
-        of_sequence = ["train"] * (before - gap) + [""] * gap + ["test"] * n_test
-        for i, split in zip(members, of_sequence, strict=True):
-            splits[i] = split
-    return splits
-
-
-def by_number(path: PurePath) -> tuple[list[tuple[int, str]], str]:
-    """Return a sort key that puts frame_9 before frame_10."""
-    parts = re.split(r"(\d+)", path.stem)
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts], path.name
-
-
-def split_by_folder(names: Sequence[PurePosixPath]) -> list[str] | None:
-    """Return the splits of files in ``train/`` and ``test/``, or None if there are none.
-
-    The folder may be the first or the second: ``train/FILE``, ``CLASS/train/FILE`` and so on.
-
-    Raises:
-        UserError: some files are in a folder of a split and others are not.
-    """
-    splits = [next((part for part in name.parts[:-1][:2] if part in SPLITS), "") for name in names]
-    if not any(splits):
-        return None
-    if "" in splits:
-        raise UserError(
-            f"root: {names[splits.index('')]} is neither in train/ nor in test/, but other files "
-            "are. Move it into one of them."
-        )
-    return splits
-
-
-def class_of(name: PurePosixPath) -> str:
-    """Return the first folder of a path that is not a split's, or ``cloud``."""
-    return next((part for part in name.parts[:-1][:2] if part not in SPLITS), "cloud")
-
-
-def split_by_share(names: Sequence[PurePosixPath], test_share: float, seed: int) -> list[str]:
-    """Draw a share of the files of every class as the test split.
-
-    Args:
-        names: of the files.
-        test_share: share of test files in a class; at least one file of two.
-        seed: of the draw.
-
-    Returns:
-        A split per file: ``train`` or ``test``.
-    """
-    classes = [class_of(name) for name in names]
-    splits = ["train"] * len(names)
-    for label, of_class in enumerate(sorted(set(classes))):
-        members = [i for i, name in enumerate(classes) if name == of_class]
-        order = np.random.default_rng(derive_seed(seed, label)).permutation(len(members))
-        number = max(round(len(members) * test_share), 1) if len(members) > 1 else 0
-        for place in order[:number]:
-            splits[members[place]] = "test"
-    return splits

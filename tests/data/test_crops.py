@@ -1,0 +1,49 @@
+"""Crops of clouds."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mops_lightning.data.crops import random_crops
+from mops_lightning.data.formats.guard import BadCloudError
+
+PATH = Path("scan.ply")
+FAR = np.array([431_000.0, 5_412_000.0, 120.0])
+
+
+def cloud(number=2000, side=10.0):
+    return np.random.default_rng(0).uniform(0, side, (number, 3)) + FAR
+
+
+def draw(points, crop="nearest", n_points=50, number=6, seed=1):
+    rng = np.random.default_rng(seed)
+    return random_crops(points, n_points, number, crop, rng, PATH).points
+
+
+def test_random_crops_nearest_is_a_ball_around_a_point():
+    points = cloud()
+
+    crops = draw(points)
+
+    assert crops.shape == (6, 50, 3)
+    assert np.abs(crops.mean(1)).max() < 1e-5
+    first = points[np.random.default_rng(1).integers(len(points))]
+    distances = np.sort(np.linalg.norm(points - first, axis=1))[:50]
+    near = points[np.linalg.norm(points - first, axis=1) <= distances[-1]]
+    assert np.allclose(crops[0], near - near.mean(0), atol=1e-5)
+
+
+def test_random_crops_whole():
+    points = cloud()
+
+    whole = draw(points, "whole", n_points=1000, number=2)
+
+    assert np.ptp(whole, axis=1).min() > 9
+    assert not np.array_equal(whole[0], whole[1])
+    assert len(np.unique(whole[0], axis=0)) == 1000
+
+
+def test_random_crops_of_coincident_points_raises():
+    with pytest.raises(BadCloudError, match="the 50 points of a crop coincide"):
+        draw(np.ones((60, 3)), "whole")
