@@ -198,6 +198,9 @@ def test_colours_are_averaged_and_labels_vote(tmp_path):
         (["small.npz", "empty.npz", "--field", "label"], "must be a cloud of at least one point"),
         (["small.npz", "mesh.ply", "--field", "label"], "must be a cloud of at least one point"),
         (["small.npz", "mesh.off", "out.ply", "--field", "label"], "mesh.off must end in .ply"),
+        (["small.npz", ".", "--field", "label"], ".: not a file"),
+        (["small.npz", "", "--field", "label"], ".: not a file"),
+        (["small.npz", "/", "--field", "label"], "/: not a file"),
     ],
 )
 def test_mistake_ends_in_one_line(arguments, said, tmp_path, monkeypatch):
@@ -208,6 +211,7 @@ def test_mistake_ends_in_one_line(arguments, said, tmp_path, monkeypatch):
     (tmp_path / "old.ply").touch()
     WRITERS[".npz"](tmp_path / "empty.npz", Table(line[:0], {}))
     trimesh.creation.box().export(tmp_path / "mesh.ply")
+    trimesh.creation.box().export(tmp_path / "mesh.off")
     before = sorted(tmp_path.iterdir())
     assert said in refused(main, arguments)
     assert sorted(tmp_path.iterdir()) == before

@@ -52,7 +52,7 @@ def sample_surface(
         random = np.random.default_rng([seed, int(digest[:16], 16)])
         from mops_lightning.data.formats.mesh import sample_mesh  # imports the readers
 
-        points, _ = sample_mesh(path, data, n_points, random)
+        points = sample_mesh(path, data, n_points, random).points
         return [UnitSphere.around(points).normalise(points).numpy()]
 
     return digest, torch.from_numpy(cached(kept, [((n_points, 3), FLOAT)], sample)[0])

@@ -15,9 +15,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mops_lightning.data.formats.cloud_file import PART, CloudFile
 from mops_lightning.data.formats.guard import check_coordinates, check_size
 from mops_lightning.data.formats.registry import open_cloud_file
-from mops_lightning.data.formats.table import PART, CloudFile, Table, join_tables
+from mops_lightning.data.formats.table import Table, join_tables
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.ops.attention import Partial

@@ -9,7 +9,7 @@ from dataclasses import fields
 from os.path import realpath
 from pathlib import Path
 
-from mops_lightning.data.formats.table import Area
+from mops_lightning.data.formats.area import Area
 from mops_lightning.errors import Parser, UserError, did_you_mean, one_line_endings, printable
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
@@ -236,10 +236,12 @@ def _propagate_arguments(add: Add) -> None:
 
 def _propagate(chosen: argparse.Namespace) -> None:
     start = time.perf_counter()
+    from mops_lightning.data.formats.guard import check_is_file
     from mops_lightning.data.formats.registry import PART_WRITERS
     from mops_lightning.files.propagate import propagate_file
 
     big, target = chosen.big, chosen.target
+    check_is_file(big)
     if target is None:
         suffix = big.suffix if big.suffix.lower() in PART_WRITERS else ".ply"
         target = big.with_name(f"{big.stem}_propagated{suffix}")

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from mops_lightning.data.formats.table import Area
+from mops_lightning.data.formats.area import Area
 from mops_lightning.errors import UserError
 from mops_lightning.zoo.names import UNTRAINED
 

@@ -9,14 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mops_lightning.data.formats import guard
+from mops_lightning.data.formats.cloud_file import PART
 from mops_lightning.data.formats.registry import READERS, open_cloud_file, write
-from mops_lightning.data.formats.table import PART, Column, Table, TableParts
+from mops_lightning.data.formats.table import Column, Table, TableParts
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.files.engine import with_progress
 from mops_lightning.filesystem import atomic_write
-from mops_lightning.ops.propagation import mapper, propagate, propagation_map
+from mops_lightning.ops.propagation import PropagationMap, mapper, propagate, propagation_map
 
 Points = NDArray[np.float64]
+
+PACKED_COLOURS = ("rgb", "rgba")
+"""Columns of PCD files with a colour in the bytes of a number."""
 
 
 def write_map(path: Path, points: Points, sampled: Points, k: int) -> None:
@@ -74,14 +78,33 @@ def propagate_file(
 
     def carry(table: Table) -> Table:
         found = map_part(table.points)
-        columns = {name: propagate(values, found, mean) for name, values in carried.items()}
-        return Table(table.points, {**table.columns, **columns}, table.header)
+        columns = {name: _carried(name, values, found, mean) for name, values in carried.items()}
+        return replace(table, columns={**table.columns, **columns})
 
     tables = _tables(big)
     form = _measure(big, tables("measuring"))
     parts = (carry(table) for table in tables("propagating"))
     write(target, replace(form, parts=parts, columns={**form.columns, **carried}))
     return form.number
+
+
+def _carried(name: str, values: Column, found: PropagationMap, mean: bool) -> Column:
+    """Return the values of all points; packed colours are averaged channel by channel.
+
+    Raises:
+        UserError: packed colours to average have another data type than 32 bits.
+    """
+    averages = found.rows.shape[-1] > 1 and (mean or values.dtype.kind == "f")
+    if name not in PACKED_COLOURS or not averages:
+        return np.asarray(propagate(values, found, mean))
+    if values.dtype.itemsize != 4:
+        raise UserError(
+            f"--field {name}: only packed colours of 32 bits can be averaged, got "
+            f"{values.dtype}. Leave --k out."
+        )
+    channels = np.ascontiguousarray(values).view(np.uint8).reshape(-1, 4)
+    averaged = np.ascontiguousarray(propagate(channels, found, mean=True))
+    return averaged.view(values.dtype)[:, 0]
 
 
 def _read(path: Path) -> Table:
@@ -119,7 +142,8 @@ def _measure(path: Path, tables: Iterable[Table]) -> TableParts:
     Raises:
         BadCloudError: there are no points.
     """
-    number, lost, low, high = 0, 0.0, np.full(3, np.inf), np.full(3, -np.inf)
+    number = 0
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
     first: Table | None = None
     columns: dict[str, Column] = {}
     for table in tables:
@@ -130,12 +154,11 @@ def _measure(path: Path, tables: Iterable[Table]) -> TableParts:
         guard.check_coordinates(path, table.points)
         number += len(table.points)
         low, high = np.minimum(low, table.points.min(0)), np.maximum(high, table.points.max(0))
-        lost = max(lost, float(np.abs(table.points.astype(np.float32) - table.points).max()))
     if first is None:
         raise guard.BadCloudError(f"{path} holds no points.")
-    single = lost <= 1e-6 * float((high - low).max())
-    kind = np.dtype(np.float32 if single else np.float64)
-    return TableParts([], number, np.stack([low, high]), kind, columns, first.header)
+    kind = first.form.coordinates or np.dtype(np.float64)
+    corners = np.stack([low, high])
+    return TableParts([], number, corners, kind, columns, first.header, first.form)
 
 
 def _extremes(column: Column) -> Column:

@@ -5,6 +5,7 @@ weights, as in PointNet++ (Qi et al., NeurIPS 2017); whole numbers are never ave
 caller asks for it, so that a label stays a label.
 """
 
+import warnings
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
@@ -24,6 +25,22 @@ from mops_lightning.ops.points import as_tensor, cloud_sizes
 
 CLOSE = 1e-8
 """Squared distance in the unit sphere below which a point has nearly all of the weight."""
+
+
+MORE = 8
+"""Additional points that a tree is asked for, among which ties are broken."""
+
+ROUNDING = 1e-12
+"""Relative error of squared distances, which are rounded differently in the tree."""
+
+SIGNED = {
+    torch.uint16: torch.int16,
+    torch.uint32: torch.int32,
+    torch.uint64: torch.int64,
+}
+"""Data types of the same size, for which torch has all operations."""
+
+HALF = 2.0**32
 
 
 class PropagationMap(NamedTuple):
@@ -137,16 +154,45 @@ def _search(points: Tensor, sampled: Tensor, k: int, tree: Any = None) -> tuple[
     if k == 1:
         rows = nearest(points[None], sampled[None])[1][0, :, None]
         return rows, torch.ones_like(rows, dtype=torch.promote_types(dtype, torch.float32))
-    if points.is_cpu:
-        tree = cKDTree(sampled.double().numpy()) if tree is None else tree
-        distances, rows = map(torch.from_numpy, tree.query(points.double().numpy(), k=k))
-        squared = distances.square()
-    else:
-        squared, rows = (part[0] for part in k_nearest(points[None], sampled[None], k))
+    if tree is None:
+        tree = cKDTree(sampled.double().cpu().numpy())
+    found = _nearest_in_tree(tree, points.double().cpu().numpy(), k)
+    squared, rows = (torch.from_numpy(part).to(points.device) for part in found)
     # Relative to the nearest point, because 1/d² may be infinite.
     inverse = torch.where(squared[:, :1] > 0, squared[:, :1] / squared, (squared == 0).to(squared))
     weights = inverse / inverse.sum(1, keepdim=True)
     return rows, weights.to(torch.promote_types(dtype, torch.float32))
+
+
+def _nearest_in_tree(
+    tree: Any, points: NDArray[np.float64], k: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the squared distances and rows ``(N, k)`` of the nearest points of a tree.
+
+    They are sorted by distance, and by row in case of ties. The tree itself takes any of the points
+    at the same distance, so more points are asked for, and all where these are not enough.
+    """
+    asked = min(k + MORE, tree.n)
+    rows = np.asarray(tree.query(points, k=asked)[1], np.int64).reshape(len(points), asked)
+    squared, rows = _by_distance(tree, points, rows)
+    if asked < tree.n:
+        tied = np.flatnonzero(squared[:, -1] <= squared[:, k - 1] * (1 + ROUNDING))
+        reach = np.sqrt(squared[tied, k - 1]) * (1 + ROUNDING)
+        within = tree.query_ball_point(points[tied], reach)
+        for place, candidates in zip(tied, within, strict=True):
+            row = np.asarray(candidates, np.int64)[None]
+            near, ordered = _by_distance(tree, points[place, None], row)
+            squared[place, :k], rows[place, :k] = near[0, :k], ordered[0, :k]
+    return squared[:, :k], rows[:, :k]
+
+
+def _by_distance(
+    tree: Any, points: NDArray[np.float64], rows: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return squared distances ``(N, n)`` and rows, by distance and by row in case of ties."""
+    squared = np.square(tree.data[rows] - points[:, None]).sum(2)
+    order = np.lexsort((rows, squared), axis=1)
+    return np.take_along_axis(squared, order, 1), np.take_along_axis(rows, order, 1)
 
 
 def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> Any:
@@ -161,6 +207,9 @@ def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> An
         map: from ``propagation_map``, or the file that ``downsample --map`` writes.
         mean: average whole numbers too, such as colours, and round them.
         fill: value of the points of a file without finite coordinates.
+
+    Packed colours are numbers to this function: ``mops-lightning propagate`` knows them by their
+    name.
 
     Returns:
         ``(N, ...)`` or ``(B, N, ...)``, of the type and dtype of ``values``, on their device.
@@ -188,15 +237,18 @@ def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> An
             f"map: {int(missing.sum())} points have no finite coordinates. Give their value, such "
             "as fill=0."
         )
-    rows, table = rows.clamp_min(0), numbers.reshape(-1, *numbers.shape[leading:])
+    rows = rows.clamp_min(0)
+    table = numbers.reshape(-1, *numbers.shape[leading:])
     weights = map.weights.to(numbers.device).reshape(rows.shape)
     if rows.shape[1] == 1:
-        result = table[rows[:, 0]]
+        result = _signed(table)[rows[:, 0]].view(table.dtype)
+    elif mean or table.is_floating_point():
+        result = _mean(table, rows, weights)
     else:
-        averaged = mean or numbers.is_floating_point()
-        result = (_mean if averaged else _vote)(table, rows, weights)
+        result = _vote(table, rows, weights)
     if bool(missing.any()):
-        result[missing] = fill
+        value = _fill_value(fill, table.dtype).to(table.device)
+        _signed(result)[missing] = _signed(value)
     result = result.reshape(*map.rows.shape[:-1], *numbers.shape[leading:])
     return result if isinstance(values, Tensor) else result.numpy()
 
@@ -249,8 +301,35 @@ def _rows(map: PropagationMap, values: Tensor) -> Tensor:
     return rows.reshape(-1, rows.shape[-1])
 
 
+def _signed(numbers: Tensor) -> Tensor:
+    """Return the same memory as signed integers, where torch lacks operations for unsigned ones."""
+    return numbers.view(SIGNED.get(numbers.dtype, numbers.dtype))
+
+
+def _fill_value(fill: Any, dtype: torch.dtype) -> Tensor:
+    """Return the value of points without coordinates.
+
+    Raises:
+        UserError: the data type of the values cannot hold it.
+    """
+    kind = torch.empty(0, dtype=dtype).numpy().dtype if dtype != torch.bfloat16 else None
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            wanted = np.asarray(fill)
+            stored = wanted.astype(kind or np.float32)
+    except (TypeError, ValueError, OverflowError):
+        raise UserError(f"fill must be a number, got {fill!r}.") from None
+    exact = stored.dtype.kind == "f" or np.array_equal(stored.astype(object), wanted.astype(object))
+    if not exact:
+        raise UserError(f"fill must be a number of the type {dtype}, got {fill!r}.")
+    return torch.from_numpy(np.array(stored)).to(dtype)
+
+
 def _mean(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     """Return weighted means, of the table's dtype."""
+    if table.dtype in (torch.int64, torch.uint64):
+        return _mean_of_64_bits(table, rows, weights)
     exact = table if table.is_floating_point() else table.double()
     weights = weights.to(torch.promote_types(exact.dtype, torch.float32))
     weights = weights.reshape(*weights.shape, *[1] * (table.ndim - 1))
@@ -260,14 +339,41 @@ def _mean(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     return (total if table.is_floating_point() else total.round()).to(table.dtype)
 
 
+def _mean_of_64_bits(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """Return rounded weighted means of whole numbers that float64 does not hold.
+
+    The differences from the value with the largest weight are averaged, in two halves of 32 bits.
+    The sum of value and difference may overflow on the way, and the result does not.
+    """
+    bits = _signed(table)
+    high = (bits >> 32).double()
+    if table.dtype == torch.uint64:
+        high = torch.where(high < 0, high + HALF, high)
+    low = (bits & 0xFFFFFFFF).double()
+    base = rows.gather(1, weights.argmax(1, keepdim=True))[:, 0]
+    weights = weights.double() / weights.double().sum(1, keepdim=True)
+    weights = weights.reshape(*weights.shape, *[1] * (table.ndim - 1))
+    difference = torch.zeros_like(high[base])
+    for i in range(rows.shape[1]):
+        row = rows[:, i]
+        away = (high[row] - high[base]) * HALF + (low[row] - low[base])
+        difference = difference + away * weights[:, i]
+    difference = difference.round()
+    upper = (difference / HALF).floor()
+    lower = difference - upper * HALF
+    return (bits[base] + (upper.long() << 32) + lower.long()).view(table.dtype)
+
+
 def _vote(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     """Return, column by column, the value with the largest sum of weights; of equals the nearer."""
-    codes = table.long().reshape(len(table), -1)[rows]  # (T, k, columns)
+    bits = _signed(table)
+    codes = bits.long().reshape(len(table), -1)[rows]  # (T, k, columns)
     votes = [
         ((codes == codes[:, i, None]) * weights[..., None]).sum(1) for i in range(rows.shape[1])
     ]
     winner = torch.stack(votes, 1).argmax(1, keepdim=True)
-    return codes.gather(1, winner).to(table.dtype).reshape(-1, *table.shape[1:])
+    chosen = codes.gather(1, winner).to(bits.dtype).reshape(-1, *table.shape[1:])
+    return chosen.view(table.dtype)
 
 
 def read_map(path: Path) -> PropagationMap:
@@ -282,15 +388,19 @@ def read_map(path: Path) -> PropagationMap:
     rows: Any = arrays.get("rows")
     m: Any = arrays.get("m")
     kinds = {array.dtype.kind for array in (rows, m) if array is not None}
-    if rows is None or m is None or kinds != {"i"} or not _sizes_fit(rows, m):
+    if rows is None or m is None or not kinds <= {"i", "u"} or not _sizes_fit(rows, m):
         raise UserError(
             f"{path} is no map: it must hold whole numbers, rows (N, k) and m of at least 1, got "
             f"{', '.join(arrays) or 'no arrays'}. Write it by downsample --map."
         )
     weights = arrays.get("weights", np.ones((len(rows), 1), np.float32))  # may lack for k = 1
-    if weights.shape != rows.shape or not (np.isfinite(weights).all() and (weights >= 0).all()):
+    are_numbers = weights.dtype.kind in "fiu" and weights.shape == rows.shape
+    if not are_numbers or not (np.isfinite(weights).all() and (weights >= 0).all()):
         raise UserError(f"{path}: weights must be finite, at least 0, and of shape {rows.shape}.")
-    return PropagationMap(torch.from_numpy(rows), torch.from_numpy(weights), int(m))
+    if weights.dtype.kind != "f":
+        weights = weights.astype(np.float64)
+    whole = as_tensor("rows", rows.astype(np.int64))
+    return PropagationMap(whole, as_tensor("weights", weights), int(m))
 
 
 def _sizes_fit(rows: NDArray[Any], m: NDArray[Any]) -> bool:

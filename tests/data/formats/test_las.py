@@ -9,9 +9,10 @@ import lazrs
 import numpy as np
 import pytest
 
+from mops_lightning.data.formats.area import Area
 from mops_lightning.data.formats.las import chunks
 from mops_lightning.data.formats.registry import WRITERS, open_cloud_file, read, write
-from mops_lightning.data.formats.table import Area, Table
+from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from tests.support.copc import write_copc
 

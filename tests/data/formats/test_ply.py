@@ -48,7 +48,8 @@ def test_ply_header_variant_is_read(kind, tmp_path):
 
 def test_ply_vertices_with_lists_are_rejected(tmp_path):
     path = tmp_path / "a.ply"
-    head = "element vertex 1\nproperty float x\nproperty list uchar int seen\n"
+    axes = "property float x\nproperty float y\nproperty float z\n"
+    head = f"element vertex 1\n{axes}property list uchar int seen\n"
     path.write_text(f"ply\nformat binary_little_endian 1.0\n{head}end_header\n")
     with pytest.raises(UserError, match="without lists"):
         open_cloud_file(path)

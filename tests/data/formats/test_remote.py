@@ -8,9 +8,10 @@ from threading import Thread
 import numpy as np
 import pytest
 
+from mops_lightning.data.formats.area import Area
 from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.remote import local
-from mops_lightning.data.formats.table import Area, Table
+from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from tests.support.copc import write_copc
 from tests.support.downsample import call, done

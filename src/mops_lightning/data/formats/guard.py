@@ -22,6 +22,10 @@ class WholeOnlyError(BadCloudError):
     """A file that can be read as a whole only, not in ranges of its rows."""
 
 
+class CannotHoldError(BadCloudError):
+    """A format that has no type for the numbers of a table; the message names no file."""
+
+
 @contextmanager
 def naming_file(path: Path) -> Iterator[None]:
     """Turn any error of a parser into one that names the file.
@@ -41,6 +45,14 @@ def naming_file(path: Path) -> Iterator[None]:
         raise BadCloudError(f"{path} is broken: {one_line(error)}.") from None
 
 
+def check_is_file(path: Path) -> None:
+    """Reject what is missing, a folder, a pipe or a device."""
+    if not path.exists():
+        raise BadCloudError(f"{path}: no such file.")
+    if not path.is_file():
+        raise BadCloudError(f"{path}: not a file.")
+
+
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
     """Read ``path``; any error names the file.
@@ -48,8 +60,7 @@ def reading(path: Path) -> Iterator[None]:
     Raises:
         BadCloudError: the file is missing or broken, or is a pipe or a device, which may never end.
     """
-    if not path.is_file():
-        raise BadCloudError(f"{path}: {'not a file' if path.exists() else 'no such file'}.")
+    check_is_file(path)
     with naming_file(path):
         yield
 

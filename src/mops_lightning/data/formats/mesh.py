@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mops_lightning.data.formats import ply
+from mops_lightning.data.formats.gltf import plain_glb
 from mops_lightning.data.formats.guard import BadCloudError, naming_file
 from mops_lightning.data.formats.isolated import isolated
-from mops_lightning.data.formats.ply import plain_header
+from mops_lightning.data.formats.surface import attributes, face_colours, file_attributes
+from mops_lightning.data.formats.table import Form, Table
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -20,13 +22,14 @@ SUFFIXES = (".off", ".obj", ".ply", ".stl", ".glb")
 FLAT = 1e-12
 """Smallest ratio of area to squared extent; below, a mesh is a line or a point."""
 
+LEFT_OUT = "left out"
+"""Key of a mesh's metadata: what the file has that a table does not hold."""
+
 MAX_MATERIALS = 1000
 """In an OBJ file with more, materials are ignored: trimesh's time grows with their square."""
 
 
-def sample_mesh(
-    path: Path, data: bytes, number: int, seed: int | np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+def sample_mesh(path: Path, data: bytes, number: int, seed: int | np.random.Generator) -> Table:
     """Sample points on the surface of a mesh, uniform by area.
 
     Args:
@@ -36,7 +39,8 @@ def sample_mesh(
         seed: of the draw.
 
     Returns:
-        The points ``(number, 3)``, and the normals of their faces ``(number, 3)``.
+        The points ``(number, 3)`` with their normals, and with the colours and other numbers of
+        vertices and faces; see ``surface.attributes``.
 
     Raises:
         BadCloudError: the file is not a valid mesh with a surface.
@@ -44,14 +48,32 @@ def sample_mesh(
     return isolated(_sample, path, data, number, seed)
 
 
-def _sample(
-    path: Path, data: bytes, number: int, seed: int | np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+def _sample(path: Path, data: bytes, number: int, seed: int | np.random.Generator) -> Table:
     from trimesh.sample import sample_surface
 
     mesh = parse_mesh(data, path)
     points, faces = sample_surface(mesh, number, seed=seed)
-    return np.asarray(points, np.float64), np.asarray(mesh.face_normals)[faces].astype(np.float32)
+    exact = np.asarray(points, np.float64)
+    columns = attributes(mesh, exact, np.asarray(faces))
+    return Table(exact, columns, form=Form(left_out=mesh.metadata.get(LEFT_OUT, ())))
+
+
+def mesh_vertices(path: Path, data: bytes) -> Table:
+    """Return the vertices of a mesh with their numbers, in the order of the file.
+
+    Vertices that faces share with different normals may be there several times, except in PLY.
+
+    Raises:
+        BadCloudError: the file is not a valid mesh.
+    """
+    return isolated(_parse_vertices, path, data)
+
+
+def _parse_vertices(path: Path, data: bytes) -> Table:
+    mesh = parse_mesh(data, path)
+    left_out = (*mesh.metadata.get(LEFT_OUT, ()), "faces")
+    columns = {name: np.asarray(column) for name, column in mesh.vertex_attributes.items()}
+    return Table(np.asarray(mesh.vertices, np.float64), columns, form=Form(left_out=left_out))
 
 
 def parse_mesh(data: bytes, path: Path) -> "Trimesh":
@@ -75,7 +97,7 @@ def parse_mesh(data: bytes, path: Path) -> "Trimesh":
     if not data.strip():
         raise BadCloudError(f"{path} is empty.")
     with naming_file(path), np.errstate(all="ignore"):
-        mesh = _load(data, kind)
+        mesh = _load(data, kind, path)
         if mesh.vertices.shape[1] != 3:
             raise ValueError(f"vertices must have 3 coordinates, got {mesh.vertices.shape[1]}")
         faces = np.asarray(mesh.faces).reshape(-1, 3)
@@ -95,43 +117,63 @@ def parse_mesh(data: bytes, path: Path) -> "Trimesh":
     return mesh
 
 
-def _load(data: bytes, kind: str) -> "Trimesh":
-    """Parse a file with trimesh and join the parts of a scene."""
+def _load(data: bytes, kind: str, path: Path) -> "Trimesh":
+    """Parse a file and join the parts of a scene."""
     import trimesh
 
-    text = kind in (".off", ".obj")
+    if kind == ".ply":
+        parsed = ply.parse_mesh(data, path)
+        mesh = trimesh.Trimesh(parsed.table.points, parsed.faces, process=False)
+        mesh.vertex_attributes.update(parsed.table.columns)
+        mesh.face_attributes.update(parsed.face_columns)
+        mesh.metadata[LEFT_OUT] = parsed.left_out
+        return mesh
     if kind == ".stl":
         count = int.from_bytes(data[80:84], "little")
-        text = len(data) != 84 + 50 * count
-        if text and not data.lstrip().startswith(b"solid"):
+        is_ascii = len(data) != 84 + 50 * count
+        if is_ascii and not data.lstrip().startswith(b"solid"):
             raise ValueError(f"{count} triangles take {84 + 50 * count} bytes, not {len(data)}")
-    if text:
-        # Comments may have any encoding, for which trimesh would need another package.
-        try:
-            data.decode()
-        except UnicodeDecodeError:
-            data = data.decode("latin-1").encode()
-        data = data.replace(b"\t", b" ")  # trimesh recognises faces of OBJ files by "f " only
+    if kind in (".off", ".obj") or (kind == ".stl" and is_ascii):
+        data = _plain_text(data)
     if kind == ".obj" and data.count(b"usemtl") > MAX_MATERIALS:
         data = re.sub(rb"(?m)^[ ]*usemtl.*$", b"", data)
-    if kind == ".ply":
-        data = plain_header(data)
+    if kind == ".glb":
+        data = plain_glb(data)
     # Materials do not affect the surface, and their files may be missing.
     extra: dict[str, Any] = {"skip_materials": True} if kind != ".off" else {}
     scene: Any = trimesh.load(
         BytesIO(data), file_type=kind[1:], force="scene", process=False, **extra
     )
-    mesh: Trimesh = scene.to_mesh()
-    return mesh
+    joined: Trimesh = scene.to_mesh()
+    joined.vertex_attributes.update(file_attributes(joined))
+    joined.face_attributes.update(face_colours(joined))
+    if _has_texture(data, kind):
+        joined.metadata[LEFT_OUT] = ("texture",)
+    return joined
+
+
+def _plain_text(data: bytes) -> bytes:
+    """Return a text file in UTF-8, with blanks for tabs.
+
+    Comments may have any encoding, for which trimesh would need another package, and it recognises
+    faces of OBJ files by "f " only.
+    """
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        data = data.decode("latin-1").encode()
+    return data.replace(b"\t", b" ")
+
+
+def _has_texture(data: bytes, kind: str) -> bool:
+    if kind == ".obj":
+        return re.search(rb"(?m)^usemtl ", data) is not None
+    return kind == ".glb" and b'"textures"' in data
 
 
 def _announced_faces(data: bytes, kind: str) -> int:
-    """Return the face count in the header of an OFF or PLY file; truncated files have fewer."""
-    head = data[:4096]
-    if kind == ".ply":
-        counts = re.search(rb"element\s+face\s+(\d+)", head)
-    elif kind == ".off":
-        counts = re.search(rb"OFF\s*\d+\s+(\d+)", re.sub(rb"#[^\n]*", b"", head))
-    else:
+    """Return the face count in the header of an OFF file; truncated files have fewer."""
+    if kind != ".off":
         return 0
+    counts = re.search(rb"OFF\s*\d+\s+(\d+)", re.sub(rb"#[^\n]*", b"", data[:4096]))
     return int(counts[1]) if counts else 0

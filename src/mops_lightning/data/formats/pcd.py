@@ -1,19 +1,38 @@
 """PCD files of the Point Cloud Library, version 0.7: ascii and binary."""
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 
-from mops_lightning.data.formats import table as tables
+from mops_lightning.data.formats.columns import (
+    fitting_type,
+    floating,
+    from_columns,
+    split_array,
+    to_rows,
+    unique_names,
+)
 from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.data.formats.table import Column, Table
 
 KINDS = {"F": "f", "I": "i", "U": "u"}
 
+TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 
-def read(path: Path) -> tables.Table:
+NO_VIEWPOINT = "0 0 0 1 0 0 0"
+
+
+@dataclass(frozen=True)
+class PcdForm:
+    """The pose of the sensor in a PCD file: translation and quaternion, as text."""
+
+    viewpoint: str = NO_VIEWPOINT
+
+
+def read(path: Path) -> Table:
     """Read a PCD file; a field with a COUNT of k becomes k columns."""
     data = path.read_bytes()
     header, start = _header(data)
@@ -22,41 +41,78 @@ def read(path: Path) -> tables.Table:
     number = int(header.get("POINTS", [header["WIDTH"][0]])[0])
     if number < 1:
         raise BadCloudError(f"{path} holds no points.")
-    kinds = zip(header["TYPE"], header["SIZE"], counts, strict=True)
-    layout = np.dtype(
-        [
-            (name if name != "_" else f"_{place}", f"<{KINDS[kind]}{int(size)}", (count,))
-            for place, (name, (kind, size, count)) in enumerate(zip(names, kinds, strict=True))
-        ]
-    )
-    array = _body(path, data[start:], header["DATA"][0], layout, number)
-    columns: dict[str, tables.Column] = {}
-    for name in layout.names or ():
-        values = array[name][:, 0] if layout[name].shape == (1,) else array[name]
-        columns |= {} if name.startswith("_") else tables.split_array(name, values)
-    return tables.from_columns(columns, path)
+    fields = []
+    kinds = zip(names, header["TYPE"], header["SIZE"], counts, strict=True)
+    for place, (name, kind, size, count) in enumerate(kinds):
+        field = f"_{place}" if name == "_" else name
+        fields.append((field, f"<{KINDS[kind]}{int(size)}", (count,)))
+    array = _body(path, data[start:], header["DATA"][0], np.dtype(fields), number)
+    columns: dict[str, Column] = {}
+    grouped: dict[str, tuple[str, ...]] = {}
+    for name, _, (count,) in fields:
+        if name.startswith("_"):
+            continue  # bytes without a meaning
+        values = array[name][:, 0] if count == 1 else array[name]
+        parts = split_array(name, values)
+        if count > 1:
+            grouped[name] = tuple(parts)
+        columns |= parts
+    viewpoint = " ".join(header.get("VIEWPOINT", [NO_VIEWPOINT]))
+    table = from_columns(columns, path, PcdForm(viewpoint))
+    return replace(table, form=replace(table.form, arrays=grouped))
 
 
-def write(path: Path, table: tables.Table) -> None:
-    """Write a binary PCD file: coordinates as float32, or double where that would lose digits."""
-    columns = tables.to_columns(table)
-    kinds = {"f": "F", "i": "I", "u": "U", "b": "U"}
-    rows = tables.to_rows(columns)
+def write(path: Path, table: Table) -> None:
+    """Write a binary PCD file with the data types of the table; float16 becomes float32.
+
+    Raises:
+        CannotHoldError: a column has numbers that no data type of PCD holds.
+    """
+    points = table.stored_coordinates()
+    points = points.astype(floating(points.dtype))
+    columns: dict[str, Column] = dict(zip("xyz", points.T, strict=True))
+    for name, column in unique_names(table).items():
+        columns[name] = column.astype(fitting_type(name, column, TYPES, ".pcd"))
+    fields = _fields(columns, table)
+    letters = {kind: letter for letter, kind in KINDS.items()}
+    kinds = {name: columns[parts[0]].dtype for name, parts in fields.items()}
+    layout = table.form.layout
+    form = layout if isinstance(layout, PcdForm) else PcdForm()
+    rows = to_rows(columns)
     header = {
         "VERSION": "0.7",
-        "FIELDS": " ".join(columns),
-        "SIZE": " ".join(str(column.dtype.itemsize) for column in columns.values()),
-        "TYPE": " ".join(kinds[column.dtype.kind] for column in columns.values()),
-        "COUNT": " ".join("1" for _ in columns),
+        "FIELDS": " ".join(fields),
+        "SIZE": " ".join(str(kind.itemsize) for kind in kinds.values()),
+        "TYPE": " ".join(letters[kind.kind] for kind in kinds.values()),
+        "COUNT": " ".join(str(len(parts)) for parts in fields.values()),
         "WIDTH": str(len(rows)),
         "HEIGHT": "1",
-        "VIEWPOINT": "0 0 0 1 0 0 0",
+        "VIEWPOINT": form.viewpoint,
         "POINTS": str(len(rows)),
         "DATA": "binary\n",
     }
     lines = [f"{name} {values}" for name, values in header.items()]
     text = "\n".join(["# .PCD v0.7 - Point Cloud Data file format", *lines])
-    path.write_bytes(text.encode() + rows.tobytes())
+    with path.open("wb") as file:
+        file.write(text.encode())
+        rows.tofile(file)
+
+
+def _fields(columns: dict[str, Column], table: Table) -> dict[str, list[str]]:
+    """Return the fields of a file with the columns of each: several, where they were one field."""
+    names = list(columns)
+    fields: dict[str, list[str]] = {}
+    place = 0
+    while place < len(names):
+        name, length = names[place], 1
+        for array, parts in table.form.arrays.items():
+            together = tuple(names[place : place + len(parts)]) == parts
+            kinds = {columns[part].dtype for part in parts if part in columns}
+            if together and len(kinds) == 1 and array not in columns:
+                name, length = array, len(parts)
+        fields[name] = names[place : place + length]
+        place += length
+    return fields
 
 
 def _header(data: bytes) -> tuple[dict[str, list[str]], int]:
@@ -77,11 +133,29 @@ def _body(path: Path, body: bytes, kind: str, layout: np.dtype[Any], number: int
     if kind == "ascii":
         if number > len(body):
             raise ValueError(f"{len(body)} bytes are not {number} points")
-        numbers = np.array(body.split(), dtype=np.float64).reshape(number, -1)
-        return unstructured_to_structured(numbers, layout)
+        return _ascii_rows(body, layout, number)
     if kind == "binary":
         return np.frombuffer(body, layout, number)
     raise BadCloudError(
         f"{path} has DATA {kind}, which is not ascii or binary. Convert it by PCL's "
         f"pcl_convert_pcd_ascii_binary {path} OUT.pcd 1."
     )
+
+
+def _ascii_rows(body: bytes, layout: np.dtype[Any], number: int) -> NDArray[Any]:
+    """Return the rows of an ascii file; whole numbers of 64 bits keep all digits."""
+    words = np.array(body.split()).reshape(number, -1)
+    rows = np.zeros(number, layout)
+    place = 0
+    for name in layout.names or ():
+        (count,) = layout[name].shape
+        kind = layout[name].base
+        for column in range(count):
+            text = words[:, place]
+            if kind.kind == "f" or kind.itemsize < 8:
+                text = text.astype(np.float64)
+            rows[name][:, column] = text.astype(kind)
+            place += 1
+    if place != words.shape[1]:
+        raise ValueError(f"its points have {words.shape[1]} numbers, not {place}")
+    return rows

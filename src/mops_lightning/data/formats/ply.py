@@ -1,142 +1,211 @@
 """PLY files: ascii and binary are read, binary is written."""
 
-import re
-from io import BytesIO
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mops_lightning.data.formats import table as tables
+from mops_lightning.data.formats.cloud_file import CloudFile, binary_file
+from mops_lightning.data.formats.columns import (
+    fitting_type,
+    floating,
+    from_columns,
+    in_native_order,
+    to_rows,
+    unique_names,
+)
 from mops_lightning.data.formats.guard import BadCloudError, WholeOnlyError
-from mops_lightning.data.formats.isolated import isolated
+from mops_lightning.data.formats.ply_elements import (
+    KINDS,
+    LONGEST_HEADER,
+    Element,
+    Header,
+    Lists,
+    Values,
+    read_elements,
+    read_header,
+)
+from mops_lightning.data.formats.table import Column, Form, Table, TableParts
 
-KINDS = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
-    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
 TYPES = {kind: name for name, kind in KINDS.items() if not name[-1].isdigit()}
+"""PLY's names of data types."""
 
-LONGEST_HEADER = 1 << 20
-"""Most bytes of a header; a file that exceeds it is not PLY."""
+INDICES = ("vertex_indices", "vertex_index")
+"""Names of the list of a face's corners."""
 
 
-def split_header(data: bytes) -> tuple[list[list[str]], int]:
-    """Return the words of a header's lines, without comments, and where it ends in bytes.
+@dataclass(frozen=True)
+class PlyMesh:
+    """A mesh of triangles.
 
-    Args:
-        data: the first bytes of a file, at least ``LONGEST_HEADER`` if it has as many.
-
-    Raises:
-        ValueError: the header does not end.
+    Attributes:
+        table: its vertices.
+        faces: ``(F, 3)`` rows of vertices; polygons are cut into triangles.
+        face_columns: ``(F,)`` numbers of the faces.
+        left_out: names of lists and elements besides.
     """
-    first = re.match(rb"[^\r\n]*(\r?\n|\r)", data)
-    end = b"\r" if first and first[1] == b"\r" else b"\n"
-    last = re.compile(end + rb"[ \t]*end_header[ \t\r]*?" + end).search(data, 0, LONGEST_HEADER)
-    if not last:
-        raise ValueError("its header does not end")
-    lines = data[: last.start()].decode("latin-1").split(end.decode())
-    words = [line.split() for line in lines]
-    return [line for line in words if line[:1] not in ([], ["comment"], ["obj_info"])], last.end()
+
+    table: Table
+    faces: NDArray[np.int64]
+    face_columns: dict[str, Column]
+    left_out: tuple[str, ...]
 
 
-def plain_header(data: bytes) -> bytes:
-    """Return a PLY file with a header that trimesh reads: no comments, lines that end in LF.
-
-    A comment may name a texture, which would be a path to any file.
-    """
-    lines, end = split_header(data)
-    return "\n".join([*map(" ".join, lines), "end_header\n"]).encode() + data[end:]
-
-
-def read(path: Path) -> tables.Table | None:
+def read(path: Path) -> Table | None:
     """Read the vertices with all their properties; None for a mesh, which has faces as well.
 
     Raises:
         BadCloudError: the file is broken or ends before its last vertex.
     """
-    return isolated(_parse, path)
-
-
-def _parse(path: Path) -> tables.Table | None:
-    from trimesh.exchange.ply import load_ply
-
-    with np.errstate(all="ignore"):
-        content = BytesIO(plain_header(path.read_bytes()))
-        found: Any = load_ply(content, skip_materials=True)
-    if "faces" in found and len(found["faces"]):
+    data = path.read_bytes()
+    header = read_header(data[:LONGEST_HEADER])
+    if any(_is_faces(element) for element in header.elements):
         return None
-    vertex = found["metadata"]["_ply_raw"]["vertex"]
-    if not vertex["length"]:
+    return _vertices(path, header, read_elements(data, header))
+
+
+def read_vertices(path: Path) -> Table:
+    """Read the vertices with all their properties, also of a mesh; see ``read``."""
+    data = path.read_bytes()
+    header = read_header(data[:LONGEST_HEADER])
+    return _vertices(path, header, read_elements(data, header))
+
+
+def parse_mesh(data: bytes, path: Path) -> PlyMesh:
+    """Parse a mesh.
+
+    Args:
+        data: content of the file.
+        path: of the file, for errors.
+
+    Raises:
+        ValueError: the file is broken, or its faces have no list of corners.
+    """
+    header = read_header(data[:LONGEST_HEADER])
+    elements = read_elements(data, header)
+    table = _vertices(path, header, elements)
+    found = elements.get("face", {})
+    lists = [name for name, values in found.items() if isinstance(values, Lists)]
+    chosen = next((name for name in (*INDICES, *lists) if name in lists), None)
+    if chosen is None:
+        return PlyMesh(table, np.empty((0, 3), np.int64), {}, table.form.left_out)
+    corners = found[chosen]
+    assert isinstance(corners, Lists)
+    faces, rows = _triangles(corners)
+    columns = {
+        name: in_native_order(values)[rows]
+        for name, values in found.items()
+        if not isinstance(values, Lists)
+    }
+    left_out = tuple(name for name in table.form.left_out if name != "element face")
+    return PlyMesh(table, faces, columns, left_out)
+
+
+def _is_faces(element: Element) -> bool:
+    return element.name == "face" and element.number > 0 and element.has_lists
+
+
+def _triangles(polygons: Lists) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Cut polygons into triangles ``(F, 3)`` from their first corners; and the row of each."""
+    triangles, rows = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
+    for of_length, corners in polygons.by_length():
+        whole = corners.astype(np.int64)
+        for second in range(1, corners.shape[1] - 1):
+            triangles.append(whole[:, [0, second, second + 1]])
+            rows.append(of_length)
+    of_face = np.concatenate(rows)
+    order = of_face.argsort(kind="stable")
+    return np.concatenate(triangles)[order], of_face[order]
+
+
+def _vertices(path: Path, header: Header, elements: dict[str, dict[str, Values]]) -> Table:
+    """Return the table of the element with the points; lists and other elements are left out."""
+    points = _points(path, header)
+    if points.number < 1:
         raise BadCloudError(f"{path} holds no points.")
-    columns = _columns(vertex["data"])
-    number, declared = len(next(iter(columns.values()))), vertex["length"]
-    if number < declared:
-        raise BadCloudError(f"{path} is broken: its header says {declared} points, not {number}.")
-    return tables.from_columns(columns, path)
+    columns = {}
+    left_out = []
+    for name, values in elements[points.name].items():
+        if isinstance(values, Lists):
+            left_out.append(name)
+        else:
+            columns[name] = values
+    left_out += [
+        f"element {element.name}"
+        for element in header.elements
+        if element.name != points.name and element.number > 0
+    ]
+    table = from_columns(columns, path)
+    form = Form(table.form.coordinates, left_out=tuple(left_out))
+    return replace(table, form=form)
 
 
-def _columns(data: Any) -> dict[str, tables.Column]:
-    """Return the columns of trimesh's rows, or of its arrays ``(N, 1)`` from an ascii file."""
-    if not isinstance(data, dict):
-        return {name: data[name] for name in data.dtype.names}
-    columns = {name: np.asarray(column) for name, column in data.items()}
-    return {name: column.ravel() for name, column in columns.items() if column.size == len(column)}
+def _points(path: Path, header: Header) -> Element:
+    """Return the element ``vertex``, or else the first one with x, y and z.
+
+    Raises:
+        BadCloudError: there is none, or it is packed.
+    """
+    for element in header.elements:
+        if any(part.name == "packed_position" for part in element.properties):
+            raise BadCloudError(
+                f"{path} is a compressed PLY of SuperSplat, which needs gsply: "
+                "pip install 'mops-lightning[splats]'."
+            )
+    named = [element for element in header.elements if element.name == "vertex"]
+    for element in (*named, *header.elements):
+        names = {part.name.lower() for part in element.properties if part.count is None}
+        if {"x", "y", "z"} <= names:
+            return element
+    found = ", ".join(element.name for element in header.elements) or "none"
+    raise BadCloudError(f"{path} has no element with x, y and z. Its elements: {found}.")
 
 
-def write(path: Path, table: tables.Table) -> None:
-    """Write binary PLY: float coordinates, or double where float would lose digits."""
-    write_parts(path, tables.TableParts.whole(table))
+def write(path: Path, table: Table) -> None:
+    """Write binary PLY with the data types of the table; see ``write_parts``."""
+    write_parts(path, TableParts.whole(table))
 
 
-def write_parts(path: Path, table: tables.TableParts) -> None:
-    """Write binary PLY part by part."""
-    examples = tables.unique_names(tables.Table(table.corners, table.columns))
-    kinds = dict.fromkeys("xyz", table.coordinates.newbyteorder("<").str)
-    kinds |= {name: _ply_kind(column) for name, column in examples.items()}
+def write_parts(path: Path, table: TableParts) -> None:
+    """Write binary PLY part by part.
+
+    Raises:
+        CannotHoldError: a column has numbers that no data type of PLY holds.
+    """
+    examples = unique_names(Table(table.corners, table.columns))
+    kinds = dict.fromkeys("xyz", floating(table.coordinates))
+    for name, column in examples.items():
+        kinds[name] = fitting_type(name, column, TYPES, ".ply")
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {table.number}"]
-    lines += [f"property {TYPES[kind[1:]]} {name}" for name, kind in kinds.items()]
+    lines += [f"property {TYPES[kind.str[1:]]} {name}" for name, kind in kinds.items()]
     with path.open("wb") as file:
         file.write("\n".join([*lines, "end_header\n"]).encode())
         for part in table.parts:
-            columns = dict(zip("xyz", part.points.T, strict=True)) | tables.unique_names(part)
-            rows = {name: column.astype(kinds[name]) for name, column in columns.items()}
-            file.write(tables.to_rows(rows).tobytes())
+            columns = dict(zip("xyz", part.points.T, strict=True)) | unique_names(part)
+            typed = {name: column.astype(kinds[name]) for name, column in columns.items()}
+            file.write(to_rows(typed).tobytes())
 
 
-def _ply_kind(column: tables.Column) -> str:
-    """Return the data type that holds a column: PLY has no integers of 64 bits."""
-    kind, size = column.dtype.kind, column.dtype.itemsize
-    if kind in "iu" and size == 8:
-        small = len(column) == 0 or (column.min() >= -(2**31) and column.max() < 2**31)
-        return "<i4" if small else "<f8"
-    if kind == "f":
-        return f"<f{min(max(size, 4), 8)}"
-    return "<u1" if kind == "b" else column.dtype.newbyteorder("<").str
-
-
-def locate(path: Path) -> tables.CloudFile:
+def locate(path: Path) -> CloudFile:
     """Find the vertices of a binary PLY file.
 
     Raises:
         BadCloudError: the file is broken, a mesh, or its vertices are not rows of fixed length.
     """
     with path.open("rb") as file:
-        lines, offset = split_header(file.read(LONGEST_HEADER))
-    words = [line for line in lines if line[0] != "ply"]
-    order = {"binary_little_endian": "<", "binary_big_endian": ">"}
-    form, *elements = words or [["format", "missing"]]
-    begin = [place for place, line in enumerate(elements) if line[0] == "element"]
-    if form[:1] != ["format"] or form[1] not in order or begin[:1] != [0]:
-        raise WholeOnlyError(f"{path}: --chunk needs binary PLY with a complete header.")
-    first, *others = (elements[start] for start in begin)
-    if first[1] != "vertex":
-        raise WholeOnlyError(f"{path}: --chunk needs PLY with its vertices before all else.")
-    if any(other[1] == "face" and other[2] != "0" for other in others):
+        header = read_header(file.read(LONGEST_HEADER))
+    if header.is_ascii:
+        raise WholeOnlyError(f"{path}: --chunk needs binary PLY.")
+    if any(_is_faces(element) for element in header.elements):
         raise WholeOnlyError(f"{path} is a mesh: --chunk needs a cloud.")
-    fields = elements[1 : begin[1] if others else None]
-    if any(field[1] not in KINDS for field in fields):
-        raise WholeOnlyError(f"{path}: --chunk needs vertices without lists.")
-    kind = np.dtype([(name, order[form[1]] + KINDS[typed]) for _, typed, name in fields])
-    return tables.binary_file(path, int(first[2]), kind, offset)
+    points = _points(path, header)
+    offset = header.end
+    for element in header.elements[: header.elements.index(points) + 1]:
+        if element.has_lists:
+            raise WholeOnlyError(
+                f"{path}: --chunk needs vertices without lists, and no lists before them."
+            )
+        if element is not points:
+            offset += element.row_type().itemsize * element.number
+    return binary_file(path, points.number, points.row_type(), offset)

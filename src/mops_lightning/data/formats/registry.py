@@ -1,44 +1,77 @@
 """The file formats, and reading and writing a file of any of them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from mops_lightning.data.formats import arrays, las, pcd, ply, text
-from mops_lightning.data.formats.guard import BadCloudError, WholeOnlyError, reading
+from mops_lightning.data.formats import las, numpy_files, pcd, ply, scans, text
+from mops_lightning.data.formats.area import Area
+from mops_lightning.data.formats.cloud_file import CloudFile
+from mops_lightning.data.formats.guard import (
+    BadCloudError,
+    CannotHoldError,
+    WholeOnlyError,
+    reading,
+)
 from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
-from mops_lightning.data.formats.mesh import sample_mesh
-from mops_lightning.data.formats.table import Area, CloudFile, Table, TableParts
-from mops_lightning.errors import one_line
+from mops_lightning.data.formats.mesh import mesh_vertices, sample_mesh
+from mops_lightning.data.formats.table import Table, TableParts
+from mops_lightning.errors import one_line, printable
 from mops_lightning.filesystem import atomic_write
 
 READERS: dict[str, Callable[[Path], Table | None]] = {
-    ".ply": ply.read, ".pcd": pcd.read, ".las": las.read, ".laz": las.read,
-    ".bin": arrays.read_kitti, ".npy": arrays.read_npy, ".npz": arrays.read_npz,
-    ".xyz": text.read, ".txt": text.read,
-}  # fmt: skip
+    ".ply": ply.read,
+    ".pcd": pcd.read,
+    ".las": las.read,
+    ".laz": las.read,
+    ".bin": scans.read,
+    ".npy": numpy_files.read_npy,
+    ".npz": numpy_files.read_npz,
+    ".xyz": text.read,
+    ".txt": text.read,
+}
 """Readers of clouds; they return None for a mesh."""
 
-WRITERS: dict[str, Callable[[Path, Table], None]] = {
-    ".ply": ply.write, ".pcd": pcd.write, ".las": las.write, ".laz": las.write,
-    ".bin": arrays.write_kitti, ".npy": arrays.write_npy, ".npz": arrays.write_npz,
-    ".xyz": text.write, ".txt": text.write,
-}  # fmt: skip
+WRITERS: dict[str, Callable[[Path, Table], list[str] | None]] = {
+    ".ply": ply.write,
+    ".pcd": pcd.write,
+    ".las": las.write,
+    ".laz": las.write,
+    ".bin": scans.write,
+    ".npy": numpy_files.write_npy,
+    ".npz": numpy_files.write_npz,
+    ".xyz": text.write,
+    ".txt": text.write,
+}
+"""Writers of clouds; they return in words what the file does not hold, if anything."""
 
 PART_WRITERS: dict[str, Callable[[Path, TableParts], None]] = {
-    ".ply": ply.write_parts, ".las": las.write_parts, ".laz": las.write_parts,
-}  # fmt: skip
+    ".ply": ply.write_parts,
+    ".las": las.write_parts,
+    ".laz": las.write_parts,
+}
 """Formats that are written part by part."""
 
 CHUNKED: dict[str, Callable[[Path], CloudFile]] = {
-    ".npy": arrays.locate_npy, ".bin": arrays.locate_kitti, ".ply": ply.locate,
-    ".las": las.locate, ".laz": las.locate,
-}  # fmt: skip
+    ".npy": numpy_files.locate_npy,
+    ".bin": scans.locate,
+    ".ply": ply.locate,
+    ".las": las.locate,
+    ".laz": las.locate,
+}
 """Formats whose rows can be read in any range."""
 
 READABLE = tuple(dict.fromkeys((*READERS, *MESHES)))
 
 
-def read(path: Path, surface: int, seed: int, area: Area | None = None) -> Table:
+def read(
+    path: Path,
+    surface: int,
+    seed: int,
+    area: Area | None = None,
+    columns: Sequence[str] | None = None,
+    vertices: bool = False,
+) -> Table:
     """Read a cloud, or sample a mesh.
 
     Args:
@@ -46,50 +79,89 @@ def read(path: Path, surface: int, seed: int, area: Area | None = None) -> Table
         surface: number of points to sample from a mesh's surface, uniform by area.
         seed: of these.
         area: the part of the file to read.
+        columns: names of the columns of a .bin file; None: those that its name implies.
+        vertices: take the vertices of a mesh, instead of points on its surface.
 
     Raises:
         UserError: the file is missing or broken.
     """
     if area is not None:
         try:
-            return open_cloud_file(path, area).read_all()
+            return open_cloud_file(path, area, columns).read_all()
         except WholeOnlyError:
-            return area.clip(read(path, surface, seed), path)
+            return area.clip(read(path, surface, seed, None, columns, vertices), path)
     suffix = path.suffix.lower()
     if suffix not in READABLE:
         raise BadCloudError(f"{path} must end in {', '.join(READABLE)}.")
     with reading(path):
-        table = READERS[suffix](path) if suffix in READERS else None
+        table = read_points(path, columns)
         if table is not None:
             return table
-        points, normals = sample_mesh(path, path.read_bytes(), surface, seed)
-    return Table(points, dict(zip(("nx", "ny", "nz"), normals.T, strict=True)))
+        data = path.read_bytes()
+        if not vertices:
+            return sample_mesh(path, data, surface, seed)
+        return ply.read_vertices(path) if suffix == ".ply" else mesh_vertices(path, data)
+
+
+def read_points(path: Path, columns: Sequence[str] | None = None) -> Table | None:
+    """Read a cloud; None for a mesh. See ``read``."""
+    suffix = path.suffix.lower()
+    if suffix == ".bin":
+        return scans.read(path, columns)
+    check_no_columns(path, columns)
+    return READERS[suffix](path) if suffix in READERS else None
+
+
+def check_no_columns(path: Path, columns: Sequence[str] | None) -> None:
+    """Reject names of columns for a file that has its own."""
+    if columns is not None:
+        raise BadCloudError(f"{path}: --columns is for .bin files, which have no header.")
 
 
 def write(path: Path, table: Table | TableParts) -> None:
     """Write a file that ends in one of ``WRITERS``, completely or not at all.
 
+    A line says what the format does not hold.
+
     Raises:
         BadCloudError: the format cannot hold the table, or the file cannot be written.
     """
+    suffix = path.suffix.lower()
+    notes: list[str] | None = None
     try:
         with atomic_write(path) as temporary:
             if isinstance(table, TableParts):
-                PART_WRITERS[path.suffix.lower()](temporary, table)
+                PART_WRITERS[suffix](temporary, table)
+            elif path.name.lower().endswith(scans.NUSCENES_SUFFIX):
+                notes = scans.write(temporary, table, scans.NUSCENES)
             else:
-                WRITERS[path.suffix.lower()](temporary, table)
+                notes = WRITERS[suffix](temporary, table)
+    except CannotHoldError as error:
+        raise BadCloudError(f"OUT: {path}: {error}") from None
     except OSError as error:
         raise BadCloudError(
             f"OUT: cannot write {path} ({one_line(error)}). Free space, or give another OUT."
         ) from None
+    _say(path, table, notes or [])
 
 
-def open_cloud_file(path: Path, area: Area | None = None) -> CloudFile:
+def _say(path: Path, table: Table | TableParts, notes: list[str]) -> None:
+    """Print in one line what a written file does not hold of its source."""
+    if table.form.left_out:
+        notes = [*notes, f"without {', '.join(table.form.left_out)}"]
+    if notes:
+        print(printable(f"{path}: {'; '.join(notes)}"))
+
+
+def open_cloud_file(
+    path: Path, area: Area | None = None, columns: Sequence[str] | None = None
+) -> CloudFile:
     """Open a file whose rows can be read in any range.
 
     Args:
         path: the file.
         area: the part of it to read.
+        columns: see ``read``.
 
     Raises:
         WholeOnlyError: the file is of a kind that is read as a whole only.
@@ -99,5 +171,13 @@ def open_cloud_file(path: Path, area: Area | None = None) -> CloudFile:
     if suffix not in CHUNKED:
         raise WholeOnlyError(f"{path}: --chunk works with {', '.join(CHUNKED)}.")
     with reading(path):
-        file = CHUNKED[suffix](path)
-        return file if area is None else las.locate_area(file, area)
+        if suffix == ".bin":
+            file = scans.locate(path, columns)
+        else:
+            check_no_columns(path, columns)
+            file = CHUNKED[suffix](path)
+        if area is None:
+            return file
+        if suffix in (".las", ".laz"):
+            return las.locate_area(file, area)
+        return replace(file, area=area)

@@ -10,9 +10,9 @@ from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 from mops_lightning.data.formats import las
+from mops_lightning.data.formats.area import Area
 from mops_lightning.data.formats.guard import naming_file
 from mops_lightning.data.formats.isolated import isolated
-from mops_lightning.data.formats.table import Area
 from mops_lightning.errors import UserError, one_line
 
 HEAD, BLOCK = 2**16, 2**20

@@ -1,64 +1,144 @@
 """Text files: .xyz and .txt with one point per line."""
 
 import re
+import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mops_lightning.data.formats import table as tables
+from mops_lightning.data.formats.columns import from_columns, unique_names
 from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.data.formats.table import Column, Table
+
+COMMENT = re.compile("#|//")
+
+HEADER_LINES = 20
+"""The names of the columns are in one of so many lines."""
 
 
-def read(path: Path) -> tables.Table:
+@dataclass(frozen=True)
+class TextForm:
+    """How a text file is written.
+
+    Attributes:
+        separator: of the numbers in a line.
+        header: the line with the names, as it is; empty: there is none.
+        names: of the columns in the order of the file; x, y and z are named so.
+        counted: whether the first line is the number of points.
+    """
+
+    separator: str = " "
+    header: str = ""
+    names: tuple[str, ...] = ()
+    counted: bool = False
+
+
+def read(path: Path) -> Table:
     """Read rows of numbers separated by spaces, commas or semicolons, with or without a header.
+
+    A column of whole numbers without a point is int64 or uint64, others are float64.
 
     Raises:
         BadCloudError: the file has no points, or fewer than its first line announces.
     """
     text = path.read_text(encoding="utf-8-sig", errors="replace")
-    lines = [re.split("#|//", line)[0].strip() for line in text.splitlines()]
+    lines = [COMMENT.split(line)[0].strip() for line in text.splitlines()]
     lines = [line for line in lines if line]
     if not lines:
         raise BadCloudError(f"{path} is empty.")
     separator = next((mark for mark in ",;" if mark in lines[-1]), None)
-    announced = 0
+    announced = None
     if len(lines) > 1 and len(lines[0].split(separator)) == 1 and lines[0].isdecimal():
         announced = int(lines.pop(0))
-    if not any(map(_is_number, lines[0].split(separator))):
-        lines.pop(0)  # a header
+    words = _words(lines[0], separator)
+    if not any(map(_is_number, words)):
+        lines.pop(0)
+    else:
+        words = []
     if not lines:
         raise BadCloudError(f"{path} holds no points.")
-    array = np.loadtxt(lines, delimiter=separator, ndmin=2)
-    if len(array) < announced:
-        raise BadCloudError(
-            f"{path} is broken: it announces {announced} points, but has {len(array)}."
-        )
-    # A header may be a comment: as many words as there are columns, x, y and z among them.
-    for line in text.lstrip("\ufeff").splitlines()[:20]:
-        words = [word.strip() for word in line.strip().lstrip("#/ ").split(separator)]
-        if len(words) == array.shape[1] and {"x", "y", "z"} <= {word.lower() for word in words}:
-            first = {word: words.index(word) for word in words}  # a name may be there twice
-            return tables.from_columns(
-                {word: array[:, place] for word, place in first.items()}, path
-            )
-    return tables.from_array(array, path)
+    columns = _numbers(lines, separator)
+    number = len(columns[0])
+    if announced is not None and number < announced:
+        raise BadCloudError(f"{path} is broken: it announces {announced} points, but has {number}.")
+    if len(columns) < 3:
+        raise BadCloudError(f"{path} must hold rows of x, y, z, got {len(columns)} columns.")
+    header, names = _header(text, separator, words, len(columns))
+    mark = separator or ("\t" if "\t" in lines[-1] else " ")
+    table = from_columns(dict(zip(names, columns, strict=True)), path)
+    in_table = [_name_in_table(name, table) for name in names]
+    layout = TextForm(mark, header, tuple(in_table), announced is not None)
+    return replace(table, form=replace(table.form, layout=layout))
 
 
-def write(path: Path, table: tables.Table) -> None:
-    """Write ``x y z`` and the columns, separated by spaces, without loss of digits."""
-    columns = tables.to_columns(table)
-    unnamed = all(name.startswith("column_") for name in list(columns)[3:])
-    header = "" if unnamed else " ".join(columns)
-    formats = [_number_format(column) for column in columns.values()]
-    np.savetxt(path, tables.to_rows(columns), fmt=formats, header=header, comments="# ")
+def _name_in_table(name: str, table: Table) -> str:
+    return name if name in table.columns else name.lower()
 
 
-def _number_format(column: tables.Column) -> str:
-    """Return the shortest ``%`` format that keeps every number of a column."""
-    if column.dtype.kind != "f":
-        return "%d"
-    short = column.dtype.itemsize <= 4 or np.array_equal(column.astype("f4"), column)
-    return "%.9g" if short else "%.17g"
+def _words(line: str, separator: str | None) -> list[str]:
+    """Return the words of a line, without the quotes around them."""
+    words = line.split(separator)
+    if separator is None:  # quotes may hold blanks
+        words = re.findall(r'"[^"]*"|\S+', line)
+    return [word.strip().strip("\"'") for word in words]
+
+
+def _header(
+    text: str, separator: str | None, words: list[str], number: int
+) -> tuple[str, list[str]]:
+    """Return the line with the names of the columns, and a different name for every column.
+
+    Args:
+        text: the whole file.
+        separator: of words; None: blanks.
+        words: of the first line that is no comment, if it has no numbers.
+        number: of columns.
+    """
+    for line in text.lstrip("\ufeff").splitlines()[:HEADER_LINES]:
+        # A header may be a comment: as many words as there are columns, x, y and z among them.
+        names = _words(line.strip().lstrip("#/ "), separator)
+        if len(names) == number and {"x", "y", "z"} <= {name.lower() for name in names}:
+            return line, _different(names)
+        if words and names == words and len(words) == number:
+            return line, _different(["x", "y", "z", *words[3:]])
+    return "", ["x", "y", "z", *(f"column_{place}" for place in range(3, number))]
+
+
+def _different(names: list[str]) -> list[str]:
+    """Return the names, those that are there already with a ``_`` appended."""
+    different: list[str] = []
+    for name in names:
+        own = name or "column"
+        while own in different:
+            own += "_"
+        different.append(own)
+    return different
+
+
+def _numbers(lines: list[str], separator: str | None) -> list[Column]:
+    """Return the columns of lines; whole numbers of 64 bits keep all digits."""
+    array: NDArray[Any] = np.loadtxt(lines, delimiter=separator, ndmin=2)
+    columns: list[Column] = []
+    for place, values in enumerate(array.T):
+        whole = np.isfinite(values).all() and bool((values == np.rint(values)).all())
+        integers = _integers(lines, separator, place) if whole else None
+        columns.append(values if integers is None else integers)
+    return columns
+
+
+def _integers(lines: list[str], separator: str | None, place: int) -> Column | None:
+    """Return a column as integers; None where a number is written with a point or too large."""
+    for kind in (np.int64, np.uint64):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")  # numpy reads 1.0 as 1, with a warning
+                return np.loadtxt(lines, kind, delimiter=separator, usecols=place, ndmin=1)
+        except (ValueError, OverflowError, DeprecationWarning):
+            continue
+    return None
 
 
 def _is_number(word: str) -> bool:
@@ -67,3 +147,49 @@ def _is_number(word: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def write(path: Path, table: Table) -> None:
+    """Write the coordinates and columns, one point per line.
+
+    Every number has as few digits as give the same number of its data type. Separator and names are
+    those of a text file that was read.
+    """
+    columns = dict(zip("xyz", table.stored_coordinates().T, strict=True)) | unique_names(table)
+    layout = table.form.layout
+    form = layout if isinstance(layout, TextForm) else TextForm()
+    known = [name for name in form.names if name in columns]
+    order = [*known, *(name for name in columns if name not in known)]
+    header = form.header
+    if tuple(order) != form.names:
+        header = _new_header(form, order)
+    words = [_shortest(columns[name]) for name in order]
+    lines = map(form.separator.join, zip(*words, strict=True))
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        if form.counted:
+            file.write(f"{len(table.points)}\n")
+        if header:
+            file.write(f"{header}\n")
+        file.writelines(f"{line}\n" for line in lines)
+
+
+def _new_header(form: TextForm, names: list[str]) -> str:
+    """Return a line of names; none if all names are those of unnamed columns."""
+    unnamed = all(name in ("x", "y", "z") or name.startswith("column_") for name in names)
+    if unnamed and not form.header:
+        return ""
+    is_comment = not form.header or COMMENT.match(form.header) is not None
+    line = form.separator.join(names)
+    return f"# {line}" if is_comment else line
+
+
+def _shortest(column: Column) -> list[str]:
+    """Return the numbers of a column as text, with as few digits as keep them."""
+    if column.dtype.kind == "b":
+        column = column.astype(np.uint8)
+    if column.dtype.kind in "iu":
+        return [str(number) for number in column.tolist()]
+    if column.dtype == np.float64:
+        return [repr(number).removesuffix(".0") for number in column.tolist()]
+    words = column.astype("U48")  # numpy's text of a float32 gives the same float32
+    return [word.removesuffix(".0") for word in words.tolist()]

@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 
 from mops_lightning.data.formats import table as tables
+from mops_lightning.data.formats.area import Area
+from mops_lightning.data.formats.cloud_file import CloudFile
+from mops_lightning.data.formats.columns import split_array, unique_names
 from mops_lightning.data.formats.guard import BadCloudError, ends_early
 from mops_lightning.data.formats.isolated import isolated
 from mops_lightning.data.formats.las.chunks import read_rows
@@ -38,17 +41,17 @@ def read(path: Path) -> tables.Table:
     return isolated(_parse, path)
 
 
-def locate(path: Path) -> tables.CloudFile:
+def locate(path: Path) -> CloudFile:
     """Open a file to read ranges of its rows.
 
     Raises:
         UserError: laspy is not installed, or the file is broken.
     """
     header = isolated(_parse_header, path)
-    return tables.CloudFile(path, header.point_count, partial(isolated, _parse_rows), header)
+    return CloudFile(path, header.point_count, partial(isolated, _parse_rows), header)
 
 
-def locate_area(file: tables.CloudFile, area: tables.Area) -> tables.CloudFile:
+def locate_area(file: CloudFile, area: Area) -> CloudFile:
     """Return the part of a file in an area.
 
     The rows of a COPC file are then those of the cells of its octree that overlap the area.
@@ -67,7 +70,7 @@ def locate_area(file: tables.CloudFile, area: tables.Area) -> tables.CloudFile:
         return replace(file, area=area)
     number = isolated(_count_in_nodes, file.path, area)
     parse = partial(isolated, partial(_parse_nodes, area))
-    return tables.CloudFile(
+    return CloudFile(
         file.path, number, parse, file.header, replace(area, level=None, resolution=None)
     )
 
@@ -126,12 +129,12 @@ def _parse_rows(path: Path, rows: range) -> tables.Table:
     return _table_near(path, cloud, header)
 
 
-def _count_in_nodes(path: Path, area: tables.Area) -> int:
+def _count_in_nodes(path: Path, area: Area) -> int:
     with _laspy(path).CopcReader.open(path) as reader:
         return sum(node.point_count for node in _nodes(reader, area))
 
 
-def ranges_of_bytes(path: Path, area: tables.Area) -> list[tuple[int, int]]:
+def ranges_of_bytes(path: Path, area: Area) -> list[tuple[int, int]]:
     """Return where the octree's cells that overlap an area are in a file: starts and ends.
 
     Cells with little between them are joined: an answer of a server takes as long as ``GAP`` bytes.
@@ -146,7 +149,7 @@ def ranges_of_bytes(path: Path, area: tables.Area) -> list[tuple[int, int]]:
     return joined
 
 
-def _parse_nodes(area: tables.Area, path: Path, rows: range) -> tables.Table:
+def _parse_nodes(area: Area, path: Path, rows: range) -> tables.Table:
     """Read a range of the rows of the octree's cells that overlap an area.
 
     Raises:
@@ -164,7 +167,7 @@ def _parse_nodes(area: tables.Area, path: Path, rows: range) -> tables.Table:
     return table.take(np.arange(len(table.points))[rows.start - first : rows.stop - first])
 
 
-def _nodes(reader: Any, area: tables.Area) -> list[Any]:
+def _nodes(reader: Any, area: Area) -> list[Any]:
     """Return the cells of a COPC file's octree that overlap an area, in the order of the file."""
     from laspy.copc import Bounds, load_octree_for_query
 
@@ -195,7 +198,7 @@ def _table(cloud: Any, header: Any) -> tables.Table:
     names = [name for name in cloud.point_format.dimension_names if name not in "XYZ"]
     columns: dict[str, tables.Column] = {}
     for name in names:
-        columns |= tables.split_array(name, np.asarray(cloud[name]))
+        columns |= split_array(name, np.asarray(cloud[name]))
     return tables.Table(points, columns, header)
 
 
@@ -215,7 +218,7 @@ def write_parts(path: Path, table: tables.TableParts) -> None:
         for part in table.parts:
             points = laspy.ScaleAwarePointRecord.zeros(len(part.points), header=header)
             points.x, points.y, points.z = part.points.T
-            for name, column in tables.unique_names(part).items():
+            for name, column in unique_names(part).items():
                 points[dimensions[name]] = column
             file.write_points(points)
         if header.evlrs:
@@ -226,7 +229,7 @@ def _add_dimensions(laspy: Any, header: Any, table: tables.Table) -> dict[str, s
     """Add what a header lacks for a table, and return the dimension of every column."""
     known = set(header.point_format.dimension_names)
     dimensions = {}
-    for name, column in tables.unique_names(table).items():
+    for name, column in unique_names(table).items():
         if name in known and _holds(laspy, header, name, column):
             dimensions[name] = name
             continue

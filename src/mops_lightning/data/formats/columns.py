@@ -1,0 +1,185 @@
+"""Columns of a table: from the arrays of a file, and to rows of types that a format has."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mops_lightning.data.formats.guard import BadCloudError, CannotHoldError
+from mops_lightning.data.formats.table import Column, Form, Table
+
+RESERVED = ("x", "y", "z", "points")
+"""Names that a column cannot have in a file."""
+
+LARGEST_WHOLE = 2**53
+"""Up to here float64 holds every whole number."""
+
+
+def from_columns(columns: Mapping[str, Column], path: Path, layout: Any = None) -> Table:
+    """Make a table of columns, x, y and z among them, in capitals or not.
+
+    Args:
+        columns: ``(N,)``, in the order of the file. Strings, dates and lists are left out.
+        path: for errors.
+        layout: see ``Form``.
+
+    Raises:
+        BadCloudError: there are no coordinates, or float64 does not hold them.
+    """
+    lower = {name.lower(): name for name in reversed(list(columns))}
+    if not {"x", "y", "z"} <= set(lower):
+        raise BadCloudError(f"{path} must have columns x, y and z, got {', '.join(columns)}.")
+    axes = [lower[axis] for axis in "xyz"]
+    for name in axes:
+        if columns[name].dtype.kind not in "fiu":
+            raise BadCloudError(f"{path}: {name} must be numbers, got {columns[name].dtype}.")
+        if not holds_exactly(np.dtype(np.float64), columns[name]):
+            raise BadCloudError(f"{path}: {name} has numbers that float64 does not hold exactly.")
+    points = np.stack([np.asarray(columns[name], np.float64) for name in axes], 1)
+    kind = np.result_type(*(columns[name].dtype for name in axes))
+    attributes: dict[str, Column] = {}
+    left_out = []
+    for name, column in columns.items():
+        if name in axes:
+            continue
+        if is_number_column(column):
+            attributes[name] = in_native_order(column)
+        else:
+            left_out.append(name)
+    return Table(points, attributes, form=Form(kind, left_out=tuple(left_out), layout=layout))
+
+
+def is_number_column(column: Column) -> bool:
+    """Return whether an array has one number, or truth value, per point."""
+    return column.ndim == 1 and column.dtype.kind in "fiub"
+
+
+def in_native_order(column: Column) -> Column:
+    """Return a column in the byte order of this machine: torch reads no other."""
+    return column.astype(column.dtype.newbyteorder("="), copy=False)
+
+
+def from_array(array: NDArray[Any], path: Path, layout: Any = None) -> Table:
+    """Make a table of the columns of an array; see ``column_names``."""
+    names = column_names(array, path)
+    if array.dtype.names:
+        return from_columns({name: array[name] for name in names}, path, layout)
+    return from_columns(dict(zip(names, array.T, strict=True)), path, layout)
+
+
+def column_names(array: NDArray[Any], path: Path) -> list[str]:
+    """Return the names of an array's columns: its fields, or x, y, z, column_3 and so on.
+
+    Args:
+        array: plain or structured; its numbers are not read.
+        path: for errors.
+
+    Raises:
+        BadCloudError: the array has neither rows of at least three numbers nor one row of fields
+            per point.
+    """
+    shape, kind = array.shape, array.dtype.kind
+    if array.dtype.names:
+        if array.ndim != 1:
+            raise BadCloudError(f"{path} must hold one row of fields per point, got {shape}.")
+        return list(array.dtype.names)
+    if len(shape) != 2 or shape[1] < 3 or kind not in "fiu":
+        raise BadCloudError(f"{path} must hold rows of x, y, z, got {array.dtype} {shape}.")
+    return ["x", "y", "z", *(f"column_{place}" for place in range(3, shape[1]))]
+
+
+def split_array(name: str, values: NDArray[Any]) -> dict[str, Column]:
+    """Return values ``(N,)`` as one column, or ``(N, k)`` as ``NAME_0`` to ``NAME_k-1``."""
+    if values.ndim == 1:
+        return {name: values}
+    return {f"{name}_{place}": values[:, place] for place in range(values.shape[1])}
+
+
+def unique_names(table: Table) -> dict[str, Column]:
+    """Return the columns under names that a file's header can hold: unique and without spaces."""
+    named: dict[str, Column] = {}
+    for name, column in table.columns.items():
+        plain = "_".join(name.split()) or "column"
+        while plain.lower() in RESERVED or plain in named:
+            plain += "_"
+        named[plain] = column
+    return named
+
+
+def holds_exactly(kind: np.dtype[Any], column: Column) -> bool:
+    """Return whether a data type holds every number of a column."""
+    if np.can_cast(column.dtype, kind) or not len(column):
+        return True
+    if column.dtype.kind == "f":
+        return changed_numbers(column, kind) == 0
+    if kind.kind == "f":
+        most = min(LARGEST_WHOLE, 2 ** (np.finfo(kind).nmant + 1))
+        least = -most
+    else:
+        least, most = np.iinfo(kind).min, np.iinfo(kind).max
+    # Compared as Python's integers, which do not overflow.
+    return least <= int(column.min()) and int(column.max()) <= most
+
+
+def changed_numbers(column: Column, kind: np.dtype[Any]) -> int:
+    """Return how many numbers of a column another data type would change."""
+    with np.errstate(all="ignore"):
+        back = column.astype(kind).astype(column.dtype)
+    same = back == column
+    if column.dtype.kind == "f":
+        same |= np.isnan(column) & np.isnan(back)
+    return int((~same).sum())
+
+
+WIDER = {
+    "f": ("f4", "f8"),
+    "i": ("i4", "u4", "i8", "f8"),
+    "u": ("u4", "u8", "f8"),
+}
+"""Data types that are tried for a column whose own type a format does not have."""
+
+
+def fitting_type(name: str, column: Column, allowed: Iterable[str], suffix: str) -> np.dtype[Any]:
+    """Return a column's own data type, or one that holds its numbers exactly.
+
+    Args:
+        name: of the column, for the error.
+        column: its numbers, or at least the smallest and the largest one.
+        allowed: the data types that a format has, such as ``i4``.
+        suffix: of the format, for the error.
+
+    Raises:
+        CannotHoldError: no data type of the format holds the numbers.
+    """
+    own = np.dtype("u1") if column.dtype.kind == "b" else in_native_order(column).dtype
+    kinds = [np.dtype(kind) for kind in allowed]
+    if own in kinds:
+        return own
+    wider = [np.dtype(kind) for kind in WIDER[own.kind]]
+    for kind in wider:
+        if kind in kinds and holds_exactly(kind, column):
+            return kind
+    if own.kind == "f":  # longdouble, with more digits than any format has
+        return np.dtype(np.float64)
+    others = [other for other in (".npz", ".las") if other != suffix]
+    raise CannotHoldError(
+        f"{suffix} has no type for {name!r}, whole numbers of 64 bits up to "
+        f"{int(column.max())}. Write {' or '.join(others)}, or leave all columns out by "
+        "--coordinates-only."
+    )
+
+
+def floating(kind: np.dtype[Any]) -> np.dtype[Any]:
+    """Return float32 or float64, whichever holds all numbers of a data type up to 2**53."""
+    return np.dtype(np.float32 if np.can_cast(kind, np.float32) else np.float64)
+
+
+def to_rows(columns: Mapping[str, Column]) -> NDArray[Any]:
+    """Return columns ``(N,)`` as a structured array of N rows, in little-endian order."""
+    fields = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
+    rows = np.empty(len(next(iter(columns.values()))), fields)
+    for name, column in columns.items():
+        rows[name] = column
+    return rows

@@ -1,0 +1,163 @@
+"""Binary glTF files as trimesh reads them: without quantised and sparse accessors."""
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+"""Data types of accessors by their number."""
+
+FLOAT = 5126
+
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+"""How many numbers an item of an accessor has."""
+
+SURFACE = ("POSITION", "NORMAL")
+"""Attributes that quantisation stores as integers."""
+
+HARMLESS = ("KHR_mesh_quantization", "KHR_texture", "EXT_texture", "KHR_materials", "KHR_lights")
+"""Beginnings of the names of required extensions that are read, or do not affect the surface."""
+
+
+def plain_glb(data: bytes) -> bytes:
+    """Return a GLB file with its positions and normals as float32, and without sparse accessors.
+
+    Raises:
+        ValueError: the file needs an extension that is not read, or its accessors are broken.
+    """
+    tree, buffer = _chunks(data)
+    check_extensions(tree)
+    accessors = tree.get("accessors", [])
+    quantised = _quantised(tree)
+    changed = {place for place, accessor in enumerate(accessors) if "sparse" in accessor}
+    changed |= quantised
+    if not changed:
+        return data
+    extended = bytearray(buffer)
+    for place in sorted(changed):
+        numbers = _numbers(tree, buffer, accessors[place])
+        if place in quantised:
+            numbers = _dequantised(numbers, bool(accessors[place].get("normalized")))
+        accessors[place] = _append(tree, extended, accessors[place], numbers)
+    return _packed(tree, bytes(extended))
+
+
+def check_extensions(tree: dict[str, Any]) -> None:
+    """Reject a file that needs an extension which changes its surface."""
+    for name in tree.get("extensionsRequired", []):
+        if not str(name).startswith(HARMLESS):
+            raise ValueError(
+                f"it needs the glTF extension {name}. Write it without, such as by "
+                "npx @gltf-transform/cli copy IN.glb OUT.glb"
+            )
+
+
+def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return the scene and the buffer of a file."""
+    if data[:4] != b"glTF":
+        raise ValueError("it does not begin with glTF")
+    length = struct.unpack_from("<I", data, 12)[0]
+    tree = json.loads(data[20 : 20 + length])
+    if not isinstance(tree, dict):
+        raise ValueError("its scene is not an object")
+    return tree, data[28 + length :]
+
+
+def _quantised(tree: dict[str, Any]) -> set[int]:
+    """Return the accessors of positions and normals that do not hold float32."""
+    found = set()
+    for mesh in tree.get("meshes", []):
+        for primitive in mesh.get("primitives", []):
+            for name in SURFACE:
+                place = primitive.get("attributes", {}).get(name)
+                if place is None:
+                    continue
+                if tree["accessors"][place]["componentType"] != FLOAT:
+                    found.add(place)
+    return found
+
+
+def _numbers(tree: dict[str, Any], buffer: bytes, accessor: dict[str, Any]) -> NDArray[Any]:
+    """Return the items ``(count, width)`` of an accessor."""
+    kind = np.dtype(KINDS[accessor["componentType"]])
+    width, count = WIDTHS[accessor["type"]], accessor["count"]
+    if "bufferView" in accessor:
+        offset = accessor.get("byteOffset", 0)
+        numbers = _items(tree, buffer, accessor["bufferView"], offset, kind, count, width)
+    elif count * width * kind.itemsize > len(buffer):
+        raise ValueError(f"an accessor without data has {count} items")
+    else:
+        numbers = np.zeros((count, width), kind)
+    sparse = accessor.get("sparse")
+    if sparse is None:
+        return numbers
+    places, values = sparse["indices"], sparse["values"]
+    place_kind, number = np.dtype(KINDS[places["componentType"]]), sparse["count"]
+    offset = places.get("byteOffset", 0)
+    rows = _items(tree, buffer, places["bufferView"], offset, place_kind, number, 1)[:, 0]
+    offset = values.get("byteOffset", 0)
+    numbers = numbers.copy()
+    numbers[rows] = _items(tree, buffer, values["bufferView"], offset, kind, number, width)
+    return numbers
+
+
+def _items(
+    tree: dict[str, Any],
+    buffer: bytes,
+    place: int,
+    offset: int,
+    kind: np.dtype[Any],
+    count: int,
+    width: int,
+) -> NDArray[Any]:
+    """Return items ``(count, width)`` of a view of the buffer."""
+    view = tree["bufferViews"][place]
+    if view.get("buffer", 0) != 0:
+        raise ValueError("it has several buffers")
+    start = view.get("byteOffset", 0) + offset
+    step = view.get("byteStride") or kind.itemsize * width
+    end = start + step * (count - 1) + kind.itemsize * width
+    if min(start, step, count) < 0 or end > len(buffer):
+        raise ValueError("an accessor ends after the buffer")
+    strides = (step, kind.itemsize)
+    return np.ndarray((count, width), kind, buffer, start, strides)
+
+
+def _dequantised(numbers: NDArray[Any], normalised: bool) -> NDArray[np.float32]:
+    """Return what integers stand for: themselves, or shares of the largest one."""
+    if not normalised or numbers.dtype.kind == "f":
+        return numbers.astype(np.float32)
+    largest = np.iinfo(numbers.dtype).max
+    return np.maximum(numbers / largest, -1).astype(np.float32)
+
+
+def _append(
+    tree: dict[str, Any], buffer: bytearray, accessor: dict[str, Any], numbers: NDArray[Any]
+) -> dict[str, Any]:
+    """Append numbers to the buffer, and return their accessor."""
+    buffer += bytes(-len(buffer) % 4)
+    start = len(buffer)
+    buffer += numbers.tobytes()
+    tree["bufferViews"].append(
+        {"buffer": 0, "byteOffset": start, "byteLength": len(buffer) - start}
+    )
+    left = ("sparse", "byteOffset", "min", "max")
+    plain = {key: value for key, value in accessor.items() if key not in left}
+    plain["bufferView"] = len(tree["bufferViews"]) - 1
+    if numbers.dtype == np.float32:
+        plain["componentType"] = FLOAT
+        plain.pop("normalized", None)
+    return plain
+
+
+def _packed(tree: dict[str, Any], buffer: bytes) -> bytes:
+    tree["buffers"] = [{"byteLength": len(buffer)}]
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    buffer += bytes(-len(buffer) % 4)
+    parts = struct.pack("<I", len(text)) + b"JSON" + text
+    parts += struct.pack("<I", len(buffer)) + b"BIN\0" + buffer
+    return b"glTF" + struct.pack("<II", 2, 12 + len(parts)) + parts

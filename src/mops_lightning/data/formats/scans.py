@@ -1,0 +1,208 @@
+"""Laser scans without a header: .bin of KITTI, .pcd.bin of nuScenes, and their labels (.label)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mops_lightning.data.formats.cloud_file import CloudFile, binary_file
+from mops_lightning.data.formats.columns import changed_numbers
+from mops_lightning.data.formats.guard import BadCloudError, CannotHoldError
+from mops_lightning.data.formats.table import Column, Table
+from mops_lightning.errors import UserError
+
+KITTI = ("x", "y", "z", "intensity")
+NUSCENES = ("x", "y", "z", "intensity", "ring")
+
+NUSCENES_SUFFIX = ".pcd.bin"
+
+OTHER_LENGTHS = (3, 5, 6, 7, 8)
+"""Numbers per point in other files that end in .bin."""
+
+TOLERANCE = 1e-6
+"""Largest distance by which float32 may move a point, as a share of the extent of the cloud."""
+
+LOOKED_AT = 100_000
+"""So many numbers of a file show whether they fit its columns."""
+
+CLEARLY_SMOOTHER = 0.7
+"""Ratio of mean differences between points, below which another number of columns fits better."""
+
+FEW_POINTS = 32
+"""Fewer points do not show how many columns they have."""
+
+
+@dataclass(frozen=True)
+class ScanForm:
+    """The columns of a scan, all float32."""
+
+    names: tuple[str, ...]
+
+
+def parse_columns(text: str) -> tuple[str, ...]:
+    """Return the names of columns that a user gave, separated by commas.
+
+    Raises:
+        UserError: a name is missing or there twice.
+    """
+    names = tuple(name.strip() for name in text.split(","))
+    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names) or "" in names:
+        raise UserError(
+            f"--columns must name all columns of a .bin file, each once, with x, y and z among "
+            f"them, such as x,y,z,intensity,ring; got {text!r}."
+        )
+    return names
+
+
+def read(path: Path, names: Sequence[str] | None = None) -> Table:
+    """Read a scan, with the classes and instances of a SemanticKITTI .label file beside it.
+
+    Args:
+        path: the file.
+        names: of its columns; None: those of KITTI, or of nuScenes in a .pcd.bin file.
+
+    Raises:
+        BadCloudError: the file does not have these columns.
+    """
+    scan = locate(path, names)
+    return scan.parse(path, range(scan.number))
+
+
+def locate(path: Path, names: Sequence[str] | None = None) -> CloudFile:
+    """Find the rows of a scan; see ``read``."""
+    chosen = tuple(names) if names is not None else assumed_columns(path)
+    kind = np.dtype([(name, "<f4") for name in chosen])
+    length = path.stat().st_size
+    if not length or length % kind.itemsize:
+        raise BadCloudError(
+            f"{path}: {length} bytes are not rows of {len(chosen)} float32 "
+            f"({', '.join(chosen)}). Name the columns of the file, such as --columns "
+            f"{','.join(NUSCENES)}."
+        )
+    number = length // kind.itemsize
+    if names is None:
+        _check_values(path, chosen)
+    parse_numbers = binary_file(path, number, kind).parse
+    labels = _label_file(path)
+    if labels is not None and labels.stat().st_size != 4 * number:
+        raise BadCloudError(
+            f"{labels} has {labels.stat().st_size} bytes, not 4 for each of the {number} points of "
+            f"{path}."
+        )
+    return CloudFile(path, number, partial(_parse, parse_numbers, labels, ScanForm(chosen)))
+
+
+def _parse(
+    parse_numbers: Callable[[Path, range], Table],
+    labels: Path | None,
+    layout: ScanForm,
+    path: Path,
+    rows: range,
+) -> Table:
+    table = parse_numbers(path, rows)
+    form = replace(table.form, layout=layout)
+    if labels is None:
+        return replace(table, form=form)
+    packed = np.fromfile(labels, "<u4", len(rows), offset=4 * rows.start)
+    classes = {
+        "label": (packed & 0xFFFF).astype(np.uint16),
+        "instance": (packed >> 16).astype(np.uint16),
+    }
+    return replace(table, columns={**table.columns, **classes}, form=form)
+
+
+def assumed_columns(path: Path) -> tuple[str, ...]:
+    """Return the columns of a file by its name."""
+    return NUSCENES if path.name.lower().endswith(NUSCENES_SUFFIX) else KITTI
+
+
+def _label_file(path: Path) -> Path | None:
+    """Return the labels of a scan: beside it, or in the folder ``labels`` beside ``velodyne``."""
+    beside = path.with_suffix(".label")
+    places = [beside]
+    if path.parent.name == "velodyne":
+        places.append(path.parent.parent / "labels" / beside.name)
+    return next((place for place in places if place.is_file()), None)
+
+
+def _check_values(path: Path, names: tuple[str, ...]) -> None:
+    """Reject a file whose numbers do not look like the columns that it should have."""
+    width = len(names)
+    numbers = np.fromfile(path, "<f4", LOOKED_AT // width * width)
+    rows = numbers.reshape(-1, width)
+    with np.errstate(invalid="ignore"):
+        negative = bool((rows[:, names.index("intensity")] < 0).any())
+    if negative or _fits_others_better(numbers, width):
+        raise BadCloudError(
+            f"{path} does not look like rows of {', '.join(names)}. Name its columns, such as "
+            f"--columns {','.join(NUSCENES)}; if these are right: --columns {','.join(names)}."
+        )
+
+
+def _fits_others_better(numbers: NDArray[np.float32], width: int) -> bool:
+    """Return whether points with another number of columns would differ much less."""
+    values = np.arcsinh(numbers[np.isfinite(numbers)].astype(np.float64))
+    if len(values) < FEW_POINTS * width:
+        return False
+    assumed = _mean_difference(values, width)
+    others = [_mean_difference(values, other) for other in OTHER_LENGTHS if other != width]
+    return min(others) < CLEARLY_SMOOTHER * assumed
+
+
+def _mean_difference(values: NDArray[np.float64], width: int) -> float:
+    """Return the mean difference of numbers that would be one column of neighbouring points."""
+    return float(np.abs(values[width:] - values[:-width]).mean())
+
+
+def write(path: Path, table: Table, names: tuple[str, ...] = KITTI) -> list[str]:
+    """Write float32 columns: those of a scan that was read, or others.
+
+    Args:
+        path: the file.
+        table: without an intensity, or another one of the columns, it is 0.
+        names: the columns of a table that was not read from a scan.
+
+    Returns:
+        Columns that are left out, and numbers that float32 changes.
+
+    Raises:
+        CannotHoldError: float32 would move the points by more than ``TOLERANCE``.
+    """
+    _check_digits(table.points)
+    layout = table.form.layout
+    chosen = layout.names if isinstance(layout, ScanForm) else names
+    available: dict[str, Column] = {
+        **dict(zip("xyz", table.points.T, strict=True)),
+        **table.columns,
+    }
+    rows = np.zeros((len(table.points), len(chosen)), "<f4")
+    notes = []
+    for place, name in enumerate(chosen):
+        column = available.get(name)
+        if column is None:
+            continue
+        with np.errstate(over="ignore"):
+            rows[:, place] = column
+        if changed := changed_numbers(column, np.dtype("f4")):
+            notes.append(f"{changed:,} numbers of {name} are rounded to float32")
+    left_out = [name for name in table.columns if name not in chosen]
+    if left_out:
+        notes.append(f"no room for {', '.join(left_out)}: .bin holds {', '.join(chosen)}")
+    rows.tofile(path)
+    return notes
+
+
+def _check_digits(points: NDArray[np.float64]) -> None:
+    finite = points[np.isfinite(points).all(axis=1)]
+    if not len(finite):
+        return
+    with np.errstate(over="ignore"):
+        moved = np.abs(finite.astype(np.float32) - finite).max()
+    if moved > TOLERANCE * np.ptp(finite, axis=0).max():
+        raise CannotHoldError(
+            ".bin holds float32, which would move these points, far from the origin, by "
+            f"up to {moved:.3g}. Write .ply, .npy or .las."
+        )
