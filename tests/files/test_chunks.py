@@ -74,7 +74,7 @@ def test_bounds_hold_for_chunks_and_whole_files(folder, tmp_path):
     ("name", "content", "said"),
     [
         ("a.xyz", b"1 2 3", "--chunk works with .npy"),
-        ("a.bin", b"123", "not a KITTI scan"),
+        ("a.bin", b"123", "3 bytes are not rows of 4 float32"),
         ("a.npy", b"123", "a.npy is broken"),
         ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n", "does not end"),
         ("a.ply", b"\n" * 10_000, "does not end"),

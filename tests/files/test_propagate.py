@@ -215,3 +215,32 @@ def test_mistake_ends_in_one_line(arguments, said, tmp_path, monkeypatch):
     before = sorted(tmp_path.iterdir())
     assert said in refused(main, arguments)
     assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("kind", ["f4", "u4"])
+def test_packed_colours_are_averaged_channel_by_channel(kind, tmp_path):
+    line = np.arange(3.0)[:, None] * [1, 0, 0]
+    bytes_of_colours = np.array([[0, 0, 200, 0], [100, 2, 0, 0]], np.uint8)  # blue, green, red
+    packed = bytes_of_colours.view(f"<{kind}")[:, 0]
+    WRITERS[".npz"](tmp_path / "big.npz", Table(line, {}))
+    WRITERS[".pcd"](tmp_path / "small.pcd", Table(line[[0, 2]], {"rgb": packed}))
+    files = [tmp_path / "small.pcd", tmp_path / "big.npz", tmp_path / "out.ply"]
+
+    done(main, [*files, "--field", "rgb", "--k", 2, "--mean"])
+
+    carried = np.ascontiguousarray(contents(tmp_path / "out.ply").columns["rgb"])
+    assert carried.view(np.uint8).reshape(-1, 4).tolist() == [
+        [0, 0, 200, 0],
+        [50, 1, 100, 0],
+        [100, 2, 0, 0],
+    ]
+
+
+def test_double_coordinates_near_the_origin_keep_every_bit(tmp_path):
+    points = np.random.default_rng(1).random((50, 3))
+    np.save(tmp_path / "big.npy", points)
+    WRITERS[".npz"](tmp_path / "small.npz", Table(points[:3], {"label": np.arange(3)}))
+
+    done(main, [tmp_path / "small.npz", tmp_path / "big.npy", "--field", "label"])
+
+    np.testing.assert_array_equal(contents(tmp_path / "big_propagated.ply").points, points)

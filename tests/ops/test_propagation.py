@@ -1,5 +1,7 @@
 """The way back: maps of nearest sampled points, and values that follow them."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 import torch
@@ -158,3 +160,77 @@ POINTS = torch.rand(6, 3)
 def test_wrong_argument_gets_one_line(arguments, said):
     with pytest.raises(UserError, match=said):
         propagation_map(**{"points": POINTS, "sampled": POINTS[:4], **arguments})
+
+
+@pytest.mark.parametrize("k", [1, 2, 5])
+def test_map_breaks_ties_by_the_lowest_row(k):
+    axis = np.arange(6.0)
+    grid = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
+    sampled = np.concatenate([grid[::3], grid[::3]])[::-1].copy()  # each twice
+
+    rows = propagation_map(grid + 0.5, sampled, k).rows.numpy()
+
+    squared = np.square((grid + 0.5)[:, None] - sampled).sum(2)
+    np.testing.assert_array_equal(rows, squared.argsort(1, kind="stable")[:, :k])
+
+
+def exact_mean(values, weights):
+    """Round a weighted mean of whole numbers, computed in fractions."""
+    total = sum(Fraction(w) for w in weights)
+    return round(sum(int(v) * Fraction(w) for v, w in zip(values, weights, strict=True)) / total)
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.uint64])
+def test_mean_of_64_bits_does_not_wrap(kind):
+    info = np.iinfo(kind)
+    values = np.array([info.max, info.max - 1, info.min, info.min + 2, 2**60 + 1], kind)
+    rows = torch.tensor([[0, 1], [1, 0], [2, 3], [0, 2], [3, 1], [4, 0]])
+    weights = torch.tensor([[0.5, 0.5], [0.75, 0.25], [0.5, 0.5], [0.5, 0.5], [0.25, 0.75], [1, 0]])
+
+    means = propagate(values, PropagationMap(rows, weights, 5), mean=True)
+
+    assert means.dtype == kind
+    for row, weight, mean in zip(rows.tolist(), weights.tolist(), means, strict=True):
+        expected = exact_mean(values[row], weight)
+        assert abs(int(mean) - expected) <= 2**10  # float64 has 53 bits of the difference
+        assert min(values[row]) <= mean <= max(values[row])
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.uint32, np.uint64, np.int64, np.float32])
+@pytest.mark.parametrize("k", [1, 2])
+def test_fill_is_the_value_of_points_without_coordinates(kind, k):
+    rows = torch.tensor([[0, 1], [-1, -1], [2, 1]])[:, :k]
+    made = PropagationMap(rows, torch.full((3, k), 1 / k), 3)
+    values = np.array([5, 6, np.iinfo(kind).max if kind != np.float32 else 9], kind)
+
+    carried = propagate(values, made, fill=7)
+
+    assert carried.dtype == kind
+    assert carried[1] == 7
+    if k == 1:
+        np.testing.assert_array_equal(carried[[0, 2]], values[[0, 2]])
+
+
+def test_fill_that_the_type_cannot_hold_is_refused():
+    made = PropagationMap(torch.tensor([[0], [-1]]), torch.ones(2, 1), 1)
+
+    with pytest.raises(UserError, match=r"fill must be a number of the type torch.uint16, got -1"):
+        propagate(np.array([5], np.uint16), made, fill=-1)
+
+
+def test_map_file_with_big_endian_arrays_is_read(tmp_path):
+    path = tmp_path / "map.npz"
+    np.savez(path, rows=np.array([[1], [0]], ">i4"), m=np.array(2, ">i8"))
+
+    assert propagate(np.array([7, 8]), path).tolist() == [8, 7]
+
+
+@pytest.mark.parametrize("name", ["rows", "weights", "m"])
+@pytest.mark.parametrize("kind", ["c16", "M8[s]", "U3"])
+def test_map_file_with_arrays_that_are_no_numbers_is_refused(kind, name, tmp_path):
+    arrays = {"rows": np.zeros((2, 2), int), "weights": np.ones((2, 2)), "m": np.array(2)}
+    arrays[name] = arrays[name].astype(int).astype(kind)
+    np.savez(tmp_path / "map.npz", allow_pickle=True, **arrays)
+
+    with pytest.raises(UserError, match=r"is no map|weights must be finite"):
+        propagate(np.array([7, 8]), tmp_path / "map.npz")

@@ -110,11 +110,11 @@ def unique_names(table: Table) -> dict[str, Column]:
 
 def holds_exactly(kind: np.dtype[Any], column: Column) -> bool:
     """Return whether a data type holds every number of a column."""
-    if np.can_cast(column.dtype, kind) or not len(column):
+    if not len(column) or column.dtype.kind == "b":
         return True
     if column.dtype.kind == "f":
-        return changed_numbers(column, kind) == 0
-    if kind.kind == "f":
+        return np.can_cast(column.dtype, kind) or changed_numbers(column, kind) == 0
+    if kind.kind == "f":  # numpy calls every cast from int64 to float64 safe
         most = min(LARGEST_WHOLE, 2 ** (np.finfo(kind).nmant + 1))
         least = -most
     else:

@@ -11,7 +11,7 @@ from mops_lightning.data.formats import ply
 from mops_lightning.data.formats.gltf import plain_glb
 from mops_lightning.data.formats.guard import BadCloudError, naming_file
 from mops_lightning.data.formats.isolated import isolated
-from mops_lightning.data.formats.surface import attributes, face_colours, file_attributes
+from mops_lightning.data.formats.surface import attributes, scene_attributes
 from mops_lightning.data.formats.table import Form, Table
 
 if TYPE_CHECKING:
@@ -144,11 +144,13 @@ def _load(data: bytes, kind: str, path: Path) -> "Trimesh":
     scene: Any = trimesh.load(
         BytesIO(data), file_type=kind[1:], force="scene", process=False, **extra
     )
+    of_vertices, of_faces = scene_attributes(scene)
     joined: Trimesh = scene.to_mesh()
-    joined.vertex_attributes.update(file_attributes(joined))
-    joined.face_attributes.update(face_colours(joined))
-    if _has_texture(data, kind):
-        joined.metadata[LEFT_OUT] = ("texture",)
+    joined.vertex_attributes.clear()
+    joined.vertex_attributes.update(of_vertices)
+    joined.face_attributes.clear()
+    joined.face_attributes.update(of_faces)
+    joined.metadata[LEFT_OUT] = _left_out(data, kind)
     return joined
 
 
@@ -165,10 +167,15 @@ def _plain_text(data: bytes) -> bytes:
     return data.replace(b"\t", b" ")
 
 
-def _has_texture(data: bytes, kind: str) -> bool:
-    if kind == ".obj":
-        return re.search(rb"(?m)^usemtl ", data) is not None
-    return kind == ".glb" and b'"textures"' in data
+def _left_out(data: bytes, kind: str) -> tuple[str, ...]:
+    """Return what a file has besides the surface and the colours of its vertices and faces."""
+    if kind == ".obj" and re.search(rb"(?m)^usemtl ", data):
+        return ("materials",)
+    if kind == ".glb" and b'"textures"' in data:
+        return ("textures",)
+    if kind == ".off" and re.match(rb"\s*(#[^\n]*\s*)*COFF", data):
+        return ("colours",)
+    return ()
 
 
 def _announced_faces(data: bytes, kind: str) -> int:

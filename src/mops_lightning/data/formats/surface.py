@@ -15,21 +15,51 @@ NORMALS = ("nx", "ny", "nz")
 COLOURS = ("red", "green", "blue", "alpha")
 
 
-def file_attributes(mesh: Mesh) -> dict[str, Column]:
-    """Return the normals and colours of the vertices of a file that trimesh has read."""
+def scene_attributes(scene: Any) -> tuple[dict[str, Column], dict[str, Column]]:
+    """Return the normals and colours of the vertices, and the colours of the faces, of all parts.
+
+    Args:
+        scene: a ``trimesh.Scene`` as a file was read, without further processing.
+
+    Returns:
+        Columns in the order of ``scene.to_mesh()``; none that a part of the scene lacks.
+    """
+    of_vertices, of_faces = [], []
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        part = scene.geometry[name]
+        if hasattr(part, "faces"):
+            of_vertices.append(_vertex_attributes(part, transform))
+            of_faces.append(_colours(part.visual.face_colors) if _has_colours(part, "face") else {})
+    return _joined(of_vertices), _joined(of_faces)
+
+
+def _vertex_attributes(part: Mesh, transform: NDArray[np.float64]) -> dict[str, Column]:
     columns: dict[str, Column] = {}
-    if "vertex_normals" in mesh._cache.cache:  # otherwise trimesh would compute them
-        columns |= dict(zip(NORMALS, np.asarray(mesh.vertex_normals).T, strict=True))
-    if mesh.visual.kind == "vertex":
-        columns |= dict(zip(COLOURS, np.asarray(mesh.visual.vertex_colors).T, strict=True))
+    if "vertex_normals" in part._cache.cache:  # otherwise trimesh would compute them
+        # Under an uneven scale, normals turn the other way than the surface.
+        inverse = np.linalg.inv(transform[:3, :3])
+        normals = np.asarray(part.vertex_normals) @ inverse
+        columns |= dict(zip(NORMALS, normals.T, strict=True))
+    if _has_colours(part, "vertex"):
+        columns |= _colours(part.visual.vertex_colors)
     return columns
 
 
-def face_colours(mesh: Mesh) -> dict[str, Column]:
-    """Return the colours of the faces of a file that trimesh has read."""
-    if mesh.visual.kind != "face":
+def _has_colours(part: Mesh, kind: str) -> bool:
+    return bool(part.visual.kind == kind)
+
+
+def _colours(values: Any) -> dict[str, Column]:
+    return dict(zip(COLOURS, np.asarray(values).T, strict=True))
+
+
+def _joined(parts: list[dict[str, Column]]) -> dict[str, Column]:
+    """Return the columns that all parts have."""
+    if not parts:
         return {}
-    return dict(zip(COLOURS, np.asarray(mesh.visual.face_colors).T, strict=True))
+    names = [name for name in parts[0] if all(name in part for part in parts)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
 
 def attributes(

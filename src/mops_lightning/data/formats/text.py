@@ -155,15 +155,17 @@ def write(path: Path, table: Table) -> None:
     Every number has as few digits as give the same number of its data type. Separator and names are
     those of a text file that was read.
     """
-    columns = dict(zip("xyz", table.stored_coordinates().T, strict=True)) | unique_names(table)
     layout = table.form.layout
     form = layout if isinstance(layout, TextForm) else TextForm()
-    known = [name for name in form.names if name in columns]
-    order = [*known, *(name for name in columns if name not in known)]
+    names = ["x", "y", "z", *table.columns]
+    known = [names.index(name) for name in form.names if name in names]
+    order = [*known, *(place for place in range(len(names)) if place not in known)]
     header = form.header
-    if tuple(order) != form.names:
-        header = _new_header(form, order)
-    words = [_shortest(columns[name]) for name in order]
+    if tuple(names[place] for place in order) != form.names:
+        plain = ["x", "y", "z", *unique_names(table)]
+        header = _new_header(form, [plain[place] for place in order])
+    columns = [*table.stored_coordinates().T, *table.columns.values()]
+    words = [_shortest(columns[place]) for place in order]
     lines = map(form.separator.join, zip(*words, strict=True))
     with path.open("w", encoding="utf-8", newline="\n") as file:
         if form.counted:
