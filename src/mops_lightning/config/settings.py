@@ -132,8 +132,8 @@ class RunSettings:
     )
     weights: str | None = setting(
         "auto",
-        "task net: auto (cached, else trained first), a model, a run, a weights file, or null "
-        "(untrained); with learn=task the file that training starts from",
+        "task net: auto (cached, else trained first), a model, a run, a weights file, its "
+        "URL#sha256=HASH, or null (untrained); with learn=task the file that training starts from",
         nullable=True,
         by_content=True,
         repeat=False,

@@ -37,7 +37,7 @@ Each file is sampled to m points by random, voxel, farthest point and Poisson-di
 with --weights, by a trained sampler. A table and a page with the clouds in 3-D show the chamfer and
 Hausdorff distances to the full cloud, how evenly it is represented, and the time."""
 
-WEIGHTS = "a trained sampler: a model's name, a weights file or the folder of a run"
+WEIGHTS = "a trained sampler: a model, a weights file, a run, or URL#sha256=HASH of a weights file"
 
 Add = Callable[..., object]
 """``ArgumentParser.add_argument``."""

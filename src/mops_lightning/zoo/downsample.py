@@ -9,7 +9,7 @@ import torch
 import mops_lightning
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.zoo import names, weights
+from mops_lightning.zoo import addresses, names, weights
 from mops_lightning.zoo.load import load
 
 
@@ -82,7 +82,8 @@ def _model(name: str, device: str) -> Sampler:
         UserError: there is no such method or model.
     """
     known = {*names.UNTRAINED, *names.available()}
-    if not (name in known or Path(name).expanduser().exists()):
+    exists = addresses.is_address(name) or Path(name).expanduser().exists()
+    if name not in known and not exists:
         raise UserError(f"method: unknown {name!r}.{did_you_mean(name, known)}")
     path = weights.of_run(names.resolve(name))
     return _loaded(path, path.stat().st_mtime_ns, device)

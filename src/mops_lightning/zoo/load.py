@@ -44,8 +44,8 @@ def load(path: str | Path, cls: type[Sampler] | None = None) -> Sampler:
     package, or ``cls``, are built. Torch's random state is left as it is.
 
     Args:
-        path: a model's name (``mops-lightning models`` lists them), a weights file or the folder
-            of a run.
+        path: a model's name (``mops-lightning models`` lists them), a weights file, the folder
+            of a run, or the address of a weights file, ``https://…#sha256=HASH``.
         cls: the sampler's class, if it is not one of this package.
 
     Returns:

@@ -1,11 +1,11 @@
-"""Models by name: where they are, and the file that a name or path means."""
+"""Models by name: where they are, and the file that a name, path or address means."""
 
 import os
 import re
 from pathlib import Path
 
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.zoo import model_file
+from mops_lightning.zoo import addresses, model_file
 
 UNTRAINED = {
     "fps": "FPSSampler",
@@ -76,18 +76,21 @@ def find_model(reference: str) -> Path | None:
 
 
 def resolve(reference: str | Path) -> Path:
-    """Return the path that a user means: an existing file or folder, or a model.
+    """Return the path that a user means: an existing file or folder, a model, or a download.
 
     Args:
-        reference: a path, or the name of a model.
+        reference: a path, the name of a model, or an address with a hash; see ``addresses``.
 
     Returns:
         A path. It may not exist if it contains a folder or ends like a file.
 
     Raises:
-        UserError: there is no file and no model of this name; the nearest names are listed.
+        UserError: there is no file and no model of this name; the nearest names are listed. Or the
+            address has no valid file.
     """
     text = str(reference)
+    if addresses.is_address(text):
+        return addresses.fetch(text)
     path = Path(text).expanduser()
     if path.exists():
         return path
