@@ -35,7 +35,7 @@ SLOW_FILES = (
     *("test_wheel", "training/test_precision", "training/run/test_load", "zoo/test_export"),
     *("training/recipe/test_warm_start", "cli/test_sweep", "files/test_batch", "zoo/test_models"),
     *("docs/test_extend", "docs/test_own_network", "hydra_plugins/test_grid_sweeper"),
-    *("samplers/test_contract", "training/run/test_run"),
+    *("samplers/test_contract", "training/run/test_run", "zoo/test_at_once"),
     *("training/run/test_build", "training/test_evaluation", "tasks/test_contract"),
 )
 """Files of few tests that take long. They begin first, or one process would end alone with one.

@@ -1,10 +1,11 @@
-"""The wheel, built, installed and used outside the checkout."""
+"""The wheel, built, installed and used outside the checkout, and the source distribution."""
 
 import json
 import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -88,3 +89,18 @@ def test_run_of_installed_copy_leaves_a_record(installed: Path, tmp_path: Path) 
     # Only a checkout has a commit: one more sign that it was not the checkout that ran.
     assert record["git"] == {"commit": None, "dirty": None}
     assert list(elsewhere.iterdir()) == []
+
+
+def test_source_distribution_contains_every_tracked_file(tmp_path: Path) -> None:
+    if not (ROOT / ".git").exists() or shutil.which("git") is None:
+        pytest.skip("not a git checkout")
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
+    tracked = {name for name in listed.stdout.split("\0") if name and (ROOT / name).is_file()}
+
+    python("-m", "build", "--sdist", "--no-isolation", "--outdir", str(tmp_path), cwd=ROOT)
+
+    (built,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(built) as archive:
+        packed = {name.partition("/")[2] for name in archive.getnames()}
+    assert len(tracked) > 400
+    assert tracked - packed == {".ci/run"}

@@ -29,3 +29,13 @@ def test_serial_of_all_points_keeps_each_once():
     points = torch.tensor([[[1.0, 2.0, 3.0]] * 5, [[0.0, 0.0, 0.0]] * 4 + [[9.0, 9.0, 9.0]]])
     assert SerialSampler(5)(points).indices.sort(1).values.tolist() == [[0, 1, 2, 3, 4]] * 2
     assert SerialSampler(1)(points).indices.shape == (2, 1)
+
+
+def test_serial_scales_all_axes_of_a_cloud_by_one_number():
+    x = torch.arange(16.0)
+    y = torch.tensor([0.0, 1e-3]).repeat(8)  # were it stretched to the length of x, it would lead
+    rod = torch.stack([x, y, torch.zeros(16)], 1)
+
+    indices = SerialSampler(4)(rod[None]).indices
+
+    assert indices.tolist() == [[2, 6, 10, 14]]

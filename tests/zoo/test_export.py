@@ -38,6 +38,30 @@ def test_exported_program_equals_the_sampler_at_any_size(sampler, m, tmp_path):
             assert torch.allclose(program(points), sampler(points, m).points, atol=1e-5)
 
 
+@pytest.mark.parametrize("shape", [(1, 2**20), (40, 2**15)])
+def test_exported_program_takes_more_points_than_s_has_entries_in_one_piece(shape, tmp_path):
+    sampler = MOPSNet(8, **SMALL).eval()
+    points = clouds(*shape)
+
+    export(sampler, tmp_path / "net.pt2")
+
+    with torch.no_grad():
+        generated = torch.export.load(tmp_path / "net.pt2").module()(points)
+        assert torch.allclose(generated, sampler(points).points, atol=1e-5)
+
+
+def test_onnx_file_names_its_axes(tmp_path):
+    pytest.importorskip("onnxscript", reason="extra onnx")
+    onnxruntime = pytest.importorskip("onnxruntime", reason="extra onnx")
+
+    export(FMOPSNet(12, **SMALL).eval(), tmp_path / "net.onnx", 5)
+
+    session = onnxruntime.InferenceSession(tmp_path / "net.onnx")
+    (points,), (generated,) = session.get_inputs(), session.get_outputs()
+    assert (points.name, points.shape) == ("points", ["batch", "points", 3])
+    assert (generated.name, generated.shape) == ("generated", ["batch", 5, 3])
+
+
 def test_onnx_file_equals_the_model_at_any_size(tmp_path):
     pytest.importorskip("onnxscript", reason="extra onnx")
     onnxruntime = pytest.importorskip("onnxruntime", reason="extra onnx")

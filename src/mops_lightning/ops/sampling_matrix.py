@@ -71,9 +71,13 @@ class SamplingMatrix(NamedTuple):
         """
         entries = self.keys.shape[0] * self.keys.shape[1] * self.m
         if entries <= blocks_on(self.keys.device).dense:
-            # Values with contiguous columns halve the time of the product.
-            return self._columns() @ points.mT.contiguous().mT
+            return self.sample_dense(points)
         return streamed_attention(self.queries / self.tau, self.keys, points)
+
+    def sample_dense(self, points: Tensor) -> Tensor:
+        """Return the same as ``sample``, with all of S in memory at any size."""
+        # Values with contiguous columns halve the time of the product.
+        return self._columns() @ points.mT.contiguous().mT
 
     def sparse(self, threshold: float = 0.01) -> Tensor:
         """Return S in coordinate (COO) format, as the paper stores it for inference.

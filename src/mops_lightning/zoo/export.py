@@ -21,6 +21,12 @@ TOLERANCE = 1e-5
 """Largest difference between points of the file and of the sampler, in the unit sphere."""
 CHECKED = ((1, 1), (3, 2), (2, 7))
 """Numbers of clouds, and of points as multiples of m, at which a file is compared."""
+MANY = 2**23
+"""Number of points times m at which a file is compared as well: more than S has in one piece."""
+MOST_POINTS = 2**16
+"""Largest number of points in this comparison."""
+AXES = ("batch", "points")
+"""Names of the axes of the input that have any size."""
 
 
 class GeneratedPoints(nn.Module):
@@ -54,6 +60,9 @@ class GeneratedPoints(nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:
         """Return the generated points."""
+        if isinstance(self.sampler, MOPSNet) and not self.sampler.threshold:
+            # Blocks of S for many points would limit the number of points of the program.
+            return self.sampler.sampling_matrix(points, self.m).sample_dense(points)
         return self.sampler.sample(points, self.m).points
 
 
@@ -80,7 +89,7 @@ def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
     net = GeneratedPoints(sampler, m)
     m = net.m
     example = torch.rand(2, 2 * m + 3, 3, generator=torch.Generator().manual_seed(0))
-    dynamic = ({0: torch.export.Dim("batch"), 1: torch.export.Dim("points")},)
+    dynamic = ({axis: torch.export.Dim(name) for axis, name in enumerate(AXES)},)
     with torch.no_grad(), atomic_write(path) as temporary:
         program = torch.export.export(net, (example,), dynamic_shapes=dynamic)
         if path.suffix == ".pt2":
@@ -104,8 +113,9 @@ def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
 
 def _clouds(m: int) -> Iterable[Tensor]:
     rng = torch.Generator().manual_seed(1)
-    for clouds, times in CHECKED:
-        points = torch.randn(clouds, times * m + 5, 3, generator=rng)
+    many = min(MANY // m + 1, MOST_POINTS)
+    for clouds, number in [*((clouds, times * m + 5) for clouds, times in CHECKED), (1, many)]:
+        points = torch.randn(clouds, number, 3, generator=rng)
         yield points / points.norm(dim=2).amax(1)[:, None, None]
 
 
@@ -126,6 +136,7 @@ def _to_onnx(program: Any, path: Path) -> Callable[[Tensor], Tensor]:
             (),
             path,
             input_names=["points"],
+            dynamic_shapes=[dict(enumerate(AXES))],
             output_names=["generated"],
             dynamo=True,
             external_data=False,

@@ -1,7 +1,6 @@
 """Samplers and task nets by name or from weights files, without Hydra."""
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from functools import cache
 from inspect import signature
 from pathlib import Path
@@ -9,13 +8,13 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn.modules.module import register_module_parameter_registration_hook
 
 import mops_lightning
 from mops_lightning.errors import UserError
 from mops_lightning.nets import atlasnet, autoencoder, dgcnn, foldingnet, pcrnet, pointnet
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.zoo import names, weights
+from mops_lightning.zoo.construction import Construction
 from mops_lightning.zoo.weights import fit_state
 
 M = TypeVar("M", bound=nn.Module)
@@ -41,7 +40,8 @@ def load(path: str | Path, cls: type[Sampler] | None = None) -> Sampler:
     """Load a trained sampler by its name, or from a weights file.
 
     Nothing in the file is executed: it holds tensors and plain data, and only samplers of this
-    package, or ``cls``, are built. Torch's random state is left as it is.
+    package, or ``cls``, are built. Nothing global is changed, torch's random state included:
+    threads may load at the same time.
 
     Args:
         path: a model's name (``mops-lightning models`` lists them), a weights file, the folder
@@ -147,39 +147,17 @@ def _build(
 
     def make() -> M:
         try:
-            return cls(**arguments)
+            with Construction(len(state)):
+                return cls(**arguments)
         except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: sizes over 64 bits
             reason = str(error).partition("\n")[0]
             name = f"{cls.__module__}.{cls.__qualname__}"
             raise UserError(f"{path}: cannot build {name}: {reason}") from None
 
-    with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
-        # Without memory first: a small file can describe a large net.
-        with torch.device("meta"), _at_most(len(state)):
-            bare = make()
-        fit_state(bare, state, path, hint, assign=True)
-        module = make()
+    # Without memory first: a small file can describe a large net.
+    with torch.device("meta"):
+        bare = make()
+    fit_state(bare, state, path, hint, assign=True)
+    module = make()
     fit_state(module, state, path, hint)
     return module.eval()
-
-
-@contextmanager
-def _at_most(number: int) -> Iterator[None]:
-    """Limit the number of parameters of the modules that are built.
-
-    Raises:
-        ValueError: there are more.
-    """
-    left = number
-
-    def count(*_: Any) -> None:
-        nonlocal left
-        left -= 1
-        if left < 0:
-            raise ValueError(f"it has more than the {number} tensors of the file.")
-
-    hook = register_module_parameter_registration_hook(count)
-    try:
-        yield
-    finally:
-        hook.remove()

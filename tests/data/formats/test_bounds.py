@@ -1,0 +1,51 @@
+"""Areas of clouds on a grid, with points exactly on the bounds."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from mops_lightning.data.formats.area import Area
+from mops_lightning.data.formats.registry import open_cloud_file, read, write
+from mops_lightning.data.formats.table import Table
+from tests.support.copc import write_copc
+
+GRID = np.array(list(itertools.product(range(5), repeat=3)), np.float64)
+"""125 points with coordinates 0 to 4."""
+
+
+@pytest.fixture(params=["grid.npy", "grid.ply", "grid.las", "grid.copc.laz"])
+def grid(request, tmp_path):
+    path = tmp_path / request.param
+    if path.name.endswith(".copc.laz"):
+        write_copc(path, GRID, spacing=1.0, depth=1, each=20)
+    else:
+        write(path, Table(GRID))
+    return path
+
+
+def rows_between(low, high):
+    """Return the points of the grid from low to high, both included, sorted."""
+    axes = [range(first, last + 1) for first, last in zip(low, high, strict=True)]
+    return [list(map(float, corner)) for corner in itertools.product(*axes)]
+
+
+@pytest.mark.parametrize(
+    ("bounds", "expected"),
+    [
+        ("1,1,1,3,3,3", rows_between((1, 1, 1), (3, 3, 3))),
+        ("0,0,0,4,4,1", rows_between((0, 0, 0), (4, 4, 1))),
+        ("0,0,3,4,4,9", rows_between((0, 0, 3), (4, 4, 4))),
+        ("1,2,3,3", rows_between((1, 2, 0), (3, 3, 4))),
+        ("-9,-9,-9,1,0,0", rows_between((0, 0, 0), (1, 0, 0))),
+    ],
+)
+def test_area_of_bounds_holds_the_points_on_them_and_none_beyond(grid, bounds, expected):
+    area = Area.parse(bounds, None, None)
+
+    whole = read(grid, 1, 0, area)
+    opened = open_cloud_file(grid, area)
+    parts = [opened.read(rows).points for rows in opened.row_ranges(40)]
+
+    assert sorted(whole.points.tolist()) == expected
+    assert sorted(np.concatenate(parts).tolist()) == expected

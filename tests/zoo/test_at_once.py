@@ -1,0 +1,139 @@
+"""Many calls at once in fresh processes, where the first calls of all threads meet."""
+
+import os
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import torch
+
+from mops_lightning import MOPSNet, Sampler, SNet, downsample, load
+from mops_lightning.zoo import weights
+
+MODELS = ("mops.modelnet40-m32", "snet.modelnet40-m32")
+
+CALLS = """
+import hashlib, sys, threading
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+
+from mops_lightning import downsample
+
+METHODS = ("mops.modelnet40-m32", "fps", "snet.modelnet40-m32", "fmops.modelnet40-m512", "serial")
+threads, calls = int(sys.argv[1]), int(sys.argv[2])
+torch.set_num_threads(1)
+all_ready = threading.Barrier(threads)
+
+
+def call(number):
+    if number < threads:
+        all_ready.wait()
+    cloud = torch.rand(200, 3, generator=torch.Generator().manual_seed(number))
+    points, rows = downsample(cloud, 32, METHODS[number % len(METHODS)])
+    return points, rows
+
+
+before = torch.get_rng_state()
+with ThreadPoolExecutor(threads) as pool:
+    results = list(pool.map(call, range(calls)))
+assert torch.equal(torch.get_rng_state(), before)
+digest = hashlib.sha256()
+for points, rows in results:
+    digest.update(points.numpy().tobytes() + rows.numpy().tobytes())
+print(digest.hexdigest())
+"""
+
+
+def digest(threads: int, calls: int, cache: str) -> str:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_CACHE_DIR": cache}
+    command = [sys.executable, "-W", "error", "-c", CALLS, str(threads), str(calls)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_downsample_200_calls_in_threads_of_two_processes_equal_serial_calls(tmp_path):
+    cache = str(tmp_path)  # empty: first calls compile loops
+
+    with ThreadPoolExecutor(2) as pool:
+        at_once = list(pool.map(lambda _: digest(20, 200, cache), range(2)))
+
+    assert at_once == [digest(1, 200, cache)] * 2
+
+
+def build_own_net(_: int) -> int:
+    net = torch.nn.Sequential(*[torch.nn.Linear(4, 4) for _ in range(60)])
+    return len(list(net.parameters()))
+
+
+def test_load_in_threads_leaves_nets_of_other_threads_alone():
+    with ThreadPoolExecutor(8) as pool:
+        loads = [pool.submit(load, MODELS[i % 2]) for i in range(8)]
+        sizes = list(pool.map(build_own_net, range(20)))
+
+    assert sizes == [120] * 20
+    assert [type(load.result()) for load in loads] == [MOPSNet, SNet] * 4
+
+
+def test_load_while_another_thread_draws_repeats_no_random_number():
+    drawn = []
+    loaded = threading.Event()
+
+    def draw() -> None:
+        while not loaded.is_set():
+            drawn.append(float(torch.rand((), dtype=torch.float64)))
+
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(draw)
+        for name in MODELS * 3:
+            load(name)
+        loaded.set()
+
+    assert len(drawn) > 10
+    assert len(set(drawn)) == len(drawn)
+
+
+class Noisy(Sampler):
+    """A sampler from outside the package with random numbers that no weights file holds."""
+
+    noise: torch.Tensor
+
+    def __init__(self, m: int) -> None:
+        super().__init__(m)
+        self.scale = torch.nn.Parameter(torch.empty(3).uniform_())
+        self.register_buffer("noise", torch.randn(3), persistent=False)
+
+
+def test_load_own_class_leaves_the_random_state_and_keeps_its_buffers(tmp_path):
+    path = tmp_path / weights.FILE
+    own = Noisy(4)
+    weights.save(path, own, {"learn": "sampler", "sampler": {"_target_": "own", "m": 4}}, {})
+    before = torch.get_rng_state()
+
+    sampler = load(path, cls=Noisy)
+
+    assert torch.equal(torch.get_rng_state(), before)
+    assert isinstance(sampler, Noisy)
+    assert torch.equal(sampler.scale, own.scale)
+    assert sampler.noise.isfinite().all()
+
+
+def test_downsample_600_calls_need_no_more_memory():
+    cloud = torch.rand(200, 3)
+    for _ in range(100):
+        downsample(cloud, 32, "mops.modelnet40-m32")
+    before = resident()
+
+    for _ in range(600):
+        downsample(cloud, 32, "mops.modelnet40-m32")
+
+    assert resident() - before < 2_000_000
+
+
+def resident() -> int:
+    """Return the memory of this process in bytes."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGESIZE")
