@@ -76,7 +76,7 @@ def sample_by_chunks(
     assert options.chunk is not None
     net = sampler.fused()
     sampler.check_m(m)
-    file = open_cloud_file(source, options.area)
+    file = open_cloud_file(source, options.area, options.columns)
     cloud, row_ranges = replace(file, header=None), file.row_ranges(options.chunk)
 
     def over(title: str, function: Callable[..., Any], *common: Any) -> Iterable[Any]:
@@ -120,7 +120,7 @@ def draw(source: Path, options: Options, engine: Engine) -> tuple[Table, int, in
     Raises:
         UserError: the file is broken.
     """
-    file = open_cloud_file(source, options.area)
+    file = open_cloud_file(source, options.area, options.columns)
     function = partial(_draw, replace(file, header=None), options)
     drawn = Drawn(np.empty(0), join_tables([]), 0)
     for part in engine.map("drawing", function, file.row_ranges(PART)):

@@ -10,6 +10,7 @@ from os.path import realpath
 from pathlib import Path
 
 from mops_lightning.data.formats.area import Area
+from mops_lightning.data.formats.bin_columns import parse_columns
 from mops_lightning.errors import Parser, UserError, did_you_mean, one_line_endings, printable
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
@@ -38,6 +39,11 @@ with --weights, by a trained sampler. A table and a page with the clouds in 3-D 
 Hausdorff distances to the full cloud, how evenly it is represented, and the time."""
 
 WEIGHTS = "a trained sampler: a model, a weights file, a run, or URL#sha256=HASH of a weights file"
+
+COLUMNS = (
+    "names of the columns of .bin files, all float32, such as x,y,z,intensity,ring; default: "
+    "x,y,z,intensity, in .pcd.bin files also ring"
+)
 
 Add = Callable[..., object]
 """``ArgumentParser.add_argument``."""
@@ -81,6 +87,8 @@ def _downsample_arguments(add: Add) -> None:
         help="leave out colours, normals, intensities and the like, which are kept by default",
     )
     add("--surface", type=int, help="points to sample from a mesh first; default: 10000 or 8m")
+    add("--vertices", action="store_true", help="of a mesh: its vertices, not its surface")
+    add("--columns", metavar="X,Y,Z,...", help=COLUMNS)
     add("--workers", type=int, default=1, help="processes that share a folder's files")
     add(
         "--tile",
@@ -150,6 +158,8 @@ def _downsample_files(chosen: argparse.Namespace, options: Options) -> int:
         chosen.source = chosen.source.absolute()
     pairs = file_pairs(chosen.source, chosen.target)
     is_folder = is_many(chosen.source)
+    if options.columns and not any(source.suffix.lower() == ".bin" for source, _ in pairs):
+        raise UserError(f"--columns is for .bin files, got {chosen.source}.")
     if not is_folder and pairs[0][1].exists() and not chosen.overwrite:
         raise UserError(f"{pairs[0][1]} exists. Give another OUT, or --overwrite.")
     if chosen.map is not None:
@@ -186,9 +196,14 @@ def _options(chosen: argparse.Namespace) -> Options:
         raise UserError("--cluster: the workers do not see a copy from the web. Download the file.")
     if chosen.cluster and chosen.chunk is None:
         raise UserError("--cluster distributes the chunks of a file: give --chunk as well.")
+    chosen.columns = _columns(chosen)
     chosen.area = Area.parse(chosen.bounds, chosen.level, chosen.resolution)
     values = {field.name: getattr(chosen, field.name) for field in fields(Options)}
     return Options(**{**values, "readout": chosen.readout or "completed"})
+
+
+def _columns(chosen: argparse.Namespace) -> tuple[str, ...] | None:
+    return None if chosen.columns is None else parse_columns(chosen.columns)
 
 
 def _engine(chosen: argparse.Namespace, is_file: bool) -> AbstractContextManager[Engine | None]:
@@ -230,6 +245,7 @@ def _propagate_arguments(add: Add) -> None:
         help="use the k nearest points of SMALL, weighted by 1/d^2: floats are averaged, of whole "
         "numbers the one with the largest weight is taken; default: 1, which copies",
     )
+    add("--columns", metavar="X,Y,Z,...", help=COLUMNS)
     add("--mean", action="store_true", help="with --k: average whole numbers, such as colours")
     add("--overwrite", action="store_true", help="replace an existing OUT")
 
@@ -252,7 +268,8 @@ def _propagate(chosen: argparse.Namespace) -> None:
     if target.exists() and not chosen.overwrite:
         raise UserError(f"{target} exists. Give another OUT, or --overwrite.")
     remove_temporary(target.parent, below=False)
-    number = propagate_file(chosen.small, big, target, chosen.field, chosen.k, chosen.mean)
+    columns = _columns(chosen)
+    number = propagate_file(chosen.small, big, target, chosen.field, chosen.k, chosen.mean, columns)
     names, seconds = ", ".join(chosen.field), time.perf_counter() - start
     print(printable(f"{target}: {names} of {number:,} points, {seconds:.1f} s"))
 

@@ -98,7 +98,7 @@ def downsample_file(
         table, outcome = sample_by_chunks(source, sampler, m, options, engine)
     else:
         surface = options.surface or max(SURFACE, 8 * m)
-        whole = read(source, surface, options.seed, options.area)
+        whole = read(source, surface, options.seed, options.area, options.columns, options.vertices)
         finite = whole.finite()
         table, number = _sample_table(source, finite, sampler, m, options), len(finite.points)
         outcome = Outcome(m, number, len(whole.points) - number)

@@ -26,6 +26,8 @@ class Options:
         map_k: number of sampled points per point in this file.
         weight: a column with a weight per point, or ``curvature``; None: all points are equal.
         area: the part of the file to sample; None: all of it.
+        columns: names of the columns of .bin files; None: those that their names imply.
+        vertices: take the vertices of a mesh, instead of points on its surface.
 
     Raises:
         UserError: a value is out of range, or options exclude each other.
@@ -44,6 +46,8 @@ class Options:
     map_k: int = 1
     weight: str | None = None
     area: Area | None = None
+    columns: tuple[str, ...] | None = None
+    vertices: bool = False
 
     def __post_init__(self) -> None:
         """Reject values out of range and options that exclude each other."""
@@ -55,6 +59,8 @@ class Options:
             raise UserError(f"--m must be a whole number of at least 1, got {self.m}.")
         if self.surface is not None and self.surface < 1:
             raise UserError(f"--surface must be at least 1, got {self.surface}.")
+        if self.vertices and self.surface is not None:
+            raise UserError("--vertices takes the vertices of a mesh: leave --surface out.")
         if not 0 <= self.seed < 2**63:
             raise UserError(f"--seed must be from 0 to 2**63 - 1, got {self.seed}.")
         if self.map is not None and self.map.suffix.lower() != ".npz":

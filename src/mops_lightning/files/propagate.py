@@ -1,6 +1,6 @@
 """The way back in files: the map of a downsampled file, and columns of a sample for all points."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mops_lightning.data.formats import guard
 from mops_lightning.data.formats.cloud_file import PART
-from mops_lightning.data.formats.registry import READERS, open_cloud_file, write
+from mops_lightning.data.formats.registry import READERS, open_cloud_file, read_points, write
 from mops_lightning.data.formats.table import Column, Table, TableParts
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.files.engine import with_progress
@@ -44,7 +44,13 @@ def write_map(path: Path, points: Points, sampled: Points, k: int) -> None:
 
 
 def propagate_file(
-    small: Path, big: Path, target: Path, fields: list[str], k: int = 1, mean: bool = False
+    small: Path,
+    big: Path,
+    target: Path,
+    fields: list[str],
+    k: int = 1,
+    mean: bool = False,
+    columns: Sequence[str] | None = None,
 ) -> int:
     """Carry columns of a sample to all points of a file.
 
@@ -58,6 +64,7 @@ def propagate_file(
         fields: names of the columns.
         k: number of sampled points per point; see ``mops_lightning.propagate``.
         mean: average whole numbers, too.
+        columns: names of the columns of .bin files; None: those that their names imply.
 
     Returns:
         The number of points written.
@@ -65,7 +72,7 @@ def propagate_file(
     Raises:
         UserError: a file is broken, or the sample lacks a column.
     """
-    sample = _read(small).finite()
+    sample = _read(small, columns).finite()
     missing = next((name for name in fields if name not in sample.columns), None)
     if missing is not None:
         hint = did_you_mean(missing, sample.columns)
@@ -81,7 +88,7 @@ def propagate_file(
         columns = {name: _carried(name, values, found, mean) for name, values in carried.items()}
         return replace(table, columns={**table.columns, **columns})
 
-    tables = _tables(big)
+    tables = _tables(big, columns)
     form = _measure(big, tables("measuring"))
     parts = (carry(table) for table in tables("propagating"))
     write(target, replace(form, parts=parts, columns={**form.columns, **carried}))
@@ -107,23 +114,23 @@ def _carried(name: str, values: Column, found: PropagationMap, mean: bool) -> Co
     return averaged.view(values.dtype)[:, 0]
 
 
-def _read(path: Path) -> Table:
+def _read(path: Path, columns: Sequence[str] | None) -> Table:
     """Read a cloud; a mesh has no points that could be matched."""
     if path.suffix.lower() not in READERS:
         raise guard.BadCloudError(f"{path} must end in {', '.join(READERS)}.")
     with guard.reading(path):
-        table = READERS[path.suffix.lower()](path)
+        table = read_points(path, columns)
     if table is None or not len(table.finite().points):
         raise guard.BadCloudError(f"{path} must be a cloud of at least one point.")
     return table
 
 
-def _tables(path: Path) -> Callable[[str], Iterable[Table]]:
+def _tables(path: Path, columns: Sequence[str] | None) -> Callable[[str], Iterable[Table]]:
     """Return a function of a title that reads a file's finite points, in parts if possible."""
     try:
-        file = open_cloud_file(path)
+        file = open_cloud_file(path, None, columns)
     except guard.WholeOnlyError:  # for example ascii PLY
-        whole = _read(path).finite()
+        whole = _read(path, columns).finite()
         return lambda title: [whole]
     ranges = file.row_ranges(PART)
 

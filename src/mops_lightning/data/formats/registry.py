@@ -79,7 +79,7 @@ def read(
         surface: number of points to sample from a mesh's surface, uniform by area.
         seed: of these.
         area: the part of the file to read.
-        columns: names of the columns of a .bin file; None: those that its name implies.
+        columns: names of the columns of .bin files; None: those that their names imply.
         vertices: take the vertices of a mesh, instead of points on its surface.
 
     Raises:
@@ -108,14 +108,7 @@ def read_points(path: Path, columns: Sequence[str] | None = None) -> Table | Non
     suffix = path.suffix.lower()
     if suffix == ".bin":
         return scans.read(path, columns)
-    check_no_columns(path, columns)
     return READERS[suffix](path) if suffix in READERS else None
-
-
-def check_no_columns(path: Path, columns: Sequence[str] | None) -> None:
-    """Reject names of columns for a file that has its own."""
-    if columns is not None:
-        raise BadCloudError(f"{path}: --columns is for .bin files, which have no header.")
 
 
 def write(path: Path, table: Table | TableParts) -> None:
@@ -171,11 +164,7 @@ def open_cloud_file(
     if suffix not in CHUNKED:
         raise WholeOnlyError(f"{path}: --chunk works with {', '.join(CHUNKED)}.")
     with reading(path):
-        if suffix == ".bin":
-            file = scans.locate(path, columns)
-        else:
-            check_no_columns(path, columns)
-            file = CHUNKED[suffix](path)
+        file = scans.locate(path, columns) if suffix == ".bin" else CHUNKED[suffix](path)
         if area is None:
             return file
         if suffix in (".las", ".laz"):

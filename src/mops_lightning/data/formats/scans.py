@@ -12,7 +12,6 @@ from mops_lightning.data.formats.cloud_file import CloudFile, binary_file
 from mops_lightning.data.formats.columns import changed_numbers
 from mops_lightning.data.formats.guard import BadCloudError, CannotHoldError
 from mops_lightning.data.formats.table import Column, Table
-from mops_lightning.errors import UserError
 
 KITTI = ("x", "y", "z", "intensity")
 NUSCENES = ("x", "y", "z", "intensity", "ring")
@@ -40,21 +39,6 @@ class ScanForm:
     """The columns of a scan, all float32."""
 
     names: tuple[str, ...]
-
-
-def parse_columns(text: str) -> tuple[str, ...]:
-    """Return the names of columns that a user gave, separated by commas.
-
-    Raises:
-        UserError: a name is missing or there twice.
-    """
-    names = tuple(name.strip() for name in text.split(","))
-    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names) or "" in names:
-        raise UserError(
-            f"--columns must name all columns of a .bin file, each once, with x, y and z among "
-            f"them, such as x,y,z,intensity,ring; got {text!r}."
-        )
-    return names
 
 
 def read(path: Path, names: Sequence[str] | None = None) -> Table:

@@ -1,0 +1,110 @@
+"""Laser scans without a header: .bin, .pcd.bin and .label."""
+
+import numpy as np
+import pytest
+
+from mops_lightning.data.formats.bin_columns import parse_columns
+from mops_lightning.data.formats.registry import open_cloud_file, read, write
+from mops_lightning.errors import UserError
+
+NUSCENES = ("x", "y", "z", "intensity", "ring")
+
+
+@pytest.fixture
+def sweep():
+    """400 points of five columns: 32 rings one after the other, as nuScenes has them."""
+    random = np.random.default_rng(0)
+    rows = np.empty((400, 5), np.float32)
+    rows[:, :3] = random.normal(0, [20, 20, 1], (400, 3))
+    rows[:, 3] = random.integers(0, 256, 400)
+    rows[:, 4] = np.arange(400) % 32
+    return rows
+
+
+def test_read_pcd_bin_has_five_columns_in_parts_too(sweep, tmp_path):
+    path = tmp_path / "n015__LIDAR_TOP__1.pcd.bin"
+    sweep.tofile(path)
+
+    whole = read(path, 9, 0)
+    part = open_cloud_file(path).read(range(100, 200))
+
+    np.testing.assert_array_equal(whole.points, sweep[:, :3])
+    np.testing.assert_array_equal(whole.columns["ring"], sweep[:, 4])
+    np.testing.assert_array_equal(part.columns["intensity"], sweep[100:200, 3])
+
+
+def test_read_bin_with_other_columns_asks_for_their_names(sweep, tmp_path):
+    path = tmp_path / "sweep.bin"
+    sweep.tofile(path)  # 8,000 bytes would also be 500 rows of four columns
+
+    with pytest.raises(UserError, match="Name its columns, such as --columns"):
+        read(path, 9, 0)
+    with pytest.raises(UserError, match="does not look like"):
+        open_cloud_file(path)
+    table = read(path, 9, 0, columns=NUSCENES)
+
+    np.testing.assert_array_equal(table.points, sweep[:, :3])
+
+
+def test_read_bin_of_room_with_colours_is_refused(tmp_path):
+    random = np.random.default_rng(1)
+    rows = random.random((400, 6)) * [4, 4, 2.5, 255, 255, 255]
+    rows.astype(np.float32).tofile(tmp_path / "room.bin")
+
+    with pytest.raises(UserError, match="does not look like rows of x, y, z, intensity"):
+        read(tmp_path / "room.bin", 9, 0)
+
+
+def test_read_bin_of_three_columns_is_refused_by_its_size(tmp_path):
+    np.ones((399, 3), np.float32).tofile(tmp_path / "a.bin")
+
+    with pytest.raises(UserError, match=r"4788 bytes are not rows of 4 float32 .*--columns"):
+        read(tmp_path / "a.bin", 9, 0)
+
+
+def test_write_bin_keeps_the_columns_that_were_read(sweep, tmp_path):
+    path = tmp_path / "a.bin"
+    sweep.tofile(path)
+
+    write(tmp_path / "b.bin", read(path, 9, 0, columns=NUSCENES))
+    write(tmp_path / "b.pcd.bin", read(path, 9, 0, columns=NUSCENES).without_attributes())
+
+    np.testing.assert_array_equal(np.fromfile(tmp_path / "b.bin", "<f4").reshape(-1, 5), sweep)
+    coordinates = np.fromfile(tmp_path / "b.pcd.bin", "<f4").reshape(-1, 5)
+    np.testing.assert_array_equal(coordinates, sweep * [1, 1, 1, 0, 0])
+
+
+@pytest.mark.parametrize("folders", [("", ""), ("velodyne", "labels")])
+def test_read_label_file_gives_class_and_instance(folders, tmp_path):
+    scans, labels = (tmp_path / folder for folder in folders)
+    scans.mkdir(exist_ok=True)
+    labels.mkdir(exist_ok=True)
+    rows = np.random.default_rng(0).random((40, 4)).astype(np.float32)
+    rows.tofile(scans / "000000.bin")
+    classes = np.arange(40, dtype="<u4")
+    (classes + (classes + 7 << 16)).tofile(labels / "000000.label")
+
+    table = read(scans / "000000.bin", 9, 0)
+    part = open_cloud_file(scans / "000000.bin").read(range(10, 20))
+
+    assert table.columns["label"].tolist() == list(range(40))
+    assert table.columns["instance"].tolist() == list(range(7, 47))
+    assert part.columns["label"].tolist() == list(range(10, 20))
+
+
+def test_read_label_file_of_another_scan_is_refused(tmp_path):
+    np.ones((40, 4), np.float32).tofile(tmp_path / "a.bin")
+    np.ones(39, "<u4").tofile(tmp_path / "a.label")
+
+    with pytest.raises(UserError, match=r"a\.label has 156 bytes, not 4 for each of the 40 points"):
+        read(tmp_path / "a.bin", 9, 0)
+
+
+@pytest.mark.parametrize("text", ["x,y", "x,y,z,", "x,y,z,z", "a b c"])
+def test_columns_without_axes_or_twice_are_refused(text):
+    with pytest.raises(UserError, match="--columns must name all columns"):
+        parse_columns(text)
+
+
+def test_columns_are_split_at_commas():
+    assert parse_columns("x, y,z,ring") == ("x", "y", "z", "ring")
