@@ -1,0 +1,118 @@
+"""Voxels of a given size beside a plain twin with exact fractions."""
+
+from collections import defaultdict
+from fractions import Fraction
+from math import floor
+
+import numpy as np
+import pytest
+
+from mops_lightning.errors import UserError
+from mops_lightning.ops.voxels import occupied, representatives
+
+RNG = np.random.default_rng(0)
+CLOUDS = {
+    "random": RNG.normal(size=(400, 3)),
+    "ties": RNG.integers(-3, 4, (300, 3)) * 0.25,
+    "copies": np.repeat(RNG.normal(size=(60, 3)), 4, axis=0),
+    "map": RNG.uniform(0, 3, (300, 3)) + [512_345.678901, 5_412_345.678901, 312.5],
+    "one": np.array([[1.0, -2.0, 3.0]]),
+}
+
+
+def plain_voxels(points, size):
+    """Return the rows of every voxel, and the exact mean of its points in voxels."""
+    rows = defaultdict(list)
+    for row, point in enumerate(points):
+        rows[tuple(floor(value / size) for value in point)].append(row)
+    means = {}
+    for place, members in rows.items():
+        exact = [[Fraction(float(value / size)) for value in points[row]] for row in members]
+        means[place] = [sum(axis) / len(members) for axis in zip(*exact, strict=True)]
+    return rows, means
+
+
+@pytest.mark.parametrize("cloud", CLOUDS)
+@pytest.mark.parametrize("size", [0.3, 0.75, 5.0])
+def test_representatives_equal_plain_twin(cloud, size):
+    points = CLOUDS[cloud]
+    members, means = plain_voxels(points, size)
+
+    rows = representatives(points, size).rows
+
+    assert len(rows) == len(members)
+    chosen = {tuple(floor(value / size) for value in points[row]): row for row in rows}
+    assert chosen.keys() == members.keys()
+    for place, row in chosen.items():
+        distances = {
+            other: sum((Fraction(float(v / size)) - mean) ** 2 for v, mean in zip(
+                points[other], means[place], strict=True))
+            for other in members[place]
+        }  # fmt: skip
+        assert float(distances[row]) <= float(min(distances.values())) * (1 + 1e-6) + 1e-18
+
+
+def test_representatives_tie_takes_lowest_coordinates():
+    points = np.array([[0.75, 0.5, 0.5], [0.25, 0.5, 0.5], [0.25, 0.5, 0.5]])
+
+    rows = representatives(points, 1.0).rows
+
+    assert rows.tolist() == [1]
+
+
+def test_representatives_weight_takes_heaviest_then_nearest():
+    points = np.array([[0.5, 0.5, 0.5], [0.1, 0.1, 0.1], [0.6, 0.6, 0.6], [1.5, 0.5, 0.5]])
+
+    rows = representatives(points, 1.0, weight=np.array([1.0, 2.0, 2.0, 0.5])).rows
+
+    assert rows.tolist() == [2, 3]
+
+
+@pytest.mark.parametrize("cloud", CLOUDS)
+def test_representatives_any_order_of_points_gives_the_same(cloud):
+    points = CLOUDS[cloud]
+    expected = {tuple(point) for point in points[representatives(points, 0.3).rows]}
+
+    for seed in range(5):
+        shuffled = np.random.default_rng(seed).permutation(points)
+        assert {tuple(p) for p in shuffled[representatives(shuffled, 0.3).rows]} == expected
+
+
+@pytest.mark.parametrize("cloud", CLOUDS)
+@pytest.mark.parametrize("part", [1, 7, 100])
+def test_parts_merge_to_the_voxels_of_the_whole(cloud, part):
+    points = CLOUDS[cloud]
+    whole = occupied(points, 0.3)
+    parts = [points[start : start + part] for start in range(0, len(points), part)]
+
+    merged = occupied(parts[0], 0.3)
+    for other in parts[1:]:
+        merged = merged.merge(occupied(other, 0.3))
+
+    for expected, actual in zip(whole, merged, strict=True):
+        np.testing.assert_array_equal(actual, expected)
+
+
+def test_means_are_exact_to_a_billionth_of_a_voxel():
+    points = CLOUDS["map"]
+    _, means = plain_voxels(points, 0.75)
+
+    voxels = occupied(points, 0.75)
+
+    expected = [[float(axis * Fraction(0.75)) for axis in means[place]] for place in sorted(means)]
+    np.testing.assert_allclose(voxels.means(0.75), expected, rtol=0, atol=2e-9)
+
+
+def test_many_voxels_are_counted():
+    points = np.random.default_rng(1).uniform(-500, 500, (20_000, 3))
+
+    voxels = occupied(points, 3.0)
+
+    places, counts = np.unique(np.floor(points / 3.0), axis=0, return_counts=True)
+    np.testing.assert_array_equal(voxels.places, places)
+    np.testing.assert_array_equal(voxels.counts, counts)
+
+
+def test_too_small_voxels_are_refused():
+    with pytest.raises(UserError, match="voxel: 1e-12 is too small for coordinates of up to 5e"):
+        occupied(np.array([[5e6, 0.0, 0.0]]), 1e-12)
