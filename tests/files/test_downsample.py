@@ -47,3 +47,9 @@ def test_huge_coordinates_are_rejected(size, folder, tmp_path):
     learned = ["--weights", folder, "--readout", "matched", "--chunk", 60]
     for settings in (["--method", "fps", "--m", 4], learned):
         assert "too large" in refused(tmp_path / "a.npy", tmp_path / "b.npy", *settings)
+
+
+def test_tile_trained_sampler_of_many_sizes(folder, tmp_path):
+    options = ["--weights", folder, "--tile", 64, "--m", 120]
+    assert call(folder / "in" / "a.ply", tmp_path / "a.npy", *options)[0] == 0
+    assert len(np.unique(np.load(tmp_path / "a.npy"), axis=0)) == 120

@@ -10,7 +10,7 @@ CLOUDS = {
     "random": RNG.normal(size=(400, 3)),
     "ties": RNG.integers(-3, 4, (300, 3)) * 0.25,
     "copies": np.repeat(RNG.normal(size=(60, 3)), 4, axis=0),
-    "map": RNG.uniform(0, 3, (300, 3)) + [512_345.678901, 5_412_345.678901, 312.5],
+    "map": RNG.uniform(0, 3, (300, 3)) + np.array([512_345.678901, 5_412_345.678901, 312.5]),
     "five columns": RNG.normal(size=(300, 5)),
     "line": RNG.normal(size=(300, 1)),
     "one": np.array([[1.0, -2.0, 3.0]]),

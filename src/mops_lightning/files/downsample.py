@@ -16,10 +16,10 @@ from mops_lightning.files.chunks import Outcome, draw, sample_by_chunks
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.files.propagate import write_map
-from mops_lightning.files.tiles import sample_by_tiles
 from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.weights import CURVATURE, check_positive, check_weight, curvature
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.tiles import sample_by_tiles
 from mops_lightning.zoo.downsample import untrained
 from mops_lightning.zoo.load import load
 

@@ -25,7 +25,7 @@ class Voxels(NamedTuple):
     Attributes:
         places: ``(K, 3)`` int64, the voxel's lowest corner divided by the size; ascending.
         counts: ``(K,)`` int64 number of points.
-        sums: ``(K, 3)`` int64 sums of the points' distances from the lowest corner, in ``cell_kernels.STEPS``.
+        sums: ``(K, 3)`` int64 sums of the distances from the lowest corner, in ``STEPS``.
     """
 
     places: NDArray[np.int64]
@@ -184,3 +184,79 @@ def representatives(
     distances = np.full(len(counts), np.inf)
     rows[voxel_of_cell], distances[voxel_of_cell] = found
     return Representatives(rows, distances)
+
+
+class Sums(NamedTuple):
+    """Exact sums of further columns in every voxel, in two parts of 36 bits.
+
+    Attributes:
+        high: ``(K, A)`` int64.
+        low: ``(K, A)`` int64.
+        wrong: ``(K, A)`` int64 number of values that are not finite.
+    """
+
+    high: NDArray[np.int64]
+    low: NDArray[np.int64]
+    wrong: NDArray[np.int64]
+
+    def means(self, counts: NDArray[np.int64], scales: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the means ``(K, A)``; NaN where a value is not finite."""
+        total = self.high + self.low / cell_kernels.STEPS
+        means: NDArray[np.float64] = np.where(
+            self.wrong > 0, np.nan, total / counts[:, None] / scales
+        )
+        return means
+
+
+def column_scales(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return powers of two ``(A,)`` that bring the numbers of columns ``(N, A)`` below 2³⁶."""
+    largest = np.abs(np.where(np.isfinite(values), values, 0.0)).max(axis=0, initial=0.0)
+    return scales_for(largest)
+
+
+def scales_for(largest: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``column_scales`` for the largest absolute values ``(A,)`` of columns."""
+    exponent = np.frexp(largest)[1]
+    scales: NDArray[np.float64] = np.ldexp(1.0, np.clip(36 - exponent, -1000, 1000))
+    return scales
+
+
+def sum_columns(
+    points: NDArray[np.float64],
+    size: float,
+    voxels: Voxels,
+    values: NDArray[np.float64],
+    scales: NDArray[np.float64],
+) -> Sums:
+    """Sum further columns of points in every voxel.
+
+    Args:
+        points: ``(N, 3)`` the cloud, or a part of it.
+        size: side of a voxel.
+        voxels: those of the whole cloud.
+        values: ``(N, A)`` the columns.
+        scales: ``(A,)`` from ``column_scales`` of the whole cloud.
+    """
+    grouped = group(np.ascontiguousarray(points, np.float64), size)
+    voxel = voxels.rows_of(grouped.places.reshape(-1, 3))[grouped.cell_of]
+    wrong = ~np.isfinite(values)
+    scaled = np.where(wrong, 0.0, values) * scales
+    high = np.trunc(scaled)
+    low = np.rint((scaled - high) * cell_kernels.STEPS)
+    sums = [np.zeros((len(voxels.counts), values.shape[1]), np.int64) for _ in range(3)]
+    for total, part in zip(sums, (high, low, wrong), strict=True):
+        np.add.at(total, voxel, part.astype(np.int64))
+    return Sums(*sums)
+
+
+def voxel_means(points: NDArray[np.float64], size: float) -> NDArray[np.float64]:
+    """Return the means ``(K, C)`` of all columns of the points ``(N, C)`` of every voxel.
+
+    The first three columns are the coordinates. The voxels are in ascending (x, y, z) order.
+    """
+    coordinates = np.ascontiguousarray(points[:, :3], np.float64)
+    voxels = occupied(coordinates, size)
+    further = np.asarray(points[:, 3:], np.float64)
+    scales = column_scales(further)
+    sums = sum_columns(coordinates, size, voxels, further, scales)
+    return np.concatenate([voxels.means(size), sums.means(voxels.counts, scales)], axis=1)

@@ -72,7 +72,7 @@ class Sampler(nn.Module):
 
     def __init__(self, m: int) -> None:
         super().__init__()
-        if not isinstance(m, int) or m < 1:
+        if isinstance(m, bool) or not isinstance(m, int) or m < 1:
             raise UserError(f"m must be a whole number of at least 1, got {m!r}.")
         self.m = m
 
@@ -134,7 +134,7 @@ class Sampler(nn.Module):
         m = self.m if m is None else m
         self.check_m(m)
         if readout not in READOUTS:
-            raise UserError(f"readout: unknown {readout!r}.{did_you_mean(readout, READOUTS)}")
+            raise UserError(f"readout: unknown {readout!r}.{did_you_mean(str(readout), READOUTS)}")
         if self.learned and self.training:
             raise UserError("downsample needs a sampler in eval mode: call eval() first.")
         if weight is not None:
@@ -269,7 +269,7 @@ class Sampler(nn.Module):
             UserError: it does not return m points.
         """
         size: object = m  # mypy would take the check for needless
-        if not isinstance(size, Integral):
+        if isinstance(size, bool) or not isinstance(size, Integral):
             raise UserError(f"m must be a whole number, got {m!r}.")
         if self.flexible and not 1 <= m <= self.m:
             raise UserError(f"m must be between 1 and {self.m}, got {m}.")

@@ -42,7 +42,10 @@ def select_points(
     """
     tensor = as_tensor("points", points)
     if not tensor.is_floating_point():
-        raise UserError(f"points must be floating point, got {tensor.dtype}. Try points.float().")
+        conversion = "astype(float)" if isinstance(points, np.ndarray) else "float()"
+        raise UserError(
+            f"points must be floating point, got {tensor.dtype}. Try points.{conversion}."
+        )
     if weight is not None and not isinstance(weight, str):
         weight = check_weight(weight, tuple(tensor.shape[:-1])).to(tensor.device)
     one = tensor.ndim == 2

@@ -1,51 +1,74 @@
-"""Downsampling by the name of a method or of a model."""
+"""Downsampling by the name of a method or of a model, to a number, a spacing or voxels."""
 
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 import mops_lightning
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.budget import as_size, number_of
 from mops_lightning.zoo import addresses, names, weights
 from mops_lightning.zoo.load import load
 
 
 def downsample(
     points: Any,
-    m: int,
+    m: Any = None,
     method: str | Path = "fps",
     readout: str = "completed",
     batch: Any = None,
     start: int | str | None = None,
     seed: int | None = None,
     weight: Any = None,
+    *,
+    spacing: float | None = None,
+    voxel: float | None = None,
+    space: Any = None,
+    tile: int | None = None,
 ) -> tuple[Any, Any]:
-    """Downsample clouds by a method or a model.
+    """Downsample clouds by a method or a model, or to a spacing or one point per voxel.
 
-    Clouds are moved into the unit sphere, as in training, and the result is mapped back.
+    Give exactly one of ``m``, ``spacing`` and ``voxel``. A method or model gets every cloud in the
+    unit sphere, as in training, and the result is mapped back.
 
     Args:
-        points: ``(N, 3)``, ``(B, N, 3)``, or ``(P, 3)`` with ``batch``; a tensor or an array,
-            floating point, in any unit.
-        m: number of points to return of each cloud.
+        points: ``(N, C)``, ``(B, N, C)``, or ``(P, C)`` with ``batch``; a tensor or an array, in
+            any unit; or a list of ``(N, C)``, of several sizes. The first three columns are the
+            coordinates. Further columns take no part in the choice, and stay with their points.
+        m: number of points to return of each cloud, or a share of its points, a float below 1; a
+            list holds one for each cloud.
         method: ``random``, ``serial``, ``voxel``, ``fps`` or ``poisson``, or what ``load`` takes,
             such as the name of a model. A model suits the task net and the shapes that it was
             trained for.
         readout: of a model: ``generated``, ``matched`` or ``completed``; see
-            ``Sampler.downsample``.
+            ``Sampler.downsample``. With ``voxel=``, ``generated`` returns the means of the voxels.
         batch: ``(P,)`` the cloud of every point, ascending from 0, as in PyTorch Geometric.
         start: with ``fps``, the row of the first point in every cloud, or ``"farthest"`` for the
             point farthest from the mean.
         seed: of random choices; None means 0.
         weight: one number of at least 0 per point, or ``"curvature"``; with ``random``, ``fps``,
-            ``poisson`` and completed sets. See ``Sampler.downsample``.
+            ``poisson``, completed sets, ``spacing`` and ``voxel``. Heavier points are preferred;
+            points of weight 0 are left out. A list for a list of clouds. See
+            ``Sampler.downsample``.
+        spacing: a distance. No two points that are kept are nearer, and every point of the cloud
+            has a kept one that is nearer. The result does not depend on the order of the points.
+        voxel: side of cubic voxels, of which each occupied one keeps the point nearest to the mean
+            of its points. The grid starts at 0.
+        space: one factor per column: distances are those of the columns times these factors. With
+            ``fps`` and ``spacing``.
+        tile: cut every cloud into tiles of up to so many points (a balanced kd-tree), and sample
+            each, as in training.
 
     Returns:
         The points, and their indices in the input, or None for generated points; tensors or arrays
-        like the input. See ``Sampler.downsample`` for the shapes.
+        like the input. See ``Sampler.downsample`` for the shapes. For a list of clouds both are
+        lists; so they are for ``(B, N, C)`` where clouds may keep different numbers of points:
+        with a list as ``m``, ``spacing`` or ``voxel``. A cloud of a list with fewer than m points
+        is returned whole.
 
     Raises:
         UserError: an argument is invalid, or there is no such method or model.
@@ -56,15 +79,59 @@ def downsample(
         >>> points, indices = downsample(torch.rand(64, 3), 8)
         >>> points.shape, indices.shape
         (torch.Size([8, 3]), torch.Size([8]))
+        >>> points, indices = downsample(torch.rand(1000, 6), voxel=0.5)
+        >>> points.shape
+        torch.Size([8, 6])
     """
-    if start is not None and method != "fps":
+    from mops_lightning.zoo import clouds
+
+    _check_budgets(m, spacing, voxel)
+    if start is not None and (method != "fps" or m is None):
         raise UserError(f"start is for method='fps', got method={str(method)!r}.")
+    if m is None:
+        return clouds.to_distance(
+            points, method, readout, batch, seed or 0, weight, spacing, voxel, space
+        )
+    if not isinstance(m, list | tuple):
+        m = as_size(m)
+    if space is None and tile is None and _is_plain(points, m, batch):
+        number = number_of(m, points.shape[-2])
+        sampler = find_sampler(method, number, points, start, seed)
+        return sampler.downsample(points, number, readout, batch, weight)
+    return clouds.to_number(
+        points, m, method, readout, batch, start, seed, weight, space=space, tile=tile
+    )
+
+
+def _check_budgets(m: Any, spacing: Any, voxel: Any) -> None:
+    given = {"m": m, "spacing": spacing, "voxel": voxel}
+    chosen = [name for name, value in given.items() if value is not None]
+    if len(chosen) != 1:
+        got = " and ".join(chosen) or "none of them"
+        raise UserError(f"give m, spacing or voxel, got {got}.")
+
+
+def _is_plain(points: Any, m: Any, batch: Any) -> bool:
+    """Return whether the points are what ``Sampler.downsample`` takes."""
+    if not hasattr(points, "dtype") or not hasattr(points, "shape"):
+        return False
+    is_share = isinstance(m, float)
+    if isinstance(m, list | tuple) or (is_share and batch is not None):
+        return False
+    is_floating = points.is_floating_point() if isinstance(points, Tensor) else (
+        points.dtype.kind == "f"
+    )  # fmt: skip
+    return is_floating and len(points.shape) in (2, 3) and points.shape[-1] == 3
+
+
+def find_sampler(
+    method: str | Path, m: int, points: Any, start: int | str | None, seed: int | None
+) -> Sampler:
+    """Return the sampler of a method, or of a model on the device of the points."""
     if method in names.UNTRAINED:
         arguments = {} if start is None else {"start": start}
-        sampler = untrained(str(method), m, seed or 0, **arguments)
-    else:
-        sampler = _model(str(method), str(getattr(points, "device", "cpu")))
-    return sampler.downsample(points, m, readout, batch, weight)
+        return untrained(str(method), m, seed or 0, **arguments)
+    return _model(str(method), str(getattr(points, "device", "cpu")))
 
 
 def untrained(method: str, m: int, seed: int = 0, **arguments: Any) -> Sampler:
@@ -83,9 +150,11 @@ def _model(name: str, device: str) -> Sampler:
     """
     known = {*names.UNTRAINED, *names.available()}
     exists = addresses.is_address(name) or Path(name).expanduser().exists()
-    if name not in known and not exists:
+    if not name or not (name in known or exists):
         raise UserError(f"method: unknown {name!r}.{did_you_mean(name, known)}")
     path = weights.of_run(names.resolve(name))
+    if not path.is_file():
+        raise UserError(f"method: {name!r} holds no weights: there is no {path}.")
     return _loaded(path, path.stat().st_mtime_ns, device)
 
 

@@ -9,11 +9,10 @@ import torch
 from scipy.spatial import cKDTree
 
 from mops_lightning.errors import UserError
-from mops_lightning.files.tiles import balanced_tiles, sample_by_tiles, shares, thin
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.random import RandomSampler
-from tests.support.downsample import call
+from mops_lightning.samplers.tiles import balanced_tiles, sample_by_tiles, shares, thin
 
 
 def cloud(number, seed=0):
@@ -124,9 +123,3 @@ def test_sample_by_tiles_all_points_and_too_many(sampler):
     assert len(sample_by_tiles(points, 250, 128, sampler)) == 128
     with pytest.raises(UserError, match=r"2 tiles of up to 250 points .* up to 64 points of each"):
         sample_by_tiles(points, 250, 129, sampler)
-
-
-def test_tile_trained_sampler_of_many_sizes(folder, tmp_path):
-    options = ["--weights", folder, "--tile", 64, "--m", 120]
-    assert call(folder / "in" / "a.ply", tmp_path / "a.npy", *options)[0] == 0
-    assert len(np.unique(np.load(tmp_path / "a.npy"), axis=0)) == 120

@@ -1,0 +1,202 @@
+"""``downsample`` to numbers, shares, spacings and voxels, of one and of many clouds."""
+
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning import downsample
+from mops_lightning.errors import UserError
+from mops_lightning.ops.spacing import keep_spaced
+
+CLOUD = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 7
+
+
+@pytest.mark.parametrize(
+    ("m", "number"),
+    [
+        (20, 20),
+        (1, 1),
+        (np.int64(20), 20),
+        (np.uint8(20), 20),
+        (np.array(20), 20),
+        (torch.tensor(20), 20),
+        (0.1, 20),
+        (np.float32(0.1), 20),
+        (0.0001, 1),
+        (0.0125, 3),
+    ],
+)
+def test_m_is_a_number_or_a_share(m, number):
+    points, rows = downsample(CLOUD, m)
+
+    assert torch.equal(rows, downsample(CLOUD, number)[1])
+    assert torch.equal(points, CLOUD[rows])
+
+
+@pytest.mark.parametrize(
+    "m", [True, np.True_, 0, -1, 1.0, 1.5, 0.0, -0.1, float("nan"), "5", torch.tensor(True)]
+)
+def test_m_of_another_kind_is_refused(m):
+    with pytest.raises(UserError, match="m must be a whole number of at least 1, or a share"):
+        downsample(CLOUD, m)
+
+
+@pytest.mark.parametrize("arguments", [{}, {"m": 5, "spacing": 1.0}, {"spacing": 1, "voxel": 1}])
+def test_not_one_budget_is_refused(arguments):
+    with pytest.raises(UserError, match="give m, spacing or voxel, got"):
+        downsample(CLOUD, **arguments)
+
+
+def test_spacing_of_a_tensor():
+    points, rows = downsample(CLOUD, spacing=1.5)
+
+    assert torch.equal(points, CLOUD[rows])
+    distances = torch.cdist(CLOUD.double(), points.double())
+    assert distances.amin(1).max() < 1.5
+    assert distances[rows].fill_diagonal_(9.0).min() >= 1.5
+
+
+def test_spacing_prefers_weights_and_leaves_zeros_out():
+    weight = torch.ones(200)
+    weight[7] = 5.0
+    weight[:5] = 0.0
+
+    _, rows = downsample(CLOUD, spacing=1.5, weight=weight)
+
+    assert 7 in rows.tolist()
+    assert min(rows.tolist()) >= 5
+
+
+def test_voxel_keeps_one_point_of_each():
+    points, rows = downsample(CLOUD.numpy(), voxel=2.0)
+
+    assert isinstance(points, np.ndarray)
+    assert np.array_equal(points, CLOUD.numpy()[rows])
+    places = np.unique(np.floor(CLOUD.numpy().astype(np.float64) / 2.0), axis=0)
+    assert len(points) == len(places)
+
+
+def test_voxel_generated_returns_means_of_all_columns():
+    points = np.array([[0.1, 0.1, 0.1, 4.0], [0.3, 0.5, 0.9, 6.0], [1.5, 0.5, 0.5, 1.0]])
+
+    means, rows = downsample(points, voxel=1.0, readout="generated")
+
+    assert rows is None
+    np.testing.assert_allclose(means, [[0.2, 0.3, 0.5, 5.0], [1.5, 0.5, 0.5, 1.0]], atol=1e-10)
+
+
+def test_further_columns_stay_with_their_points():
+    points = np.concatenate([CLOUD.numpy(), np.arange(200.0)[:, None]], axis=1)
+
+    for budget in ({"m": 10}, {"spacing": 2.0}, {"voxel": 3.0}, {"m": 10, "tile": 50}):
+        kept, rows = downsample(points, **budget)
+        assert np.array_equal(kept, points[rows])
+        assert np.array_equal(kept[:, 3], rows)
+    assert np.array_equal(downsample(points, 10)[1], downsample(points[:, :3], 10)[1])
+
+
+def test_whole_number_coordinates_are_kept():
+    points = np.arange(150).reshape(50, 3)
+
+    kept, rows = downsample(points, 5)
+
+    assert kept.dtype == points.dtype
+    assert np.array_equal(kept, points[rows])
+    assert len(set(rows.tolist())) == 5
+
+
+def test_list_of_clouds_of_several_sizes():
+    clouds = [CLOUD[:50], CLOUD[:120].numpy(), CLOUD[:4]]
+
+    points, rows = downsample(clouds, 10)
+
+    assert [len(cloud) for cloud in points] == [10, 10, 4]
+    assert torch.equal(rows[0], downsample(CLOUD[:50], 10)[1])
+    assert isinstance(points[1], np.ndarray)
+    assert rows[2].tolist() == [0, 1, 2, 3]
+
+
+def test_another_m_per_cloud():
+    batch = torch.arange(200) // 100
+
+    _, rows = downsample(CLOUD.view(2, 100, 3), [5, 0.2])
+    flat_points, flat_rows = downsample(CLOUD, [5, 0.2], batch=batch)
+
+    assert [len(part) for part in rows] == [5, 20]
+    assert flat_rows.tolist() == [*rows[0].tolist(), *(rows[1] + 100).tolist()]
+    assert torch.equal(flat_points, CLOUD[flat_rows])
+
+
+def test_share_of_each_cloud_of_a_batch():
+    batch = torch.tensor([0] * 50 + [1] * 150)
+
+    _, rows = downsample(CLOUD, 0.1, batch=batch)
+
+    assert (rows < 50).sum() == 5
+    assert (rows >= 50).sum() == 15
+
+
+def test_spacing_and_voxel_of_a_batch_are_lists():
+    batch = CLOUD.view(2, 100, 3)
+
+    for budget in ({"spacing": 2.0}, {"voxel": 2.0}):
+        points, rows = downsample(batch, **budget)
+        assert torch.equal(rows[1], downsample(batch[1], **budget)[1])
+        assert torch.equal(points[1], batch[1][rows[1]])
+
+
+def test_space_makes_columns_count():
+    points = np.concatenate([CLOUD.numpy(), np.zeros((200, 1))], axis=1)
+    points[17, 3] = 100.0
+
+    assert 17 in downsample(points, 2, start=0, space=(1, 1, 1, 1))[1]
+    assert 17 not in downsample(points, 2, start=0, space=(1, 1, 1, 0))[1]
+    scaled = points.astype(np.float64)[:, :3] * [1, 1, 2]
+    expected = keep_spaced(scaled, 2.0)
+    assert downsample(points, spacing=2.0, space=(1, 1, 2, 0))[1].tolist() == expected.tolist()
+
+
+def test_tile_keeps_m_points():
+    _, rows = downsample(CLOUD, 40, tile=64)
+
+    assert len(set(rows.tolist())) == 40
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"spacing": 0}, "spacing must be a number above 0"),
+        ({"voxel": float("inf")}, "voxel must be a number above 0"),
+        ({"spacing": True}, "spacing must be a number above 0"),
+        ({"spacing": 1, "method": "random"}, "method needs m"),
+        ({"spacing": 1, "start": 3}, "start is for method='fps'"),
+        ({"spacing": 1, "readout": "generated"}, "spacing keeps input points"),
+        ({"spacing": 1, "readout": None}, "readout must be completed or generated"),
+        ({"m": 5, "readout": None}, "readout: unknown None"),
+        ({"m": 5, "method": ""}, "method: unknown ''"),
+        ({"m": 500}, "m must be at most the number of points N=200"),
+        ({"m": [5, 6]}, "m: 2 numbers for 1 clouds"),
+        ({"m": 5, "space": (1, 1)}, "space must hold a factor of at least 0 for each of the 3"),
+        ({"m": 5, "space": (1, 1, 1), "method": "random"}, "space is for method='fps'"),
+        ({"m": 5, "tile": 1}, "tile must be a whole number of at least 2"),
+        ({"voxel": 1e-20}, "voxel: 1e-20 is too small"),
+    ],
+)
+def test_mistakes_are_one_line(arguments, words):
+    with pytest.raises(UserError, match=words) as refused:
+        downsample(CLOUD, **arguments)
+
+    assert "\n" not in str(refused.value)
+
+
+def test_folder_without_weights_is_refused(tmp_path):
+    with pytest.raises(UserError, match="holds no weights"):
+        downsample(CLOUD, 5, tmp_path)
+
+
+def test_points_that_are_not_finite_are_refused():
+    points = CLOUD.clone()
+    points[3, 1] = torch.nan
+
+    with pytest.raises(UserError, match="points must be finite"):
+        downsample(points, spacing=1.0)
