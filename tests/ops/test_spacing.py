@@ -23,7 +23,7 @@ def squared_distances(points):
 
 def plain_spaced(points, spacing, order):
     squared = squared_distances(points)
-    kept = []
+    kept: list[int] = []
     for row in order:
         if all(squared[row, other] >= spacing * spacing for other in kept):
             kept.append(row)

@@ -1,5 +1,7 @@
 """``downsample`` to numbers, shares, spacings and voxels, of one and of many clouds."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -88,7 +90,8 @@ def test_voxel_generated_returns_means_of_all_columns():
 def test_further_columns_stay_with_their_points():
     points = np.concatenate([CLOUD.numpy(), np.arange(200.0)[:, None]], axis=1)
 
-    for budget in ({"m": 10}, {"spacing": 2.0}, {"voxel": 3.0}, {"m": 10, "tile": 50}):
+    budgets: list[Any] = [{"m": 10}, {"spacing": 2.0}, {"voxel": 3.0}, {"m": 10, "tile": 50}]
+    for budget in budgets:
         kept, rows = downsample(points, **budget)
         assert np.array_equal(kept, points[rows])
         assert np.array_equal(kept[:, 3], rows)
@@ -139,7 +142,8 @@ def test_share_of_each_cloud_of_a_batch():
 def test_spacing_and_voxel_of_a_batch_are_lists():
     batch = CLOUD.view(2, 100, 3)
 
-    for budget in ({"spacing": 2.0}, {"voxel": 2.0}):
+    budgets: list[Any] = [{"spacing": 2.0}, {"voxel": 2.0}]
+    for budget in budgets:
         points, rows = downsample(batch, **budget)
         assert torch.equal(rows[1], downsample(batch[1], **budget)[1])
         assert torch.equal(points[1], batch[1][rows[1]])
