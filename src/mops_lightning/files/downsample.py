@@ -20,7 +20,7 @@ from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.weights import CURVATURE, check_positive, check_weight, curvature
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.tiles import sample_by_tiles
-from mops_lightning.zoo.downsample import untrained
+from mops_lightning.zoo.find_sampler import untrained
 from mops_lightning.zoo.load import load
 
 SURFACE = 10_000

@@ -18,6 +18,7 @@ from mops_lightning.ops.weights import CURVATURE, check_positive, check_weight, 
 from mops_lightning.samplers.budget import as_size, check_distance, check_scales, number_of
 from mops_lightning.samplers.fps import FPSSampler, farthest_rows
 from mops_lightning.samplers.tiles import sample_by_tiles
+from mops_lightning.zoo.find_sampler import find_sampler
 
 Sample = tuple[Tensor, Tensor | None]
 """Points ``(m, C)``, and their rows ``(m,)``, None for generated points."""
@@ -238,8 +239,6 @@ def to_number(
     tile: int | None,
 ) -> tuple[Any, Any]:
     """Downsample clouds to numbers of points; see ``downsample``."""
-    from mops_lightning.zoo.downsample import find_sampler
-
     clouds = Clouds.of(points, batch, weight)
     is_per_cloud = isinstance(m, list | tuple)
     sizes = [as_size(size) for size in m] if is_per_cloud else [m] * len(clouds.clouds)

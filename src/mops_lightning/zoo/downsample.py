@@ -1,18 +1,14 @@
 """Downsampling by the name of a method or of a model, to a number, a spacing or voxels."""
 
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
-import mops_lightning
-from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.samplers.base import Sampler
+from mops_lightning.errors import UserError
 from mops_lightning.samplers.budget import as_size, number_of
-from mops_lightning.zoo import addresses, names, weights
-from mops_lightning.zoo.load import load
+from mops_lightning.zoo import clouds
+from mops_lightning.zoo.find_sampler import find_sampler
 
 
 def downsample(
@@ -83,8 +79,6 @@ def downsample(
         >>> points.shape
         torch.Size([8, 6])
     """
-    from mops_lightning.zoo import clouds
-
     _check_budgets(m, spacing, voxel)
     if start is not None and (method != "fps" or m is None):
         raise UserError(f"start is for method='fps', got method={str(method)!r}.")
@@ -122,43 +116,3 @@ def _is_plain(points: Any, m: Any, batch: Any) -> bool:
         points.dtype.kind == "f"
     )  # fmt: skip
     return is_floating and len(points.shape) in (2, 3) and points.shape[-1] == 3
-
-
-def find_sampler(
-    method: str | Path, m: int, points: Any, start: int | str | None, seed: int | None
-) -> Sampler:
-    """Return the sampler of a method, or of a model on the device of the points."""
-    if method in names.UNTRAINED:
-        arguments = {} if start is None else {"start": start}
-        return untrained(str(method), m, seed or 0, **arguments)
-    return _model(str(method), str(getattr(points, "device", "cpu")))
-
-
-def untrained(method: str, m: int, seed: int = 0, **arguments: Any) -> Sampler:
-    """Return the sampler of one of the ``UNTRAINED`` methods; some have no seed."""
-    if method not in ("voxel", "serial"):
-        arguments["seed"] = seed
-    make: type[Sampler] = getattr(mops_lightning, names.UNTRAINED[method])
-    return make(m, **arguments)
-
-
-def _model(name: str, device: str) -> Sampler:
-    """Return a model's sampler, which is loaded once.
-
-    Raises:
-        UserError: there is no such method or model.
-    """
-    known = {*names.UNTRAINED, *names.available()}
-    exists = addresses.is_address(name) or Path(name).expanduser().exists()
-    if not name or not (name in known or exists):
-        raise UserError(f"method: unknown {name!r}.{did_you_mean(name, known)}")
-    path = weights.of_run(names.resolve(name))
-    if not path.is_file():
-        raise UserError(f"method: {name!r} holds no weights: there is no {path}.")
-    return _loaded(path, path.stat().st_mtime_ns, device)
-
-
-@lru_cache(maxsize=4)
-def _loaded(path: Path, changed: int, device: str) -> Sampler:
-    """Load a sampler; a file that has changed since is loaded again."""
-    return load(path).to(torch.device(device))
