@@ -1,41 +1,76 @@
-"""APES, a published sampler to compare with, written from the formulas of its paper."""
+"""APES, a published sampler to compare with."""
 
 from collections.abc import Sequence
 from typing import Literal
 
+import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.losses.subset import simplification_losses
-from mops_lightning.nets.layers import PointMLP
-from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.ops.points import gather_points
+from mops_lightning.samplers.base import Sampler
 from mops_lightning.types import SampleOutput
 
-from .selector import Selector
+from .edge_net import EdgeEmbedding, NeighbourAttention, feature_neighbours
+from .selector import straight_through
+
+STAGES = 2
 
 
-class APES(Selector):
+class EdgeSampling(nn.Module):
+    """One sampling layer of APES: scores from attention, and the attention itself.
+
+    Args:
+        channels: channels of the features, queries and keys.
+        variant: ``local`` or ``global``; see ``APES``.
+        k: number of neighbours of the local variant.
+    """
+
+    def __init__(self, channels: int, variant: str, k: int) -> None:
+        super().__init__()
+        self.variant = variant
+        self.k = k
+        self.queries = nn.Linear(channels, channels, bias=False)
+        self.keys = nn.Linear(channels, channels, bias=False)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return scores ``(B, N)``, attention ``(B, N, K)`` and its rows ``(B, N, K)``."""
+        queries = self.queries(features) * self.queries.out_features**-0.5
+        logits = queries @ self.keys(features).mT
+        if self.variant == "global":
+            weights = logits.softmax(2)
+            rows = torch.arange(logits.shape[2], device=logits.device).expand_as(logits)
+            return weights.sum(1), weights, rows
+        # The published keys are those of f_j − f_i: the part of f_i is cancelled by the softmax.
+        rows = feature_neighbours(features, self.k)
+        weights = logits.gather(2, rows).softmax(2)
+        return weights.std(2, unbiased=False), weights, rows
+
+
+class APES(Sampler):
     """APES: the input points with the most conspicuous attention, which lie on edges.
 
-    Wu et al., "Attention-based Point Cloud Edge Sampling", CVPR 2023. From features of the points,
-    attention softmax(Q·Kᵀ/√C) is computed: ``local``, from every point over its k nearest points,
+    Wu et al., "Attention-based Point Cloud Edge Sampling", CVPR 2023. Features come from two edge
+    convolutions and attention to neighbours. In each of two stages, attention softmax(Q·Kᵀ/√C) is
+    computed: ``local``, from every point over its k nearest points in the space of the features,
     whose weights' standard deviation is the point's score; or ``global``, over the cloud, where the
-    score is the sum of a point's column. The points with the m largest scores are selected.
+    score is the sum of a point's column. The points with the largest scores are kept, with the
+    attention times the values as their new features. The first stage keeps twice as many points as
+    the second, as in the published classifier.
 
-    Differences from the publication: there, the layer is inside a classifier, whose next layer gets
-    the rows of attention of the selected points times the values; here, it selects input points for
-    a task net. In training, a selected point has the gradient of its row times the coordinates. The
-    simplification loss is an addition, with weight 0 as published.
+    Differences from the publication: there, the stages are inside a classifier, which gets the
+    features; here, they select input points for a task net. In training, a selected point has the
+    gradient of its attention times the coordinates. The simplification loss is an addition, with
+    weight 0 as published.
 
     Args:
         m: number of points to select.
         variant: ``local`` or ``global``.
         alpha: weight of the simplification loss.
-        k: number of neighbours of the local variant.
-        channels: channels of queries and keys.
-        feature_channels: sizes of the pointwise layers.
-        candidates: as for ``Selector``.
+        k: number of neighbours.
+        channels: channels of the features.
+        heads: heads of the attention to neighbours.
 
     Raises:
         UserError: an argument is out of range.
@@ -47,45 +82,44 @@ class APES(Selector):
         variant: Literal["local", "global"] = "local",
         alpha: float = 0.0,
         k: int = 32,
-        channels: int = 64,
-        feature_channels: Sequence[int] = (64, 64, 64, 128, 128),
-        candidates: int | None = 256,
+        channels: int = 128,
+        heads: int = 4,
     ) -> None:
-        super().__init__(m, candidates)
+        super().__init__(m)
         if variant not in ("local", "global"):
             raise UserError(f"variant must be local or global, got {variant!r}.")
         check_at_least(0, alpha=alpha)
         check_at_least(2, k=k)
-        check_at_least(1, channels=channels)
-        self.variant = variant
+        check_at_least(2, channels=channels)
+        check_at_least(1, heads=heads)
         self.alpha = alpha
-        self.k = k
-        self.features = PointMLP([3, *feature_channels])
-        self.queries = nn.Linear(feature_channels[-1], channels, bias=False)
-        self.keys = nn.Linear(feature_channels[-1], channels, bias=False)
+        self.embedding = EdgeEmbedding((128, 128), channels, k)
+        self.attention = nn.ModuleList(
+            NeighbourAttention(channels, heads, 4, k) for _ in range(STAGES)
+        )
+        self.sampling = nn.ModuleList(EdgeSampling(channels, variant, k) for _ in range(STAGES))
+        self.values = nn.Linear(channels, channels, bias=False)
 
-    def attention(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the scores ``(B, N)`` of ``(B, N, 3)`` points, and means ``(B, N, 3)`` by rows."""
-        features = self.features(points).to(points)
-        queries = self.queries(features) * self.queries.out_features**-0.5
-        logits = queries @ self.keys(features).mT
-        if self.variant == "global":
-            weights = logits.softmax(2)
-            return weights.sum(1), weights @ points
-        # The published keys are those of f_j − f_i: the part of f_i is cancelled by the softmax.
-        near = k_nearest(points.detach(), points.detach(), min(self.k, points.shape[1]))[1]
-        weights = logits.gather(2, near).softmax(2)
-        return weights.std(2), (weights[..., None] * gather_points(points, near)).sum(2)
+    def sample(self, points: Tensor, m: int) -> SampleOutput:
+        """Select points; see ``Sampler.forward``."""
+        features = self.attention[0](self.embedding(points))
+        kept = min(2 * m, points.shape[1])
+        scores, weights, near = self.sampling[0](features)
+        first = scores.topk(kept).indices
+        means = _attended(points, weights, near, first)
+        features = _attended(self.values(features), weights, near, first)
 
-    def select_rows(self, points: Tensor, m: int) -> SampleOutput:
-        """Select points; in training, add means that have the gradient."""
-        scores, means = self.attention(points)
-        rows = scores.topk(m).indices
+        features = self.attention[1](features)
+        soft = straight_through(gather_points(points, first), means)
+        scores, weights, near = self.sampling[1](features)
+        second = scores.topk(m).indices
+        means = _attended(soft, weights, near, second)
+
+        rows = first.gather(1, second)
         chosen = gather_points(points, rows)
         if not self.training:
             return SampleOutput(chosen, rows, {})
-        mean = gather_points(means, rows)
-        return SampleOutput(chosen, rows, {}, soft_projected=chosen + mean - mean.detach())
+        return SampleOutput(chosen, rows, {}, soft_projected=straight_through(chosen, means))
 
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]
@@ -96,3 +130,20 @@ class APES(Selector):
         assert output.soft_projected is not None
         losses = simplification_losses(points, output.soft_projected, sizes)
         return {m: {"simplification": self.alpha * loss} for m, loss in losses.items()}
+
+
+def _attended(values: Tensor, weights: Tensor, near: Tensor, rows: Tensor) -> Tensor:
+    """Return the attention of the selected points times the values of what it is for.
+
+    Args:
+        values: ``(B, N, C)``.
+        weights: ``(B, N, K)`` attention of every point.
+        near: ``(B, N, K)`` the rows that it is for.
+        rows: ``(B, M)`` the selected points.
+
+    Returns:
+        ``(B, M, C)``.
+    """
+    places = rows[..., None].expand(-1, -1, near.shape[2])
+    of_selected = weights.gather(1, places)
+    return (of_selected[..., None] * gather_points(values, near.gather(1, places))).sum(2)

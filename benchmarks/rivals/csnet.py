@@ -1,4 +1,4 @@
-"""CS-Net, a published sampler to compare with, written from the formulas of its paper."""
+"""CS-Net, a published sampler to compare with."""
 
 from collections.abc import Sequence
 
@@ -10,9 +10,10 @@ from mops_lightning.nets.layers import PointMLP
 from mops_lightning.ops.maxima import max_of_rows
 from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.ops.points import gather_points
+from mops_lightning.samplers.base import Sampler
 from mops_lightning.types import SampleOutput
 
-from .selector import Selector, soft_top_k
+from .selector import soft_top_k, straight_through
 
 
 def soft_coverage(points: Tensor, logarithms: Tensor, width: float) -> Tensor:
@@ -49,7 +50,7 @@ class OffsetAttention(nn.Module):
         return features + self.offset(features - attended).to(features)
 
 
-class CSNet(Selector):
+class CSNet(Sampler):
     """CS-Net: the input points with the largest contribution scores.
 
     Guo et al., "CS-Net: Contribution-based Sampling Network for Point Cloud Simplification", 2025.
@@ -69,7 +70,6 @@ class CSNet(Selector):
         k: number of neighbours, in the features and in the gradient.
         channels: channels of the attention.
         feature_channels: sizes of the pointwise layers.
-        candidates: as for ``Selector``.
 
     Raises:
         UserError: an argument is out of range.
@@ -84,9 +84,8 @@ class CSNet(Selector):
         k: int = 16,
         channels: int = 64,
         feature_channels: Sequence[int] = (64, 64, 64),
-        candidates: int | None = 256,
     ) -> None:
-        super().__init__(m, candidates)
+        super().__init__(m)
         check_at_least(0, alpha=alpha)
         check_at_least(1e-3, epsilon=epsilon, width=width)
         check_at_least(1, k=k, channels=channels)
@@ -112,7 +111,7 @@ class CSNet(Selector):
         centred = raw - raw.mean(1, keepdim=True)
         return centred / (centred.square().mean(1, keepdim=True) + 1e-6).sqrt()
 
-    def select_rows(self, points: Tensor, m: int) -> SampleOutput:
+    def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Select points; in training, add their soft projection and the sampling loss."""
         scores = self.scores(points)
         rows = scores.topk(m).indices
@@ -125,7 +124,7 @@ class CSNet(Selector):
         weights = (logits - distances / distances.mean(2, keepdim=True)).softmax(2)
         mean = (weights[..., None] * gather_points(points, near)).sum(2)
         sampling = {"coverage": self.alpha * soft_coverage(points, degrees, self.width)}
-        return SampleOutput(chosen, rows, sampling, soft_projected=chosen + mean - mean.detach())
+        return SampleOutput(chosen, rows, sampling, soft_projected=straight_through(chosen, mean))
 
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]

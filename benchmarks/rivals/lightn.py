@@ -1,4 +1,4 @@
-"""LighTN, a published sampler to compare with, written from the formulas of its paper."""
+"""The self-correlation of LighTN, a published sampler, in MOPS-Net."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,44 +1,17 @@
-"""Selection by scores: a base class of samplers, and the differentiable choice of k."""
+"""What samplers that select points by scores share: gradients of a selection."""
 
 import torch
 from torch import Tensor
 
-from mops_lightning.errors import check_at_least
-from mops_lightning.ops.points import gather_points
-from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.ordering import seeded_order
-from mops_lightning.types import SampleOutput
 
-
-class Selector(Sampler):
-    """Base class of samplers that select points by scores; implements thinning before a test.
-
-    A point is selected for a score above those of all other points: the same net chooses other
-    places from a denser cloud. In evaluation, larger clouds are therefore thinned at random to
-    about the number of points that ``recipe.train_points`` lets training see.
+def straight_through(chosen: Tensor, means: Tensor) -> Tensor:
+    """Return selected points with the gradient of means.
 
     Args:
-        m: number of points to select.
-        candidates: number of points to select from in evaluation; None: all.
+        chosen: ``(B, M, 3)`` the selected points.
+        means: ``(B, M, 3)`` weighted means that depend on the scores.
     """
-
-    def __init__(self, m: int, candidates: int | None) -> None:
-        super().__init__(m)
-        check_at_least(m, candidates=m if candidates is None else candidates)
-        self.candidates = candidates
-
-    def sample(self, points: Tensor, m: int) -> SampleOutput:
-        """Select points; see ``Sampler.forward``."""
-        if self.training or self.candidates is None:
-            return self.select_rows(points, m)
-        rows = seeded_order(points, 0)[:, : self.candidates]
-        output = self.select_rows(gather_points(points, rows), m)
-        assert output.indices is not None
-        return output._replace(indices=rows.gather(1, output.indices))
-
-    def select_rows(self, points: Tensor, m: int) -> SampleOutput:
-        """Select from all points; arguments and result as for ``sample``."""
-        raise NotImplementedError
+    return chosen + means - means.detach()
 
 
 def soft_top_k(scores: Tensor, k: int, epsilon: float, iterations: int = 20) -> Tensor:

@@ -1,0 +1,120 @@
+"""The feature net of APES and SAMBLE: edge convolutions, then attention to neighbours.
+
+Neighbours are the k nearest points in the space of the current features, as published.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from mops_lightning.ops.points import gather_points
+
+SLOPE = 0.2
+"""Of the leaky ReLU."""
+
+
+def feature_neighbours(features: Tensor, k: int) -> Tensor:
+    """Return the rows ``(B, N, k)`` of the nearest features ``(B, N, C)``, each point's own first.
+
+    Clouds with fewer than k points have N neighbours.
+    """
+    with torch.no_grad():
+        distances = torch.cdist(features, features)
+        return distances.topk(min(k, features.shape[1]), largest=False).indices
+
+
+class EdgeConvolution(nn.Module):
+    """Two layers on [f_i, f_j − f_i] of every neighbour j, then the maximum over the neighbours.
+
+    Args:
+        channels_in: channels of f.
+        hidden: channels of the first layer.
+        channels_out: channels of the result.
+        k: number of neighbours.
+    """
+
+    def __init__(self, channels_in: int, hidden: int, channels_out: int, k: int) -> None:
+        super().__init__()
+        self.k = k
+        self.layers = nn.Sequential(
+            nn.Linear(2 * channels_in, hidden, bias=False),
+            nn.BatchNorm1d(hidden),
+            nn.LeakyReLU(SLOPE),
+            nn.Linear(hidden, channels_out, bias=False),
+            nn.BatchNorm1d(channels_out),
+            nn.LeakyReLU(SLOPE),
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map ``(B, N, channels_in)`` to ``(B, N, channels_out)``."""
+        near = gather_points(features, feature_neighbours(features, self.k))
+        own = features[:, :, None].expand_as(near)
+        edges = torch.cat([own, near - own], 3)
+        return self.layers(edges.flatten(0, 2)).unflatten(0, edges.shape[:3]).amax(2)
+
+
+class EdgeEmbedding(nn.Module):
+    """Two edge convolutions, whose outputs are joined.
+
+    Args:
+        hidden: channels of the hidden layer of the first and of the second convolution.
+        channels: channels of the result, half of them from each convolution.
+        k: number of neighbours.
+    """
+
+    def __init__(self, hidden: tuple[int, int], channels: int, k: int) -> None:
+        super().__init__()
+        half = channels // 2
+        self.first = EdgeConvolution(3, hidden[0], half, k)
+        self.second = EdgeConvolution(half, hidden[1], half, k)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Map ``(B, N, 3)`` points to features ``(B, N, channels)``."""
+        first = self.first(points)
+        return torch.cat([first, self.second(first)], 2)
+
+
+class NeighbourAttention(nn.Module):
+    """Attention of every point to its neighbours, then a feed-forward net, each added to its input.
+
+    Keys and values are those of f_j − f_i. BatchNorm follows each sum.
+
+    Args:
+        channels: channels of input and output.
+        heads: number of heads.
+        expansion: width of the feed-forward net's hidden layer over that of its input.
+        k: number of neighbours.
+    """
+
+    def __init__(self, channels: int, heads: int, expansion: int, k: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.k = k
+        self.queries = nn.Linear(channels, channels, bias=False)
+        self.keys = nn.Linear(channels, channels, bias=False)
+        self.values = nn.Linear(channels, channels, bias=False)
+        self.attention_norm = nn.BatchNorm1d(channels)
+        self.feed_forward = nn.Sequential(
+            nn.Linear(channels, expansion * channels, bias=False),
+            nn.LeakyReLU(SLOPE),
+            nn.Linear(expansion * channels, channels, bias=False),
+        )
+        self.feed_forward_norm = nn.BatchNorm1d(channels)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map ``(B, N, channels)`` to ``(B, N, channels)``."""
+        mixed = (features + self.attend(features)).flatten(0, 1)
+        mixed = self.attention_norm(mixed)
+        result = self.feed_forward_norm(mixed + self.feed_forward(mixed))
+        return result.view_as(features)
+
+    def attend(self, features: Tensor) -> Tensor:
+        """Return the attention ``(B, N, channels)`` of every point to its neighbours."""
+        rows = feature_neighbours(features, self.k)
+        queries = self.queries(features).unflatten(2, (self.heads, -1))
+        # The key of f_j − f_i differs from that of f_j by the same for all j: softmax cancels it.
+        keys = gather_points(self.keys(features), rows).unflatten(3, (self.heads, -1))
+        values = self.values(features)
+        near = gather_points(values, rows).unflatten(3, (self.heads, -1))
+        logits = torch.einsum("bnhd,bnkhd->bnhk", queries, keys) * queries.shape[-1] ** -0.5
+        mean = torch.einsum("bnhk,bnkhd->bnhd", logits.softmax(3), near)
+        return mean.flatten(2) - values
