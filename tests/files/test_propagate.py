@@ -189,7 +189,7 @@ def test_colours_are_averaged_and_labels_vote(tmp_path):
         (["small.npz", "big.npz", "--field", "label", "--k", 4], "--k must be from 1 to the 3"),
         (
             ["small.npz", "big.npz", "out.obj", "--field", "label"],
-            "OUT must end in .ply, .las, .laz, got out.obj",
+            "OUT must end in .ply, .las, .laz, .copc.laz, got",
         ),
         (["small.npz", "mesh.ply", "mesh.ply", "--field", "label"], "OUT must differ"),
         (["small.npz", "big.npz", "old.ply", "--field", "label"], "old.ply exists"),

@@ -36,12 +36,10 @@ class Nearest(NamedTuple):
     def merge(self, other: "Nearest") -> "Nearest":
         """Keep the nearer points; in case of ties, the points of the earlier range."""
         nearer = other.distance < self.distance
-        columns = {
-            name: np.where(nearer, other.table.columns[name], column)
-            for name, column in self.table.columns.items()
-        }
-        points = np.where(nearer[:, None], other.table.points, self.table.points)
-        return Nearest(np.minimum(self.distance, other.distance), Table(points, columns))
+        number = len(nearer)
+        rows = np.arange(number) + number * nearer
+        table = join_tables([self.table, other.table]).take(rows)
+        return Nearest(np.minimum(self.distance, other.distance), table)
 
 
 class Outcome(NamedTuple):
@@ -96,7 +94,7 @@ def sample_by_chunks(
     generated = sums.result()
     outcome = Outcome(m, number, 0 if options.area else file.number - number)
     if options.readout == "generated":
-        return Table(sphere.restore(generated)), outcome
+        return Table(sphere.restore(generated), header=file.header), outcome
     matched: Nearest = reduce(Nearest.merge, over("matching", _nearest, sphere, generated))
     kept = replace(matched.table, header=file.header)
     return kept.without_attributes() if options.coordinates_only else kept, outcome

@@ -260,7 +260,8 @@ def _propagate(chosen: argparse.Namespace) -> None:
     check_is_file(big)
     if target is None:
         suffix = big.suffix if big.suffix.lower() in PART_WRITERS else ".ply"
-        target = big.with_name(f"{big.stem}_propagated{suffix}")
+        stem = big.stem.removesuffix(".copc")  # a COPC file would sort the points
+        target = big.with_name(f"{stem}_propagated{suffix}")
     if target.suffix.lower() not in PART_WRITERS:
         raise UserError(f"OUT must end in {', '.join(PART_WRITERS)}, got {target}.")
     if realpath(target) in (realpath(big), realpath(chosen.small)):

@@ -86,7 +86,7 @@ def propagate_file(
     def carry(table: Table) -> Table:
         found = map_part(table.points)
         columns = {name: _carried(name, values, found, mean) for name, values in carried.items()}
-        return replace(table, columns={**table.columns, **columns})
+        return table.with_columns(columns)
 
     tables = _tables(big, columns)
     form = _measure(big, tables("measuring"))

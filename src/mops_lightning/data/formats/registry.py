@@ -37,6 +37,7 @@ WRITERS: dict[str, Callable[[Path, Table], list[str] | None]] = {
     ".pcd": pcd.write,
     ".las": las.write,
     ".laz": las.write,
+    ".copc.laz": las.write_copc,
     ".bin": scans.write,
     ".npy": numpy_files.write_npy,
     ".npz": numpy_files.write_npz,
@@ -49,6 +50,7 @@ PART_WRITERS: dict[str, Callable[[Path, TableParts], None]] = {
     ".ply": ply.write_parts,
     ".las": las.write_parts,
     ".laz": las.write_parts,
+    ".copc.laz": las.write_copc_parts,
 }
 """Formats that are written part by part."""
 
@@ -111,6 +113,11 @@ def read_points(path: Path, columns: Sequence[str] | None = None) -> Table | Non
     return READERS[suffix](path) if suffix in READERS else None
 
 
+def suffix_of(path: Path) -> str:
+    """Return the end of a name that says which format a written file has."""
+    return ".copc.laz" if path.name.lower().endswith(".copc.laz") else path.suffix.lower()
+
+
 def write(path: Path, table: Table | TableParts) -> None:
     """Write a file that ends in one of ``WRITERS``, completely or not at all.
 
@@ -119,7 +126,7 @@ def write(path: Path, table: Table | TableParts) -> None:
     Raises:
         BadCloudError: the format cannot hold the table, or the file cannot be written.
     """
-    suffix = path.suffix.lower()
+    suffix = suffix_of(path)
     notes: list[str] | None = None
     try:
         with atomic_write(path) as temporary:

@@ -13,6 +13,7 @@ from mops_lightning.data.formats import las
 from mops_lightning.data.formats.area import Area
 from mops_lightning.data.formats.guard import naming_file
 from mops_lightning.data.formats.isolated import isolated
+from mops_lightning.data.formats.las.header import COPC
 from mops_lightning.errors import UserError, one_line
 
 HEAD, BLOCK = 2**16, 2**20
@@ -59,7 +60,7 @@ def _copy(address: str, area: Area, path: Path) -> None:
         size = _fetch(address, file, 0, HEAD)
         file.seek(0)
         head = file.read(HEAD)
-        if head[377:381] != las.COPC.encode():
+        if head[377:381] != COPC.encode():
             raise UserError(f"{path} is not a COPC file: download it, and give its path.")
         first = int.from_bytes(head[96:100], "little")
         if first + 8 > HEAD:

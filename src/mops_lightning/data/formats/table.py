@@ -1,6 +1,7 @@
 """A cloud as its file has it: coordinates and columns of attributes."""
 
-from collections.abc import Iterable, Mapping
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,22 @@ class Form:
     layout: Any = None
 
 
+class PackedColumns(Mapping[str, Column]):
+    """Columns that stay packed as in their file, so that a writer of its format loses nothing."""
+
+    @abstractmethod
+    def take(self, rows: NDArray[np.int64]) -> "PackedColumns":
+        """Return the columns of some points."""
+
+    @abstractmethod
+    def replaced(self, columns: Mapping[str, Column]) -> "PackedColumns":
+        """Return the columns with others in their place, or beside them."""
+
+    @abstractmethod
+    def joined(self, others: "Sequence[Any]") -> "PackedColumns":
+        """Return these columns followed by those of other points of the same file."""
+
+
 @dataclass(frozen=True)
 class Table:
     """Points and their attributes.
@@ -48,8 +65,18 @@ class Table:
 
     def take(self, rows: NDArray[np.int64]) -> "Table":
         """Return the points in ``rows`` with their attributes."""
-        columns = {name: column[rows] for name, column in self.columns.items()}
+        columns: Mapping[str, Column]
+        if isinstance(self.columns, PackedColumns):
+            columns = self.columns.take(rows)
+        else:
+            columns = {name: column[rows] for name, column in self.columns.items()}
         return replace(self, points=self.points[rows], columns=columns)
+
+    def with_columns(self, columns: Mapping[str, Column]) -> "Table":
+        """Return the points with columns in place of those of the same name, or beside them."""
+        if isinstance(self.columns, PackedColumns):
+            return replace(self, columns=self.columns.replaced(columns))
+        return replace(self, columns={**self.columns, **columns})
 
     def finite(self) -> "Table":
         """Return the points whose coordinates are all finite."""
@@ -92,10 +119,15 @@ def join_tables(tables: Iterable[Table]) -> Table:
     if not filled:
         return Table(np.empty((0, 3)))
     first = filled[0]
-    columns = {
-        name: np.concatenate([table.columns[name] for table in filled]) for name in first.columns
-    }
     points = np.concatenate([table.points for table in filled])
+    columns: Mapping[str, Column]
+    if isinstance(first.columns, PackedColumns):
+        columns = first.columns.joined([table.columns for table in filled[1:]])
+    else:
+        columns = {
+            name: np.concatenate([table.columns[name] for table in filled])
+            for name in first.columns
+        }
     return Table(points, columns, form=first.form)
 
 

@@ -1,35 +1,24 @@
-"""LAS and LAZ files, read and written by laspy, an extra."""
+"""LAS, LAZ and COPC files. laspy describes the points, lazrs compresses them; both are an extra."""
 
-from contextlib import suppress
-from copy import deepcopy
 from dataclasses import replace
 from functools import partial
-from math import ceil, log2
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mops_lightning.data.formats import table as tables
 from mops_lightning.data.formats.area import Area
 from mops_lightning.data.formats.cloud_file import CloudFile
-from mops_lightning.data.formats.columns import split_array, unique_names
 from mops_lightning.data.formats.guard import BadCloudError, ends_early
 from mops_lightning.data.formats.isolated import isolated
-from mops_lightning.data.formats.las.chunks import read_rows
+from mops_lightning.data.formats.las import chunks, copc, copc_writer, writer
+from mops_lightning.data.formats.las.columns import table_of
+from mops_lightning.data.formats.las.header import Header, read_header
+from mops_lightning.data.formats.las.layout import Rows, layout_of
 from mops_lightning.errors import UserError
 
-COPC = "copc"
-"""The user of the records that index the points of a COPC file."""
-
-GAP = 2**16
-"""Bytes that are read with their neighbours rather than left out."""
-
-POINTS_PER_BYTE = 1024
-"""Largest number of points per byte of a file, which may be compressed."""
-
-RECORD, EXTENDED_RECORD = 54, 60
-"""Least numbers of bytes of the records before and after the points."""
+DAMAGED = 2**30
+"""Steps between coordinates of neighbours in a file that only damage explains."""
 
 
 def read(path: Path) -> tables.Table:
@@ -38,7 +27,11 @@ def read(path: Path) -> tables.Table:
     Raises:
         UserError: laspy is not installed, or the file is broken.
     """
-    return isolated(_parse, path)
+    file = locate(path)
+    table = file.parse(path, range(file.number))
+    if len(table.points) < file.number:
+        raise ends_early(path, len(table.points))
+    return replace(table, header=file.header)
 
 
 def locate(path: Path) -> CloudFile:
@@ -47,8 +40,10 @@ def locate(path: Path) -> CloudFile:
     Raises:
         UserError: laspy is not installed, or the file is broken.
     """
-    header = isolated(_parse_header, path)
-    return CloudFile(path, header.point_count, partial(isolated, _parse_rows), header)
+    _check_installed(path)
+    header = read_header(path)
+    layout_of(header)  # reports its mistakes now
+    return CloudFile(path, header.number, partial(_parse_rows, _small(header)), header)
 
 
 def locate_area(file: CloudFile, area: Area) -> CloudFile:
@@ -58,148 +53,23 @@ def locate_area(file: CloudFile, area: Area) -> CloudFile:
     Nothing else is read.
 
     Raises:
-        UserError: the file is broken, or lies outside of the box.
+        UserError: the file is broken, or no cell overlaps the area.
     """
-    if file.header is None:
+    header = file.header
+    if header is None or header.copc is None:
         return replace(file, area=area)
-    low, high = np.asarray(file.header.mins), np.asarray(file.header.maxs)
-    if (low > area.high).any() or (high < area.low).any():
-        corners = ",".join(f"{number:.10g}" for number in (*low, *high))
+    cells = isolated(copc.cells, file.path, header, area)
+    if not cells:
+        corners = ",".join(f"{number:.10g}" for corner in header.bounds for number in corner)
         raise BadCloudError(f"--bounds: all points of {file.path} are in {corners}.")
-    if not any(record.user_id == COPC for record in file.header.vlrs):
-        return replace(file, area=area)
-    number = isolated(_count_in_nodes, file.path, area)
-    parse = partial(isolated, partial(_parse_nodes, area))
-    return CloudFile(
-        file.path, number, parse, file.header, replace(area, level=None, resolution=None)
-    )
-
-
-def _parse_header(path: Path) -> Any:
-    _check_records(path)
-    with _laspy(path).open(path) as file:
-        header, size = file.header, path.stat().st_size
-    if header.point_count > POINTS_PER_BYTE * size:
-        raise BadCloudError(
-            f"{path} is broken: {size:,} bytes cannot hold {header.point_count:,} points."
-        )
-    return header
-
-
-def _check_records(path: Path) -> None:
-    """Reject more records than the file can hold: laspy would read as many, for minutes."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(247)
-    records = int.from_bytes(head[100:104], "little")
-    extended = int.from_bytes(head[243:247], "little") if head[25:26] >= b"\x04" else 0
-    if RECORD * records + EXTENDED_RECORD * extended > size:
-        raise BadCloudError(
-            f"{path} is broken: {size:,} bytes cannot hold {records + extended:,} records."
-        )
-
-
-def _parse(path: Path) -> tables.Table:
-    declared = _parse_header(path).point_count
-    with _laspy(path).open(path) as file:
-        table = _table(file.read_points(declared), file.header)
-    if len(table.points) < declared:
-        raise ends_early(path, len(table.points))
-    return table
-
-
-def _parse_rows(path: Path, rows: range) -> tables.Table:
-    """Read a range of rows.
-
-    Raises:
-        BadCloudError: points are far outside of the header's bounds: a damaged LAZ file may give
-            any numbers.
-    """
-    laspy = _laspy(path)
-    with laspy.open(path, read_evlrs=False) as file:
-        header = file.header
-        if not header.are_points_compressed:
-            file.seek(rows.start)
-            return _table_near(path, file.read_points(len(rows)), header)
-        form, record = header.point_format, header.vlrs.get("LasZipVlr")[0].record_data
-    first, total = header.offset_to_point_data, header.point_count
-    points = read_rows(path, first, record, form.size, total, rows)
-    packed = laspy.PackedPointRecord.from_buffer(points, form)
-    cloud = laspy.ScaleAwarePointRecord(packed.array, form, header.scales, header.offsets)
-    return _table_near(path, cloud, header)
-
-
-def _count_in_nodes(path: Path, area: Area) -> int:
-    with _laspy(path).CopcReader.open(path) as reader:
-        return sum(node.point_count for node in _nodes(reader, area))
+    number = sum(cell.number for cell in cells)
+    parse = partial(_parse_cells, _small(header), area)
+    return CloudFile(file.path, number, parse, header, replace(area, level=None, resolution=None))
 
 
 def ranges_of_bytes(path: Path, area: Area) -> list[tuple[int, int]]:
-    """Return where the octree's cells that overlap an area are in a file: starts and ends.
-
-    Cells with little between them are joined: an answer of a server takes as long as ``GAP`` bytes.
-    """
-    joined: list[tuple[int, int]] = []
-    with _laspy(path).CopcReader.open(path) as reader:
-        for node in _nodes(reader, area):
-            start, stop = node.offset, node.offset + node.byte_size
-            if joined and start - joined[-1][1] < GAP:
-                start = joined.pop()[0]
-            joined.append((start, stop))
-    return joined
-
-
-def _parse_nodes(area: Area, path: Path, rows: range) -> tables.Table:
-    """Read a range of the rows of the octree's cells that overlap an area.
-
-    Raises:
-        BadCloudError: see ``_parse_rows``.
-    """
-    with _laspy(path).CopcReader.open(path) as reader:
-        nodes, first = _nodes(reader, area), 0
-        while nodes and first + nodes[0].point_count <= rows.start:
-            first += nodes.pop(0).point_count
-        ends = np.cumsum([node.point_count for node in nodes]) + first
-        read = nodes[: 1 + np.searchsorted(ends, rows.stop)]
-        # The public queries have no limit of memory.
-        points = reader._fetch_and_decompress_points_of_nodes(read)
-        table = _table_near(path, points, reader.header)
-    return table.take(np.arange(len(table.points))[rows.start - first : rows.stop - first])
-
-
-def _nodes(reader: Any, area: Area) -> list[Any]:
-    """Return the cells of a COPC file's octree that overlap an area, in the order of the file."""
-    from laspy.copc import Bounds, load_octree_for_query
-
-    if not reader.root_page.entries:
-        raise ValueError("it ends before its octree")
-    levels, spacing = area.level, reader.copc_info.spacing
-    if area.resolution is not None:  # the distance of points is halved at each level
-        levels = max(0, ceil(log2(spacing) - log2(area.resolution)))
-    box = Bounds(np.array(area.low), np.array(area.high))
-    depth = None if levels is None else range(levels + 1)
-    nodes = load_octree_for_query(reader.source, reader.copc_info, reader.root_page, box, depth)
-    return sorted((n for n in nodes if n.point_count), key=lambda node: node.offset)
-
-
-def _table_near(path: Path, cloud: Any, header: Any) -> tables.Table:
-    """Make a table of points, none of which is far outside of the header's bounds."""
-    table = _table(cloud, None)
-    low, high = np.asarray(header.mins), np.asarray(header.maxs)
-    far = (high - low).max()
-    if far > 0 and ((table.points < low - far) | (table.points > high + far)).any():
-        raise BadCloudError(f"{path} is broken: it has points far outside of its header's bounds.")
-    return table
-
-
-def _table(cloud: Any, header: Any) -> tables.Table:
-    """Make a table of laspy's points; an array of k numbers per point becomes k columns."""
-    points = np.stack([np.asarray(getattr(cloud, axis), np.float64) for axis in "xyz"], 1)
-    names = [name for name in cloud.point_format.dimension_names if name not in "XYZ"]
-    columns: dict[str, tables.Column] = {}
-    for name in names:
-        columns |= split_array(name, np.asarray(cloud[name]))
-    return tables.Table(points, columns, header)
+    """Return where the cells that overlap an area are in a COPC file: starts and ends."""
+    return copc.ranges_of_bytes(path, read_header(path), area)
 
 
 def write(path: Path, table: tables.Table) -> None:
@@ -209,76 +79,75 @@ def write(path: Path, table: tables.Table) -> None:
 
 def write_parts(path: Path, table: tables.TableParts) -> None:
     """Write a LAS or LAZ file part by part."""
-    laspy = _laspy(path)
-    header = _header(laspy, table)
-    dimensions = _add_dimensions(laspy, header, tables.Table(table.corners, table.columns))
-    form = {"header": header, "do_compress": path.suffix.lower() == ".laz", "closefd": False}
-    # Opened here, because laspy leaves its file open when the disk is full.
-    with path.open("wb+") as stream, laspy.open(stream, mode="w", **form) as file:
-        for part in table.parts:
-            points = laspy.ScaleAwarePointRecord.zeros(len(part.points), header=header)
-            points.x, points.y, points.z = part.points.T
-            for name, column in unique_names(part).items():
-                points[dimensions[name]] = column
-            file.write_points(points)
-        if header.evlrs:
-            file.write_evlrs(header.evlrs)
+    _check_installed(path)
+    writer.write_parts(path, table)
 
 
-def _add_dimensions(laspy: Any, header: Any, table: tables.Table) -> dict[str, str]:
-    """Add what a header lacks for a table, and return the dimension of every column."""
-    known = set(header.point_format.dimension_names)
-    dimensions = {}
-    for name, column in unique_names(table).items():
-        if name in known and _holds(laspy, header, name, column):
-            dimensions[name] = name
-            continue
-        kind = np.dtype("u1") if column.dtype.kind == "b" else column.dtype.newbyteorder("=")
-        kind = np.dtype("f4") if kind == np.dtype("f2") else kind
-        dimensions[name] = (f"{name}_" if name in known else name)[:32]
-        header.add_extra_dim(laspy.ExtraBytesParams(name=dimensions[name], type=kind))
-    return dimensions
+def write_copc(path: Path, table: tables.Table) -> None:
+    """Write a COPC file."""
+    write_copc_parts(path, tables.TableParts.whole(table))
 
 
-def _header(laspy: Any, table: tables.TableParts) -> Any:
-    """Return a header like the one of the file that was read.
+def write_copc_parts(path: Path, table: tables.TableParts) -> None:
+    """Write a COPC file part by part."""
+    _check_installed(path)
+    copc_writer.write_copc_parts(path, table)
 
-    Without the index of COPC files, which does not fit other points, and without arrays of numbers,
-    which the table has as columns.
+
+def _small(header: Header) -> Header:
+    """Return a header without the records after the points, which no point needs."""
+    return replace(header, extended=())
+
+
+def _parse_rows(header: Header, path: Path, rows: range) -> tables.Table:
+    """Read a range of rows, or fewer where the file ends."""
+    if header.compressed:
+        packed = isolated(chunks.read_rows, path, header, rows)
+        return _table(path, header, packed)
+    start = header.first + rows.start * header.item
+    packed = np.fromfile(path, np.uint8, len(rows) * header.item, offset=start)
+    return _table(path, header, packed[: len(packed) // header.item * header.item])
+
+
+def _parse_cells(header: Header, area: Area, path: Path, rows: range) -> tables.Table:
+    """Read a range of the rows of the cells that overlap an area."""
+    return _table(path, header, isolated(partial(copc.read_cells, area), path, header, rows))
+
+
+def _table(path: Path, header: Header, packed: chunks.Bytes) -> tables.Table:
+    layout = layout_of(header)
+    rows = packed.view(layout.dtype)
+    if header.compressed:
+        _check_plausible(path, header, rows)
+    return table_of(header, layout, rows)
+
+
+def _check_plausible(path: Path, header: Header, rows: Rows) -> None:
+    """Reject coordinates as damage to compressed points gives them.
+
+    The header's bounds may be wrong, so points outside of them are no damage by themselves.
     """
-    if table.header is None:
-        header = laspy.LasHeader(point_format=3, version="1.2")
-        extent = float(np.ptp(table.corners, axis=0).max())
-        header.offsets = table.corners[0]
-        header.scales = np.full(3, max(extent, 1e-9) / 2**30)
-        return header
-    source = table.header
-    form = deepcopy(source.point_format)
-    header = laspy.LasHeader(point_format=form, version=str(source.version))
-    header.offsets, header.scales = source.offsets, source.scales
-    header.vlrs = [record for record in source.vlrs if record.user_id != COPC]
-    extended = [record for record in source.evlrs or () if record.user_id != COPC]
-    header.evlrs = laspy.vlrs.vlrlist.VLRList(extended)
-    arrays = [d.name for d in source.point_format.extra_dimensions if d.num_elements > 1]
-    header.remove_extra_dims(arrays)
-    return header
+    if not len(rows):
+        return
+    low, high = (np.array(bound) for bound in header.bounds)
+    for place, axis in enumerate("XYZ"):
+        least, most = int(rows[axis].min()), int(rows[axis].max())
+        ends = np.array([least, most]) * header.scales[place] + header.offsets[place]
+        room = (high - low).max()
+        outside = ends[0] < low[place] - room or ends[1] > high[place] + room
+        if outside and most - least > DAMAGED:
+            raise BadCloudError(
+                f"{path} is broken: it has points far outside of its header's bounds."
+            )
 
 
-def _holds(laspy: Any, header: Any, name: str, column: tables.Column) -> bool:
-    """Return whether the type of a dimension of LAS holds the numbers of a column exactly."""
-    points = laspy.ScaleAwarePointRecord.zeros(len(column), header=header)
-    with suppress(OverflowError, TypeError, ValueError), np.errstate(all="ignore"):
-        points[name] = column
-        return np.array_equal(np.asarray(points[name]), column)
-    return False
-
-
-def _laspy(path: Path) -> Any:
-    """Return laspy, or raise an error that says how to install it."""
+def _check_installed(path: Path) -> None:
+    """Raise an error that says how to install laspy where it is missing."""
     try:
         import laspy
+        import lazrs  # noqa: F401
     except ModuleNotFoundError:
         raise UserError(
             f"{path}: LAS and LAZ need laspy: pip install 'mops-lightning[las]'."
         ) from None
-    return laspy
+    assert laspy.point.dims

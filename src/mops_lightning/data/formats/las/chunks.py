@@ -5,6 +5,7 @@ do not have. Here a row is found by the file's table of chunks.
 """
 
 import struct
+from collections.abc import Iterator
 from io import BytesIO
 from itertools import accumulate
 from pathlib import Path
@@ -12,6 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mops_lightning.data.formats.las.header import Header
 
 Bytes = NDArray[np.uint8]
 
@@ -30,74 +33,68 @@ class Chunk(NamedTuple):
     number: int
 
 
-def read_rows(path: Path, first: int, record: bytes, item: int, total: int, rows: range) -> Bytes:
-    """Return the bytes of a range of points, or of fewer where the file has no more.
-
-    Args:
-        path: the file.
-        first: place of the points in the file.
-        record: data of the record that describes the compression.
-        item: bytes of a point.
-        total: number of points.
-        rows: of the points.
-    """
+def read_rows(path: Path, header: Header, rows: range) -> Bytes:
+    """Return the bytes of a range of points, or of fewer where the file has no more."""
     with path.open("rb") as file:
-        chunks = _chunks(file, first, record, total)
+        chunks = _chunks(file, header)
         ends = list(accumulate(chunk.number for chunk in chunks))
         low, high = np.searchsorted(ends, [rows.start, rows.stop - 1], side="right")
         before = ends[low - 1] if low else 0
         wanted = range(rows.start - before, rows.stop - before)
-        return decompress(file, chunks[low : high + 1], record, item, wanted)
+        return decompress(file, header, chunks[low : high + 1], wanted)
 
 
-def decompress(file: Any, chunks: list[Chunk], record: bytes, item: int, rows: range) -> Bytes:
+def decompress(file: Any, header: Header, chunks: list[Chunk], rows: range) -> Bytes:
     """Return the bytes of a range of the points of some chunks, or of fewer if they have fewer.
 
     Args:
         file: open for reading.
+        header: of the file.
         chunks: in the order of their points.
-        record: see ``read_rows``.
-        item: see ``read_rows``.
         rows: counted from the first point of the first chunk.
     """
-    parts = [np.empty(0, np.uint8)]
-    first = 0
+    number = sum(chunk.number for chunk in chunks)
+    rows = range(rows.start, max(min(rows.stop, number), rows.start))
+    points = np.empty(len(rows) * header.item, np.uint8)
+    done, first = 0, 0
     for group in _groups(chunks):
         number = sum(chunk.number for chunk in group)
         low, high = max(rows.start - first, 0), min(rows.stop - first, number)
         if low < high:
-            data = b"".join(_read(file, chunk) for chunk in group)
-            parts.append(_decompress_group(data, group, record, item, range(low, high)))
+            part = _decompress_group(file, header, group, range(low, high))
+            points[done : done + len(part)] = part
+            done += len(part)
         first += number
-    return np.concatenate(parts)
+    return points
 
 
-def _groups(chunks: list[Chunk]) -> list[list[Chunk]]:
+def _groups(chunks: list[Chunk]) -> Iterator[list[Chunk]]:
     """Group chunks that are decompressed together, by several threads."""
-    groups: list[list[Chunk]] = []
-    room = 0
+    group: list[Chunk] = []
+    room = LARGEST
     for chunk in chunks:
-        if chunk.number > room:
-            groups.append([])
-            room = LARGEST
-        groups[-1].append(chunk)
+        if group and chunk.number > room:
+            yield group
+            group, room = [], LARGEST
+        group.append(chunk)
         room -= chunk.number
-    return groups
+    if group:
+        yield group
 
 
-def _decompress_group(
-    data: bytes, chunks: list[Chunk], record: bytes, item: int, rows: range
-) -> Bytes:
+def _decompress_group(file: Any, header: Header, chunks: list[Chunk], rows: range) -> Bytes:
     import lazrs
 
+    item, record = header.item, header.compression
+    data = b"".join(_read(file, chunk) for chunk in chunks)
     table = [(chunk.number, chunk.size) for chunk in chunks]
     number = sum(chunk.number for chunk in chunks)
     if number <= LARGEST:
         points = np.empty(number * item, np.uint8)
         lazrs.decompress_points_with_chunk_table(data, record, points, table)
         return points[rows.start * item : rows.stop * item]
-    stream = BytesIO(struct.pack("<q", 8 + len(data)) + data)  # a LAZ file of one chunk
-    stream.seek(0, 2)
+    stream = BytesIO()  # a LAZ file of one chunk
+    stream.write(struct.pack("<q", 8 + len(data)) + data)
     lazrs.write_chunk_table(stream, table, lazrs.LazVlr(record))
     stream.seek(0)
     decompressor = lazrs.LasZipDecompressor(stream, record)
@@ -117,16 +114,16 @@ def _read(file: Any, chunk: Chunk) -> bytes:
     return data
 
 
-def _chunks(file: Any, first: int, record: bytes, total: int) -> list[Chunk]:
+def _chunks(file: Any, header: Header) -> list[Chunk]:
     """Return the chunks of a file from its table, which does not know how full the last one is."""
     import lazrs
 
-    file.seek(first)
-    table = lazrs.read_chunk_table(file, lazrs.LazVlr(record))
+    file.seek(header.first)
+    table = lazrs.read_chunk_table(file, lazrs.LazVlr(header.compression))
+    left, start = header.number, header.first + 8  # after the place of the table
     chunks = []
-    start = first + 8  # after the place of the table
     for number, size in table:
-        chunks.append(Chunk(start, size, min(number, total)))
+        chunks.append(Chunk(start, size, min(number, left)))
         start += size
-        total -= chunks[-1].number
+        left -= chunks[-1].number
     return chunks

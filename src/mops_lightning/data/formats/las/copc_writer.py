@@ -1,0 +1,121 @@
+"""Writing COPC files: an octree whose cells are chunks of LAZ (https://copc.io, version 1.0)."""
+
+import struct
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mops_lightning.data.formats.las.copc import ENTRY, HIERARCHY, INFO, Key
+from mops_lightning.data.formats.las.header import COPC, EXTENDED_RECORD, Header, Record
+from mops_lightning.data.formats.las.layout import Rows
+from mops_lightning.data.formats.las.octree import GRID, Builder
+from mops_lightning.data.formats.las.packing import plan
+from mops_lightning.data.formats.las.writer import Summary, begin, compression, finish
+from mops_lightning.data.formats.table import TableParts
+
+TOGETHER = 250_000
+"""Points that are compressed together, by several threads."""
+
+
+class Cells:
+    """Compresses cells into chunks, several at a time, and lists where they are."""
+
+    def __init__(self, stream: BinaryIO, record: Record, summary: Summary) -> None:
+        self.stream = stream
+        self.record = record
+        self.summary = summary
+        self.first = stream.tell()
+        stream.write(bytes(8))  # the place of the table of chunks
+        self.waiting: list[tuple[Key, Rows]] = []
+        self.chunks: list[tuple[int, int]] = []
+        self.entries: list[bytes] = []
+
+    def add(self, key: Key, rows: Rows) -> None:
+        """Write a cell, or keep it to write it with others."""
+        if not len(rows):
+            self.entries.append(ENTRY.pack(*key, 0, 0, 0))
+            return
+        self.summary.add(rows)
+        self.waiting.append((key, rows))
+        if sum(len(rows) for _, rows in self.waiting) >= TOGETHER:
+            self._write_waiting()
+
+    def _write_waiting(self) -> None:
+        import lazrs
+
+        buffer = BytesIO()
+        layout = lazrs.LazVlr(self.record.data)
+        compressor = lazrs.ParLasZipCompressor(buffer, layout)
+        compressor.compress_chunks([rows.tobytes() for _, rows in self.waiting])
+        compressor.done()
+        buffer.seek(0)
+        table = lazrs.read_chunk_table(buffer, layout)
+        start = self.stream.tell()
+        for (key, _), (number, size) in zip(self.waiting, table, strict=True):
+            self.entries.append(ENTRY.pack(*key, start, size, number))
+            start += size
+        size = sum(size for _, size in table)
+        self.stream.write(buffer.getbuffer()[8 : 8 + size])
+        self.chunks += table
+        self.waiting.clear()
+
+    def close(self) -> None:
+        """Write what waits, and the table of chunks."""
+        import lazrs
+
+        if self.waiting:
+            self._write_waiting()
+        place = self.stream.tell()
+        table = BytesIO()
+        lazrs.write_chunk_table(table, self.chunks, lazrs.LazVlr(self.record.data))
+        self.stream.write(table.getvalue())
+        self.stream.seek(self.first)
+        self.stream.write(struct.pack("<q", place))
+
+
+def write_copc_parts(path: Path, table: TableParts) -> None:
+    """Write a COPC file; its points need not fit in memory.
+
+    Points of formats 0 to 3 become points of formats 6 and 7, which hold all of their dimensions.
+    """
+    form, parts = plan(path, table, copc=True)
+    header, summary = form.header, Summary(form.layout)
+    record = compression(form.layout, variable=True)
+    low, side = _cube(header, table)
+
+    def with_info(place: int, size: int) -> Header:
+        times = summary.times if place else (0.0, 0.0)
+        info = INFO.pack(*low + side / 2, side / 2, side / GRID, place, size, *times)
+        records = (Record.new(COPC, 1, info, "COPC info VLR"), *header.records, record)
+        return replace(header, records=records)
+
+    with path.open("wb+") as stream:
+        begin(stream, with_info(0, 0), compressed=True)
+        cells = Cells(stream, record, summary)
+        scales, offsets = header.scales, header.offsets
+        builder = Builder(low, side, scales, offsets, cells.add, path.parent)
+        builder.build((form.pack(part) for part in parts), table.number)
+        cells.close()
+        page = b"".join(cells.entries)
+        place = stream.seek(0, 2) + EXTENDED_RECORD.size
+        extended = [Record.new(COPC, HIERARCHY, page, "EPT hierarchy"), *header.extended]
+        final = with_info(place, len(page))
+        finish(stream, final, True, summary, extended)
+        stream.seek(len(final.head))
+        for each in final.records:
+            stream.write(each.to_bytes())
+
+
+def _cube(header: Header, table: TableParts) -> tuple[NDArray[np.float64], float]:
+    """Return the lowest corner and the side of the smallest cube around all points.
+
+    Its lowest corner is that of the header's bounds: some readers, such as copclib 2.6, take that
+    for the corner of the octree.
+    """
+    scales, offsets = np.array(header.scales), np.array(header.offsets)
+    low, high = np.rint((table.corners - offsets) / scales) * scales + offsets
+    return low, max(float((high - low).max()), float(scales.max()))

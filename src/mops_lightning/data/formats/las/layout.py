@@ -1,0 +1,282 @@
+"""The dimensions of a point in a LAS file, and reading and writing them in packed points."""
+
+import struct
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mops_lightning.data.formats.las.header import EXTRA_BYTES, SPEC, Header, Record
+
+Rows = NDArray[np.void]
+"""Packed points, of a ``Layout``'s data type."""
+
+EXTRA = struct.Struct("<2xBB32s4x72x3d3d32s")
+"""An extra dimension in the record: type, options, name, scales, offsets, description."""
+
+TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
+"""Types 1 to 10 of extra dimensions; 11 to 20 are pairs of them, 21 to 30 triples."""
+
+SCALED, SHIFTED = 8, 16
+"""Bits of an extra dimension's options."""
+
+NAME_BYTES = 32
+"""Most bytes of the name of an extra dimension."""
+
+
+@dataclass(frozen=True)
+class Extra:
+    """An extra dimension.
+
+    Attributes:
+        name: as in the file.
+        kind: type of a number, such as ``<u2``.
+        count: how many numbers it has per point.
+        scales: of each number, or None.
+        offsets: of each number, or None.
+    """
+
+    name: str
+    kind: str
+    count: int = 1
+    scales: tuple[float, ...] | None = None
+    offsets: tuple[float, ...] | None = None
+
+    @property
+    def size(self) -> int:
+        """Number of bytes."""
+        return np.dtype(self.kind).itemsize * self.count
+
+    def to_bytes(self) -> bytes:
+        """Return the entry of a plain dimension of one number, or of undocumented bytes."""
+        type_, options = 0, self.count
+        if self.count == 1:
+            type_, options = TYPES.index(self.kind.lstrip("<|")) + 1, 0
+        numbers = (0.0,) * 6
+        return EXTRA.pack(type_, options, self.name.encode(), *numbers, b"")
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """Where a column is in packed points.
+
+    Attributes:
+        field: of the data type.
+        mask: bits of a field; 0: all.
+        element: of an array.
+        scale: value of a step.
+        offset: value of the number 0.
+    """
+
+    field: str
+    mask: int = 0
+    element: int | None = None
+    scale: float | None = None
+    offset: float | None = None
+
+    @property
+    def is_scaled(self) -> bool:
+        """Whether the values are not the numbers in the file."""
+        return self.scale is not None or self.offset is not None
+
+    @property
+    def _shift(self) -> int:
+        return (self.mask & -self.mask).bit_length() - 1
+
+    def _numbers(self, rows: Rows) -> NDArray[Any]:
+        numbers = rows[self.field]
+        return numbers if self.element is None else numbers[:, self.element]
+
+    def get(self, rows: Rows) -> NDArray[Any]:
+        """Return the values ``(N,)``."""
+        numbers = self._numbers(rows)
+        if self.mask:
+            return (numbers & self.mask) >> self._shift
+        if not self.is_scaled:
+            return numbers.copy()
+        scale = 1.0 if self.scale is None else self.scale
+        offset = 0.0 if self.offset is None else self.offset
+        return numbers * scale + offset
+
+    def set(self, rows: Rows, values: NDArray[Any]) -> None:
+        """Write values ``(N,)``, which the dimension can hold."""
+        numbers = self._numbers(rows)
+        if self.mask:
+            bits = (values.astype(numbers.dtype) << self._shift) & self.mask
+            numbers[:] = (numbers & ~np.uint8(self.mask)) | bits
+        elif self.is_scaled:
+            scale = 1.0 if self.scale is None else self.scale
+            offset = 0.0 if self.offset is None else self.offset
+            steps = (values - offset) / scale
+            numbers[:] = np.rint(steps) if numbers.dtype.kind in "iu" else steps
+        else:
+            numbers[:] = values
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The dimensions of a file's points.
+
+    Attributes:
+        format: 0 to 10.
+        extra: the extra dimensions.
+    """
+
+    format: int
+    extra: tuple[Extra, ...] = ()
+
+    @cached_property
+    def standard(self) -> np.dtype[Any]:
+        """The data type of a point without extra dimensions."""
+        import laspy
+
+        kind: np.dtype[Any] = laspy.PointFormat(self.format).dtype()
+        return kind
+
+    @cached_property
+    def dtype(self) -> np.dtype[Any]:
+        """The data type of a point."""
+        kinds: list[Any] = [(name, self.standard[name]) for name in self.standard.names or ()]
+        for place, extra in enumerate(self.extra):
+            shape = () if extra.count == 1 else (extra.count,)
+            kinds.append((f"extra {place}", extra.kind, shape))
+        return np.dtype(kinds)
+
+    @cached_property
+    def dimensions(self) -> dict[str, Dimension]:
+        """Where every column is; an array of k numbers is k columns, ``NAME_0`` to ``NAME_k-1``."""
+        import laspy
+
+        bits = laspy.point.dims.get_sub_fields_dict(self.format)
+        found: dict[str, Dimension] = {}
+        for name in laspy.PointFormat(self.format).dimension_names:
+            if name in bits:
+                field, sub_field = bits[name]
+                found[name] = Dimension(field, sub_field.mask)
+            elif name not in "XYZ":
+                found[name] = Dimension(name)
+        for place, extra in enumerate(self.extra):
+            for element in range(extra.count):
+                name = extra.name if extra.count == 1 else f"{extra.name}_{element}"
+                found[free_name(name, found)] = _extra_dimension(place, extra, element)
+        return found
+
+    @property
+    def arrays(self) -> dict[str, tuple[str, ...]]:
+        """The names of the arrays, and the columns of each."""
+        found: dict[str, list[str]] = {}
+        for name, dimension in self.dimensions.items():
+            if dimension.element is not None:
+                extra = self.extra[int(dimension.field.removeprefix("extra "))]
+                found.setdefault(extra.name, []).append(name)
+        return {name: tuple(columns) for name, columns in found.items()}
+
+    def holds(self, name: str, values: NDArray[Any]) -> bool:
+        """Return whether a dimension holds values ``(any,)`` exactly."""
+        dimension = self.dimensions[name]
+        rows = np.zeros(len(values), self.dtype)
+        floats = values.dtype.kind == "f"
+        with suppress(OverflowError, TypeError, ValueError), np.errstate(all="ignore"):
+            dimension.set(rows, values)
+            return np.array_equal(dimension.get(rows), values, equal_nan=floats)
+        return False
+
+    def with_columns(self, columns: Mapping[str, NDArray[Any]]) -> tuple["Layout", dict[str, str]]:
+        """Add dimensions for columns that the layout lacks, or cannot hold exactly.
+
+        Returns:
+            The layout, and the dimension of every column.
+        """
+        added: list[Extra] = []
+        taken = dict.fromkeys(self.dimensions)
+        names: dict[str, str] = {}
+        for name, values in columns.items():
+            if name in self.dimensions and self.holds(name, values):
+                names[name] = name
+                continue
+            names[name] = free_name(name, taken)
+            taken[names[name]] = None
+            added.append(Extra(names[name], _kind(values)))
+        return Layout(self.format, (*self.extra, *added)), names
+
+
+def _extra_dimension(place: int, extra: Extra, element: int) -> Dimension:
+    scale = None if extra.scales is None else extra.scales[element]
+    offset = None if extra.offsets is None else extra.offsets[element]
+    array_element = None if extra.count == 1 else element
+    return Dimension(f"extra {place}", 0, array_element, scale, offset)
+
+
+def free_name(name: str, taken: Mapping[str, Any]) -> str:
+    """Return a name of at most 32 bytes that is not taken."""
+    tail = ""
+    while True:
+        room = NAME_BYTES - len(tail)
+        free = name.encode()[:room].decode(errors="ignore") + tail
+        if free not in taken:
+            return free
+        tail += "_"
+
+
+def _kind(values: NDArray[Any]) -> str:
+    """Return the type of an extra dimension for values: truth values are u1, float16 float32."""
+    kind = values.dtype.newbyteorder("<")
+    if kind.kind == "b":
+        return "u1"
+    if kind.kind == "f" and kind.itemsize not in (4, 8):
+        return "<f4" if kind.itemsize == 2 else "<f8"
+    return kind.str.replace("|", "")
+
+
+def layout_of(header: Header) -> Layout:
+    """Return the dimensions of a file's points, undocumented extra bytes as an array.
+
+    Raises:
+        ValueError: a point has fewer bytes than its format needs.
+    """
+    left = header.item - Layout(header.format).standard.itemsize
+    if left < 0:
+        raise ValueError(f"a point of format {header.format} does not fit in {header.item} bytes")
+    extra = documented_extra(header)
+    left -= sum(dimension.size for dimension in extra)
+    if left:
+        extra.append(Extra("ExtraBytes", "u1", left))
+    return Layout(header.format, tuple(extra))
+
+
+def is_extra(record: Record) -> bool:
+    """Return whether a record documents extra dimensions, of which a file may have several."""
+    return (record.user, record.number) == (SPEC, EXTRA_BYTES)
+
+
+def documented_extra(header: Header) -> list[Extra]:
+    """Return the extra dimensions that a header documents.
+
+    Where it documents more bytes than a point has, the record is invalid by the specification.
+    """
+    room = header.item - Layout(header.format).standard.itemsize
+    extra = [e for r in header.records if is_extra(r) for e in _documented(r.data)]
+    return extra if sum(dimension.size for dimension in extra) <= room else []
+
+
+def _documented(data: bytes) -> Iterator[Extra]:
+    """Yield the extra dimensions that a record documents, up to one of an unknown type."""
+    for start in range(0, len(data) - EXTRA.size + 1, EXTRA.size):
+        type_, options, name, *numbers, _ = EXTRA.unpack_from(data, start)
+        if type_ > 3 * len(TYPES):
+            return
+        text = name.split(b"\0")[0].decode(errors="replace")
+        if type_ == 0:
+            extra = Extra(text, "u1", options)
+        else:
+            count = 1 + (type_ - 1) // len(TYPES)
+            scales = tuple(numbers[:count]) if options & SCALED else None
+            offsets = tuple(numbers[3 : 3 + count]) if options & SHIFTED else None
+            kind = "<" + TYPES[(type_ - 1) % len(TYPES)]
+            extra = Extra(text, kind, count, scales, offsets)
+        if extra.size:
+            yield extra

@@ -1,0 +1,202 @@
+"""Tables as the packed points of a file to write, and the header of that file."""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import date
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.data.formats.las.columns import LasColumns
+from mops_lightning.data.formats.las.crs import WKT, with_wkt
+from mops_lightning.data.formats.las.header import (
+    COPC,
+    EXTRA_BYTES,
+    HEADER_BYTES,
+    LASZIP,
+    SPEC,
+    Header,
+    Record,
+)
+from mops_lightning.data.formats.las.layout import (
+    Extra,
+    Layout,
+    Rows,
+    documented_extra,
+    is_extra,
+    layout_of,
+)
+from mops_lightning.data.formats.table import Table, TableParts
+
+INSIDE = 1 << 1
+"""Bit of the global encoding: the waveforms are inside of the file."""
+
+WAVEFORM_FORMATS = (4, 5, 9, 10)
+"""Formats whose points refer to waveforms."""
+
+MODERN = {0: 6, 1: 6, 2: 7, 3: 7}
+"""The formats of LAS 1.4 that hold all dimensions of older ones."""
+
+DEGREES = 0.006
+"""Step of the angle in formats 6 to 10; older ones have whole degrees."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a file will be like.
+
+    Attributes:
+        header: with the final records, but without counts, bounds and places.
+        layout: of its points.
+        names: the dimension of every column that is not packed.
+    """
+
+    header: Header
+    layout: Layout
+    names: dict[str, str]
+
+    def pack(self, table: Table) -> Rows:
+        """Return the packed points ``(n,)`` of a part of the table."""
+        rows = np.zeros(len(table.points), self.layout.dtype)
+        packed = table.columns if isinstance(table.columns, LasColumns) else None
+        changes = table.columns if packed is None else packed.changes
+        if packed is not None and packed.layout.format == self.layout.format:
+            size = packed.layout.dtype.itemsize
+            rows.view(np.uint8).reshape(len(rows), -1)[:, :size] = (
+                np.ascontiguousarray(packed.rows).view(np.uint8).reshape(len(rows), -1)
+            )
+        elif packed is not None:
+            _modernise(packed, rows, self.layout)
+        else:
+            self._set_coordinates(rows, table)
+        for name, column in changes.items():
+            self.layout.dimensions[self.names[name]].set(rows, column)
+        return rows
+
+    def _set_coordinates(self, rows: Rows, table: Table) -> None:
+        """Set the coordinates, and the number of returns, of which a point has one at least."""
+        axes = zip("XYZ", self.header.scales, self.header.offsets, table.points.T, strict=True)
+        for axis, scale, offset, values in axes:
+            rows[axis] = np.rint((values - offset) / scale)
+        for name in ("return_number", "number_of_returns"):
+            self.layout.dimensions[name].set(rows, np.ones(len(rows), np.uint8))
+
+
+def _modernise(packed: LasColumns, rows: Rows, layout: Layout) -> None:
+    """Copy all dimensions of points of formats 0 to 3 to points of formats 6 and 7."""
+    for axis in "XYZ":
+        rows[axis] = packed.rows[axis]
+    for name, dimension in packed.layout.dimensions.items():
+        values = dimension.get(packed.rows)
+        if name == "scan_angle_rank":
+            name, values = "scan_angle", np.rint(values / DEGREES)
+        layout.dimensions[name].set(rows, values)
+
+
+def plan(path: Path, table: TableParts, copc: bool) -> tuple[Plan, Iterator[Table]]:
+    """Return what a file will be like, and the parts of the table.
+
+    Args:
+        path: the file to write.
+        table: its points; a header, if it has one, is of a LAS file.
+        copc: whether the file is COPC.
+
+    Raises:
+        BadCloudError: the file cannot hold the points as they are.
+    """
+    parts = iter(table.parts)
+    first = next(parts)
+    packed = first.columns if isinstance(first.columns, LasColumns) else None
+    columns = table.columns
+    if packed is not None:
+        columns = {name: table.columns[name] for name in packed.changes}
+    if table.header is None:
+        source = _new_header(table, copc)
+    else:
+        source = table.header
+        _check(path, source, copc, packed is not None)
+    layout = layout_of(source)
+    if copc:
+        source, layout = _modern_header(with_wkt(source), layout)
+    layout, names = layout.with_columns(columns)
+    header = _with_records(source, layout)
+    return Plan(header, layout, names), chain([first], parts)
+
+
+def _check(path: Path, header: Header, copc: bool, has_attributes: bool) -> None:
+    """Reject points that a file cannot hold as they are."""
+    if header.waveforms_inside and has_attributes:
+        raise BadCloudError(
+            "OUT: it would lose the waveforms, which are inside of IN. Move them to a .wdp file "
+            "first, write .npz, or give --coordinates-only."
+        )
+    compressed = copc or path.suffix.lower() == ".laz"
+    if compressed and header.format in WAVEFORM_FORMATS:
+        raise BadCloudError(
+            f"OUT: points of format {header.format} refer to waveforms, which lazrs does not "
+            "write so that every reader gets them. Write .las."
+        )
+    if copc and header.minor > 4:
+        raise BadCloudError(
+            "OUT: COPC is LAS 1.4, but IN is LAS 1.5, whose time offset it cannot hold. Write .laz."
+        )
+
+
+def _new_header(table: TableParts, copc: bool) -> Header:
+    """Make the header of a file that does not come from one of LAS: 1.2, or 1.4 for COPC."""
+    minor = 4 if copc else 2
+    size = HEADER_BYTES[minor]
+    form, encoding = (7, WKT) if copc else (3, 0)
+    today = date.today()
+    item = Layout(form).standard.itemsize
+    extent = float(np.ptp(table.corners, axis=0).max())
+    scale = max(extent, 1e-9) / 2**30
+    head = bytearray(size)
+    head[:4] = b"LASF"
+    struct.pack_into("<H", head, 6, encoding)
+    head[24:26] = bytes([1, minor])
+    head[26:31] = b"OTHER"
+    struct.pack_into("<3H", head, 90, today.timetuple().tm_yday, today.year, size)
+    struct.pack_into("<BH", head, 104, form, item)
+    struct.pack_into("<3d", head, 131, *[scale] * 3)
+    struct.pack_into("<3d", head, 155, *table.corners[0])
+    return Header(bytes(head))
+
+
+def _modern_header(header: Header, layout: Layout) -> tuple[Header, Layout]:
+    """Return a header of LAS 1.4 and a layout of format 6, 7 or 8."""
+    if header.format in (6, 7, 8):
+        return header, layout
+    head = bytearray(header.head[:227])
+    head += bytes(HEADER_BYTES[4] - len(head))
+    head[25] = 4
+    form = MODERN[header.format]
+    struct.pack_into("<H", head, 94, len(head))
+    layout = Layout(form, layout.extra)
+    struct.pack_into("<BH", head, 104, form, layout.dtype.itemsize)
+    return replace(header, head=bytes(head)), layout
+
+
+def _with_records(header: Header, layout: Layout) -> Header:
+    """Return a header for a layout, without the records of a compression and an octree."""
+    left_out = {("laszip encoded", LASZIP), (COPC, 1)}
+    records = [r for r in header.records if (r.user, r.number) not in left_out]
+    if layout.extra != layout_of(header).extra:
+        records = _with_extra(records, documented_extra(header), layout)
+    head = bytearray(header.head)
+    struct.pack_into("<BH", head, 104, layout.format, layout.dtype.itemsize)
+    if header.waveforms_inside:  # the points that are written do not refer to them
+        struct.pack_into("<H", head, 6, header.encoding & ~INSIDE)
+        struct.pack_into("<Q", head, 227, 0)
+    return replace(header, head=bytes(head), records=tuple(records))
+
+
+def _with_extra(records: list[Record], documented: list[Extra], layout: Layout) -> list[Record]:
+    """Document the extra dimensions of a layout behind those that records document."""
+    others = [record for record in records if not is_extra(record)]
+    old = [record for record in records if is_extra(record)] if documented else []
+    data = b"".join(extra.to_bytes() for extra in layout.extra[len(documented) :])
+    return [*others, *old, Record.new(SPEC, EXTRA_BYTES, data, "Extra Bytes Record")]

@@ -1,0 +1,174 @@
+"""Writing LAS and LAZ files."""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+import numpy as np
+
+from mops_lightning.data.formats.las.header import LASZIP, Header, Record
+from mops_lightning.data.formats.las.layout import Layout, Rows
+from mops_lightning.data.formats.las.packing import plan
+from mops_lightning.data.formats.table import TableParts
+
+SOFTWARE = b"mops_lightning"
+
+LEGACY_LIMIT = 2**32
+"""Points that the counts of versions before 1.4 can hold."""
+
+
+class Summary:
+    """What the header says of all points: numbers, bounds, and range of GPS times."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        self.number = 0
+        self.returns = np.zeros(16, np.int64)
+        self.low = np.full(3, np.iinfo(np.int64).max)
+        self.high = np.full(3, np.iinfo(np.int64).min)
+        self.times = (np.inf, -np.inf)
+
+    def add(self, rows: Rows) -> None:
+        """Count points."""
+        self.number += len(rows)
+        returns = self.layout.dimensions["return_number"].get(rows)
+        self.returns += np.bincount(returns, minlength=16)
+        for place, axis in enumerate("XYZ"):
+            self.low[place] = min(self.low[place], rows[axis].min())
+            self.high[place] = max(self.high[place], rows[axis].max())
+        if "gps_time" in self.layout.dimensions:
+            times = rows["gps_time"]
+            low, high = self.times
+            self.times = min(low, float(times.min())), max(high, float(times.max()))
+
+    def fill(self, head: bytearray) -> None:
+        """Write the numbers, bounds and times into a header."""
+        minor, form = head[25], head[104] & 0x7F
+        legacy = minor < 4 or (minor == 4 and form < 6 and self.number < LEGACY_LIMIT)
+        counts = [self.number, *self.returns[1:6]] if legacy else [0] * 6
+        struct.pack_into("<6I", head, 107, *counts)
+        if minor >= 4:
+            struct.pack_into("<16Q", head, 247, self.number, *self.returns[1:])
+        for place in range(3):
+            (scale,) = struct.unpack_from("<d", head, 131 + 8 * place)
+            (offset,) = struct.unpack_from("<d", head, 155 + 8 * place)
+            high_low = self.high[place] * scale + offset, self.low[place] * scale + offset
+            struct.pack_into("<2d", head, 179 + 16 * place, *high_low)
+        if minor >= 5:
+            low, high = self.times
+            struct.pack_into("<2d", head, 375, high, low)
+
+
+class Points(Protocol):
+    """What takes packed points."""
+
+    def write(self, rows: Rows) -> None:
+        """Write points."""
+
+    def close(self) -> None:
+        """Write what follows the points."""
+
+
+class PlainPoints:
+    """Points of a LAS file."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self.stream = stream
+
+    def write(self, rows: Rows) -> None:
+        """Write points."""
+        self.stream.write(rows.tobytes())
+
+    def close(self) -> None:
+        """Nothing follows the points."""
+
+
+class CompressedPoints:
+    """Points of a LAZ file, compressed by several threads."""
+
+    def __init__(self, stream: BinaryIO, record: Record) -> None:
+        import lazrs
+
+        self.compressor = lazrs.ParLasZipCompressor(stream, lazrs.LazVlr(record.data))
+
+    def write(self, rows: Rows) -> None:
+        """Write points."""
+        self.compressor.compress_many(np.frombuffer(rows.tobytes(), np.uint8))
+
+    def close(self) -> None:
+        """Write the table of chunks."""
+        self.compressor.done()
+
+
+def compression(layout: Layout, variable: bool = False) -> Record:
+    """Return the record that describes the compression of points.
+
+    Args:
+        layout: of the points.
+        variable: chunks may have any numbers of points.
+    """
+    import lazrs
+
+    extra = layout.dtype.itemsize - layout.standard.itemsize
+    data = lazrs.LazVlr.new_for_compression(layout.format, extra, variable).record_data()
+    return Record.new("laszip encoded", LASZIP, bytes(data), "http://laszip.org")
+
+
+def write_parts(path: Path, table: TableParts) -> None:
+    """Write a LAS or LAZ file part by part."""
+    form, parts = plan(path, table, copc=False)
+    header, summary = form.header, Summary(form.layout)
+    compressed = path.suffix.lower() == ".laz"
+    if compressed:
+        record = compression(form.layout)
+        header = replace(header, records=(*header.records, record))
+    with path.open("wb+") as stream:
+        begin(stream, header, compressed)
+        points: Points = CompressedPoints(stream, record) if compressed else PlainPoints(stream)
+        for part in _filled(form.pack(part) for part in parts):
+            summary.add(part)
+            points.write(part)
+        points.close()
+        finish(stream, header, compressed, summary, list(header.extended))
+
+
+def _filled(parts: Iterator[Rows]) -> Iterator[Rows]:
+    return (part for part in parts if len(part))
+
+
+def begin(stream: BinaryIO, header: Header, compressed: bool) -> None:
+    """Write the header and its records, as far as they are known before the points."""
+    stream.write(_head(header, compressed))
+    for record in header.records:
+        stream.write(record.to_bytes())
+
+
+def finish(
+    stream: BinaryIO,
+    header: Header,
+    compressed: bool,
+    summary: Summary,
+    extended: list[Record],
+) -> None:
+    """Write the records after the points, and the final header."""
+    place = stream.seek(0, 2)
+    for record in extended:
+        stream.write(record.to_bytes(extended=True))
+    head = _head(header, compressed)
+    summary.fill(head)
+    if header.minor >= 4:
+        struct.pack_into("<QI", head, 235, place if extended else 0, len(extended))
+    stream.seek(0)
+    stream.write(head)
+
+
+def _head(header: Header, compressed: bool) -> bytearray:
+    """Return the bytes of a header with the place of the points and the kind of file."""
+    head = bytearray(header.head)
+    head[58:90] = SOFTWARE.ljust(32, b"\0")
+    first = len(head) + sum(len(record.to_bytes()) for record in header.records)
+    struct.pack_into("<2I", head, 96, first, len(header.records))
+    head[104] = (head[104] & 0x7F) | (0x80 if compressed else 0)
+    return head
