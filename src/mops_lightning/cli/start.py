@@ -68,7 +68,7 @@ class RunStart(Callback):
         cfg = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
         try:
             folder = Path(config.hydra.run.dir)
-            given = list(config.hydra.overrides.task)
+            given = overrides.as_typed(config.hydra.overrides.task)
             complete = checked(cfg, given)
             if cfg.evaluate:  # the job gets the settings of the trained run
                 with open_dict(config):
@@ -77,7 +77,7 @@ class RunStart(Callback):
             else:
                 check_effect(cfg, given)
             check_paths(cfg)
-            distributed.check_start(cfg, config.hydra.overrides.hydra)
+            distributed.check_start(cfg, overrides.as_typed(config.hydra.overrides.hydra))
             if not distributed.is_worker_rank(cfg):
                 claim(folder)
         except OmegaConfBaseException as error:

@@ -6,43 +6,26 @@ again with the same command at any time.
 
 import logging
 import math
-import os
-from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.cli.start import line_about_run
 from mops_lightning.config import settings
 from mops_lightning.config.settings import Affects
-from mops_lightning.errors import (
-    USER_ERROR,
-    Interrupted,
-    UserError,
-    as_line,
-    end,
-    one_line,
-    one_line_endings,
-)
+from mops_lightning.errors import Interrupted, UserError, as_line, one_line
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
-
-BEGUN = ".begun"
-"""File in a sweep's folder with the time of its last start."""
 
 MOVING = "moving"
 """Folder of an attempt that is being moved."""
 
 STAYS = (ASIDE, ".hydra", ".lock", "mops_lightning.log")
 """Files that belong to the cell, not to an attempt."""
-
-ELSEWHERE = "left to another process"
-"""State of a cell that another process runs."""
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +48,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
     from mops_lightning.training.run.run import STARTED, checked, claim, run
 
     try:
-        with _lock(folder):
+        with lock(folder):
             (folder / FAILED).unlink(missing_ok=True)
             remove_temporary(folder)
             if (folder / ASIDE / MOVING).is_dir():
@@ -104,7 +87,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
     return math.nan
 
 
-def _lock(folder: Path) -> FileLock:
+def lock(folder: Path) -> FileLock:
     """Return the cell's lock, which raises ``Timeout`` where another process runs the cell.
 
     A killed process releases it.
@@ -183,100 +166,3 @@ def _move_aside(folder: Path) -> None:
         path.rename(moving / path.name)
     numbers = [int(path.name) for path in _attempts(folder)]
     moving.rename(folder / ASIDE / str(max(numbers, default=0) + 1))
-
-
-def _state(cell: Path) -> str:
-    try:
-        with _lock(cell):
-            pass
-    except Timeout:
-        return ELSEWHERE
-    if (cell / FAILED).exists():
-        return "failed"
-    try:
-        return run_record.read(cell).status
-    except UserError:
-        return "not started"
-
-
-def _add_models(cells: list[Path], folder: Path) -> None:
-    """Write the nets that cells trained as models in ``models/`` of the sweep's folder."""
-    from mops_lightning.zoo import publish
-
-    added = publish.add_all(cells, folder, folder / "models")
-    if added:
-        place = folder / "models"
-        print(f"{len(added)} models in {place}; to test one:")
-        print(f"MOPS_MODELS={place} python -m mops_lightning evaluate={added[-1].stem}")
-
-
-class SweepSummary(Callback):
-    """Counts the cells at the end of a sweep and reports them; the exit status is 1 if any failed.
-
-    The report is that of the whole folder, so that earlier starts and the other processes of the
-    same sweep count too.
-
-    Args:
-        mixed: whether the report joins runs that differ in settings which the sweep does not vary
-            for comparison, such as epochs chosen for each size.
-        models: whether the nets that were trained become models with cards, in ``models/`` of the
-            sweep's folder.
-    """
-
-    def __init__(self, mixed: bool = False, models: bool = False) -> None:
-        self.mixed = mixed
-        self.models = models
-
-    def on_multirun_start(self, config: DictConfig, **extra: Any) -> None:
-        """Mark the start, on the clock of the folder's file system."""
-        folder = Path(config.hydra.sweep.dir)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            (folder / BEGUN).touch()
-        except OSError as error:
-            end("mops_lightning", f"out: cannot write to {folder}: {error.strerror}.", USER_ERROR)
-
-    def on_multirun_end(self, config: DictConfig, **extra: Any) -> None:
-        """Count the cells of this start by state, and write the report.
-
-        Raises:
-            SystemExit: with 1 if a cell failed or the report did. Hydra turns any other exception
-                of a callback into a warning, and ends with 0.
-        """
-        folder = Path(os.path.relpath(config.hydra.sweep.dir))
-        try:
-            with one_line_endings("mops_lightning"):
-                states = self._states(folder)
-                self._report(folder, states)
-        except Exception:
-            log.exception("the runs are done, but the end of the sweep failed")
-            raise SystemExit(1) from None
-        found = set(states.values())
-        if found - {"completed", ELSEWHERE} or not found:
-            print(f"To repeat the rest: the same command with hydra.sweep.dir={folder}")
-            raise SystemExit(1)
-
-    def _states(self, folder: Path) -> dict[Path, str]:
-        """Return the states of the cells of this start, and print their numbers."""
-        begun = (folder / BEGUN).stat().st_mtime_ns
-        states: dict[Path, str] = {}
-        # Hydra writes this into every cell that it starts.
-        for path in folder.rglob(".hydra/overrides.yaml"):
-            cell = path.parents[1]
-            if path.stat().st_mtime_ns >= begun:
-                states[cell] = _state(cell)
-        numbers = sorted(Counter(states.values()).items())
-        counts = ", ".join(f"{count} {state}" for state, count in numbers) or "no values to sweep"
-        print(f"{len(states)} cells: {counts}; in {folder}")
-        return states
-
-    def _report(self, folder: Path, states: dict[Path, str]) -> None:
-        """Write the report of all cells below a folder, and the models of this start's cells."""
-        from mops_lightning.report import cli as report
-
-        completed = [cell for cell, state in states.items() if state == "completed"]
-        if completed:
-            options = ["--mixed"] if self.mixed else []
-            report.main([str(folder), *options], "python -m mops_lightning report")
-        if self.models:
-            _add_models(completed, folder)

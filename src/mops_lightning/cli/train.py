@@ -1,6 +1,7 @@
 """Training from the command line: one run, or a sweep, composed by Hydra."""
 
 import argparse
+import math
 import os
 import sys
 import traceback
@@ -9,13 +10,22 @@ from typing import TYPE_CHECKING
 
 from mops_lightning import errors
 from mops_lightning.config.compose import check_overrides, conf_dir, explain
-from mops_lightning.config.overrides import key, readable, with_home, with_own_classes
+from mops_lightning.config.overrides import as_typed, key, readable, with_home, with_own_classes
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 NAME = "mops_lightning"
 """Prefix of error messages."""
+
+ONE_LINE_FROM = ("hydra.", "optuna.")
+"""Packages whose ValueErrors are mistakes, such as flags that exclude each other."""
+
+NO_OPTIMISERS = (
+    "hydra._internal.core_plugins.basic_sweeper.BasicSweeper",
+    "hydra_plugins.grid_sweeper.GridSweeper",
+)
+"""Sweepers that do not read scores, and end at the first exception of a job."""
 
 
 def main() -> None:
@@ -57,9 +67,9 @@ def _run() -> None:
         if isinstance(error, of_hydra):
             errors.end(NAME, explain(error, sys.argv[1:]), errors.USER_ERROR)
         *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-        if type(error) is ValueError and frame.f_globals["__name__"].startswith("hydra."):
-            message = " ".join(str(error).split())  # flags that exclude each other
-            errors.end(NAME, message, errors.USER_ERROR)
+        raised_in = frame.f_globals["__name__"]
+        if type(error) is ValueError and raised_in.startswith(ONE_LINE_FROM):
+            errors.end(NAME, " ".join(str(error).split()), errors.USER_ERROR)
         errors.end_in_one_line(NAME, error)
 
 
@@ -96,6 +106,10 @@ def flags_first(arguments: list[str]) -> list[str]:
     flags = list(arguments)
     for setting in read.overrides:
         flags.remove(setting)
+    if read.package and not read.cfg:
+        raise errors.UserError(
+            f"--package {read.package}: chooses what --cfg shows. Add --cfg job, or leave it out."
+        )
     if flags[-1:] in (["-i"], ["--info"]):  # a setting behind it would be taken for its value
         flags[-1] = "--info=all"
     return [*flags, *read.overrides]
@@ -120,13 +134,15 @@ def _job(cfg: "DictConfig") -> float | None:
     hydra_cfg = HydraConfig.get()
     swept = hydra_cfg.mode == RunMode.MULTIRUN
     folder = Path(os.path.relpath(hydra_cfg.runtime.output_dir))
-    overrides = list(hydra_cfg.overrides.task)
+    overrides = as_typed(hydra_cfg.overrides.task)
+    score: float | None = None
     with errors.quiet_on_closed_pipe():
         try:
             if swept:
                 distributed.check_multirun(cfg)
-                return run_cell(cfg, folder, overrides)
-            return run(cfg, folder, overrides, claimed=True).score
+                score = run_cell(cfg, folder, overrides)
+            else:
+                score = run(cfg, folder, overrides, claimed=True).score
         except BrokenPipeError:
             raise
         except errors.Interrupted as stop:
@@ -141,3 +157,16 @@ def _job(cfg: "DictConfig") -> float | None:
             if line is None:
                 raise
             errors.end(NAME, line, errors.USER_ERROR)
+    if swept and hydra_cfg.sweeper._target_ not in NO_OPTIMISERS:
+        _check_score(score, folder)
+    return score
+
+
+def _check_score(score: float | None, folder: Path) -> None:
+    """Tell an optimising sweeper that a trial has failed: by an exception, for it records no NaN.
+
+    Raises:
+        UserError: there is no score.
+    """
+    if score is None or math.isnan(score):
+        raise errors.UserError(f"{folder} has no score; its log and result.json say why.")

@@ -11,20 +11,26 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException, ValidationError
+from omegaconf.errors import (
+    InterpolationResolutionError,
+    OmegaConfBaseException,
+    ValidationError,
+)
 from yaml import MarkedYAMLError, YAMLError  # type: ignore[import-untyped]
 
 from mops_lightning.config import settings
 from mops_lightning.config.build import signature
 from mops_lightning.config.overrides import key as key_of
 from mops_lightning.config.overrides import parse_override, with_own_classes
-from mops_lightning.config.validate import refusal
+from mops_lightning.config.validate import AUGMENTATION, refusal
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.records.run_record import dotted
 
 NAMED = {name: name for name in ("task", "dataset", "sampler", "recipe")}
 NAMED |= {"net": "task/net", "stages": "sampler@task.net.sampler"}
 """The groups whose choices are in ``names``, by name."""
+AUGMENTED = ("augment.task", "augment.sampler")
+"""Settings of the class ``AUGMENTATION``, which may be null."""
 OTHERWISE = {
     "logger": " (logger=none for none)",
     "callbacks": " or leave single callbacks out with callbacks.NAME=null",
@@ -143,6 +149,8 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
     while cause is not None:
         if isinstance(cause, ValidationError) and cause.full_key:
             return str(refusal(cause.full_key, cause.value))
+        if isinstance(cause, InterpolationResolutionError) and cause.full_key:
+            return f"{cause.full_key}: {str(cause).splitlines()[0]}."
         if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
             if not cause.options:
                 return f"no file {cause.missing_cfg_file} in --config-dir."
@@ -197,7 +205,7 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
         return f"{key}: no such group of choices.{did_you_mean(key, offered)}"
     cfg = _composed(groups, arguments)
     node, _, name = key.rpartition(".")
-    target = OmegaConf.select(cfg, f"{node}._target_")
+    target = AUGMENTATION if node in AUGMENTED else OmegaConf.select(cfg, f"{node}._target_")
     with suppress(UserError):  # the class of a user's own file may not be importable
         if target and name in signature(str(target), node):
             return f"{key}: {target} accepts it, but no file sets it. Write +{key}=..."

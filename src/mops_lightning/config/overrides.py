@@ -2,7 +2,9 @@
 
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import OmegaConf
 
 from mops_lightning.errors import UserError
 
@@ -14,6 +16,7 @@ FOLDERS = ("out", "hydra.run.dir", "hydra.sweep.dir")
 if TYPE_CHECKING:
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.core.override_parser.types import Override
+    from omegaconf import ListConfig
 
 
 def parse_override(argument: str) -> "Override | None":
@@ -81,6 +84,17 @@ def with_home(argument: str) -> str:
         raise UserError(
             f"{argument}: no user has this name. For a folder, write ./{value}"
         ) from None
+
+
+def as_typed(arguments: "ListConfig") -> list[str]:
+    """Return a list of overrides with their interpolations as the user typed them.
+
+    Args:
+        arguments: of ``hydra.overrides``, where OmegaConf would resolve them among Hydra's own
+            settings.
+    """
+    plain: Any = OmegaConf.to_container(arguments, resolve=False)
+    return list(plain)
 
 
 def quote(text: str) -> str:

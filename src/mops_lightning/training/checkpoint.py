@@ -4,7 +4,7 @@ import hashlib
 import io
 import json
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,9 @@ from mops_lightning.zoo import model_file, weights
 CHECKPOINT = "last.ckpt"
 CHECKPOINT_KEY = "mops_lightning"
 """Key of the run's identity in a checkpoint."""
+
+ENDING = "mops_lightning_ending"
+"""Key of what a checkpoint knows of the end of its training."""
 
 LENGTH = "trainer.max_epochs"
 """The planned length of a run."""
@@ -64,12 +67,16 @@ class Checkpoint:
         identity: of the run that wrote it; see ``checkpoint_identity``.
         planned: epochs for which this run was planned.
         done: epochs that it had trained.
+        steps: optimizer steps that it had trained.
+        ending: whether something ended its training before ``planned``.
     """
 
     path: Path
     identity: dict[str, str]
     planned: int
     done: int
+    steps: int
+    ending: "Ending"
 
     @classmethod
     def read(cls, path: Path) -> "Checkpoint":
@@ -80,8 +87,37 @@ class Checkpoint:
         """
         content = read_sealed(path)
         written_by = content[CHECKPOINT_KEY]
-        done = content["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"]
-        return cls(path, written_by, int(json.loads(written_by[LENGTH])), int(done))
+        progress = content["loops"]["fit_loop"]["epoch_progress"]["current"]
+        return cls(
+            path,
+            identity=written_by,
+            planned=int(json.loads(written_by[LENGTH])),
+            done=int(progress["processed"]),
+            steps=int(content["global_step"]),
+            ending=Ending.of(content),
+        )
+
+
+@dataclass(frozen=True)
+class Ending:
+    """What a checkpoint knows of the end of its training.
+
+    Attributes:
+        should_stop: whether a callback or a limit had told the trainer to stop.
+        validation: metrics of the last validation by name; empty before the first one.
+    """
+
+    should_stop: bool = False
+    validation: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, content: dict[str, Any]) -> "Ending":
+        """Read it from the content of a checkpoint; one of another program says nothing."""
+        return cls(**content.get(ENDING, {}))
+
+    def plain(self) -> dict[str, Any]:
+        """Return it as plain data for a checkpoint."""
+        return asdict(self)
 
 
 def find_checkpoint(name: str, out: Path, identity: dict[str, str]) -> Checkpoint:

@@ -147,14 +147,16 @@ def command_line(arguments: list[str]) -> list[str]:
         return arguments
     path = Path(name).expanduser()
     trained = TrainedRun.read(str(path) if path.exists() else name)
-    _check_given(arguments, trained)
-    rest = [argument for argument in arguments if argument not in named]
-    paths = [overrides.path(argument) for argument in rest]
     learn = "task" if trained.trained_task_net else "nothing"
     run = f"{KEY}={overrides.quote(trained.name)}"
+    of_evaluation = [*trained.choices(), f"learn={learn}", f"weights={OF_RUN}", run]
+    # The processes of one run are started with what has been added here.
+    rest = [one for one in arguments if one not in named and one not in of_evaluation]
+    _check_given(rest, trained)
+    paths = [overrides.path(argument) for argument in rest]
     inserted = [
         argument
-        for argument in (*trained.choices(), f"learn={learn}", f"weights={OF_RUN}", run)
+        for argument in of_evaluation
         if not any(_covers(path, overrides.path(argument)) for path in paths)
     ]
     return [*rest, *inserted]

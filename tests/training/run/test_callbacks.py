@@ -47,3 +47,13 @@ def test_early_stopping_ends_the_run_but_not_the_pretraining(tmp_path):
     assert "epoch 2/3" not in out
     (run,) = runs(tmp_path)
     assert not (run / "checkpoints").exists()
+
+
+def test_epoch_lines_show_validation_of_their_own_epoch_only(tmp_path):
+    tiny = [one for one in TINY if "max_epochs" not in one]
+    every = ["trainer.max_epochs=4", "val_fraction=0.25", "+trainer.check_val_every_n_epoch=2"]
+
+    out = done([*tiny, *every, "weights=null"], tmp_path)
+
+    lines = [line for line in out.splitlines() if line.startswith("epoch ")]
+    assert ["val/generated/accuracy" in line for line in lines] == [False, True, False, True]

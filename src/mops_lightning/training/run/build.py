@@ -22,7 +22,7 @@ from typing import Any
 
 import lightning as L
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import Tensor, nn
 
 from mops_lightning.config import distributed
@@ -39,6 +39,7 @@ from mops_lightning.training import checkpoint
 from mops_lightning.training.evaluation import OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
+from mops_lightning.training.run.optimizers import OptimizerMakers, check_optimizers
 from mops_lightning.training.run.other_nets import other_tasks
 from mops_lightning.training.run.trainer import make_trainer
 
@@ -128,7 +129,7 @@ def build_parts(
     record.part_names = list(dataset.part_names)
     record.dataset_facts = dataset.notes
     record.resumed_from = None if resumed is None else str(resumed.path)
-    record.lengthened = resumed is not None and cfg.trainer.max_epochs > resumed.planned
+    record.lengthened = resumed is not None and _lengthens(resumed, cfg.trainer.max_epochs)
     train, held_out = split(dataset.train, cfg.val_fraction, cfg.seed)
     experiment = make_experiment(cfg, dataset, identity)
     trainer = make_trainer(cfg, folder, dataset, experiment, len(train.labels))
@@ -147,6 +148,11 @@ def build_parts(
     root = trainer.strategy.root_device
     record.device = torch.cuda.get_device_name(root) if root.type == "cuda" else root.type
     return parts
+
+
+def _lengthens(resumed: checkpoint.Checkpoint, epochs: int) -> bool:
+    """Return whether more epochs are trained than were planned; not after early stopping."""
+    return epochs > resumed.planned and not resumed.ending.should_stop
 
 
 def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, str]) -> Experiment:
@@ -180,13 +186,14 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         _try_baselines(baselines, one.points[:1])
     elif sampler is not None and sampler.flexible:
         sampler = build(cfg.sampler, "sampler", m=max(sizes), **own)
-    make_optimizer, make_schedule = _optimizer_makers(cfg)
+    check_optimizers(cfg)
+    makers = OptimizerMakers.of(cfg.optimizer, "optimizer")
     return Experiment(
         task,
         sampler,
         learn=cfg.learn,
-        make_optimizer=make_optimizer,
-        make_schedule=make_schedule,
+        make_optimizer=makers.optimizer,
+        make_schedule=makers.schedule,
         baselines=baselines,
         seed=cfg.seed,
         identity=identity,
@@ -317,19 +324,3 @@ def _try_baselines(baselines: dict[str, Sampler], points: Tensor) -> None:
             baseline.eval()(points)
         except UserError as error:
             raise UserError(f"baselines.{name}: {error}") from None
-
-
-def _optimizer_makers(cfg: DictConfig) -> tuple[Any, Any]:
-    """Return functions that make the optimizer of parameters and its schedule, if there is one."""
-    settings: Any = OmegaConf.to_container(cfg.optimizer, resolve=True)
-    schedule = settings.pop("schedule", None)
-    makers = {"optimizer": settings, "optimizer.schedule": schedule}
-    make_optimizer, make_schedule = (
-        one and build(OmegaConf.create({**one, "_partial_": True}), where)
-        for where, one in makers.items()
-    )
-    if cfg.learn != "nothing":  # an optimizer of nothing, so that its mistakes end the run here
-        optimizer = make_optimizer([torch.nn.Parameter(torch.zeros(1))])
-        if make_schedule:
-            make_schedule(optimizer, total_steps=2)
-    return make_optimizer, make_schedule

@@ -1,87 +1,19 @@
-"""Lightning callbacks of a run: checkpoints, clean stops, progress."""
+"""Lightning callbacks of a run: checkpoints, CPU time, progress."""
 
-import signal
 import sys
 import time
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import lightning as L
-from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, RichProgressBar
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, RichProgressBar
 from omegaconf import DictConfig
 
 from mops_lightning.config.build import accepted, build_as
-from mops_lightning.errors import Interrupted, UserError
+from mops_lightning.errors import UserError
 
 STANDARD = ("learning_rate", "checkpoint", "progress", "pictures")
 """Names in ``conf/callbacks/default.yaml``. None of them changes the training."""
-
-
-class StopBetweenSteps(Checkpoint):
-    """On the first Ctrl-C or SIGTERM, finish the step, write a checkpoint and stop.
-
-    A signal may arrive inside an optimizer step. The state is consistent between steps only, and
-    only then does resuming give the result of an uninterrupted run. After the last step of an
-    epoch, the epoch's validation is finished first. A second signal stops at once.
-
-    As a ``Checkpoint``, it is called after the callbacks that act at the end of an epoch.
-
-    Args:
-        checkpoint: path to write to.
-    """
-
-    def __init__(self, checkpoint: Path) -> None:
-        self.checkpoint = checkpoint
-        self.received: int | None = None
-        self.leads = True
-        self._before: dict[int, Any] = {}
-
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Install the signal handlers, after Lightning has set its own."""
-        self.leads = trainer.is_global_zero
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._note)
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.received is not None:
-            raise KeyboardInterrupt("Stopped at once; the last complete checkpoint is kept.")
-        self.received = number
-        if self.leads:
-            print("Stopping after this step (once more: at once) ...", file=sys.stderr, flush=True)
-
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        """Stop if a signal came, all processes of a run after the same optimizer step."""
-        batches = batch_idx + 1
-        stepped = batches % trainer.accumulate_grad_batches == 0
-        if stepped and batches < trainer.num_training_batches:
-            self._stop_if_asked(trainer, save=True)
-
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Stop if a signal came in the last step of the epoch or in its validation."""
-        self._stop_if_asked(trainer, save=True)
-
-    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Restore the signal handlers; stop if a signal came in the last step."""
-        self._restore()
-        self._stop_if_asked(trainer, save=False)
-
-    def _stop_if_asked(self, trainer: L.Trainer, save: bool) -> None:
-        if trainer.strategy.reduce_boolean_decision(self.received is not None, all=False):
-            if save:
-                trainer.save_checkpoint(self.checkpoint)
-            raise Interrupted(f"Resume with the same command and ckpt_path={self.checkpoint}")
-
-    def on_exception(self, trainer: L.Trainer, *args: Any) -> None:
-        """Restore the signal handlers."""
-        self._restore()
-
-    def _restore(self) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-        self._before.clear()
 
 
 class CPUTime(Callback):
@@ -126,19 +58,25 @@ class EpochLines(Callback):
 
     def __init__(self, score: str) -> None:
         self.score = score
+        self.validated = False
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Note that this epoch has a validation: Lightning keeps the values of the last one."""
+        self.validated = not trainer.sanity_checking
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Print the mean loss and the score."""
+        validated = self.validated
+        self.validated = False
         if not trainer.is_global_zero:
             return
-        numbers = {
-            name: float(value)
-            for name, value in trainer.callback_metrics.items()
-            if name == "train/mean_loss"
-            or (name.startswith("val/") and name.endswith(f"/{self.score}"))
-        }
-        shown = "  ".join(f"{name} {value:.4f}" for name, value in numbers.items())
-        print(f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}  {shown}", flush=True)
+        shown = []
+        for name, value in trainer.callback_metrics.items():
+            is_score = name.startswith("val/") and name.endswith(f"/{self.score}")
+            if name == "train/mean_loss" or (is_score and validated):
+                shown.append(f"{name} {float(value):.4f}")
+        epoch = f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
+        print("  ".join([epoch, *shown]), flush=True)
 
 
 def last_checkpoint(checkpoint: Path) -> ModelCheckpoint:

@@ -21,6 +21,8 @@ from mops_lightning.training.checkpoint import Diverged
 from mops_lightning.training.evaluation import TrainedRun, as_trained
 from mops_lightning.training.run import pretrain, stages
 from mops_lightning.training.run.build import Parts, build_parts
+from mops_lightning.training.run.ending import sigterm_as_ctrl_c
+from mops_lightning.training.run.trainer import finish_loggers
 
 STARTED = ".started"
 """Empty file in the folder of a run that has begun."""
@@ -49,7 +51,7 @@ def run(
         cfg = checked(cfg, overrides or [])
         if leads:
             claim(folder)
-    with recorded(cfg, folder, overrides or []) as record:
+    with sigterm_as_ctrl_c(), recorded(cfg, folder, overrides or []) as record:
         with record.timed("data"):
             dataset = _load_data(cfg)
         parts = build_parts(cfg, folder, dataset, record, trained)
@@ -96,6 +98,8 @@ def train_and_test(parts: Parts, record: RunRecord, task_weights: Path | None) -
             f"{error} No weights were saved.{kept} Try a lower learning rate (optimizer.lr) or "
             "other weights of the losses."
         ) from None
+    finally:
+        finish_loggers(parts.trainer)
 
 
 def checked(cfg: DictConfig, overrides: list[str]) -> DictConfig:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import lightning as L
 from omegaconf import OmegaConf
@@ -24,11 +24,13 @@ from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.recipe.warm_start import warm_start_sampler
 from mops_lightning.training.run.build import Parts, augmentation
 from mops_lightning.training.run.callbacks import CPUTime
+from mops_lightning.training.run.ending import KeepsEnding
 from mops_lightning.training.run.other_nets import check_names
 from mops_lightning.training.run.trainer import log_test
 from mops_lightning.viz.figures import CLOUDS
 from mops_lightning.zoo import weights
 
+Kind = TypeVar("Kind")
 OUTPUTS = {
     "checkpoint": "checkpoints/last.ckpt",
     "pictures": "pictures",
@@ -155,15 +157,20 @@ def fit(parts: Parts, record: RunRecord) -> None:
     with _interruptible():
         trainer.fit(experiment, loader, validation, ckpt_path=resumed)
     check_finite(dict(experiment.state_dict()), trainer.global_step, trainer.strategy)
-    callbacks: Any = trainer.callbacks  # type: ignore[attr-defined]
-    clock = next(one for one in callbacks if isinstance(one, CPUTime))
-    record.seconds["fit_cpu"] = round(clock.seconds, 3)
+    record.seconds["fit_cpu"] = round(callback_of(trainer, CPUTime).seconds, 3)
     _note_shortened(trainer, len(loader), record)
-    record.validation = {
-        name: float(value)
-        for name, value in trainer.callback_metrics.items()
-        if name.startswith("val/")
-    }
+    record.validation = dict(callback_of(trainer, KeepsEnding).validation(trainer))
+    if parts.resumed and parts.resumed.steps == trainer.global_step and trainer.is_global_zero:
+        print(
+            f"{parts.resumed.path}: this training had ended after {parts.resumed.done} epochs; "
+            "nothing was added to it."
+        )
+
+
+def callback_of(trainer: L.Trainer, kind: type[Kind]) -> Kind:
+    """Return the trainer's first callback of a class, which it must have."""
+    callbacks: Any = trainer.callbacks  # type: ignore[attr-defined]
+    return next(callback for callback in callbacks if isinstance(callback, kind))
 
 
 def _note_shortened(trainer: L.Trainer, batches: int, record: RunRecord) -> None:

@@ -28,7 +28,8 @@ from mops_lightning.records.run_record import dotted
 from mops_lightning.training.checkpoint import CHECKPOINT, sealed
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.moving_average import MovingAverage
-from mops_lightning.training.run.callbacks import CPUTime, StopBetweenSteps, build_callbacks
+from mops_lightning.training.run.callbacks import CPUTime, build_callbacks
+from mops_lightning.training.run.ending import KeepsEnding, StopBetweenSteps
 
 HARMLESS = (
     ".*does not have many workers.*",  # the data are in memory; workers would only copy them
@@ -107,6 +108,7 @@ def make_trainer(
         *build_callbacks(cfg.callbacks, offered, logged=bool(logger)),
         StopBetweenSteps(folder / "checkpoints" / CHECKPOINT),
         CPUTime(),
+        KeepsEnding(),
     ]
     trainer: L.Trainer = build_as(
         L.Trainer,
@@ -152,6 +154,15 @@ def _logger(node: DictConfig, folder: Path) -> Any:
         own |= {"name": below, "version": ""}  # the progress bar would show a version
     unset = {name: value for name, value in own.items() if name not in node}
     return build_as(Logger, node, "logger", save_dir=str(folder), **unset)
+
+
+def finish_loggers(trainer: L.Trainer) -> None:
+    """End what a logger keeps open for its process: the next run of a sweep would continue it."""
+    for logger in trainer.loggers:
+        if type(logger).__name__ == "WandbLogger":
+            import wandb
+
+            wandb.finish()
 
 
 def _silence_lightning() -> None:

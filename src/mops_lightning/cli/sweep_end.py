@@ -1,0 +1,139 @@
+"""The start and the end of a sweep: its cells are counted, reported, and made into models."""
+
+import os
+import traceback
+from collections import Counter
+from pathlib import Path
+from typing import Any, NoReturn
+
+from filelock import Timeout
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, open_dict
+
+from mops_lightning.cli.sweep import lock
+from mops_lightning.errors import USER_ERROR, UserError, end, line_about
+from mops_lightning.records import run_record
+from mops_lightning.records.run_record import FAILED
+
+BEGUN = ".begun"
+"""File in a sweep's folder with the time of its last start."""
+
+ELSEWHERE = "left to another process"
+"""State of a cell that another process runs."""
+
+SOME_FAILED = 1
+"""Exit status of a sweep that did not complete all its cells, or could not be reported."""
+
+
+def _state(cell: Path) -> str:
+    try:
+        with lock(cell):
+            pass
+    except Timeout:
+        return ELSEWHERE
+    if (cell / FAILED).exists():
+        return "failed"
+    try:
+        return run_record.read(cell).status
+    except UserError:
+        return "not started"
+
+
+def _add_models(cells: list[Path], folder: Path) -> None:
+    """Write the nets that cells trained as models in ``models/`` of the sweep's folder."""
+    from mops_lightning.zoo import publish
+
+    added = publish.add_all(cells, folder, folder / "models")
+    if added:
+        place = folder / "models"
+        print(f"{len(added)} models in {place}; to test one:")
+        print(f"MOPS_MODELS={place} python -m mops_lightning evaluate={added[-1].stem}")
+
+
+class SweepSummary(Callback):
+    """Counts the cells at the end of a sweep and reports them; the exit status is 1 if any failed.
+
+    The report is that of the whole folder, so that earlier starts and the other processes of the
+    same sweep count too.
+
+    Args:
+        mixed: whether the report joins runs that differ in settings which the sweep does not vary
+            for comparison, such as epochs chosen for each size.
+        models: whether the nets that were trained become models with cards, in ``models/`` of the
+            sweep's folder.
+    """
+
+    def __init__(self, mixed: bool = False, models: bool = False) -> None:
+        self.mixed = mixed
+        self.models = models
+
+    def on_multirun_start(self, config: DictConfig, **extra: Any) -> None:
+        """Mark the start, on the clock of the folder's file system."""
+        folder = Path(config.hydra.sweep.dir)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / BEGUN).touch()
+        except OSError as error:
+            end("mops_lightning", f"out: cannot write to {folder}: {error.strerror}.", USER_ERROR)
+        _let_search_go_on(config)
+
+    def on_multirun_end(self, config: DictConfig, **extra: Any) -> None:
+        """Count the cells of this start by state, and write the report.
+
+        Raises:
+            SystemExit: a cell has failed, or the end itself; Hydra passes over other exceptions.
+        """
+        folder = Path(os.path.relpath(config.hydra.sweep.dir))
+        try:
+            complete = self._end(folder)
+        except Exception as error:
+            _end_in_error(error, folder)
+        if not complete:
+            print(f"To repeat the rest: the same command with hydra.sweep.dir={folder}")
+            raise SystemExit(SOME_FAILED)
+
+    def _end(self, folder: Path) -> bool:
+        """Count, report, make models; return whether every cell that was started is complete."""
+        from mops_lightning.report import cli as report
+
+        begun = (folder / BEGUN).stat().st_mtime_ns
+        states: dict[Path, str] = {}
+        # Hydra writes this into every cell that it starts.
+        for path in folder.rglob(".hydra/overrides.yaml"):
+            cell = path.parents[1]
+            if path.stat().st_mtime_ns >= begun:
+                states[cell] = _state(cell)
+        found = set(states.values())
+        numbers = sorted(Counter(states.values()).items())
+        counts = ", ".join(f"{count} {state}" for state, count in numbers) or "no values to sweep"
+        print(f"{len(states)} cells: {counts}; in {folder}")
+        if "completed" in found:
+            options = ["--mixed"] if self.mixed else []
+            report.main([str(folder), *options], "python -m mops_lightning report")
+        if self.models:
+            _add_models([cell for cell, state in states.items() if state == "completed"], folder)
+        return bool(found) and found <= {"completed", ELSEWHERE}
+
+
+def _let_search_go_on(config: DictConfig) -> None:
+    """Let a search by Optuna survive failed trials, unless its user limits their share."""
+    sweeper = config.hydra.sweeper
+    limit = "hydra.sweeper.max_failure_rate"
+    given = any(str(one).startswith(limit) for one in config.hydra.overrides.hydra)
+    if "max_failure_rate" in sweeper and not given:
+        with open_dict(sweeper):
+            sweeper.max_failure_rate = 1.0
+
+
+def _end_in_error(error: Exception, folder: Path) -> NoReturn:
+    """Say what failed at the end of a sweep, whose records are complete all the same.
+
+    Raises:
+        SystemExit: always.
+    """
+    line = line_about(error)
+    if line is None:
+        traceback.print_exception(error)
+        line = f"{type(error).__name__}: {error}"
+    again = f"python -m mops_lightning report {folder} repeats the report."
+    end("mops_lightning", f"the report on {folder} failed: {line} {again}", SOME_FAILED)

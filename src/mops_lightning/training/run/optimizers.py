@@ -1,0 +1,66 @@
+"""Functions that make an optimizer and its schedule, tried before anything is trained."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from mops_lightning.config.build import build
+
+
+@dataclass(frozen=True)
+class OptimizerMakers:
+    """How a node of settings makes an optimizer.
+
+    Attributes:
+        optimizer: from parameters or their groups to the optimizer.
+        schedule: from (optimizer, total_steps) to its schedule; None: the rate is constant.
+    """
+
+    optimizer: Callable[..., Optimizer]
+    schedule: Callable[..., LRScheduler] | None
+
+    @classmethod
+    def of(cls, node: DictConfig, where: str) -> "OptimizerMakers":
+        """Return the makers that a node describes.
+
+        Args:
+            node: an optimizer's class and arguments, with those of its schedule in ``schedule``.
+            where: the node's place in the configuration, for errors.
+        """
+        arguments: Any = OmegaConf.to_container(node, resolve=True)
+        of_schedule = arguments.pop("schedule", None)
+        optimizer = _maker(arguments, where)
+        schedule = _maker(of_schedule, f"{where}.schedule") if of_schedule else None
+        return cls(optimizer, schedule)
+
+    def check(self) -> None:
+        """Make an optimizer of one parameter, so that mistakes end the run before any training.
+
+        Raises:
+            UserError: an argument is wrong.
+        """
+        optimizer = self.optimizer([torch.nn.Parameter(torch.zeros(1))])
+        if self.schedule is not None:
+            self.schedule(optimizer, total_steps=2)
+
+
+def _maker(arguments: dict[str, Any], where: str) -> Callable[..., Any]:
+    maker: Callable[..., Any] = build(OmegaConf.create({**arguments, "_partial_": True}), where)
+    return maker
+
+
+def check_optimizers(cfg: DictConfig) -> None:
+    """Check the optimizers that a run may use, also one that the cache of task nets spares it.
+
+    Raises:
+        UserError: an argument of ``optimizer`` or ``pretrain`` is wrong.
+    """
+    if cfg.learn != "nothing":
+        OptimizerMakers.of(cfg.optimizer, "optimizer").check()
+    if cfg.learn != "task" and cfg.weights == "auto":
+        OptimizerMakers.of(cfg.pretrain, "pretrain").check()
