@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from tests.support.command_line import TINY, done
+from tests.support.command_line import TINY, call, done
 
 LAUNCHERS = {
     "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "m=4,8"],
@@ -40,3 +40,29 @@ def test_optuna_searches_and_keeps_every_trial(tmp_path):
     alphas = {record["config"]["sampler"]["alpha"] for record in found}
     assert len(alphas) == 2
     assert all(0.1 <= alpha <= 30 for alpha in alphas)
+
+
+def test_optuna_is_told_of_failed_trials_and_searches_on(tmp_path):
+    pytest.importorskip("optuna", reason="the extra 'optuna' is not installed")
+    search = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=4", "hydra.sweeper.n_jobs=1"]
+    choice = ["hydra.sweeper.sampler.seed=1", "optimizer.lr=choice(0.001,1e30)"]
+    settings = [*TINY, "weights=null", "hydra.sweep.dir=trials", "hydra.sweeper.direction=maximize"]
+
+    status, out, err = call(["-m", *search, *choice, *settings], tmp_path)
+
+    assert status == 1, err  # as any sweep with failed cells
+    assert "Best parameters: {'optimizer.lr': 0.001}" in out
+    assert "failed: training diverged" in out
+    assert "Traceback" not in err
+
+
+def test_wandb_has_one_run_for_each_cell(tmp_path, monkeypatch):
+    pytest.importorskip("wandb", reason="the extra 'wandb' is not installed")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    tiny = [one for one in TINY if one != "logger=none"]
+    logger = ["logger=wandb", "logger.offline=true", "hydra.sweep.dir=cells"]
+
+    done(["-m", *tiny, *logger, "weights=null", "sampler.alpha=1,2"], tmp_path)
+
+    found = [len(list((tmp_path / "cells" / cell).glob("wandb/offline-run-*"))) for cell in "01"]
+    assert found == [1, 1]

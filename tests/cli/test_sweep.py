@@ -9,7 +9,9 @@ import pytest
 from filelock import FileLock
 
 from mops_lightning.cli.sweep import run_cell
+from mops_lightning.cli.train import _check_score
 from mops_lightning.config.compose import compose
+from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE, FAILED
@@ -224,3 +226,10 @@ def test_sweep_whose_report_fails_ends_with_an_exit_status(tmp_path, monkeypatch
     status, out, err = call([*sweep, "seed=0,1"], tmp_path)
     assert status == 1
     assert "the end of the sweep failed" in out + err
+
+
+def test_failed_cell_has_no_score_for_a_sweeper_that_optimises():
+    _check_score(0.5, Path("cell"))
+    for score in (None, math.nan):
+        with pytest.raises(UserError, match=r"cell has no score; its log and result\.json say why"):
+            _check_score(score, Path("cell"))

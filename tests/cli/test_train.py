@@ -7,7 +7,15 @@ import pytest
 from mops_lightning.cli.train import flags_first
 from mops_lightning.records import run_record
 from mops_lightning.zoo import weights
-from tests.support.command_line import SMALL_PCRNET, TINY, TINY_WITH_PICTURES, call, done, runs
+from tests.support.command_line import (
+    SMALL_PCRNET,
+    TINY,
+    TINY_WITH_PICTURES,
+    call,
+    done,
+    refused,
+    runs,
+)
 
 
 @pytest.fixture(scope="module")
@@ -131,9 +139,32 @@ def test_registration_trains_jointly_and_is_evaluated_on_other_pairs(tmp_path):
         ("m=8 --info", "--info=all m=8"),
         ("m=8 --info defaults", "--info defaults m=8"),
         ("-m --config-dir sweeps m=8", "-m --config-dir sweeps m=8"),
-        ("m=8 m=8 -p trainer m=8", "-p trainer m=8 m=8 m=8"),
+        ("m=8 m=8 -p trainer m=8 -c job", "-p trainer -c job m=8 m=8 m=8"),
         ("", ""),
     ],
 )
 def test_flags_first_any_order_keeps_all_arguments(given, ordered):
     assert flags_first(given.split()) == ordered.split()
+
+
+def test_package_without_cfg_is_refused_and_trains_nothing(tmp_path):
+    err = refused(["--package", "x"], tmp_path)
+    assert "--package x: chooses what --cfg shows. Add --cfg job, or leave it out." in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_interpolation_of_an_unknown_setting_is_named_by_its_own(tmp_path):
+    err = refused(["sampler.overlap=${nope}"], tmp_path)
+    assert "sampler.overlap: Interpolation key 'nope' not found." in err
+
+
+def test_augmentation_that_no_file_sets_gets_a_hint(tmp_path):
+    err = refused(["augment.sampler.rotate_up=z"], tmp_path)
+    assert "no file sets it. Write +augment.sampler.rotate_up=..." in err
+
+
+def test_override_with_interpolation_is_recorded_as_typed(tmp_path):
+    arguments = [*TINY, "sampler=fps", "weights=null", "test_noise_std=${sampler.m}"]
+    done(arguments, tmp_path)
+    (run,) = runs(tmp_path)
+    assert run_record.read(run).overrides == arguments

@@ -69,3 +69,18 @@ def test_two_processes_equal_one_and_rank_zero_writes(tmp_path):
     # Those that follow have a log of their own and nothing else.
     less, more = ({path.name for path in (tmp_path / run).iterdir()} for run in ("one", "two"))
     assert more - less == {"train_ddp_process_1.log"}
+
+
+def test_evaluation_by_two_processes_equals_that_by_one(tmp_path):
+    done([*TINY, "weights=null", "sampler=mops", "hydra.run.dir=trained"], tmp_path)
+    again = ["evaluate=trained", "pictures=0", "logger=none"]
+    two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "hydra.run.dir=two"]
+
+    status, _, err = call_anew([*again, *two], tmp_path)
+
+    assert status == 0, err
+    trained, tested = (
+        json.loads((tmp_path / name / "result.json").read_text()) for name in ("trained", "two")
+    )
+    assert (tested["status"], tested["processes"]) == ("completed", 2)
+    assert tested["metrics"] == pytest.approx(trained["metrics"], rel=1e-5, abs=1e-6)

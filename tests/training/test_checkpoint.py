@@ -25,7 +25,7 @@ from mops_lightning.training.muon import MuonAdam
 from mops_lightning.training.recipe.moving_average import MovingAverage
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.run.callbacks import last_checkpoint
-from mops_lightning.training.run.ending import StopBetweenSteps
+from mops_lightning.training.run.ending import StopWithCheckpoint
 from mops_lightning.training.run.trainer import AtomicCheckpointIO
 from mops_lightning.training.schedules import one_cycle
 from tests.support.training import quiet_trainer, small_dataset
@@ -124,7 +124,7 @@ def attempt(setting: Setting, path: Path, *callbacks: Callback) -> Any:
         recipe=recipe if fast else None,
     )
     average = [MovingAverage(0.3)] if fast else []
-    callbacks = (*average, *callbacks, last_checkpoint(path), StopBetweenSteps(path))
+    callbacks = (*average, *callbacks, last_checkpoint(path), StopWithCheckpoint(path))
     trainer = quiet_trainer(
         EPOCHS,
         callbacks=list(callbacks),

@@ -2,8 +2,6 @@
 
 import sys
 import traceback
-from collections.abc import Callable
-from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +10,8 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+from mops_lightning.cli.effect import check_effect
 from mops_lightning.config import distributed, overrides, settings
-from mops_lightning.config.build import accepted, build
 from mops_lightning.config.compose import explain
 from mops_lightning.errors import USER_ERROR, UserError, end, end_in_one_line, line_about, one_line
 from mops_lightning.zoo import names
@@ -33,22 +31,6 @@ MISSING = {
     "pretrain_from": "no file {}. Give a weights file, a run or a model.",
 }
 """Errors of inputs that nothing else checks before a run begins."""
-NEEDS = {
-    "sampler.anchor_width": "sampler.anchors",
-    "sampler.num_sizes": "sampler.size_sampling=nested",
-    "dataset.gap": "dataset.test_frames",
-    "recipe.all_points_from": "recipe.train_points",
-    "trainer.gradient_clip_algorithm": "trainer.gradient_clip_val",
-    "recipe.distillation": "learn=sampler",
-    "recipe.feature_distillation": "learn=sampler",
-    "recipe.nets_per_step": "learn=sampler",
-}
-"""Settings without effect unless another one is set, or has the value behind ``=``."""
-OF_TRAINED = ("recipe.", "optimizer.", "baselines.", "other_nets")
-"""Settings of the training of a sampler, and of what a trained one is compared with."""
-OF_JOINT = ("optimizer.", *(f"recipe.{name}" for name in settings.RECIPE_OF_TASK_NETS))
-"""Those that also serve a task net trained on the points of an index sampler."""
-UNTRAINED = "which is not trained"
 LIGHTNING = ("trainer.", "logger.", "callbacks.")
 """Settings that are arguments of Lightning's classes."""
 
@@ -65,7 +47,8 @@ class RunStart(Callback):
         from mops_lightning.training.run.run import checked, claim
 
         HydraConfig.instance().set_config(config)  # the folder's name is made from it
-        cfg = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+        own = [str(key) for key in config if key != "hydra"]
+        cfg = OmegaConf.masked_copy(config, own)
         try:
             folder = Path(config.hydra.run.dir)
             given = overrides.as_typed(config.hydra.overrides.task)
@@ -86,53 +69,6 @@ class RunStart(Callback):
             end_in_one_line("mops_lightning", error)
 
 
-def check_effect(cfg: DictConfig, given: list[str]) -> None:
-    """Refuse a single run's settings that nothing follows; a sweep's cells may differ.
-
-    Settings of a stage that is not run, such as ``epochs.joint``, are allowed.
-
-    Args:
-        cfg: the run's settings.
-        given: the overrides that it was composed from.
-
-    Raises:
-        UserError: there is one.
-    """
-    is_trained = cache(partial(_is_trained, cfg))  # builds the sampler
-    for argument in given:
-        if reason := _why_without_effect(cfg, overrides.path(argument), is_trained):
-            raise UserError(f"{argument}: has no effect {reason}. Leave it out.")
-
-
-def _why_without_effect(cfg: DictConfig, path: str, is_trained: Callable[[], bool]) -> str:
-    """Return why nothing follows a setting; empty if something may."""
-    setting = settings.of(path)
-    if path in settings.declared() and setting.group:
-        return ""  # a choice may change settings of other groups
-    if not setting.counts(cfg.learn):
-        return f"with learn={cfg.learn}" if setting.learn else "beside task.net.points"
-    name, _, value = NEEDS.get(path, "learn").partition("=")
-    needed = OmegaConf.select(cfg, name)
-    if not needed or (value and needed != value):
-        return f"without {NEEDS[path]}"
-    if path.startswith(("pretrain.", "pretrain_from")) and cfg.weights != "auto":
-        return f"with weights={cfg.weights or 'null'}"
-    trains_task = cfg.learn == "task" or (cfg.learn == "joint" and path.startswith(OF_JOINT))
-    counts = trains_task or path == "recipe.task_points" or not path.startswith(OF_TRAINED)
-    return "" if counts or is_trained() else f"with sampler={cfg.names.sampler}, {UNTRAINED}"
-
-
-def _is_trained(cfg: DictConfig) -> bool:
-    """Return whether the sampler has weights; one that is given the task net has its losses."""
-    from hydra.utils import get_object
-
-    from mops_lightning.samplers.base import Sampler  # imports torch
-
-    if accepted(cfg.sampler, {"net": None}):
-        return get_object(cfg.sampler._target_).losses is not Sampler.losses
-    return bool(getattr(build(cfg.sampler, "sampler"), "learned", True))
-
-
 def line_about_run(error: Exception, given: list[str]) -> str | None:
     """Return one line about an error of a run that the user can mend; None for any other.
 
@@ -143,17 +79,24 @@ def line_about_run(error: Exception, given: list[str]) -> str | None:
         given: the overrides.
     """
     line = line_about(error)
-    frames = list(traceback.walk_tb(error.__traceback__))
-    if line is None and frames[-1][0].f_globals.get("__name__", "").startswith("lightning."):
-        paths = {argument: overrides.path(argument) for argument in given}
-        suspects = [
-            argument
-            for argument, path in paths.items()
-            if path.startswith(LIGHTNING) and path not in settings.INSIDE
-        ]
-        if suspects:
-            return f"{' '.join(suspects)}: not usable in this run: {one_line(error)}"
-    return line
+    if line is not None or not _is_from_lightning(error):
+        return line
+    suspects = [argument for argument in given if _is_for_lightning(overrides.path(argument))]
+    if not suspects:
+        return None
+    return f"{' '.join(suspects)}: not usable in this run: {one_line(error)}"
+
+
+def _is_from_lightning(error: Exception) -> bool:
+    """Return whether an error was raised in Lightning's own code."""
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    return str(frame.f_globals.get("__name__", "")).startswith("lightning.")
+
+
+def _is_for_lightning(path: str) -> bool:
+    """Return whether a setting is an argument of one of Lightning's classes."""
+    is_checked_by_us = path in settings.INSIDE and settings.of(path).limits is not None
+    return path.startswith(LIGHTNING) and not is_checked_by_us
 
 
 def check_paths(cfg: DictConfig) -> None:

@@ -88,12 +88,19 @@ def _known_cause(error: BaseException, node: Any, where: str) -> UserError | Non
             target = node.get("_target_", node)
             return UserError(f"{target} needs a package that is not installed: {cause}")
         if type(cause).__name__ == "MisconfigurationException":
-            # Lightning's word for a trainer that this machine cannot run, such as trainer=gpu.
-            return UserError(f"trainer: {cause} Try trainer=auto or trainer=cpu.")
+            return _refused_by_lightning(cause, where)
         if isinstance(cause, REJECTIONS) and cause.__cause__ is None:
             return _rejected(cause, node, where)
         cause = cause.__cause__
     return None
+
+
+def _refused_by_lightning(cause: BaseException, where: str) -> UserError:
+    """Return Lightning's refusal in one line, such as of a trainer that this machine cannot run."""
+    text = " ".join(str(cause).split())
+    of_machine = any(word in text.lower() for word in ("accelerator", "gpu", "device"))
+    hint = " Try trainer=auto or trainer=cpu." if of_machine else ""
+    return UserError(f"{where}: {text}{hint}")
 
 
 def _rejected(cause: Exception, node: Any, where: str) -> UserError:

@@ -29,6 +29,8 @@ from mops_lightning.records.run_record import dotted
 NAMED = {name: name for name in ("task", "dataset", "sampler", "recipe")}
 NAMED |= {"net": "task/net", "stages": "sampler@task.net.sampler"}
 """The groups whose choices are in ``names``, by name."""
+PRESETS = ("experiment", "debug")
+"""Groups of presets, which are no settings themselves."""
 AUGMENTED = ("augment.task", "augment.sampler")
 """Settings of the class ``AUGMENTATION``, which may be null."""
 OTHERWISE = {
@@ -36,6 +38,7 @@ OTHERWISE = {
     "callbacks": " or leave single callbacks out with callbacks.NAME=null",
     "baselines": " or leave single baselines out with baselines.NAME=null",
     "experiment": " or leave it out",
+    "debug": " or leave it out",
 }
 """Hint for omitting a choice, by group."""
 
@@ -149,7 +152,7 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
     while cause is not None:
         if isinstance(cause, ValidationError) and cause.full_key:
             return str(refusal(cause.full_key, cause.value))
-        if isinstance(cause, InterpolationResolutionError) and cause.full_key:
+        if isinstance(cause, InterpolationResolutionError) and _is_setting(cause.full_key):
             return f"{cause.full_key}: {str(cause).splitlines()[0]}."
         if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
             if not cause.options:
@@ -177,6 +180,11 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
     return " ".join(dict.fromkeys(line.strip() for line in lines if line[0] != " "))
 
 
+def _is_setting(path: str | None) -> bool:
+    """Return whether a path is one of a user's settings; Hydra's own are made from these."""
+    return bool(path) and not str(path).startswith("hydra.")
+
+
 def _groups() -> list[str]:
     """List the groups of choices, such as ``task/net``."""
     root = conf_dir()
@@ -187,7 +195,7 @@ def _groups() -> list[str]:
 def _is_offered(group: str) -> bool:
     """Return whether users choose from a group; of some, other choices choose the file."""
     top = group.partition("/")[0]
-    named = top in settings.declared() or top == "experiment"
+    named = top in settings.declared() or top in PRESETS
     return named and not (conf_dir() / f"{group}.yaml").is_file()
 
 
@@ -277,7 +285,8 @@ def selectable_groups() -> str:
     # configuration files for each group: 0.15 s each time.
     files = ConfigRepository(GlobalHydra.instance().config_loader().get_search_path())
     lines = []
-    for top in (*(name for name, one in settings.declared().items() if one.group), "experiment"):
+    chosen = [name for name, one in settings.declared().items() if one.group]
+    for top in (*chosen, *PRESETS):
         choices = files.get_group_options(top)
         inner = files.get_group_options(top, ObjectType.GROUP)
         groups = [top, *(f"{top}/{name}" for name in inner if name not in choices)]

@@ -16,7 +16,6 @@ FOLDERS = ("out", "hydra.run.dir", "hydra.sweep.dir")
 if TYPE_CHECKING:
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.core.override_parser.types import Override
-    from omegaconf import ListConfig
 
 
 def parse_override(argument: str) -> "Override | None":
@@ -86,7 +85,7 @@ def with_home(argument: str) -> str:
         ) from None
 
 
-def as_typed(arguments: "ListConfig") -> list[str]:
+def as_typed(arguments: Any) -> list[str]:
     """Return a list of overrides with their interpolations as the user typed them.
 
     Args:

@@ -202,6 +202,16 @@ class RunSettings:
         Affects.SCORES,
         nullable=True,
     )
+    tags: Any = setting(
+        None,
+        "[WORD,...]: words that describe the run, for report and TensorBoard",
+        Affects.NOTHING,
+        limits=Limits(
+            "null or a list of words",
+            lambda x: x is None or (type(x) is list and all(type(one) is str for one in x)),
+        ),
+        nullable=True,
+    )
     pictures: int = setting(
         4, "number of test clouds in the pictures; 0 for none", Affects.NOTHING, limits=whole(0)
     )
@@ -252,6 +262,22 @@ SCHEMA: type = RunSettings
 """The declaration in use."""
 
 _NOTHING = {"affects": Affects.NOTHING}
+HOW_IT_RUNS = (
+    "_target_",
+    "accelerator",
+    "barebones",
+    "default_root_dir",
+    "detect_anomaly",
+    "devices",
+    "enable_checkpointing",
+    "enable_model_summary",
+    "enable_progress_bar",
+    "num_nodes",
+    "num_sanity_val_steps",
+    "profiler",
+    "strategy",
+)
+"""Arguments of the trainer that change where a run works and what it shows, not its results."""
 INSIDE: dict[str, dict[str, Any]] = {
     "callbacks.learning_rate": _NOTHING,
     "callbacks.checkpoint": _NOTHING,
@@ -275,8 +301,9 @@ INSIDE: dict[str, dict[str, Any]] = {
     "epochs.joint": {"limits": whole(0)},
     "logger.flush_logs_every_n_steps": {"limits": whole(1)},
     **{f"trainer.{name}": {"limits": limits} for name, limits in TRAINER.items()},
-    **{f"trainer.{name}": _NOTHING for name in ("_target_", "accelerator", "devices")},
-    "trainer.strategy": {**_NOTHING, "limits": TRAINER["strategy"]},
+    **{f"trainer.{name}": _NOTHING for name in HOW_IT_RUNS},
+    "trainer.log_every_n_steps": {**_NOTHING, "limits": TRAINER["log_every_n_steps"]},
+    "trainer.limit_test_batches": {"affects": Affects.SCORES},
 }
 """Settings inside groups: how they differ from their group."""
 

@@ -38,7 +38,10 @@ class PointMaxPool(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, N, channels_in)`` to ``(B, channels_out)`` in the dtype of the weights."""
         # The plain layers are faster for few points, and can be exported for any number of clouds.
-        if torch.compiler.is_exporting() or features.shape[1] <= PLAIN_MAX_POINTS:
+        few = features.shape[1] <= PLAIN_MAX_POINTS
+        # The statistics over all processes of a run are computed by its layer alone.
+        across_processes = isinstance(self.norm, nn.SyncBatchNorm)
+        if torch.compiler.is_exporting() or few or across_processes:
             return self.values(features).amax(1)
         if self.norm is None:
             increasing = torch.zeros_like(self.linear.bias, dtype=torch.bool)

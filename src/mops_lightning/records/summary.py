@@ -26,9 +26,10 @@ def closing_lines(folder: Path, record: RunRecord, console: Console | None = Non
         console: where to print; standard output by default.
     """
     console = console or Console()
-    title, table = results_table(record)
-    console.print(title, soft_wrap=True, highlight=False, style="italic")
-    console.print(table)
+    if record.metrics:  # trainer.limit_test_batches=0 tests nothing
+        title, table = results_table(record)
+        console.print(title, soft_wrap=True, highlight=False, style="italic")
+        console.print(table)
     files = ", ".join([FILE, *sorted(record.files.values())])
     seconds = record.seconds["total"]
     partial = f", but {' and '.join(record.partial)}" if record.partial else ""

@@ -161,7 +161,7 @@ class Experiment(L.LightningModule):
             self.trainer.fit_loop.reset_restart_stage()
         loader: Any = self.trainer.train_dataloader
         if self.distillation is not None:
-            self.distillation.start(loader, self.device)
+            self.distillation.start(loader, self.device, _dtype(self))
         if hasattr(loader, "load_state_dict"):
             begun = self.trainer.fit_loop.epoch_loop.batch_progress.current.ready
             position = begun if begun < len(loader) else 0
@@ -325,3 +325,8 @@ class Experiment(L.LightningModule):
         updated = self.scores.update_sets(points, outputs, self.sampler.nested, prefixes)
         for name, metric in updated.items():
             self.log(f"{stage}{name}", metric, batch_size=len(points), logger=logger)
+
+
+def _dtype(module: nn.Module) -> torch.dtype:
+    """Return the type of a module's weights, which ``trainer.precision=bf16-true`` lowers."""
+    return next((p.dtype for p in module.parameters() if p.is_floating_point()), torch.float32)

@@ -167,3 +167,12 @@ def test_resumed_pretraining_does_not_warn_about_its_folder(tmp_path, capsys, re
     train(tmp_path, "sampler=fps")
     assert capsys.readouterr().out.count("training it first, 1 epoch.") == 2
     assert not [one for one in recwarn if "not empty" in str(one.message)]
+
+
+@pytest.mark.parametrize("mistake", ["+pretrain.betas=7", "pretrain.schedule.warmup=7"])
+def test_wrong_optimizer_of_a_cached_task_net_is_an_error(mistake, tmp_path):
+    train(tmp_path, "learn=task", *SMALL_PCRNET)
+    assert len(files(tmp_path, "cache/weights/*/weights.safetensors")) == 1
+
+    with pytest.raises(UserError, match=r"^pretrain[.:]"):
+        train(tmp_path, *SMALL_PCRNET, "sampler=fps", mistake)

@@ -43,7 +43,7 @@ class Distillation:
         self.predicts = recipe.distillation > 0
         self.table: Tensor | None = None
 
-    def start(self, loader: Any, device: torch.device) -> None:
+    def start(self, loader: Any, device: torch.device, dtype: torch.dtype) -> None:
         """Compute the predictions for all points of every training cloud, if they stay the same.
 
         They do unless clouds are augmented or converted to pairs; then each step computes those of
@@ -52,10 +52,11 @@ class Distillation:
         Args:
             loader: of the training clouds.
             device: where to compute.
+            dtype: of the nets, which ``trainer.precision`` may lower.
         """
         fixed = isinstance(loader, CloudLoader) and loader.keeps_clouds
         if self.predicts and fixed:
-            self.table = full_predictions(self.tasks[0], loader, device)
+            self.table = full_predictions(self.tasks[0], loader, device, dtype)
 
     @torch.no_grad()
     def targets(self, batch: Batch, seen: Tensor) -> Targets:
@@ -117,19 +118,22 @@ def feature_distance(features: Tensor, reference: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def full_predictions(task: Task, loader: CloudLoader, device: torch.device) -> Tensor:
+def full_predictions(
+    task: Task, loader: CloudLoader, device: torch.device, dtype: torch.dtype = torch.float32
+) -> Tensor:
     """Return the predictions for all points of a loader's clouds.
 
     Args:
         task: in evaluation mode, on ``device``.
         loader: of clouds that it does not change.
         device: where to compute.
+        dtype: of the task net.
 
     Returns:
         One row per cloud, in the order of ``Batch.rows``; see ``Task.predict``.
     """
     parts = []
     for batch in CloudLoader(loader.clouds, loader.batch_size):
-        points = batch.points.to(device)
+        points = batch.points.to(device, dtype)
         parts.append(task.predict(batch._replace(points=points), points))
     return torch.cat(parts)

@@ -27,7 +27,9 @@ class MovingAverage(WeightAveraging):
 
         def update(averaged: Any, current: Any, number: Any) -> None:
             if averaged[0].is_floating_point():
-                average(averaged, current, number)
+                # The average keeps 32 bits beside weights in 16 (trainer.precision=bf16-true).
+                alike = [one.to(mean.dtype) for one, mean in zip(current, averaged, strict=True)]
+                average(averaged, alike, number)
             else:  # counters of batches: an average is cut off, also one of equal numbers
                 torch._foreach_copy_(averaged, current)
 

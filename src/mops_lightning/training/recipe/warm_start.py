@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from mops_lightning.config.shortened import shortening
 from mops_lightning.errors import UserError
 from mops_lightning.nets.layers import PointMLP
 from mops_lightning.zoo import names, weights
@@ -49,6 +50,11 @@ def _from_file(name: str, sampler: nn.Module) -> tuple[dict[str, Any], str]:
         raise UserError(
             f"recipe.warm_start: {name} holds a task net. Give the weights file of a sampler, or "
             "true for a start from the task net's first layers."
+        )
+    if reasons := shortening(content["config"]):
+        raise UserError(
+            f"recipe.warm_start: {name} was trained with {' '.join(reasons)}. Give the weights "
+            "file of a whole training."
         )
     copied = copy_tensors(content["state"], sampler)
     if not copied:

@@ -134,9 +134,8 @@ def build_parts(
     experiment = make_experiment(cfg, dataset, identity)
     trainer = make_trainer(cfg, folder, dataset, experiment, len(train.labels))
     parts = Parts(cfg, folder, dataset, train, held_out, experiment, trainer, resumed, trained)
-    distributed.check_shares(
-        cfg.batch_size, record.test_clouds, len(held_out.labels), trainer.world_size
-    )
+    validated = len(held_out.labels) if parts.trains else 0
+    distributed.check_shares(cfg.batch_size, record.test_clouds, validated, trainer.world_size)
     if not parts.has_task_weights and cfg.weights not in (None, "auto", OF_RUN):
         raise UserError(
             f"weights: {cfg.names.net} has no weights to load, got {cfg.weights}. "

@@ -16,20 +16,18 @@ from mops_lightning.errors import Interrupted
 from mops_lightning.training.checkpoint import ENDING, Ending
 
 
-class StopBetweenSteps(Checkpoint):
-    """On the first Ctrl-C or SIGTERM, finish the step, write a checkpoint and stop.
+class StopBetweenSteps(Callback):
+    """On the first Ctrl-C or SIGTERM, finish the step and stop.
 
     A signal may arrive inside an optimizer step. The state is consistent between steps only, and
     only then does resuming give the result of an uninterrupted run. After the last step of an
     epoch, the epoch's validation is finished first. A second signal stops at once.
 
-    As a ``Checkpoint``, it is called after the callbacks that act at the end of an epoch.
-
     Args:
-        checkpoint: path to write to.
+        checkpoint: path of a checkpoint to write first; None: none is written.
     """
 
-    def __init__(self, checkpoint: Path) -> None:
+    def __init__(self, checkpoint: Path | None) -> None:
         self.checkpoint = checkpoint
         self.received: int | None = None
         self.leads = True
@@ -68,6 +66,8 @@ class StopBetweenSteps(Checkpoint):
 
     def _stop_if_asked(self, trainer: L.Trainer, save: bool) -> None:
         if trainer.strategy.reduce_boolean_decision(self.received is not None, all=False):
+            if self.checkpoint is None:
+                raise Interrupted("No checkpoint was written.")
             if save:
                 trainer.save_checkpoint(self.checkpoint)
             raise Interrupted(f"Resume with the same command and ckpt_path={self.checkpoint}")
@@ -80,6 +80,14 @@ class StopBetweenSteps(Checkpoint):
         for number, handler in self._before.items():
             signal.signal(number, handler)
         self._before.clear()
+
+
+class StopWithCheckpoint(StopBetweenSteps, Checkpoint):
+    """Writes a checkpoint before it stops.
+
+    As a ``Checkpoint``, it is called after the callbacks that act at the end of an epoch. Lightning
+    refuses one with ``enable_checkpointing=false``.
+    """
 
 
 class KeepsEnding(Callback):

@@ -58,7 +58,8 @@ class CloudVisualization(Callback):
             return
         training = module.training
         module.eval()
-        batch = move_data_to_device(self.batch, module.device)
+        converted = trainer.precision_plugin.convert_input(self.batch)
+        batch = move_data_to_device(converted, module.device)
         scores = trainer.callback_metrics if folder is not None else None
         figures, samples = self._figures(module, batch, scores)
         module.train(training)

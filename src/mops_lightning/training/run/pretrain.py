@@ -11,9 +11,11 @@ from filelock import AcquireReturnProxy, FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mops_lightning.config import distributed
+from mops_lightning.config.shortened import SHORTENS, shortening
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.filesystem import atomic_write, remove_temporary
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.checkpoint import CHECKPOINT, checkpoint_identity
 from mops_lightning.training.evaluation import OF_RUN
 from mops_lightning.training.run.build import Parts
@@ -24,12 +26,23 @@ from mops_lightning.zoo.weights import FILE
 Train = Callable[[DictConfig, Path, CloudDataset], None]
 """All stages of a run in a folder."""
 
+SHORTENED = "task_net"
+"""Folder below the run's for a task net from a shortened training."""
 
-def task_weights(cfg: DictConfig, dataset: CloudDataset, train: Train) -> Path | None:
+
+def task_weights(
+    cfg: DictConfig, dataset: CloudDataset, run_folder: Path, train: Train
+) -> Path | None:
     """Return the file that ``weights`` names; ``auto`` trains the net when it is not cached.
 
     With ``learn=task``, training starts from the given file; with ``auto`` from
     ``pretrain_from``, if it is set.
+
+    Args:
+        cfg: the run's settings.
+        dataset: to train on.
+        run_folder: where a shortened training leaves its net, which is not cached.
+        train: trains a task net.
 
     Returns:
         None for ``weights=null`` (the net stays as initialised), for a resumed run (its checkpoint
@@ -43,29 +56,43 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, train: Train) -> Path |
         return weights.of_task_net(cfg.weights)
     folder = cache_folder(cfg, dataset)
     remove_temporary(folder)
-    if not (folder / FILE).is_file():
-        if distributed.started_together(cfg):
-            raise UserError(
-                f"weights: {cfg.names.net} must be trained before a launcher starts several "
-                "processes. Run the same command once with learn=task trainer=auto and without "
-                "the launcher, or give weights=FILE."
-            )
+    if (folder / FILE).is_file():
+        return folder / FILE
+    if distributed.started_together(cfg):
+        raise UserError(
+            f"weights: {cfg.names.net} must be trained before a launcher starts several "
+            "processes. Run the same command once with learn=task trainer=auto and without "
+            "the launcher, or give weights=FILE."
+        )
+    if shortening(_plain(cfg)):
+        folder = run_folder / SHORTENED
+        _train(cfg, folder, dataset, train)
+    else:
         with _lock(folder, cfg.names.net):
             if not (folder / FILE).is_file():  # otherwise another process trained it meanwhile
-                epochs = cfg.epochs.task
-                print(
-                    f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it "
-                    f"first, {epochs} {'epoch' if epochs == 1 else 'epochs'}. Cache: {folder}",
-                    flush=True,
-                )
-                own = task_config(cfg)
-                if (folder / "checkpoints" / CHECKPOINT).is_file():  # of an interrupted training
-                    own.ckpt_path = str(folder)
-                try:
-                    train(own, folder, dataset)
-                except (KeyboardInterrupt, Interrupted):
-                    raise Interrupted("The same command resumes the task net's training.") from None
+                _train(cfg, folder, dataset, train)
     return folder / FILE
+
+
+def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset, train: Train) -> None:
+    """Train the task net of a run in a folder, or resume its interrupted training there."""
+    epochs = cfg.epochs.task
+    print(
+        f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it "
+        f"first, {epochs} {'epoch' if epochs == 1 else 'epochs'}. Cache: {folder}",
+        flush=True,
+    )
+    own = task_config(cfg)
+    if (folder / "checkpoints" / CHECKPOINT).is_file():
+        own.ckpt_path = str(folder)
+    try:
+        train(own, folder, dataset)
+    except (KeyboardInterrupt, Interrupted):
+        raise Interrupted("The same command resumes the task net's training.") from None
+
+
+def _plain(cfg: DictConfig) -> Any:
+    return OmegaConf.to_container(cfg, resolve=True)
 
 
 def task_config(cfg: DictConfig) -> DictConfig:
@@ -87,22 +114,26 @@ def task_config(cfg: DictConfig) -> DictConfig:
 
 def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
     """Return the cache folder of the task net for these settings and data; it may not exist."""
-    own: Any = OmegaConf.to_container(task_config(cfg), resolve=True)
+    own = _plain(task_config(cfg))
+    for name in SHORTENS:  # the cached net is that of a whole training
+        own["trainer"].pop(name, None)
     key = checkpoint_identity(own, dataset.fingerprint)
     digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:12]
     name = f"{cfg.names.task}-{cfg.names.net}-{cfg.names.dataset}-{digest}"
     return Path(cfg.cache).expanduser() / "weights" / name
 
 
-def add_to_cache(parts: Parts) -> None:
+def add_to_cache(parts: Parts, record: RunRecord) -> None:
     """Copy a task net that was trained with ``learn=task`` into the cache, unless one is there.
 
-    Not from a run that was resumed with another number of epochs, whose learning rates differed,
-    not from one that started from given weights, and not from several devices: the BatchNorm
-    statistics of each cover its share of the data only.
+    Not from a shortened run; not from one that was resumed with another number of epochs, whose
+    learning rates differed; not from one that started from given weights; and not from several
+    devices: the BatchNorm statistics of each cover its share of the data only.
     """
     cfg = parts.cfg
     if cfg.learn != "task" or not parts.trains or parts.trainer.world_size > 1:
+        return
+    if record.partial or shortening(record.config):
         return
     if cfg.weights not in (None, "auto"):
         return

@@ -58,9 +58,9 @@ def run(
         task_weights = None
         if parts.has_task_weights:
             with record.timed("pretrain"):
-                task_weights = pretrain.task_weights(cfg, dataset, _train_task_net)
+                task_weights = pretrain.task_weights(cfg, dataset, folder, _train_task_net)
         train_and_test(parts, record, task_weights)
-        pretrain.add_to_cache(parts)
+        pretrain.add_to_cache(parts, record)
     if leads:
         closing_lines(folder, record)
     return record
@@ -69,7 +69,7 @@ def run(
 def _train_task_net(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
     """Train a task net by the same stages, with its own record."""
     with recorded(cfg, folder, []) as record:
-        start = pretrain.task_weights(cfg, dataset, _train_task_net)
+        start = pretrain.task_weights(cfg, dataset, folder, _train_task_net)
         train_and_test(build_parts(cfg, folder, dataset, record), record, start)
 
 

@@ -26,7 +26,13 @@ from mops_lightning.training.run.build import Parts, augmentation
 from mops_lightning.training.run.callbacks import CPUTime
 from mops_lightning.training.run.ending import KeepsEnding
 from mops_lightning.training.run.other_nets import check_names
-from mops_lightning.training.run.trainer import log_test
+from mops_lightning.training.run.partial import (
+    note_evaluated,
+    note_task_net,
+    note_test,
+    note_training,
+)
+from mops_lightning.training.run.trainer import PROFILE, log_test, show_profile
 from mops_lightning.viz.figures import CLOUDS
 from mops_lightning.zoo import weights
 
@@ -36,6 +42,8 @@ OUTPUTS = {
     "pictures": "pictures",
     "clouds": f"pictures/{CLOUDS}",
     "tensorboard": "tensorboard",
+    "profile_fit": f"fit-{PROFILE}.txt",
+    "profile_test": f"test-{PROFILE}.txt",
 }
 """Files and folders that callbacks and loggers may have written."""
 
@@ -46,24 +54,47 @@ def load_weights(parts: Parts, record: RunRecord, task_weights: Path | None) -> 
     Raises:
         UserError: they do not fit.
     """
-    task, cfg = parts.experiment.task, parts.cfg
     if task_weights is not None:
-        setting = "pretrain_from" if (cfg.learn, cfg.weights) == ("task", "auto") else "weights"
-        try:
-            content = weights.load_into(task, task_weights)
-        except UserError as error:
-            raise UserError(f"{setting}: {error}") from None
-        record.weights_loaded = content["sha256"]
-        if content.get("classes"):
-            check_names(content["classes"], task, parts.dataset, f"{setting}: {task_weights}")
-        theirs, net = dotted(content["config"]), OmegaConf.to_container(cfg.task.net, resolve=True)
-        ours = {f"task.net.{key}": x for key, x in dotted(net).items() if key not in BY_RUN}
-        other = [f"{key}={theirs[key]}" for key, x in ours.items() if theirs.get(key, x) != x]
-        if other and parts.trainer.is_global_zero:
-            print(f"{setting}: {task_weights} was trained with {', '.join(other)}, not as here.")
+        _load_task_net(parts, record, task_weights)
     if parts.trained is not None:
         of_run = parts.cfg.weights == OF_RUN
         record.evaluated = load_trained(parts.trained, of_run, parts.experiment, parts.dataset)
+        note_evaluated(parts.trained.name, parts.trained.record, record)
+
+
+def _load_task_net(parts: Parts, record: RunRecord, path: Path) -> None:
+    """Load the task net from a file, and say in which settings its training differed."""
+    task, cfg = parts.experiment.task, parts.cfg
+    is_start = cfg.learn == "task" and cfg.weights == "auto"
+    setting = "pretrain_from" if is_start else "weights"
+    try:
+        content = weights.load_into(task, path)
+    except UserError as error:
+        raise UserError(f"{setting}: {error}") from None
+    record.weights_loaded = content["sha256"]
+    if content.get("classes"):
+        check_names(content["classes"], task, parts.dataset, f"{setting}: {path}")
+    net: Any = OmegaConf.to_container(cfg.task.net, resolve=True)
+    different = _different_net(content["config"], net)
+    if different and parts.trainer.is_global_zero:
+        print(f"{setting}: {path} was trained with {', '.join(different)}, not as here.")
+    note_task_net(content["config"], record)
+
+
+def _different_net(recorded: dict[str, Any], net: dict[str, Any]) -> list[str]:
+    """Return the recorded settings of a task net that differ from the present ones.
+
+    Args:
+        recorded: the configuration of the run that trained the net.
+        net: the present settings of the net.
+    """
+    before = dotted(recorded)
+    different = []
+    for name, value in dotted(net).items():
+        path = f"task.net.{name}"
+        if name not in BY_RUN and path in before and before[path] != value:
+            different.append(f"{path}={before[path]}")
+    return different
 
 
 def load_trained(
@@ -146,7 +177,7 @@ def fit(parts: Parts, record: RunRecord) -> None:
     loader = CloudLoader(
         parts.train,
         cfg.batch_size,
-        shuffle=True,
+        shuffle=not cfg.trainer.get("overfit_batches"),  # the same first batches in every epoch
         augment=augmentation(cfg),
         make_batch=task.make_batch,
         drop_last=True,
@@ -158,7 +189,8 @@ def fit(parts: Parts, record: RunRecord) -> None:
         trainer.fit(experiment, loader, validation, ckpt_path=resumed)
     check_finite(dict(experiment.state_dict()), trainer.global_step, trainer.strategy)
     record.seconds["fit_cpu"] = round(callback_of(trainer, CPUTime).seconds, 3)
-    _note_shortened(trainer, len(loader), record)
+    note_training(trainer, len(loader), record)
+    show_profile(parts.folder, "fit")
     record.validation = dict(callback_of(trainer, KeepsEnding).validation(trainer))
     if parts.resumed and parts.resumed.steps == trainer.global_step and trainer.is_global_zero:
         print(
@@ -173,27 +205,14 @@ def callback_of(trainer: L.Trainer, kind: type[Kind]) -> Kind:
     return next(callback for callback in callbacks if isinstance(callback, kind))
 
 
-def _note_shortened(trainer: L.Trainer, batches: int, record: RunRecord) -> None:
-    """Note a training on part of the batches, or of fewer steps than planned.
-
-    Early stopping is a plan of its own.
-    """
-    if (seen := int(trainer.num_training_batches)) < batches:
-        record.partial.append(f"trained on {seen} of {batches} batches of an epoch")
-    steps, of_epoch = trainer.global_step, math.ceil(seen / trainer.accumulate_grad_batches)
-    planned = of_epoch * (trainer.max_epochs or 0)
-    if steps < planned and trainer.early_stopping_callback is None:
-        record.partial.append(f"trained for {steps} of {planned} steps")
-
-
 def test(parts: Parts, record: RunRecord) -> None:
     """Score all test clouds."""
     experiment, trainer = parts.experiment, parts.trainer
     loader = parts.score_loader(parts.dataset.test)
     with _interruptible():
         trainer.test(experiment, loader, verbose=False)
-    if (tested := trainer.num_test_batches[0]) < len(loader):
-        record.partial.append(f"tested on {tested} of {len(loader)} batches")
+    note_test(trainer, len(loader), record)
+    show_profile(parts.folder, "test")
     record.metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
     parsed = {name: parse_metric_name(name) for name in record.metrics}
     scores = {  # of every readout, at the run's own size
@@ -233,7 +252,7 @@ def save(parts: Parts, record: RunRecord) -> None:
     for kind, name in OUTPUTS.items():
         if (parts.folder / name).exists():
             record.files[kind] = name
-    record.score = record.metrics[experiment.score_name]
+    record.score = record.metrics.get(experiment.score_name)
     modules: dict[str, nn.Module | None] = {"task": task, "sampler": sampler}
     record.score_name = experiment.score_name
     record.metric_info = foreign_metrics(task.metrics().items())

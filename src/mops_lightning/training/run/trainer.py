@@ -12,14 +12,15 @@ from typing import Any
 import lightning as L
 import torch
 from lightning.fabric.plugins import TorchCheckpointIO
-from lightning.pytorch.callbacks import ProgressBar
+from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.profilers import AdvancedProfiler, SimpleProfiler
 from lightning.pytorch.utilities import rank_zero_only
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 from torch.utils.tensorboard.summary import hparams
 
-from mops_lightning.config.build import accepted, build_as
+from mops_lightning.config.build import accepted, build, build_as
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
@@ -28,8 +29,12 @@ from mops_lightning.records.run_record import dotted
 from mops_lightning.training.checkpoint import CHECKPOINT, sealed
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.moving_average import MovingAverage
-from mops_lightning.training.run.callbacks import CPUTime, build_callbacks
-from mops_lightning.training.run.ending import KeepsEnding, StopBetweenSteps
+from mops_lightning.training.run.callbacks import CPUTime, EpochLines, build_callbacks
+from mops_lightning.training.run.ending import (
+    KeepsEnding,
+    StopBetweenSteps,
+    StopWithCheckpoint,
+)
 
 HARMLESS = (
     ".*does not have many workers.*",  # the data are in memory; workers would only copy them
@@ -44,6 +49,10 @@ HARMLESS = (
 )
 """Warnings about intended behaviour."""
 
+PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler}
+"""Profilers with a report as text, by Lightning's names."""
+PROFILE = "profile"
+"""Name of a profiler's report, behind its stage."""
 LOG_EVERY = 10
 """Steps between two points of a curve."""
 LOGGER_FOLDERS = {"TensorBoardLogger": "tensorboard", "CSVLogger": "csv"}
@@ -94,42 +103,95 @@ def make_trainer(
     """
     _silence_lightning()
     keep_freed_memory()
-    task = experiment.task
-    logger = _logger(cfg.logger, folder) if cfg.get("logger") else False
-    score = task.score if cfg.learn != "task" else task.full_score or task.score
-    offered = {"folder": folder, "checkpoint": folder / "checkpoints" / CHECKPOINT, "score": score}
-    rows, titles = clouds_to_draw(dataset, cfg.pictures)
-    if titles:
-        batch = CloudLoader(dataset.test, cfg.batch_size, make_batch=task.make_batch).batch_of(rows)
-        offered |= {"batch": batch, "titles": titles}
-    span = experiment.recipe.ema_span
-    callbacks = [
-        *([MovingAverage(span)] if span else []),  # before the callbacks that save
-        *build_callbacks(cfg.callbacks, offered, logged=bool(logger)),
-        StopBetweenSteps(folder / "checkpoints" / CHECKPOINT),
-        CPUTime(),
-        KeepsEnding(),
-    ]
+    given = cfg.trainer
+    barebones = bool(given.get("barebones"))
+    logger = _logger(cfg.logger, folder) if cfg.get("logger") and not barebones else False
+    callbacks = _callbacks(cfg, folder, dataset, experiment, logged=bool(logger))
+    defaults = {
+        "default_root_dir": str(folder),
+        "num_sanity_val_steps": 0,
+        "enable_model_summary": False,
+        # An epoch of a small data set may be shorter than the logging interval.
+        "log_every_n_steps": max(1, min(LOG_EVERY, clouds // cfg.batch_size)),
+        "enable_progress_bar": any(isinstance(callback, ProgressBar) for callback in callbacks),
+        "enable_checkpointing": any(isinstance(callback, Checkpoint) for callback in callbacks),
+    }
     trainer: L.Trainer = build_as(
         L.Trainer,
-        cfg.trainer,
+        given,
         "trainer",
         logger=logger,
         callbacks=callbacks,
-        plugins=[AtomicCheckpointIO()],
-        default_root_dir=str(folder),
-        num_sanity_val_steps=0,
-        enable_model_summary=False,
-        # An epoch of a small data set may be shorter than the logging interval.
-        log_every_n_steps=max(1, min(LOG_EVERY, clouds // cfg.batch_size)),
-        enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
+        plugins=_plugins(given),
+        profiler=_profiler(given, folder),
+        **{name: value for name, value in defaults.items() if name not in given},
     )
-    if cfg.trainer.get("precision") == "16-mixed" and trainer.precision != "16-mixed":
+    if given.get("precision") == "16-mixed" and trainer.precision != "16-mixed":
         raise UserError(
             "trainer.precision=16-mixed needs a GPU, and none was found. Try trainer.precision="
             "bf16-mixed."
         )
     return trainer
+
+
+def _callbacks(
+    cfg: DictConfig, folder: Path, dataset: CloudDataset, experiment: Experiment, logged: bool
+) -> list[Callback]:
+    """Build the callbacks of a run: its own, and those that every run has."""
+    task, trainer = experiment.task, cfg.trainer
+    score = task.score
+    if cfg.learn == "task" and task.full_score:
+        score = task.full_score
+    path = folder / "checkpoints" / CHECKPOINT
+    offered = {"folder": folder, "checkpoint": path, "score": score}
+    rows, titles = clouds_to_draw(dataset, cfg.pictures)
+    if titles:
+        batch = CloudLoader(dataset.test, cfg.batch_size, make_batch=task.make_batch).batch_of(rows)
+        offered |= {"batch": batch, "titles": titles}
+    chosen = build_callbacks(cfg.callbacks, offered, logged=logged)
+    barebones = trainer.get("barebones")
+    if barebones or trainer.get("enable_progress_bar") is False:
+        bars = [callback for callback in chosen if isinstance(callback, ProgressBar)]
+        lines = EpochLines(score)
+        chosen = [lines if callback in bars else callback for callback in chosen]
+    if barebones or trainer.get("enable_checkpointing") is False:
+        chosen = [callback for callback in chosen if not isinstance(callback, Checkpoint)]
+        stop = StopBetweenSteps(None)
+    elif trainer.get("fast_dev_run"):
+        stop = StopBetweenSteps(None)
+    else:
+        stop = StopWithCheckpoint(path)
+    span = experiment.recipe.ema_span
+    average = [MovingAverage(span)] if span else []
+    # The average comes before the callbacks that save it.
+    return [*average, *chosen, stop, CPUTime(), KeepsEnding()]
+
+
+def _plugins(given: DictConfig) -> list[Any]:
+    """Return the plugins that the settings name, and the one that writes checkpoints safely."""
+    named = given.get("plugins")
+    if named is None:
+        return [AtomicCheckpointIO()]
+    several = named if OmegaConf.is_list(named) else [named]
+    own = [build(node, "trainer.plugins") if OmegaConf.is_dict(node) else node for node in several]
+    return [*own, AtomicCheckpointIO()]
+
+
+def _profiler(given: DictConfig, folder: Path) -> Any:
+    """Return the profiler that the settings name, which writes its report into the run's folder."""
+    named = given.get("profiler")
+    if OmegaConf.is_dict(named):
+        return build(named, "trainer.profiler")
+    if named not in PROFILERS:
+        return named  # Lightning names the ones that it knows
+    return PROFILERS[named](dirpath=folder, filename=PROFILE)
+
+
+def show_profile(folder: Path, stage: str) -> None:
+    """Print the profiler's report of a stage, ``fit`` or ``test``, if there is one."""
+    path = folder / f"{stage}-{PROFILE}.txt"
+    if path.is_file():
+        print(path.read_text().strip())
 
 
 def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str]]:
@@ -195,6 +257,8 @@ def log_test(
     leaves = dotted({key: config[key] for key in keys})
     flat = {k: v for k, v in leaves.items() if k.rsplit(".", 1)[-1][:1] != "_"}
     flat["max_epochs"] = config["trainer"]["max_epochs"]
+    if config.get("tags"):
+        flat["tags"] = ", ".join(config["tags"])
     if isinstance(board, TensorBoardLogger):
         rows = [f"| {name} | {value:.6g} |" for name, value in sorted(metrics.items())]
         table = "\n".join(["| metric | value |", "|---|--:|", *rows])
