@@ -1,17 +1,17 @@
 """The start and the end of a sweep: its cells are counted, reported, and made into models."""
 
+import logging
 import os
-import traceback
 from collections import Counter
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from filelock import Timeout
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, open_dict
 
 from mops_lightning.cli.sweep import lock
-from mops_lightning.errors import USER_ERROR, UserError, end, line_about
+from mops_lightning.errors import USER_ERROR, UserError, end, one_line_endings
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import FAILED
 
@@ -21,8 +21,7 @@ BEGUN = ".begun"
 ELSEWHERE = "left to another process"
 """State of a cell that another process runs."""
 
-SOME_FAILED = 1
-"""Exit status of a sweep that did not complete all its cells, or could not be reported."""
+log = logging.getLogger(__name__)
 
 
 def _state(cell: Path) -> str:
@@ -81,21 +80,24 @@ class SweepSummary(Callback):
         """Count the cells of this start by state, and write the report.
 
         Raises:
-            SystemExit: a cell has failed, or the end itself; Hydra passes over other exceptions.
+            SystemExit: with 1 if a cell failed or the report did. Hydra turns any other exception
+                of a callback into a warning, and ends with 0.
         """
         folder = Path(os.path.relpath(config.hydra.sweep.dir))
         try:
-            complete = self._end(folder)
-        except Exception as error:
-            _end_in_error(error, folder)
-        if not complete:
+            with one_line_endings("mops_lightning"):
+                states = self._states(folder)
+                self._report(folder, states)
+        except Exception:
+            log.exception("the runs are done, but the end of the sweep failed")
+            raise SystemExit(1) from None
+        found = set(states.values())
+        if found - {"completed", ELSEWHERE} or not found:
             print(f"To repeat the rest: the same command with hydra.sweep.dir={folder}")
-            raise SystemExit(SOME_FAILED)
+            raise SystemExit(1)
 
-    def _end(self, folder: Path) -> bool:
-        """Count, report, make models; return whether every cell that was started is complete."""
-        from mops_lightning.report import cli as report
-
+    def _states(self, folder: Path) -> dict[Path, str]:
+        """Return the states of the cells of this start, and print their numbers."""
         begun = (folder / BEGUN).stat().st_mtime_ns
         states: dict[Path, str] = {}
         # Hydra writes this into every cell that it starts.
@@ -103,16 +105,21 @@ class SweepSummary(Callback):
             cell = path.parents[1]
             if path.stat().st_mtime_ns >= begun:
                 states[cell] = _state(cell)
-        found = set(states.values())
         numbers = sorted(Counter(states.values()).items())
         counts = ", ".join(f"{count} {state}" for state, count in numbers) or "no values to sweep"
         print(f"{len(states)} cells: {counts}; in {folder}")
-        if "completed" in found:
+        return states
+
+    def _report(self, folder: Path, states: dict[Path, str]) -> None:
+        """Write the report of all cells below a folder, and the models of this start's cells."""
+        from mops_lightning.report import cli as report
+
+        completed = [cell for cell, state in states.items() if state == "completed"]
+        if completed:
             options = ["--mixed"] if self.mixed else []
             report.main([str(folder), *options], "python -m mops_lightning report")
         if self.models:
-            _add_models([cell for cell, state in states.items() if state == "completed"], folder)
-        return bool(found) and found <= {"completed", ELSEWHERE}
+            _add_models(completed, folder)
 
 
 def _let_search_go_on(config: DictConfig) -> None:
@@ -123,17 +130,3 @@ def _let_search_go_on(config: DictConfig) -> None:
     if "max_failure_rate" in sweeper and not given:
         with open_dict(sweeper):
             sweeper.max_failure_rate = 1.0
-
-
-def _end_in_error(error: Exception, folder: Path) -> NoReturn:
-    """Say what failed at the end of a sweep, whose records are complete all the same.
-
-    Raises:
-        SystemExit: always.
-    """
-    line = line_about(error)
-    if line is None:
-        traceback.print_exception(error)
-        line = f"{type(error).__name__}: {error}"
-    again = f"python -m mops_lightning report {folder} repeats the report."
-    end("mops_lightning", f"the report on {folder} failed: {line} {again}", SOME_FAILED)
