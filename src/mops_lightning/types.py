@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 from torch import Tensor
 
 if TYPE_CHECKING:
+    from mops_lightning.ops.local_matrix import LocalMatrix
     from mops_lightning.ops.sampling_matrix import SamplingMatrix
 
 UNKNOWN = -1
@@ -80,7 +81,7 @@ class SampleOutput(NamedTuple):
     points: Tensor
     indices: Tensor | None
     losses: dict[str, Tensor]
-    matrix: "SamplingMatrix | None" = None
+    matrix: "SamplingMatrix | LocalMatrix | None" = None
     soft_projected: Tensor | None = None
 
     def first(self, m: int) -> "SampleOutput":

@@ -43,6 +43,12 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "fmops": lambda m: FMOPSNet(m, **MOPS_LAYERS),
     "mops-anchors": lambda m: moved(MOPSNet(m, anchors="fps", **MOPS_LAYERS)),
     "fmops-anchors": lambda m: moved(FMOPSNet(m, anchors="fps", **MOPS_LAYERS)),
+    "mops-local": lambda m: moved(
+        MOPSNet(m, anchors="fps", candidates=2, neighbours=3, **MOPS_LAYERS)
+    ),
+    "fmops-local": lambda m: moved(
+        FMOPSNet(m, anchors="fps", candidates=2, neighbours=3, **MOPS_LAYERS)
+    ),
     "snet": lambda m: SNet(m, **SMALL),
     "snet-without-norm": lambda m: SNet(m, head_norm=False, output_norm=False, **SMALL),
     "samplenet": lambda m: SampleNet(m, k=3, **SMALL),

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from mops_lightning.ops.local_matrix import LocalMatrix
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 
@@ -67,7 +68,7 @@ def simplification_losses(
     return losses
 
 
-def overlap_losses(matrix: SamplingMatrix, sizes: Sequence[int]) -> dict[int, Tensor]:
+def overlap_losses(matrix: SamplingMatrix | LocalMatrix, sizes: Sequence[int]) -> dict[int, Tensor]:
     """Return how far SᵀS of the first m columns is from a diagonal matrix.
 
     L_overlap(S) = 1/m Σ_{i≠j} (SᵀS)_ij², averaged over the clouds. The columns of an ideal sampling
@@ -75,13 +76,18 @@ def overlap_losses(matrix: SamplingMatrix, sizes: Sequence[int]) -> dict[int, Te
     same point give two generated points with the same match.
 
     Args:
-        matrix: S of every cloud, with at least max(sizes) columns. Its N·M entries are computed.
+        matrix: S of every cloud, with at least max(sizes) columns. All its entries are computed:
+            N·M, or M·k of local columns.
         sizes: sizes m, each from 1 to M.
 
     Returns:
         Scalars by size, without unit; 0 where no point has weight in two columns.
     """
-    columns = matrix.leftmost(max(sizes)).dense().mT
-    squares = (columns @ columns.mT).square()
+    matrix = matrix.leftmost(max(sizes))
+    if isinstance(matrix, LocalMatrix):
+        squares = matrix.products().square()
+    else:
+        columns = matrix.dense().mT
+        squares = (columns @ columns.mT).square()
     squares = squares - squares.diagonal(dim1=1, dim2=2).diag_embed()
     return {m: squares[:, :m, :m].sum((1, 2)).mean() / m for m in sizes}

@@ -107,7 +107,7 @@ def carried(output: SampleOutput, points: Tensor, features: Tensor) -> Tensor:
     if output.indices is not None:
         return gather_points(features, output.indices)
     if output.matrix is not None:
-        return output.matrix.sample(features.to(output.matrix.keys.dtype))
+        return output.matrix.sample(features.to(output.matrix.dtype))
     return gather_points(features, nearest(output.points, points)[1])
 
 

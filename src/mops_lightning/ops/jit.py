@@ -6,7 +6,7 @@ from typing import Any, cast
 from numba import extending, njit
 
 jit: Any = partial(njit, nogil=True, error_model="numpy")
-"""Compile; never with ``fastmath``, which could change distances."""
+"""Compile; distances never with ``fastmath``, which could change them."""
 
 
 @cast(Any, extending.intrinsic)
@@ -25,3 +25,12 @@ def jit_cached(function: Any) -> Any:
         return jit(function, cache=True)
     except RuntimeError:  # neither folder can be written to
         return jit(function)
+
+
+def jit_sums(function: Any) -> Any:
+    """Compile as ``jit_cached``; sums may be added in any order, which vectorises products."""
+    order: Any = {"reassoc", "contract"}
+    try:
+        return jit(function, cache=True, fastmath=order)
+    except RuntimeError:  # neither folder can be written to
+        return jit(function, fastmath=order)

@@ -55,6 +55,11 @@ class SamplingMatrix(NamedTuple):
         """Number of columns of S."""
         return self.queries.shape[-2]
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """The type of the entries."""
+        return self.keys.dtype
+
     def dense(self) -> Tensor:
         """Return S as ``(B, N, M)``: every column is non-negative and sums to 1."""
         return self._columns().mT

@@ -9,11 +9,13 @@ from torch import Tensor, nn
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.losses.subset import overlap_losses, subset_losses
 from mops_lightning.nets.layers import PointFeatures, PointMLP, check_channels, linear_norm_relu
+from mops_lightning.ops.local_matrix import LocalMatrix
 from mops_lightning.ops.precision import pointwise_autocast, pointwise_autocast_dtype
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.anchors import FPSAnchors
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fused import FusedMOPSNet, fused_layer, fused_layers
+from mops_lightning.samplers.local import LocalAnchors
 from mops_lightning.types import SampleOutput
 
 DEFAULT_WIDTH = 0.5
@@ -42,6 +44,11 @@ class MOPSNet(Sampler):
             (see ``anchors``); None, as in the paper, lets them start at random.
         anchor_width: how soft that choice is before training: the width of the columns as a share
             of the spacing of the farthest points. Only with anchors.
+        candidates: c, columns choose among the first c·m farthest points of the cloud, whose
+            features alone are computed (see ``local``); None, as in the paper, for all points.
+            Only with anchors.
+        neighbours: k, every column chooses among its k nearest candidates; None, as in the paper,
+            for all. Only with anchors.
         overlap: weight of the penalty on columns of S that choose the same points
             (``losses.subset``); 0, as in the paper, for none.
 
@@ -72,6 +79,8 @@ class MOPSNet(Sampler):
         anchors: Literal["fps"] | None = None,
         anchor_width: float = DEFAULT_WIDTH,
         overlap: float = 0.0,
+        candidates: int | None = None,
+        neighbours: int | None = None,
     ) -> None:
         super().__init__(m)
         if not 0 < tau_min <= 1:
@@ -90,6 +99,7 @@ class MOPSNet(Sampler):
                 f"anchor_width has no effect without anchors=fps, got {anchor_width}. Add "
                 f"anchors=fps, or set anchor_width={DEFAULT_WIDTH}."
             )
+        check_local(anchors, candidates=candidates, neighbours=neighbours)
         if not 0 <= threshold < 1:
             raise UserError(f"threshold must be at least 0 and below 1, got {threshold}.")
         self.alpha = alpha
@@ -110,8 +120,10 @@ class MOPSNet(Sampler):
         if anchors is None:
             # A bias would be constant within a column of S, where the softmax cancels it.
             self.queries = nn.Linear(rho_channels[-1], m, bias=False)
-        else:
+        elif candidates is None and neighbours is None:
             self.queries = FPSAnchors(m, rho_channels[-1], anchor_width)
+        else:
+            self.queries = LocalAnchors(m, rho_channels[-1], anchor_width, candidates, neighbours)
 
     @property
     def tau(self) -> float:
@@ -122,12 +134,18 @@ class MOPSNet(Sampler):
         """Set tau, exponentially from 1 to ``tau_min`` for a progress from 0 to 1."""
         self.training_tau = self.tau_min ** min(max(progress, 0.0), 1.0)
 
-    def sampling_matrix(self, points: Tensor, m: int | None = None) -> SamplingMatrix:
+    def sampling_matrix(self, points: Tensor, m: int | None = None) -> SamplingMatrix | LocalMatrix:
         """Return the sampling matrices S of ``(B, N, 3)`` points, with the first m columns."""
-        m, keys = self.m if m is None else m, self._keys(points)
+        m = self.m if m is None else m
+        if isinstance(self.queries, LocalAnchors):
+            return self.queries.local_matrix(points, self._keys_of_candidates, m, self.tau)
+        keys = self._keys(points)
         if isinstance(self.queries, FPSAnchors):
             return self.queries(points, keys, m, self.tau)
         return SamplingMatrix(self.queries.weight, keys, self.tau).leftmost(m)
+
+    def _keys_of_candidates(self, candidates: Tensor, rows: Tensor) -> Tensor:
+        return self._keys(candidates)
 
     def _keys(self, points: Tensor) -> Tensor:
         """Return the inputs of the last layer of ρ ``(B, N, C)``."""
@@ -177,7 +195,7 @@ class MOPSNet(Sampler):
         """Generate points; see ``Sampler.forward``."""
         matrix = self.sampling_matrix(points, m)
         # With anchors, S is at least float32, also where points and weights are half.
-        values = points.to(matrix.keys.dtype)
+        values = points.to(matrix.dtype)
         if self.threshold and not self.training:
             sampled = torch.bmm(matrix.sparse(self.threshold).mT, values)
         else:
@@ -197,3 +215,18 @@ class MOPSNet(Sampler):
             for m, loss in overlap_losses(output.matrix, sizes).items():
                 losses[m]["overlap"] = self.overlap * loss
         return losses
+
+
+def check_local(anchors: str | None, **settings: int | None) -> None:
+    """Check the numbers of local columns.
+
+    Raises:
+        UserError: a number is not a whole one of at least 1, or there are no anchors.
+    """
+    for name, value in settings.items():
+        if value is None:
+            continue
+        if anchors is None:
+            raise UserError(f"{name} needs anchors=fps, got {name}={value!r}.")
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise UserError(f"{name} must be a whole number of at least 1 or null, got {value!r}.")

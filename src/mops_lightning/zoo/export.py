@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
+from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.snet import SNet
@@ -61,8 +62,11 @@ class GeneratedPoints(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         """Return the generated points."""
         if isinstance(self.sampler, MOPSNet) and not self.sampler.threshold:
-            # Blocks of S for many points would limit the number of points of the program.
-            return self.sampler.sampling_matrix(points, self.m).sample_dense(points)
+            matrix = self.sampler.sampling_matrix(points, self.m)
+            if isinstance(matrix, SamplingMatrix):
+                # Blocks of S for many points would limit the number of points of the program.
+                return matrix.sample_dense(points)
+            return matrix.sample(points)
         return self.sampler.sample(points, self.m).points
 
 

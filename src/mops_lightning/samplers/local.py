@@ -1,0 +1,129 @@
+"""Local columns of S: column j chooses among the candidates that are nearest to its anchor.
+
+Candidates are the first c·m farthest points of the cloud (c·m_max for a net of many sizes, whose
+smaller samples are therefore prefixes), and the first m of them are the anchors: one run of
+farthest points gives both. Features and keys are computed for candidates only, and the global
+feature is the maximum over them. Memory and time grow with m·c and m·k, not with N·m.
+
+Column j has the logits of an anchored column (see ``anchors``),
+
+    ⟨w_j + A·h(q_j)/√C, h_i⟩ − |p_i − q_j|² / s_j²,
+
+for its k nearest candidates p_i, and −∞ elsewhere.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from mops_lightning.ops.local_attention import chosen_products, nearest_rows
+from mops_lightning.ops.local_matrix import LocalMatrix
+from mops_lightning.ops.points import distance_dtype, gather_points
+from mops_lightning.samplers.anchors import (
+    SMALLEST,
+    SPACING_POINTS,
+    FPSAnchors,
+    squared_spacing,
+)
+from mops_lightning.samplers.fps import FARTHEST, farthest_rows
+
+Keys = Callable[[Tensor, Tensor], Tensor]
+"""From candidates ``(B, K, 3)`` and their rows ``(B, K)`` in the cloud to keys ``(B, K, C)``."""
+
+
+class Thinned(NamedTuple):
+    """The candidates of clouds.
+
+    Attributes:
+        rows: ``(B, K)`` int64, the candidates' rows in the cloud.
+        anchors: ``(B, m)`` int64, the places of the anchors among the candidates.
+        unit: ``(B,)``, the squared unit of widths.
+    """
+
+    rows: Tensor
+    anchors: Tensor
+    unit: Tensor
+
+
+class LocalAnchors(FPSAnchors):
+    """Columns around the farthest points of a cloud with few entries each.
+
+    Args:
+        m: largest number of points.
+        channels: C, of the keys.
+        width: see ``FPSAnchors``.
+        candidates: c, candidates per point of the largest sample; None: all points of the cloud.
+        neighbours: k, entries of a column; None: all candidates.
+    """
+
+    def __init__(
+        self, m: int, channels: int, width: float, candidates: int | None, neighbours: int | None
+    ) -> None:
+        super().__init__(m, channels, width)
+        self.candidates = candidates
+        self.neighbours = neighbours
+
+    def local_matrix(self, points: Tensor, keys_of: Keys, m: int, tau: float) -> LocalMatrix:
+        """Return the first m columns of the sampling matrices.
+
+        Args:
+            points: ``(B, N, 3)``.
+            keys_of: computes the keys of candidates.
+            m: number of columns.
+            tau: temperature.
+
+        Returns:
+            Matrices in float32 at least.
+        """
+        places = points.to(distance_dtype(points))
+        thinned = self.thin(places, m)
+        candidates = gather_points(places, thinned.rows)
+        keys = keys_of(gather_points(points, thinned.rows), thinned.rows).to(places.dtype)
+        anchors = gather_points(candidates, thinned.anchors)
+        near = self._neighbours(anchors, candidates)
+        apart = gather_points(candidates, near) - anchors[:, :, None]
+        squares = apart.square().sum(3)
+        content = self._content(gather_points(keys, thinned.anchors), m)
+        if self.neighbours is None:  # all candidates in order
+            products = content @ keys.mT
+        else:
+            products = chosen_products(content, keys, near)
+        logits = products - self._sharpness(thinned.unit, m) * squares
+        weights = (logits / tau).softmax(2)
+        rows = thinned.rows.gather(1, near.flatten(1)).view_as(near)
+        return LocalMatrix(weights, rows, points.shape[1])
+
+    def thin(self, places: Tensor, m: int) -> Thinned:
+        """Choose the candidates of clouds ``(B, N, 3)``, and m anchors among them."""
+        clouds, n = places.shape[:2]
+        wanted = n if self.candidates is None else self.candidates * len(self.slots)
+        spacing = min(SPACING_POINTS, n)
+        thins = wanted < n
+        farthest = farthest_rows(places, max(wanted if thins else m, spacing), start=FARTHEST)
+        unit = squared_spacing(gather_points(places, farthest[:, :spacing]))
+        if thins:
+            anchors = torch.arange(m, device=places.device).expand(clouds, m)
+            return Thinned(farthest[:, :wanted], anchors, unit)
+        everything = torch.arange(n, device=places.device).expand(clouds, n)
+        return Thinned(everything, farthest[:, :m], unit)
+
+    def _neighbours(self, anchors: Tensor, candidates: Tensor) -> Tensor:
+        """Return the places ``(B, m, k)`` of the candidates that columns choose among."""
+        number = candidates.shape[1]
+        if self.neighbours is None:
+            everything = torch.arange(number, device=candidates.device)
+            return everything.expand(*anchors.shape[:2], number)
+        return nearest_rows(anchors, candidates, min(self.neighbours, number))
+
+    def _content(self, keys: Tensor, m: int) -> Tensor:
+        """Return the vectors ``(B, m, C)`` that are compared with keys."""
+        related = keys @ self.relation.to(keys.dtype).mT
+        return self.slots[:m].to(keys.dtype) + related / math.sqrt(keys.shape[2])
+
+    def _sharpness(self, unit: Tensor, m: int) -> Tensor:
+        """Return 1/s_j² ``(B, m, 1)``."""
+        width = unit[:, None] * self.log_width[:m].to(unit.dtype).mul(2).exp()
+        return width.clamp_min(SMALLEST**2).reciprocal()[..., None]
