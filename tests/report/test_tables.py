@@ -197,3 +197,16 @@ def test_own_task_and_net_are_named_in_titles(tmp_path):
     put(tmp_path, "fps", 8, {"test/sampled/accuracy": 0.5}, settings=settings, config=config)
 
     assert "Test accuracy (%): Counting on boxes under Counter;" in table(tmp_path)
+
+
+def test_projected_points_are_a_fourth_figure_and_compete_with_generated_ones(tmp_path):
+    samplenet = {"generated": 0.6, "matched": 0.7, "completed": 0.7, "projected": 0.9}
+    put(tmp_path, "samplenet", 32, {f"test/{name}/accuracy": v for name, v in samplenet.items()})
+    mops = {"generated": 0.8, "matched": 0.5, "completed": 0.5}
+    put(tmp_path, "mops", 32, {f"test/{name}/accuracy": v for name, v in mops.items()})
+
+    text = table(tmp_path)
+
+    assert "60.00 / **70.00** / **70.00** / **90.00**" in text
+    assert "<u>80.00</u> / <u>50.00</u> / <u>50.00</u>" in text
+    assert "generated / matched / completed (SampleNet: / projected) sets" in text

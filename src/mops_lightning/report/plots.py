@@ -81,25 +81,35 @@ def curves(table: Table) -> Figure:
 
 
 def heat_maps(table: Table) -> Figure:
-    """Draw the planes of all samplers, a row each and a column per readout, on one colour scale."""
+    """Draw the planes of all samplers, a row each and a column per readout.
+
+    Every row has a colour scale of its own, so that one sampler's values do not hide another's.
+    """
     planes = table.planes
     scale = table.metric.scale
     names = sorted(planes, key=sort_key)
-    means = table.values["mean"] * scale
-    low, high = means.min(), means.max()
-    # On a linear scale, one large value would hide the differences of all others.
-    norm = LogNorm(low, high) if 0 < LOG_SCALE_RATIO * low < high else Normalize(low, high)
     width = max(len(table.readouts(name)) for name in names)
     figure = new_figure(3.6 * width + 1, 3.2 * len(names))
     panels = figure.subplots(len(names), width, squeeze=False)
     for line, name in zip(panels, names, strict=True):
         down, across = (key.split(".")[-1] for key in planes[name])
+        norm = _colour_scale(table.values.loc[table.values["row"] == name, "mean"] * scale)
         for axis, readout in zip(line, table.readouts(name), strict=False):
             plane = table.of(name, readout).pivot(index="down", columns="column", values="mean")
             image = _heat_map(axis, plane.sort_index().sort_index(axis=1) * scale, norm)
             axis.set(xlabel=across, ylabel=down, title=f"{name}, {readout}")
-    figure.colorbar(image, ax=panels, label=table.metric.title)
+        figure.colorbar(image, ax=line, label=table.metric.title)
     return figure
+
+
+def _colour_scale(means: pd.Series) -> Normalize:
+    """Return the colour scale of values; a logarithmic one if they differ much."""
+    low = means.min()
+    high = means.max()
+    # On a linear scale, one large value would hide the differences of all others.
+    if 0 < LOG_SCALE_RATIO * low < high:
+        return LogNorm(low, high)
+    return Normalize(low, high)
 
 
 def _heat_map(axis: Any, plane: pd.DataFrame, norm: Normalize) -> Any:
