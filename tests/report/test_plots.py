@@ -57,5 +57,5 @@ def test_curves_have_a_panel_for_projected_points_where_there_are_any(tmp_path):
         "completed",
         "projected",
     ]
-    lines = [container.lines[0].get_ydata().tolist() for container in figure.axes[3].containers]
-    assert [8, 32] in lines
+    drawn: list[Any] = list(figure.axes[3].containers)
+    assert [8, 32] in [container.lines[0].get_ydata().tolist() for container in drawn]
