@@ -7,9 +7,10 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from mops_lightning.data import shapes as source
+from mops_lightning.data.procedural import sampled
 from mops_lightning.data.procedural.mesh_parts import join, turned
-from mops_lightning.data.shapes import ASYMMETRIC, BUILDERS, shapes
+from mops_lightning.data.procedural.sampled import BUILDERS
+from mops_lightning.data.shapes import ASYMMETRIC, CLASSES, shapes
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
 
@@ -35,7 +36,7 @@ def same(first, second):
 
 
 def test_shapes_are_labelled_and_in_unit_sphere(dataset):
-    assert dataset.class_names == tuple(BUILDERS)
+    assert dataset.class_names == CLASSES == tuple(BUILDERS)
     assert len(dataset.class_names) >= 12
     for clouds, count in ((dataset.train, 20), (dataset.test, 6)):
         assert clouds.points.shape == (count * len(BUILDERS), 512, 3)
@@ -53,9 +54,9 @@ def test_shapes_points_are_uniform_by_area(monkeypatch):
     def cylinder(rng):
         return join([turned([(0, 0), (1, 0)], 64), turned([(1, 0), (1, 2)], 64)])
 
-    monkeypatch.setattr(source, "BUILDERS", {"cylinder": cylinder})
-    monkeypatch.setattr(source, "STRETCH", (0.0, 0.0, 0.0))
-    height = shapes(40_000, 1, 1).train.points[0, :, 1].double().numpy()
+    monkeypatch.setattr(sampled, "BUILDERS", {"bottle": cylinder})
+    monkeypatch.setattr(sampled, "STRETCH", (0.0, 0.0, 0.0))
+    height = shapes(40_000, 1, 1, ["bottle"]).train.points[0, :, 1].double().numpy()
     height = 2 * (height - height.min()) / np.ptp(height)
     assert (height < 1e-6).mean() == pytest.approx(np.pi / (np.pi + 4 * np.pi), abs=0.01)
     wall = height[height >= 1e-6]

@@ -6,37 +6,41 @@ It replaces the paper's ModelNet40 in quick starts, tests and demonstrations.
 import hashlib
 import json
 import sys
-import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
 import torch
-import trimesh
-from numpy.random import Generator, SeedSequence
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes
-from mops_lightning.data.procedural.airplane import airplane
-from mops_lightning.data.procedural.furniture import bed, desk, lamp, shelf, table
-from mops_lightning.data.procedural.seats import chair, sofa, stool
-from mops_lightning.data.procedural.vessels import bottle, bowl, bucket, cup, goblet, teapot, vase
-from mops_lightning.data.surfaces import FLOAT, PART, cached
+from mops_lightning.data.surfaces import FLOAT, PART, Kind, cached
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import remove_temporary
-from mops_lightning.ops.points import UnitSphere
 
-BUILDERS: Mapping[str, Callable[[Generator], trimesh.Trimesh]] = MappingProxyType({
-    builder.__name__: builder for builder in (
-        airplane, bed, bottle, bowl, bucket, chair, cup, desk,
-        goblet, lamp, shelf, sofa, stool, table, teapot, vase,
-    )
-})  # fmt: skip
-"""Builders by class name, in the order of the labels; each call draws new proportions."""
+CLASSES = (
+    "airplane",
+    "bed",
+    "bottle",
+    "bowl",
+    "bucket",
+    "chair",
+    "cup",
+    "desk",
+    "goblet",
+    "lamp",
+    "shelf",
+    "sofa",
+    "stool",
+    "table",
+    "teapot",
+    "vase",
+)
+"""All classes, in the order of their labels."""
 
 ASYMMETRIC = ("airplane", "bed", "chair", "shelf", "sofa", "teapot")
 """Classes whose shapes do not look alike from several sides, for registration."""
@@ -55,12 +59,6 @@ PARTS: Mapping[str, tuple[str, ...]] = MappingProxyType({
 
 GENERATOR_VERSION = 1
 """Part of the fingerprint; increment it with every change of the shapes."""
-
-STRETCH = (0.15, 0.3, 0.15)
-"""Largest random scaling of x, y, z, as a natural logarithm, so that proportions differ."""
-
-YAW = np.radians(30)
-"""Largest random rotation about the up axis, in radians."""
 
 
 def shapes(
@@ -95,17 +93,13 @@ def shapes(
     Raises:
         UserError: an argument is invalid, or ``cache`` cannot be written.
     """
+    _check_number(1, n_points=n_points)
+    _check_number(1, train_per_class=train_per_class)
+    _check_number(1, test_per_class=test_per_class)
+    _check_number(0, seed=seed)
+    chosen = _chosen_classes(classes)
+    part_names = _part_names(chosen)
     counts = (train_per_class, test_per_class)
-    values = (n_points, *counts, seed)
-    names = ("n_points", "train_per_class", "test_per_class", "seed")
-    for name, value, minimum in zip(names, values, (1, 1, 1, 0), strict=True):
-        if not isinstance(value, int) or isinstance(value, bool) or value < minimum:
-            raise UserError(f"{name} must be a whole number of at least {minimum}, got {value!r}.")
-    named_sets = {"asymmetric": ASYMMETRIC, "parts": tuple(PARTS)}
-    wanted = named_sets.get(classes, classes) if isinstance(classes, str) else classes
-    chosen = choose_classes(wanted, tuple(BUILDERS))
-    labelled = set(chosen) <= set(PARTS)
-    part_names = tuple(dict.fromkeys(sum((PARTS[name] for name in chosen), ()))) if labelled else ()
     settings = {
         "dataset": "shapes",
         "version": GENERATOR_VERSION,
@@ -119,18 +113,51 @@ def shapes(
     if cache is not None:
         path = Path(cache).expanduser() / f"shapes-{fingerprint[:20]}.npz"
         remove_temporary(path.parent, below=False)
-    sizes = [(count * len(chosen), n_points) for count in counts]
-    kinds = [((*size, 3), FLOAT) for size in sizes] + [(size, PART) for size in sizes if part_names]
+
+    kinds: list[Kind] = []
+    for count in counts:
+        kinds.append(((count * len(chosen), n_points, 3), FLOAT))
+    if part_names:
+        for count in counts:
+            kinds.append(((count * len(chosen), n_points), PART))
     arrays = cached(path, kinds, lambda: _generate(n_points, counts, chosen, seed, part_names))
-    train, test = (
-        Clouds(
-            torch.from_numpy(arrays[split]),
-            torch.arange(len(chosen)).repeat_interleave(count),
-            parts=torch.from_numpy(arrays[2 + split]) if part_names else None,
-        )
-        for split, count in enumerate(counts)
-    )
+
+    splits = []
+    for split, count in enumerate(counts):
+        points = torch.from_numpy(arrays[split])
+        labels = torch.arange(len(chosen)).repeat_interleave(count)
+        parts = torch.from_numpy(arrays[2 + split]) if part_names else None
+        splits.append(Clouds(points, labels, parts=parts))
+    train, test = splits
     return CloudDataset(chosen, train, test, fingerprint, part_names=part_names)
+
+
+def _check_number(minimum: int, **argument: Any) -> None:
+    """Refuse a value that is not a whole number of at least ``minimum``."""
+    ((name, value),) = argument.items()
+    is_number = isinstance(value, int) and not isinstance(value, bool)
+    if not is_number or value < minimum:
+        raise UserError(f"{name} must be a whole number of at least {minimum}, got {value!r}.")
+
+
+def _chosen_classes(
+    classes: Sequence[str] | Literal["asymmetric", "parts"] | None,
+) -> tuple[str, ...]:
+    if classes == "asymmetric":
+        return choose_classes(ASYMMETRIC, CLASSES)
+    if classes == "parts":
+        return choose_classes(tuple(PARTS), CLASSES)
+    return choose_classes(classes, CLASSES)
+
+
+def _part_names(chosen: Sequence[str]) -> tuple[str, ...]:
+    """Return the parts of the classes, each once; none if a class does not know its parts."""
+    if not set(chosen) <= set(PARTS):
+        return ()
+    names: list[str] = []
+    for class_name in chosen:
+        names.extend(name for name in PARTS[class_name] if name not in names)
+    return tuple(names)
 
 
 def _generate(
@@ -141,44 +168,29 @@ def _generate(
     part_names: Sequence[str],
 ) -> list[NDArray[Any]]:
     """Return the clouds of both splits, ``(S, n_points, 3)``, class by class, then their parts."""
-    jobs = [
-        (name, split, i)
-        for split, count in enumerate(counts)
-        for name in chosen
-        for i in range(count)
-    ]
+    # Imported here: most runs find their shapes in the cache and need no builder.
+    from mops_lightning.data.procedural.sampled import sampled_shape
+
+    jobs = []
+    for split, count in enumerate(counts):
+        for class_name in chosen:
+            for number in range(count):
+                jobs.append((class_name, split, number))
     # Not rich's is_terminal, which FORCE_COLOR makes true for log files.
     silent = not sys.stderr.isatty()
     console = Console(stderr=True)
-    progress = track(jobs, "Making shapes", console=console, transient=True, disable=silent)
-    clouds, names = zip(
-        *(_cloud(name, n_points, seed, split, i) for name, split, i in progress), strict=True
-    )
-    first = counts[0] * len(chosen)
-    arrays = np.split(np.stack(clouds), [first])
+    clouds = []
+    names_of_parts = []
+    for class_name, split, number in track(
+        jobs, "Making shapes", console=console, transient=True, disable=silent
+    ):
+        cloud, names = sampled_shape(class_name, n_points, seed, split, number)
+        clouds.append(cloud)
+        names_of_parts.append(names)
+    first_test = counts[0] * len(chosen)
+    arrays = np.split(np.stack(clouds), [first_test])
     if part_names:
         order = np.argsort(part_names)
-        numbers = order[np.searchsorted(part_names, np.stack(names), sorter=order)]
-        arrays += np.split(numbers.astype(PART), [first])
+        numbers = order[np.searchsorted(part_names, np.stack(names_of_parts), sorter=order)]
+        arrays += np.split(numbers.astype(PART), [first_test])
     return arrays
-
-
-def _cloud(
-    name: str, n_points: int, seed: int, split: int, i: int
-) -> tuple[NDArray[np.float32], NDArray[np.str_]]:
-    """Build shape i of a class in a split and sample it: ``(n_points, 3)``, and the parts' names.
-
-    Form and points have separate random streams, so that the form does not depend on ``n_points``.
-    """
-    key = (split, zlib.crc32(name.encode()), i)
-    form, spread = SeedSequence(seed, spawn_key=key).spawn(2)
-    rng = np.random.default_rng(form)
-    mesh = BUILDERS[name](rng)
-    mesh.vertices *= np.exp(rng.uniform(-1, 1, 3) * STRETCH)
-    angle = rng.uniform(-YAW, YAW)
-    cos, sin = np.cos(angle), np.sin(angle)
-    number = int(spread.generate_state(1, np.uint64)[0])
-    sampled, faces = trimesh.sample.sample_surface(mesh, n_points, seed=number)
-    cloud = np.asarray(sampled) @ ((cos, 0, -sin), (0, 1, 0), (sin, 0, cos))
-    parts = mesh.metadata.get("parts", np.full(len(mesh.faces), ""))
-    return UnitSphere.around(cloud).normalise(cloud).numpy(), parts[faces]
