@@ -84,7 +84,8 @@ def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:
     if not path.is_file():
         raise UserError(f"root: {path} is missing. Complete the folder, or use another root.")
     with reading(path), h5py.File(path, "r") as file:
-        data, label = _dataset(path, file, "data"), _dataset(path, file, "label")
+        data = _dataset(path, file, "data")
+        label = _dataset(path, file, "label")
         if (
             data.ndim != 3
             or data.shape[2] != 3
@@ -112,7 +113,8 @@ def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:
         labels = np.asarray(label[()], dtype=np.int64).reshape(-1)
     if not np.isfinite(points).all():
         raise UserError(f"{path} contains NaN or infinite values. Replace it by an intact copy.")
-    low, high = labels.min(), labels.max()
+    low = labels.min()
+    high = labels.max()
     allowed = MAX_CLASSES if n_classes is None else n_classes
     if low < 0 or high >= allowed:
         reason = (

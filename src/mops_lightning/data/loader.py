@@ -52,7 +52,9 @@ class Augmentation:
         """Return the augmented ``(B, N, 3)`` points."""
         if self.rotate_up:
             angle = torch.rand(len(points), generator=rng) * (2 * torch.pi)
-            cos, sin, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
+            cos = angle.cos()
+            sin = angle.sin()
+            zero = torch.zeros_like(angle)
             rows = [cos, zero, sin, zero, zero + 1, zero, -sin, zero, cos]
             # These matrices are for y; moved along the diagonal, they are for another axis.
             up = self.rotate_up if isinstance(self.rotate_up, str) else "y"
@@ -70,7 +72,8 @@ class Augmentation:
         return points
 
 
-FIXED, DRAWN = 11, 12
+FIXED = 11
+DRAWN = 12
 """Random streams of tasks: the same in every epoch, or new in every epoch."""
 
 MakeBatch = Callable[[Tensor, list[Generator]], Any]
@@ -124,7 +127,9 @@ class CloudLoader:
     def set_epoch(self, epoch: int) -> None:
         """Start ``epoch`` from its first batch, unless it is the current epoch."""
         if epoch != self.epoch:
-            self.epoch, self.position, self.resume_at = epoch, 0, 0
+            self.epoch = epoch
+            self.position = 0
+            self.resume_at = 0
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position of the next batch, which Lightning saves in checkpoints."""
@@ -137,8 +142,10 @@ class CloudLoader:
 
     def __iter__(self) -> Iterator[Any]:
         # This code runs at the first batch, after set_epoch and load_state_dict.
-        epoch, number = self.epoch, len(self.clouds.points)
-        start, self.resume_at = self.resume_at, 0
+        epoch = self.epoch
+        number = len(self.clouds.points)
+        start = self.resume_at
+        self.resume_at = 0
         if self.shuffle:
             order = torch.randperm(number, generator=generator(self.seed, epoch))
         else:

@@ -18,7 +18,8 @@ from mops_lightning.ops.points import UnitSphere
 VERSION = 1
 """Part of the cache key; increment it when the same file gives another cloud."""
 
-FLOAT, PART = np.dtype(np.float32), np.dtype(np.int64)
+FLOAT = np.dtype(np.float32)
+PART = np.dtype(np.int64)
 """Dtypes of coordinates and of part numbers."""
 
 Kind = tuple[tuple[int, ...], np.dtype[Any]]

@@ -79,7 +79,8 @@ class DGCNN(nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:
         """Map ``(B, N, 3)`` points to ``(B, num_classes)`` logits."""
-        features, outputs = points, []
+        features = points
+        outputs = []
         for layer in self.edges:
             features = layer(features)
             outputs.append(features)

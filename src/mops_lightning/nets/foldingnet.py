@@ -73,7 +73,8 @@ class Fold(nn.Module):
 
     def forward(self, pieces: Tensor, coordinates: Tensor) -> Tensor:
         """Map ``(P, piece)`` and ``(P or 1, g, coordinates)`` to ``(P, g, 3)``."""
-        narrow, offsets = self.narrow, self.from_piece(pieces)
+        narrow = self.narrow
+        offsets = self.from_piece(pieces)
         others = (coordinates, self.from_coordinates.weight, narrow.weight, narrow.bias)
         # Under autocast, only the offsets would be in half precision.
         return self.rest(_WideLayer.apply(offsets, *(other.to(offsets) for other in others)))
@@ -103,7 +104,8 @@ class _WideLayer(Function):
     def backward(ctx: Any, *grads: Any) -> Any:
         (grad,) = grads
         offsets, coordinates, inner, outer = ctx.saved_tensors
-        d_offsets, d_inner = torch.zeros_like(offsets), torch.zeros_like(inner.T)
+        d_offsets = torch.zeros_like(offsets)
+        d_inner = torch.zeros_like(inner.T)
         d_outer = torch.zeros_like(outer)
         wanted = ctx.needs_input_grad[1]
         d_coordinates = torch.zeros_like(coordinates) if wanted else None

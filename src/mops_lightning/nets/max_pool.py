@@ -67,7 +67,8 @@ class PointMaxPool(nn.Module):
         assert norm.running_mean is not None
         assert norm.running_var is not None
         if not self.training:
-            mean, variance = norm.running_mean, norm.running_var
+            mean = norm.running_mean
+            variance = norm.running_var
         else:
             rows = features.flatten(0, 1).to(weight)
             centre = rows.mean(0)
@@ -130,7 +131,9 @@ class _MaxOverPoints(Function):
         (gradient,) = gradients
         dtype = features.dtype
         if dtype.itemsize < 4:  # sums of few rows: float32 costs little here
-            features, weight, gradient = features.float(), weight.float(), gradient.float()
+            features = features.float()
+            weight = weight.float()
+            gradient = gradient.float()
         clouds, n, _ = features.shape
         channels = len(weight)
         to_features = to_weight = None

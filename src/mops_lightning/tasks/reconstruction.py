@@ -20,9 +20,11 @@ from mops_lightning.types import Batch, TaskOutput
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-TRAINED_BLOCK, TRAINED_ROUNDS = 32, 1
+TRAINED_BLOCK = 32
+TRAINED_ROUNDS = 1
 """Blocks and rounds of the earth mover's distances in training; every published net had these."""
-SCORED_BLOCK, SCORED_ROUNDS = 128, 8
+SCORED_BLOCK = 128
+SCORED_ROUNDS = 8
 """Blocks and rounds of the earth mover's distances of clouds above ``exact_up_to``, in scores."""
 
 
@@ -87,7 +89,8 @@ class Reconstruction(Task):
     ) -> reconstruction.Distances:
         """Return distances by cloud; that of the earth mover by one process per thread of torch."""
         # Before the other distance: gradients are summed in this order.
-        chamfer, emd = chamfer_distance(built, clouds), None
+        chamfer = chamfer_distance(built, clouds)
+        emd = None
         if self.exact_up_to is not None:
             emd = earth_movers_distance(built, clouds, block, rounds, torch.get_num_threads())
         return reconstruction.Distances(chamfer, emd)

@@ -12,8 +12,10 @@ def airplane(rng: Generator) -> Trimesh:
 
     Jets have engines under the wings or at the tail. Some propeller planes have high wings.
     """
-    length, radius = 2.0, rng.uniform(0.09, 0.15)
-    nose, tail = length / 2, -length / 2
+    length = 2.0
+    radius = rng.uniform(0.09, 0.15)
+    nose = length / 2
+    tail = -length / 2
     z = np.array((nose, nose - 0.05, nose - 0.2, nose - 0.4, tail * 0.35, tail * 0.8, tail))
     y = radius * np.array((-0.3, -0.2, -0.05, 0, 0, 0.4, 0.75))
     wide = radius * np.array((0.12, 0.45, 0.85, 1, 1, 0.55, 0.15))
@@ -63,14 +65,16 @@ def _wing(
 ) -> Trimesh:
     """Return a flat wing between the leading edges at its root and tip."""
     chord = (0, -0.25, -0.6, -1, -0.6, -0.25)
-    rise, level = (0, 0.06, 0.05, 0, -0.05, -0.06), np.zeros(6)
+    rise = (0, 0.06, 0.05, 0, -0.05, -0.06)
+    level = np.zeros(6)
     shape = np.column_stack((rise, level, chord) if upright else (level, rise, chord))
     return loft((root + root_chord * shape, tip + tip_chord * shape))
 
 
 def _propeller(rng: Generator, nose: float, y: float) -> list[Trimesh]:
     blades = int(rng.integers(2, 5))
-    start, hub = rng.uniform(0, np.pi), np.array((0, y, nose + 0.03))
+    start = rng.uniform(0, np.pi)
+    hub = np.array((0, y, nose + 0.03))
     parts = [rod((0, y, nose - 0.03), (0, y, nose + 0.08), (0.05, 0.015))]
     for turn in start + 2 * np.pi * np.arange(blades) / blades:
         out = np.array((np.cos(turn), np.sin(turn), 0))
@@ -82,6 +86,7 @@ def _propeller(rng: Generator, nose: float, y: float) -> list[Trimesh]:
 def _engine(rng: Generator, x: float, y: float, z: float, size: float) -> list[Trimesh]:
     """Return a jet engine on each side; ``size`` is its radius at the front."""
     long = rng.uniform(0.22, 0.32)
-    front, rear = z + long * 0.4, z - long * 0.6
+    front = z + long * 0.4
+    rear = z - long * 0.6
     sides = (rod((at, y, front), (at, y, rear), (size, size * 0.7), 14) for at in (-x, x))
     return named("engine", *sides)

@@ -25,9 +25,11 @@ from mops_lightning.data.procedural.mesh_parts import (
 
 def table(rng: Generator) -> Trimesh:
     """Return a table: a round, oval or rectangular top on legs, a pillar or two trestles."""
-    width, height = rng.uniform(0.6, 1.9), rng.uniform(0.5, 1.1)
+    width = rng.uniform(0.6, 1.9)
+    height = rng.uniform(0.5, 1.1)
     depth = width * rng.uniform(0.5, 1.0)
-    thick, y = rng.uniform(0.03, 0.1), height
+    thick = rng.uniform(0.03, 0.1)
+    y = height
     under = y - thick
     if rng.random() < 0.4:
         top = disc(width / 2, (under, y))
@@ -56,7 +58,8 @@ def table(rng: Generator) -> Trimesh:
         )
         if rng.random() < 0.4:
             apron = (under - rng.uniform(0.07, 0.14), under)
-            wide, deep = width * inset, depth * inset
+            wide = width * inset
+            deep = depth * inset
             legs += [box(around(wide - 0.1), apron, around(0.03, z)) for z in around(deep - 0.06)]
             legs += [box(around(0.03, x), apron, around(deep - 0.1)) for x in around(wide - 0.06)]
         if rng.random() < 0.25:
@@ -66,7 +69,8 @@ def table(rng: Generator) -> Trimesh:
 
 def desk(rng: Generator) -> Trimesh:
     """Return a desk with drawer blocks or flat drawers, and possibly a back panel and a hutch."""
-    width, height = rng.uniform(1.2, 1.9), rng.uniform(0.7, 0.95)
+    width = rng.uniform(1.2, 1.9)
+    height = rng.uniform(0.7, 0.95)
     depth = rng.uniform(0.6, 0.9)
     under = height - rng.uniform(0.03, 0.06)
     parts = [box(around(width), (under, height), around(depth))]
@@ -82,14 +86,16 @@ def desk(rng: Generator) -> Trimesh:
         outer = side * (width / 2 - 0.03)
         inner = outer - side * block
         if side in with_drawers:
-            floor, feet = under * rng.choice((0.08, 0.45)), [outer, inner]
+            floor = under * rng.choice((0.08, 0.45))
+            feet = [outer, inner]
             rows = int(rng.integers(2, 4))
             parts += _drawers((min(feet), max(feet)), (floor, under), around(depth * 0.9), rows)
         elif rng.random() < 0.5:
             parts.append(box(around(0.04, outer), (0, under), around(depth * 0.9)))
             continue
         else:
-            floor, feet = under, [outer]
+            floor = under
+            feet = [outer]
         for x, z in product(feet, around(depth * 0.8)):
             parts.append(rod((x, 0, z), (x, floor, z), 0.03, 4))
     if rng.random() < 0.6:
@@ -120,11 +126,14 @@ def _hutch(rng: Generator, width: float, y: Span, back: float) -> list[Trimesh]:
 
 def shelf(rng: Generator) -> Trimesh:
     """Return a shelf with sides and boards, and possibly a back, dividers and books."""
-    width, height = rng.uniform(0.6, 1.6), rng.uniform(0.65, 1.9)
-    depth, board = rng.uniform(0.25, 0.5), rng.uniform(0.03, 0.05)
+    width = rng.uniform(0.6, 1.6)
+    height = rng.uniform(0.65, 1.9)
+    depth = rng.uniform(0.25, 0.5)
+    board = rng.uniform(0.03, 0.05)
     foot = rng.uniform(0.0, 0.12)
     floors = np.linspace(foot, height - board, rng.integers(3, 7))
-    half, z = width / 2, around(depth)
+    half = width / 2
+    z = around(depth)
     parts = [box((-half + board, half - board), (y, y + board), z) for y in floors]
     if rng.random() < 0.8:
         parts += [box(around(board, x), (0, height), z) for x in around(width - board)]
@@ -150,7 +159,8 @@ def _books(rng: Generator, x: Span, y: float, room: float, z: Span) -> list[Trim
     edges = x[0] + edges if rng.random() < 0.5 else x[1] - filled + edges
     parts = []
     for left, right in pairwise(edges):
-        tall, deep = room * rng.uniform(0.55, 0.9), (z[1] - z[0]) * rng.uniform(0.6, 0.9)
+        tall = room * rng.uniform(0.55, 0.9)
+        deep = (z[1] - z[0]) * rng.uniform(0.6, 0.9)
         parts.append(box((left, right), (y, y + tall), (z[0] + 0.02, z[0] + deep)))
     return parts
 
@@ -161,7 +171,8 @@ def lamp(rng: Generator) -> Trimesh:
     foot_profile = [(0, 0), (base, 0), (base, 0.03), (base * 0.3, 0.06), (0, 0.06)]
     parts = named("base", turned(foot_profile))
     kind = rng.random()
-    wide, low = rng.uniform(0.2, 0.36), rng.uniform(0.3, 0.95)
+    wide = rng.uniform(0.2, 0.36)
+    low = rng.uniform(0.3, 0.95)
     deep = rng.uniform(0.2, 0.36)
     narrow = wide * rng.uniform(0.4, 1.0)
     pole = rng.uniform(0.016, 0.03)
@@ -179,7 +190,8 @@ def lamp(rng: Generator) -> Trimesh:
         parts += named("base", turned(smooth(profile, 18)))
         shade = [turned([(wide, low), (narrow, low + deep)])]
     elif kind < 0.85:  # bent pole
-        y, reach = rng.uniform(0.9, 1.3), rng.uniform(0.35, 0.6)
+        y = rng.uniform(0.9, 1.3)
+        reach = rng.uniform(0.35, 0.6)
         path = [(0, 0.05, 0), (0, y * 0.75, 0), (reach * 0.4, y, 0), (reach, y * 0.85, 0)]
         parts += named("pole", tube(smooth(path, 20), pole, 8, across=(0, 0, 1)))
         cone = turned([(wide * 0.7, y * 0.85 - 0.2), (0.05, y * 0.85 + 0.02)])
@@ -198,8 +210,10 @@ def lamp(rng: Generator) -> Trimesh:
 
 def bed(rng: Generator) -> Trimesh:
     """Return a bed with mattress, pillows and headboard, possibly a footboard or four posts."""
-    width, length = rng.uniform(0.8, 1.7), rng.uniform(1.7, 2.1)
-    foot, frame = rng.uniform(0.08, 0.3), rng.uniform(0.12, 0.22)
+    width = rng.uniform(0.8, 1.7)
+    length = rng.uniform(1.7, 2.1)
+    foot = rng.uniform(0.08, 0.3)
+    frame = rng.uniform(0.12, 0.22)
     top = foot + frame + rng.uniform(0.14, 0.28)
     head = top + rng.uniform(0.2, 0.7)
     z = around(length)
@@ -232,7 +246,8 @@ def bed(rng: Generator) -> Trimesh:
         posts = [(x, at) for at in z for x in around(width)]
         bars = [rod((x, 0, at), (x, tall, at), 0.045, 8) for x, at in posts]
         for start, end in ((0, 1), (1, 3), (3, 2), (2, 0)):
-            (x0, z0), (x1, z1) = posts[start], posts[end]
+            (x0, z0) = posts[start]
+            (x1, z1) = posts[end]
             bars.append(rod((x0, tall, z0), (x1, tall, z1), 0.035, 8))
         parts += named("frame", *bars)
     return join(parts)

@@ -99,7 +99,8 @@ def tube(
     turn = 2 * np.pi * (np.arange(sections) + 0.5) / sections
     # Radius of the inscribed circle, so that bars with few corners are not thinner.
     reach = (np.broadcast_to(radii, len(centres)) / np.cos(np.pi / sections))[:, None, None]
-    first, second = normal[:, None] * flatten, np.cross(along, normal)[:, None]
+    first = normal[:, None] * flatten
+    second = np.cross(along, normal)[:, None]
     rings = np.cos(turn)[None, :, None] * first + np.sin(turn)[None, :, None] * second
     return loft(centres[:, None] + reach * rings)
 

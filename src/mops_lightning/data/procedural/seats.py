@@ -21,8 +21,10 @@ from mops_lightning.data.procedural.mesh_parts import (
 
 def chair(rng: Generator) -> Trimesh:
     """Return a chair with one of four backs, legs or a swivel foot, and possibly arms."""
-    width, depth = rng.uniform(0.75, 1.05), rng.uniform(0.75, 1.0)
-    seat, rise = rng.uniform(0.65, 1.15), rng.uniform(0.3, 1.25)
+    width = rng.uniform(0.75, 1.05)
+    depth = rng.uniform(0.75, 1.0)
+    seat = rng.uniform(0.65, 1.15)
+    rise = rng.uniform(0.3, 1.25)
     thick = rng.uniform(0.06, 0.16)
     parts = named("seat", _pad(rng, width, depth, (seat - thick, seat)))
     if rng.random() < 0.25:
@@ -36,7 +38,8 @@ def chair(rng: Generator) -> Trimesh:
             parts += named("leg", *rungs(ends, rng.uniform(0.25, 0.5), 0.025))
     parts += named("back", _chair_back(rng, width, -depth / 2, (seat, seat + rise)))
     if rng.random() < 0.3:
-        y, reach = seat + rise * rng.uniform(0.3, 0.6), depth * rng.uniform(0.25, 0.45)
+        y = seat + rise * rng.uniform(0.3, 0.6)
+        reach = depth * rng.uniform(0.25, 0.45)
         for side in (-1, 1):
             x = side * (width / 2 - 0.03)
             post = rod((x, seat - thick / 2, reach - 0.06), (x, y, reach - 0.06), 0.03, 8)
@@ -62,7 +65,8 @@ def _swivel(rng: Generator, height: float, reach: float) -> list[Trimesh]:
 def _chair_back(rng: Generator, width: float, z: float, y: Span) -> Trimesh:
     """Return a back of posts and rails, slats, rungs or a panel, at ``z`` and tilted back."""
     low, high = y
-    post, half = 0.045, width / 2 - 0.045
+    post = 0.045
+    half = width / 2 - 0.045
     kind = rng.integers(4)
     if kind == 0:
         gap = rng.uniform(0.0, 0.25)
@@ -87,7 +91,8 @@ def _chair_back(rng: Generator, width: float, z: float, y: Span) -> Trimesh:
 
 def stool(rng: Generator) -> Trimesh:
     """Return a stool: a round or square seat on three or four legs or one foot."""
-    width, height = rng.uniform(0.6, 1.0), rng.uniform(0.5, 1.4)
+    width = rng.uniform(0.6, 1.0)
+    height = rng.uniform(0.5, 1.4)
     depth = width * rng.uniform(0.8, 1.0)
     thick = rng.uniform(0.04, 0.2)
     y = (height - thick, height)
@@ -99,13 +104,15 @@ def stool(rng: Generator) -> Trimesh:
         pillar = rod((0, 0, 0), (0, height - thick, 0), 0.05)
         parts += named("leg", disc(base, (0, 0.05)), pillar)
         if height > 0.9:
-            ring, y_ring = width * 0.33, height * rng.uniform(0.3, 0.45)
+            ring = width * 0.33
+            y_ring = height * rng.uniform(0.3, 0.45)
             turn = np.linspace(0, 2 * np.pi, 25)
             path = np.column_stack((np.cos(turn) * ring, np.full(25, y_ring), np.sin(turn) * ring))
             bar = rod((-ring, y_ring, 0), (ring, y_ring, 0), 0.02, 8)
             parts += named("leg", tube(path, 0.025, 8, across=(0, 1, 0)), bar)
         return join(parts)
-    splay, radius = rng.uniform(0.03, 0.2), rng.uniform(0.03, 0.055)
+    splay = rng.uniform(0.03, 0.2)
+    radius = rng.uniform(0.03, 0.055)
     inset = 0.75 if is_round else 1.0
     if is_round and kind < 0.6:
         turn = 2 * np.pi * np.arange(3) / 3 + np.pi / 2
@@ -127,8 +134,10 @@ def sofa(rng: Generator) -> Trimesh:
     arm = rng.uniform(0.1, 0.28)
     width = seats * rng.uniform(0.6, 0.8)
     depth = rng.uniform(0.8, 1.0)
-    foot, seat = rng.uniform(0.05, 0.18), rng.uniform(0.4, 0.52)
-    back, rest = seat + rng.uniform(0.32, 0.6), seat + rng.uniform(0.1, 0.28)
+    foot = rng.uniform(0.05, 0.18)
+    seat = rng.uniform(0.4, 0.52)
+    back = seat + rng.uniform(0.32, 0.6)
+    rest = seat + rng.uniform(0.1, 0.28)
     thick = rng.uniform(0.18, 0.28)
     whole = width + 2 * arm
     base = seat - rng.uniform(0.14, 0.2)

@@ -21,7 +21,8 @@ from mops_lightning.data.procedural.mesh_parts import (
 
 def bottle(rng: Generator) -> Trimesh:
     """Return a bottle with a straight, waisted or round body and a neck, usually with a cap."""
-    radius, height = rng.uniform(0.22, 0.42), 1.0
+    radius = rng.uniform(0.22, 0.42)
+    height = 1.0
     neck = radius * rng.uniform(0.28, 0.6)
     shoulder = rng.uniform(0.48, 0.68)
     start = shoulder + rng.uniform(0.1, 0.2)
@@ -47,18 +48,21 @@ def bottle(rng: Generator) -> Trimesh:
 
 def vase(rng: Generator) -> Trimesh:
     """Return a vase with foot, belly, neck and lip, sometimes with two handles; or a beaker."""
-    belly, height = rng.uniform(0.24, 0.45), 1.0
+    belly = rng.uniform(0.24, 0.45)
+    height = 1.0
     foot = belly * rng.uniform(0.4, 0.7)
     neck = belly * rng.uniform(0.28, 0.85)
     lip = min(neck * rng.uniform(1.05, 1.9), belly * 1.15)
-    low, high = rng.uniform(0.3, 0.55), rng.uniform(0.72, 0.85)
+    low = rng.uniform(0.3, 0.55)
+    high = rng.uniform(0.72, 0.85)
     if rng.random() < 0.25:  # a beaker: no belly, wider at the top
         wall = smooth([(foot, 0), (foot * rng.uniform(0.9, 1.3), low), (belly, height)], 24)
         return turned([(0.0, 0.0), *wall])
     wall = smooth([(foot, 0), (foot * 0.85, 0.06), (belly, low), (neck, high), (lip, height)], 32)
     parts = [turned([(0.0, 0.0), *wall])]
     if rng.random() < 0.3:
-        reach, thick = rng.uniform(0.12, 0.22), rng.uniform(0.022, 0.035)
+        reach = rng.uniform(0.12, 0.22)
+        thick = rng.uniform(0.022, 0.035)
         ends = (high + height) / 2, (low + high) / 2
         parts += [_handle(wall, *ends, side * reach, thick) for side in (-1, 1)]
     return join(parts)
@@ -66,7 +70,8 @@ def vase(rng: Generator) -> Trimesh:
 
 def bowl(rng: Generator) -> Trimesh:
     """Return a bowl on a foot ring; a deep one is similar to a cup without a handle."""
-    radius, depth = 0.5, rng.uniform(0.28, 0.75)
+    radius = 0.5
+    depth = rng.uniform(0.28, 0.75)
     foot = radius * rng.uniform(0.3, 0.55)
     ring = rng.uniform(0.02, 0.14)
     bulge = rng.uniform(1.5, 3.2)
@@ -82,13 +87,15 @@ def bowl(rng: Generator) -> Trimesh:
 
 def cup(rng: Generator) -> Trimesh:
     """Return a cup with a handle, sometimes with a saucer."""
-    radius, height = rng.uniform(0.34, 0.5), rng.uniform(0.55, 1.0)
+    radius = rng.uniform(0.34, 0.5)
+    height = rng.uniform(0.55, 1.0)
     foot = radius * rng.uniform(0.55, 1.0)
     waist = rng.uniform(0.85, 1.12)
     middle = (radius + foot) / 2 * waist
     wall = smooth([(foot, 0), (middle, height * 0.45), (radius, height)], 14)
     parts = named("vessel", turned([(0.0, 0.0), *wall]))
-    top, low = height * rng.uniform(0.78, 0.92), height * rng.uniform(0.15, 0.4)
+    top = height * rng.uniform(0.78, 0.92)
+    low = height * rng.uniform(0.15, 0.4)
     handle = _handle(wall, top, low, rng.uniform(0.15, 0.36), rng.uniform(0.025, 0.05))
     parts += named("handle", handle)
     if rng.random() < 0.25:
@@ -99,7 +106,8 @@ def cup(rng: Generator) -> Trimesh:
 
 def bucket(rng: Generator) -> Trimesh:
     """Return a bucket with a conical wall, a rim and a handle at a random angle."""
-    radius, height = 0.5, rng.uniform(0.75, 1.1)
+    radius = 0.5
+    height = rng.uniform(0.75, 1.1)
     foot = radius * rng.uniform(0.6, 0.85)
     parts = [turned([(0, 0), (foot, 0), (radius, height)])]
     rim = rng.uniform(0.025, 0.06)
@@ -125,7 +133,8 @@ def bucket(rng: Generator) -> Trimesh:
 
 def goblet(rng: Generator) -> Trimesh:
     """Return a stemmed glass with a round, tall, conical or tulip-shaped bowl."""
-    foot, stem = rng.uniform(0.2, 0.3), rng.uniform(0.025, 0.045)
+    foot = rng.uniform(0.2, 0.3)
+    stem = rng.uniform(0.025, 0.045)
     rise = rng.uniform(0.15, 0.55)
     deep = 1.0 - rise
     wide = rng.uniform(0.18, 0.42)
@@ -141,15 +150,19 @@ def goblet(rng: Generator) -> Trimesh:
     ]
     parts = [turned([(0.0, 0.0), *smooth(start, 12), *smooth(glass, 18)])]
     if rng.random() < 0.4:
-        knob, y, half = stem * rng.uniform(1.6, 2.4), rise * rng.uniform(0.4, 0.8), 0.04
+        knob = stem * rng.uniform(1.6, 2.4)
+        y = rise * rng.uniform(0.4, 0.8)
+        half = 0.04
         parts.append(turned(smooth([(stem, y - half), (knob, y), (stem, y + half)], 9), 16))
     return join(parts)
 
 
 def teapot(rng: Generator) -> Trimesh:
     """Return a teapot with lid, spout, and a handle at the back or over the top."""
-    radius, height = 0.5, rng.uniform(0.6, 1.1)
-    foot, mouth = radius * rng.uniform(0.5, 0.8), radius * rng.uniform(0.35, 0.6)
+    radius = 0.5
+    height = rng.uniform(0.6, 1.1)
+    foot = radius * rng.uniform(0.5, 0.8)
+    mouth = radius * rng.uniform(0.35, 0.6)
     widest = height * rng.uniform(0.3, 0.55)
     wall = smooth([(foot, 0), (radius, widest), (mouth, height)], 18)
     dome = rng.uniform(0.06, 0.16)
@@ -159,7 +172,8 @@ def teapot(rng: Generator) -> Trimesh:
     ball_profile = np.column_stack((knob * np.array((0, 0.7, 1, 0.7, 0)), ball))
     parts = named("vessel", turned([(0.0, 0.0), *wall]))
     parts += named("lid", turned(lid), turned(ball_profile, 12))
-    reach, tip = rng.uniform(0.3, 0.5), height * rng.uniform(0.85, 1.1)
+    reach = rng.uniform(0.3, 0.5)
+    tip = height * rng.uniform(0.85, 1.1)
     root = widest * rng.uniform(0.6, 1.0)
     spout = [
         (-radius * 0.85, root, 0),
@@ -179,7 +193,8 @@ def teapot(rng: Generator) -> Trimesh:
         path = np.column_stack((np.cos(turn) * start, rise, np.zeros(16)))
         parts += named("handle", tube(path, thick, 10, across=(0, 0, 1)))
     else:
-        top, low = height * rng.uniform(0.75, 0.92), height * rng.uniform(0.15, 0.35)
+        top = height * rng.uniform(0.75, 0.92)
+        low = height * rng.uniform(0.15, 0.35)
         parts += named("handle", _handle(wall, top, low, rng.uniform(0.28, 0.45), thick))
     return join(parts)
 
