@@ -2,6 +2,7 @@
 
 import io
 import json
+import struct
 from typing import Any
 
 import h5py
@@ -17,7 +18,7 @@ from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.training.checkpoint import CHECKPOINT_KEY, sealed
 from mops_lightning.viz.figures import save_clouds
 from mops_lightning.zoo import weights
-from tests.support.meshes import BOX
+from tests.support.meshes import BOX, quantised_glb
 from tests.support.mutations import flip_bits
 from tests.support.records import record
 
@@ -47,6 +48,12 @@ def seeds(folder):
         made[suffix[1:]] = (suffix, [_bytes(BOX.export(file_type=suffix[1:]))])
     made["stl"][1].append(_bytes(BOX.export(file_type="stl_ascii")))
     made["glb"][1].append(_bytes(trimesh.Scene([BOX, BOX.copy()]).export(file_type="glb")))
+    made["ply lists"] = (".ply", [_ply_with_lists()])
+    made["pts"] = (".pts", [b"2\n1 2 3 -5 10 20 30\n4 5 6 7 8 9 10\n" * 9])
+    made["ptx"] = (".ptx", [PTX, PTX * 2])
+    made["e57"] = (".e57", [_e57(folder / "a.e57", points)])
+    made["spz"] = (".spz", [_spz(folder / "a.spz", points)])
+    made["glb quantised"] = (".glb", [quantised_glb(), quantised_glb(sparse=True)])
     packed = {"compression": "gzip", "chunks": (2, 20, 3)}
     made["hdf5"] = (".h5", [_hdf5(folder / "a.h5", options) for options in ({}, packed)])
     made["names"] = (".txt", [b"chair\ntable\nlamp\n"])
@@ -59,6 +66,11 @@ def seeds(folder):
     made["pictured clouds"] = (".npz", [(folder / "c.npz").read_bytes()])
     return made
 
+
+PTX = (
+    b"2\n2\n1 2 3\n1 0 0\n0 1 0\n0 0 1\n0 1 0 0\n-1 0 0 0\n0 0 1 0\n100 200 300 1\n"
+    b"1 0 0 0.5 255 0 0\n0 1 0 0.25 0 255 0\n0 0 0 0.5 0 0 0\n0 0 1 1 0 0 255\n"
+)
 
 CHECKPOINT = {
     CHECKPOINT_KEY: {"trainer.max_epochs": "3", "m": "8"},
@@ -99,6 +111,49 @@ def _las(path, form):
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = np.random.default_rng(form).uniform(0, 9, (3, 40))
     cloud.write(path)
+    return path.read_bytes()
+
+
+def _ply_with_lists():
+    """Return a mesh of a triangle and a quad, with lists of the vertices and another element."""
+    head = (
+        "ply\nformat binary_little_endian 1.0\nelement camera 1\nproperty float f\n"
+        "element vertex 4\nproperty double X\nproperty double Y\nproperty double Z\n"
+        "property list uchar short seen\nelement face 2\nproperty uchar red\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    corners = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+    vertices = [
+        struct.pack("<3dB", *corner, row) + struct.pack(f"<{row}h", *range(row))
+        for row, corner in enumerate(corners)
+    ]
+    faces = struct.pack("<BB3i", 9, 3, 0, 1, 2) + struct.pack("<BB4i", 8, 4, 0, 1, 2, 3)
+    return head.encode() + struct.pack("<f", 1.5) + b"".join(vertices) + faces
+
+
+def _e57(path, points):
+    import pye57
+
+    axes = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), points.T, strict=True))
+    data = {**axes, "intensity": np.ones(len(points), np.float32)}
+    with pye57.E57(str(path), mode="w") as file:
+        file.write_scan_raw(data, translation=np.array([1.0, 2, 3]))
+        file.write_scan_raw(data)
+    return path.read_bytes()
+
+
+def _spz(path, points):
+    import gsply
+
+    splats = gsply.GSData.from_arrays(
+        means=points.astype(np.float32),
+        scales=np.full((len(points), 3), -4, np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (len(points), 1)),
+        opacities=np.zeros(len(points), np.float32),
+        sh0=np.zeros((len(points), 3), np.float32),
+        shN=np.zeros((len(points), 3, 3), np.float32),
+    )
+    gsply.write_spz(path, splats)
     return path.read_bytes()
 
 

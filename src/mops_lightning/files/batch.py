@@ -28,6 +28,10 @@ from mops_lightning.ops.workers import start_worker
 if TYPE_CHECKING:
     from mops_lightning.files.chunks import Outcome
 
+NO_E57 = (
+    "E57 is not written: pye57 stores coordinates in single precision. Write .las, .ply or .npz."
+)
+
 FilePair = tuple[Path, Path]
 """An input file and its output file."""
 
@@ -61,6 +65,8 @@ def file_pairs(source: Path, target: Path) -> list[FilePair]:
         return pairs
     if target.is_dir():
         target = _output(source, target / source.name)
+    if target.suffix.lower() == ".e57":
+        raise UserError(f"{target}: {NO_E57}")
     if target.suffix.lower() not in WRITERS:
         raise UserError(f"OUT must end in one of {', '.join(WRITERS)}, got {target}.")
     return [(source, target)]

@@ -26,6 +26,7 @@ from mops_lightning.data.formats.ply_elements import (
     read_elements,
     read_header,
 )
+from mops_lightning.data.formats.splats import read_compressed_ply
 from mops_lightning.data.formats.table import Column, Form, Table, TableParts
 
 TYPES = {kind: name for name, kind in KINDS.items() if not name[-1].isdigit()}
@@ -60,6 +61,8 @@ def read(path: Path) -> Table | None:
     """
     data = path.read_bytes()
     header = read_header(data[:LONGEST_HEADER])
+    if _is_compressed(header):
+        return read_compressed_ply(path)
     if any(_is_faces(element) for element in header.elements):
         return None
     return _vertices(path, header, read_elements(data, header))
@@ -100,6 +103,12 @@ def parse_mesh(data: bytes, path: Path) -> PlyMesh:
     }
     left_out = tuple(name for name in table.form.left_out if name != "element face")
     return PlyMesh(table, faces, columns, left_out)
+
+
+def _is_compressed(header: Header) -> bool:
+    """Return whether the vertices are packed splats."""
+    names = {part.name for element in header.elements for part in element.properties}
+    return "packed_position" in names
 
 
 def _is_faces(element: Element) -> bool:
@@ -145,14 +154,8 @@ def _points(path: Path, header: Header) -> Element:
     """Return the element ``vertex``, or else the first one with x, y and z.
 
     Raises:
-        BadCloudError: there is none, or it is packed.
+        BadCloudError: there is none.
     """
-    for element in header.elements:
-        if any(part.name == "packed_position" for part in element.properties):
-            raise BadCloudError(
-                f"{path} is a compressed PLY of SuperSplat, which needs gsply: "
-                "pip install 'mops-lightning[splats]'."
-            )
     named = [element for element in header.elements if element.name == "vertex"]
     for element in (*named, *header.elements):
         names = {part.name.lower() for part in element.properties if part.count is None}
@@ -199,6 +202,8 @@ def locate(path: Path) -> CloudFile:
         raise WholeOnlyError(f"{path}: --chunk needs binary PLY.")
     if any(_is_faces(element) for element in header.elements):
         raise WholeOnlyError(f"{path} is a mesh: --chunk needs a cloud.")
+    if _is_compressed(header):
+        raise WholeOnlyError(f"{path} is a compressed PLY, which --chunk does not read.")
     points = _points(path, header)
     offset = header.end
     for element in header.elements[: header.elements.index(points) + 1]:

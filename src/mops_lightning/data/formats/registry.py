@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from mops_lightning.data.formats import las, numpy_files, pcd, ply, scans, text
+from mops_lightning.data.formats import e57, las, leica, numpy_files, pcd, ply, scans, splats, text
 from mops_lightning.data.formats.area import Area
 from mops_lightning.data.formats.cloud_file import CloudFile
 from mops_lightning.data.formats.guard import (
@@ -29,6 +29,11 @@ READERS: dict[str, Callable[[Path], Table | None]] = {
     ".npz": numpy_files.read_npz,
     ".xyz": text.read,
     ".txt": text.read,
+    ".e57": e57.read,
+    ".pts": leica.read_pts,
+    ".ptx": leica.read_ptx,
+    ".spz": splats.read_spz,
+    ".splat": splats.refuse_splat,
 }
 """Readers of clouds; they return None for a mesh."""
 

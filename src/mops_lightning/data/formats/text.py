@@ -60,7 +60,7 @@ def read(path: Path) -> Table:
         words = []
     if not lines:
         raise BadCloudError(f"{path} holds no points.")
-    columns = _numbers(lines, separator)
+    columns = numbers_of_lines(lines, separator)
     number = len(columns[0])
     if announced is not None and number < announced:
         raise BadCloudError(f"{path} is broken: it announces {announced} points, but has {number}.")
@@ -118,7 +118,7 @@ def _different(names: list[str]) -> list[str]:
     return different
 
 
-def _numbers(lines: list[str], separator: str | None) -> list[Column]:
+def numbers_of_lines(lines: list[str], separator: str | None) -> list[Column]:
     """Return the columns of lines; whole numbers of 64 bits keep all digits."""
     array: NDArray[Any] = np.loadtxt(lines, delimiter=separator, ndmin=2)
     columns: list[Column] = []

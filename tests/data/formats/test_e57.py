@@ -1,0 +1,92 @@
+"""E57 files, written by pye57."""
+
+import sys
+
+import numpy as np
+import pye57
+import pytest
+
+from mops_lightning.data.formats.registry import read
+from mops_lightning.errors import UserError
+from tests.support.downsample import call, refused
+
+QUARTER_TURN = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+"""Quaternion of a quarter turn about z."""
+
+
+def scan(number, **more):
+    random = np.random.default_rng(number)
+    axes = dict(
+        zip(("cartesianX", "cartesianY", "cartesianZ"), random.random((3, 30)), strict=True)
+    )
+    intensity = random.random(30).astype(np.float32)
+    colours = {name: random.integers(0, 256, 30).astype(np.uint8) for name in COLOURS}
+    return axes | {"intensity": intensity} | colours | more
+
+
+AXES = ("cartesianX", "cartesianY", "cartesianZ")
+COLOURS = ("colorRed", "colorGreen", "colorBlue")
+
+
+def points_of(data):
+    return np.stack([data[f"cartesian{axis}"] for axis in "XYZ"], 1).astype(np.float32)
+
+
+def test_read_e57_joins_scans_at_their_poses(tmp_path):
+    path = tmp_path / "a.e57"
+    first, second = scan(1), scan(2)
+    with pye57.E57(str(path), mode="w") as file:
+        file.write_scan_raw(first, translation=np.array([1000.5, 2000, 0]))
+        file.write_scan_raw(second, rotation=QUARTER_TURN, translation=np.array([0, 0, 5.0]))
+
+    table = read(path, 9, 0)
+
+    turned = points_of(second)[:, [1, 0, 2]] * [-1, 1, 1] + [0, 0, 5]
+    moved = points_of(first) + np.array([1000.5, 2000, 0])
+    expected = np.concatenate([moved, turned])
+    np.testing.assert_allclose(table.points, expected, atol=1e-12)
+    assert table.columns["scan"].tolist() == [0] * 30 + [1] * 30
+    assert table.columns["red"].dtype == np.uint8
+    np.testing.assert_array_equal(table.columns["red"][:30], first["colorRed"])
+    np.testing.assert_array_equal(table.columns["intensity"][30:], second["intensity"])
+
+
+def test_downsample_e57_leaves_invalid_points_out(tmp_path):
+    path = tmp_path / "a.e57"
+    invalid = np.zeros(30, np.int8)
+    invalid[:4] = 1
+    with pye57.E57(str(path), mode="w") as file:
+        file.write_scan_raw(scan(1, cartesianInvalidState=invalid))
+
+    status, said, _ = call(path, tmp_path / "b.ply", "--method", "fps", "--m", 10)
+
+    assert status == 0
+    assert "10 of 26 points (4 more without finite coordinates left out)" in said
+
+
+def test_e57_as_output_is_refused_with_the_reason(tmp_path):
+    np.save(tmp_path / "a.npy", np.ones((9, 3)))
+
+    said = refused(tmp_path / "a.npy", tmp_path / "b.e57", "--method", "fps", "--m", 3)
+
+    assert "pye57 stores coordinates in single precision" in said
+
+
+def test_broken_e57_is_named(tmp_path):
+    (tmp_path / "a.e57").write_bytes(b"ASTM-E57" + bytes(90))
+
+    with pytest.raises(UserError, match=r"a\.e57 is broken"):
+        read(tmp_path / "a.e57", 9, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "extra"), [("a.e57", "pye57", "e57"), ("a.spz", "gsply", "splats")]
+)
+def test_missing_library_gets_one_line(name, module, extra, tmp_path, monkeypatch):
+    from mops_lightning.data.formats import e57, splats
+
+    monkeypatch.setitem(sys.modules, module, None)
+    parse = e57._parse if name == "a.e57" else splats._parse_spz
+
+    with pytest.raises(UserError, match=rf"{module}: pip install 'mops-lightning\[{extra}\]'"):
+        parse(tmp_path / name)
