@@ -135,3 +135,14 @@ def test_glb_that_needs_an_extension_is_refused_by_its_name(name, tmp_path):
 
     with pytest.raises(UserError, match=rf"a\.glb.*needs the glTF extension {name}"):
         read(tmp_path / "a.glb", 9, 0)
+
+
+def test_colours_that_a_part_of_a_scene_lacks_are_named(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    ball.visual.vertex_colors = np.full((len(ball.vertices), 4), 9, np.uint8)
+    scene = trimesh.Scene([ball, trimesh.creation.box()])
+    (tmp_path / "a.glb").write_bytes(scene.export(file_type="glb"))
+
+    table = read(tmp_path / "a.glb", 9, 0)
+
+    assert table.form.left_out == ("red", "green", "blue", "alpha")

@@ -91,9 +91,11 @@ def column_names(array: NDArray[Any], path: Path) -> list[str]:
 
 
 def split_array(name: str, values: NDArray[Any]) -> dict[str, Column]:
-    """Return values ``(N,)`` as one column, or ``(N, k)`` as ``NAME_0`` to ``NAME_k-1``."""
+    """Return values ``(N,)`` or ``(N, 1)`` as one column, ``(N, k)`` as ``NAME_0`` and so on."""
     if values.ndim == 1:
         return {name: values}
+    if values.shape[1] == 1:
+        return {name: values[:, 0]}
     return {f"{name}_{place}": values[:, place] for place in range(values.shape[1])}
 
 

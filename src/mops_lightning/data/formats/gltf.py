@@ -2,10 +2,13 @@
 
 import json
 import struct
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mops_lightning.data.formats.guard import BadCloudError
 
 KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 """Data types of accessors by their number."""
@@ -22,14 +25,19 @@ HARMLESS = ("KHR_mesh_quantization", "KHR_texture", "EXT_texture", "KHR_material
 """Beginnings of the names of required extensions that are read, or do not affect the surface."""
 
 
-def plain_glb(data: bytes) -> bytes:
+def plain_glb(data: bytes, path: Path) -> bytes:
     """Return a GLB file with its positions and normals as float32, and without sparse accessors.
 
+    Args:
+        data: content of the file.
+        path: of the file, for errors.
+
     Raises:
-        ValueError: the file needs an extension that is not read, or its accessors are broken.
+        BadCloudError: the file needs an extension that is not read.
+        ValueError: its accessors are broken.
     """
     tree, buffer = _chunks(data)
-    check_extensions(tree)
+    _check_extensions(tree, path)
     accessors = tree.get("accessors", [])
     quantised = _quantised(tree)
     changed = {place for place, accessor in enumerate(accessors) if "sparse" in accessor}
@@ -45,13 +53,13 @@ def plain_glb(data: bytes) -> bytes:
     return _packed(tree, bytes(extended))
 
 
-def check_extensions(tree: dict[str, Any]) -> None:
+def _check_extensions(tree: dict[str, Any], path: Path) -> None:
     """Reject a file that needs an extension which changes its surface."""
     for name in tree.get("extensionsRequired", []):
         if not str(name).startswith(HARMLESS):
-            raise ValueError(
-                f"it needs the glTF extension {name}. Write it without, such as by "
-                "npx @gltf-transform/cli copy IN.glb OUT.glb"
+            raise BadCloudError(
+                f"{path} needs the glTF extension {name}, which is not read. Write it without, "
+                f"such as by npx @gltf-transform/cli copy {path.name} plain.glb"
             )
 
 

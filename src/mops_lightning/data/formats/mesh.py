@@ -138,19 +138,19 @@ def _load(data: bytes, kind: str, path: Path) -> "Trimesh":
     if kind == ".obj" and data.count(b"usemtl") > MAX_MATERIALS:
         data = re.sub(rb"(?m)^[ ]*usemtl.*$", b"", data)
     if kind == ".glb":
-        data = plain_glb(data)
+        data = plain_glb(data, path)
     # Materials do not affect the surface, and their files may be missing.
     extra: dict[str, Any] = {"skip_materials": True} if kind != ".off" else {}
     scene: Any = trimesh.load(
         BytesIO(data), file_type=kind[1:], force="scene", process=False, **extra
     )
-    of_vertices, of_faces = scene_attributes(scene)
+    found = scene_attributes(scene)
     joined: Trimesh = scene.to_mesh()
     joined.vertex_attributes.clear()
-    joined.vertex_attributes.update(of_vertices)
+    joined.vertex_attributes.update(found.of_vertices)
     joined.face_attributes.clear()
-    joined.face_attributes.update(of_faces)
-    joined.metadata[LEFT_OUT] = _left_out(data, kind)
+    joined.face_attributes.update(found.of_faces)
+    joined.metadata[LEFT_OUT] = (*_left_out(data, kind), *found.left_out)
     return joined
 
 

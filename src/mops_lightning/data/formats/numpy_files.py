@@ -22,7 +22,7 @@ from mops_lightning.data.formats.guard import BadCloudError, WholeOnlyError
 from mops_lightning.data.formats.table import Column, Table
 from mops_lightning.filesystem import load_npz
 
-POINTS = ("points", "xyz", "pos")
+POINTS = ("points", "xyz", "pos", "positions")
 """Names of the array of an .npz file that holds the coordinates."""
 
 
@@ -42,7 +42,8 @@ def write_npy(path: Path, table: Table) -> list[str]:
     """Write ``(N, 3 + columns)`` numbers of one data type, or rows of named fields.
 
     Returns:
-        Why the file has rows of fields: no data type holds the numbers of all columns.
+        The names of the columns, which a plain array does not hold; or why the file has rows of
+        fields, because no data type holds the numbers of all columns.
     """
     points = table.stored_coordinates()
     columns = table.columns.values()
@@ -54,10 +55,17 @@ def write_npy(path: Path, table: Table) -> list[str]:
             for place, column in enumerate(columns, 3):
                 array[:, place] = column
             np.save(file, array)
-            return []
+            return _lost_names(table)
         named: dict[str, Column] = dict(zip("xyz", points.T, strict=True)) | unique_names(table)
         np.save(file, to_rows(named))
     return ["rows of named fields, because no data type holds the numbers of all columns"]
+
+
+def _lost_names(table: Table) -> list[str]:
+    """Return a note of the names of columns that a plain array does not hold."""
+    if all(name.startswith("column_") for name in table.columns):
+        return []
+    return [f"its columns are x, y, z, {', '.join(table.columns)}, without names in the file"]
 
 
 def locate_npy(path: Path) -> CloudFile:

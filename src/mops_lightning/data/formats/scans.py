@@ -36,9 +36,9 @@ FEW_POINTS = 32
 
 @dataclass(frozen=True)
 class ScanForm:
-    """The columns of a scan, all float32."""
+    """The columns of a scan that a user has named; None: those that the file's name implies."""
 
-    names: tuple[str, ...]
+    names: tuple[str, ...] | None
 
 
 def read(path: Path, names: Sequence[str] | None = None) -> Table:
@@ -70,13 +70,14 @@ def locate(path: Path, names: Sequence[str] | None = None) -> CloudFile:
     if names is None:
         _check_values(path, chosen)
     parse_numbers = binary_file(path, number, kind).parse
+    given = chosen if names is not None else None
     labels = _label_file(path)
     if labels is not None and labels.stat().st_size != 4 * number:
         raise BadCloudError(
             f"{labels} has {labels.stat().st_size} bytes, not 4 for each of the {number} points of "
             f"{path}."
         )
-    return CloudFile(path, number, partial(_parse, parse_numbers, labels, ScanForm(chosen)))
+    return CloudFile(path, number, partial(_parse, parse_numbers, labels, ScanForm(given)))
 
 
 def _parse(
@@ -142,12 +143,12 @@ def _mean_difference(values: NDArray[np.float64], width: int) -> float:
 
 
 def write(path: Path, table: Table, names: tuple[str, ...] = KITTI) -> list[str]:
-    """Write float32 columns: those of a scan that was read, or others.
+    """Write float32 columns: those that a user has named for a scan that was read, or others.
 
     Args:
         path: the file.
         table: without an intensity, or another one of the columns, it is 0.
-        names: the columns of a table that was not read from a scan.
+        names: the columns otherwise.
 
     Returns:
         Columns that are left out, and numbers that float32 changes.
@@ -157,7 +158,9 @@ def write(path: Path, table: Table, names: tuple[str, ...] = KITTI) -> list[str]
     """
     _check_digits(table.points)
     layout = table.form.layout
-    chosen = layout.names if isinstance(layout, ScanForm) else names
+    chosen = names
+    if isinstance(layout, ScanForm) and layout.names is not None:
+        chosen = layout.names
     available: dict[str, Column] = {
         **dict(zip("xyz", table.points.T, strict=True)),
         **table.columns,

@@ -1,5 +1,6 @@
 """Numbers of the vertices and faces of a mesh at points on its surface."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,26 @@ NORMALS = ("nx", "ny", "nz")
 COLOURS = ("red", "green", "blue", "alpha")
 
 
-def scene_attributes(scene: Any) -> tuple[dict[str, Column], dict[str, Column]]:
-    """Return the normals and colours of the vertices, and the colours of the faces, of all parts.
+@dataclass(frozen=True)
+class SceneAttributes:
+    """The numbers of a scene's vertices and faces, in the order of ``scene.to_mesh()``.
+
+    Attributes:
+        of_vertices: normals and colours of the vertices.
+        of_faces: colours of the faces.
+        left_out: names of columns that a part of the scene lacks.
+    """
+
+    of_vertices: dict[str, Column]
+    of_faces: dict[str, Column]
+    left_out: tuple[str, ...]
+
+
+def scene_attributes(scene: Any) -> SceneAttributes:
+    """Return the normals and colours of all parts of a scene.
 
     Args:
         scene: a ``trimesh.Scene`` as a file was read, without further processing.
-
-    Returns:
-        Columns in the order of ``scene.to_mesh()``; none that a part of the scene lacks.
     """
     of_vertices, of_faces = [], []
     for node in scene.graph.nodes_geometry:
@@ -31,7 +44,10 @@ def scene_attributes(scene: Any) -> tuple[dict[str, Column], dict[str, Column]]:
         if hasattr(part, "faces"):
             of_vertices.append(_vertex_attributes(part, transform))
             of_faces.append(_colours(part.visual.face_colors) if _has_colours(part, "face") else {})
-    return _joined(of_vertices), _joined(of_faces)
+    vertices, faces = _joined(of_vertices), _joined(of_faces)
+    names = dict.fromkeys(name for part in (*of_vertices, *of_faces) for name in part)
+    left_out = tuple(name for name in names if name not in vertices and name not in faces)
+    return SceneAttributes(vertices, faces, left_out)
 
 
 def _vertex_attributes(part: Mesh, transform: NDArray[np.float64]) -> dict[str, Column]:
