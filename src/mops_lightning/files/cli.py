@@ -20,11 +20,12 @@ from mops_lightning.zoo.names import UNTRAINED
 
 DOWNSAMPLE = """Downsample clouds and meshes from files.
 
-IN is a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt .e57 .pts .ptx .spz, or a mesh: .off .obj
-.stl .glb), a folder of them, a pattern such as 'county/*.laz', or the web address of a COPC file, of
-which an area is read. OUT is a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt) or a folder. Clouds
-are normalised to the unit sphere, as in training, sampled by a trained sampler (--weights) or an
-untrained method (--method), and mapped back. Meshes are first sampled on their surface."""
+IN is a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt .e57 .pts .ptx .spz, or a mesh: .off
+.obj .stl .glb), a folder of them, a pattern such as 'county/*.laz', or the web address of a COPC
+file, of which an area is read. OUT is a file (.ply .pcd .las .laz .bin .npy .npz .xyz .txt) or a
+folder. Clouds are normalised to the unit sphere, as in training, sampled by a trained sampler
+(--weights) or an untrained method (--method), and mapped back. Meshes are first sampled on their
+surface."""
 
 PROPAGATE = """Carry labels, colours or scores from a sample to all points of a cloud.
 
