@@ -96,3 +96,45 @@ def test_plain_torchmetrics_class_gets_defaults():
     foreign = foreign_metrics([("accuracy", SumMetric())])
     info = metric_info("accuracy", [record(metric_info=foreign)])
     assert (info.title, info.format(0.5), info.summary_order) == ("accuracy", "0.5", 10)
+
+
+def test_collapsed_sampler_shows_its_distinct_points_beside_the_score():
+    metrics = {
+        "test/fps/accuracy": 0.25,
+        "test/generated/accuracy": 0.75,
+        "test/matched/accuracy": 0.5,
+        "test/completed/accuracy": 0.25,
+        "test/full/accuracy": 0.75,
+        "test/matched/unique_points": 2.25,
+    }
+
+    text = printed(metrics, "test/generated/accuracy", m=16)
+
+    assert cells(text) == [
+        ["sampled by", "accuracy (%)", "distinct points"],
+        ["fps", "25.00", ""],
+        ["mops generated", "75.00", "2.2"],
+        ["mops matched", "50.00", "2.2"],
+        ["mops completed", "25.00", ""],
+        ["all points", "75.00", ""],
+    ]
+    said = "collapsed: only 2.2 of 16 matched points are distinct. Try sampler.anchors=fps"
+    assert said in " ".join(text.split())
+
+
+def test_collapse_at_one_size_shows_the_distinct_points_of_all():
+    metrics = {"test/full/accuracy": 1.0}
+    for m, distinct in ((8, 7.5), (32, 15.5)):
+        metrics[f"test/m{m}/generated/accuracy"] = 0.5
+        metrics[f"test/m{m}/matched/unique_points"] = distinct
+
+    text = printed(metrics, "test/m32/generated/accuracy")
+
+    assert cells(text)[-1] == ["distinct points", "7.5", "15.5"]
+    assert "collapsed: only 15.5 of 32 matched points are distinct." in " ".join(text.split())
+
+
+def test_sampler_with_half_of_its_points_distinct_has_not_collapsed():
+    metrics = {"test/full/accuracy": 1.0, "test/generated/accuracy": 0.5}
+    text = printed({**metrics, "test/matched/unique_points": 16.0}, "test/generated/accuracy")
+    assert "distinct" not in text

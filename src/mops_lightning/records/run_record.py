@@ -123,6 +123,8 @@ class RunRecord:
         metrics: test metrics by name; None in a file where the value was not finite.
         score_name: name of the task's main metric on the first readout, among ``metrics``.
         score: its value.
+        collapsed: sizes at which fewer than half of the matched points are distinct, with the mean
+            number of distinct ones; such a score says nothing of the sample as a sample.
         metric_info: label, unit, direction of metrics that are not this package's.
         validation: metrics of the held-out clouds after the last epoch.
         seconds: wall time by stage; ``fit_cpu``: CPU time of the training, all attempts together.
@@ -162,6 +164,7 @@ class RunRecord:
     metrics: dict[str, Any] = field(default_factory=dict)
     score_name: str = ""
     score: float | None = None
+    collapsed: dict[str, float] = field(default_factory=dict)
     metric_info: dict[str, dict[str, Any]] = field(default_factory=dict)
     validation: dict[str, float | None] = field(default_factory=dict)
     seconds: dict[str, Annotated[float, msgspec.Meta(ge=0)]] = field(default_factory=dict)

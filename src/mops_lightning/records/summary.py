@@ -6,6 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from mops_lightning.records.collapse import collapse_line, collapsed, distinct_points
 from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL, ROWS, parse_metric_name
 from mops_lightning.records.run_record import FILE, Names, RunRecord
@@ -30,6 +31,8 @@ def closing_lines(folder: Path, record: RunRecord, console: Console | None = Non
         title, table = results_table(record)
         console.print(title, soft_wrap=True, highlight=False, style="italic")
         console.print(table)
+        if line := collapse_line(record):
+            console.print(line, soft_wrap=True, highlight=False)
     files = ", ".join([FILE, *sorted(record.files.values())])
     seconds = record.seconds["total"]
     partial = f", but {' and '.join(record.partial)}" if record.partial else ""
@@ -70,13 +73,23 @@ def results_table(record: RunRecord) -> tuple[str, Table]:
     table.add_column("sampled by")
     for head, _ in columns.values():
         table.add_column(head, justify="right")
+    found = collapsed(record)
+    if found and not by_size:
+        table.add_column("distinct points", justify="right")
     for readout, row in rows.items():
         cells = [
             "" if (value := row.get(column)) is None else info.format(value)
             for column, (_, info) in columns.items()
         ]
-        if any(cells):  # others have metrics of the sampled set only
-            table.add_row(_label(readout, config), *cells)
+        if not any(cells):  # it has metrics of the sampled set only
+            continue
+        if found and not by_size and readout in ("generated", "matched"):
+            cells.append(f"{found[config['m']]:.1f}")
+        table.add_row(_label(readout, config), *cells)
+    if found and by_size:
+        distinct = distinct_points(record)
+        counts = [f"{distinct[m]:.1f}" for m in (int(column[2:]) for column in columns)]
+        table.add_row("distinct points", *counts)
     title = f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test"
     changed = [f"{name}={config[name]}" for name in OF_TEST_CLOUDS if config.get(name)]
     return ", ".join([title, *changed]), table

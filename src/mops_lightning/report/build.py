@@ -9,7 +9,7 @@ from mops_lightning.report import collect
 from mops_lightning.report.comparable import Group, groups, net_groups, weightless
 from mops_lightning.report.grids import grids
 from mops_lightning.report.nets import nets_grid
-from mops_lightning.report.provenance import edited, provenance, without_result
+from mops_lightning.report.provenance import collapses, edited, provenance, without_result
 from mops_lightning.report.tables import Table, make_table
 from mops_lightning.report.text import Grid
 
@@ -95,7 +95,9 @@ def _about_runs(found: collect.Found, shown: list[RunRecord], tables: list[Table
     same_task = [record for record in found.done if collect.names(record)["task"] in tasks]
     nets = {table.net for table in tables}
     hidden = sorted({folder for table in tables for folder in table.hidden})
+    net = nets.pop() if len(nets) == 1 else ""
     return [
-        *provenance(same_task, nets.pop() if len(nets) == 1 else ""),
+        *provenance(same_task, net),
+        *collapses(same_task, net),
         *(f"- {run}: not shown; a later run has the same row, column and seed" for run in hidden),
     ]

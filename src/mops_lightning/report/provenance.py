@@ -1,9 +1,12 @@
 """The lines below a report: how its runs were made, and which have no result."""
 
+from collections import defaultdict
 from pathlib import Path
+from statistics import mean
 
 import pandas as pd
 
+from mops_lightning.records.collapse import ADVICE, collapsed
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report import collect
 from mops_lightning.report.comparable import commit
@@ -40,6 +43,25 @@ def edited(found: list[RunRecord]) -> list[str]:
         for record in found
         if record.is_edited
     ]
+
+
+def collapses(found: list[RunRecord], net: str) -> list[str]:
+    """Return a line for each kind of runs whose sampler has collapsed, over all seeds.
+
+    Args:
+        found: completed records.
+        net: the table's task net; other nets are named.
+    """
+    counts: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for record in found:
+        for m, count in collapsed(record).items():
+            counts[_kind(record, net)][m].append(count)
+    lines = []
+    for kind, by_size in counts.items():
+        means = [f"{mean(values):.1f} of {m}" for m, values in sorted(by_size.items())]
+        shown = ", ".join(means)
+        lines.append(f"- {kind}: collapsed: only {shown} matched points are distinct. {ADVICE}.")
+    return lines
 
 
 def without_result(found: collect.Found) -> list[str]:

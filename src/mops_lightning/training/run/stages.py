@@ -14,6 +14,7 @@ from torch import nn
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import Interrupted, UserError
+from mops_lightning.records.collapse import collapsed
 from mops_lightning.records.metric_info import foreign_metrics
 from mops_lightning.records.readout_names import parse_metric_name
 from mops_lightning.records.run_record import BY_RUN, Evaluated, RunRecord, dotted
@@ -253,6 +254,7 @@ def save(parts: Parts, record: RunRecord) -> None:
         if (parts.folder / name).exists():
             record.files[kind] = name
     record.score = record.metrics.get(experiment.score_name)
+    record.collapsed = {str(m): count for m, count in collapsed(record).items()}
     modules: dict[str, nn.Module | None] = {"task": task, "sampler": sampler}
     record.score_name = experiment.score_name
     record.metric_info = foreign_metrics(task.metrics().items())

@@ -1,0 +1,44 @@
+"""Samplers that have collapsed: most of their points lie on few points of the cloud.
+
+A task net can score such a sample well, for it was trained for this net alone. As a sample of the
+cloud it is worthless, and the score does not show it.
+"""
+
+from mops_lightning.records.readout_names import parse_metric_name
+from mops_lightning.records.run_record import RunRecord
+
+UNIQUE = "unique_points"
+"""The metric that counts the distinct matched points of a cloud."""
+
+FEWEST = 0.5
+"""Share of m below which the mean number of distinct points means a collapse."""
+
+ADVICE = "Try sampler.anchors=fps (docs/samplers.md)"
+
+
+def distinct_points(record: RunRecord) -> dict[int, float]:
+    """Return the mean number of distinct matched points of the test clouds, by size.
+
+    Args:
+        record: of a run; those without a generating sampler have no such number.
+    """
+    found: dict[int, float] = {}
+    for name, value in record.metrics.items():
+        parts = parse_metric_name(name)
+        if parts and parts.metric == UNIQUE and value is not None:
+            found[parts.m or record.config["m"]] = value
+    return found
+
+
+def collapsed(record: RunRecord) -> dict[int, float]:
+    """Return the sizes at which a run's sampler has collapsed, with its distinct points."""
+    return {m: count for m, count in distinct_points(record).items() if count < FEWEST * m}
+
+
+def collapse_line(record: RunRecord) -> str:
+    """Return one line about a collapsed sampler and what to try; empty if it has not collapsed."""
+    found = collapsed(record)
+    if not found:
+        return ""
+    counts = ", ".join(f"{count:.1f} of {m}" for m, count in found.items())
+    return f"collapsed: only {counts} matched points are distinct. {ADVICE}."
