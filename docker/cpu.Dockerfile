@@ -22,9 +22,11 @@ RUN pip install --no-cache-dir -c constraints.txt build hatchling
 COPY pyproject.toml README.md LICENSE ./
 COPY src src
 COPY conf conf
-# The requirements are written to a file too, so that the last stage can install them first.
+COPY sweeps sweeps
+# The requirements, with those of LAS files, are written to a file too, so that the last stage can
+# install them first.
 RUN python -m build --wheel --no-isolation --outdir dist \
-    && python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['dependencies'], sep='\n')" > dist/requirements.txt
+    && python -c "import tomllib; p = tomllib.load(open('pyproject.toml', 'rb'))['project']; print(*p['dependencies'], *p['optional-dependencies']['las'], sep='\n')" > dist/requirements.txt
 
 FROM python:3.12.12-slim-trixie
 LABEL org.opencontainers.image.title="mops-lightning (CPU)" \

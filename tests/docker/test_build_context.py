@@ -1,6 +1,8 @@
 """What an image is built from; hadolint checks the rest of the Dockerfiles."""
 
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -66,3 +68,15 @@ def test_pip_install_uses_the_constraints(name):
     installs = [step for step in steps if "pip install" in step]
     assert installs
     assert all(" -c constraints.txt " in step for step in installs)
+
+
+@pytest.mark.parametrize("name", DOCKERFILES)
+def test_image_reads_las_files(name):
+    step = next(line for line in commands(name) if "import tomllib" in line)
+    code = step.split('python -c "')[1].split('"')[0]
+
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+
+    requirements = done.stdout.splitlines()
+    assert [line for line in requirements if line.startswith("laspy[lazrs]")]
+    assert [line for line in requirements if line.startswith("torch>=")]

@@ -1,5 +1,6 @@
 """Clouds and trained weights, as a user has them in a folder."""
 
+import distributed
 import numpy as np
 import pytest
 import torch
@@ -8,6 +9,7 @@ from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
+from tests.support.dask import environment_kept
 
 
 @pytest.fixture(scope="module")
@@ -37,3 +39,14 @@ def anchored(tmp_path_factory):
     config = {"learn": "sampler", "sampler": node}
     weights.save(folder / "weights.safetensors", FMOPSNet(40, anchors="fps"), config, {})
     return folder
+
+
+@pytest.fixture(scope="module")
+def client():
+    """A Dask client of two worker processes."""
+    with (
+        environment_kept(),
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as two,
+        distributed.Client(two) as client,
+    ):
+        yield client

@@ -3,7 +3,6 @@
 import os
 import signal
 import sys
-from contextlib import contextmanager
 
 import distributed
 import numpy as np
@@ -18,28 +17,8 @@ from mops_lightning.files.engine import DaskEngine, Engine, dask_engine
 from mops_lightning.files.options import Options
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.zoo import weights
+from tests.support.dask import environment_kept
 from tests.support.downsample import call, done, refused
-
-
-@contextmanager
-def environment_kept():
-    """Restore the environment: Dask sets OMP_NUM_THREADS=1 for its workers in this process too."""
-    before = dict(os.environ)
-    try:
-        yield
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
-
-
-@pytest.fixture(scope="module")
-def client():
-    with (
-        environment_kept(),
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as two,
-        distributed.Client(two) as client,
-    ):
-        yield client
 
 
 @pytest.fixture(scope="module")

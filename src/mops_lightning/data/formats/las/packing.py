@@ -22,6 +22,7 @@ from mops_lightning.data.formats.las.header import (
     Record,
 )
 from mops_lightning.data.formats.las.layout import (
+    EXTRA,
     Extra,
     Layout,
     Rows,
@@ -195,8 +196,13 @@ def _with_records(header: Header, layout: Layout) -> Header:
 
 
 def _with_extra(records: list[Record], documented: list[Extra], layout: Layout) -> list[Record]:
-    """Document the extra dimensions of a layout behind those that records document."""
+    """Document the extra dimensions of a layout behind those that records document.
+
+    They are added to the last record: some readers, such as laspy, read one record only.
+    """
     others = [record for record in records if not is_extra(record)]
-    old = [record for record in records if is_extra(record)] if documented else []
-    data = b"".join(extra.to_bytes() for extra in layout.extra[len(documented) :])
-    return [*others, *old, Record.new(SPEC, EXTRA_BYTES, data, "Extra Bytes Record")]
+    known = [record for record in records if is_extra(record)] if documented else []
+    last = known.pop() if known else Record.new(SPEC, EXTRA_BYTES, b"", "Extra Bytes Record")
+    data = last.data[: len(last.data) // EXTRA.size * EXTRA.size]
+    data += b"".join(extra.to_bytes() for extra in layout.extra[len(documented) :])
+    return [*others, *known, replace(last, data=data)]

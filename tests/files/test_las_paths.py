@@ -1,0 +1,112 @@
+"""Every point format of LAS on every path: all bytes of a point and of the header are kept."""
+
+import laspy
+import numpy as np
+import pytest
+
+from mops_lightning.files.cli import propagate
+from tests.support import captured
+from tests.support.downsample import call, done
+from tests.support.las import WAVEFORM_FORMATS, full_cloud, header_fields
+
+FILES = [(form, ".las") for form in range(11)]
+FILES += [(form, ".laz") for form in range(11) if form not in WAVEFORM_FORMATS]
+PATHS = {
+    "whole": ["--method", "fps", "--m", 40],
+    "chunk": ["--method", "random", "--m", 40, "--chunk", 90],
+    "tile": ["--method", "fps", "--tile", 64, "--m", 40],
+    "bounds": ["--method", "random", "--m", 40, "--bounds", "499950,5399950,500040,5400040"],
+}
+
+
+@pytest.fixture(scope="module", params=FILES, ids=lambda pair: f"{pair[0]}{pair[1]}")
+def scan(request, tmp_path_factory):
+    form, suffix = request.param
+    path = tmp_path_factory.mktemp("scan") / f"scan{suffix}"
+    full_cloud(form).write(path)
+    return path
+
+
+def check_copy(source, copy, number):
+    """Check that a copy has rows of its source, and a header that fits them."""
+    before, after = laspy.read(source), laspy.read(copy)
+    assert len(after.points) == number
+    rows = np.asarray(after.point_source_id)
+    assert after.points.array.dtype == before.points.array.dtype
+    np.testing.assert_array_equal(after.points.array, before.points.array[rows])
+    assert header_fields(copy) == header_fields(source)
+    header = after.header
+    np.testing.assert_array_equal(header.mins, after.xyz.min(0))
+    np.testing.assert_array_equal(header.maxs, after.xyz.max(0))
+    returns = np.bincount(after.return_number, minlength=16)[1:]
+    most = 15 if header.version.minor >= 4 else 5
+    np.testing.assert_array_equal(header.number_of_points_by_return[:most], returns[:most])
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_downsampled_points_keep_all_bytes(scan, path, tmp_path):
+    target = tmp_path / f"out{scan.suffix}"
+
+    done(scan, target, *PATHS[path])
+
+    check_copy(scan, target, 40)
+
+
+def test_propagated_file_keeps_all_bytes_but_the_field(scan, tmp_path):
+    target = tmp_path / f"out{scan.suffix}"
+
+    captured.done(propagate, [scan, scan, target, "--field", "classification"])
+
+    check_copy(scan, target, 300)
+
+
+@pytest.mark.parametrize("form", range(11))
+def test_cluster_keeps_all_bytes(form, client, tmp_path):
+    scan, target = tmp_path / "scan.las", tmp_path / "out.las"
+    full_cloud(form).write(scan)
+
+    done(scan, target, *PATHS["chunk"], "--cluster", client.scheduler.address)
+
+    check_copy(scan, target, 40)
+
+
+def test_propagate_sets_an_element_of_an_array_and_adds_a_dimension(tmp_path):
+    scan, small, out = (tmp_path / name for name in ("scan.laz", "small.npz", "out.laz"))
+    cloud = full_cloud(7)
+    cloud.write(scan)
+    np.savez(small, points=cloud.xyz, Colors_1=np.arange(300) % 200, label=np.arange(300) - 7)
+
+    settings = ["--field", "Colors_1", "--field", "label"]
+    captured.done(propagate, [small, scan, out, *settings])
+
+    again = laspy.read(out)
+    np.testing.assert_array_equal(again["label"], np.arange(300) - 7)
+    np.testing.assert_array_equal(again["Colors"][:, 1], np.arange(300) % 200)
+    np.testing.assert_array_equal(again["Colors"][:, [0, 2]], cloud["Colors"][:, [0, 2]])
+    np.testing.assert_array_equal(again["long steps"].array, cloud["long steps"].array)
+
+
+@pytest.mark.parametrize("form", WAVEFORM_FORMATS)
+@pytest.mark.parametrize("name", ["out.laz", "out.copc.laz"])
+def test_waveforms_are_refused_where_they_would_be_lost(form, name, tmp_path):
+    scan = tmp_path / "scan.las"
+    full_cloud(form).write(scan)
+
+    status, _, err = call(scan, tmp_path / name, *PATHS["whole"])
+
+    assert status == 2
+    assert f"points of format {form} refer to waveforms" in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_points_without_attributes_have_one_return(tmp_path):
+    scan, out = tmp_path / "scan.laz", tmp_path / "out.laz"
+    full_cloud(6).write(scan)
+
+    done(scan, out, *PATHS["whole"], "--coordinates-only")
+
+    cloud = laspy.read(out)
+    assert set(np.asarray(cloud.return_number)) == {1}
+    assert set(np.asarray(cloud.number_of_returns)) == {1}
+    assert not np.asarray(cloud.intensity).any()
+    assert cloud.header.file_source_id == 77

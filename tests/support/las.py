@@ -1,0 +1,106 @@
+"""LAS files with a value in every place of the header and every dimension of a point."""
+
+import struct
+from datetime import date
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+import laspy
+import numpy as np
+
+WAVEFORM_FORMATS = (4, 5, 9, 10)
+VERSIONS = dict.fromkeys(range(4), "1.2") | dict.fromkeys((4, 5), "1.3")
+EXTRA = [
+    laspy.ExtraBytesParams("height above ground", "f4"),
+    laspy.ExtraBytesParams("points", "u1", "a reserved word elsewhere"),
+    laspy.ExtraBytesParams("intensity_", "u2"),
+    laspy.ExtraBytesParams("Amplitude", "u2", scales=[0.01], offsets=[5.0], no_data=[0]),
+    laspy.ExtraBytesParams("long steps", "i8", scales=[0.001], offsets=[0.0]),
+    laspy.ExtraBytesParams("Colors", "3u1"),
+    laspy.ExtraBytesParams("a name of exactly thirty-two b.s", "i8"),
+]
+"""Extra dimensions with awkward names, scales and arrays."""
+
+
+def full_cloud(form: int, number: int = 300) -> laspy.LasData:
+    """Make a cloud with random numbers in all dimensions and rows as ``point_source_id``."""
+    header = laspy.LasHeader(point_format=form, version=VERSIONS.get(form, "1.4"))
+    header.scales, header.offsets = np.array([0.01, 0.01, 0.001]), np.array([5e5, 5.4e6, 0])
+    header.file_source_id = 77
+    header.uuid = UUID(int=2**100 + 3)
+    header.system_identifier, header.creation_date = "MERGE", date(2019, 5, 4)
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+    header.global_encoding.synthetic_return_numbers = True
+    header.global_encoding.wkt = form >= 6
+    header.global_encoding.waveform_data_packets_external = form in WAVEFORM_FORMATS
+    wkt = laspy.VLR("LASF_Projection", 2112, "WKT", b'LOCAL_CS["somewhere"]\0')
+    classes = laspy.VLR("LASF_Spec", 0, "classes", struct.pack("<B15s", 5, b"veg. > 2 m (?)"))
+    header.vlrs += [wkt, classes, laspy.VLR("somebody", 9, "notes", bytes(range(256)))]
+    header.add_extra_dims(EXTRA)
+    cloud = laspy.LasData(header)
+    random = np.random.default_rng(form)
+    cloud.points.array = np.zeros(number, cloud.point_format.dtype())
+    for dimension in cloud.point_format.dimensions:
+        fill(cloud, dimension, random)
+    cloud["X"], cloud["Y"], cloud["Z"] = random.integers(-5000, 5000, (3, number))
+    cloud.point_source_id = np.arange(number)
+    cloud["long steps"].array[:] += 2**60
+    if header.version.minor >= 4:
+        note = laspy.VLR("somebody", 10, "long note", bytes(70_000))
+        cloud.evlrs = laspy.vlrs.vlrlist.VLRList([note])
+    return cloud
+
+
+def fill(cloud: laspy.LasData, dimension: Any, random: np.random.Generator) -> None:
+    """Write random numbers into a dimension."""
+    numbers = cloud.points.array
+    shape = (len(numbers), dimension.num_elements)
+    if dimension.kind == laspy.DimensionKind.BitField:
+        cloud[dimension.name] = random.integers(0, 2**dimension.num_bits, len(numbers))
+        return
+    if dimension.kind == laspy.DimensionKind.FloatingPoint:
+        numbers[dimension.name] = (random.normal(size=shape) * 1000).squeeze()
+    else:
+        least = 1 if dimension.kind == laspy.DimensionKind.UnsignedInteger else -100
+        numbers[dimension.name] = random.integers(least, 100, shape).squeeze()
+
+
+def header_fields(path: Path) -> dict[str, Any]:
+    """Return what a copy of a file must have in common with it, from the bytes of its header."""
+    content = path.read_bytes()
+    fields = {
+        "source id and encoding": content[4:8],
+        "identifier": content[8:24],
+        "version": content[24:26],
+        "system": content[26:58],
+        "date": content[90:94],
+        "scales and offsets": content[131:179],
+        "records": [r for r in records(content) if r[0] != b"laszip encoded".ljust(16, b"\0")],
+    }
+    if content[25] >= 4:
+        fields["extended"] = extended_records(content)
+    return fields
+
+
+def records(content: bytes) -> list[tuple]:
+    """Return user, number, description and data of the records before the points."""
+    (place,) = struct.unpack_from("<H", content, 94)
+    (number,) = struct.unpack_from("<I", content, 100)
+    found = []
+    for _ in range(number):
+        user, identifier, length, text = struct.unpack_from("<2x16sHH32s", content, place)
+        found.append((user, identifier, text, content[place + 54 : place + 54 + length]))
+        place += 54 + length
+    return found
+
+
+def extended_records(content: bytes) -> list[tuple]:
+    """Return user, number, description and data of the records after the points."""
+    place, number = struct.unpack_from("<QI", content, 235)
+    found = []
+    for _ in range(number):
+        user, identifier, length, text = struct.unpack_from("<2x16sHQ32s", content, place)
+        found.append((user, identifier, text, content[place + 60 : place + 60 + length]))
+        place += 60 + length
+    return found
