@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from mops_lightning.nets.hierarchical import HierarchicalNet
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.stage import StageMOPSNet
 
 ALL_POINTS = [512, 256, 128, 64]
 HALF = [256, 128, 64, 32]
@@ -21,6 +22,7 @@ SAMPLERS: dict[str, Callable[..., nn.Module]] = {
     "mops": MOPSNet,
     "mops anchored": partial(MOPSNet, anchors="fps"),
     "mops anchored, narrow": partial(MOPSNet, anchors="fps", **NARROW),
+    "mops on the stage's features": StageMOPSNet,
 }
 CLOUDS = 32
 

@@ -22,6 +22,7 @@ from .samplers.samplenet import ProgressiveSampleNet as ProgressiveSampleNet
 from .samplers.samplenet import SampleNet as SampleNet
 from .samplers.serial import SerialSampler as SerialSampler
 from .samplers.snet import SNet as SNet
+from .samplers.stage import StageMOPSNet as StageMOPSNet
 from .samplers.voxel import VoxelSampler as VoxelSampler
 from .types import SampleOutput as SampleOutput
 from .zoo.downsample import downsample as downsample

@@ -116,7 +116,8 @@ class Hierarchy(nn.Module):
 
     Args:
         sampler: makes the sampler of a stage from its number of points, given as ``m_max`` if it
-            takes that, otherwise as ``m``.
+            takes that, otherwise as ``m``, and the ``channels`` of the points' features if it takes
+            these.
         points: number of points after every stage.
         channels: channels of the features before the first stage and after every stage.
         k: number of neighbours.
@@ -143,10 +144,16 @@ class Hierarchy(nn.Module):
                 f"channels must have one number more than the {len(points)} of points, got "
                 f"{len(channels)}."
             )
-        size = "m_max" if "m_max" in inspect.signature(sampler).parameters else "m"
+        accepted = inspect.signature(sampler).parameters
+        size = "m_max" if "m_max" in accepted else "m"
+
+        def make(m: int, before: int) -> nn.Module:
+            host = {"channels": before} if "channels" in accepted else {}
+            return sampler(**{size: m}, **host)
+
         self.stem = PointMLP([3, channels[0], channels[0]])
         self.stages = nn.ModuleList(
-            Stage(sampler(**{size: m}), m, before, after, k)
+            Stage(make(m, before), m, before, after, k)
             for m, (before, after) in zip(points, pairwise(channels), strict=True)
         )
 

@@ -1,0 +1,99 @@
+"""MOPS-Net inside a hierarchical net, on the features that the net has at a stage."""
+
+from torch import Tensor
+
+from mops_lightning.errors import UserError
+from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.precision import pointwise_autocast, restrict_autocast_to_pointwise
+from mops_lightning.samplers.local import LocalAnchors
+from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.types import SampleOutput
+
+
+class StageMOPSNet(MOPSNet):
+    """MOPS-Net with local columns, whose keys are computed from the features of its host.
+
+    A stage of a hierarchical net knows features of its points. This sampler reads them instead of
+    computing features of its own from coordinates: one layer of ρ maps the local feature and the
+    maximum over the candidates to keys. It works inside such a net only, where it maps
+    ``(B, N, 3)`` points to ``(B, m, 3)``.
+
+    Args:
+        m: largest number of points; of a cloud with fewer points, all are returned.
+        channels: of the host's features.
+        alpha: weight of the subset loss.
+        tau_min: temperature at the end of training and in evaluation.
+        key_channels: C, of the keys.
+        anchor_width: see ``MOPSNet``.
+        overlap: weight of the penalty on columns that choose the same points.
+        candidates: see ``MOPSNet``.
+        neighbours: see ``MOPSNet``.
+
+    Raises:
+        UserError: an argument is out of range.
+
+    Examples:
+        >>> import torch
+        >>> from mops_lightning import StageMOPSNet
+        >>> points, features = torch.rand(2, 64, 3), torch.rand(2, 64, 16)  # (B, N, 3), (B, N, C)
+        >>> StageMOPSNet(m=8, channels=16).eval().by_features(points, features, 8).points.shape
+        torch.Size([2, 8, 3])
+    """
+
+    flexible = True
+    nested = True
+
+    def __init__(
+        self,
+        m: int,
+        channels: int,
+        alpha: float = 30.0,
+        tau_min: float = 0.1,
+        key_channels: int = 32,
+        anchor_width: float = 0.5,
+        overlap: float = 0.0,
+        candidates: int | None = None,
+        neighbours: int | None = 16,
+    ) -> None:
+        super().__init__(
+            m,
+            alpha,
+            tau_min,
+            feature_channels=[channels],
+            rho_channels=[key_channels],
+            anchors="fps",
+            anchor_width=anchor_width,
+            overlap=overlap,
+            candidates=candidates,
+            neighbours=neighbours,
+        )
+        del self.features  # the host has features
+
+    def sample(self, points: Tensor, m: int) -> SampleOutput:
+        """Refuse points without features."""
+        raise UserError(
+            "StageMOPSNet samples inside a hierarchical net only, whose features it reads. Choose "
+            "sampler=mops outside."
+        )
+
+    def by_features(self, points: Tensor, features: Tensor, m: int) -> SampleOutput:
+        """Generate m of the points ``(B, N, 3)`` with features ``(B, N, channels)``."""
+
+        def keys_of(candidates: Tensor, rows: Tensor) -> Tensor:
+            everything = rows.shape[1] == features.shape[1]
+            return self._keys_from(features if everything else gather_points(features, rows))
+
+        assert isinstance(self.queries, LocalAnchors)
+        with restrict_autocast_to_pointwise(points.device.type):
+            matrix = self.queries.local_matrix(points, keys_of, m, self.tau)
+            sampled = matrix.sample(points.to(matrix.dtype)).to(points.dtype)
+        output = SampleOutput(sampled, None, {}, matrix)
+        losses = self.losses(points, output, [m])[m] if self.training else {}
+        return output._replace(losses=losses)
+
+    def _keys_from(self, local: Tensor) -> Tensor:
+        """Return keys ``(B, K, C)`` of the candidates' features ``(B, K, channels)``."""
+        with pointwise_autocast(local.device.type):
+            hidden = self.rho_local(local) + self.rho_global(local.amax(1))[:, None]
+            rows = self.rho_first(hidden.flatten(0, 1))
+        return rows.to(self.queries.weight).unflatten(0, local.shape[:2])
