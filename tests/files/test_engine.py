@@ -62,7 +62,7 @@ class Watched(Engine):
 
 def test_killed_worker_leaves_result_unchanged(client, scan):
     engine, killed = DaskEngine(client), []
-    whole, *_ = sample_by_chunks(scan[0], scan[1], 24, options("matched"), engine)
+    whole, *_ = sample_by_chunks(scan[0], scan[1], options("matched"), engine)
 
     def kill(title, done):
         if title in ("sampling", "matching") and done == 3:
@@ -71,7 +71,7 @@ def test_killed_worker_leaves_result_unchanged(client, scan):
             os.kill(next(filter(None, pids)), signal.SIGKILL)
             killed.append(title)
 
-    again, *_ = sample_by_chunks(scan[0], scan[1], 24, options("matched"), Watched(engine, kill))
+    again, *_ = sample_by_chunks(scan[0], scan[1], options("matched"), Watched(engine, kill))
     assert killed == ["sampling", "matching"]
     same(again, whole)
 
@@ -148,4 +148,4 @@ def test_lost_scheduler_is_reported(scan):
 
         engine = Watched(DaskEngine(client), close)
         with pytest.raises(UserError, match="lost the connection"):
-            sample_by_chunks(scan[0], scan[1], 24, options("generated", 10), engine)
+            sample_by_chunks(scan[0], scan[1], options("generated", 10), engine)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from mops_lightning.errors import UserError
-from mops_lightning.files.batch import file_pairs
+from mops_lightning.files.batch import find_inputs
 from mops_lightning.filesystem import TEMPORARY
 from tests.support.downsample import refused
 
@@ -32,7 +32,7 @@ def inputs(tmp_path, monkeypatch):
     ],
 )
 def test_outputs_follow_inputs(source, target, expected, inputs):
-    found = file_pairs(Path(source), Path(target))
+    found = find_inputs(Path(source), Path(target)).pairs
     assert [str(path) for _, path in found] == expected
 
 
@@ -54,7 +54,7 @@ def test_impossible_output_is_rejected(source, target, message, inputs):
     Path("empty").mkdir()
     Path("in/c.ply").touch()
     with pytest.raises(UserError, match=message):
-        file_pairs(Path(source), Path(target))
+        find_inputs(Path(source), Path(target))
 
 
 @pytest.mark.parametrize(
@@ -72,5 +72,5 @@ def test_outputs_links_and_temporary_files_are_no_inputs(inputs):
     Path("in/loop.npy").symlink_to("loop.npy")
     Path("in/circle").symlink_to("../in")
     Path(f"in/{TEMPORARY}a-x.npy").touch()
-    found = file_pairs(Path("in"), Path("out"))
+    found = find_inputs(Path("in"), Path("out")).pairs
     assert [str(path) for path, _ in found] == ["in/a.npy", "in/c.stl", "in/deep/b.ply"]

@@ -1,6 +1,6 @@
 """The command that downsamples files, in this process."""
 
-from mops_lightning.files.cli import downsample as main
+from mops_lightning.files.downsample_cli import downsample as main
 from tests.support import captured
 
 

@@ -14,7 +14,7 @@ from mops_lightning.errors import USER_ERROR, did_you_mean, end, quiet_on_closed
 
 COMMANDS = {
     "report": "mops_lightning.report.cli.main",
-    "downsample": "mops_lightning.files.cli.downsample",
+    "downsample": "mops_lightning.files.downsample_cli.downsample",
     "propagate": "mops_lightning.files.cli.propagate",
     "compare": "mops_lightning.files.cli.compare",
     "models": "mops_lightning.cli.models.main",

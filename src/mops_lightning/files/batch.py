@@ -11,10 +11,11 @@ from collections.abc import Generator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
+from dataclasses import replace
 from multiprocessing import active_children, get_context
 from os.path import realpath  # unlike Path.resolve, it accepts loops of symbolic links
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from rich.progress import track
 
@@ -24,6 +25,7 @@ from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.filesystem import is_temporary
 from mops_lightning.ops.workers import start_worker
+from mops_lightning.samplers.budget import number_of
 
 if TYPE_CHECKING:
     from mops_lightning.files.chunks import Outcome
@@ -36,7 +38,19 @@ FilePair = tuple[Path, Path]
 """An input file and its output file."""
 
 
-def file_pairs(source: Path, target: Path) -> list[FilePair]:
+class Inputs(NamedTuple):
+    """The files of a command.
+
+    Attributes:
+        pairs: input and output files.
+        unreadable: files of a folder of other kinds.
+    """
+
+    pairs: list[FilePair]
+    unreadable: list[Path]
+
+
+def find_inputs(source: Path, target: Path) -> Inputs:
     """Return the input files and their output files.
 
     An output file in a folder has the format of its input, or .ply where that cannot be written.
@@ -55,21 +69,30 @@ def file_pairs(source: Path, target: Path) -> list[FilePair]:
     if blocking := next((p for p in target.parents if p.exists() and not p.is_dir()), None):
         raise UserError(f"OUT: {blocking} is a file, not a folder. Give another OUT.")
     if is_many(source):
-        base, pattern = (source, "**/*") if source.is_dir() else (source.parent, source.name)
-        inputs = _inputs(base, pattern, target)
-        pairs = [(path, _output(path, target / path.relative_to(base))) for path in inputs]
-        targets = Counter(path for _, path in pairs)
-        if twice := next((path for path, number in targets.items() if number > 1), None):
-            both = " and ".join(str(path) for path, output in pairs if output == twice)
-            raise UserError(f"{both} have the same output {twice}. Rename one.")
-        return pairs
+        return _several(source, target)
     if target.is_dir():
         target = _output(source, target / source.name)
     if target.suffix.lower() == ".e57":
         raise UserError(f"{target}: {NO_E57}")
     if target.suffix.lower() not in WRITERS:
         raise UserError(f"OUT must end in one of {', '.join(WRITERS)}, got {target}.")
-    return [(source, target)]
+    return Inputs([(source, target)], [])
+
+
+def _several(source: Path, target: Path) -> Inputs:
+    """Return the files of a folder or a pattern."""
+    base, pattern = (source, "**/*") if source.is_dir() else (source.parent, source.name)
+    files = _files(base, pattern, target)
+    readable = [path for path in files if path.suffix.lower() in READABLE]
+    if not readable:
+        raise UserError(f"{base / pattern}: no file ends in {', '.join(READABLE)}.")
+    pairs = [(path, _output(path, target / path.relative_to(base))) for path in readable]
+    targets = Counter(path for _, path in pairs)
+    if twice := next((path for path, number in targets.items() if number > 1), None):
+        both = " and ".join(str(path) for path, output in pairs if output == twice)
+        raise UserError(f"{both} have the same output {twice}. Rename one.")
+    unreadable = [path for path in files if path.suffix.lower() not in READABLE]
+    return Inputs(pairs, unreadable)
 
 
 def is_many(source: Path) -> bool:
@@ -83,20 +106,18 @@ def _output(source: Path, path: Path) -> Path:
     return path.with_suffix(own if own in WRITERS else ".ply")
 
 
-def _inputs(folder: Path, pattern: str, target: Path) -> list[Path]:
-    """Return the readable files of a pattern below a folder, without those below ``target``."""
+def _files(folder: Path, pattern: str, target: Path) -> list[Path]:
+    """Return the files of a pattern below a folder, without hidden ones and those below target."""
     if target.is_file():
         raise UserError(f"OUT must be a folder because IN is several, got the file {target}.")
     outputs = Path(realpath(target))
-    files = sorted(
+    return sorted(
         path
         for path in folder.glob(pattern)
-        if path.suffix.lower() in READABLE and path.is_file() and not is_temporary(path)
+        if path.is_file() and not is_temporary(path)
+        if not path.name.startswith(".") or path.suffix.lower() in READABLE
         if outputs not in Path(realpath(path)).parents
     )
-    if not files:
-        raise UserError(f"{folder / pattern}: no file ends in {', '.join(READABLE)}.")
-    return files
 
 
 def attempt(
@@ -139,81 +160,135 @@ def process_file(source: Path, target: Path, options: Options, engine: Engine | 
     result = attempt(source, target, options, engine=engine)
     if isinstance(result, UserError):
         raise result
-    more = f" ({result.dropped:,} more without finite coordinates left out)"
-    print(
-        printable(
-            f"{target}: {result.kept:,} of {result.number:,} points"
-            f"{more if result.dropped else ''}, {time.perf_counter() - start:.1f} s"
-        )
-    )
+    seconds = time.perf_counter() - start
+    print(printable(f"{target}: {_told(result, options)}, {seconds:.1f} s"))
+
+
+def _told(result: "Outcome", options: Options) -> str:
+    """Return the numbers of points of a file, and how they were chosen, in words."""
+    words = f"{result.kept:,} of {result.number:,} points"
+    if result.dropped:
+        words += f" ({result.dropped:,} more without finite coordinates left out)"
+    if result.drawn is not None and result.drawn < result.number:
+        words += f", chosen among {result.drawn:,} that were drawn at random (--chunk)"
+    if options.voxel is not None:
+        words += f", voxels of {options.voxel:g} from the origin 0 0 0"
+    return words
 
 
 def process_folder(
-    pairs: list[FilePair],
+    inputs: Inputs,
     options: Options,
     target: Path,
     workers: int,
-    overwrite: bool,
     engine: Engine | None,
+    is_total: bool = False,
 ) -> int:
     """Downsample files, print errors and a closing line, and return how many files failed.
 
     Args:
-        pairs: input and output files.
+        inputs: input and output files. Existing output files are skipped, unless
+            ``options.overwrite``.
         options: how.
         target: the folder of the output files, for the closing line.
         workers: number of processes that share the files.
-        overwrite: replace existing output files; otherwise they are skipped.
         engine: processes the chunks of one file after the other; None: processes share the files.
+        is_total: share ``options.m`` among all files, in proportion to their points.
     """
-    done: Counter[str] = Counter()
-    todo = [pair for pair in pairs if overwrite or not pair[1].exists()]
-    failures, dropped = {}, 0
+    jobs = [Job(source, output, options) for source, output in inputs.pairs]
+    if is_total:
+        jobs = _sharing(jobs)
+    todo = [job for job in jobs if options.overwrite or not job.target.exists()]
     if todo:
         target.mkdir(parents=True, exist_ok=True)
         if not os.access(target, os.W_OK):
             raise UserError(f"OUT: cannot write into {target}. Give another OUT.")
-    results = _results(todo, options, workers, engine)
+    done = dropped = 0
+    failures = {}
+    results = _results(todo, workers, engine)
     with closing(results):  # ends the processes when the user interrupts
-        for (source, _), result in track(
+        for job, result in track(
             results, "downsampling", total=len(todo), disable=not sys.stdout.isatty()
         ):
-            done["failed" if isinstance(result, UserError) else "done"] += 1
             if isinstance(result, UserError):
-                failures[source] = result
+                failures[job.source] = result
             else:
+                done += 1
                 dropped += result.dropped
-    if len(pairs) > len(todo):
-        done["skipped"] = len(pairs) - len(todo)
     for source, error in sorted(failures.items()):
         name = "" if str(source) in str(error) else f"{source}: "
         print(as_line(f"failed: {name}{error}"), file=sys.stderr)
-    counts = ", ".join(f"{number} {state}" for state, number in done.items())
-    left = f"; {dropped:,} points without finite coordinates left out" if dropped else ""
-    print(printable(f"{len(pairs)} files: {counts}{left}; in {target}"))
+    counts = {
+        "failed": len(failures),
+        "done": done,
+        "done before": len(jobs) - len(todo),
+        "skipped": len(inputs.unreadable),
+    }
+    words = ", ".join(f"{number} {state}" for state, number in counts.items() if number)
+    if inputs.unreadable:
+        words += f": {' '.join(_kinds(inputs.unreadable))}"
+    if dropped:
+        words += f"; {dropped:,} points without finite coordinates left out"
+    print(printable(f"{len(jobs) + len(inputs.unreadable)} files: {words}; in {target}"))
     return len(failures)
 
 
+def _kinds(paths: list[Path]) -> list[str]:
+    """Return the suffixes of files, or their names where they have none."""
+    return sorted({path.suffix.lower() or path.name for path in paths})
+
+
+class Job(NamedTuple):
+    """One file to downsample: its input, its output, and how."""
+
+    source: Path
+    target: Path
+    options: Options
+
+
+def _sharing(jobs: list[Job]) -> list[Job]:
+    """Share the number of points to keep among the files, in proportion to their points.
+
+    Raises:
+        UserError: a file would keep none.
+    """
+    from mops_lightning.files.downsample import count_points
+    from mops_lightning.samplers.tiles import shares
+
+    sizes = [count_points(job.source, job.options) for job in jobs]
+    size = jobs[0].options.m
+    assert size is not None
+    total = number_of(size, sum(sizes))
+    numbers = shares(total, sizes).tolist() if sum(sizes) else [0] * len(sizes)
+    for job, number in zip(jobs, numbers, strict=True):
+        if number == 0:
+            raise UserError(f"--total: {total} points for all files leave none for {job.source}.")
+    return [
+        job._replace(options=replace(job.options, m=number))
+        for job, number in zip(jobs, numbers, strict=True)
+    ]
+
+
 def _results(
-    pairs: list[FilePair], options: Options, workers: int, engine: Engine | None
-) -> Generator["tuple[FilePair, Outcome | UserError]", None, None]:
-    """Yield pairs of files and results, in the order of completion."""
-    workers = min(workers, len(pairs))
+    jobs: list[Job], workers: int, engine: Engine | None
+) -> Generator["tuple[Job, Outcome | UserError]", None, None]:
+    """Yield jobs and results, in the order of completion."""
+    workers = min(workers, len(jobs))
     if engine is not None or workers < 2:
-        yield from ((pair, attempt(*pair, options, engine=engine)) for pair in pairs)
+        yield from ((job, attempt(*job, engine=engine)) for job in jobs)
         return
     # Spawned, because forking after torch has started threads can deadlock.
     with ProcessPoolExecutor(workers, get_context("spawn"), start_worker) as executor:
-        pair_of = {executor.submit(attempt, *pair, options, workers): pair for pair in pairs}
+        job_of = {executor.submit(attempt, *job, workers): job for job in jobs}
         try:
-            for future in as_completed(pair_of):
-                pair = pair_of[future]
+            for future in as_completed(job_of):
+                job = job_of[future]
                 try:
-                    yield pair, future.result()
+                    yield job, future.result()
                 except BrokenProcessPool:
                     died = "its process died, perhaps for lack of memory"
                     again = "Run the same command again with fewer --workers."
-                    yield pair, UserError(f"{pair[0]}: {died}. {again}")
+                    yield job, UserError(f"{job.source}: {died}. {again}")
         except BaseException:  # interrupted
             for process in active_children():
                 process.terminate()

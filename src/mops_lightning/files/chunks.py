@@ -4,7 +4,8 @@ The ranges of a pass are independent, so an engine may distribute them over proc
 Results are merged in the order of the file, so they do not depend on the distribution.
 """
 
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial, reduce
 from pathlib import Path
@@ -21,6 +22,7 @@ from mops_lightning.data.formats.registry import open_cloud_file
 from mops_lightning.data.formats.table import Table, join_tables
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
+from mops_lightning.files.strata import count_classes
 from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.points import UnitSphere, largest_distance
@@ -49,22 +51,23 @@ class Outcome(NamedTuple):
         kept: number of points that were kept.
         number: how many points with finite coordinates the cloud has.
         dropped: how many it has without.
+        drawn: how many were drawn at random, among which the kept ones were chosen; None: all.
     """
 
     kept: int
     number: int
     dropped: int
+    drawn: int | None = None
 
 
 def sample_by_chunks(
-    source: Path, sampler: Sampler, m: int, options: Options, engine: Engine
+    source: Path, sampler: Sampler, options: Options, engine: Engine
 ) -> tuple[Table, Outcome]:
     """Sample a file by a trained MOPS-Net without reading it as a whole.
 
     Args:
         source: of a format in ``registry.CHUNKED``.
         sampler: trained.
-        m: number of points to keep.
         options: ``chunk``, with m, bounds the memory.
         engine: processes the chunks.
 
@@ -73,7 +76,6 @@ def sample_by_chunks(
     """
     assert options.chunk is not None
     net = sampler.fused()
-    sampler.check_m(m)
     file = open_cloud_file(source, options.area, options.columns)
     cloud, row_ranges = replace(file, header=None), file.row_ranges(options.chunk)
 
@@ -85,6 +87,8 @@ def sample_by_chunks(
     for count, part in over("centre", _count_and_sum):
         number += count
         summed += part
+    m = options.number(sampler.m, number)
+    sampler.check_m(m)
     check_size(source, number, m, options.area)
     centre = summed / number
     sphere = UnitSphere(centre, max(over("radius", _radius, centre)) or 1.0)
@@ -100,7 +104,25 @@ def sample_by_chunks(
     return kept.without_attributes() if options.coordinates_only else kept, outcome
 
 
-def draw(source: Path, options: Options, engine: Engine) -> tuple[Table, int, int]:
+def count_by_class(source: Path, options: Options, engine: Engine) -> dict[int, int]:
+    """Return the number of points of every class of ``options.strata`` in a file."""
+    file = open_cloud_file(source, options.area, options.columns)
+    function = partial(_count_classes, replace(file, header=None), options)
+    total: Counter[int] = Counter()
+    for counts in engine.map("counting classes", function, file.row_ranges(PART)):
+        total.update(counts)
+    return dict(total)
+
+
+def _count_classes(cloud: CloudFile, options: Options, rows: range) -> dict[int, int]:
+    assert options.strata is not None
+    table = cloud.read(rows)
+    return count_classes(options.strata.classes(table, cloud.path)) if len(table.points) else {}
+
+
+def draw(
+    source: Path, options: Options, engine: Engine, quotas: Mapping[int, int] | None = None
+) -> tuple[Table, int, int]:
     """Draw random points of a file without reading it as a whole.
 
     Every point gets a random key, and the points with the lowest keys are drawn. The keys depend on
@@ -110,6 +132,7 @@ def draw(source: Path, options: Options, engine: Engine) -> tuple[Table, int, in
         source: of a format in ``registry.CHUNKED``.
         options: ``chunk`` is the number of points to draw.
         engine: reads the ranges.
+        quotas: number of points to draw of every class; None: classes do not matter.
 
     Returns:
         The points, in the order of the file, or all if there are fewer; how many points with finite
@@ -119,12 +142,12 @@ def draw(source: Path, options: Options, engine: Engine) -> tuple[Table, int, in
         UserError: the file is broken.
     """
     file = open_cloud_file(source, options.area, options.columns)
-    function = partial(_draw, replace(file, header=None), options)
+    function = partial(_draw, replace(file, header=None), options, quotas)
     drawn = Drawn(np.empty(0), join_tables([]), 0)
     for part in engine.map("drawing", function, file.row_ranges(PART)):
         keys = np.concatenate([drawn.keys, part.keys])
         both = Drawn(keys, join_tables([drawn.table, part.table]), drawn.number + part.number)
-        drawn = both.lowest(options.chunk)
+        drawn = both.lowest(source, options, quotas)
     dropped = 0 if options.area else file.number - drawn.number
     return replace(drawn.table, header=file.header), drawn.number, dropped
 
@@ -136,21 +159,44 @@ class Drawn(NamedTuple):
     table: Table
     number: int
 
-    def lowest(self, most: int | None) -> "Drawn":
-        """Keep the points with the lowest keys."""
-        if most is None or len(self.keys) <= most:
+    def lowest(self, path: Path, options: Options, quotas: Mapping[int, int] | None) -> "Drawn":
+        """Keep the points with the lowest keys: ``options.chunk``, or as many of every class."""
+        assert options.chunk is not None
+        if quotas is None:
+            return self.take(_lowest(self.keys, options.chunk))
+        assert options.strata is not None
+        if not len(self.keys):
             return self
-        rows = np.sort(self.keys.argpartition(most)[:most])
+        classes = options.strata.classes(self.table, path)
+        by_class = []
+        for name, quota in quotas.items():
+            members = np.flatnonzero(classes == name)
+            by_class.append(members[_lowest(self.keys[members], quota)])
+        return self.take(np.sort(np.concatenate(by_class)))
+
+    def take(self, rows: NDArray[np.int64]) -> "Drawn":
+        """Keep some of the points."""
+        if len(rows) == len(self.keys):
+            return self
         return Drawn(self.keys[rows], self.table.take(rows), self.number)
 
 
-def _draw(cloud: CloudFile, options: Options, rows: range) -> Drawn:
+def _lowest(keys: NDArray[np.float64], most: int) -> NDArray[np.int64]:
+    """Return the rows of the lowest keys, ascending."""
+    if len(keys) <= most:
+        return np.arange(len(keys))
+    return np.sort(keys.argpartition(most)[:most])
+
+
+def _draw(
+    cloud: CloudFile, options: Options, quotas: Mapping[int, int] | None, rows: range
+) -> Drawn:
     table = cloud.read(rows)
     check_coordinates(cloud.path, table.points)
-    if options.coordinates_only and options.weight is None:
+    if not options.needs_columns:
         table = table.without_attributes()
     keys = np.random.default_rng([options.seed, rows.start]).random(len(table.points))
-    return Drawn(keys, table, len(keys)).lowest(options.chunk)
+    return Drawn(keys, table, len(keys)).lowest(cloud.path, options, quotas)
 
 
 def _count_and_sum(cloud: CloudFile, rows: range) -> tuple[int, NDArray[np.float64]]:

@@ -1,24 +1,32 @@
 """Downsampling one file: read, normalise as in training, sample, map back, write."""
 
+import filecmp
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import expit
 
-from mops_lightning.data.formats.guard import BadCloudError, check_coordinates, check_size
-from mops_lightning.data.formats.registry import read, write
+from mops_lightning.data.formats.cloud_file import PART
+from mops_lightning.data.formats.guard import WholeOnlyError, check_coordinates, check_size
+from mops_lightning.data.formats.registry import open_cloud_file, read, write
 from mops_lightning.data.formats.table import Table
-from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.files.chunks import Outcome, draw, sample_by_chunks
+from mops_lightning.errors import UserError
+from mops_lightning.files.by_distance import keep_by_distance
+from mops_lightning.files.chunks import Outcome, count_by_class, draw, sample_by_chunks
+from mops_lightning.files.column_weights import weights_of
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.files.propagate import write_map
+from mops_lightning.files.space import in_space
+from mops_lightning.files.strata import count_classes
 from mops_lightning.ops.points import UnitSphere
-from mops_lightning.ops.weights import CURVATURE, check_positive, check_weight, curvature
+from mops_lightning.ops.weights import check_positive
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.fps import farthest_rows
 from mops_lightning.samplers.tiles import sample_by_tiles
 from mops_lightning.zoo.find_sampler import untrained
 from mops_lightning.zoo.load import load
@@ -26,18 +34,21 @@ from mops_lightning.zoo.load import load
 SURFACE = 10_000
 """Least number of points that are sampled from a mesh."""
 
-SPLAT = {"opacity", "f_dc_0", "scale_0", "rot_0"}
-"""Columns of a splat file (Kerbl et al., "3D Gaussian Splatting", SIGGRAPH 2023)."""
-
 
 @cache
-def load_sampler(options: Options) -> Sampler:
+def load_sampler(options: Options, m: int | None = None) -> Sampler:
     """Load or build the sampler that the options name.
+
+    Args:
+        options: with a method or weights.
+        m: number of points to keep of a file; None: ``options.m``, where that is a number.
 
     Raises:
         UserError: the weights are not a sampler's, or were trained for another number of points.
     """
-    sampler = _load(options)
+    if m is None and isinstance(options.m, int):
+        m = options.m
+    sampler = _load(options, m)
     if options.weight is not None:
         try:
             sampler.check_weighted(options.readout)
@@ -46,31 +57,47 @@ def load_sampler(options: Options) -> Sampler:
     return sampler
 
 
-def _load(options: Options) -> Sampler:
+def _load(options: Options, m: int | None) -> Sampler:
     torch.manual_seed(options.seed)
     if options.method:
-        assert options.m is not None
-        return untrained(options.method, options.m, options.seed)
+        return untrained(options.method, m or 1, options.seed)
     assert options.weights is not None
     try:
         sampler = load(options.weights)
     except UserError as error:
         raise UserError(f"--weights: {error}") from None
-    if options.tile is not None:
-        if not sampler.flexible:
-            raise UserError(
-                f"--weights: tiles need a sampler of every size, such as FMOPS-Net; "
-                f"{options.weights} is a {type(sampler).__name__} for {sampler.m} points."
-            )
-        return sampler  # a tile keeps a part of the m points
-    m = sampler.m if options.m is None else options.m
-    if m > sampler.m or (m != sampler.m and not sampler.flexible):
-        allowed = f"up to {sampler.m}" if sampler.flexible else f"{sampler.m}"
-        raise UserError(
-            f"--m: {options.weights} was trained for {allowed} points, got {m}. "
-            f"Give --m {sampler.m}{' or less' * sampler.flexible}, or train with m={m}."
-        )
+    needs_sizes = options.tile is not None or options.strata is not None
+    if needs_sizes or isinstance(options.m, float):
+        _check_flexible(sampler, options)
+    if not needs_sizes:
+        _check_size(sampler, options, m)
     return sampler
+
+
+def _check_flexible(sampler: Sampler, options: Options) -> None:
+    if sampler.flexible:
+        return
+    reason = "a share needs"
+    if options.strata is not None:
+        reason = "classes need"
+    if options.tile is not None:
+        reason = "tiles need"
+    raise UserError(
+        f"--weights: {reason} a sampler of every size, such as FMOPS-Net; {options.weights} is a "
+        f"{type(sampler).__name__} for {sampler.m} points."
+    )
+
+
+def _check_size(sampler: Sampler, options: Options, m: int | None) -> None:
+    if m is None or m == sampler.m or (m < sampler.m and sampler.flexible):
+        return
+    allowed, advice = f"{sampler.m}", f"Give --m {sampler.m}"
+    if sampler.flexible:
+        allowed, advice = f"up to {sampler.m}", f"Give --m {sampler.m} or less"
+    raise UserError(
+        f"--m: {options.weights} was trained for {allowed} points, got {m}. {advice}, or train "
+        f"with m={m}."
+    )
 
 
 def downsample_file(
@@ -87,66 +114,165 @@ def downsample_file(
     Raises:
         UserError: the file holds no cloud, or one of too few points.
     """
-    sampler = load_sampler(options)
-    m = options.m or sampler.m
     engine = engine or Engine()
     if options.draws:
-        drawn, number, dropped = draw(source, options, engine)
-        table = _sample_table(source, drawn, sampler, m, options)
-        outcome = Outcome(m, number, dropped)
-    elif options.chunk is not None:
-        table, outcome = sample_by_chunks(source, sampler, m, options, engine)
+        table, outcome = _sample_drawn(source, options, engine)
+    elif options.chunk is None:
+        table, outcome = _sample_whole(source, options, engine)
+    elif options.is_by_distance:
+        table, outcome = keep_by_distance(source, None, options, engine)
     else:
-        surface = options.surface or max(SURFACE, 8 * m)
-        whole = read(source, surface, options.seed, options.area, options.columns, options.vertices)
-        finite = whole.finite()
-        table, number = _sample_table(source, finite, sampler, m, options), len(finite.points)
-        outcome = Outcome(m, number, len(whole.points) - number)
-        if options.map is not None:
-            write_map(options.map, whole.points, table.points, options.map_k)
+        table, outcome = sample_by_chunks(source, load_sampler(options), options, engine)
     write(target, table)  # last, so that a file that exists is complete
     return outcome
 
 
-def _sample_table(source: Path, finite: Table, sampler: Sampler, m: int, options: Options) -> Table:
-    """Sample the finite points of a file, or some of them; without those of weight 0."""
+def _sample_whole(source: Path, options: Options, engine: Engine) -> tuple[Table, Outcome]:
+    """Read a file as a whole, keep a part of its points, and write their map."""
+    surface = options.surface or _surface(options)
+    whole = read(source, surface, options.seed, options.area, options.columns, options.vertices)
+    if options.is_by_distance:
+        table, outcome = keep_by_distance(source, whole, options, engine)
+    else:
+        finite = whole.finite()
+        number = len(finite.points)
+        counts = None
+        if options.strata is not None:
+            counts = count_classes(options.strata.classes(finite, source))
+        m = _number(options, number)
+        table = _sample_table(source, finite, m, options, counts)
+        outcome = Outcome(m, number, len(whole.points) - number)
+    if options.map is not None:
+        _write_map(options.map, whole, table, options)
+    return table, outcome
+
+
+def _write_map(path: Path, whole: Table, kept: Table, options: Options) -> None:
+    """Write the map, or keep an equal one of the same command that was killed before its output.
+
+    Raises:
+        UserError: there is another file.
+    """
+    k = min(options.map_k, len(kept.points))
+    if options.overwrite or not path.exists():
+        write_map(path, whole.points, kept.points, k)
+        return
+    with TemporaryDirectory() as folder:
+        fresh = Path(folder) / path.name
+        write_map(fresh, whole.points, kept.points, k)
+        is_same = filecmp.cmp(fresh, path, shallow=False)
+    if not is_same:
+        raise UserError(f"{path} exists. Give another --map, or --overwrite.")
+
+
+def count_points(source: Path, options: Options) -> int:
+    """Return how many points a file has, of which ``options.m`` are to be kept."""
+    try:
+        file = open_cloud_file(source, options.area, options.columns)
+    except WholeOnlyError:
+        surface = options.surface or SURFACE
+        table = read(source, surface, options.seed, options.area, options.columns, options.vertices)
+        return len(table.finite().points)
+    return sum(len(file.read(rows).points) for rows in file.row_ranges(PART))
+
+
+def _surface(options: Options) -> int:
+    """Return how many points to sample from a mesh."""
+    if options.is_by_distance or isinstance(options.m, float):
+        return SURFACE
+    return max(SURFACE, 8 * _number(options, 0))
+
+
+def _number(options: Options, points: int) -> int:
+    """Return how many of a file's points to keep."""
+    trained = 1 if options.m is not None else load_sampler(options).m
+    return options.number(trained, points)
+
+
+def _sample_drawn(source: Path, options: Options, engine: Engine) -> tuple[Table, Outcome]:
+    """Draw random points of a file, and sample these."""
+    assert options.chunk is not None
+    counts = quotas = None
+    if options.strata is not None:
+        counts = count_by_class(source, options, engine)
+        m = _number(options, sum(counts.values()))
+        options.check_chunk(m)
+        check_size(source, sum(counts.values()), m, options.area)
+        quotas = options.strata.numbers(counts, min(options.chunk, sum(counts.values())))
+        for name, number in options.strata.numbers(counts, m).items():
+            quotas[name] = max(quotas[name], number)
+    drawn, number, dropped = draw(source, options, engine, quotas)
+    m = _number(options, number)
+    options.check_chunk(m)
+    table = _sample_table(source, drawn, m, options, counts)
+    return table, Outcome(m, number, dropped, len(drawn.points))
+
+
+def _sample_table(
+    source: Path, finite: Table, m: int, options: Options, counts: Mapping[int, int] | None
+) -> Table:
+    """Sample the finite points of a file, or some of them; without those of weight 0.
+
+    Args:
+        source: the file.
+        finite: the points.
+        m: number of points to keep.
+        options: how.
+        counts: number of points of every class in the file; None: classes do not matter.
+    """
     check_size(source, len(finite.points), m, options.area)
-    weight = None
-    if options.weight is not None:
-        weight = weights_of(finite, options.weight, source)
-        check_positive(int((weight > 0).sum()), m, f"--weight {options.weight} of {source}")
-        finite, weight = finite.take(weight.nonzero()[0]), weight[weight > 0]
-    rows, points = sample_cloud(finite.points, sampler, m, options, source, weight)
-    if rows is None:
-        return Table(points, {}, finite.header)
-    kept = finite.take(rows)
+    if options.strata is None or counts is None:
+        rows, points = _rows(source, finite, m, options)
+        if rows is None:
+            return Table(points, {}, finite.header)
+        return _kept(finite, rows, options)
+    classes = options.strata.classes(finite, source)
+    by_class = []
+    for name, number in options.strata.numbers(counts, m).items():
+        if number:
+            members = np.flatnonzero(classes == name)
+            chosen, _ = _rows(source, finite.take(members), number, options)
+            assert chosen is not None  # classes keep input points
+            by_class.append(members[chosen])
+    return _kept(finite, np.sort(np.concatenate(by_class)), options)
+
+
+def _kept(table: Table, rows: NDArray[np.int64], options: Options) -> Table:
+    kept = table.take(rows)
     return kept.without_attributes() if options.coordinates_only else kept
 
 
-def weights_of(table: Table, field: str, source: Path) -> NDArray[np.float64]:
-    """Return one number of at least 0 per point.
+def _rows(
+    source: Path, finite: Table, m: int, options: Options
+) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
+    """Return the rows of the points that are kept, None for generated points; and the points."""
+    if options.weight is None:
+        return _rows_of_weighted(source, finite, m, options, None)
+    weight = weights_of(finite, options.weight, source)
+    heavy = np.flatnonzero(weight)
+    check_positive(len(heavy), m, f"--weight {options.weight} of {source}")
+    rows, points = _rows_of_weighted(source, finite.take(heavy), m, options, weight[heavy])
+    return None if rows is None else heavy[rows], points
 
-    Args:
-        table: of finite points.
-        field: a column, or ``curvature``. Splat files hold the logit of the opacity; its weight is
-            the opacity itself.
-        source: the file, for errors.
 
-    Raises:
-        UserError: there is no such column, or it holds numbers that are no weights.
-    """
-    values = table.columns.get(field)
-    if values is None and field == CURVATURE:
-        return curvature(table.points)
-    if values is None:
-        hint = did_you_mean(field, {*table.columns, CURVATURE})
-        raise BadCloudError(f"--weight: {source} has no column {field!r}.{hint}")
-    values = values.astype(np.float64)
-    if field == "opacity" and table.columns.keys() >= SPLAT:
-        values = expit(values)
-    name = f"--weight {field} of {source}"
-    weight: NDArray[np.float64] = check_weight(values, values.shape, name).numpy()
-    return weight
+def _rows_of_weighted(
+    source: Path, table: Table, m: int, options: Options, weight: NDArray[np.float64] | None
+) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
+    if options.space is not None:
+        rows = _farthest_in_space(table, m, options, source, weight)
+        return rows, table.points[rows]
+    return sample_cloud(table.points, load_sampler(options, m), m, options, source, weight)
+
+
+def _farthest_in_space(
+    table: Table, m: int, options: Options, source: Path, weight: NDArray[np.float64] | None
+) -> NDArray[np.int64]:
+    """Choose farthest points by the columns that count."""
+    used = in_space(table, options.space, source)
+    check_coordinates(source, used)
+    points = UnitSphere.around(used).normalise(used)[None]
+    weights = None if weight is None else torch.from_numpy(weight)[None]
+    return farthest_rows(points, m, options.seed, weight=weights)[0].numpy()
 
 
 def sample_cloud(

@@ -1,10 +1,13 @@
 """Options of ``downsample``, checked."""
 
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 
 from mops_lightning.data.formats.area import Area
 from mops_lightning.errors import UserError
+from mops_lightning.files.strata import Strata
+from mops_lightning.samplers.budget import Size, number_of
 from mops_lightning.zoo.names import UNTRAINED
 
 
@@ -13,10 +16,12 @@ class Options:
     """Options of downsampling a file.
 
     Attributes:
-        m: number of points to keep; None: as many as the weights were trained for.
+        m: number of points to keep, or their share, a float; None: as many as the weights were
+            trained for, or a spacing or voxels.
         weights: of a trained sampler: a model, a weights file, or the folder of its run.
         method: one of ``zoo.names.UNTRAINED``, instead of weights.
-        readout: of a trained sampler: generated, matched or completed.
+        readout: of a trained sampler: generated, matched or completed; of voxels: generated means,
+            or the points nearest to them.
         coordinates_only: leave out colours, normals and the like of the kept points.
         surface: number of points to sample from a mesh's surface first.
         seed: of random choices.
@@ -28,12 +33,17 @@ class Options:
         area: the part of the file to sample; None: all of it.
         columns: names of the columns of .bin files; None: those that their names imply.
         vertices: take the vertices of a mesh, instead of points on its surface.
+        spacing: smallest distance of kept points, in the file's unit.
+        voxel: side of voxels of which each keeps one point, in the file's unit.
+        space: factors of columns that count in distances; None: the coordinates alone.
+        strata: how the points of each class are kept; None: classes do not matter.
+        overwrite: replace existing files.
 
     Raises:
         UserError: a value is out of range, or options exclude each other.
     """
 
-    m: int | None
+    m: Size | None = None
     weights: str | None = None
     method: str | None = None
     readout: str = "completed"
@@ -48,38 +58,85 @@ class Options:
     area: Area | None = None
     columns: tuple[str, ...] | None = None
     vertices: bool = False
+    spacing: float | None = None
+    voxel: float | None = None
+    space: tuple[tuple[str, float], ...] | None = None
+    strata: Strata | None = None
+    overwrite: bool = False
 
     def __post_init__(self) -> None:
         """Reject values out of range and options that exclude each other."""
-        if self.weights is None and self.method is None:
-            raise UserError(f"give --method {'|'.join(UNTRAINED)}, or --weights MODEL.")
-        if self.weights is not None and self.method is not None:
-            raise UserError(f"give --weights or --method {self.method}, not both.")
-        if (self.m is not None and self.m < 1) or (self.m is None and self.method):
-            raise UserError(f"--m must be a whole number of at least 1, got {self.m}.")
+        self._check_budget()
         if self.surface is not None and self.surface < 1:
             raise UserError(f"--surface must be at least 1, got {self.surface}.")
         if self.vertices and self.surface is not None:
             raise UserError("--vertices takes the vertices of a mesh: leave --surface out.")
         if not 0 <= self.seed < 2**63:
             raise UserError(f"--seed must be from 0 to 2**63 - 1, got {self.seed}.")
+        self._check_map()
+        self._check_parts()
+        self._check_space()
+
+    def _check_budget(self) -> None:
+        """Reject anything but one budget, and one way of keeping to it."""
+        budgets = {"--m": self.m, "--spacing": self.spacing, "--voxel": self.voxel}
+        given = [name for name, value in budgets.items() if value is not None]
+        if len(given) > 1:
+            raise UserError(f"give one of --m, --spacing and --voxel, got {' and '.join(given)}.")
+        if self.is_by_distance:
+            self._check_distance(given[0])
+            return
+        if self.weights is None and self.method is None:
+            raise UserError(
+                f"give --method {'|'.join(UNTRAINED)}, or --weights MODEL; or instead of --m "
+                "--spacing or --voxel."
+            )
+        if self.weights is not None and self.method is not None:
+            raise UserError(f"give --weights or --method {self.method}, not both.")
+        is_missing = self.m is None and self.method is not None
+        is_too_small = isinstance(self.m, int) and self.m < 1
+        is_no_share = isinstance(self.m, float) and not 0 < self.m < 1
+        if is_missing or is_too_small or is_no_share:
+            raise UserError(
+                "--m must be a whole number of at least 1, or a share of the points such as 10%, "
+                f"got {self.m}."
+            )
+        if self.strata is not None and self.readout != "completed":
+            raise UserError(f"--stratify keeps input points: no --readout {self.readout}.")
+
+    def _check_distance(self, name: str) -> None:
+        """Reject what a spacing or voxels exclude."""
+        distance = self.voxel if self.spacing is None else self.spacing
+        assert distance is not None
+        if not (isfinite(distance) and distance > 0):
+            raise UserError(f"{name} must be a number above 0, in the file's unit, got {distance}.")
+        if self.weights is not None or self.method is not None:
+            raise UserError(f"{name} needs neither --method nor --weights.")
+        if self.strata is not None:
+            raise UserError(f"--stratify shares a number of points among classes: no {name}.")
+        if self.readout == "matched" or (self.readout == "generated" and self.voxel is None):
+            raise UserError(f"{name} keeps input points: no --readout {self.readout}.")
+        if self.readout == "generated" and self.weight is not None:
+            raise UserError("--weight: the means of voxels take no weights.")
+
+    def _check_map(self) -> None:
+        """Reject a map of another format, or of more rows than points are kept."""
         if self.map is not None and self.map.suffix.lower() != ".npz":
             raise UserError(f"--map must end in .npz, got {self.map}.")
-        if self.map_k < 1 or (self.m is not None and self.map_k > self.m):
+        if self.map_k < 1 or (isinstance(self.m, int) and self.map_k > self.m):
             raise UserError(f"--map-k must be from 1 to --m, got {self.map_k}.")
         if self.map is None and self.map_k != 1:
             raise UserError(f"--map-k {self.map_k} has no effect without --map FILE.npz.")
-        self._check_parts()
 
     def _check_parts(self) -> None:
         """Reject tiles and chunks out of range, or with options that they exclude."""
         if self.tile is not None and self.tile < 2:
             raise UserError(f"--tile must be at least 2, got {self.tile}.")
-        if self.tile is not None and self.m is None:
+        if self.tile is not None and self.m is None and not self.is_by_distance:
             raise UserError("--tile needs --m, the number of points to keep of all tiles together.")
-        if self.tile is not None and self.readout != "completed":
+        if self.tile is not None and self.readout != "completed" and not self.is_by_distance:
             raise UserError(f"--tile keeps different input points: no --readout {self.readout}.")
-        if self.weight is not None and self.tile is not None:
+        if self.weight is not None and self.tile is not None and not self.is_by_distance:
             raise UserError("--weight needs the whole cloud at once: leave --tile out.")
         if self.chunk is not None and self.map is not None:
             raise UserError("--map needs the whole cloud in memory: use propagate after --chunk.")
@@ -87,11 +144,95 @@ class Options:
             raise UserError("--map has a row for every point of IN: no --bounds or level with it.")
         if self.chunk is not None and self.chunk < 1:
             raise UserError(f"--chunk must be at least 1, got {self.chunk}.")
-        if self.draws and self.m is not None and self.m > (self.chunk or 0):
-            raise UserError(f"--chunk must be at least --m {self.m}, got {self.chunk}.")
+        if self.draws:
+            self.check_chunk(self.m)
+
+    def check_chunk(self, m: Size | None) -> None:
+        """Reject more points than are drawn; a share is known once the file has been counted."""
+        if isinstance(m, int) and m > (self.chunk or 0):
+            raise UserError(f"--chunk must be at least --m {m}, got {self.chunk}.")
+
+    def _check_space(self) -> None:
+        if self.space is None:
+            return
+        if self.method not in (None, "fps") or self.weights is not None or self.voxel is not None:
+            raise UserError("--space is for --method fps and --spacing.")
+        if self.tile is not None and not self.is_by_distance:
+            raise UserError("--space needs the whole cloud at once: leave --tile out.")
+
+    @property
+    def is_by_distance(self) -> bool:
+        """Whether a spacing or voxels decide how many points are kept."""
+        return self.spacing is not None or self.voxel is not None
 
     @property
     def draws(self) -> bool:
         """Whether ``chunk`` random points of a file are drawn first, and sampled."""
         streams = self.weights is not None and self.readout != "completed"
-        return self.chunk is not None and not streams
+        return self.chunk is not None and not streams and not self.is_by_distance
+
+    @property
+    def needs_columns(self) -> bool:
+        """Whether attributes are kept, or decide which points are."""
+        decides = self.weight is not None or self.space is not None or self.strata is not None
+        return decides or not self.coordinates_only
+
+    def number(self, trained: int, points: int) -> int:
+        """Return how many of so many points to keep.
+
+        Args:
+            trained: the number that the sampler was made for.
+            points: number of points of the file.
+        """
+        return trained if self.m is None else number_of(self.m, points)
+
+
+def parse_size(text: str) -> Size:
+    """Return the number of points, or their share such as 10%, of a command line.
+
+    Raises:
+        UserError: it is neither.
+    """
+    number, percent, rest = text.partition("%")
+    try:
+        if not percent:
+            return int(number)
+        share = float(number) / 100
+    except ValueError:
+        share = 0.0
+    if rest or not 0 < share < 1:
+        raise UserError(
+            "--m must be a whole number of at least 1, or a share of the points above 0% and below "
+            f"100%, got {text}."
+        )
+    return share
+
+
+def parse_space(text: str) -> tuple[tuple[str, float], ...]:
+    """Return the columns that count in distances, and their factors.
+
+    Args:
+        text: ``NAME`` or ``NAME=FACTOR``, separated by commas. The coordinates have factor 1
+            unless they are named.
+
+    Raises:
+        UserError: a factor is no number of at least 0, or a name is given twice.
+    """
+    factors: dict[str, float] = {"x": 1.0, "y": 1.0, "z": 1.0}
+    named = set()
+    for word in text.split(","):
+        name, equals, number = word.strip().partition("=")
+        try:
+            factor = float(number) if equals else 1.0
+        except ValueError:
+            factor = -1.0
+        if not name or name in named or not (isfinite(factor) and factor >= 0):
+            raise UserError(
+                f"--space must be columns with factors of at least 0, such as intensity=0.01,z=2, "
+                f"got {text!r}."
+            )
+        named.add(name)
+        factors[name] = factor
+    if not any(factors.values()):
+        raise UserError("--space: all factors are 0.")
+    return tuple(factors.items())

@@ -1,0 +1,386 @@
+"""Files downsampled to a spacing or to voxels, whole or in ranges of rows, with equal results.
+
+A spacing takes several passes over a file: each draws the points of highest priority to which no
+kept point is near, as many as fit in memory, and keeps those that are spaced. Voxels take two: the
+first adds up the points of every voxel, the second finds the point nearest to each mean. Kept
+points and occupied voxels must fit in memory.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from functools import partial, reduce
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mops_lightning.data.formats.cloud_file import CloudFile
+from mops_lightning.data.formats.guard import BadCloudError, check_coordinates
+from mops_lightning.data.formats.registry import open_cloud_file
+from mops_lightning.data.formats.table import Column, Table, join_tables
+from mops_lightning.errors import UserError
+from mops_lightning.files.chunks import Outcome
+from mops_lightning.files.column_weights import weights_of
+from mops_lightning.files.engine import Engine
+from mops_lightning.files.options import Options
+from mops_lightning.files.space import check_unit, in_space
+from mops_lightning.ops.spacing import keep_spaced, priorities, priority_order, uncovered
+from mops_lightning.ops.voxels import Sums, Voxels, occupied, representatives, scales_for
+from mops_lightning.ops.voxels import sum_columns as sum_in_voxels
+from mops_lightning.ops.weights import CURVATURE
+
+AVERAGED = {
+    "red", "green", "blue", "nir", "alpha", "intensity", "r", "g", "b", "a",
+    "diffuse_red", "diffuse_green", "diffuse_blue",
+}  # fmt: skip
+"""Columns of whole numbers that are quantities; others are names, of which there is no mean."""
+
+PACKED = {"rgb", "rgba"}
+"""Columns whose bits are colours (PCD)."""
+
+NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
+
+
+def keep_by_distance(
+    source: Path, whole: Table | None, options: Options, engine: Engine
+) -> tuple[Table, Outcome]:
+    """Downsample a file to ``options.spacing`` or ``options.voxel``.
+
+    Args:
+        source: the file.
+        whole: its points; None: they are read in ranges of ``options.chunk`` rows.
+        options: how.
+        engine: processes the ranges.
+
+    Raises:
+        UserError: the file is broken, has no points, or has no such columns.
+    """
+    file = _file(source, whole, options)
+    name = "--voxel" if options.spacing is None else "--spacing"
+    check_unit(file.header, name, source)
+    if options.chunk is not None and options.weight == CURVATURE:
+        raise UserError("--weight curvature needs the whole cloud in memory: leave --chunk out.")
+    # The header of a file is needed only where it is written.
+    cloud = replace(file, header=None)
+    ranges = file.row_ranges(options.chunk or max(file.number, 1))
+    passes = Passes(cloud, ranges, options, engine)
+    if options.spacing is not None:
+        kept, number = passes.spaced()
+    else:
+        kept, number = passes.in_voxels()
+    if not len(kept.points):
+        raise BadCloudError(f"{source} holds no points that could be kept.")
+    left_out = len(whole.points) if whole is not None else file.number
+    dropped = 0 if options.area else left_out - number
+    table = replace(kept, header=file.header)
+    if options.coordinates_only:
+        table = table.without_attributes()
+    return table, Outcome(len(table.points), number, dropped)
+
+
+def _file(source: Path, whole: Table | None, options: Options) -> CloudFile:
+    if whole is None:
+        return open_cloud_file(source, options.area, options.columns)
+    return CloudFile(source, len(whole.points), partial(_rows_of, whole), whole.header)
+
+
+def _rows_of(table: Table, path: Path, rows: range) -> Table:
+    return replace(table.take(np.arange(rows.start, rows.stop)), header=None)
+
+
+class Part(NamedTuple):
+    """Points of a range of rows that may be kept.
+
+    Attributes:
+        table: the points, without those of weight 0, with the columns that are needed.
+        rows: ``(n,)`` their rows among the finite points of the range, plus its first row.
+        weight: ``(n,)`` their weights, None: all are equal.
+        number: how many finite points the range has.
+    """
+
+    table: Table
+    rows: NDArray[np.int64]
+    weight: NDArray[np.float64] | None
+    number: int
+
+
+def _read(cloud: CloudFile, options: Options, rows: range) -> Part:
+    table = cloud.read(rows)
+    check_coordinates(cloud.path, table.points)
+    places = np.arange(len(table.points)) + rows.start
+    if options.weight is not None:
+        weight = weights_of(table, options.weight, cloud.path)
+        heavy = np.flatnonzero(weight)
+        return Part(table.take(heavy), places[heavy], weight[heavy], len(places))
+    if not options.needs_columns:
+        table = table.without_attributes()
+    return Part(table, places, None, len(places))
+
+
+class Candidates(NamedTuple):
+    """The points of highest priority so far that no kept point is near to.
+
+    Attributes:
+        table: the points.
+        rows: ``(n,)`` see ``Part``.
+        used: ``(n, C)`` their coordinates in the space of distances.
+        weight: ``(n,)`` or None.
+        number: of finite points that were read.
+        is_cut: whether there are more.
+    """
+
+    table: Table
+    rows: NDArray[np.int64]
+    used: NDArray[np.float64]
+    weight: NDArray[np.float64] | None
+    number: int
+    is_cut: bool = False
+
+    def take(self, rows: NDArray[np.int64], is_cut: bool) -> "Candidates":
+        """Return the candidates in some rows."""
+        weight = None if self.weight is None else self.weight[rows]
+        table, used = self.table.take(rows), self.used[rows]
+        return Candidates(table, self.rows[rows], used, weight, self.number, is_cut)
+
+    def first(self, most: int | None, seed: int) -> "Candidates":
+        """Return the candidates that come first, each place once, in the order of the file."""
+        if most is None or len(self.rows) <= most:
+            return self
+        order = priority_order(self.used, priorities(self.used, seed), self.weight)
+        ordered = self.used[order]
+        is_new = np.ones(len(order), bool)
+        is_new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+        order = order[is_new]
+        return self.take(np.sort(order[:most]), self.is_cut or len(order) > most)
+
+    def merge(self, other: "Candidates") -> "Candidates":
+        """Join the candidates of two ranges, of which the other one comes later."""
+        if not len(self.rows):
+            is_cut = self.is_cut or other.is_cut
+            return other._replace(number=self.number + other.number, is_cut=is_cut)
+        if not len(other.rows):
+            return self._replace(number=self.number + other.number)
+        weight = None
+        if self.weight is not None and other.weight is not None:
+            weight = np.concatenate([self.weight, other.weight])
+        return Candidates(
+            join_tables([self.table, other.table]),
+            np.concatenate([self.rows, other.rows]),
+            np.concatenate([self.used, other.used]),
+            weight,
+            self.number + other.number,
+            self.is_cut or other.is_cut,
+        )
+
+
+def _candidates(
+    cloud: CloudFile, options: Options, kept: NDArray[np.float64] | None, rows: range
+) -> Candidates:
+    assert options.spacing is not None
+    part = _read(cloud, options, rows)
+    used = in_space(part.table, options.space, cloud.path)
+    found = Candidates(part.table, part.rows, used, part.weight, part.number)
+    if kept is not None:
+        found = found.take(uncovered(used, kept, options.spacing), is_cut=False)
+    return found.first(options.chunk, options.seed)
+
+
+class Found(NamedTuple):
+    """One point for each of some voxels.
+
+    Attributes:
+        table: the points.
+        rows: ``(n,)`` see ``Part``.
+        voxel: ``(n,)`` the voxel of every point.
+        distance: ``(n,)`` squared distance from its mean.
+        weight: ``(n,)`` or None.
+    """
+
+    table: Table
+    rows: NDArray[np.int64]
+    voxel: NDArray[np.int64]
+    distance: NDArray[np.float64]
+    weight: NDArray[np.float64] | None
+
+    def take(self, rows: NDArray[np.int64]) -> "Found":
+        """Return some of the points."""
+        weight = None if self.weight is None else self.weight[rows]
+        table, places = self.table.take(rows), self.rows[rows]
+        return Found(table, places, self.voxel[rows], self.distance[rows], weight)
+
+    def merge(self, other: "Found") -> "Found":
+        """Keep the better point of every voxel; see ``representatives``."""
+        if not len(self.rows):
+            return other
+        if not len(other.rows):
+            return self
+        weight = None
+        if self.weight is not None and other.weight is not None:
+            weight = np.concatenate([self.weight, other.weight])
+        both = Found(
+            join_tables([self.table, other.table]),
+            np.concatenate([self.rows, other.rows]),
+            np.concatenate([self.voxel, other.voxel]),
+            np.concatenate([self.distance, other.distance]),
+            weight,
+        )
+        x, y, z = both.table.points.T
+        lightness = np.zeros(len(both.rows)) if weight is None else -weight
+        order = np.lexsort((both.rows, z, y, x, both.distance, lightness, both.voxel))
+        is_first = np.ones(len(order), bool)
+        is_first[1:] = both.voxel[order[1:]] != both.voxel[order[:-1]]
+        return both.take(order[is_first])
+
+
+def _occupied(cloud: CloudFile, options: Options, rows: range) -> tuple[Voxels, int]:
+    assert options.voxel is not None
+    part = _read(cloud, options, rows)
+    return occupied(part.table.points, options.voxel), part.number
+
+
+def _found(cloud: CloudFile, options: Options, voxels: Voxels, rows: range) -> Found:
+    assert options.voxel is not None
+    part = _read(cloud, options, rows)
+    best = representatives(part.table.points, options.voxel, voxels, part.weight)
+    voxel = np.flatnonzero(best.rows >= 0)
+    kept = best.rows[voxel]
+    weight = None if part.weight is None else part.weight[kept]
+    return Found(part.table.take(kept), part.rows[kept], voxel, best.distances[voxel], weight)
+
+
+def _averaged(table: Table) -> list[str]:
+    """Return the names of columns that have a mean."""
+    return [
+        name
+        for name, column in table.columns.items()
+        if column.ndim == 1
+        and name.lower() not in PACKED
+        and (column.dtype.kind == "f" or name.lower() in AVERAGED)
+    ]
+
+
+def _values(table: Table, names: list[str]) -> NDArray[np.float64]:
+    if not names:
+        return np.empty((len(table.points), 0))
+    return np.stack([table.columns[name].astype(np.float64) for name in names], axis=1)
+
+
+def _largest(
+    cloud: CloudFile, options: Options, names: list[str], rows: range
+) -> NDArray[np.float64]:
+    values = _values(_read(cloud, options, rows).table, names)
+    finite: NDArray[np.float64] = np.abs(np.where(np.isfinite(values), values, 0.0))
+    return finite.max(axis=0, initial=0.0)
+
+
+def _column_sums(
+    cloud: CloudFile,
+    options: Options,
+    names: list[str],
+    voxels: Voxels,
+    scales: NDArray[np.float64],
+    rows: range,
+) -> Sums:
+    assert options.voxel is not None
+    table = _read(cloud, options, rows).table
+    return sum_in_voxels(table.points, options.voxel, voxels, _values(table, names), scales)
+
+
+def _add(left: Sums, right: Sums) -> Sums:
+    return Sums(left.high + right.high, left.low + right.low, left.wrong + right.wrong)
+
+
+class Passes(NamedTuple):
+    """Passes over the rows of a file, range by range.
+
+    Attributes:
+        cloud: the file.
+        ranges: of its rows.
+        options: how it is downsampled.
+        engine: processes the ranges.
+    """
+
+    cloud: CloudFile
+    ranges: list[range]
+    options: Options
+    engine: Engine
+
+    def over(self, title: str, function: Any, *common: Any) -> Iterable[Any]:
+        """Return the function's result for every range, in order."""
+        work = partial(function, self.cloud, self.options, *common)
+        return self.engine.map(title, work, self.ranges)
+
+    def spaced(self) -> tuple[Table, int]:
+        """Return the points that a spacing keeps, and how many finite points the file has."""
+        assert self.options.spacing is not None
+        kept: Candidates | None = None
+        number = 0
+        is_cut = True
+        while is_cut:
+            used = None if kept is None else kept.used
+            drawn: Candidates | None = None
+            for part in self.over("spacing", _candidates, used):
+                drawn = part if drawn is None else drawn.merge(part)
+                drawn = drawn.first(self.options.chunk, self.options.seed)
+            if drawn is None:
+                break
+            is_cut = drawn.is_cut
+            rows = keep_spaced(drawn.used, self.options.spacing, self.options.seed, drawn.weight)
+            new = drawn.take(rows, is_cut)
+            number = drawn.number
+            kept = new if kept is None else kept.merge(new)
+        if kept is None:
+            return Table(np.empty((0, 3))), 0
+        return kept.table.take(kept.rows.argsort()), number
+
+    def in_voxels(self) -> tuple[Table, int]:
+        """Return one point of every voxel, and how many finite points the file has."""
+        number = 0
+        voxels: Voxels | None = None
+        for part, read in self.over("voxels", _occupied):
+            number += read
+            voxels = part if voxels is None else voxels.merge(part)
+        if voxels is None or not len(voxels.counts):
+            return Table(np.empty((0, 3))), number
+        found: Found = reduce(Found.merge, self.over("nearest", _found, voxels))
+        if self.options.readout == "generated":
+            return self._means(voxels, found), number
+        return found.table.take(found.rows.argsort()), number
+
+    def _means(self, voxels: Voxels, found: Found) -> Table:
+        """Return the means of all voxels; columns of names are those of the nearest points."""
+        assert self.options.voxel is not None
+        nearest = found.table.take(found.voxel.argsort())
+        names = _averaged(nearest)
+        columns = dict(nearest.columns)
+        if names:
+            largest: NDArray[np.float64] = reduce(np.maximum, self.over("scale", _largest, names))
+            scales = scales_for(largest)
+            work = self.over("means", _column_sums, names, voxels, scales)
+            sums: Sums = reduce(_add, work)
+            means = sums.means(voxels.counts, scales)
+            for name, values in zip(names, means.T, strict=True):
+                columns[name] = _as_stored(values, nearest.columns[name])
+        _renormalise(columns)
+        is_alone = (voxels.counts == 1)[:, None]
+        points = np.where(is_alone, nearest.points, voxels.means(self.options.voxel))
+        form = replace(nearest.form, coordinates=None)
+        return replace(nearest, points=points, columns=columns, form=form)
+
+
+def _as_stored(means: NDArray[np.float64], column: Column) -> Column:
+    if column.dtype.kind != "f":
+        means = np.rint(means)
+    return means.astype(column.dtype)
+
+
+def _renormalise(columns: dict[str, Column]) -> None:
+    """Scale normals to length 1; those that cancel out stay 0."""
+    for names in NORMALS:
+        if all(name in columns for name in names):
+            normals = np.stack([columns[name].astype(np.float64) for name in names], axis=1)
+            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+            normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+            for name, values in zip(names, normals.T, strict=True):
+                columns[name] = values.astype(columns[name].dtype)

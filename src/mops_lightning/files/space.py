@@ -1,0 +1,79 @@
+"""The space of distances: coordinates and further columns of a table, scaled; and its unit."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.data.formats.table import Table
+from mops_lightning.errors import did_you_mean
+
+Space = tuple[tuple[str, float], ...]
+"""Columns and their factors, x, y and z among them."""
+
+WKT, GEO_KEYS = 2112, 34735
+"""Numbers of the records of a LAS file that hold a coordinate system (LAS 1.4 R15)."""
+
+MODEL_KEY, GEOGRAPHIC = 1024, 2
+"""The key of GeoTIFF for the kind of coordinates, and its value for degrees."""
+
+
+def in_space(table: Table, space: Space | None, path: Path) -> NDArray[np.float64]:
+    """Return the columns ``(N, C)`` that count in distances, scaled; without a space, the points.
+
+    Raises:
+        BadCloudError: there is no such column, or it is not finite.
+    """
+    if space is None:
+        return table.points
+    axes = dict(zip("xyz", table.points.T, strict=True))
+    columns = []
+    for name, factor in space:
+        values = axes.get(name, table.columns.get(name))
+        if values is None:
+            hint = did_you_mean(name, {*axes, *table.columns})
+            raise BadCloudError(f"--space: {path} has no column {name!r}.{hint}")
+        if not np.isfinite(values).all():
+            raise BadCloudError(f"--space: {name!r} of {path} is not finite.")
+        if factor > 0:
+            columns.append(values.astype(np.float64) * factor)
+    return np.stack(columns, axis=1)
+
+
+def check_unit(header: Any, name: str, path: Path) -> None:
+    """Reject a LAS file in degrees, where a distance has no meaning.
+
+    Args:
+        header: see ``Table``.
+        name: of the option with the distance.
+        path: the file.
+
+    Raises:
+        BadCloudError: the file has a geographic coordinate system.
+    """
+    if _is_geographic(header):
+        raise BadCloudError(
+            f"{name}: the coordinates of {path} are degrees (a geographic coordinate system). "
+            "Project them first, for example with PDAL, or give --m."
+        )
+
+
+def _is_geographic(header: Any) -> bool:
+    records = [*(getattr(header, "vlrs", None) or ()), *(getattr(header, "evlrs", None) or ())]
+    texts = [record for record in records if record.record_id == WKT]
+    keys = [record for record in records if record.record_id == GEO_KEYS]
+    for record in texts:
+        words = _text_of(record).upper()
+        is_projected = "PROJCS" in words or "PROJCRS" in words
+        return not is_projected and ("GEOGCS" in words or "GEOGCRS" in words)
+    for record in keys:
+        numbers = np.frombuffer(record.record_data_bytes(), "<u2")
+        entries = numbers[4 : len(numbers) // 4 * 4].reshape(-1, 4)
+        return any(key == MODEL_KEY and value == GEOGRAPHIC for key, _, _, value in entries)
+    return False
+
+
+def _text_of(record: Any) -> str:
+    return bytes(record.record_data_bytes()).decode("utf-8", "replace")

@@ -1,0 +1,140 @@
+"""Spacing and voxels of files: whole, in chunks, by Dask, in folders, with attributes and maps."""
+
+import numpy as np
+import pytest
+
+from mops_lightning.data.formats.registry import WRITERS, read
+from mops_lightning.data.formats.table import Table
+from mops_lightning.ops.spacing import keep_spaced
+from tests.support.downsample import done, refused
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    """A scan in map coordinates of six digits, with copies, ties and points that are not finite."""
+    path = tmp_path_factory.mktemp("scan") / "scan.ply"
+    points = RNG.uniform(0, 4, (900, 3)) + [512_345.25, 5_412_345.5, 100.0]
+    points[100:200] = points[:100]
+    points[200:400] = np.round(points[200:400] * 2) / 2
+    points[500] = np.nan
+    normals = RNG.normal(size=(900, 3))
+    columns = {
+        "row": np.arange(900, dtype=np.int32),
+        "red": RNG.integers(0, 256, 900).astype(np.uint8),
+        "heat": RNG.normal(size=900) * 1e9,
+        "nx": normals[:, 0],
+        "ny": normals[:, 1],
+        "nz": normals[:, 2],
+    }
+    WRITERS[".ply"](path, Table(points, columns))
+    return path
+
+
+BUDGETS = {
+    "spacing": ["--spacing", 0.7],
+    "spacing weighted": ["--spacing", 0.7, "--weight", "red"],
+    "spacing in space": ["--spacing", 0.7, "--space", "z=2,red=0.01"],
+    "voxel": ["--voxel", 0.8],
+    "voxel weighted": ["--voxel", 0.8, "--weight", "red"],
+    "voxel means": ["--voxel", 0.8, "--readout", "generated"],
+    "spacing in bounds": ["--spacing", 0.7, "--bounds", "512345,5412345,512348,5412348"],
+    "voxel in bounds": ["--voxel", 0.8, "--bounds", "512345,5412345,512348,5412348"],
+}
+
+
+@pytest.mark.parametrize("budget", BUDGETS)
+def test_chunks_and_tiles_equal_one_pass(budget, scan, tmp_path):
+    done(scan, tmp_path / "whole.npz", *BUDGETS[budget])
+    whole = read(tmp_path / "whole.npz", 9, 0)
+
+    for name, options in {
+        "1000": ["--chunk", 1000],
+        "250": ["--chunk", 250],
+        "31": ["--chunk", 31],
+        "tile": ["--tile", 64],
+    }.items():
+        done(scan, tmp_path / f"{name}.npz", *BUDGETS[budget], *options)
+        part = read(tmp_path / f"{name}.npz", 9, 0)
+        np.testing.assert_array_equal(part.points, whole.points)
+        assert part.columns.keys() == whole.columns.keys()
+        for column, values in whole.columns.items():
+            np.testing.assert_array_equal(part.columns[column], values)
+
+
+def test_spacing_keeps_rows_of_the_op(scan, tmp_path):
+    out = done(scan, tmp_path / "out.npz", "--spacing", 0.7)
+
+    kept, whole = read(tmp_path / "out.npz", 9, 0), read(scan, 9, 0).finite()
+    rows = keep_spaced(whole.points, 0.7)
+    np.testing.assert_array_equal(kept.points, whole.points[rows])
+    np.testing.assert_array_equal(kept.columns["row"], whole.columns["row"][rows])
+    assert f"{len(rows)} of 899 points (1 more without finite coordinates left out)" in out
+
+
+def test_voxel_keeps_one_row_of_each_and_prints_the_origin(scan, tmp_path):
+    out = done(scan, tmp_path / "out.npz", "--voxel", 0.8)
+
+    kept, whole = read(tmp_path / "out.npz", 9, 0), read(scan, 9, 0)
+    places = np.unique(np.floor(whole.finite().points / 0.8), axis=0)
+    assert len(kept.points) == len(places)
+    np.testing.assert_array_equal(kept.points, whole.points[kept.columns["row"]])
+    assert "voxels of 0.8 from the origin 0 0 0" in out
+
+
+def test_voxel_means_average_quantities_and_renormalise_normals(scan, tmp_path):
+    done(scan, tmp_path / "out.npz", "--voxel", 0.8, "--readout", "generated")
+
+    means, whole = read(tmp_path / "out.npz", 9, 0), read(scan, 9, 0).finite()
+    places, voxel = np.unique(np.floor(whole.points / 0.8), axis=0, return_inverse=True)
+    counts = np.bincount(voxel)
+    for axis in range(3):
+        expected = np.bincount(voxel, whole.points[:, axis]) / counts
+        np.testing.assert_allclose(means.points[:, axis], expected, rtol=0, atol=2e-8)
+    heat = np.bincount(voxel, whole.columns["heat"]) / counts
+    np.testing.assert_allclose(means.columns["heat"], heat, rtol=1e-9, atol=1e-3)
+    red = np.bincount(voxel, whole.columns["red"]) / counts
+    np.testing.assert_allclose(means.columns["red"], red, atol=0.5)
+    normals = np.stack([means.columns[name] for name in ("nx", "ny", "nz")], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+    rows = means.columns["row"]
+    assert (voxel[np.searchsorted(whole.columns["row"], rows)] == np.arange(len(places))).all()
+
+
+def test_map_of_a_spacing(scan, tmp_path):
+    done(scan, tmp_path / "out.npz", "--spacing", 0.7, "--map", tmp_path / "map.npz")
+
+    rows = np.load(tmp_path / "map.npz")["rows"]
+    kept = read(tmp_path / "out.npz", 9, 0).points
+    points = read(scan, 9, 0).points
+    finite = np.isfinite(points).all(axis=1)
+    distances = np.linalg.norm(points[finite] - kept[rows[finite, 0]], axis=1)
+    assert distances.max() < 0.7
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--m", 5, "--spacing", 1], "give one of --m, --spacing and --voxel, got --m and --spac"),
+        (["--spacing", 1, "--method", "fps"], "--spacing needs neither --method nor --weights"),
+        (["--voxel", 0], "--voxel must be a number above 0, in the file's unit, got 0"),
+        (["--spacing", "nan"], "--spacing must be a number above 0"),
+        (["--spacing", 1, "--readout", "generated"], "--spacing keeps input points"),
+        (["--voxel", 1, "--stratify", "row:share"], "--stratify shares a number of points"),
+        (["--voxel", 1, "--space", "z=2"], "--space is for --method fps and --spacing"),
+        (["--spacing", 1, "--space", "zz"], "has no column 'zz'"),
+        (["--spacing", 1, "--space", "z=-1"], "--space must be columns with factors of at least 0"),
+        (["--voxel", 1e-20], "is too small for coordinates"),
+        (["--spacing", 1, "--total"], "--total is for --m"),
+        (["--m", "0%", "--method", "fps"], "--m must be a whole number of at least 1, or a share"),
+        (["--m", "100%", "--method", "fps"], "--m must be a whole number of at least 1, or a sh"),
+        (["--m", "1.5", "--method", "fps"], "--m must be a whole number of at least 1, or a share"),
+        (["--m", 5, "--method", "fps", "--stratify", "row"], "--stratify must be a column and"),
+        (["--m", 5, "--method", "fps", "--stratify", "heat:share"], "'heat' must hold whole"),
+        (["--m", 5, "--method", "poisson", "--space", "z=2"], "--space is for --method fps"),
+    ],
+)
+def test_mistakes_are_one_line(options, words, scan, tmp_path):
+    assert words in refused(scan, tmp_path / "out.npz", *options)
+    assert not (tmp_path / "out.npz").exists()
