@@ -1,5 +1,7 @@
 """Shares, totals and classes; and commands that were killed between the map and the output."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -20,7 +22,10 @@ def clouds(tmp_path_factory):
         classes[:2] = 9
         classes[2 : number // 5] = 4
         points = RNG.normal(size=(number, 3))
-        columns = {"classification": classes, "row": np.arange(number, dtype=np.int32)}
+        columns: dict[str, Any] = {
+            "classification": classes,
+            "row": np.arange(number, dtype=np.int32),
+        }
         WRITERS[".ply"](folder / f"{name}.ply", Table(points, columns))
     (folder / "notes.md").write_text("two files of other kinds\n")
     (folder / "scan.xyzzy").write_text("1 2 3\n")

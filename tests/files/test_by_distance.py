@@ -1,5 +1,7 @@
 """Spacing and voxels of files: whole, in chunks, by Dask, in folders, with attributes and maps."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -20,7 +22,7 @@ def scan(tmp_path_factory):
     points[200:400] = np.round(points[200:400] * 2) / 2
     points[500] = np.nan
     normals = RNG.normal(size=(900, 3))
-    columns = {
+    columns: dict[str, Any] = {
         "row": np.arange(900, dtype=np.int32),
         "red": RNG.integers(0, 256, 900).astype(np.uint8),
         "heat": RNG.normal(size=900) * 1e9,
