@@ -17,7 +17,7 @@ RNG = np.random.default_rng(0)
 def scan(tmp_path_factory):
     """A scan in map coordinates of six digits, with copies, ties and points that are not finite."""
     path = tmp_path_factory.mktemp("scan") / "scan.ply"
-    points = RNG.uniform(0, 4, (900, 3)) + [512_345.25, 5_412_345.5, 100.0]
+    points = RNG.uniform(0, 4, (900, 3)) + np.array([512_345.25, 5_412_345.5, 100.0])
     points[100:200] = points[:100]
     points[200:400] = np.round(points[200:400] * 2) / 2
     points[500] = np.nan
