@@ -133,7 +133,7 @@ def _scales(spans: NDArray[np.floating], m: int) -> NDArray[np.floating]:
 
 
 def _sorted(spans: NDArray[np.floating], scale: np.floating) -> NDArray[np.floating]:
-    """Sort positions by voxels of about the final size, which counts them in a third of the time."""
+    """Sort positions by voxels of about the final size: they are then counted faster."""
     cell_of, keys = voxel_search.group(spans, scale)
     ordered: NDArray[np.floating] = voxel_search.sort_by_cell(spans, cell_of, len(keys))
     return ordered
