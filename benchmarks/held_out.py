@@ -3,7 +3,7 @@
     python benchmarks/held_out.py MODELNET40 FOLDER
 
 FOLDER becomes a ModelNet40 folder whose test shapes are a fifth of the training shapes, drawn with
-a fixed seed. The trials of docs/plan.md read it; they read no test shape.
+a fixed seed. The trials of results/PROTOCOL.md read it; they read no test shape.
 """
 
 import argparse

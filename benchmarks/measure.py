@@ -72,6 +72,8 @@ def interleaved(cases: Mapping[str, Callable[[], Any]], rounds: int = 7) -> dict
 
 
 def _timing(values: list[float]) -> Timing:
+    if len(values) == 1:  # a try: there are no quartiles
+        return Timing(values[0], values[0], values[0], 1)
     low, _, high = statistics.quantiles(values, n=4, method="inclusive")
     return Timing(statistics.median(values), low, high, len(values))
 

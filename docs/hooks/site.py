@@ -14,8 +14,15 @@ import mops_lightning
 ROOT = Path(__file__).parents[2]
 DOCS = "docs/"
 HOME = "README.md"
-PAGES = (HOME, "CONTRIBUTING.md", "CHANGELOG.md", "MAINTAINING.md", "SECURITY.md")
-"""Pages at the top of the repository."""
+PAGES = (
+    HOME,
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    "MAINTAINING.md",
+    "SECURITY.md",
+    "results/PROTOCOL.md",
+)
+"""Pages outside docs/, beside those of results and benchmarks."""
 
 MAX_BYTES = 1_000_000
 """Larger files are not copied; a link to one becomes plain text."""

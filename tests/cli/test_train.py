@@ -34,7 +34,7 @@ def test_main_job_prints_scores_and_output_paths(main_job):
     for word in ("random", "voxel", "fps", "generated", "matched", "completed", "accuracy"):
         assert word in out
     last = out.strip().splitlines()[-1]
-    for name in ("result.json", "checkpoints/last.ckpt", "pictures", "tensorboard"):
+    for name in ("result.json", "checkpoints/last.ckpt", "pictures"):
         assert name in last
         assert (run / name).exists()
     assert err == "", "nothing but the result is said"
@@ -62,18 +62,18 @@ def test_main_job_writes_weights_pictures_and_curves(main_job):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     tags: dict[str, set[str]] = {}
-    for path in (run / "tensorboard").rglob("events*"):
+    for path in run.rglob("events*"):
         accumulator = EventAccumulator(str(path))
         accumulator.Reload()
         for kind, names in accumulator.Tags().items():
             if isinstance(names, list):
                 tags.setdefault(kind, set()).update(names)
-    for tag in ("train/loss/cross_entropy", "train/loss/subset", "train/tau", "lr-Adam/sampler"):
+    for tag in ("train/loss/cross_entropy", "train/loss/subset", "curves/8 tau", "lr-Adam/sampler"):
         assert tag in tags["scalars"]
     assert not [tag for tag in tags["scalars"] if tag.startswith("test/")]
     assert "test/text_summary" in tags["tensors"]
-    assert "val/matched/accuracy" in tags["scalars"]
-    assert {"clouds", "matrix"} <= tags["images"]
+    assert "curves/2 val accuracy, matched" in tags["scalars"]
+    assert {"pictures/clouds", "pictures/matrix"} <= tags["images"]
 
 
 def test_second_run_uses_cached_task_net(main_job):

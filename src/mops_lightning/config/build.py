@@ -17,7 +17,12 @@ logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
 REJECTIONS = (ValueError, TypeError, OverflowError, ZeroDivisionError)
 """Errors that constructors of other libraries raise for invalid settings."""
 
-PASSED_ON = {"lightning.pytorch.loggers.TensorBoardLogger": "torch.utils.tensorboard.SummaryWriter"}
+WRITER = "torch.utils.tensorboard.SummaryWriter"
+
+PASSED_ON = {
+    "lightning.pytorch.loggers.TensorBoardLogger": WRITER,
+    "mops_lightning.training.run.board.Board": WRITER,
+}
 """Classes that pass further settings on to others, which refuse them after pretraining."""
 
 

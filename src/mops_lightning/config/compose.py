@@ -259,6 +259,14 @@ def run_label(_root_: DictConfig) -> str:
     return f"{names.sampler}{anchored}-m{size}{'-joint' if _root_.learn == 'joint' else ''}"
 
 
+def tested_label(_root_: DictConfig) -> str:
+    """Return the label of a test's folder: the run or model that it tests, else the sampler."""
+    if not _root_.evaluate:
+        return str(_root_.names.sampler)
+    parts = [part for part in Path(_root_.evaluate).parts if part not in ("/", ".", "..", "~")]
+    return "-".join(parts[-2:])  # of a cell of a sweep: the sweep and the cell
+
+
 def run_level_keys() -> str:
     """Return the run-level keys with their texts, for ``--help``."""
     shown = {name: one for name, one in settings.declared().items() if not one.group}
@@ -294,5 +302,5 @@ def selectable_groups() -> str:
     return "\n".join(sorted(lines))
 
 
-for resolver in (group_choices, run_label, run_level_keys, selectable_groups, min):
+for resolver in (group_choices, run_label, tested_label, run_level_keys, selectable_groups, min):
     OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)

@@ -115,7 +115,7 @@ class RunSettings:
         learn=WITH_SAMPLER,
         compare=False,
     )
-    # What a run learned, its weights, data and task net are compared by the record's notes.
+    # What a run learned, its weights, data and task net are compared by fields of the record.
     learn: str = setting(
         "sampler",
         "what is trained: sampler (task net frozen), task (alone, full clouds), joint, nothing",
@@ -236,7 +236,7 @@ class RunSettings:
         per_learn=True,
         repeat=True,
     )
-    # The recipe in force is compared by the record's notes: index samplers have no recipe.
+    # The recipe in force is compared by a field of the record: index samplers have no recipe.
     recipe: Any = group(Affects.TRAINING, learn=("sampler", "joint"), repeat=False, compare=False)
     pretrain: Any = setting(
         None,

@@ -101,7 +101,10 @@ def sampler_row(record: RunRecord) -> str:
     That is ``anchored`` for a MOPS-Net with anchors, its recipe unless it is the paper's, and the
     number of task nets that it was trained under if there were several.
     """
-    parts = [sampler_name(record.config), recorded_recipe(record).get("name")]
+    parts = [sampler_name(record.config)]
+    recipe = recorded_recipe(record).get("name")
+    if recipe != "paper":  # recorded where a setting of it was changed
+        parts.append(recipe)
     if others := record.config.get("other_nets"):
         parts.append(f"{1 + len(others)} nets")
     return " ".join(str(part) for part in parts if part)

@@ -50,16 +50,51 @@ def board(tmp_path_factory):
         server.terminate()
 
 
+def answer(board, address):
+    with urllib.request.urlopen(f"{board}/data/plugin/{address}") as page:
+        return json.load(page)
+
+
+FIRST = [
+    "curves/1 val accuracy, generated",
+    "curves/2 val accuracy, matched",
+    "curves/3 val accuracy, completed",
+    "curves/7 train loss",
+    "curves/8 tau",
+]
+"""The curves of the first screen, for a run that trains a MOPS-Net."""
+
+
+def test_first_curves_are_scores_loss_and_temperature_under_short_names(board):
+    tags = answer(board, "scalars/tags")
+
+    assert set(tags) == {"run1", "run2"}  # nothing is trained in run0
+    for run_name in ("run1", "run2"):
+        assert sorted(tags[run_name])[: len(FIRST)] == FIRST
+    every = {tag for of_run in tags.values() for tag in of_run}
+    assert not {tag for tag in every if tag.startswith(("hparams", "test/"))}
+    assert "epoch" not in every
+
+
+def test_clouds_are_meshes_and_the_matrix_an_image_of_each_run(board):
+    meshes = answer(board, "mesh/tags")
+    images = answer(board, "images/tags")
+
+    for run_name in ("run1", "run2"):
+        shown = {name.partition("_")[0] for name in meshes[run_name]}
+        assert shown == {"clouds/generated", "clouds/matched", "clouds/completed"}
+        assert {"pictures/clouds", "pictures/matrix"} <= set(images[run_name])
+
+
 def test_hparams_compare_all_runs_and_begin_with_what_differs(board):
-    with urllib.request.urlopen(f"{board}/data/plugin/hparams/experiment?request={{}}") as answer:
-        experiment = json.load(answer)
+    experiment = answer(board, "hparams/experiment?request={}")
+
     settings = experiment["hparamInfos"]
     differing = [one["name"] for one in settings if one["differs"]]
-    assert differing == ["names.sampler", "sampler.alpha", "sampler.tau_min"]
-    assert [one["name"] for one in settings[:3]] == differing
-    assert "sampler.threshold" in [one["name"] for one in settings]
-    shown = [one["name"]["tag"] for one in experiment["metricInfos"][:5]]  # the first five columns
-    assert "hparams/test/generated/accuracy" in shown
+    assert [one["name"] for one in settings[: len(differing)]] == differing
+    of_runs = [name for name in differing if not name.startswith("test/")]
+    assert of_runs == ["sampler", "sampler.alpha", "sampler.tau_min"]
+    assert {"net", "m", "seed", "optimizer.lr"} <= {one["name"] for one in settings}
 
 
 def test_tensorboard_shows_curves_settings_images(board, opened):
@@ -71,9 +106,12 @@ def test_tensorboard_shows_curves_settings_images(board, opened):
             found.first.wait_for(state="attached")
         return page, errors, requests
 
-    see("?tagFilter=mean_loss#timeseries", "mean_loss", "canvas")
+    page, *_ = see("#timeseries", "canvas", FIRST[0].partition("/")[2])
+    titles = page.locator("card-view .tag").all_inner_texts()
+    assert [title.replace("\n", "") for title in titles[: len(FIRST)]] == FIRST
     see("#text", "test/generated/accuracy")
     see("#hparams", "tau_min")
+    see("#mesh", "clouds/generated")
     _, errors, requests = see("#images", "matrix")
     hosts = {urlparse(url).hostname for url in requests if urlparse(url).scheme.startswith("http")}
     assert hosts == {"127.0.0.1"}

@@ -26,7 +26,7 @@ def test_make_trainer_writes_checkpoints_atomically_and_shows_no_version(tmp_pat
     assert isinstance(trainer.strategy.checkpoint_io, module.AtomicCheckpointIO)
     assert trainer.logger is not None
     assert trainer.logger.log_dir is not None
-    assert Path(trainer.logger.log_dir) == tmp_path / "tensorboard"
+    assert Path(trainer.logger.log_dir) == tmp_path
     assert "v_num" not in get_standard_metrics(trainer)
 
 

@@ -18,6 +18,7 @@ from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.tasks.base import Task, figures_of
 from mops_lightning.training.readouts import readouts
+from mops_lightning.training.run.board import Board
 from mops_lightning.viz import figures as drawing
 
 DENSE_PIXELS = 2**20
@@ -67,15 +68,18 @@ class CloudVisualization(Callback):
         titles = cloud_titles(task, self.titles)
         if folder is not None and samples:
             drawing.save_clouds(folder / drawing.CLOUDS, batch.points, samples, titles)
+            if isinstance(board, Board):
+                board.add_clouds(batch.points, samples, trainer.global_step)
         for name, figure in figures.items():
             path = folder and drawing.save_figure(figure, folder / f"{name}.png")
             if board is None:
                 continue
+            tag = f"pictures/{name}"  # a group behind the curves
             if path is None:
-                board.experiment.add_figure(name, figure, trainer.global_step)
+                board.experiment.add_figure(tag, figure, trainer.global_step)
             else:  # what was drawn already
                 pixels = np.asarray(Image.open(path).convert("RGB"))
-                board.experiment.add_image(name, pixels, trainer.global_step, dataformats="HWC")
+                board.experiment.add_image(tag, pixels, trainer.global_step, dataformats="HWC")
 
     @torch.no_grad()
     def _figures(

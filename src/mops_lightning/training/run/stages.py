@@ -42,7 +42,6 @@ OUTPUTS = {
     "checkpoint": "checkpoints/last.ckpt",
     "pictures": "pictures",
     "clouds": f"pictures/{CLOUDS}",
-    "tensorboard": "tensorboard",
     "profile_fit": f"fit-{PROFILE}.txt",
     "profile_test": f"test-{PROFILE}.txt",
 }
@@ -221,7 +220,7 @@ def test(parts: Parts, record: RunRecord) -> None:
         for name, key in parsed.items()
         if key and key.metric == experiment.task.score and key.m in (None, experiment.m)
     }
-    log_test(trainer, record.config, record.metrics, scores)
+    log_test(trainer, record, scores)
     if experiment.learn in ("sampler", "nothing") and parts.has_task_weights:
         # A resumed run has its task net from the checkpoint, not from a weights file.
         record.task_weights_sha256 = weights.digest(experiment.task.state_dict())

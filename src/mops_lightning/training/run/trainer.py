@@ -13,22 +13,21 @@ import lightning as L
 import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
-from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.loggers import Logger
 from lightning.pytorch.profilers import AdvancedProfiler, SimpleProfiler
-from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
-from torch.utils.tensorboard.summary import hparams
 
 from mops_lightning.config.build import accepted, build, build_as
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
-from mops_lightning.records.run_record import dotted
+from mops_lightning.records.run_record import RunRecord, dotted
 from mops_lightning.training.checkpoint import CHECKPOINT, sealed
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.moving_average import MovingAverage
+from mops_lightning.training.run.board import Board
 from mops_lightning.training.run.callbacks import CPUTime, EpochLines, build_callbacks
 from mops_lightning.training.run.ending import (
     KeepsEnding,
@@ -55,8 +54,8 @@ PROFILE = "profile"
 """Name of a profiler's report, behind its stage."""
 LOG_EVERY = 10
 """Steps between two points of a curve."""
-LOGGER_FOLDERS = {"TensorBoardLogger": "tensorboard", "CSVLogger": "csv"}
-"""Subfolder of the run's folder that a logger writes to."""
+LOGGER_FOLDERS = {"Board": "", "TensorBoardLogger": "", "CSVLogger": "csv"}
+"""Subfolder of the run's folder that a logger writes to. TensorBoard calls a run by its folder."""
 
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX = -1, -2, -4
 """Options of mallopt(3)."""
@@ -105,7 +104,9 @@ def make_trainer(
     keep_freed_memory()
     given = cfg.trainer
     barebones = bool(given.get("barebones"))
-    logger = _logger(cfg.logger, folder) if cfg.get("logger") and not barebones else False
+    logger: Any = False
+    if cfg.get("logger") and not barebones:
+        logger = _logger(cfg.logger, folder, _score(cfg, experiment))
     callbacks = _callbacks(cfg, folder, dataset, experiment, logged=bool(logger))
     defaults = {
         "default_root_dir": str(folder),
@@ -139,9 +140,7 @@ def _callbacks(
 ) -> list[Callback]:
     """Build the callbacks of a run: its own, and those that every run has."""
     task, trainer = experiment.task, cfg.trainer
-    score = task.score
-    if cfg.learn == "task" and task.full_score:
-        score = task.full_score
+    score = _score(cfg, experiment)
     path = folder / "checkpoints" / CHECKPOINT
     offered = {"folder": folder, "checkpoint": path, "score": score}
     rows, titles = clouds_to_draw(dataset, cfg.pictures)
@@ -209,12 +208,21 @@ def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str
     return torch.tensor(rows, dtype=torch.int64), names
 
 
-def _logger(node: DictConfig, folder: Path) -> Any:
+def _score(cfg: DictConfig, experiment: Experiment) -> str:
+    """Return the metric that is shown during the training."""
+    task = experiment.task
+    if cfg.learn == "task" and task.full_score:
+        return task.full_score
+    return task.score
+
+
+def _logger(node: DictConfig, folder: Path, score: str) -> Any:
     """Build the logger, which writes into the run's folder itself unless it has a name."""
-    own = accepted(node, {"name": ""})
-    if below := LOGGER_FOLDERS.get(node["_target_"].rpartition(".")[2]):
-        own |= {"name": below, "version": ""}  # the progress bar would show a version
-    unset = {name: value for name, value in own.items() if name not in node}
+    offered = accepted(node, {"name": "", "score": score})
+    below = LOGGER_FOLDERS.get(node["_target_"].rpartition(".")[2])
+    if below is not None:
+        offered |= {"name": below, "version": ""}  # the progress bar would show a version
+    unset = {name: value for name, value in offered.items() if name not in node}
     return build_as(Logger, node, "logger", save_dir=str(folder), **unset)
 
 
@@ -236,56 +244,35 @@ def _silence_lightning() -> None:
         warnings.filterwarnings("ignore", message=message)
 
 
-def log_test(
-    trainer: L.Trainer, config: dict[str, Any], metrics: dict[str, float], scores: dict[str, float]
-) -> None:
+def log_test(trainer: L.Trainer, record: RunRecord, scores: dict[str, float]) -> None:
     """Log the test: metrics, and the settings that distinguish runs with the main scores.
-
-    TensorBoard shows the metrics as one table of text. As curves of one point each they would bury
-    the curves of the training.
 
     Args:
         trainer: its logger gets them, if it has one.
-        config: the settings as plain data.
-        metrics: by name.
-        scores: those for TensorBoard's hparams.
+        record: of the run, with its metrics.
+        scores: the metrics of every readout at the run's own size, for TensorBoard's HPARAMS.
     """
-    board = trainer.logger
-    if board is None:
+    logger = trainer.logger
+    if logger is None:
         return
+    if isinstance(logger, Board):
+        logger.log_test(record, scores, trainer.global_step)
+    else:
+        logger.log_metrics(record.metrics, trainer.global_step)
+        logger.log_hyperparams(_logged_settings(record.config))
+    # Lightning closed it after the test; logging opened it again.
+    logger.finalize("success")
+
+
+def _logged_settings(config: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings that distinguish runs, with dotted keys."""
     keys = ("names", "sampler", "optimizer", "augment", "m", "learn", "seed", "batch_size")
     leaves = dotted({key: config[key] for key in keys})
-    flat = {k: v for k, v in leaves.items() if k.rsplit(".", 1)[-1][:1] != "_"}
+    flat = {key: leaf for key, leaf in leaves.items() if not key.rpartition(".")[2].startswith("_")}
     flat["max_epochs"] = config["trainer"]["max_epochs"]
     if config.get("tags"):
         flat["tags"] = ", ".join(config["tags"])
-    if isinstance(board, TensorBoardLogger):
-        rows = [f"| {name} | {value:.6g} |" for name, value in sorted(metrics.items())]
-        table = "\n".join(["| metric | value |", "|---|--:|", *rows])
-        board.experiment.add_text("test", table, trainer.global_step)
-        _log_hparams(board, flat, {f"hparams/{k}": v for k, v in scores.items()})
-    else:
-        board.log_metrics(metrics, trainer.global_step)
-        board.log_hyperparams(flat)
-    # Lightning closed it after the test; logging opened it again.
-    board.finalize("success")
-
-
-@rank_zero_only
-def _log_hparams(
-    board: TensorBoardLogger, settings: dict[str, Any], scores: dict[str, float]
-) -> None:
-    """Log the start and the end of a session of TensorBoard's hparams.
-
-    Lightning also logs a summary of the experiment, with this run's settings alone. TensorBoard
-    takes the first that it finds for all runs. Without one it compares the runs itself and shows
-    the settings that differ first.
-    """
-    board.log_metrics(scores)
-    plain = {k: v if isinstance(v, int | float | str) else str(v) for k, v in settings.items()}
-    _, *session = hparams(plain, scores)
-    for summary in session:
-        board.experiment.file_writer.add_summary(summary)
+    return flat
 
 
 def keep_freed_memory() -> None:
