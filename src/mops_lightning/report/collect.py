@@ -103,7 +103,7 @@ def sampler_row(record: RunRecord) -> str:
     """
     parts = [sampler_name(record.config)]
     recipe = recorded_recipe(record).get("name")
-    if recipe != "paper":  # recorded where a setting of it was changed
+    if recipe and recipe != "paper":  # the paper's is recorded where a setting of it was changed
         parts.append(recipe)
     if others := record.config.get("other_nets"):
         parts.append(f"{1 + len(others)} nets")
