@@ -8,7 +8,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from mops_lightning.cli.main import COMMANDS
-from mops_lightning.config.compose import compose, conf_dir
+from mops_lightning.config.compose import compose
+from mops_lightning.config.groups import conf_dir
 from mops_lightning.config.settings import declared
 from mops_lightning.records.run_record import dotted, read
 from tests.support.command_line import TINY, TINY_ANY_DATA, call, done, runs
@@ -47,14 +48,14 @@ def test_no_default_is_computed_from_other_choices():
         assert not any(word in text for word in ("choose:", "model_for:", "oc.select")), path
 
 
-def test_only_experiments_set_keys_of_other_groups():
+def test_only_presets_set_keys_of_other_groups():
     names = [
         path.relative_to(conf_dir()).as_posix()
         for path in conf_dir().rglob("*.yaml")
         if "@package _global_" in path.read_text()
     ]
     assert names
-    assert {name.split("/")[0] for name in names} == {"experiment"}
+    assert {name.split("/")[0] for name in names} == {"experiment", "debug"}
 
 
 FOLLOWING = """

@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from hydra_plugins.grid_sweeper import parsed
-from mops_lightning.config.compose import conf_dir
+from mops_lightning.config.groups import conf_dir
 from mops_lightning.config.validate import check
 from mops_lightning.records.run_record import dotted
 

@@ -7,7 +7,8 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from mops_lightning.config.build import signature
-from mops_lightning.config.compose import compose, conf_dir
+from mops_lightning.config.compose import compose
+from mops_lightning.config.groups import conf_dir
 from mops_lightning.config.validate import check, misfit
 from mops_lightning.errors import UserError
 

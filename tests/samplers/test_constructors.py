@@ -22,7 +22,8 @@ from mops_lightning import (
     SNet,
     VoxelSampler,
 )
-from mops_lightning.config.compose import compose, conf_dir
+from mops_lightning.config.compose import compose
+from mops_lightning.config.groups import conf_dir
 from mops_lightning.errors import UserError
 from mops_lightning.zoo.load import package_samplers
 

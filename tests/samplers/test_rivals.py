@@ -6,7 +6,7 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from mops_lightning.config.build import build
-from mops_lightning.config.compose import conf_dir
+from mops_lightning.config.groups import conf_dir
 
 # From the root, as sampler=NAME finds them.
 lightn = import_module("benchmarks.rivals.lightn")

@@ -5,7 +5,7 @@ import torch
 from omegaconf import OmegaConf
 
 from mops_lightning import FMOPSNet, SampleOutput, Sampler, load
-from mops_lightning.config.compose import conf_dir
+from mops_lightning.config.groups import conf_dir
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.tasks.classification import Classification

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mops_lightning import errors
-from mops_lightning.config.compose import check_overrides, conf_dir, explain
+from mops_lightning.config.compose import explain
+from mops_lightning.config.given import check_overrides
+from mops_lightning.config.groups import conf_dir
 from mops_lightning.config.overrides import as_typed, key, readable, with_home, with_own_classes
 
 if TYPE_CHECKING:

@@ -7,8 +7,6 @@ import re
 import textwrap
 from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
@@ -20,8 +18,10 @@ from yaml import MarkedYAMLError, YAMLError  # type: ignore[import-untyped]
 
 from mops_lightning.config import settings
 from mops_lightning.config.build import signature
+from mops_lightning.config.given import check_overrides
+from mops_lightning.config.groups import PRESETS, choice_groups, conf_dir, is_offered
 from mops_lightning.config.overrides import key as key_of
-from mops_lightning.config.overrides import parse_override, with_own_classes
+from mops_lightning.config.overrides import with_own_classes
 from mops_lightning.config.validate import AUGMENTATION, refusal
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.records.run_record import dotted
@@ -29,24 +29,8 @@ from mops_lightning.records.run_record import dotted
 NAMED = {name: name for name in ("task", "dataset", "sampler", "recipe")}
 NAMED |= {"net": "task/net", "stages": "sampler@task.net.sampler"}
 """The groups whose choices are in ``names``, by name."""
-PRESETS = ("experiment", "debug")
-"""Groups of presets, which are no settings themselves."""
 AUGMENTED = ("augment.task", "augment.sampler")
 """Settings of the class ``AUGMENTATION``, which may be null."""
-OTHERWISE = {
-    "logger": " (logger=none for none)",
-    "callbacks": " or leave single callbacks out with callbacks.NAME=null",
-    "baselines": " or leave single baselines out with baselines.NAME=null",
-    "experiment": " or leave it out",
-    "debug": " or leave it out",
-}
-"""Hint for omitting a choice, by group."""
-
-
-def conf_dir() -> Path:
-    """Return the folder with the Hydra groups: in the wheel, or at the top of a checkout."""
-    here = Path(__file__).resolve().parents[1]
-    return here / "conf" if (here / "conf").is_dir() else here.parents[1] / "conf"
 
 
 def composed(overrides: list[str]) -> DictConfig:
@@ -81,56 +65,6 @@ def compose(overrides: list[str] | None = None) -> DictConfig:
         return composed(given)
     except (HydraException, OmegaConfBaseException, YAMLError, UnicodeDecodeError) as error:
         raise UserError(explain(error, given)) from None
-
-
-def check_overrides(arguments: Sequence[str]) -> None:
-    """Refuse ``logger=null`` and the like: Hydra's error has no key, or there is none.
-
-    Raises:
-        UserError: there is no key, or a group of choices is set to something else than a name.
-    """
-    groups = _groups()
-    for argument in arguments:
-        override = parse_override(argument)
-        name = key_of(argument)
-        if override is not None and not name:
-            raise UserError(f"{argument!r} has no key. Settings are KEY=VALUE.")
-        if name.partition(".")[0] == "names":
-            raise UserError(f"{argument}: names follow from the chosen groups. Leave it out.")
-        group = name.partition("@")[0]
-        if override is None:
-            continue
-        value: Any = override.value()
-        if override.is_range_sweep() and abs(value.stop - value.start) > 1e5 * abs(value.step):
-            raise UserError(f"{argument}: more than 100,000 values. Give fewer.")
-        if override.is_delete():
-            declared = settings.declared().get(group)
-            if declared is not None and declared.group and not declared.nullable:
-                other = f"choose another one with {name}=NAME{OTHERWISE.get(name, '')}"
-                raise UserError(f"{argument}: {name} cannot be removed; {other}.")
-            if group in groups and value is not None and not _is_choice(value, group):
-                raise UserError(f"{argument}: write ~{name}.")
-            continue
-        if name == "hydra.verbose" and type(value) in (int, float, dict, type(None)):
-            raise UserError(f"{argument}: give true, false, or a list of loggers.")
-        if group not in (*groups, "hydra") and not (
-            group.startswith("hydra/") and isinstance(value, list | dict)
-        ):
-            continue
-        values = [value]
-        if override.is_sweep_override():
-            values = value.list if override.is_choice_sweep() else []
-        chosen = all(_is_choice(one, group) for one in values)
-        if not (chosen or (name == "baselines" and value == {})):
-            raise UserError(f"{argument}: choose one with {name}=NAME{OTHERWISE.get(name, '')}.")
-
-
-def _is_choice(value: Any, group: str) -> bool:
-    """Return whether a value is a choice of a group: a name, or settings of a top-level object."""
-    from hydra.core.override_parser.types import QuotedString
-
-    settings_of_it = isinstance(value, dict) and bool(value) and "/" not in group
-    return isinstance(value, str | QuotedString) or settings_of_it
 
 
 def explain(error: BaseException, arguments: Sequence[str]) -> str:
@@ -185,23 +119,9 @@ def _is_setting(path: str | None) -> bool:
     return bool(path) and not str(path).startswith("hydra.")
 
 
-def _groups() -> list[str]:
-    """List the groups of choices, such as ``task/net``."""
-    root = conf_dir()
-    paths = [path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_dir()]
-    return [path for path in paths if not path.startswith("hydra")]
-
-
-def _is_offered(group: str) -> bool:
-    """Return whether users choose from a group; of some, other choices choose the file."""
-    top = group.partition("/")[0]
-    named = top in settings.declared() or top in PRESETS
-    return named and not (conf_dir() / f"{group}.yaml").is_file()
-
-
 def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     """Name the nearest group or setting, or say how to set an argument that no YAML file sets."""
-    groups = _groups()
+    groups = choice_groups()
     if key in groups:
         return f"{key}: its files are chosen by other groups. --cfg job shows what they set."
     if key.startswith("sampler@"):
@@ -209,7 +129,7 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
         hint = f"Write +{key}=..." if "@baselines." in key else hint
         return f"{key}: no sampler is chosen there. {hint}"
     if "/" in key or "@" in key:
-        offered = [group for group in groups if _is_offered(group)]
+        offered = [group for group in groups if is_offered(group)]
         return f"{key}: no such group of choices.{did_you_mean(key, offered)}"
     cfg = _composed(groups, arguments)
     node, _, name = key.rpartition(".")

@@ -1,0 +1,28 @@
+"""The folder ``conf/`` and its groups of choices, such as ``task/net``."""
+
+from pathlib import Path
+
+from mops_lightning.config import settings
+
+PRESETS = ("experiment", "debug")
+"""Groups of presets, which are no settings themselves."""
+
+
+def conf_dir() -> Path:
+    """Return the folder with the Hydra groups: in the wheel, or at the top of a checkout."""
+    here = Path(__file__).resolve().parents[1]
+    return here / "conf" if (here / "conf").is_dir() else here.parents[1] / "conf"
+
+
+def choice_groups() -> list[str]:
+    """List the groups of choices, such as ``task/net``."""
+    root = conf_dir()
+    paths = [path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_dir()]
+    return [path for path in paths if not path.startswith("hydra")]
+
+
+def is_offered(group: str) -> bool:
+    """Return whether users choose from a group; of some, other choices choose the file."""
+    top = group.partition("/")[0]
+    is_named = top in settings.declared() or top in PRESETS
+    return is_named and not (conf_dir() / f"{group}.yaml").is_file()
