@@ -108,7 +108,7 @@ def test_collapsed_sampler_shows_its_distinct_points_beside_the_score():
         "test/matched/unique_points": 2.25,
     }
 
-    text = printed(metrics, "test/generated/accuracy", m=16)
+    text = printed(metrics, "test/generated/accuracy", m=16, sampler={"overlap": 0.0})
 
     assert cells(text) == [
         ["sampled by", "accuracy (%)", "distinct points"],
@@ -118,7 +118,7 @@ def test_collapsed_sampler_shows_its_distinct_points_beside_the_score():
         ["mops completed", "25.00", ""],
         ["all points", "75.00", ""],
     ]
-    said = "collapsed: only 2.2 of 16 matched points are distinct. Try sampler.anchors=fps"
+    said = "collapsed: only 2.2 of 16 matched points are distinct. Try sampler.overlap=10"
     assert said in " ".join(text.split())
 
 
@@ -131,7 +131,8 @@ def test_collapse_at_one_size_shows_the_distinct_points_of_all():
     text = printed(metrics, "test/m32/generated/accuracy")
 
     assert cells(text)[-1] == ["distinct points", "7.5", "15.5"]
-    assert "collapsed: only 15.5 of 32 matched points are distinct." in " ".join(text.split())
+    said = "collapsed: only 15.5 of 32 matched points are distinct. Use the completed set"
+    assert said in " ".join(text.split())
 
 
 def test_sampler_with_half_of_its_points_distinct_has_not_collapsed():

@@ -13,7 +13,8 @@ UNIQUE = "unique_points"
 FEWEST = 0.5
 """Share of m below which the mean number of distinct points means a collapse."""
 
-ADVICE = "Try sampler.anchors=fps (docs/samplers.md)"
+TRY_OVERLAP = "Try sampler.overlap=10 or sampler.anchors=fps (docs/samplers.md)"
+TRY_COMPLETED = "Use the completed set, whose points are distinct"
 
 
 def distinct_points(record: RunRecord) -> dict[int, float]:
@@ -35,10 +36,16 @@ def collapsed(record: RunRecord) -> dict[int, float]:
     return {m: count for m, count in distinct_points(record).items() if count < FEWEST * m}
 
 
+def advice(record: RunRecord) -> str:
+    """Return what to try: a penalty on equal choices, where the sampler has one."""
+    sampler = record.config.get("sampler") or {}
+    return TRY_OVERLAP if "overlap" in sampler else TRY_COMPLETED
+
+
 def collapse_line(record: RunRecord) -> str:
     """Return one line about a collapsed sampler and what to try; empty if it has not collapsed."""
     found = collapsed(record)
     if not found:
         return ""
     counts = ", ".join(f"{count:.1f} of {m}" for m, count in found.items())
-    return f"collapsed: only {counts} matched points are distinct. {ADVICE}."
+    return f"collapsed: only {counts} matched points are distinct. {advice(record)}."

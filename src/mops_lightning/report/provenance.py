@@ -6,7 +6,7 @@ from statistics import mean
 
 import pandas as pd
 
-from mops_lightning.records.collapse import ADVICE, collapsed
+from mops_lightning.records.collapse import advice, collapsed
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report import collect
 from mops_lightning.report.comparable import commit
@@ -53,14 +53,18 @@ def collapses(found: list[RunRecord], net: str) -> list[str]:
         net: the table's task net; other nets are named.
     """
     counts: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    advices: dict[str, str] = {}
     for record in found:
         for m, count in collapsed(record).items():
-            counts[_kind(record, net)][m].append(count)
+            kind = _kind(record, net)
+            counts[kind][m].append(count)
+            advices[kind] = advice(record)
     lines = []
     for kind, by_size in counts.items():
         means = [f"{mean(values):.1f} of {m}" for m, values in sorted(by_size.items())]
         shown = ", ".join(means)
-        lines.append(f"- {kind}: collapsed: only {shown} matched points are distinct. {ADVICE}.")
+        text = f"collapsed: only {shown} matched points are distinct. {advices[kind]}."
+        lines.append(f"- {kind}: {text}")
     return lines
 
 
