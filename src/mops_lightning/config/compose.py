@@ -7,6 +7,7 @@ import re
 import textwrap
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
