@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -23,6 +23,9 @@ TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 
 SCALED, SHIFTED = 8, 16
 """Bits of an extra dimension's options."""
+
+PIECE = 7
+"""Most undocumented bytes in an entry."""
 
 NAME_BYTES = 32
 """Most bytes of the name of an extra dimension."""
@@ -50,6 +53,15 @@ class Extra:
     def size(self) -> int:
         """Number of bytes."""
         return np.dtype(self.kind).itemsize * self.count
+
+    def pieces(self) -> "Iterator[Extra]":
+        """Yield undocumented bytes in pieces that laspy 2.7 reads.
+
+        It takes bits 8 and 16 of their number for those of a scale and an offset.
+        """
+        for start in range(0, self.count, PIECE):
+            name = self.name if start == 0 else f"{self.name}_{start}"
+            yield replace(self, name=name, count=min(PIECE, self.count - start))
 
     def to_bytes(self) -> bytes:
         """Return the entry of a plain dimension of one number, or of undocumented bytes."""

@@ -204,5 +204,6 @@ def _with_extra(records: list[Record], documented: list[Extra], layout: Layout) 
     known = [record for record in records if is_extra(record)] if documented else []
     last = known.pop() if known else Record.new(SPEC, EXTRA_BYTES, b"", "Extra Bytes Record")
     data = last.data[: len(last.data) // EXTRA.size * EXTRA.size]
-    data += b"".join(extra.to_bytes() for extra in layout.extra[len(documented) :])
+    for extra in layout.extra[len(documented) :]:
+        data += b"".join(piece.to_bytes() for piece in extra.pieces())
     return [*others, *known, replace(last, data=data)]

@@ -1,0 +1,194 @@
+"""Headers of LAS that are rare, wrong or new, and second readers of what is written."""
+
+import struct
+
+import copclib
+import laspy
+import numpy as np
+import pytest
+
+from mops_lightning.data.formats.area import Area
+from mops_lightning.data.formats.las.columns import LasColumns
+from mops_lightning.data.formats.registry import open_cloud_file, read, write
+from mops_lightning.data.formats.table import Table
+from mops_lightning.errors import UserError
+from tests.support.las import full_cloud, header_fields
+
+MINOR, BOUNDS, WAVEFORMS = 25, 179, 227
+"""Places in the header."""
+
+
+def patched(path, kind, place, *values):
+    content = bytearray(path.read_bytes())
+    struct.pack_into(kind, content, place, *values)
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("name", ["a.las", "a.laz"])
+def test_points_outside_of_the_headers_bounds_are_read_on_every_path(name, tmp_path):
+    path = tmp_path / name
+    cloud = full_cloud(6)
+    cloud.write(path)
+    patched(path, "<6d", BOUNDS, 1, 0, 1, 0, 1, 0)
+    area = Area((5e5 - 100, 5.4e6 - 100, -9), (5e5 + 100, 5.4e6 + 100, 9))
+
+    file = open_cloud_file(path)
+    parts = [file.read(rows).points for rows in file.row_ranges(70)]
+
+    np.testing.assert_array_equal(read(path, 1, 0).points, cloud.xyz)
+    np.testing.assert_array_equal(np.concatenate(parts), cloud.xyz)
+    assert len(read(path, 1, 0, area).points) == 300
+
+
+def as_version_15(path):
+    """Make a file of LAS 1.4 one of 1.5: 18 more bytes of header, for times and their offset."""
+    content = bytearray(path.read_bytes())
+    content[MINOR] = 5
+    (first,) = struct.unpack_from("<I", content, 96)
+    (extended,) = struct.unpack_from("<Q", content, 235)
+    struct.pack_into("<H", content, 94, 393)
+    struct.pack_into("<I", content, 96, first + 18)
+    struct.pack_into("<Q", content, 235, extended + 18)
+    content[375:375] = struct.pack("<2dH", 9.0, 1.0, 1234)
+    path.write_bytes(content)
+
+
+def test_las_15_keeps_points_and_header_with_its_times(tmp_path):
+    path, out = tmp_path / "a.las", tmp_path / "out.las"
+    full_cloud(8).write(path)
+    as_version_15(path)
+
+    write(out, read(path, 1, 0).take(np.arange(7, 40)))
+
+    cloud, again = laspy.read(path), laspy.read(out)
+    np.testing.assert_array_equal(again.points.array, cloud.points.array[7:40])
+    assert header_fields(out) == header_fields(path)
+    assert again.header.gps_time_offset == 1234
+    assert again.header.min_gps_time == again.gps_time.min()
+    assert again.header.max_gps_time == again.gps_time.max()
+
+
+def test_las_15_does_not_become_copc(tmp_path):
+    full_cloud(8).write(tmp_path / "a.las")
+    as_version_15(tmp_path / "a.las")
+
+    with pytest.raises(UserError, match=r"COPC is LAS 1\.4, but IN is LAS 1\.5"):
+        write(tmp_path / "out.copc.laz", read(tmp_path / "a.las", 1, 0))
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"),
+    [
+        (MINOR, 6, r"is LAS 1\.6, but versions 1\.0 to 1\.5 are read"),
+        (104, 11, "points of format 11, but formats 0 to 10 are read"),
+    ],
+)
+def test_later_versions_are_refused_in_one_line(place, value, said, tmp_path):
+    full_cloud(6).write(tmp_path / "a.las")
+    patched(tmp_path / "a.las", "<B", place, value)
+
+    for reader in (lambda path: read(path, 1, 0), open_cloud_file):
+        with pytest.raises(UserError, match=said):
+            reader(tmp_path / "a.las")
+
+
+def test_waveforms_inside_of_the_file_are_refused_unless_left_out(tmp_path):
+    path = tmp_path / "a.las"
+    full_cloud(4).write(path)
+    patched(path, "<Q", WAVEFORMS, path.stat().st_size)
+    table = read(path, 1, 0)
+
+    with pytest.raises(UserError, match="would lose the waveforms, which are inside of IN"):
+        write(tmp_path / "out.las", table)
+    write(tmp_path / "out.las", table.without_attributes())
+
+    again = laspy.read(tmp_path / "out.las")
+    np.testing.assert_array_equal(again.xyz, laspy.read(path).xyz)
+    assert not again.header.start_of_waveform_data_packet_record
+
+
+def test_undocumented_bytes_stay_and_are_documented_beside_a_new_dimension(tmp_path):
+    path = tmp_path / "a.las"
+    cloud = full_cloud(1)
+    cloud.write(path)
+    content = path.read_bytes()
+    path.write_bytes(content.replace(struct.pack("<16sH", b"LASF_Spec", 4), bytes(18)))
+    table = read(path, 1, 0)
+
+    write(tmp_path / "b.las", table)
+    write(tmp_path / "c.las", table.with_columns({"label": np.arange(300)}))
+
+    size = cloud.points.array.dtype.itemsize
+    data = [(tmp_path / f"{name}.las").read_bytes()[-300 * size :] for name in "ab"]
+    assert data[0] == data[1]
+    again = laspy.read(tmp_path / "c.las")
+    np.testing.assert_array_equal(again["label"], np.arange(300))
+    rows = again.points.array.view(np.uint8).reshape(300, -1)
+    np.testing.assert_array_equal(
+        rows[:, :size], cloud.points.array.view(np.uint8).reshape(300, -1)
+    )
+
+
+@pytest.mark.parametrize("form", [0, 1, 2, 3, 6, 7, 8])
+def test_written_laz_is_equal_in_both_of_laspys_backends(form, tmp_path):
+    cloud = full_cloud(form, 2000)
+    cloud.write(tmp_path / "a.las")
+
+    write(tmp_path / "out.laz", read(tmp_path / "a.las", 1, 0))
+
+    for backend in (laspy.LazBackend.Lazrs, laspy.LazBackend.Laszip):
+        again = laspy.read(tmp_path / "out.laz", laz_backend=backend)
+        np.testing.assert_array_equal(again.points.array, cloud.points.array)
+
+
+@pytest.mark.parametrize("form", range(11))
+def test_laz_of_laszip_is_read_exactly(form, tmp_path):
+    cloud = full_cloud(form, 2000)
+    cloud.write(tmp_path / "a.laz", laz_backend=laspy.LazBackend.Laszip)
+
+    table = read(tmp_path / "a.laz", 1, 0)
+
+    assert isinstance(table.columns, LasColumns)
+    assert table.columns.rows.tobytes() == cloud.points.array.tobytes()
+
+
+@pytest.mark.parametrize("form", [6, 7, 8])
+def test_written_laz_is_read_by_copclib(form, tmp_path):
+    cloud = full_cloud(form)
+    cloud.write(tmp_path / "a.las")
+
+    write(tmp_path / "out.laz", read(tmp_path / "a.las", 1, 0))
+
+    points = copclib.LazReader(str(tmp_path / "out.laz")).GetPoints()
+    found = [(p.x, p.y, p.z, p.gps_time, p.classification, p.return_number) for p in points]
+    columns = [*cloud.xyz.T, cloud.gps_time, cloud.classification, cloud.return_number]
+    assert found == list(zip(*(np.asarray(c).tolist() for c in columns), strict=True))
+    extra = cloud.points.array.dtype.itemsize - laspy.PointFormat(form).size
+    raw = cloud.points.array.view(np.uint8).reshape(300, -1)[:, -extra:]
+    assert [bytes(p.extra_bytes) for p in points] == [row.tobytes() for row in raw]
+
+
+def test_columns_of_other_formats_become_dimensions(tmp_path):
+    points = np.random.default_rng(0).random((20, 3))
+    columns = {
+        "classification": np.arange(20) + 20,  # too large for five bits
+        "a name of more than thirty-two bytes, cut": np.arange(20.0),
+        "a name of more than thirty-two bytes, too": np.arange(20) - 5,
+        "flag": np.arange(20) % 2 == 0,
+        "half": np.arange(20).astype(np.float16),
+    }
+
+    write(tmp_path / "a.laz", Table(points, columns))
+
+    again = laspy.read(tmp_path / "a.laz")
+    names = list(again.point_format.extra_dimension_names)
+    assert names == [
+        "classification_",
+        "a name of more than thirty-two b",
+        "a name of more than thirty-two _",
+        "flag",
+        "half",
+    ]
+    for name, column in zip(names, columns.values(), strict=True):
+        np.testing.assert_array_equal(again[name], column)
+    assert set(np.asarray(again.return_number)) == {1}
