@@ -14,7 +14,8 @@ from twins import PlainMOPS, plain_farthest_point_sample
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.attention import attend
-from mops_lightning.ops.fps import farthest_point_sample, fps
+from mops_lightning.ops.flat_fps import fps
+from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.ops.nearest import k_nearest, nearest, search_in_blocks
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.samplers.base import stream_sample

@@ -1,8 +1,8 @@
 # The public API, and the samplers that weights files may name (zoo/load.py).
 
 from .ops.emd import earth_movers_distance as earth_movers_distance
+from .ops.flat_fps import fps as fps
 from .ops.fps import farthest_point_sample as farthest_point_sample
-from .ops.fps import fps as fps
 from .ops.nearest import chamfer_distance as chamfer_distance
 from .ops.nearest import nearest as nearest
 from .ops.propagation import propagate as propagate

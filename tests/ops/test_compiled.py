@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 
-from mops_lightning.ops import compiled
+from mops_lightning.ops import compiled, farthest
 from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample
 from mops_lightning.ops.nearest import k_nearest, search_in_blocks
 from mops_lightning.ops.nearest import nearest as nearest_points
@@ -20,7 +20,7 @@ KINDS += ["outlier"]
 def both(monkeypatch):
     """Return a function that calls another in the compiled and in the torch form."""
     monkeypatch.setattr(compiled, "NEAREST_LEAF", 8)
-    monkeypatch.setattr(compiled, "FARTHEST_LEAF", 40)  # several levels
+    monkeypatch.setattr(farthest, "LEAF", 40)  # several levels
 
     def call(function, *arguments, **options):
         fast = function(*arguments, **options)
@@ -132,7 +132,7 @@ def test_farthest_of_odd_points_equals_torch_form(kind, both):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_farthest_in_threads_equals_torch_form(threads, rng, both, monkeypatch):
-    monkeypatch.setattr(compiled, "THREADS_MIN_WORK", 1)
+    monkeypatch.setattr(farthest, "THREADS_MIN_WORK", 1)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     points = torch.rand(5, 300, 3, generator=rng)
     fast, plain = both(farthest_point_sample, points, 100)
@@ -142,9 +142,9 @@ def test_farthest_in_threads_equals_torch_form(threads, rng, both, monkeypatch):
 @pytest.mark.parametrize("k", [1, 3])
 def test_compiled_forms_take_finite_points_only(k, rng):
     points = torch.rand(1, 30, 3, generator=rng)
-    start = torch.zeros(1, 30)
+    given = torch.zeros(1, 1, dtype=torch.int64), torch.ones(1, dtype=torch.int64)
     assert compiled.nearest(points[:, :5], points, k) is not None
-    assert compiled.farthest(points, 4, start) is not None
+    assert compiled.farthest(points, *given, 4) is not None
     points[0, 7, 0] = torch.nan
     assert compiled.nearest(points[:, :5], points, k) is None
-    assert compiled.farthest(points, 4, start) is None
+    assert compiled.farthest(points, *given, 4) is None

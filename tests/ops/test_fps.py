@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample, fps
+from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample
 from tests.support.plain import plain_farthest
 
 
@@ -91,65 +91,3 @@ def test_fill_of_points_with_gradients_equals_fill_without(rng):
     indices, given = torch.arange(10).expand(2, -1), torch.tensor([2, 5])
     filled = farthest_point_fill(points.clone().requires_grad_(), indices, given)
     assert torch.equal(filled, farthest_point_fill(points, indices, given))
-
-
-def torch_cluster_fps(x, batch, ratio):
-    """Choose farthest points as torch_cluster does: its loops, in plain torch."""
-    chosen = []
-    for cloud in batch.unique().tolist():
-        rows = (batch == cloud).nonzero()[:, 0]
-        points = x[rows].view(len(rows), -1)
-        number = int((torch.tensor(float(len(rows))) * torch.tensor(ratio)).ceil())
-        picked, distances = [0], (points - points[0]).pow(2).sum(1)
-        for _ in range(number - 1):
-            picked.append(int(distances.argmax()))
-            distances = distances.min((points - points[picked[-1]]).pow(2).sum(1))
-        chosen.append(rows[picked])
-    return torch.cat(chosen)
-
-
-@pytest.mark.parametrize("sizes", [(40,), (30, 30, 30), (50, 1, 0, 27)])
-@pytest.mark.parametrize(("ratio", "shape"), [(0.1, (3,)), (0.5, ()), (1.0, (2, 2)), (0.3, (7,))])
-def test_flat_fps_equals_torch_cluster(sizes, ratio, shape, rng):
-    batch = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
-    x = torch.randn(len(batch), *shape, generator=rng)
-    rows = fps(x, batch, ratio, random_start=False, batch_size=len(sizes) + 1)
-    assert torch.equal(rows, torch_cluster_fps(x, batch, ratio))
-    if len(sizes) == 1:
-        assert torch.equal(rows, fps(x, ratio=ratio, random_start=False))
-
-
-def test_ratio_of_each_cloud_is_its_own(rng):
-    x, batch = torch.rand(60, 3, generator=rng), torch.arange(2).repeat_interleave(30)
-    alone = [fps(x[i * 30 :][:30], None, r, False) + i * 30 for i, r in enumerate((0.1, 0.5))]
-    assert torch.equal(fps(x, batch, torch.tensor([0.1, 0.5]), False), torch.cat(alone))
-
-
-def test_random_start_differs_between_clouds_and_repeats_with_torch_seed():
-    x, batch = torch.rand(600, 3), torch.arange(6).repeat_interleave(100)
-    torch.manual_seed(3)
-    starts = fps(x, batch, 0.01)
-    assert batch[starts].tolist() == list(range(6))
-    assert len((starts % 100).unique()) > 1
-    torch.manual_seed(3)
-    assert torch.equal(fps(x, batch, 0.01), starts)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ({"x": torch.zeros(0, 3)}, r"x must be a tensor .*\(0, 3\)"),
-        ({"x": torch.rand(4, 3).numpy()}, "x must be a tensor"),
-        ({"x": torch.full((4, 3), torch.nan)}, "x must be finite"),
-        ({"ratio": torch.tensor([0.5, 0.5])}, "one or one per cloud"),
-        ({"ratio": 0.0}, "ratio must be above 0 and at most 1"),
-        ({"ratio": 1.5}, "ratio must be above 0 and at most 1"),
-        ({"batch": torch.tensor([0, 1, 0, 0])}, "must be ascending"),
-        ({"batch": torch.tensor([0, 1])}, r"shape \(P=4,\)"),
-        ({"batch": torch.zeros(4)}, "batch must be whole numbers"),
-        ({"batch": torch.tensor([0, 0, 1, 1]), "batch_size": 1}, "batch_size must be at least 2"),
-    ],
-)
-def test_fps_of_wrong_arguments_raises(arguments, said):
-    with pytest.raises(UserError, match=said):
-        fps(**{"x": torch.rand(4, 3), **arguments})

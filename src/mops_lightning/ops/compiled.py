@@ -16,14 +16,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.ops import kernel_neighbours, kernels
+from mops_lightning.ops.farthest import farthest_rows
 from mops_lightning.ops.points import distance_dtype
 
-FARTHEST_LEAF, NEAREST_LEAF = 1024, 256
-"""Maximum number of points of a leaf of the tree: more leaves exclude more points, larger ones
-take less time per point."""
-
-SPARSE = 100
-"""Points per chosen point from which a tree with four times as large leaves is faster."""
+NEAREST_LEAF = 256
+"""Maximum number of points of a leaf of the tree."""
 
 THREADS_MIN_WORK = 2**22
 """Minimum number of distances or comparisons in a batch, estimated, for using several threads."""
@@ -32,29 +29,26 @@ Array = NDArray[Any]
 
 
 def farthest(
-    points: Tensor, steps: int, distances: Tensor, factors: Tensor | None = None
+    points: Tensor,
+    given: Tensor,
+    counts: Tensor,
+    m: int,
+    factors: Tensor | None = None,
+    ranks: Tensor | None = None,
 ) -> Tensor | None:
-    """Repeatedly choose the point with the largest distance and update the distances.
-
-    Args:
-        points: ``(B, N, C)``.
-        steps: number of points to choose, at most the number of points that are not chosen.
-        distances: ``(B, N)`` initial squared distances; -1 marks chosen points.
-        factors: ``(B, N)`` float64 of the squared distances in the choice; None: 1.
-
-    Returns:
-        ``(B, steps)`` int64, the lowest row in case of ties.
-    """
+    """Fill up rows of every cloud by farthest points; see ``ops.farthest.farthest_rows``."""
     if points.device.type != "cpu" or points.numel() == 0:
         return None
-    planes = _planes(points)
-    bits = np.ascontiguousarray(distances.numpy()).view(_integer(planes))
-    scales = np.empty((len(points), 0)) if factors is None else factors.contiguous().numpy()
-    sparse = points.shape[1] > SPARSE * steps
-    fixed = (steps, points.shape[2], FARTHEST_LEAF * (4 if sparse else 1))
-    work = steps * points.shape[1] * len(points)
-    clouds = zip(planes, bits, scales, strict=True)
-    return _rows(lambda cloud: kernels.farthest(*cloud, *fixed), clouds, work)
+    rows = farthest_rows(
+        points.detach().to(distance_dtype(points)).numpy(),
+        given.numpy(),
+        counts.numpy(),
+        m,
+        None if factors is None else factors.numpy(),
+        None if ranks is None else ranks.numpy(),
+        torch.get_num_threads(),
+    )
+    return None if rows is None else torch.from_numpy(rows)
 
 
 def nearest(queries: Tensor, points: Tensor, k: int) -> Tensor | None:

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops import compiled
-from mops_lightning.ops.nearest import nearest
-from mops_lightning.ops.points import cloud_sizes, distance_dtype, gather_points, to_planes
+from mops_lightning.ops.points import gather_points, to_planes
 
 LEAST_FACTOR = 1e-200
 """Least squared weight: products of a chosen point, whose distance is -1, must be below 0."""
@@ -30,8 +29,9 @@ def farthest_point_sample(
             and in S-FPS (Chen et al., "SASA", AAAI 2022).
 
     Returns:
-        ``(B, m)`` distinct int64 indices in the order of choice, the lowest index in case of ties;
-        the first k are the result for m = k.
+        ``(B, m)`` distinct int64 indices in the order of choice; the first k are the result for
+        m = k. The choice is that of float64 arithmetic on the given numbers, the lowest index in
+        case of ties, on every device.
 
     Raises:
         UserError: ``points`` has another shape, or ``m`` or ``start`` is out of range.
@@ -52,9 +52,7 @@ def farthest_point_sample(
     if outside if isinstance(outside, bool) else bool(outside.any()):
         raise UserError(f"start must be between 0 and N-1={n - 1}, got {start}.")
     first = torch.as_tensor(start, device=points.device).expand(clouds)
-    dtype = distance_dtype(points)
-    distances = points.new_full((clouds, n), torch.finfo(dtype).max, dtype=dtype)
-    return _farthest(points, distances.scatter_(1, first[:, None], torch.inf), m, weight)
+    return farthest(points, first[:, None], torch.ones_like(first), m, weight)
 
 
 def farthest_point_fill(
@@ -77,118 +75,94 @@ def farthest_point_fill(
     missing = wanted - int(counts.min())
     if missing == 0:
         return indices
-    slot = torch.arange(wanted, device=indices.device)
-    chosen = torch.where(slot < counts[:, None], indices, indices[:, :1])
-    distinct = chosen[:, : int(counts.max())]
-    distances, _ = nearest(points.detach(), gather_points(points.detach(), distinct))
-    distances = distances.to(distance_dtype(points)).scatter_(1, chosen, -1.0)
-    added = _farthest(points, distances, missing, weight)
-    # Clouds that lack fewer points write the surplus beyond column M, which is then cut off.
-    filled = torch.cat([chosen, added], 1)
-    return filled.scatter_(1, counts[:, None] + slot[:missing], added)[:, :wanted]
+    return farthest(points, indices, counts, wanted, weight)
 
 
 @torch.no_grad()
-def _farthest(
-    points: Tensor, distances: Tensor, steps: int, weight: Tensor | None = None
+def farthest(
+    points: Tensor,
+    given: Tensor,
+    counts: Tensor,
+    m: int,
+    weight: Tensor | None = None,
+    ranks: Tensor | None = None,
 ) -> Tensor:
-    """Choose farthest points; arguments and result as in ``compiled.farthest``."""
+    """Fill up rows of every cloud to m by farthest points.
+
+    Args:
+        points: ``(B, N, C)``.
+        given: ``(B, G)`` int64, G ≤ m; the first ``counts[b]`` of cloud b are the given rows.
+        counts: ``(B,)`` int64, from 1 to G.
+        m: number of rows, at most N.
+        weight: as for ``farthest_point_sample``.
+        ranks: ``(B, N)`` int64: the lowest rank wins a tie; None: the lowest row does.
+
+    Returns:
+        ``(B, m)`` int64.
+    """
     factors = None
     if weight is not None:
         relative = weight.double() / weight.double().amax(1, keepdim=True)
         factors = relative.square().clamp_min(LEAST_FACTOR)
-    rows = compiled.farthest(points, steps, distances, factors)
-    if rows is None and factors is None and points.is_cuda and not torch.compiler.is_compiling():
-        with suppress(ImportError):  # a build of torch without Triton
-            from mops_lightning.ops import triton_fps
+    rows = compiled.farthest(points, given, counts, m, factors, ranks)
+    if rows is not None:
+        return rows
+    if ranks is not None:  # in the order of the ranks, the lowest row wins a tie
+        order = ranks.argsort(1, stable=True)
+        ordered = gather_points(points, order)
+        factors = None if factors is None else factors.gather(1, order)
+        given = order.argsort(1).gather(1, given)
+        return order.gather(1, _on_device(ordered, given, counts, m, factors))
+    return _on_device(points, given, counts, m, factors)
 
-            rows = triton_fps.farthest(points, distances, steps)
-    return farthest_in_steps(points, distances, steps, factors) if rows is None else rows
+
+def _on_device(
+    points: Tensor, given: Tensor, counts: Tensor, m: int, factors: Tensor | None
+) -> Tensor:
+    """Choose farthest points of points on a GPU, or of points that are not finite."""
+    if points.is_cuda and not torch.compiler.is_compiling():
+        if factors is None:
+            with suppress(ImportError):  # a build of torch without Triton
+                from mops_lightning.ops import triton_fps
+
+                rows = triton_fps.farthest(points, given, counts, m)
+                if rows is not None:
+                    return rows
+        host = None if factors is None else factors.cpu()
+        rows = compiled.farthest(points.detach().cpu(), given.cpu(), counts.cpu(), m, host)
+        if rows is not None:
+            return rows.to(points.device)
+    return farthest_in_steps(points, given, counts, m, factors)
 
 
 def farthest_in_steps(
-    points: Tensor, distances: Tensor, steps: int, factors: Tensor | None = None
+    points: Tensor, given: Tensor, counts: Tensor, m: int, factors: Tensor | None = None
 ) -> Tensor:
-    """Choose farthest points in torch, for GPUs; arguments as for ``compiled.farthest``."""
-    planes = to_planes(points.to(distances.dtype))
-    distances, differences = distances.clone(), torch.empty_like(planes)
-    chosen = []
-    for _ in range(steps):
+    """Choose farthest points in torch; arguments as for ``farthest``."""
+    slot = torch.arange(given.shape[1], device=points.device)
+    known = torch.where(slot < counts[:, None], given, given[:, :1])
+    planes = to_planes(points.detach().double())
+    distances = torch.full_like(planes[0], torch.inf)
+    for column in range(known.shape[1]):
+        _lower(distances, planes, known[:, column : column + 1])
+    added = []
+    for _ in range(m - int(counts.min())):
         gains = distances if factors is None else distances * factors
-        index = gains.argmax(1, keepdim=True)
-        chosen.append(index)
-        distances.scatter_(1, index, -1.0)
-        torch.sub(planes, planes.gather(2, index.expand(len(planes), -1, -1)), out=differences)
-        total, *others = differences
-        total.mul_(total)
-        for other in others:
-            total.addcmul_(other, other)
-        torch.minimum(distances, total, out=distances)
-    return torch.cat(chosen, 1)
+        added.append(gains.argmax(1, keepdim=True))
+        _lower(distances, planes, added[-1])
+    if not added:
+        return known
+    # Clouds that lack fewer points write the surplus beyond column m, which is then cut off.
+    filled = torch.cat([known, *added], 1)
+    places = counts[:, None] + torch.arange(len(added), device=points.device)
+    return filled.scatter_(1, places, torch.cat(added, 1))[:, :m]
 
 
-def fps(
-    x: Tensor,
-    batch: Tensor | None = None,
-    ratio: float | Tensor = 0.5,
-    random_start: bool = True,
-    batch_size: int | None = None,
-) -> Tensor:
-    """Choose farthest points of flat clouds: a replacement for ``torch_geometric.nn.fps``.
-
-    Signature and result are those of torch_cluster's ``fps``. Random starts are drawn by torch, so
-    that ``torch.manual_seed`` repeats them. Where a cloud has fewer different points than are
-    chosen, copies are chosen instead of the same row again.
-
-    Args:
-        x: ``(P, C)`` points of all clouds, or ``(P,)`` numbers.
-        batch: ``(P,)`` the cloud of every point, ascending from 0; None: one cloud.
-        ratio: share of the points to choose, 0 < ratio ≤ 1: ⌈ratio · n⌉ of a cloud's n points; a
-            tensor holds one for all clouds, or one for each.
-        random_start: start from a random point of every cloud instead of its first point.
-        batch_size: number of clouds; None: as many as ``batch`` has.
-
-    Returns:
-        Rows of ``x``, int64, cloud by cloud, in the order of choice. With ``(B, N, C)`` points as
-        ``x.flatten(0, 1)`` and ⌈ratio · N⌉ = M they are ``(B, M)``, flattened.
-
-    Raises:
-        UserError: an argument has a wrong shape or value.
-
-    Examples:
-        >>> import torch
-        >>> from mops_lightning import fps
-        >>> square = torch.tensor([[-1.0, -1], [-1, 1], [1, -1], [1, 1]])
-        >>> fps(square, torch.tensor([0, 0, 0, 0]), ratio=0.5, random_start=False)
-        tensor([0, 3])
-    """
-    if not isinstance(x, Tensor) or x.ndim == 0 or len(x) == 0:
-        shape = tuple(getattr(x, "shape", ()))
-        raise UserError(f"x must be a tensor (P, C) with P ≥ 1, got {type(x).__name__} {shape}.")
-    if not bool(x.isfinite().all()):
-        raise UserError("x must be finite, got NaN or infinity.")
-    counts = torch.tensor([len(x)]) if batch is None else cloud_sizes(len(x), batch)
-    if batch_size is not None and batch_size < len(counts):
-        raise UserError(f"batch_size must be at least {len(counts)}, got {batch_size}.")
-    points = x.detach().reshape(len(x), -1)
-    share = torch.as_tensor(ratio, dtype=points.dtype).cpu()  # torch_cluster rounds as here
-    if not bool(((share > 0) & (share <= 1)).all()) or share.numel() not in (1, len(counts)):
-        raise UserError(f"ratio must be above 0 and at most 1, one or one per cloud, got {ratio}.")
-    sizes = (counts.float() * share).ceil().long()
-    starts = torch.zeros_like(counts)
-    if random_start:
-        starts = torch.randint(2**62, counts.shape) % counts.clamp_min(1)
-    begins = counts.cumsum(0) - counts
-    if len(counts.unique()) == len(sizes.unique()) == 1:
-        clouds = points.reshape(len(counts), int(counts[0]), -1)
-        rows = farthest_point_sample(clouds, int(sizes[0]), starts.to(x.device))
-        return (rows + begins[:, None].to(x.device)).flatten()
-    numbers = zip(*(part.tolist() for part in (sizes, starts, begins)), strict=True)
-    parts = zip(points.split(counts.tolist()), numbers, strict=True)
-    return torch.cat(
-        [
-            farthest_point_sample(cloud[None], m, start)[0] + begin
-            for cloud, (m, start, begin) in parts
-            if m
-        ]
-    )
+def _lower(distances: Tensor, planes: Tensor, rows: Tensor) -> None:
+    """Lower squared distances ``(B, N)`` to those from rows ``(B, 1)``, which are marked by -1."""
+    total = torch.zeros_like(distances)
+    for plane in planes:
+        difference = plane - plane.gather(1, rows)
+        total += difference.square_()  # two steps: a fused multiply-add would round once
+    torch.minimum(distances, total, out=distances)
+    distances.scatter_(1, rows, -1.0)

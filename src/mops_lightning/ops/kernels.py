@@ -1,4 +1,4 @@
-"""Farthest and nearest points in loops that numba compiles; ``ops.compiled`` calls them.
+"""A tree of boxes and nearest points in loops that numba compiles; ``ops.compiled`` calls them.
 
 Squares are summed by fused multiply-add, which rounds once, as torch does on processors with
 AVX2: the rows are identical to the torch forms' rows.
@@ -9,22 +9,28 @@ computed by the same operations in the same order, each of which is monotonic.
 
 Arrays have one dimension, which halves the time of compilation, and are copied in loops, because
 the assignment of a slice takes seconds to compile. Coordinates of C channels and N points are
-``(C·N,)``, one channel after the other. All functions are in this file, because numba does not
-notice that a cached function calls one that has changed in another file.
+``(C·N,)``, one channel after the other. ``kernel_farthest`` uses the tree, too.
 """
 
 # mypy: disable-error-code="no-untyped-def"
 
 import numpy as np
 
-from mops_lightning.ops.jit import jit, jit_cached, multiply_add
+from mops_lightning.ops.jit import (
+    bits_float,
+    float_bits,
+    jit,
+    jit_cached,
+    jit_inlined,
+    multiply_add,
+)
 
-FANOUT, PROBES = 8, 8
+LANES, FANOUT, PROBES = 64, 8, 8
 """Maximum number of children of a node, and sampled coordinates per child for where to split."""
 
 
 @jit
-def _all_finite(values):
+def all_finite(values):
     """Return whether all values are finite."""
     wrong = 0
     for i in range(len(values)):
@@ -33,7 +39,7 @@ def _all_finite(values):
 
 
 @jit
-def _write_distances(planes, size, start, stop, point, out):
+def write_distances(planes, size, start, stop, point, out):
     """Write the squared distances from a point to the rows from start to stop."""
     for axis in range(len(point)):
         line, at = planes[axis * size + start : axis * size + stop], point[axis]
@@ -48,7 +54,7 @@ def _write_distances(planes, size, start, stop, point, out):
 
 
 @jit
-def _distance_to_box(boxes, node, point):
+def distance_to_box(boxes, node, point):
     """Return the squared distance from a point to the box of a node."""
     channels = len(point)
     first = 2 * channels * node
@@ -61,7 +67,7 @@ def _distance_to_box(boxes, node, point):
 
 
 @jit
-def _build(planes, channels, leaf):
+def build_tree(planes, channels, leaf):
     """Sort points into a tree.
 
     Rows keep their order within a leaf, so that its first row is the lowest one.
@@ -77,7 +83,9 @@ def _build(planes, channels, leaf):
         lowest and the highest coordinates.
     """
     size = len(planes) // channels
-    rows = np.arange(size).astype(np.uint32)
+    rows = np.empty(size, np.uint32)
+    for row in range(size):
+        rows[row] = row
     # A node has at least two children or none, hence fewer than 2·N nodes. Unused memory of large
     # arrays is never touched.
     nodes = np.empty(8 * size, np.int64)
@@ -117,11 +125,19 @@ def _write_box(planes, channels, start, stop, boxes, node):
     """Write the box of a node and return its longest axis."""
     size = len(planes) // channels
     longest, length = 0, planes.dtype.type(0)
+    lows, highs = np.empty(LANES, planes.dtype), np.empty(LANES, planes.dtype)
     for axis in range(channels):
         line = planes[axis * size + start : axis * size + stop]
-        low = high = line[0]
-        for i in range(len(line)):
-            low, high = min(low, line[i]), max(high, line[i])
+        for lane in range(LANES):
+            lows[lane] = highs[lane] = line[0]
+        for begin in range(0, len(line), LANES):  # minima of separate lanes are vectorised
+            part = line[begin : begin + LANES]
+            for i in range(len(part)):
+                lows[i] = part[i] if part[i] < lows[i] else lows[i]
+                highs[i] = part[i] if part[i] > highs[i] else highs[i]
+        low, high = lows[0], highs[0]
+        for lane in range(LANES):
+            low, high = min(low, lows[lane]), max(high, highs[lane])
         boxes[2 * channels * node + axis] = low
         boxes[2 * channels * node + channels + axis] = high
         if high - low > length:
@@ -143,15 +159,20 @@ def _split(line, low, high, child, counts, places):
     middle = low / 2 + high / 2
     if not low <= middle < high:
         middle = low
-    child[: len(line)] = 0
+    for i in range(len(line)):
+        child[i] = 0
     for k in range(FANOUT - 1):  # the first cut is below the highest coordinate
         cut = samples[PROBES * (k + 1) - 1] if samples[PROBES - 1] < high else middle
         for i in range(len(line)):
             child[i] += line[i] > cut
-    counts[:] = 0
+    for k in range(FANOUT):
+        counts[k] = 0
     for i in range(len(line)):
         counts[child[i]] += 1
-    following = np.cumsum(counts) - counts
+    following = np.empty(FANOUT, np.int64)
+    following[0] = 0
+    for k in range(1, FANOUT):
+        following[k] = following[k - 1] + counts[k - 1]
     for i in range(len(line)):
         places[i] = following[child[i]]
         following[child[i]] += 1
@@ -167,19 +188,7 @@ def _move(line, places, moved):
 
 
 @jit
-def _lower(bits, new):
-    """Lower distances to new ones and return the place of the first of the largest."""
-    # The bits of floats ≥ 0, read as integers, have the same order, and numba vectorises the
-    # maximum of integers only.
-    top = min(bits[0], new[0])
-    for i in range(len(bits)):
-        bits[i] = min(bits[i], new[i])
-        top = max(top, bits[i])
-    return _place(bits, top)
-
-
-@jit
-def _place(bits, wanted):
+def place_of(bits, wanted):
     """Return the first place of a value that occurs."""
     start, matches = 0, 0
     while not matches:
@@ -190,101 +199,6 @@ def _place(bits, wanted):
     while bits[start] != wanted:
         start += 1
     return start
-
-
-@jit_cached
-def farthest(planes, distances, factors, steps, channels, leaf):
-    """Repeatedly choose the point with the largest distance and update the distances.
-
-    Args:
-        planes: ``(C·N,)`` coordinates, sorted in place.
-        distances: ``(N,)`` initial squared distances, their bits read as integers; a negative
-            number marks points that are never chosen.
-        factors: ``(N,)`` float64, at least 0: the point with the largest product of factor and
-            squared distance is chosen; or ``(0,)``.
-        steps: number of points to choose, at most the number of points that are not chosen.
-        channels: C.
-        leaf: maximum number of points of a leaf.
-
-    Returns:
-        ``(steps,)`` rows, the lowest row in case of ties; none if a coordinate is not finite.
-    """
-    size = len(distances)
-    if not _all_finite(planes):
-        return np.empty(0, np.int64)
-    rows, nodes, boxes = _build(planes, channels, leaf)
-    known = len(nodes) // 4
-    left, new = np.empty(size, planes.dtype), np.empty(size, planes.dtype)
-    bits, new_bits = left.view(distances.dtype), new.view(distances.dtype)
-    for i in range(size):
-        bits[i] = new_bits[i] = distances[rows[i]]
-    if len(factors):
-        factors = factors[rows]
-    # The largest distance of every node, and the place of the point to choose of it.
-    tops, peaks = np.empty(known, planes.dtype), np.empty(known, np.int64)
-    for node in range(known - 1, -1, -1):
-        if nodes[4 * node + 3]:
-            _choose_child(nodes, peaks, tops, left, factors, rows, node)
-        else:
-            start, stop = nodes[4 * node], nodes[4 * node + 1]
-            place = start + _lower(bits[start:stop], new_bits[start:stop])
-            tops[node], peaks[node] = left[place], _choose(left, factors, start, stop, place)
-    chosen, point = np.empty(steps, np.int64), np.empty(channels, planes.dtype)
-    stack = np.empty(known + FANOUT, np.int64)
-    for step in range(steps):
-        latest = peaks[0]
-        chosen[step] = rows[latest]
-        left[latest] = -1
-        for axis in range(channels):
-            point[axis] = planes[axis * size + latest]
-        stack[0], depth = 0, 1
-        while depth:
-            depth -= 1
-            node = stack[depth]
-            if node < 0:  # all children are up to date
-                _choose_child(nodes, peaks, tops, left, factors, rows, ~node)
-            elif nodes[4 * node + 3]:
-                stack[depth] = ~node
-                depth += 1
-                for k in range(nodes[4 * node + 2], nodes[4 * node + 2] + nodes[4 * node + 3]):
-                    near = _distance_to_box(boxes, k, point) < tops[k]
-                    if near or nodes[4 * k] <= latest < nodes[4 * k + 1]:
-                        stack[depth] = k
-                        depth += 1
-            else:
-                start, stop = nodes[4 * node], nodes[4 * node + 1]
-                _write_distances(planes, size, start, stop, point, new)
-                place = start + _lower(bits[start:stop], new_bits)
-                tops[node], peaks[node] = left[place], _choose(left, factors, start, stop, place)
-    return chosen
-
-
-@jit
-def _choose(left, factors, start, stop, farthest):
-    """Return the place of a leaf's point to choose, given the place of its farthest point."""
-    if not len(factors):
-        return farthest
-    best = start
-    for i in range(start + 1, stop):
-        if left[i] * factors[i] > left[best] * factors[best]:
-            best = i
-    return best
-
-
-@jit
-def _choose_child(nodes, peaks, tops, left, factors, rows, node):
-    """Take over the children's largest distance and the best of their points."""
-    first = nodes[4 * node + 2]
-    best, tops[node] = peaks[first], tops[first]
-    for k in range(first + 1, first + nodes[4 * node + 3]):
-        tops[node] = max(tops[node], tops[k])
-        other = peaks[k]
-        gain, most = np.float64(left[other]), np.float64(left[best])
-        if len(factors):
-            gain, most = gain * factors[other], most * factors[best]
-        if gain > most or (gain == most and rows[other] < rows[best]):
-            best = other
-    peaks[node] = best
 
 
 @jit_cached
@@ -302,9 +216,9 @@ def nearest(planes, queries, scratch, channels, leaf):
         ``(M,)`` rows, the lowest row in case of ties; none if a coordinate is not finite.
     """
     size = len(planes) // channels
-    if not (_all_finite(planes) and _all_finite(queries)):
+    if not (all_finite(planes) and all_finite(queries)):
         return np.empty(0, np.int64)
-    rows, nodes, boxes = _build(planes, channels, leaf)
+    rows, nodes, boxes = build_tree(planes, channels, leaf)
     known = len(nodes) // 4
     nearest_rows = np.empty(len(queries) // channels, np.int64)
     distances, point = scratch.view(planes.dtype), np.empty(channels, planes.dtype)
@@ -322,7 +236,7 @@ def nearest(planes, queries, scratch, channels, leaf):
             if nodes[4 * node + 3]:
                 bottom = depth
                 for k in range(nodes[4 * node + 2], nodes[4 * node + 2] + nodes[4 * node + 3]):
-                    bound = _distance_to_box(boxes, k, point)
+                    bound = distance_to_box(boxes, k, point)
                     if bound <= best:  # the nearest child is visited first
                         place = depth
                         while place > bottom and bounds[place - 1] < bound:
@@ -332,11 +246,11 @@ def nearest(planes, queries, scratch, channels, leaf):
                         depth += 1
             else:
                 start, stop = nodes[4 * node], nodes[4 * node + 1]
-                _write_distances(planes, size, start, stop, point, distances)
+                write_distances(planes, size, start, stop, point, distances)
                 low = scratch[0]
                 for i in range(stop - start):
                     low = min(low, scratch[i])
-                i = _place(scratch[: stop - start], low)
+                i = place_of(scratch[: stop - start], low)
                 if distances[i] < best or (distances[i] == best and rows[start + i] < row):
                     best, row = distances[i], rows[start + i]
         nearest_rows[query] = row

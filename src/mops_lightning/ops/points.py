@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.errors import UserError
+from mops_lightning.ops import batches
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
@@ -30,22 +31,8 @@ def as_tensor(name: str, value: Any) -> Tensor:
 
 
 def cloud_sizes(number: int, batch: Tensor, name: str = "batch") -> Tensor:
-    """Return the number of points ``(B,)`` of every cloud, on the CPU.
-
-    Args:
-        number: P, of points.
-        batch: ``(P,)`` the cloud of every point, ascending from 0, as in PyTorch Geometric.
-        name: of the argument, for errors.
-    """
-    if batch.ndim != 1 or len(batch) != number or batch.is_floating_point():
-        raise UserError(
-            f"{name} must be whole numbers of shape (P={number},), got {batch.dtype} of shape "
-            f"{tuple(batch.shape)}."
-        )
-    batch = batch.long()  # torch computes with few of the unsigned types
-    if len(batch) and (int(batch.min()) < 0 or bool((batch[1:] < batch[:-1]).any())):
-        raise UserError(f"{name} must be ascending and at least 0. Sort the points by cloud.")
-    return batch.bincount().cpu()
+    """Return the number of points ``(B,)`` of every cloud; see ``ops.batches.cloud_sizes``."""
+    return torch.from_numpy(batches.cloud_sizes(number, batch.cpu().numpy(), name))
 
 
 def gather_points(points: Tensor, indices: Tensor) -> Tensor:

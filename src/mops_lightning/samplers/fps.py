@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.fps import farthest_point_sample
+from mops_lightning.ops.fps import farthest
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.ordering import seeded_order
+from mops_lightning.samplers.ordering import seeded_keys
 from mops_lightning.types import SampleOutput
 
 FARTHEST: Final = "farthest"
@@ -93,13 +93,33 @@ def farthest_rows(
     n = points.shape[1]
     if isinstance(start, int) and start >= n:
         raise UserError(f"start must be less than the number of points N={n}, got {start}.")
-    order = seeded_order(points, seed)
-    ordered = gather_points(points.detach(), order)
-    weight = None if weight is None else weight.gather(1, order)
-    first: int | Tensor = 0 if weight is None else weight.argmax(1)
-    if start == FARTHEST:
-        # The mean of ordered points has the same rounding error for every order of the input.
-        first = (ordered - ordered.mean(1, keepdim=True)).square().sum(2).argmax(1)
-    elif isinstance(start, int):
-        first = torch.eq(order, start).byte().argmax(1)
-    return order.gather(1, farthest_point_sample(ordered, m, first, weight))
+    keys = seeded_keys(points, seed)
+    if isinstance(start, int):
+        first = torch.full((len(points),), start, device=points.device)
+    elif start == FARTHEST:
+        first = _first_of_largest(_squares_from_mean(points.detach()), keys)
+    elif weight is not None:
+        first = _first_of_largest(weight, keys)
+    else:
+        first = keys.argmin(1)
+    one = torch.ones_like(first)
+    return farthest(points.detach(), first[:, None], one, m, weight, keys)
+
+
+def _squares_from_mean(points: Tensor) -> Tensor:
+    """Return the float64 squared distances ``(B, N)`` of points ``(B, N, C)`` from their mean."""
+    exact = points.double()
+    # Sums of integers do not depend on the order of the points.
+    largest = exact.abs().amax((1, 2), keepdim=True).clamp_min(torch.finfo(exact.dtype).tiny)
+    units = 2.0 ** (62 - points.shape[1].bit_length() - largest.log2().ceil())
+    centre = (exact * units).round().long().sum(1, keepdim=True) / units / points.shape[1]
+    squares = torch.zeros_like(exact[..., 0])
+    for axis in range(points.shape[2]):
+        squares += (exact[..., axis] - centre[..., axis]).square()
+    return squares
+
+
+def _first_of_largest(values: Tensor, keys: Tensor) -> Tensor:
+    """Return the rows ``(B,)`` of the largest values; the lowest key wins a tie."""
+    largest = values == values.amax(1, keepdim=True)
+    return torch.where(largest, keys, torch.iinfo(keys.dtype).max).argmin(1)

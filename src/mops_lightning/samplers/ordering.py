@@ -5,8 +5,12 @@ order of its points. Here, points are ordered by a hash of their coordinates, th
 cloud.
 """
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+from mops_lightning.ops import kernel_order
 
 WORD = 2**64
 STEP = 0x9E3779B97F4A7C15  # 2⁶⁴ divided by the golden ratio, odd
@@ -27,6 +31,16 @@ def seeded_order(points: Tensor, seed: int) -> Tensor:
     Returns:
         ``(B, N)`` int64 permutations.
     """
+    keys = seeded_keys(points, seed)
+    if keys.is_cpu:  # NumPy's vectorised sort is several times faster than torch's
+        return torch.from_numpy(np.argsort(keys.numpy(), axis=1, kind="stable"))
+    return keys.argsort(dim=1, stable=True)
+
+
+def seeded_keys(points: Tensor, seed: int) -> Tensor:
+    """Return the random keys ``(B, N)`` int64 whose order is ``seeded_order``."""
+    if points.is_cpu:
+        return torch.from_numpy(_compiled_keys(points, seed))
     keys = point_hashes(points.detach(), seed)
     values, order = keys.sort(dim=1, stable=True)
     equal = values[:, 1:] == values[:, :-1]
@@ -37,8 +51,41 @@ def seeded_order(points: Tensor, seed: int) -> Tensor:
         copy = place - begin.cummax(1).values
         # First copies keep their keys, so that clouds without copies do not depend on the batch.
         values = torch.where(copy > 0, _scramble(values + copy * _signed(STEP)), values)
-        order = order.gather(1, values.argsort(dim=1, stable=True))
-    return order
+        keys = torch.empty_like(keys).scatter_(1, order, values)
+    return keys
+
+
+def smallest(keys: Tensor, m: int) -> Tensor:
+    """Return the rows ``(B, m)`` of the m smallest keys ``(B, N)`` of every cloud, ascending."""
+    if not keys.is_cpu or m == keys.shape[1]:
+        return keys.argsort(dim=1, stable=True)[:, :m].contiguous()
+    values = keys.numpy()
+    rows = np.argpartition(values, m - 1, axis=1)[:, :m]
+    order = np.argsort(np.take_along_axis(values, rows, 1), axis=1)
+    return torch.from_numpy(np.take_along_axis(rows, order, 1))
+
+
+def _compiled_keys(points: Tensor, seed: int) -> NDArray[np.int64]:
+    """Return the keys of clouds on a CPU, without a sort of all of them."""
+    given = points.detach()
+    if given.dtype not in (torch.float32, torch.float64):
+        given = given.float()
+    coordinates = given.contiguous().numpy()
+    clouds, size, channels = coordinates.shape
+    word = np.uint64((seed * STEP + 1) % WORD)
+    keys = kernel_order.point_keys(coordinates.reshape(-1), clouds, channels, word)
+    repeated = kernel_order.perhaps_repeated(keys)
+    if len(repeated):
+        order = np.lexsort((keys[repeated], repeated // size))  # stable: copies keep their order
+        rows = repeated[order]
+        values = keys[rows]
+        starts = np.ones(len(rows), np.bool_)
+        starts[1:] = (values[1:] != values[:-1]) | (rows[1:] // size != rows[:-1] // size)
+        place = np.arange(len(rows))
+        copy = (place - np.maximum.accumulate(np.where(starts, place, 0))).astype(np.uint64)
+        later = torch.from_numpy((values + copy * np.uint64(STEP)).view(np.int64))
+        keys[rows] = np.where(copy > 0, _scramble(later).numpy().view(np.uint64), values)
+    return keys.view(np.int64).reshape(clouds, size)
 
 
 def point_hashes(points: Tensor, seed: int) -> Tensor:

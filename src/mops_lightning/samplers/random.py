@@ -5,7 +5,7 @@ from torch import Tensor
 
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.ordering import seeded_order
+from mops_lightning.samplers.ordering import seeded_keys, seeded_order, smallest
 from mops_lightning.types import SampleOutput
 
 
@@ -39,7 +39,7 @@ class RandomSampler(Sampler):
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices, in random order."""
-        indices = seeded_order(points, self.seed)[:, :m].contiguous()
+        indices = smallest(seeded_keys(points, self.seed), m)
         return SampleOutput(gather_points(points, indices), indices, {})
 
     def sample_weighted(self, points: Tensor, m: int, weight: Tensor) -> Tensor:

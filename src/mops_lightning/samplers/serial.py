@@ -1,24 +1,20 @@
 """Serial sampling: every k-th point along a Morton curve, in linear time but for a sort."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from mops_lightning.ops import kernel_order
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.ordering import seeded_order
+from mops_lightning.samplers.ordering import seeded_keys
 from mops_lightning.types import SampleOutput
 
 BITS = 21
 """Bits of a coordinate: three of them fill an int64 but for its sign."""
 
-SPREADS = (
-    (32, 0x1F00000000FFFF),
-    (16, 0x1F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
-"""Shifts and masks that put two zeros after every bit of a coordinate."""
+SPREAD = np.array([sum((n >> bit & 1) << 3 * bit for bit in range(11)) for n in range(2**11)])
+"""Numbers of 11 bits with two zeros after every bit."""
 
 
 class SerialSampler(Sampler):
@@ -43,20 +39,28 @@ class SerialSampler(Sampler):
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices, along the curve."""
-        order = seeded_order(points, seed=0)  # ties do not depend on the input order
-        codes = morton_codes(gather_points(points.detach(), order))
-        along = order.gather(1, codes.argsort(dim=1, stable=True))
+        along = along_curve(points)
         n = points.shape[1]
         indices = along[:, (torch.arange(m, device=points.device) * 2 + 1) * n // (2 * m)]
         return SampleOutput(gather_points(points, indices), indices, {})
 
 
+def along_curve(points: Tensor) -> Tensor:
+    """Return the rows ``(B, N)`` in the order of the curve; the seeded order breaks ties."""
+    codes = morton_codes(points).numpy()
+    order = np.argsort(codes, axis=1)
+    ordered = np.take_along_axis(codes, order, 1)
+    if (ordered[:, 1:] == ordered[:, :-1]).any():
+        keys = seeded_keys(points, seed=0).cpu().numpy()
+        order = np.lexsort((keys, codes), axis=1)
+    return torch.from_numpy(order).to(points.device)
+
+
 def morton_codes(points: Tensor) -> Tensor:
-    """Return the place on the curve ``(B, N)`` int64 of points ``(B, N, 3)``."""
-    offsets = points.double() - points.double().amin(1, keepdim=True)
-    side = offsets.amax((1, 2), keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
-    cells = (offsets / side * (2**BITS - 1)).long()
-    for shift, mask in SPREADS:
-        cells = (cells | cells << shift) & mask
-    x, y, z = cells.unbind(2)
-    return x << 2 | y << 1 | z
+    """Return the place on the curve ``(B, N)`` int64 of points ``(B, N, 3)``, on the CPU."""
+    coordinates = points.detach().cpu()
+    if coordinates.dtype not in (torch.float32, torch.float64):
+        coordinates = coordinates.float()
+    flat = coordinates.contiguous().numpy().reshape(-1)
+    codes = kernel_order.morton_codes(flat, len(points), SPREAD)
+    return torch.from_numpy(codes).view(points.shape[:2])

@@ -1,0 +1,26 @@
+"""Clouds one after the other, as in PyTorch Geometric; without torch."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mops_lightning.errors import UserError
+
+
+def cloud_sizes(number: int, batch: NDArray[Any], name: str = "batch") -> NDArray[np.int64]:
+    """Return the number of points ``(B,)`` of every cloud.
+
+    Args:
+        number: P, of points.
+        batch: ``(P,)`` the cloud of every point, ascending from 0, as in PyTorch Geometric.
+        name: of the argument, for errors.
+    """
+    if batch.shape != (number,) or batch.dtype.kind not in "iub":
+        raise UserError(
+            f"{name} must be whole numbers of shape (P={number},), got {batch.dtype} of shape "
+            f"{batch.shape}."
+        )
+    if number and (batch[0] < 0 or bool((batch[1:] < batch[:-1]).any())):
+        raise UserError(f"{name} must be ascending and at least 0. Sort the points by cloud.")
+    return np.bincount(batch.astype(np.int64))

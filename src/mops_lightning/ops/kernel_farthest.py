@@ -1,0 +1,268 @@
+"""Farthest points in loops that numba compiles; ``ops.farthest`` calls them."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+import numpy as np
+
+from mops_lightning.ops import kernels
+from mops_lightning.ops.jit import (
+    bits_float,
+    float_bits,
+    jit,
+    jit_cached_with,
+    jit_inlined,
+    multiply_add,
+)
+from mops_lightning.ops.kernels import (
+    FANOUT,
+    all_finite,
+    build_tree,
+    distance_to_box,
+    place_of,
+    write_distances,
+)
+
+BLOCK = 128
+"""Number of distances that are compared at a time."""
+
+
+@jit_cached_with(kernels)
+def farthest(points, chosen, counts, factors, ranks, channels, leaf):
+    """Repeatedly choose the point that is farthest from all points chosen before it.
+
+    Distances in the type of the coordinates find the candidates of a choice. Where there are
+    several, float64 distances decide, so that rounding to float32 does not change the choice.
+
+    Args:
+        points: ``(B·N·C,)`` coordinates, one point after the other.
+        chosen: ``(B·M,)`` rows; the first ``counts`` of a cloud are given, the others are written.
+        counts: ``(B,)`` number of given rows, at least 1. The number of chosen rows is written: it
+            is below M where all points that are left are copies of chosen ones.
+        factors: ``(B·N,)`` float64, above 0: the point with the largest product of factor and
+            squared distance is chosen; or ``(0,)``.
+        ranks: ``(B·N,)`` int64: the lowest rank is chosen in case of ties; or ``(0,)``: the lowest
+            row.
+        channels: C.
+        leaf: maximum number of points of a leaf.
+
+    Returns:
+        Whether all coordinates are finite.
+    """
+    clouds = len(counts)
+    size, steps = len(points) // (clouds * channels), len(chosen) // clouds
+    for cloud in range(clouds):
+        start, stop = cloud * size, (cloud + 1) * size
+        planes = _to_planes(points[start * channels : stop * channels], channels)
+        if not all_finite(planes):
+            return False
+        weights = factors[start:stop] if len(factors) else factors
+        order = ranks[start:stop] if len(ranks) else ranks
+        rows = chosen[cloud * steps : (cloud + 1) * steps]
+        counts[cloud] = _choose(planes, rows, counts[cloud], weights, order, channels, leaf)
+    return True
+
+
+@jit
+def _to_planes(points, channels):
+    """Return coordinates one channel after the other."""
+    size = len(points) // channels
+    planes = np.empty(len(points), points.dtype)
+    if channels == 3:  # a constant stride is vectorised
+        x, y, z = planes[:size], planes[size : 2 * size], planes[2 * size :]
+        for i in range(size):
+            x[i] = points[3 * i]
+            y[i] = points[3 * i + 1]
+            z[i] = points[3 * i + 2]
+    else:
+        for axis in range(channels):
+            for i in range(size):
+                planes[axis * size + i] = points[channels * i + axis]
+    return planes
+
+
+@jit_inlined
+def _choose(planes, chosen, given, factors, ranks, channels, leaf):
+    """Choose farthest points of one cloud; arguments as for ``farthest``."""
+    size, steps = len(planes) // channels, len(chosen)
+    rows, nodes, boxes = build_tree(planes, channels, leaf)
+    known = len(nodes) // 4
+    factors = _sorted(factors, rows)
+    # The bits of floats ≥ 0, read as integers, have the same order, and numba vectorises the
+    # maximum of integers only. Chosen points have the distance -1, a negative integer.
+    bits = np.full(size, float_bits(planes.dtype.type(np.inf)))
+    gaps = bits.view(planes.dtype)
+    # The largest distance of every node and, with factors, the largest product.
+    tops = np.full(known, bits[0])
+    gains = np.full(known if len(factors) else 0, np.inf)
+    # Float64 coordinates of the chosen points; float64 distances, and to how many of them.
+    path = np.empty(channels * steps)
+    exact, seen = np.empty(size), np.zeros(size, np.int32)
+    found, stack = np.empty(size, np.uint32), np.empty(known + FANOUT, np.int64)
+    new, point = np.empty(min(leaf, size), planes.dtype), np.empty(channels, planes.dtype)
+    places = _inverse(rows) if given > 1 else rows
+    for step in range(steps):
+        place = np.int64(0)
+        if step < given:
+            place = np.int64(places[chosen[step]]) if given > 1 else place_of(rows, chosen[step])
+        else:
+            count = _candidates(nodes, tops, bits, gains, factors, gaps, channels, stack, found)
+            place, best = np.int64(found[0]), -1.0
+            for k in range(count if count > 1 else 0):
+                i = found[k]
+                low = _least_square(path, seen[i], step, steps, planes, i)
+                exact[i] = min(exact[i], low) if seen[i] else low
+                seen[i] = step
+                gain = exact[i] * factors[i] if len(factors) else exact[i]
+                if gain > best or (gain == best and _precedes(rows, ranks, i, place)):
+                    best, place = gain, np.int64(i)
+            if best == 0:
+                return step
+            chosen[step] = rows[place]
+        gaps[place] = -1
+        for axis in range(channels):
+            point[axis] = planes[axis * size + place]
+            path[axis * steps + step] = point[axis]
+        _update(planes, nodes, boxes, place, point, bits, tops, gains, factors, gaps, stack, new)
+    return np.int64(steps)
+
+
+@jit
+def _sorted(factors, rows):
+    """Return the factors in the order of the tree."""
+    moved = np.empty(len(factors))
+    for place in range(len(factors)):
+        moved[place] = factors[rows[place]]
+    return moved
+
+
+@jit
+def _inverse(rows):
+    """Return the place of every row."""
+    places = np.empty_like(rows)
+    for place in range(len(rows)):
+        places[rows[place]] = place
+    return places
+
+
+@jit
+def _precedes(rows, ranks, place, other):
+    """Return whether a point is chosen before another one at the same distance."""
+    row, other_row = rows[place], rows[other]
+    if len(ranks) and ranks[row] != ranks[other_row]:
+        return ranks[row] < ranks[other_row]
+    return row < other_row
+
+
+@jit
+def _least_square(path, start, stop, steps, planes, place):
+    """Return a point's least squared distance to chosen points, computed in float64."""
+    size, channels = len(planes) * steps // len(path), len(path) // steps
+    bits = np.full(stop - start, float_bits(0.0))
+    squares = bits.view(path.dtype)
+    for axis in range(channels):
+        at = np.float64(planes[axis * size + place])
+        line = path[axis * steps + start : axis * steps + stop]
+        for i in range(len(squares)):
+            d = line[i] - at
+            squares[i] += d * d  # rounded twice, as in NumPy
+    least = bits[0]
+    for i in range(len(bits)):
+        least = min(least, bits[i])
+    return bits_float(least, 0.0)
+
+
+@jit
+def _candidates(nodes, tops, bits, gains, factors, gaps, channels, stack, found):
+    """Find the places of all points that could be the farthest; return their number."""
+    limits = np.finfo(gaps.dtype)
+    share = 1 - 2 * (channels + 2) * np.float64(limits.eps)  # twice the largest rounding error
+    top = gains[0] if len(gains) else np.float64(bits_float(tops[0], gaps[0]))
+    least = max(min(top, np.float64(limits.max)) * share - channels * limits.tiny, 0.0)
+    wanted = float_bits(gaps.dtype.type(least))
+    stack[0], depth, count = 0, 1, 0
+    while depth:
+        depth -= 1
+        node = stack[depth]
+        if gains[node] < least if len(gains) else tops[node] < wanted:
+            continue
+        first = nodes[4 * node + 2]
+        for k in range(first, first + nodes[4 * node + 3]):
+            stack[depth] = k
+            depth += 1
+        if nodes[4 * node + 3]:
+            continue
+        start, stop = nodes[4 * node], nodes[4 * node + 1]
+        if len(gains):
+            for i in range(start, stop):
+                if gaps[i] >= 0 and gaps[i] * factors[i] >= least:
+                    found[count] = i
+                    count += 1
+            continue
+        for begin in range(start, stop, BLOCK):
+            part, low = bits[begin : min(begin + BLOCK, stop)], bits[begin]
+            for i in range(len(part)):
+                low = part[i] if part[i] > low else low
+            for i in range(len(part) if low >= wanted else 0):
+                if part[i] >= wanted:
+                    found[count] = begin + i
+                    count += 1
+    return count
+
+
+@jit
+def _update(planes, nodes, boxes, place, point, bits, tops, gains, factors, gaps, stack, new):
+    """Lower the distances of all points to those from a chosen point."""
+    size = len(bits)
+    stack[0], depth = 0, 1
+    while depth:
+        depth -= 1
+        node = stack[depth]
+        above = node < 0  # all children are up to date
+        node = ~node if above else node
+        first, stop = nodes[4 * node + 2], nodes[4 * node + 2] + nodes[4 * node + 3]
+        if above:
+            tops[node] = tops[first]
+            for k in range(first + 1, stop):
+                tops[node] = max(tops[node], tops[k])
+            if len(gains):
+                gains[node] = gains[first]
+                for k in range(first + 1, stop):
+                    gains[node] = max(gains[node], gains[k])
+        elif nodes[4 * node + 3]:
+            stack[depth] = ~node
+            depth += 1
+            for k in range(first, stop):
+                near = float_bits(distance_to_box(boxes, k, point)) < tops[k]
+                if near or nodes[4 * k] <= place < nodes[4 * k + 1]:
+                    stack[depth] = k
+                    depth += 1
+        else:
+            start, stop = nodes[4 * node], nodes[4 * node + 1]
+            tops[node] = _lower(planes, size, start, stop, point, bits[start:stop], new)
+            if len(gains):
+                gains[node] = -1
+                for i in range(start, stop):
+                    gains[node] = max(gains[node], gaps[i] * factors[i])
+
+
+@jit
+def _lower(planes, size, start, stop, point, bits, new):
+    """Lower distances to those from a point and return the largest."""
+    top = float_bits(point.dtype.type(-1))
+    if len(point) == 3:
+        px, py, pz = point[0], point[1], point[2]
+        x = planes[start:stop]
+        y = planes[size + start : size + stop]
+        z = planes[2 * size + start : 2 * size + stop]
+        for i in range(len(bits)):
+            dx, dy, dz = x[i] - px, y[i] - py, z[i] - pz
+            low = float_bits(multiply_add(dz, dz, multiply_add(dy, dy, dx * dx)))
+            low = low if low < bits[i] else bits[i]
+            bits[i] = low
+            top = top if top > low else low
+        return top
+    write_distances(planes, size, start, stop, point, new)
+    for i in range(len(bits)):
+        bits[i] = min(bits[i], float_bits(new[i]))
+        top = max(top, bits[i])
+    return top

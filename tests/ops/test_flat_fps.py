@@ -1,0 +1,167 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning.errors import UserError
+from mops_lightning.ops.flat_fps import fps
+
+
+def torch_cluster_fps(x, batch, ratio):
+    """Choose farthest points as torch_cluster does: its loops, in plain torch."""
+    chosen = []
+    for cloud in batch.unique().tolist():
+        rows = (batch == cloud).nonzero()[:, 0]
+        points = x[rows].view(len(rows), -1)
+        number = int((torch.tensor(float(len(rows))) * torch.tensor(ratio)).ceil())
+        picked, distances = [0], (points - points[0]).pow(2).sum(1)
+        for _ in range(number - 1):
+            picked.append(int(distances.argmax()))
+            distances = distances.min((points - points[picked[-1]]).pow(2).sum(1))
+        chosen.append(rows[picked])
+    return torch.cat(chosen)
+
+
+@pytest.mark.parametrize("sizes", [(40,), (30, 30, 30), (50, 1, 0, 27)])
+@pytest.mark.parametrize(("ratio", "shape"), [(0.1, (3,)), (0.5, ()), (1.0, (2, 2)), (0.3, (7,))])
+def test_flat_fps_equals_torch_cluster(sizes, ratio, shape, rng):
+    batch = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
+    x = torch.randn(len(batch), *shape, generator=rng)
+    rows = fps(x, batch, ratio, random_start=False, batch_size=len(sizes) + 1)
+    assert torch.equal(rows, torch_cluster_fps(x, batch, ratio))
+    if len(sizes) == 1:
+        assert torch.equal(rows, fps(x, ratio=ratio, random_start=False))
+
+
+def test_ratio_of_each_cloud_is_its_own(rng):
+    x, batch = torch.rand(60, 3, generator=rng), torch.arange(2).repeat_interleave(30)
+    alone = [fps(x[i * 30 :][:30], None, r, False) + i * 30 for i, r in enumerate((0.1, 0.5))]
+    assert torch.equal(fps(x, batch, torch.tensor([0.1, 0.5]), False), torch.cat(alone))
+
+
+def test_random_start_differs_between_clouds_and_repeats_with_torch_seed():
+    x, batch = torch.rand(600, 3), torch.arange(6).repeat_interleave(100)
+    torch.manual_seed(3)
+    starts = fps(x, batch, 0.01)
+    assert batch[starts].tolist() == list(range(6))
+    assert len((starts % 100).unique()) > 1
+    torch.manual_seed(3)
+    assert torch.equal(fps(x, batch, 0.01), starts)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"x": torch.zeros(0, 3)}, r"x must be a tensor or an array .*\(0, 3\)"),
+        ({"x": [[1.0, 2.0], [3.0, 4.0]]}, "x must be a tensor or an array"),
+        ({"x": torch.full((4, 3), torch.nan)}, "x must be finite"),
+        ({"ratio": torch.tensor([0.5, 0.5])}, "one or one per cloud"),
+        ({"ratio": 0.0}, "ratio must be above 0 and at most 1"),
+        ({"ratio": 1.5}, "ratio must be above 0 and at most 1"),
+        ({"batch": torch.tensor([0, 1, 0, 0])}, "must be ascending"),
+        ({"batch": torch.tensor([0, 1])}, r"shape \(P=4,\)"),
+        ({"batch": torch.zeros(4)}, "batch must be whole numbers"),
+        ({"batch": torch.tensor([0, 0, 1, 1]), "batch_size": 1}, "batch_size must be at least 2"),
+    ],
+)
+def test_fps_of_wrong_arguments_raises(arguments, said):
+    with pytest.raises(UserError, match=said):
+        fps(**{"x": torch.rand(4, 3), **arguments})
+
+
+def exact_farthest(cloud, m):
+    """Choose farthest points from row 0 in float64, the lowest row in case of ties."""
+    cloud = cloud.astype(np.float64)
+    rows = [0]
+    gaps = np.full(len(cloud), np.inf)
+    while len(rows) < m:
+        gaps = np.minimum(gaps, ((cloud - cloud[rows[-1]]) ** 2).sum(1))
+        rows.append(int(gaps.argmax()))
+    return rows
+
+
+def steps_of_a_centimetre():
+    return np.random.default_rng(0).integers(0, 300, (2000, 3)) / 100
+
+
+def grid_of_tenths():
+    return np.stack(np.meshgrid(*[np.arange(13) * 0.1] * 3), -1).reshape(-1, 3)
+
+
+def repeated_points():
+    return np.repeat(np.random.default_rng(0).random((50, 3)), 20, 0)
+
+
+def map_coordinates():
+    return np.random.default_rng(0).random((2000, 3)) * 2 + [500_000, 4_500_000, 100]
+
+
+def whole_numbers():
+    return np.random.default_rng(0).integers(-20, 20, (1500, 3))
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.int32])
+@pytest.mark.parametrize(
+    ("cloud", "m"),
+    [
+        (steps_of_a_centimetre, 600),
+        (grid_of_tenths, 440),
+        (repeated_points, 50),
+        (map_coordinates, 64),
+        (whole_numbers, 500),
+    ],
+)
+def test_fps_of_near_ties_is_that_of_float64_arithmetic(cloud, m, dtype):
+    if dtype == np.float16 and cloud is map_coordinates:
+        pytest.skip("beyond the numbers of half precision")
+    points = cloud().astype(dtype)
+    number = min(m, len(np.unique(points, axis=0)))
+
+    rows = fps(points, ratio=(number - 0.5) / len(points), random_start=False)
+
+    assert rows.tolist() == exact_farthest(points, number)
+
+
+def test_fps_of_an_array_is_that_of_a_tensor(rng):
+    x = torch.randn(90, 3, generator=rng)
+    batch = torch.arange(3).repeat_interleave(torch.tensor([40, 20, 30]))
+
+    of_array = fps(x.numpy(), batch.numpy(), 0.3, random_start=False)
+
+    assert isinstance(of_array, np.ndarray)
+    assert of_array.tolist() == fps(x, batch, 0.3, random_start=False).tolist()
+
+
+def test_fps_of_an_array_repeats_with_numpy_seed():
+    x = np.random.default_rng(0).random((500, 3))
+    np.random.seed(4)  # noqa: NPY002  the generator that users seed
+    first = fps(x, ratio=0.1)
+    np.random.seed(4)  # noqa: NPY002
+
+    assert fps(x, ratio=0.1).tolist() == first.tolist()
+
+
+def test_fps_of_whole_numbers_chooses_half():
+    whole = torch.tensor([[0, 0, 0], [4, 0, 0], [1, 0, 0], [9, 0, 0]])
+
+    assert fps(whole, ratio=0.5, random_start=False).tolist() == [0, 3]
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
+def test_fps_number_of_points_is_that_of_pyg_lib(dtype):
+    x = torch.arange(2000, dtype=torch.float32)[:, None].to(dtype)
+
+    rows = fps(x, ratio=0.1, random_start=False)
+
+    assert len(rows) == 200  # in half precision 0.1 is below 0.1, and 0.3 above 0.3
+
+
+def test_fps_of_an_array_does_not_import_torch():
+    code = (
+        "import sys, numpy as np; from mops_lightning import fps; "
+        "fps(np.zeros((9, 3)), random_start=False); assert 'torch' not in sys.modules"
+    )
+
+    subprocess.run([sys.executable, "-c", code], check=True)
