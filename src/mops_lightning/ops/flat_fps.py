@@ -3,7 +3,7 @@
 Arrays are sampled without importing torch.
 """
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +15,30 @@ from mops_lightning.ops.farthest import Array, Rows, farthest_rows, float_points
 if TYPE_CHECKING:
     from torch import Tensor
 
-Points = TypeVar("Points", "Tensor", NDArray[Any])
 
-
+@overload
 def fps(
-    x: Points,
-    batch: Points | None = None,
+    x: "Tensor",
+    batch: "Tensor | None" = None,
     ratio: Any = 0.5,
     random_start: bool = True,
     batch_size: int | None = None,
-) -> Points:
+) -> "Tensor": ...
+@overload
+def fps(
+    x: NDArray[Any],
+    batch: NDArray[Any] | None = None,
+    ratio: Any = 0.5,
+    random_start: bool = True,
+    batch_size: int | None = None,
+) -> NDArray[np.int64]: ...
+def fps(
+    x: Any,
+    batch: Any = None,
+    ratio: Any = 0.5,
+    random_start: bool = True,
+    batch_size: int | None = None,
+) -> Any:
     """Choose farthest points of flat clouds: a replacement for ``torch_geometric.nn.fps``.
 
     The arguments are those of PyTorch Geometric, and so is the number of chosen points: that of

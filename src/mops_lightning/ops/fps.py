@@ -108,7 +108,7 @@ def farthest(
     if rows is not None:
         return rows
     if ranks is not None:  # in the order of the ranks, the lowest row wins a tie
-        order = ranks.argsort(1, stable=True)
+        order = ranks.argsort(dim=1, stable=True)
         ordered = gather_points(points, order)
         factors = None if factors is None else factors.gather(1, order)
         given = order.argsort(1).gather(1, given)

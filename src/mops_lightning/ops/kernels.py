@@ -17,11 +17,8 @@ the assignment of a slice takes seconds to compile. Coordinates of C channels an
 import numpy as np
 
 from mops_lightning.ops.jit import (
-    bits_float,
-    float_bits,
     jit,
     jit_cached,
-    jit_inlined,
     multiply_add,
 )
 
