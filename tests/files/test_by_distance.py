@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import laspy
 import numpy as np
 import pytest
 
@@ -140,3 +141,43 @@ def test_map_of_a_spacing(scan, tmp_path):
 def test_mistakes_are_one_line(options, words, scan, tmp_path):
     assert words in refused(scan, tmp_path / "out.npz", *options)
     assert not (tmp_path / "out.npz").exists()
+
+
+@pytest.mark.parametrize("budget", ["--spacing", "--voxel"])
+@pytest.mark.parametrize(
+    ("name", "distance"), [("autzen_trim_7.las", 6), ("lone-star.copc.laz", 0.8)]
+)
+def test_real_scans_in_chunks_equal_one_pass(name, distance, budget, real_data, tmp_path):
+    source = real_data(f"airborne/{name}")
+
+    done(source, tmp_path / "whole.las", budget, distance)
+    done(source, tmp_path / "parts.las", budget, distance, "--chunk", 200_000)
+
+    whole, parts = read(tmp_path / "whole.las", 9, 0), read(tmp_path / "parts.las", 9, 0)
+    assert len(whole.points) > 100
+    np.testing.assert_array_equal(parts.points, whole.points)
+    for column, values in whole.columns.items():
+        np.testing.assert_array_equal(parts.columns[column], values)
+
+
+@pytest.mark.parametrize(
+    ("wkt", "is_refused"),
+    [
+        ('GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]]]', True),
+        ('PROJCS["WGS 84 / UTM zone 32N",GEOGCS["WGS 84",DATUM["WGS_1984"]]]', False),
+    ],
+)
+@pytest.mark.parametrize("budget", ["--spacing", "--voxel"])
+def test_degrees_are_refused(budget, wkt, is_refused, tmp_path):
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = np.full(3, 1e-7)
+    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = RNG.uniform(8, 9, (3, 50))
+    las.write(tmp_path / "in.las")
+
+    if is_refused:
+        words = refused(tmp_path / "in.las", tmp_path / "out.las", budget, 0.05)
+        assert f"{budget}: the coordinates of {tmp_path / 'in.las'} are degrees" in words
+    else:
+        done(tmp_path / "in.las", tmp_path / "out.las", budget, 0.05)

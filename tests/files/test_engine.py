@@ -149,3 +149,12 @@ def test_lost_scheduler_is_reported(scan):
         engine = Watched(DaskEngine(client), close)
         with pytest.raises(UserError, match="lost the connection"):
             sample_by_chunks(scan[0], scan[1], options("generated", 10), engine)
+
+
+@pytest.mark.parametrize("budget", [["--spacing", 0.6], ["--voxel", 0.8]])
+def test_spacing_and_voxels_by_workers_equal_one_pass(budget, client, scan, tmp_path):
+    done(scan[0], tmp_path / "whole.npz", *budget)
+    address = client.scheduler.address
+    done(scan[0], tmp_path / "parts.npz", *budget, "--chunk", 500, "--cluster", address)
+
+    same(read(tmp_path / "parts.npz", 9, 0), read(tmp_path / "whole.npz", 9, 0))

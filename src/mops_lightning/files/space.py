@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.data.formats.las.header import Header
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import did_you_mean
 
@@ -53,27 +54,22 @@ def check_unit(header: Any, name: str, path: Path) -> None:
     Raises:
         BadCloudError: the file has a geographic coordinate system.
     """
-    if _is_geographic(header):
+    if isinstance(header, Header) and _is_geographic(header):
         raise BadCloudError(
             f"{name}: the coordinates of {path} are degrees (a geographic coordinate system). "
             "Project them first, for example with PDAL, or give --m."
         )
 
 
-def _is_geographic(header: Any) -> bool:
-    records = [*(getattr(header, "vlrs", None) or ()), *(getattr(header, "evlrs", None) or ())]
-    texts = [record for record in records if record.record_id == WKT]
-    keys = [record for record in records if record.record_id == GEO_KEYS]
-    for record in texts:
-        words = _text_of(record).upper()
+def _is_geographic(header: Header) -> bool:
+    """Return what the WKT says, which comes before GeoTIFF keys (LAS 1.4 R15)."""
+    records = {record.number: record.data for record in (*header.records, *header.extended)}
+    if WKT in records:
+        words = records[WKT].decode("utf-8", "replace").upper()
         is_projected = "PROJCS" in words or "PROJCRS" in words
         return not is_projected and ("GEOGCS" in words or "GEOGCRS" in words)
-    for record in keys:
-        numbers = np.frombuffer(record.record_data_bytes(), "<u2")
-        entries = numbers[4 : len(numbers) // 4 * 4].reshape(-1, 4)
-        return any(key == MODEL_KEY and value == GEOGRAPHIC for key, _, _, value in entries)
-    return False
-
-
-def _text_of(record: Any) -> str:
-    return bytes(record.record_data_bytes()).decode("utf-8", "replace")
+    if GEO_KEYS not in records:
+        return False
+    data = records[GEO_KEYS]
+    numbers = np.frombuffer(data[: len(data) // 8 * 8], "<u2").reshape(-1, 4)
+    return any(key == MODEL_KEY and value == GEOGRAPHIC for key, _, _, value in numbers[1:])
