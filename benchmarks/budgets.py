@@ -8,6 +8,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -40,17 +41,14 @@ def voxel_cases(points: Points, size: float, m: int | None) -> dict[str, Call]:
     if m is not None:
         cases["downsample(m, 'voxel')"] = lambda: downsample(points, m, "voxel")
     if find_spec("point_cloud_utils"):
-        import point_cloud_utils
-
+        point_cloud_utils = import_module("point_cloud_utils")
         reduce = point_cloud_utils.downsample_point_cloud_on_voxel_grid
         cases["point-cloud-utils"] = lambda: reduce(size, points)
     if find_spec("small_gicp"):
-        import small_gicp
-
+        small_gicp = import_module("small_gicp")
         cases["small_gicp"] = lambda: small_gicp.voxelgrid_sampling(points, size)
     if find_spec("open3d"):
-        import open3d
-
+        open3d = import_module("open3d")
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
         cases["open3d"] = lambda: cloud.voxel_down_sample(size)
     return cases
@@ -60,8 +58,7 @@ def spacing_cases(points: Points, spacing: float) -> dict[str, Call]:
     """Return the calls that keep points of a smallest distance."""
     cases: dict[str, Call] = {"downsample(spacing=)": lambda: downsample(points, spacing=spacing)}
     if find_spec("point_cloud_utils"):
-        import point_cloud_utils
-
+        point_cloud_utils = import_module("point_cloud_utils")
         reduce = point_cloud_utils.downsample_point_cloud_poisson_disk
         cases["point-cloud-utils"] = lambda: reduce(points, spacing, random_seed=1)
     return cases
