@@ -1,0 +1,50 @@
+"""Every pair of formats: what goes in comes out."""
+
+import numpy as np
+import pytest
+
+from mops_lightning.data.formats.registry import read, write
+from mops_lightning.data.formats.table import Form, Table
+
+EXACT = (".ply", ".pcd", ".npz", ".txt", ".xyz", ".npy")
+"""Formats that hold float64 coordinates."""
+
+NAMED = (".ply", ".pcd", ".npz", ".txt", ".xyz", ".las", ".laz")
+"""Formats with names of columns."""
+
+
+@pytest.fixture
+def table():
+    random = np.random.default_rng(0)
+    columns = {
+        "red": random.integers(0, 256, 50).astype(np.uint8),
+        "part": random.integers(-9, 9, 50).astype(np.int32),
+        "score": random.random(50).astype(np.float32),
+        "time": 3e8 + random.random(50),
+    }
+    points = random.normal(0, 3, (50, 3)) + np.array([400_000.125, 5_000_000.25, 0])
+    return Table(points, columns, form=Form(np.dtype(np.float64)))
+
+
+@pytest.mark.parametrize("source", EXACT)
+@pytest.mark.parametrize("target", EXACT)
+def test_coordinates_of_every_pair_are_the_same_to_the_bit(source, target, table, tmp_path):
+    write(tmp_path / f"a{source}", table)
+
+    write(tmp_path / f"b{target}", read(tmp_path / f"a{source}", 9, 0))
+
+    np.testing.assert_array_equal(read(tmp_path / f"b{target}", 9, 0).points, table.points)
+
+
+@pytest.mark.parametrize("source", NAMED)
+@pytest.mark.parametrize("target", NAMED)
+def test_columns_of_every_pair_keep_names_and_numbers(source, target, table, tmp_path):
+    write(tmp_path / f"a{source}", table)
+
+    write(tmp_path / f"b{target}", read(tmp_path / f"a{source}", 9, 0))
+
+    again = read(tmp_path / f"b{target}", 9, 0).columns
+    for name, column in table.columns.items():
+        # Text is read as float64, a LAS dimension of the name may have another type.
+        kept = again.get(f"{name}_", again[name])
+        np.testing.assert_array_equal(kept.astype(column.dtype), column)
