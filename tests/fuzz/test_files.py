@@ -22,7 +22,7 @@ from tests.support.fuzz_seeds import changed_content, changed_glb, json_bytes, s
 
 FILES = int(os.environ.get("MOPS_FUZZ", "12"))
 KINDS = (
-    "bin", "checkpoint", "e57", "glb", "glb content", "glb quantised", "hdf5", "las", "laz",
+    "bin", "checkpoint", "e57", "glb", "glb content", "hdf5", "las", "laz",
     "names", "npy", "npz", "obj", "off", "pcd", "pcd ascii", "pictured clouds", "ply",
     "ply ascii", "ply lists", "ply mesh", "pts", "ptx", "record", "record content", "spz", "stl",
     "weights", "weights content", "xyz",

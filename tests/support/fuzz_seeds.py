@@ -53,7 +53,7 @@ def seeds(folder):
     made["ptx"] = (".ptx", [PTX, PTX * 2])
     made["e57"] = (".e57", [_e57(folder / "a.e57", points)])
     made["spz"] = (".spz", [_spz(folder / "a.spz", points)])
-    made["glb quantised"] = (".glb", [quantised_glb(), quantised_glb(sparse=True)])
+    made["glb"][1].extend([quantised_glb(), quantised_glb(sparse=True)])
     packed = {"compression": "gzip", "chunks": (2, 20, 3)}
     made["hdf5"] = (".h5", [_hdf5(folder / "a.h5", options) for options in ({}, packed)])
     made["names"] = (".txt", [b"chair\ntable\nlamp\n"])

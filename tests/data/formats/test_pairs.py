@@ -1,5 +1,7 @@
 """Every pair of formats: what goes in comes out."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -16,7 +18,7 @@ NAMED = (".ply", ".pcd", ".npz", ".txt", ".xyz", ".las", ".laz")
 @pytest.fixture
 def table():
     random = np.random.default_rng(0)
-    columns = {
+    columns: dict[str, Any] = {
         "red": random.integers(0, 256, 50).astype(np.uint8),
         "part": random.integers(-9, 9, 50).astype(np.int32),
         "score": random.random(50).astype(np.float32),
