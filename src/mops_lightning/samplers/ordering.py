@@ -83,8 +83,10 @@ def _compiled_keys(points: Tensor, seed: int) -> NDArray[np.int64]:
         starts[1:] = (values[1:] != values[:-1]) | (rows[1:] // size != rows[:-1] // size)
         place = np.arange(len(rows))
         copy = (place - np.maximum.accumulate(np.where(starts, place, 0))).astype(np.uint64)
-        later = torch.from_numpy((values + copy * np.uint64(STEP)).view(np.int64))
-        keys[rows] = np.where(copy > 0, _scramble(later).numpy().view(np.uint64), values)
+        later = copy > 0
+        if later.any():
+            words = (values[later] + copy[later] * np.uint64(STEP)).view(np.int64)
+            keys[rows[later]] = _scramble(torch.from_numpy(words)).numpy().view(np.uint64)
     return keys.view(np.int64).reshape(clouds, size)
 
 
