@@ -11,7 +11,7 @@ import pytest
 from mops_lightning.zoo import model_file, names, weights
 
 ROOT = Path(__file__).parents[1]
-TREE = 25_000_000
+TREE = 40_000_000
 MODELS = 20_000_000
 PICTURE = 300_000
 PICTURES = {".png", ".svg", ".jpg", ".jpeg", ".gif", ".webp"}
@@ -31,7 +31,7 @@ def tracked() -> list[Path]:
     return [path for path in paths if path.is_file()]
 
 
-def test_tracked_files_stay_below_25_mb_and_pictures_below_300_kb(tracked):
+def test_tracked_files_stay_below_40_mb_and_pictures_below_300_kb(tracked):
     sizes = {path: path.stat().st_size for path in tracked}
     assert sum(sizes.values()) < TREE
     assert not [path for path in sizes if path.suffix in PICTURES and sizes[path] >= PICTURE]
