@@ -1,6 +1,6 @@
 """The remarks below a report's tables."""
 
-from mops_lightning.report.provenance import collapses
+from mops_lightning.report.provenance import collapses, provenance
 from tests.support.records import record
 
 
@@ -20,3 +20,8 @@ def test_collapses_name_each_kind_once_with_the_mean_over_seeds():
         "- mops: collapsed: only 2.5 of 16 matched points are distinct. "
         "Try sampler.overlap=10 or sampler.anchors=fps (docs/samplers.md)."
     ]
+
+
+def test_tags_of_a_run_are_shown_with_how_it_was_made():
+    (line,) = provenance([record(config={"tags": ["first", "wide"]})], "pointnet")
+    assert line.endswith(", tags first wide")

@@ -91,9 +91,11 @@ def _kind(record: RunRecord, net: str) -> str:
 def _way(record: RunRecord) -> str:
     threads = "thread" if record.threads == 1 else "threads"
     changes = " with changes" if record.git["dirty"] else ""
+    tags = record.config.get("tags")
+    tagged = f", tags {' '.join(tags)}" if tags else ""
     return (
         f"{_length(record)}, seed {collect.seed(record)}, {record.device}, "
-        f"{record.threads} {threads}, commit {commit(record)}{changes}"
+        f"{record.threads} {threads}, commit {commit(record)}{changes}{tagged}"
     )
 
 
