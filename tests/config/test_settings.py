@@ -15,8 +15,9 @@ from mops_lightning.config.settings import Affects, RunSettings, number, setting
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.report.build import build_report
+from mops_lightning.training.as_trained import as_trained
 from mops_lightning.training.checkpoint import checkpoint_identity
-from mops_lightning.training.evaluation import TrainedRun, as_trained, command_line
+from mops_lightning.training.evaluation import TrainedRun, command_line
 from mops_lightning.training.run.pretrain import cache_folder
 from tests.support.command_line import TINY, call
 from tests.support.reports import put_cell

@@ -12,7 +12,8 @@ from omegaconf import OmegaConf
 from mops_lightning.config.compose import compose
 from mops_lightning.config.overrides import readable
 from mops_lightning.errors import UserError
-from mops_lightning.training.evaluation import TrainedRun, as_trained, command_line
+from mops_lightning.training.as_trained import as_trained
+from mops_lightning.training.evaluation import TrainedRun, command_line
 from tests.support.command_line import TINY
 from tests.support.records import record
 

@@ -5,23 +5,14 @@ that names code is taken from it, and no path in place of a choice.
 """
 
 import re
-from copy import deepcopy
 from dataclasses import dataclass
-from inspect import Parameter
 from pathlib import Path
-from typing import Any
-
-from omegaconf import DictConfig, OmegaConf, open_dict
-from omegaconf.errors import OmegaConfBaseException
 
 from mops_lightning.config import overrides, settings
-from mops_lightning.config.build import signature
 from mops_lightning.config.compose import NAMED
-from mops_lightning.config.settings import Affects
-from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
-from mops_lightning.records.run_record import RunRecord, dotted
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.zoo import model_file, names
 
@@ -105,7 +96,7 @@ class TrainedRun:
         chosen = [f"{group}={used[name]}" for name, group in groups.items() if used.get(name)]
         for argument in self.record.overrides:
             key = overrides.key(argument)
-            if ("/" in key or "@" in key) and _is_repeated(overrides.path(argument)):
+            if ("/" in key or "@" in key) and is_repeated(overrides.path(argument)):
                 chosen.append(overrides.readable(argument))
         for argument in chosen:
             override = overrides.parse_override(argument)
@@ -121,13 +112,13 @@ class TrainedRun:
         )
 
 
-def _is_repeated(path: str) -> bool:
+def is_repeated(path: str) -> bool:
     """Return whether an evaluation repeats a setting of the run."""
     top = path.partition(".")[0]
     return top in settings.declared() and top != "names" and settings.of(path).repeated
 
 
-def _is_special(path: str) -> bool:
+def is_special(path: str) -> bool:
     """Return whether a setting is a special key such as ``_target_``, or is below one."""
     return any(part.startswith("_") for part in path.split("."))
 
@@ -157,7 +148,7 @@ def command_line(arguments: list[str]) -> list[str]:
     inserted = [
         argument
         for argument in of_evaluation
-        if not any(_covers(path, overrides.path(argument)) for path in paths)
+        if not any(covers(path, overrides.path(argument)) for path in paths)
     ]
     return [*rest, *inserted]
 
@@ -186,12 +177,12 @@ def _check_given(arguments: list[str], trained: TrainedRun) -> None:
     inert = OF_SAMPLER if "weights=auto" in arguments else OF_TRAINING
     for argument in arguments:
         path = overrides.path(argument)
-        if settings.of(path).learn == () or any(_covers(setting, path) for setting in inert):
+        if settings.of(path).learn == () or any(covers(setting, path) for setting in inert):
             raise UserError(
                 f"{argument}: has no effect with {KEY}, which trains nothing. Leave it out, or "
                 f"train with the settings of {trained.name} and without {KEY}."
             )
-        of_sampler = path in ("m", "sizes", "weights") or _covers("sampler", path)
+        of_sampler = path in ("m", "sizes", "weights") or covers("sampler", path)
         if trained.trained_task_net and of_sampler:
             raise UserError(
                 f"{argument}: has no effect with {KEY}={trained.name}, which trained a task net "
@@ -205,136 +196,6 @@ def _check_given(arguments: list[str], trained: TrainedRun) -> None:
             )
 
 
-def _covers(path: str, other: str) -> bool:
+def covers(path: str, other: str) -> bool:
     """Return whether a setting is another one or contains it."""
     return other == path or other.startswith(f"{path}.")
-
-
-def as_trained(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -> DictConfig:
-    """Return the checked configuration of an evaluation: the run's settings, then the user's.
-
-    Interpolations stay where they lead to the run's values, so that ``sampler.seed`` follows a
-    ``seed`` of the user.
-
-    Args:
-        cfg: composed from the run's groups.
-        trained: the run.
-        arguments: the overrides it was composed from.
-
-    Raises:
-        UserError: a value in the record or in ``cfg`` is wrong, or not accepted from a record.
-    """
-    chosen = trained.choices()
-    changed = [overrides.path(argument) for argument in arguments if argument not in chosen]
-    for path in map(overrides.path, trained.record.overrides):
-        if _is_special(path) and _is_repeated(path) and path not in changed:
-            raise trained.not_accepted(path)
-    try:
-        merged = _recorded(cfg, trained)
-        sampler = _plain(merged.sampler)
-        with open_dict(merged):
-            for path in changed:
-                _restore(merged, cfg, path)
-        check(merged)
-    except (UserError, OmegaConfBaseException) as error:
-        text = str(error).splitlines()[0]
-        if any(text.startswith(path) for path in changed):
-            raise
-        raise UserError(f"{KEY}: the record of {trained.name}: {text}") from None
-    if not trained.trained_task_net:
-        _check_sampler(sampler, _plain(merged.sampler), trained.name)
-    return merged
-
-
-def _check_sampler(old: dict[str, Any], new: dict[str, Any], name: str) -> None:
-    """Refuse settings of the sampler's training that differ from the run's.
-
-    Raises:
-        UserError: a setting differs.
-    """
-    for key in sorted({*old, *new}):
-        used, chosen = old.get(key), new.get(key)
-        if used != chosen and Affects.TRAINING in settings.of(f"sampler.{key}").affects:
-            hint = " For other sizes of a flexible sampler give sizes=[...]." if key == "m" else ""
-            raise UserError(
-                f"{KEY}: sampler.{key} must be {used}, as in {name}, got {chosen}. "
-                f"Leave it out, or train a sampler with it.{hint}"
-            )
-
-
-def _plain(node: DictConfig) -> Any:
-    return OmegaConf.to_container(node, resolve=True)
-
-
-def _recorded(cfg: DictConfig, trained: TrainedRun) -> DictConfig:
-    """Return a configuration with the run's values of all settings that an evaluation repeats.
-
-    A setting that no longer exists is left out, unless the run's user had given it.
-    """
-    recorded = _leaves(trained.record.config)
-    present = _leaves(OmegaConf.to_container(cfg, resolve=False))
-    overridden = {overrides.path(argument) for argument in trained.record.overrides}
-    follows = {path for path, value in present.items() if "${" in str(value)}
-    merged = deepcopy(cfg)
-    with open_dict(merged):
-        for name in set(merged.baselines or ()) - set(trained.record.config.get("baselines") or ()):
-            del merged.baselines[name]
-        for path, value in recorded.items():
-            if not all(map(NAME.fullmatch, path.split("."))) or _names_code(value):
-                raise trained.not_accepted(path)
-            node, name = _node_of(cfg, path)
-            exists = path in overridden or name in node or name in _parameters(node, path)
-            if exists and path not in follows:
-                OmegaConf.update(merged, path, value, merge=False)
-        for path in present.keys() - recorded.keys() - follows:
-            node, name = _node_of(merged, path)
-            parameter = _parameters(node, path).get(name)
-            if parameter is not None and parameter.default is not parameter.empty:
-                OmegaConf.update(merged, path, parameter.default, merge=False)
-        resolved = dotted(_plain(merged))
-        for path in follows & recorded.keys():
-            if resolved.get(path) != recorded[path]:
-                OmegaConf.update(merged, path, recorded[path], merge=False)
-    return merged
-
-
-def _leaves(config: Any) -> dict[str, Any]:
-    """Return the settings that an evaluation repeats, by dotted path, without classes."""
-    return {
-        path: value
-        for path, value in dotted(config).items()
-        if _is_repeated(path) and not _is_special(path)
-    }
-
-
-def _node_of(cfg: DictConfig, path: str) -> tuple[Any, str]:
-    """Return the node of a setting, empty if there is none, and the setting's name in it."""
-    where, _, name = path.rpartition(".")
-    node = OmegaConf.select(cfg, where)
-    return node if isinstance(node, DictConfig) else {}, name
-
-
-def _parameters(node: Any, path: str) -> dict[str, Parameter]:
-    """Return the arguments of the class that a setting's node describes, if any."""
-    return signature(str(node["_target_"]), path.rpartition(".")[0]) if "_target_" in node else {}
-
-
-def _restore(merged: DictConfig, cfg: DictConfig, path: str) -> None:
-    """Set a setting that the user gave to the user's value, or remove it as the user did."""
-    source, name = _node_of(cfg, path)
-    target, _ = _node_of(merged, path)
-    if source and not target:  # of a baseline that the run did not have
-        _restore(merged, cfg, path.rpartition(".")[0])
-    elif name in source:
-        OmegaConf.update(merged, path, source._get_node(name), merge=False)
-    elif name in target:
-        del target[name]
-
-
-def _names_code(value: Any) -> bool:
-    """Return whether a value holds a special key such as ``_target_``, or an interpolation."""
-    if isinstance(value, dict):
-        return any(str(key).startswith("_") or _names_code(item) for key, item in value.items())
-    if isinstance(value, list):
-        return any(map(_names_code, value))
-    return "${" in str(value)

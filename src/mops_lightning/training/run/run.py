@@ -17,8 +17,9 @@ from mops_lightning.errors import Interrupted, UserError, closed_outputs
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import closing_lines
+from mops_lightning.training.as_trained import as_trained
 from mops_lightning.training.checkpoint import Diverged
-from mops_lightning.training.evaluation import TrainedRun, as_trained
+from mops_lightning.training.evaluation import TrainedRun
 from mops_lightning.training.run import pretrain, stages
 from mops_lightning.training.run.build import Parts, build_parts
 from mops_lightning.training.run.ending import sigterm_as_ctrl_c

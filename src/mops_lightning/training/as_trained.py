@@ -1,0 +1,182 @@
+"""The settings of an evaluation: those of the trained run, then the user's."""
+
+from copy import deepcopy
+from inspect import Parameter
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+
+from mops_lightning.config import overrides, settings
+from mops_lightning.config.build import signature
+from mops_lightning.config.settings import Affects
+from mops_lightning.config.validate import check
+from mops_lightning.errors import UserError
+from mops_lightning.records.run_record import RunRecord, dotted
+from mops_lightning.training.evaluation import KEY, NAME, TrainedRun, is_repeated, is_special
+
+
+def as_trained(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -> DictConfig:
+    """Return the checked configuration of an evaluation: the run's settings, then the user's.
+
+    Interpolations stay where they lead to the run's values, so that ``sampler.seed`` follows a
+    ``seed`` of the user.
+
+    Args:
+        cfg: composed from the run's groups.
+        trained: the run.
+        arguments: the overrides it was composed from.
+
+    Raises:
+        UserError: a value in the record or in ``cfg`` is wrong, or not accepted from a record.
+    """
+    chosen = trained.choices()
+    changed = [overrides.path(argument) for argument in arguments if argument not in chosen]
+    for path in map(overrides.path, trained.record.overrides):
+        if is_special(path) and is_repeated(path) and path not in changed:
+            raise trained.not_accepted(path)
+    try:
+        merged = _recorded(cfg, trained)
+        sampler = _plain(merged.sampler)
+        with open_dict(merged):
+            for path in changed:
+                _restore(merged, cfg, path)
+        check(merged)
+    except (UserError, OmegaConfBaseException) as error:
+        text = str(error).splitlines()[0]
+        if any(text.startswith(path) for path in changed):
+            raise
+        raise UserError(f"{KEY}: the record of {trained.name}: {text}") from None
+    if not trained.trained_task_net:
+        _check_sampler(sampler, _plain(merged.sampler), trained.name)
+    return merged
+
+
+def _check_sampler(old: dict[str, Any], new: dict[str, Any], name: str) -> None:
+    """Refuse settings of the sampler's training that differ from the run's.
+
+    Raises:
+        UserError: a setting differs.
+    """
+    for key in sorted({*old, *new}):
+        used, chosen = old.get(key), new.get(key)
+        if used != chosen and Affects.TRAINING in settings.of(f"sampler.{key}").affects:
+            hint = " For other sizes of a flexible sampler give sizes=[...]." if key == "m" else ""
+            raise UserError(
+                f"{KEY}: sampler.{key} must be {used}, as in {name}, got {chosen}. "
+                f"Leave it out, or train a sampler with it.{hint}"
+            )
+
+
+def _plain(node: DictConfig) -> Any:
+    return OmegaConf.to_container(node, resolve=True)
+
+
+def _recorded(cfg: DictConfig, trained: TrainedRun) -> DictConfig:
+    """Return a configuration with the run's values of all settings that an evaluation repeats.
+
+    A setting that no longer exists is left out, unless the run's user had given it.
+    """
+    recorded = _leaves(trained.record.config)
+    present = _leaves(OmegaConf.to_container(cfg, resolve=False))
+    interpolated = {path for path, value in present.items() if "${" in str(value)}
+    fixed = {path: value for path, value in recorded.items() if path not in interpolated}
+    new = [path for path in present if path not in recorded and path not in interpolated]
+    merged = deepcopy(cfg)
+    with open_dict(merged):
+        _drop_new_baselines(merged, trained.record)
+        _check_trusted(recorded, trained)
+        _take_values(merged, cfg, fixed, trained.record)
+        _take_defaults(merged, new)
+        _take_other_results(merged, {path: recorded[path] for path in interpolated & {*recorded}})
+    return merged
+
+
+def _drop_new_baselines(merged: DictConfig, record: RunRecord) -> None:
+    """Remove the baselines that the run did not have."""
+    known = record.config.get("baselines") or {}
+    for name in list(merged.baselines or ()):
+        if name not in known:
+            del merged.baselines[name]
+
+
+def _check_trusted(recorded: dict[str, Any], trained: TrainedRun) -> None:
+    """Refuse recorded settings that name code.
+
+    Raises:
+        UserError: there is one.
+    """
+    for path, value in recorded.items():
+        has_plain_names = all(map(NAME.fullmatch, path.split(".")))
+        if not has_plain_names or _names_code(value):
+            raise trained.not_accepted(path)
+
+
+def _take_values(
+    merged: DictConfig, cfg: DictConfig, recorded: dict[str, Any], record: RunRecord
+) -> None:
+    """Set the recorded values of settings that exist, or that the run's user had given."""
+    given = {overrides.path(argument) for argument in record.overrides}
+    for path, value in recorded.items():
+        node, name = _node_of(cfg, path)
+        if path in given or name in node or name in _parameters(node, path):
+            OmegaConf.update(merged, path, value, merge=False)
+
+
+def _take_defaults(merged: DictConfig, new: list[str]) -> None:
+    """Set settings that the run's version did not have to the defaults of their classes."""
+    for path in new:
+        node, name = _node_of(merged, path)
+        parameter = _parameters(node, path).get(name)
+        if parameter is not None and parameter.default is not parameter.empty:
+            OmegaConf.update(merged, path, parameter.default, merge=False)
+
+
+def _take_other_results(merged: DictConfig, recorded: dict[str, Any]) -> None:
+    """Set the recorded values of interpolations that lead to other values now."""
+    resolved = dotted(_plain(merged))
+    for path, value in recorded.items():
+        if resolved.get(path) != value:
+            OmegaConf.update(merged, path, value, merge=False)
+
+
+def _leaves(config: Any) -> dict[str, Any]:
+    """Return the settings that an evaluation repeats, by dotted path, without classes."""
+    return {
+        path: value
+        for path, value in dotted(config).items()
+        if is_repeated(path) and not is_special(path)
+    }
+
+
+def _node_of(cfg: DictConfig, path: str) -> tuple[Any, str]:
+    """Return the node of a setting, empty if there is none, and the setting's name in it."""
+    where, _, name = path.rpartition(".")
+    node = OmegaConf.select(cfg, where)
+    return node if isinstance(node, DictConfig) else {}, name
+
+
+def _parameters(node: Any, path: str) -> dict[str, Parameter]:
+    """Return the arguments of the class that a setting's node describes, if any."""
+    return signature(str(node["_target_"]), path.rpartition(".")[0]) if "_target_" in node else {}
+
+
+def _restore(merged: DictConfig, cfg: DictConfig, path: str) -> None:
+    """Set a setting that the user gave to the user's value, or remove it as the user did."""
+    source, name = _node_of(cfg, path)
+    target, _ = _node_of(merged, path)
+    if source and not target:  # of a baseline that the run did not have
+        _restore(merged, cfg, path.rpartition(".")[0])
+    elif name in source:
+        OmegaConf.update(merged, path, source._get_node(name), merge=False)
+    elif name in target:
+        del target[name]
+
+
+def _names_code(value: Any) -> bool:
+    """Return whether a value holds a special key such as ``_target_``, or an interpolation."""
+    if isinstance(value, dict):
+        return any(str(key).startswith("_") or _names_code(item) for key, item in value.items())
+    if isinstance(value, list):
+        return any(map(_names_code, value))
+    return "${" in str(value)
