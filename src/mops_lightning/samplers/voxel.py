@@ -16,8 +16,8 @@ COARSEST, FINEST = -1.0, 20.0
 """Range of log₂(side of the cloud / side of a voxel): one voxel, and the precision of float32."""
 BISECTIONS = 24
 """Bisection steps; the relative error of the voxel size is about one in a million."""
-COARSE_BISECTIONS = 6
-"""Steps after which the points are sorted by voxels."""
+SORTING_STEPS = (5, 11)
+"""Bisection steps before which the points are sorted by voxels."""
 
 
 class VoxelSampler(Sampler):
@@ -121,7 +121,7 @@ def _scales(spans: NDArray[np.floating], m: int) -> NDArray[np.floating]:
     for step in range(BISECTIONS):
         middle = (coarse + fine) / 2
         scales = middle.exp2().numpy()
-        if step == COARSE_BISECTIONS:
+        if step in SORTING_STEPS:
             clouds = [_sorted(*pair) for pair in zip(clouds, scales, strict=True)]
         enough = torch.tensor(
             [voxel_search.reaches(*pair, m) for pair in zip(clouds, scales, strict=True)]
