@@ -11,6 +11,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
+import mops_lightning.config.compose  # noqa: F401  registers the resolvers
 from hydra_plugins.grid_sweeper import parsed
 from mops_lightning.config.groups import conf_dir
 from mops_lightning.config.validate import check

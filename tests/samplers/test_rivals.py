@@ -5,6 +5,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
+import mops_lightning.config.compose  # noqa: F401  registers the resolvers
 from mops_lightning.config.build import build
 from mops_lightning.config.groups import conf_dir
 
