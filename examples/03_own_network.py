@@ -1,6 +1,6 @@
 """Train a sampler for a network and a loss of your own, in a plain loop.
 
-    python examples/03_own_network.py 100
+    python examples/03_own_network.py 200
 
 The network tells boxes that are short in x from boxes that are short in y. A tenth of the points
 are outliers. Farthest points take outliers first; the sampler learns to leave them out.
@@ -22,8 +22,8 @@ def boxes(count):
     labels = torch.randint(2, (count,))
     sides = torch.ones(count, 1, 3)
     sides[torch.arange(count), 0, labels] = 0.6
-    points = (torch.rand(count, 256, 3) - 0.5) * sides
-    points[:, :25] *= 3  # the outliers
+    points = (torch.rand(count, 128, 3) - 0.5) * sides
+    points[:, :12] = 1.5 * (torch.rand(count, 12, 3) - 0.5)  # the outliers
     return points, labels
 
 
@@ -42,18 +42,18 @@ def train(module, lr, loss_of):
 
 def loss_of_sampler(step, points, labels):
     sampler.anneal(step / steps)  # lowers the temperature of S
-    sample = sampler(points)  # sample.points: (32, 8, 3)
+    sample = sampler(points)  # sample.points: (32, 16, 3)
     return cross_entropy(net(sample.points), labels) + sum(sample.losses.values())
 
 
 net = Net(nn.Linear(3, 64), nn.ReLU(), nn.Linear(64, 64), nn.ReLU(), nn.Linear(64, 2))
 train(net, 1e-2, lambda step, points, labels: cross_entropy(net(points), labels))
 net.eval().requires_grad_(False)
-sampler = MOPSNet(m=8)
+sampler = MOPSNet(m=16)
 train(sampler, 2e-3, loss_of_sampler)
 
 points, labels = boxes(200)
-for name, method in (("MOPS-Net", sampler.eval()), ("farthest points", FPSSampler(8))):
-    few, _ = method.downsample(points, 8)  # 8 different points of each cloud
+for name, method in (("MOPS-Net", sampler.eval()), ("farthest points", FPSSampler(16))):
+    few, _ = method.downsample(points, 16)  # 16 different points of each cloud
     share = (net(few).argmax(dim=1) == labels).float().mean()
-    print(f"{name}: {share:.1%} of the boxes right from 8 of 256 points")
+    print(f"{name}: {share:.1%} of the boxes right from 16 of 128 points")
