@@ -37,12 +37,10 @@ def test_tracked_files_stay_below_40_mb_and_pictures_below_300_kb(tracked):
     assert not [path for path in sizes if path.suffix in PICTURES and sizes[path] >= PICTURE]
 
 
-def test_results_have_at_most_150_files_and_short_pages(tracked):
+def test_results_have_at_most_150_files(tracked):
     files = [path for path in tracked if path.is_relative_to(ROOT / "results")]
+
     assert len(files) <= 150
-    pages = {path: len(path.read_text().splitlines()) for path in files if path.suffix == ".md"}
-    readmes = {path: lines for path, lines in pages.items() if path.name == "README.md"}
-    assert {path: lines for path, lines in readmes.items() if lines > 65} == {}
 
 
 def test_weights_are_models_of_the_package(tracked):
