@@ -11,11 +11,12 @@ import libraries
 import measure
 import torch
 from inside import inside
+from local import local
 from measure import ceiling, machine
 
 from mops_lightning.filesystem import atomic_write
 
-ALL = {"inside": inside, **cases.ALL}
+ALL = {"inside": inside, "local": local, **cases.ALL}
 COLUMNS = {
     "seconds": lambda value: f"{1000 * value:.3g} ms",
     "spread": lambda value: f"{1000 * value:.2g} ms",
