@@ -88,11 +88,22 @@ NOT_FLEXIBLE = (GumbelSampler, MOPSNet, SNet, SampleNet)
 FLEXIBLE_NOT_NESTED = (VoxelSampler, PoissonSampler, SerialSampler)
 
 
+def accepting_classes(cls):
+    """Return the classes whose arguments a constructor takes: up to the first without ``**``."""
+    classes = []
+    for base in cls.__mro__:
+        classes.append(base)
+        kinds = {argument.kind for argument in signature(base.__init__).parameters.values()}
+        if Parameter.VAR_KEYWORD not in kinds:
+            break
+    return classes
+
+
 @pytest.mark.parametrize("name", [path.stem for path in FILES])
 def test_constructor_has_the_defaults_of_its_file(name):
     node = compose([f"sampler={name}", "recipe=paper"]).sampler
     defaults: dict[str, Any] = {}
-    for cls in reversed(get_class(node._target_).__mro__):
+    for cls in reversed(accepting_classes(get_class(node._target_))):
         if issubclass(cls, Sampler):
             arguments = signature(cls.__init__).parameters.values()
             defaults |= {a.name: a.default for a in arguments if a.default is not Parameter.empty}
