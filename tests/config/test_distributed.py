@@ -47,8 +47,14 @@ def test_wrong_batch_size_fails_before_pretraining(tmp_path):
 
 
 REGISTRATION = [
-    *(*TINY, *SMALL_PCRNET, "logger=tensorboard", "learn=task", "trainer.max_epochs=2"),
-    *("batch_size=8", "val_fraction=0.2", "dataset.test_per_class=8"),
+    *TINY,
+    *SMALL_PCRNET,
+    "logger=tensorboard",
+    "learn=task",
+    "trainer.max_epochs=2",
+    "batch_size=8",
+    "val_fraction=0.2",
+    "dataset.test_per_class=8",
 ]
 
 

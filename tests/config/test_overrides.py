@@ -35,7 +35,10 @@ def test_value_is_read_as_typed(text):
 def test_own_class_chooses_the_group_of_own_and_takes_any_setting():
     given = ["sampler._target_=my.Sampler", "sampler.width=3", "m=8", "task.net.dropout=0"]
     assert overrides.with_own_classes(given) == [
-        *("++sampler._target_=my.Sampler", "++sampler.width=3", "m=8", "task.net.dropout=0"),
+        "++sampler._target_=my.Sampler",
+        "++sampler.width=3",
+        "m=8",
+        "task.net.dropout=0",
         "sampler=own",
     ]
     kept = ["sampler=mops", "sampler._target_=my.MOPSNet", "~sampler.overlap"]

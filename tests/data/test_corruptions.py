@@ -114,7 +114,8 @@ def test_scaling_and_shear_are_linear_maps(clouds):
 
 
 def test_distortion_moves_neighbours_alike(clouds):
-    cloud, other = clouds.points[0], corrupt(clouds, "distortion-1").points[0]
+    cloud = clouds.points[0]
+    other = corrupt(clouds, "distortion-1").points[0]
     near = torch.cdist(cloud, cloud).fill_diagonal_(9).argmin(1)
     shift = other - cloud
     assert (shift - shift[near]).norm(dim=1).mean() < 0.5 * shift.std(0).norm()

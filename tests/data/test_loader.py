@@ -79,14 +79,16 @@ def test_augmentation_equals_written_out_formulas():
     angles = torch.rand(300, generator=rng) * 2 * math.pi
     noise = 0.04 * torch.randn(points.shape, generator=rng)
     x, y, z = points.unbind(2)
-    cos, sin = angles.cos()[:, None], angles.sin()[:, None]
+    cos = angles.cos()[:, None]
+    sin = angles.sin()[:, None]
     turned = torch.stack([x * cos - z * sin, y, x * sin + z * cos], 2)
     torch.testing.assert_close(got, turned + noise.clamp(-0.2, 0.2))
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])
 def test_augmentation_turns_about_its_vertical_axis(up):
-    points, axis = clouds(20).points, "xyz".index(up)
+    points = clouds(20).points
+    axis = "xyz".index(up)
     turned = Augmentation(rotate_up=up)(points, torch.Generator().manual_seed(3))
     torch.testing.assert_close(turned[..., axis], points[..., axis])
     # As about y, after the axes were moved in a circle, which mirrors nothing.

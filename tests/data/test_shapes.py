@@ -80,9 +80,11 @@ def test_shapes_depend_on_seed():
 
 
 def test_shapes_are_independent_of_counts():
-    few, more = shapes(**SMALL), shapes(64, 5, 3, ["bowl", "cup", "stool", "vase"])
+    few = shapes(**SMALL)
+    more = shapes(64, 5, 3, ["bowl", "cup", "stool", "vase"])
     for split in ("train", "test"):
-        small, large = getattr(few, split), getattr(more, split)
+        small = getattr(few, split)
+        large = getattr(more, split)
         for name in few.class_names:
             expected = small.points[small.labels == few.class_names.index(name)]
             found = large.points[large.labels == more.class_names.index(name)]
@@ -135,7 +137,8 @@ def _extents(clouds):
 
 def test_shapes_bounding_boxes_do_not_identify_classes(dataset):
     labels = dataset.train.labels
-    train, test = _extents(dataset.train).double(), _extents(dataset.test).double()
+    train = _extents(dataset.train).double()
+    test = _extents(dataset.test).double()
     nearest = labels[cKDTree(train.numpy()).query(test.numpy())[1]]
     assert (nearest == dataset.test.labels).double().mean() < 0.55
 
@@ -156,7 +159,8 @@ def test_shapes_cache_is_written_and_read(tmp_path):
     assert same(shapes(**SMALL, cache=tmp_path / "new"), fresh)
     (path,) = (tmp_path / "new").iterdir()
     # Changed clouds in the file are returned, so it is read.
-    train, test = fresh.train, fresh.test
+    train = fresh.train
+    test = fresh.test
     parts: list[Any] = [train.parts, test.parts]
     np.savez(path, train.points / 2, test.points, *parts)
     again = shapes(**SMALL, cache=str(tmp_path / "new"))
@@ -199,8 +203,14 @@ def test_shapes_damaged_cache_or_one_of_other_shapes_is_replaced(tmp_path):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *(("n_points", 0), ("n_points", "many"), ("n_points", 10.5), ("train_per_class", 0)),
-        *(("test_per_class", -1), ("test_per_class", True), ("seed", -1), ("seed", None)),
+        ("n_points", 0),
+        ("n_points", "many"),
+        ("n_points", 10.5),
+        ("train_per_class", 0),
+        ("test_per_class", -1),
+        ("test_per_class", True),
+        ("seed", -1),
+        ("seed", None),
         ("classes", ["cupp"]),
     ],
 )

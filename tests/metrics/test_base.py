@@ -116,7 +116,8 @@ class TwiceTheError(TranslationError):
 
 def test_accuracy_over_batches_matches_hand_computed_value():
     labels, answers = torch.tensor([[0, 0, 0, 1, 2, 2], [0, 0, 1, 1, 2, 0]])
-    logits, metrics = F.one_hot(answers, 3).float(), (Accuracy(3), MeanClassAccuracy(3))
+    logits = F.one_hot(answers, 3).float()
+    metrics = (Accuracy(3), MeanClassAccuracy(3))
     for metric in metrics:
         metric.update(logits[:2], labels[:2])
         metric.update(logits[2:], labels[2:])

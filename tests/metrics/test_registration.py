@@ -29,7 +29,8 @@ def recall(limit):
 
 
 def test_rotation_error_matches_scipy():
-    a, b = Rotation.random(40, random_state=1), Rotation.random(40, random_state=2)
+    a = Rotation.random(40, random_state=1)
+    b = Rotation.random(40, random_state=2)
     want = np.degrees((a.inv() * b).magnitude())
     given = motions(a), motions(b)
     assert in_batches(registration.RotationError(), *given) == pytest.approx(want.mean(), abs=1e-4)

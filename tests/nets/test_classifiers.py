@@ -19,7 +19,8 @@ def test_dgcnn_neighbours_are_found_in_the_space_of_features(rng):
     """Every edge convolution has a graph of its own."""
     net: Any = DGCNN(5, k=4, edge_channels=(8, 8)).eval()
     points = torch.randn(2, 30, 3, generator=rng)
-    features, outputs = points, []
+    features = points
+    outputs = []
     for layer in net.edges:
         near = torch.cdist(features, features).topk(4, largest=False).indices
         others = features[torch.arange(2)[:, None, None], near]

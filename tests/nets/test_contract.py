@@ -58,8 +58,10 @@ def test_all_parameters_have_gradients(name, rng):
 
 @pytest.mark.parametrize("name", ALL)
 def test_mixed_precision_is_close_with_finite_gradients(name, rng):
-    net, points = ALL[name](50).eval(), torch.randn(8, 60, 3, generator=rng)
-    single, half = net(points), mixed(net, points)
+    net = ALL[name](50).eval()
+    points = torch.randn(8, 60, 3, generator=rng)
+    single = net(points)
+    half = mixed(net, points)
     assert half.dtype == torch.float32
     torch.testing.assert_close(half, single, rtol=0.05, atol=0.05)
     half.square().sum().backward()

@@ -32,7 +32,8 @@ def pools(channels_in=6, channels_out=20, norm=True):
 @pytest.mark.parametrize("points", [4, PLAIN_MAX_POINTS, PLAIN_MAX_POINTS + 1, 50, 100])
 def test_max_pool_equals_plain_layers(points, training, norm, rng):
     fast, plain = pools(norm=norm)
-    outputs, gradients = [], []
+    outputs = []
+    gradients = []
     features = torch.randn(3, points, 6, dtype=torch.float64, generator=rng)
     weight = torch.randn(3, 20, dtype=torch.float64, generator=rng)
     for net in (fast, plain):

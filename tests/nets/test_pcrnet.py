@@ -46,8 +46,10 @@ def homogeneous(motion):
 
 def test_pcrnet_pose_is_product_of_homogeneous_matrices(rng):
     source, target = torch.randn(2, 4, 60, 3, generator=rng)
-    one, three = net(), net(iterations=3)
-    total, moved = np.tile(np.eye(4), (4, 1, 1)), source
+    one = net()
+    three = net(iterations=3)
+    total = np.tile(np.eye(4), (4, 1, 1))
+    moved = source
     for _ in range(3):
         step = homogeneous(one(moved, target))
         assert np.abs(step - np.eye(4)).max() > 0.1

@@ -7,7 +7,8 @@ from typing import Any
 
 def captured(main, arguments, *more):
     """Exit status and what it printed."""
-    out, err = io.StringIO(), io.StringIO()
+    out = io.StringIO()
+    err = io.StringIO()
     status: Any = 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:

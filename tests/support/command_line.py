@@ -17,19 +17,29 @@ from mops_lightning.config.compose import compose
 from mops_lightning.training.run.run import run
 
 TINY_ANY_DATA = [
-    *("trainer=cpu", "trainer.max_epochs=1", "epochs.task=1", "dataset.n_points=64"),
-    *("batch_size=4", "m=8", "pictures=0", "logger=none"),
+    "trainer=cpu",
+    "trainer.max_epochs=1",
+    "epochs.task=1",
+    "dataset.n_points=64",
+    "batch_size=4",
+    "m=8",
+    "pictures=0",
+    "logger=none",
 ]
 """The settings of the smallest job that do not depend on the dataset."""
 
 TINY = [
-    *(*TINY_ANY_DATA, "dataset.train_per_class=4", "dataset.test_per_class=3"),
+    *TINY_ANY_DATA,
+    "dataset.train_per_class=4",
+    "dataset.test_per_class=3",
     "dataset.classes=[chair,vase,lamp]",
 ]
 """The smallest job that runs every stage, on procedural shapes."""
 
 SMALL_PCRNET = [
-    *("task=registration", "weights=auto", "pretrain_from=null"),
+    "task=registration",
+    "weights=auto",
+    "pretrain_from=null",
     "task.net.feature_channels=[16,32]",
 ]
 """Registration by a net that is written to disk in no time."""
@@ -41,7 +51,8 @@ def start(arguments, folder, **extra):
     """Begin in a new process."""
     env = {**os.environ, **variables(folder), **extra}
     env.pop("HYDRA_FULL_ERROR", None)
-    command, pipe = [sys.executable, "-m", "mops_lightning", *arguments], subprocess.PIPE
+    command = [sys.executable, "-m", "mops_lightning", *arguments]
+    pipe = subprocess.PIPE
     return subprocess.Popen(command, cwd=folder, env=env, stdout=pipe, stderr=pipe, text=True)
 
 
@@ -54,7 +65,8 @@ def call_anew(arguments, folder, **extra):
 
 def call(arguments, folder):
     """Run in this process: a new one spends most of its time on importing torch and lightning."""
-    out, err = io.StringIO(), io.StringIO()
+    out = io.StringIO()
+    err = io.StringIO()
     with (
         contextlib.chdir(folder),
         patch.dict(os.environ, {**variables(folder), "HYDRA_FULL_ERROR": ""}),

@@ -11,7 +11,8 @@ import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
-INFO, HIERARCHY = 1, 1000
+INFO = 1
+HIERARCHY = 1000
 """Numbers of COPC's records."""
 
 
@@ -30,12 +31,15 @@ def write_copc(
     half = float(np.ptp(points, axis=0).max()) / 2 + 1e-3
     centre = (points.min(0) + points.max(0)) / 2
     header = laspy.LasHeader(point_format=6, version="1.4")
-    header.offsets, header.scales = centre, [1e-3] * 3
+    header.offsets = centre
+    header.scales = [1e-3] * 3
     record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
     record.x, record.y, record.z = points.T
     record.intensity = np.arange(len(points)) % 2**16
-    header.point_count, header.are_points_compressed = len(points), True
-    header.mins, header.maxs = points.min(0), points.max(0)
+    header.point_count = len(points)
+    header.are_points_compressed = True
+    header.mins = points.min(0)
+    header.maxs = points.max(0)
     laz = lazrs.LazVlr.new_for_compression(6, 0, True)
 
     def write_header(page: int, size: int) -> None:
@@ -44,7 +48,8 @@ def write_copc(
         records = [laspy.VLR("copc", INFO, "", info)]
         records += [laspy.VLR("laszip encoded", 22204, "", laz.record_data())]
         header.vlrs = laspy.vlrs.vlrlist.VLRList(records)
-        header.number_of_evlrs, header.start_of_first_evlr = int(page > 0), max(page - 60, 0)
+        header.number_of_evlrs = int(page > 0)
+        header.start_of_first_evlr = max(page - 60, 0)
         stream.seek(0)
         header.write_to(stream)
 
@@ -61,7 +66,8 @@ def _write_cells(stream, laz, record, points, corner, side, depth, each):
     """Write the points of every cell, and return the entries of the octree's page."""
     compressor = lazrs.LasZipCompressor(stream, laz)
     compressor.reserve_offset_to_chunk_table()
-    left, entries = np.arange(len(points)), []
+    left = np.arange(len(points))
+    entries = []
     for level in range(depth + 1):
         keys = ((points[left] - corner) / side * 2**level).astype(int)
         taken = []

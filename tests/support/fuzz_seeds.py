@@ -201,7 +201,8 @@ def changed_glb(random, content):
     Other changes rarely get past its JSON.
     """
     start = 20 + int.from_bytes(content[12:16], "little")
-    scene, buffer = json.loads(content[20:start]), content[start + 8 :]
+    scene = json.loads(content[20:start])
+    buffer = content[start + 8 :]
     if random.random() < 0.5:
         scene = changed_content(random, scene)
     else:

@@ -20,7 +20,8 @@ def keep_choices() -> None:
     """Let Hydra read each file, and find and merge those of equal choices, once; never values."""
     hydra: Any = config_loader_impl
     loader = hydra.ConfigLoaderImpl
-    find, merge = hydra.create_defaults_list, loader._compose_config_from_defaults_list
+    find = hydra.create_defaults_list
+    merge = loader._compose_config_from_defaults_list
     Plugins.instance()  # imports the sources' modules anew
     source: Any = SourcesRegistry.instance().resolve("file")
     read = source.load_config

@@ -26,10 +26,12 @@ EXTRA = [
 def full_cloud(form: int, number: int = 300) -> laspy.LasData:
     """Make a cloud with random numbers in all dimensions and rows as ``point_source_id``."""
     header = laspy.LasHeader(point_format=form, version=VERSIONS.get(form, "1.4"))
-    header.scales, header.offsets = np.array([0.01, 0.01, 0.001]), np.array([5e5, 5.4e6, 0])
+    header.scales = np.array([0.01, 0.01, 0.001])
+    header.offsets = np.array([5e5, 5.4e6, 0])
     header.file_source_id = 77
     header.uuid = UUID(int=2**100 + 3)
-    header.system_identifier, header.creation_date = "MERGE", date(2019, 5, 4)
+    header.system_identifier = "MERGE"
+    header.creation_date = date(2019, 5, 4)
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.global_encoding.synthetic_return_numbers = True
     header.global_encoding.wkt = form >= 6

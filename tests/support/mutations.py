@@ -58,12 +58,14 @@ def delete(random, content, others):
 
 
 def repeat(random, content, others):
-    at, length = place(random, content), int(random.integers(1, 400))
+    at = place(random, content)
+    length = int(random.integers(1, 400))
     return content[:at] + content[at : at + length] * int(random.integers(2, 9)) + content[at:]
 
 
 def change_binary_number(random, content, others):
-    at, size = place(random, content), int(random.choice([1, 2, 4, 8]))
+    at = place(random, content)
+    size = int(random.choice([1, 2, 4, 8]))
     number = NUMBERS[random.integers(len(NUMBERS))] % (1 << 8 * size)
     content[at : at + size] = number.to_bytes(size, random.choice(["little", "big"]))
     return content

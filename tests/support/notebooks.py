@@ -73,7 +73,8 @@ def main(paths: list[str]) -> None:
             outputs = run(path)
         notebook = json.loads(path.read_text())
         for number, (cell, made) in enumerate(zip(code_cells(notebook), outputs, strict=True), 1):
-            cell["outputs"], cell["execution_count"] = made, number
+            cell["outputs"] = made
+            cell["execution_count"] = number
         path.write_text(json.dumps(notebook, indent=1, ensure_ascii=False) + "\n")
 
 

@@ -8,14 +8,17 @@ def squared(a, b):
 
 
 def plain_nearest(queries, points):
-    distances, indices = [], []
+    distances = []
+    indices = []
     for cloud_q, cloud_p in zip(queries, points, strict=True):
         for q in cloud_q:
-            best, place = torch.tensor(torch.inf), -1
+            best = torch.tensor(torch.inf)
+            place = -1
             for i, p in enumerate(cloud_p):
                 d = squared(q, p)
                 if d < best:
-                    best, place = d, i
+                    best = d
+                    place = i
             distances.append(best)
             indices.append(place)
     shape = queries.shape[:2]
@@ -23,15 +26,18 @@ def plain_nearest(queries, points):
 
 
 def plain_farthest(cloud, chosen, m, weight=None):
-    cloud, chosen = cloud.tolist(), list(chosen)
+    cloud = cloud.tolist()
+    chosen = list(chosen)
     weight = [1.0] * len(cloud) if weight is None else weight.tolist()
     while len(chosen) < m:
-        best, place = -1.0, -1
+        best = -1.0
+        place = -1
         for i, p in enumerate(cloud):
             if i in chosen:
                 continue
             d = min(squared(p, cloud[j]) for j in chosen) * weight[i] ** 2
             if d > best:
-                best, place = d, i
+                best = d
+                place = i
         chosen.append(place)
     return chosen

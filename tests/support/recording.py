@@ -61,7 +61,8 @@ class RecordingTask(Task):
     score = MeanFingerprint.name
 
     def step(self, batch: Batch, points: Tensor) -> TaskOutput:
-        clouds, labels = batch.points.detach().clone(), batch.labels.tolist()
+        clouds = batch.points.detach().clone()
+        labels = batch.labels.tolist()
         CALLS.append(Call(points.detach().clone(), clouds, labels, torch.is_grad_enabled()))
         prints = self.net(points)
         return TaskOutput({"task": prints.square().mean()}, prints, batch.labels)
@@ -81,7 +82,8 @@ def numbered_clouds(
         points = torch.randn(number, n_points, 3, generator=rng).mul(64).round() / 64
         return Clouds(points, torch.arange(first, first + number))
 
-    train, test = clouds(train_per_class, 0), clouds(test_per_class, FIRST_TEST_CLOUD)
+    train = clouds(train_per_class, 0)
+    test = clouds(test_per_class, FIRST_TEST_CLOUD)
     return CloudDataset(("numbered",), train, test, "numbered")
 
 

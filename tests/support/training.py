@@ -26,7 +26,8 @@ def small_dataset(train: int = 24, test: int = 10, points: int = 48) -> CloudDat
         drawn = torch.randn(number, points, 3, generator=rng) * scale[:, None]
         return Clouds(drawn, labels, parts=drawn[..., 0].gt(0).long())
 
-    names, parts = ("long", "tall", "round"), ("left", "right")
+    names = ("long", "tall", "round")
+    parts = ("left", "right")
     return CloudDataset(names, clouds(train), clouds(test), "blobs", part_names=parts)
 
 

@@ -23,7 +23,8 @@ from mops_lightning.types import Batch
 from tests.support.samplers import SAMPLERS
 from tests.support.training import changed, quiet_trainer, small_dataset, state
 
-POINTS, LARGEST = 72, 64
+POINTS = 72
+LARGEST = 64
 
 TASKS = {
     "classification": lambda: Classification(PointNetVanilla(3), 3),
@@ -86,7 +87,8 @@ def test_disagreement_is_zero_only_for_equal_predictions(task: str) -> None:
 def test_disagreement_is_divergence_of_reference_from_prediction():
     """Kullback-Leibler divergences are not symmetric."""
     task = Classification(PointNetVanilla(2), 2)
-    reference, found = torch.tensor([[0.9, 0.1]]), torch.tensor([[0.5, 0.5]])
+    reference = torch.tensor([[0.9, 0.1]])
+    found = torch.tensor([[0.5, 0.5]])
     expected = 0.9 * torch.tensor(0.9 / 0.5).log() + 0.1 * torch.tensor(0.1 / 0.5).log()
     apart = task.disagreement(found.log(), reference.log() + 3)  # logits, up to a constant
     torch.testing.assert_close(apart, expected[None])

@@ -12,7 +12,8 @@ def quaternions(seed, number=50):
 
 
 def test_quaternion_distance_is_minimum_over_signs():
-    a, b = quaternions(1), quaternions(2)
+    a = quaternions(1)
+    b = quaternions(2)
     plain = torch.minimum((a - b).norm(dim=1), (a + b).norm(dim=1)).mean()
     torch.testing.assert_close(quaternion_distance(a, b), plain)
     torch.testing.assert_close(quaternion_distance(-a, b), plain)

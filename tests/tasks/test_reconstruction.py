@@ -50,7 +50,8 @@ def values_of(module, result):
 
 @pytest.mark.parametrize("distances", [{"cd"}, {"cd", "emd"}])
 def test_normalized_errors_full_cloud_are_one(rng, distances):
-    module, given = task(exact_up_to=2048 if "emd" in distances else None).eval(), batch(rng)
+    module = task(exact_up_to=2048 if "emd" in distances else None).eval()
+    given = batch(rng)
     values = values_of(module, scored(module, given, given.points))
     assert len(module.step(given, given.points).losses) == len(distances)
     ratios = {name: value for name, value in values.items() if name.startswith("nre")}
@@ -84,7 +85,8 @@ def test_scores_are_exact_up_to_a_number_of_points(rng):
 
 
 def test_scores_of_several_samples_equal_each_alone(rng):
-    module, given = task().eval(), batch(rng)
+    module = task().eval()
+    given = batch(rng)
     samples = {m: FPSSampler(m)(given.points).points for m in (4, 9)}
     for m, result in module.scores(given, samples).items():
         alone = scored(module, given, samples[m])

@@ -18,7 +18,8 @@ class Kabsch(torch.nn.Module):
     """The exact answer where point i of the source is point i of the target."""
 
     def forward(self, source, target):
-        a, b = source.mean(1, keepdim=True), target.mean(1, keepdim=True)
+        a = source.mean(1, keepdim=True)
+        b = target.mean(1, keepdim=True)
         u, _, vh = torch.linalg.svd((source - a).mT @ (target - b))
         flip = torch.eye(3).repeat(len(u), 1, 1)
         flip[:, 2, 2] = torch.linalg.det(vh.mT @ u.mT).sign()

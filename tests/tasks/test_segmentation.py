@@ -33,7 +33,8 @@ class Halves(nn.Module):
 
 
 def test_interpolation_equals_plain_loops(rng):
-    values, points = torch.rand(2, 6, 4, generator=rng), torch.rand(2, 6, 3, generator=rng)
+    values = torch.rand(2, 6, 4, generator=rng)
+    points = torch.rand(2, 6, 3, generator=rng)
     queries = torch.rand(2, 9, 3, generator=rng)
     found = interpolate(values, points, queries)
     for cloud in range(2):
@@ -60,7 +61,8 @@ def test_all_points_are_scored_from_few(rng):
     assert 0.7 < right < 1
     losses = {n: task.step(batch, points[:, :n]).losses["cross_entropy"].item() for n in (25, 200)}
     assert losses[200] < losses[25]
-    same, copy = task.predict(batch, points), task.predict(batch, points.clone())
+    same = task.predict(batch, points)
+    copy = task.predict(batch, points.clone())
     torch.testing.assert_close(same, copy, atol=1e-2, rtol=1e-4)
     metrics = task.metrics()
     metrics.update(few.predictions, few.targets)
@@ -77,8 +79,10 @@ def test_all_points_are_scored_from_few(rng):
 
 
 def test_points_of_unknown_part_are_neither_learned_nor_scored(rng):
-    points, known = torch.randn(2, 99, 3, generator=rng), torch.rand(2, 99, generator=rng) > 0.3
-    task, parts = Segmentation(Halves(), 2), (points[..., 1] > 0).long()
+    points = torch.randn(2, 99, 3, generator=rng)
+    known = torch.rand(2, 99, generator=rng) > 0.3
+    task = Segmentation(Halves(), 2)
+    parts = (points[..., 1] > 0).long()
     batch = Batch(points, torch.zeros(2).long(), parts=parts.where(known, UNKNOWN))
     found = task.step(batch, points)
     loss = F.cross_entropy(task.predict(batch, points)[known], parts[known])

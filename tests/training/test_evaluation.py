@@ -161,8 +161,14 @@ def test_evaluation_record_chooses_no_folder_to_write_and_no_part_of_training(pa
 @pytest.mark.parametrize(
     "argument",
     [
-        *("task_lr_scale=3", "trainer.max_epochs=5", "optimizer=exponential", "++optimizer.lr=1"),
-        *("learn=sampler", "experiment=own_scans", "other_nets=null", "task.net.sampler.m=8"),
+        "task_lr_scale=3",
+        "trainer.max_epochs=5",
+        "optimizer=exponential",
+        "++optimizer.lr=1",
+        "learn=sampler",
+        "experiment=own_scans",
+        "other_nets=null",
+        "task.net.sampler.m=8",
     ],
 )
 def test_evaluation_setting_without_effect_raises(run, argument):

@@ -79,7 +79,8 @@ def test_save_figure_png_has_a_palette_near_the_colours(tmp_path):
 
 def test_save_clouds_large_thins_input_and_keeps_samples(tmp_path, rng):
     points = torch.rand(2, 20_000, 3, generator=rng)
-    path, samples = tmp_path / "clouds.npz", {"generated": points[:, :4096]}
+    path = tmp_path / "clouds.npz"
+    samples = {"generated": points[:, :4096]}
     figures.save_clouds(path, points, samples, ["a", "b"])
     titles, arrays = figures.load_clouds(path)
     assert titles == ["a", "b"]

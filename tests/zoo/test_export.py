@@ -57,7 +57,8 @@ def test_onnx_file_names_its_axes(tmp_path):
     export(FMOPSNet(12, **SMALL).eval(), tmp_path / "net.onnx", 5)
 
     session = onnxruntime.InferenceSession(tmp_path / "net.onnx")
-    (points,), (generated,) = session.get_inputs(), session.get_outputs()
+    (points,) = session.get_inputs()
+    (generated,) = session.get_outputs()
     assert (points.name, points.shape) == ("points", ["batch", "points", 3])
     assert (generated.name, generated.shape) == ("generated", ["batch", 5, 3])
 

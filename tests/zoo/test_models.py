@@ -51,7 +51,8 @@ def figures(name):
     data = dataset(cfg.names.task, card["record"]["class_names"])
     experiment = make_experiment(cfg, data, {}).eval()
     load_trained(trained, True, experiment, data)
-    task, sampler = experiment.task, experiment.sampler
+    task = experiment.task
+    sampler = experiment.sampler
     score = task.full_score or task.score if m is None else task.score
     metric = task.metrics()[score]
     for batch in CloudLoader(data.test, 16, make_batch=task.make_batch):

@@ -34,7 +34,13 @@ FAILED = ".failed"
 BY_RUN = ("n_points", "sampler.m", "sampler.m_max", "sampler.seed")
 """Settings of a task net that follow the run's, or that its stages have for themselves."""
 PACKAGES = (
-    *("mops-lightning", "torch", "lightning", "hydra-core", "torchmetrics", "trimesh", "numpy"),
+    "mops-lightning",
+    "torch",
+    "lightning",
+    "hydra-core",
+    "torchmetrics",
+    "trimesh",
+    "numpy",
 )
 """Packages whose versions are recorded."""
 

@@ -231,7 +231,8 @@ def _trained(record: RunRecord) -> tuple[str, ...] | None:
     """Return what the task nets of a table share; None for a net without weights."""
     if weightless(record):
         return None
-    task, learned = record.config["task"], trained_with(record)
+    task = record.config["task"]
+    learned = trained_with(record)
     settings = f"task.net={json.dumps(with_defaults(task.get('net')), sort_keys=True)}"
     return collect.names(record)["net"], settings, f"learn={learned}"
 

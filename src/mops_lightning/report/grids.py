@@ -181,7 +181,8 @@ def _plane(table: Table, row: str) -> Grid:
 def _spread(table: Table, row: str, readout: str) -> str:
     """Return the range of a plane's values as text."""
     means = table.of(row, readout)["mean"]
-    low, high = means.min(), means.max()
+    low = means.min()
+    high = means.max()
     ends = f"{readout} {table.metric.format(low)} to {table.metric.format(high)}"
     return f"{ends} (factor {high / low:.3g})" if low > 0 else ends
 

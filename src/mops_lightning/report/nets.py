@@ -35,7 +35,8 @@ def nets_grid(group: comparable.Group, metrics: Sequence[str] = ()) -> Grid:
         UserError: no record has a metric.
     """
     found = sorted(group.records, key=lambda record: record.started)
-    names, infos = collect.names(found[0]), _metrics(found, metrics)
+    names = collect.names(found[0])
+    infos = _metrics(found, metrics)
     shown = _settings(found)
     settings = pd.DataFrame(shown).drop(columns=[*BY_RUN], errors="ignore")
     keys = [key for key in sorted(settings) if settings[key].dropna().map(str).nunique() > 1]
@@ -143,7 +144,8 @@ def _metrics(found: list[RunRecord], requested: Sequence[str]) -> list[MetricInf
 
 
 def _paper(record: RunRecord) -> str:
-    names, points = collect.names(record), _points(record)
+    names = collect.names(record)
+    points = _points(record)
     values = None
     if names["task"] == "reconstruction":
         values = paper.net(names["net"], _arguments(record).get("pieces"), points)

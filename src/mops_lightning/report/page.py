@@ -36,7 +36,8 @@ def page(report: Report, folder: Path, plots: Sequence[Path]) -> str:
         plots: SVG files.
     """
     clouds, damaged = _clouds(report, folder)
-    name, remarks = folder.resolve().name, [*report.remarks, *damaged]
+    name = folder.resolve().name
+    remarks = [*report.remarks, *damaged]
     return render(name, report.grids, clouds, remarks, "How the runs were made", plots)
 
 

@@ -26,7 +26,8 @@ def plots(report: Report) -> dict[str, Figure]:
     """Return the figures of a report by file name without suffix."""
     figures: dict[str, Figure] = {}
     for table in report.tables:
-        name, group = table.metric.name, table.group
+        name = table.metric.name
+        group = table.group
         if group.column == "net" or not (group.planes or len(table.columns()) > 1):
             continue
         kind, draw = ("planes", heat_maps) if group.planes else ("curves", curves)

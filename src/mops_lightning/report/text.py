@@ -9,7 +9,8 @@ from mops_lightning.report.tables import Cell
 PAPER = "*the paper's*"
 """Label of a row with the paper's values for the sampler in the row above."""
 
-BEST, SECOND = 1, 2
+BEST = 1
+SECOND = 2
 """Ranks of the values that are set in bold and underlined."""
 
 

@@ -23,14 +23,27 @@ NAME = re.compile(r"[A-Za-z0-9_-]+")
 """A choice of a group, or a part of a setting's name."""
 
 OF_SAMPLER = (
-    *("learn", "experiment", "optimizer", "task_lr_scale", "recipe", "trainer.max_epochs"),
-    *("epochs.sampler", "augment.sampler", "other_nets"),
+    "learn",
+    "experiment",
+    "optimizer",
+    "task_lr_scale",
+    "recipe",
+    "trainer.max_epochs",
+    "epochs.sampler",
+    "augment.sampler",
+    "other_nets",
 )
 """Settings of the training of a sampler."""
 OF_TRAINING = (
     *OF_SAMPLER,
-    *("pretrain", "pretrain_from", "val_fraction", "augment", "epochs", "ckpt_path"),
-    *("trainer.gradient_clip_algorithm", "trainer.accumulate_grad_batches"),
+    "pretrain",
+    "pretrain_from",
+    "val_fraction",
+    "augment",
+    "epochs",
+    "ckpt_path",
+    "trainer.gradient_clip_algorithm",
+    "trainer.accumulate_grad_batches",
 )
 """Settings of any training."""
 

@@ -204,7 +204,8 @@ def upright(points: Tensor | np.ndarray) -> np.ndarray:
 
 def frame_cloud(axes: Axes3D, cloud: np.ndarray) -> None:
     """Fit the axes to a cloud with equal scales, and hide them."""
-    centre, reach = (cloud.max(0) + cloud.min(0)) / 2, np.ptp(cloud, axis=0).max() / 2 or 1.0
+    centre = (cloud.max(0) + cloud.min(0)) / 2
+    reach = np.ptp(cloud, axis=0).max() / 2 or 1.0
     for name, middle in zip("xyz", centre, strict=True):
         getattr(axes, f"set_{name}lim")(middle - reach, middle + reach)
     axes.set_box_aspect((1, 1, 1), zoom=1.3)

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from mops_lightning.viz import figures
 
-SOURCE_COLOUR, TARGET_COLOUR = (0.12, 0.47, 0.86), (0.84, 0.3, 0.05)
+SOURCE_COLOUR = (0.12, 0.47, 0.86)
+TARGET_COLOUR = (0.84, 0.3, 0.05)
 SAMPLE_SIZE = 14
 
 
@@ -99,7 +100,8 @@ def reconstruction_grid(
         results: by readout or sampler, one column each.
         titles: one per cloud.
     """
-    columns, rows = 1 + len(results), 2 * len(points)
+    columns = 1 + len(results)
+    rows = 2 * len(points)
     figure = figures.new_figure(2.4 * columns, 2.4 * rows, "tight")
 
     def cell(row: int, column: int, title: str, label: str) -> Axes3D:
@@ -108,7 +110,8 @@ def reconstruction_grid(
         return figures.cloud_axes(figure, rows, columns, row, column, shown, label)
 
     for number, cloud in enumerate(map(figures.thinned, figures.upright(points))):
-        above, under = 2 * number, 2 * number + 1
+        above = 2 * number
+        under = 2 * number + 1
         _draw_depth(cell(above, 0, "input", titles[number]), cloud, cloud)
         from_full = figures.thinned(figures.upright(full)[number])
         _draw_depth(cell(under, 0, "from all points", ""), from_full, cloud)
@@ -134,7 +137,8 @@ def part_grid(points: Tensor, parts: Mapping[str, Tensor], titles: Sequence[str]
     colour = colormaps["tab20"].with_extremes(under="lightgrey")  # for points of unknown part
     for row, cloud in enumerate(map(figures.thinned, figures.upright(points))):
         for column, (name, numbers) in enumerate(parts.items()):
-            title, label = name if row == 0 else "", titles[row] if column == 0 else ""
+            title = name if row == 0 else ""
+            label = titles[row] if column == 0 else ""
             axes = figures.cloud_axes(figure, len(points), len(parts), row, column, title, label)
             drawn = figures.thinned(numbers[row, :, None].cpu())[:, 0]
             colours: Any = {"c": drawn, "cmap": colour, "vmin": 0, "vmax": most}

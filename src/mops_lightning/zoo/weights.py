@@ -105,7 +105,8 @@ def of_run(run: Path, kind: str = "weights") -> Path:
     if kind == "weights" and not run.is_dir():
         return run
     if run.is_file():
-        files, run = model_file.read_card(run)["record"]["files"], run.parent
+        files = model_file.read_card(run)["record"]["files"]
+        run = run.parent
     else:
         has_record = (run / run_record.FILE).is_file()
         files = run_record.read(run).files if has_record else {}

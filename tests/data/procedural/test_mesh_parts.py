@@ -7,9 +7,14 @@ from mops_lightning.data.procedural import mesh_parts
 
 
 def test_cushion_has_size_and_volume():
-    a, b, c, r = 2.0, 1.0, 1.5, 0.3
+    a = 2.0
+    b = 1.0
+    c = 1.5
+    r = 0.3
     mesh = mesh_parts.cushion((0, a), (0, b), (0, c), r)
-    x, y, z = a - 2 * r, b - 2 * r, c - 2 * r
+    x = a - 2 * r
+    y = b - 2 * r
+    z = c - 2 * r
     exact = x * y * z + 2 * r * (x * y + y * z + z * x) + np.pi * r**2 * (x + y + z)
     exact += 4 / 3 * np.pi * r**3
     assert np.allclose(mesh.bounds, np.array([(0, 0, 0), (a, b, c)]))

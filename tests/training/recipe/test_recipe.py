@@ -68,9 +68,14 @@ def composed():
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *(("train_points", 0), ("task_points", 0), ("all_points_from", 1.5)),
-        *(("straight_through", -0.1), ("ema_span", float("nan")), ("distillation", -1.0)),
-        *(("distillation", float("inf")), ("feature_distillation", -1.0)),
+        ("train_points", 0),
+        ("task_points", 0),
+        ("all_points_from", 1.5),
+        ("straight_through", -0.1),
+        ("ema_span", float("nan")),
+        ("distillation", -1.0),
+        ("distillation", float("inf")),
+        ("feature_distillation", -1.0),
     ],
 )
 def test_recipe_value_out_of_range_raises(composed, name, value):
