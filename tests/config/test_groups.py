@@ -11,7 +11,8 @@ from mops_lightning.cli.main import COMMANDS
 from mops_lightning.config.compose import compose
 from mops_lightning.config.groups import conf_dir
 from mops_lightning.config.settings import declared
-from mops_lightning.records.run_record import dotted, read
+from mops_lightning.records.run_record import read
+from mops_lightning.tree import dotted
 from tests.support.command_line import TINY, TINY_ANY_DATA, call, done, runs
 
 composed = cache(lambda chosen: compose(chosen.split()))

@@ -15,7 +15,7 @@ import mops_lightning.config.compose  # noqa: F401  registers the resolvers
 from hydra_plugins.grid_sweeper import parsed
 from mops_lightning.config.groups import conf_dir
 from mops_lightning.config.validate import check
-from mops_lightning.records.run_record import dotted
+from mops_lightning.tree import dotted
 
 ROOT = Path(__file__).parents[2] / "sweeps"
 SWEEPS = sorted(path.stem for path in ROOT.glob("*.yaml"))

@@ -13,7 +13,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from mops_lightning.config.compose import compose
-from mops_lightning.records.run_record import dotted
+from mops_lightning.tree import dotted
 from tests.support.command_line import TINY, call
 
 hypothesis = pytest.importorskip("hypothesis", reason="hypothesis is in the extra test")

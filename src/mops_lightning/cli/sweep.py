@@ -20,6 +20,7 @@ from mops_lightning.errors import Interrupted, UserError, as_line, one_line
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import ASIDE, FAILED, RunRecord
+from mops_lightning.tree import dotted
 
 MOVING = "moving"
 """Folder of an attempt that is being moved."""
@@ -120,8 +121,8 @@ def _earlier(cfg: DictConfig, folder: Path) -> tuple[str, float] | None:
 
 def _differences(cfg: DictConfig, record: RunRecord) -> dict[str, tuple[Any, Any]]:
     """Return the dotted settings that differ but must not: the present and the earlier value."""
-    mine = run_record.dotted(OmegaConf.to_container(cfg, resolve=True))
-    theirs = run_record.dotted(record.config)
+    mine = dotted(OmegaConf.to_container(cfg, resolve=True))
+    theirs = dotted(record.config)
     return {
         key: (mine.get(key), theirs.get(key))
         for key in {**mine, **theirs}

@@ -25,7 +25,7 @@ from mops_lightning.config.overrides import key as key_of
 from mops_lightning.config.overrides import with_own_classes
 from mops_lightning.config.validate import AUGMENTATION, refusal
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.records.run_record import dotted
+from mops_lightning.tree import dotted
 
 NAMED = {name: name for name in ("task", "dataset", "sampler", "recipe")}
 NAMED |= {"net": "task/net", "stages": "sampler@task.net.sampler"}

@@ -9,7 +9,7 @@ from mops_lightning.config import settings
 from mops_lightning.config.build import signature
 from mops_lightning.config.settings import Affects
 from mops_lightning.errors import UserError
-from mops_lightning.records.run_record import dotted
+from mops_lightning.tree import dotted
 
 OWN = "mops_lightning."
 """Package of the classes whose defaults are known; a record's other classes are not imported."""

@@ -14,7 +14,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from mops_lightning.config import settings
 from mops_lightning.config.build import build, signature
 from mops_lightning.errors import UserError, did_you_mean
-from mops_lightning.records.run_record import dotted
+from mops_lightning.tree import dotted
 
 OPTIMIZERS = ("optimizer", "pretrain")
 """Nodes whose ``schedule`` is not an argument of the optimizer."""

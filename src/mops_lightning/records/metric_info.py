@@ -7,6 +7,9 @@ from typing import Any
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.run_record import RunRecord
 
+PACKAGE = "mops_lightning."
+"""Where the metrics are whose classes a report knows."""
+
 
 def foreign_metrics(metrics: Iterable[tuple[str, object]]) -> dict[str, dict[str, Any]]:
     """Return label, unit and direction of the metrics that this package does not know.
@@ -17,9 +20,12 @@ def foreign_metrics(metrics: Iterable[tuple[str, object]]) -> dict[str, dict[str
     Returns:
         Name of the metric → what its class declares, as plain data for a record.
     """
-    infos = {name: MetricInfo.of(name, metric) for name, metric in metrics}
-    known = _package_metrics()
-    return {name: info.as_dict() for name, info in infos.items() if known.get(name) != info}
+    described = {}
+    for name, metric in metrics:
+        is_own = type(metric).__module__.startswith(PACKAGE) and getattr(metric, "name", "") == name
+        if not is_own:
+            described[name] = MetricInfo.of(name, metric).as_dict()
+    return described
 
 
 def metric_info(name: str, records: Iterable[RunRecord] = ()) -> MetricInfo:

@@ -31,8 +31,6 @@ MAX_DEPTH = 50
 """Deepest nesting of a record that is read."""
 FAILED = ".failed"
 """File in a cell's folder that says why its last start failed, with or without a record."""
-BY_RUN = ("n_points", "sampler.m", "sampler.m_max", "sampler.seed")
-"""Settings of a task net that follow the run's, or that its stages have for themselves."""
 PACKAGES = (
     "mops-lightning",
     "torch",
@@ -306,16 +304,6 @@ def _check_extent(plain: Any, deepest: int) -> None:
     if isinstance(plain, dict | list):
         for item in plain.values() if isinstance(plain, dict) else plain:
             _check_extent(item, deepest - 1)
-
-
-def dotted(tree: Any, prefix: str = "") -> dict[str, Any]:
-    """Return the leaves of nested settings under dotted keys; lists are leaves."""
-    if not isinstance(tree, dict):
-        return {prefix: tree}
-    leaves: dict[str, Any] = {}
-    for key, below in tree.items():
-        leaves |= dotted(below, f"{prefix}.{key}" if prefix else str(key))
-    return leaves
 
 
 def _finite(plain: dict[str, Any]) -> dict[str, Any]:

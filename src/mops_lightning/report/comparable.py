@@ -8,10 +8,11 @@ from typing import Any
 import pandas as pd
 
 from mops_lightning.config.shared_settings import table_settings, with_defaults
-from mops_lightning.records.run_record import RunRecord, dotted
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import OF_TEST_CLOUDS
 from mops_lightning.report import collect
 from mops_lightning.report.collect import epochs, recorded_recipe, sampler_row, seed, trained_with
+from mops_lightning.tree import dotted
 
 
 @dataclass(frozen=True)

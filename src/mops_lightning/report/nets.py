@@ -8,13 +8,15 @@ from pandas.api.types import is_numeric_dtype
 
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics.info import MetricInfo
+from mops_lightning.nets.by_run import BY_RUN
 from mops_lightning.records.metric_info import in_summary_order, metric_info
 from mops_lightning.records.readout_names import FULL
-from mops_lightning.records.run_record import BY_RUN, RunRecord, dotted
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report import collect, comparable, paper
 from mops_lightning.report.collect import score, seed, training_time
 from mops_lightning.report.tables import DIRTY, dirty_line, over_seeds
 from mops_lightning.report.text import PAPER, Grid
+from mops_lightning.tree import dotted
 
 NAMES = {"points": "points after stages"}
 """Settings of a net whose names have another meaning in the table."""

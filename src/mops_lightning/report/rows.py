@@ -12,9 +12,10 @@ from mops_lightning.records.readout_names import (
     PROJECTED,
     parse_metric_name,
 )
-from mops_lightning.records.run_record import RunRecord, dotted
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import baseline_name
 from mops_lightning.report import collect
+from mops_lightning.tree import dotted
 
 READOUTS = (INDEX_READOUT, *GENERATED_READOUTS, PROJECTED)
 """Readouts of a cell, in its order."""

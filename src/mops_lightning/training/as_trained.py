@@ -12,8 +12,9 @@ from mops_lightning.config.build import signature
 from mops_lightning.config.settings import Affects
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
-from mops_lightning.records.run_record import RunRecord, dotted
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.evaluation import KEY, NAME, TrainedRun, is_repeated, is_special
+from mops_lightning.tree import dotted
 
 
 def as_trained(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -> DictConfig:

@@ -1,7 +1,6 @@
 import ctypes
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -53,17 +52,3 @@ def test_keep_freed_memory_sets_options_of_linux(monkeypatch, platform, options)
     monkeypatch.setattr(sys, "platform", platform)
     module.keep_freed_memory()
     assert len(called) == options
-
-
-def test_clouds_to_draw_spreads_over_classes_that_have_test_clouds():
-    dataset = small_dataset()
-    chosen, names = module.clouds_to_draw(dataset, 2)
-    assert names == ["long", "round"]
-    assert dataset.test.labels[chosen].tolist() == [0, 2]
-    assert chosen.tolist() == [0, 2]  # the first of each class
-    assert module.clouds_to_draw(dataset, 9)[1] == ["long", "tall", "round"]
-    assert module.clouds_to_draw(dataset, 1)[1] == ["long"]
-    assert module.clouds_to_draw(dataset, 0)[1] == []
-    test = dataset.test.take(dataset.test.labels != 0)
-    chosen, names = module.clouds_to_draw(replace(dataset, test=test), 3)
-    assert (names, test.labels[chosen].tolist()) == (["tall", "round"], [1, 2])

@@ -12,8 +12,9 @@ from torch import Tensor
 from torch.utils.tensorboard.summary import hparams
 
 from mops_lightning.records.readout_names import FULL, GENERATED_READOUTS, INDEX_READOUT, PROJECTED
-from mops_lightning.records.run_record import RunRecord, dotted
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import shown_names
+from mops_lightning.tree import dotted
 from mops_lightning.viz.figures import COLOURS, INPUT_COLOUR, thinned
 
 ORDER = (*GENERATED_READOUTS, PROJECTED, INDEX_READOUT, FULL)

@@ -6,6 +6,7 @@ from mops_lightning.config.build import accepted, build_as
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.tasks.base import Task
+from mops_lightning.zoo.outputs import check_names
 
 
 def other_tasks(cfg: DictConfig, dataset: CloudDataset) -> list[Task]:
@@ -34,33 +35,3 @@ def other_tasks(cfg: DictConfig, dataset: CloudDataset) -> list[Task]:
         except UserError as error:
             raise UserError(f"other_nets: {error}") from None
     return tasks
-
-
-def check_names(names: list[str] | None, task: Task, dataset: CloudDataset, what: str) -> None:
-    """Reject a net whose outputs are other classes or parts than the data's.
-
-    Args:
-        names: the classes or parts that the net was trained on; None if unknown.
-        task: of the net.
-        dataset: the data.
-        what: the file or folder of the net.
-
-    Raises:
-        UserError: they differ, or are unknown.
-    """
-    if task.output_names is None:
-        return
-    own = list(getattr(dataset, task.output_names))
-    kind = "classes" if task.output_names == "class_names" else "parts"
-    if names is None:
-        raise UserError(
-            f"{what} does not name the {kind} of its net, so it can be used with its own data only."
-        )
-    if list(names) != own:
-        missing = [name for name in names if name not in own] or list(names)
-        raise UserError(
-            f"{what}: its net has {len(names)} {kind}, which are not the {len(own)} {kind} "
-            f"of the data: {', '.join(missing[:3])} ... instead of {', '.join(own[:3])} .... "
-            f"Give a task net of these {kind} with weights=auto, or data of its {kind} with "
-            "dataset.classes or dataset.label."
-        )

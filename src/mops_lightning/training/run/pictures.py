@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor
 
+from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.tasks.base import Task, figures_of
@@ -138,3 +139,18 @@ def cloud_titles(task: Task, titles: Sequence[str]) -> list[str]:
     if task.clouds_per_prediction == 1:
         return list(titles)
     return [f"{title}_{side}" for side in ("source", "target") for title in titles]
+
+
+def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str]]:
+    """Choose test clouds of different classes, spread over all classes.
+
+    Returns:
+        Rows of the test split, at most ``number``, and the names of their classes.
+    """
+    labels = dataset.test.labels
+    classes = len(dataset.class_names)
+    wanted = torch.linspace(0, classes - 1, min(max(number, 1), classes)).round().long()
+    rows = [int((labels == label).nonzero()[0]) for label in wanted.unique() if label in labels]
+    rows = rows[:number]
+    names = [dataset.class_names[int(labels[row])] for row in rows]
+    return torch.tensor(rows, dtype=torch.int64), names

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +17,17 @@ from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.checkpoint import CHECKPOINT, checkpoint_identity
 from mops_lightning.training.evaluation import OF_RUN
-from mops_lightning.training.run.build import Parts
+from mops_lightning.training.run.build import Parts, build_parts
 from mops_lightning.training.run.callbacks import STANDARD
+from mops_lightning.training.run.whole import recorded, train_and_test
 from mops_lightning.zoo import weights
 from mops_lightning.zoo.weights import FILE
-
-Train = Callable[[DictConfig, Path, CloudDataset], None]
-"""All stages of a run in a folder."""
 
 SHORTENED = "task_net"
 """Folder below the run's for a task net from a shortened training."""
 
 
-def task_weights(
-    cfg: DictConfig, dataset: CloudDataset, run_folder: Path, train: Train
-) -> Path | None:
+def task_weights(cfg: DictConfig, dataset: CloudDataset, run_folder: Path) -> Path | None:
     """Return the file that ``weights`` names; ``auto`` trains the net when it is not cached.
 
     With ``learn=task``, training starts from the given file; with ``auto`` from
@@ -42,7 +37,6 @@ def task_weights(
         cfg: the run's settings.
         dataset: to train on.
         run_folder: where a shortened training leaves its net, which is not cached.
-        train: trains a task net.
 
     Returns:
         None for ``weights=null`` (the net stays as initialised), for a resumed run (its checkpoint
@@ -66,15 +60,15 @@ def task_weights(
         )
     if shortening(_plain(cfg)):
         folder = run_folder / SHORTENED
-        _train(cfg, folder, dataset, train)
+        _train(cfg, folder, dataset)
     else:
         with _lock(folder, cfg.names.net):
             if not (folder / FILE).is_file():  # otherwise another process trained it meanwhile
-                _train(cfg, folder, dataset, train)
+                _train(cfg, folder, dataset)
     return folder / FILE
 
 
-def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset, train: Train) -> None:
+def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
     """Train the task net of a run in a folder, or resume its interrupted training there."""
     epochs = cfg.epochs.task
     print(
@@ -86,7 +80,9 @@ def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset, train: Train) -
     if (folder / "checkpoints" / CHECKPOINT).is_file():
         own.ckpt_path = str(folder)
     try:
-        train(own, folder, dataset)
+        with recorded(own, folder, []) as record:
+            start = task_weights(own, dataset, folder)
+            train_and_test(build_parts(own, folder, dataset, record), record, start)
     except (KeyboardInterrupt, Interrupted):
         raise Interrupted("The same command resumes the task net's training.") from None
 

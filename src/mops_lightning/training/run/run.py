@@ -1,29 +1,24 @@
 """One run: load the data, pretrain the task net if needed, fit, test, save."""
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from mops_lightning.config import distributed
 from mops_lightning.config.build import build_as
 from mops_lightning.config.validate import check
 from mops_lightning.data.clouds import CloudDataset, noisy, scale_warning
-from mops_lightning.errors import Interrupted, UserError, closed_outputs
-from mops_lightning.records import run_record
+from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import closing_lines
 from mops_lightning.training.as_trained import as_trained
-from mops_lightning.training.checkpoint import Diverged
 from mops_lightning.training.evaluation import TrainedRun
-from mops_lightning.training.run import pretrain, stages
-from mops_lightning.training.run.build import Parts, build_parts
+from mops_lightning.training.run import pretrain
+from mops_lightning.training.run.build import build_parts
 from mops_lightning.training.run.ending import sigterm_as_ctrl_c
-from mops_lightning.training.run.trainer import finish_loggers
+from mops_lightning.training.run.whole import recorded, train_and_test
 
 STARTED = ".started"
 """Empty file in the folder of a run that has begun."""
@@ -59,48 +54,12 @@ def run(
         task_weights = None
         if parts.has_task_weights:
             with record.timed("pretrain"):
-                task_weights = pretrain.task_weights(cfg, dataset, folder, _train_task_net)
+                task_weights = pretrain.task_weights(cfg, dataset, folder)
         train_and_test(parts, record, task_weights)
         pretrain.add_to_cache(parts, record)
     if leads:
         closing_lines(folder, record)
     return record
-
-
-def _train_task_net(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
-    """Train a task net by the same stages, with its own record."""
-    with recorded(cfg, folder, []) as record:
-        start = pretrain.task_weights(cfg, dataset, folder, _train_task_net)
-        train_and_test(build_parts(cfg, folder, dataset, record), record, start)
-
-
-def train_and_test(parts: Parts, record: RunRecord, task_weights: Path | None) -> None:
-    """Load weights, train the learned parts, test and save them.
-
-    Args:
-        parts: of the run.
-        record: is filled.
-        task_weights: a file for the task net; None leaves it as initialised.
-    """
-    stages.load_weights(parts, record, task_weights)
-    try:
-        if parts.trains:
-            stages.warm_start(parts, record)
-            with record.timed("fit"):
-                stages.fit(parts, record)
-        with record.timed("test"):
-            stages.test(parts, record)
-        if parts.trainer.is_global_zero:
-            stages.save(parts, record)
-    except Diverged as error:
-        last = parts.last_checkpoint
-        kept = f" The last finite checkpoint is {last}." if last else ""
-        raise UserError(
-            f"{error} No weights were saved.{kept} Try a lower learning rate (optimizer.lr) or "
-            "other weights of the losses."
-        ) from None
-    finally:
-        finish_loggers(parts.trainer)
 
 
 def checked(cfg: DictConfig, overrides: list[str]) -> DictConfig:
@@ -113,42 +72,6 @@ def checked(cfg: DictConfig, overrides: list[str]) -> DictConfig:
         return as_trained(cfg, TrainedRun.read(cfg.evaluate), overrides)
     check(cfg)
     return cfg
-
-
-@contextmanager
-def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[RunRecord]:
-    """Write ``result.json`` when the block begins and when it ends, however it ends.
-
-    Only the first process of a run writes.
-
-    Args:
-        cfg: a composed configuration.
-        folder: the run's folder.
-        overrides: what the user changed.
-
-    Yields:
-        The record, for the block to fill.
-    """
-    config: Any = OmegaConf.to_container(cfg, resolve=True)
-    record = RunRecord.begin(config, overrides, cfg.seed)
-    writes = not distributed.is_worker_rank(cfg)
-    if writes:
-        run_record.write(folder, record)
-    try:
-        with record.timed("total"):
-            yield record
-        record.status = "completed"
-    except (KeyboardInterrupt, Interrupted) as stop:
-        record.status, record.error = "interrupted", str(stop) or "interrupted"
-        raise
-    except BaseException as error:
-        stopped = isinstance(error, BrokenPipeError) and closed_outputs()
-        record.status = "interrupted" if stopped else "failed"
-        record.error = f"{type(error).__name__}: {error}"
-        raise
-    finally:
-        if writes:
-            run_record.write(folder, record)
 
 
 def claim(folder: Path) -> None:

@@ -14,10 +14,11 @@ from torch import nn
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import Interrupted, UserError
+from mops_lightning.nets.by_run import BY_RUN
 from mops_lightning.records.collapse import collapsed
 from mops_lightning.records.metric_info import foreign_metrics
 from mops_lightning.records.readout_names import parse_metric_name
-from mops_lightning.records.run_record import BY_RUN, Evaluated, RunRecord, dotted
+from mops_lightning.records.run_record import Evaluated, RunRecord
 from mops_lightning.training.checkpoint import Diverged, check_finite
 from mops_lightning.training.evaluation import KEY, OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
@@ -26,7 +27,6 @@ from mops_lightning.training.recipe.warm_start import warm_start_sampler
 from mops_lightning.training.run.build import Parts, augmentation
 from mops_lightning.training.run.callbacks import CPUTime
 from mops_lightning.training.run.ending import KeepsEnding
-from mops_lightning.training.run.other_nets import check_names
 from mops_lightning.training.run.partial import (
     note_evaluated,
     note_task_net,
@@ -34,8 +34,10 @@ from mops_lightning.training.run.partial import (
     note_training,
 )
 from mops_lightning.training.run.trainer import PROFILE, log_test, show_profile
+from mops_lightning.tree import dotted
 from mops_lightning.viz.figures import CLOUDS
 from mops_lightning.zoo import weights
+from mops_lightning.zoo.outputs import check_names
 
 Kind = TypeVar("Kind")
 OUTPUTS = {

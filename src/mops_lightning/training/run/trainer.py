@@ -16,14 +16,13 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.profilers import AdvancedProfiler, SimpleProfiler
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
 
 from mops_lightning.config.build import accepted, build, build_as
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
-from mops_lightning.records.run_record import RunRecord, dotted
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.checkpoint import CHECKPOINT, sealed
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.moving_average import MovingAverage
@@ -34,6 +33,7 @@ from mops_lightning.training.run.ending import (
     StopBetweenSteps,
     StopWithCheckpoint,
 )
+from mops_lightning.tree import dotted
 
 HARMLESS = (
     ".*does not have many workers.*",  # the data are in memory; workers would only copy them
@@ -143,8 +143,10 @@ def _callbacks(
     score = _score(cfg, experiment)
     path = folder / "checkpoints" / CHECKPOINT
     offered = {"folder": folder, "checkpoint": path, "score": score}
-    rows, titles = clouds_to_draw(dataset, cfg.pictures)
-    if titles:
+    if cfg.pictures:
+        from mops_lightning.training.run.pictures import clouds_to_draw  # imports matplotlib
+
+        rows, titles = clouds_to_draw(dataset, cfg.pictures)
         batch = CloudLoader(dataset.test, cfg.batch_size, make_batch=task.make_batch).batch_of(rows)
         offered |= {"batch": batch, "titles": titles}
     chosen = build_callbacks(cfg.callbacks, offered, logged=logged)
@@ -191,21 +193,6 @@ def show_profile(folder: Path, stage: str) -> None:
     path = folder / f"{stage}-{PROFILE}.txt"
     if path.is_file():
         print(path.read_text().strip())
-
-
-def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str]]:
-    """Choose test clouds of different classes, spread over all classes.
-
-    Returns:
-        Rows of the test split, at most ``number``, and the names of their classes.
-    """
-    labels = dataset.test.labels
-    classes = len(dataset.class_names)
-    wanted = torch.linspace(0, classes - 1, min(max(number, 1), classes)).round().long()
-    rows = [int((labels == label).nonzero()[0]) for label in wanted.unique() if label in labels]
-    rows = rows[:number]
-    names = [dataset.class_names[int(labels[row])] for row in rows]
-    return torch.tensor(rows, dtype=torch.int64), names
 
 
 def _score(cfg: DictConfig, experiment: Experiment) -> str:
