@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 # .gitignore too: hatchling leaves out of the wheel what git ignores.
-SOURCES = ("pyproject.toml", "README.md", "LICENSE", ".gitignore", "src", "conf")
+SOURCES = ("pyproject.toml", "README.md", "LICENSE", ".gitignore", "src", "conf", "sweeps")
 TINY_JOB = "learn=task dataset=shapes dataset.train_per_class=4 dataset.test_per_class=2"
 TINY_SIZES = "dataset.n_points=64 batch_size=16 m=8 trainer=cpu trainer.max_epochs=1"
 
@@ -71,10 +71,13 @@ def test_wheel_contains_package_configs_console_script_and_licence_only(wheel: P
     assert scripts[scripts.index("[console_scripts]") + 1] == script
     names = {name for name in names if not name.startswith(f"{info}/")}
     configs = files_below(ROOT / "conf", "mops_lightning/conf")
+    sweeps = files_below(ROOT / "sweeps", "mops_lightning/sweeps")
     assert "mops_lightning/conf/config.yaml" in configs
     assert {"mops_lightning/report/paper.json", "mops_lightning/py.typed"} <= names
+    assert "mops_lightning/sweeps/modelnet40.yaml" in sweeps
     packages = ("mops_lightning", "hydra_plugins")
-    assert names == configs.union(*(files_below(ROOT / "src" / name, name) for name in packages))
+    sources = set().union(*(files_below(ROOT / "src" / name, name) for name in packages))
+    assert names == sources | configs | sweeps
 
 
 def test_run_of_installed_copy_leaves_a_record(installed: Path, tmp_path: Path) -> None:
