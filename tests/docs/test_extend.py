@@ -1,5 +1,6 @@
 """The examples of docs/extend.md, run as written."""
 
+import ast
 import re
 import sys
 from pathlib import Path
@@ -9,12 +10,23 @@ import torch
 
 from mops_lightning import load
 from mops_lightning.records import run_record
-from tests.docs.test_own_network import SCRIPTS
 from tests.support.command_line import TINY, call, runs
 
-PAGE = (Path(__file__).parents[2] / "docs" / "extend.md").read_text()
-MODULES = dict(re.findall(r"```python\n# (\w+\.py)\n(.*?)```", PAGE, flags=re.S))
-EXAMPLES = {**MODULES, **SCRIPTS}
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "extend.md").read_text()
+EXAMPLES = dict(re.findall(r"```python\n# (\w+\.py)\n(.*?)```", PAGE, flags=re.S))
+
+
+def class_and_imports(path):
+    """Return what a reader copies from an example: its class and its imports."""
+    module = ast.parse(path.read_text())
+    copied = (ast.Import, ast.ImportFrom, ast.ClassDef)
+    module.body = [node for node in module.body if isinstance(node, copied)]
+    return ast.unparse(module)
+
+
+MY_SAMPLER = class_and_imports(ROOT / "examples" / "04_own_sampler.py")
+MODULES = {"my_sampler.py": MY_SAMPLER, **EXAMPLES}
 COMMANDS = re.findall(r"```sh\npython -m mops_lightning (.*?)\n```", PAGE)
 
 

@@ -1,4 +1,4 @@
-"""Examples of docs/api.md, run as written."""
+"""Examples of docs/python.md, run as written."""
 
 import re
 from pathlib import Path
@@ -14,7 +14,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 def example(title):
     """Return the first Python block below a title."""
-    page = (DOCS / "api.md").read_text()
+    page = (DOCS / "python.md").read_text()
     text = re.search(rf"#+ {title}\n.*?```python\n(.*?)```", page, flags=re.S)
     assert text is not None
     return text[1]
