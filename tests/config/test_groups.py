@@ -197,6 +197,15 @@ def test_run_label_names_net_or_sampler(learn, label):
     assert cfg.logger.name2 == label
 
 
+def test_labels_name_own_samplers_by_their_class():
+    own = "sampler._target_=mops_lightning.samplers.fps.FPSSampler"
+    labels = ["+logger.one=${run_label:}", "+logger.two=${sampler_label:}"]
+
+    cfg = compose([own, "m=8", *labels])
+
+    assert (cfg.logger.one, cfg.logger.two) == ("FPSSampler-m8", "FPSSampler")
+
+
 @pytest.mark.parametrize("files", [2, 4])
 def test_own_scans_needs_a_folder_and_gives_a_sampler_for_tiles(files, tmp_path):
     """Of two files, none is held out for early stopping."""

@@ -61,7 +61,7 @@ def test_sweep_cells_are_valid_and_named_by_swept_settings(name):
     raw: Any = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)
     for swept in (one for grid in grids(cfg) for one in grid if one.is_sweep_override()):
         key = swept.get_key_element()
-        known_as = "names.sampler" if key == "sampler" else key
+        known_as = "sampler_label" if key == "sampler" else key
         names_all = "run_label" in raw["subdir"] or "override_dirname" in raw["subdir"]
         assert names_all or known_as in raw["subdir"]
     assert "${" not in f"{cfg.hydra.sweep.dir}/{cfg.hydra.sweep.subdir}"

@@ -25,6 +25,29 @@ def test_exponential_spans_first_to_last_rate_and_step_decay_stops_at_floor():
     assert seen == pytest.approx([1, 1, 0.5, 0.5, 0.25, 0.25, 0.2, 0.2, 0.2, 0.2])
 
 
+def test_step_decay_floor_is_a_rate_and_no_share_of_the_first_one():
+    seen = rates(step_decay, 6, lr=0.5, every=2, factor=0.5, floor_lr=0.2)
+
+    assert seen == pytest.approx([0.5, 0.5, 0.25, 0.25, 0.2, 0.2])
+
+
+def test_exponential_ends_at_the_rate_of_the_first_group_and_stays_there():
+    """In joint training, the second group is the task net's, with a rate of its own."""
+    sampler, task = (torch.nn.Parameter(torch.zeros(1)) for _ in range(2))
+    groups = [{"params": [sampler], "lr": 1e-2}, {"params": [task], "lr": 1e-3}]
+    optimizer = torch.optim.SGD(groups)
+    schedule = exponential(optimizer, 5, end_lr=1e-4)
+    seen = []
+
+    for _ in range(7):
+        seen.append([group["lr"] for group in optimizer.param_groups])
+        optimizer.step()
+        schedule.step()
+
+    assert seen[0] == pytest.approx([1e-2, 1e-3])
+    assert seen[4:] == [pytest.approx([1e-4, 1e-5])] * 3
+
+
 def test_one_cycle_equals_torch():
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
     form: dict[str, Any] = {"pct_start": 0.3, "cycle_momentum": False, "final_div_factor": 400}

@@ -47,6 +47,15 @@ def test_half_precision_is_for_wide_layers(run, tmp_path):
     assert load(path).rho_local.weight.dtype == torch.float32  # type: ignore[union-attr]
 
 
+def test_shortened_run_is_no_model(run, tmp_path):
+    record = run_record.read(run)
+    record.partial.append("tested on 1 of 4 batches")
+    run_record.write(run, record)
+
+    with pytest.raises(UserError, match=r"run: tested on 1 of 4 batches\. A model is made"):
+        publish.add(run, "fmops.mine", tmp_path)
+
+
 @pytest.mark.parametrize("name", ["mine", "Fmops.mine", "../a.b", "a.pt", "a..b", "a.b/c", ""])
 def test_other_names_are_refused(run, tmp_path, name):
     with pytest.raises(UserError, match="NAME must be words"):

@@ -30,6 +30,8 @@ from mops_lightning.tree import dotted
 NAMED = {name: name for name in ("task", "dataset", "sampler", "recipe")}
 NAMED |= {"net": "task/net", "stages": "sampler@task.net.sampler"}
 """The groups whose choices are in ``names``, by name."""
+OWN = "own"
+"""The choice of a group for a class of the user's own."""
 AUGMENTED = ("augment.task", "augment.sampler")
 """Settings of the class ``AUGMENTATION``, which may be null."""
 
@@ -174,16 +176,25 @@ def run_label(_root_: DictConfig) -> str:
     if _root_.learn == "task":
         return str(names.net)
     if _root_.evaluate:  # the size is in the run's record
-        return f"{names.sampler}-evaluated"
+        return f"{sampler_label(_root_)}-evaluated"
     size = _root_.sampler.get("m_max", _root_.m)
     anchored = "-anchored" if _root_.sampler.get("anchors") else ""
-    return f"{names.sampler}{anchored}-m{size}{'-joint' if _root_.learn == 'joint' else ''}"
+    joint = "-joint" if _root_.learn == "joint" else ""
+    return f"{sampler_label(_root_)}{anchored}-m{size}{joint}"
+
+
+def sampler_label(_root_: DictConfig) -> str:
+    """Return the name of the sampler: its choice, or the class of a sampler of the user's own."""
+    name = str(_root_.names.sampler)
+    if name != OWN:
+        return name
+    return str(_root_.sampler.get("_target_")).rpartition(".")[2]
 
 
 def tested_label(_root_: DictConfig) -> str:
     """Return the label of a test's folder: the run or model that it tests, else the sampler."""
     if not _root_.evaluate:
-        return str(_root_.names.sampler)
+        return sampler_label(_root_)
     parts = [part for part in Path(_root_.evaluate).parts if part not in ("/", ".", "..", "~")]
     return "-".join(parts[-2:])  # of a cell of a sweep: the sweep and the cell
 
@@ -223,5 +234,15 @@ def selectable_groups() -> str:
     return "\n".join(sorted(lines))
 
 
-for resolver in (group_choices, run_label, tested_label, run_level_keys, selectable_groups, min):
+RESOLVERS = (
+    group_choices,
+    run_label,
+    sampler_label,
+    tested_label,
+    run_level_keys,
+    selectable_groups,
+    min,
+)
+
+for resolver in RESOLVERS:
     OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)

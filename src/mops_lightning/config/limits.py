@@ -51,7 +51,9 @@ _ELSEWHERE = {
 """Arguments of Lightning's trainer that are groups of settings, and how to set these."""
 
 TRAINER = {
-    "max_epochs": whole(0),
+    "max_epochs": Limits(
+        "-1 or a whole number of at least 0", lambda x: x == -1 or whole(0).fits(x)
+    ),
     # Lightning uses these only when training begins, after pretraining.
     "max_steps": Limits(
         "-1 or a whole number of at least 1", lambda x: x == -1 or whole(1).fits(x)

@@ -3,6 +3,9 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+UNLIMITED = -1
+"""Value of ``max_epochs`` and ``max_steps`` for no limit."""
+
 
 def _is_set(value: Any) -> bool:
     return bool(value)
@@ -15,7 +18,7 @@ def _is_part(value: Any) -> bool:
 
 
 def _is_limit(value: Any) -> bool:
-    return value not in (None, -1)
+    return value not in (None, UNLIMITED)
 
 
 SHORTENS: dict[str, Callable[[Any], bool]] = {
@@ -28,6 +31,23 @@ SHORTENS: dict[str, Callable[[Any], bool]] = {
 """Arguments of the trainer, each with whether a value of it shortens the training."""
 
 
+def has_step_limit(trainer: Mapping[str, Any]) -> bool:
+    """Return whether ``max_steps`` or ``fast_dev_run`` ends the training."""
+    return _is_limit(trainer.get("max_steps")) or bool(trainer.get("fast_dev_run"))
+
+
+def planned_steps(trainer: Mapping[str, Any], of_epoch: int) -> int:
+    """Return the optimizer steps of a whole training: of its epochs, or ``max_steps`` without.
+
+    Args:
+        trainer: settings of Lightning's trainer.
+        of_epoch: steps of an epoch.
+    """
+    if trainer["max_epochs"] == UNLIMITED:
+        return int(trainer.get("max_steps") or 0)
+    return of_epoch * int(trainer["max_epochs"])
+
+
 def shortening(config: Mapping[str, Any]) -> list[str]:
     """Return the settings that shorten the training of a run, such as ``trainer.max_steps=3``.
 
@@ -35,8 +55,9 @@ def shortening(config: Mapping[str, Any]) -> list[str]:
         config: the run's settings as plain data, such as a record's or a weights file's.
     """
     trainer = config.get("trainer") or {}
+    is_length = trainer.get("max_epochs") == UNLIMITED
     return [
         f"trainer.{name}={trainer[name]}"
         for name, shortens in SHORTENS.items()
-        if name in trainer and shortens(trainer[name])
+        if name in trainer and shortens(trainer[name]) and not (name == "max_steps" and is_length)
     ]

@@ -13,6 +13,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from mops_lightning.config import settings
 from mops_lightning.config.build import build, signature
+from mops_lightning.config.shortened import UNLIMITED, has_step_limit
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.tree import dotted
 
@@ -76,15 +77,33 @@ def check(cfg: DictConfig) -> None:
         if setting.counts(plain["learn"]):
             _check_node(plain.get(name), name)
     _check_limits(plain)
-    if cfg.learn != "nothing" and cfg.trainer.max_epochs < 1:
+    if cfg.learn != "nothing":
+        _check_length(plain["trainer"])
+
+
+def _check_length(trainer: dict[str, Any]) -> None:
+    """Refuse a training without an end that is known before it begins.
+
+    Learning rate, temperature and recipe follow the share of the steps that are done.
+    """
+    epochs = trainer["max_epochs"]
+    if epochs == UNLIMITED:
+        if not has_step_limit(trainer):
+            raise UserError(
+                "trainer.max_epochs=-1 needs trainer.max_steps: the learning rate and the "
+                "temperature depend on the length of the training. Add +trainer.max_steps=NUMBER; "
+                "trainer.max_time may end the training earlier."
+            )
+        return
+    if epochs < 1:
         raise UserError(
-            "trainer.max_epochs must be a whole number of at least 1, got "
-            f"{cfg.trainer.max_epochs}."
+            "trainer.max_epochs must be a whole number of at least 1, or -1 with "
+            f"trainer.max_steps, got {epochs}."
         )
-    if (fewest := cfg.trainer.get("min_epochs") or 0) > cfg.trainer.max_epochs:
+    fewest = trainer.get("min_epochs") or 0
+    if fewest > epochs:
         raise UserError(
-            f"trainer.min_epochs must be at most trainer.max_epochs={cfg.trainer.max_epochs}, got "
-            f"{fewest}."
+            f"trainer.min_epochs must be at most trainer.max_epochs={epochs}, got {fewest}."
         )
 
 

@@ -12,6 +12,7 @@ import torch
 from lightning.pytorch.strategies import Strategy
 
 from mops_lightning.config.shared_settings import training_settings
+from mops_lightning.config.shortened import UNLIMITED
 from mops_lightning.errors import UserError
 from mops_lightning.zoo import model_file, weights
 
@@ -134,7 +135,7 @@ def find_checkpoint(name: str, out: Path, identity: dict[str, str]) -> Checkpoin
     """
     checkpoint = _newest(out, identity) if name == "last" else _named(name, identity)
     epochs = int(json.loads(identity[LENGTH]))
-    if epochs < checkpoint.done:
+    if epochs != UNLIMITED and epochs < checkpoint.done:
         raise UserError(
             f"trainer.max_epochs must be at least {checkpoint.done}, the epochs of "
             f"{checkpoint.path}, got {epochs}."

@@ -60,6 +60,11 @@ def add(
     record = run_record.read(run)
     if record.status != "completed" or "weights" not in record.files:
         raise UserError(f"{run}: not a completed run that kept its weights. Give another RUN.")
+    if record.partial:
+        raise UserError(
+            f"{run}: {' and '.join(record.partial)}. A model is made from a whole run. Repeat "
+            "it without what shortened it."
+        )
     content = weights.read(weights.of_run(run))
     state = content["state"]
     wide = {name for name, value in state.items() if value.ndim == 2 and value.numel() >= WIDE}

@@ -106,6 +106,18 @@ def test_limits_of_zero_train_and_test_nothing(tmp_path, capsys):
     assert "but trained on 0 of 2 batches of an epoch" in capsys.readouterr().out
 
 
+def test_barebones_trains_and_is_marked_as_a_run_without_scores(tmp_path):
+    plain = job(tmp_path / "plain", "weights=null")
+
+    record = job(tmp_path / "bare", "weights=null", "+trainer.barebones=true")
+
+    assert record.partial == ["tested on all clouds without scores (trainer.barebones)"]
+    assert (record.score, record.metrics) == (None, {})
+    trained, same = (weights.read(tmp_path / run / weights.FILE) for run in ("plain", "bare"))
+    assert trained["sha256"] == same["sha256"]
+    assert plain.partial == []
+
+
 def test_switches_of_display_and_checks_work_and_change_no_result(tmp_path):
     switches = [
         "+trainer.enable_progress_bar=false",
@@ -196,10 +208,42 @@ def test_shortened_sampler_is_no_warm_start_and_no_figure_of_a_report(tmp_path):
     assert "trained for 1 of 2 steps" in found.undone[str(tmp_path / "short")]
 
 
+def test_number_of_steps_in_place_of_epochs_is_a_whole_training(tmp_path, capsys):
+    endless = ["trainer.max_epochs=-1", "+trainer.max_steps=5"]
+
+    record = job(tmp_path / "run", *endless)
+
+    assert record.partial == []
+    assert "epoch 3  train/mean_loss" in capsys.readouterr().out  # two steps each
+    assert list((tmp_path / "cache").rglob(weights.FILE))  # of a whole training of the task net
+    again = job(tmp_path / "again", *endless, f"ckpt_path={tmp_path}/run")
+    assert again.metrics == record.metrics
+
+
+def test_limit_before_early_stopping_is_marked_and_early_stopping_is_not(tmp_path):
+    stops = [
+        "+callbacks.stop._target_=lightning.pytorch.callbacks.EarlyStopping",
+        "+callbacks.stop.monitor=train/mean_loss",
+        "+callbacks.stop.patience=1",
+        "weights=null",
+        "trainer.max_epochs=6",
+    ]
+    at_once = "+callbacks.stop.stopping_threshold=1e9"
+
+    limited = job(tmp_path / "limited", *stops, "+trainer.max_steps=1")
+    stopped = job(tmp_path / "stopped", *stops, at_once)
+
+    assert limited.partial == ["trained for 1 of 12 steps"]
+    assert stopped.partial == []
+    assert stopped.seconds["fit"] > 0
+
+
 @pytest.mark.parametrize(
     ("trainer", "reasons"),
     [
         ({"limit_train_batches": 1.0, "max_steps": -1, "fast_dev_run": False}, []),
+        ({"max_epochs": -1, "max_steps": 9}, []),
+        ({"max_epochs": 4, "max_steps": 9}, ["trainer.max_steps=9"]),
         ({"limit_train_batches": 1}, ["trainer.limit_train_batches=1"]),
         ({"limit_train_batches": 0.5}, ["trainer.limit_train_batches=0.5"]),
         ({"fast_dev_run": 2, "max_time": "00:00:00:01"}, 2),

@@ -28,6 +28,7 @@ from torch import Tensor, nn
 from mops_lightning.config import distributed
 from mops_lightning.config.build import accepted, build, build_as
 from mops_lightning.config.settings import RECIPE_OF_TASK_NETS
+from mops_lightning.config.shortened import UNLIMITED
 from mops_lightning.data.clouds import CloudDataset, Clouds, check_parts
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
@@ -151,7 +152,8 @@ def build_parts(
 
 def _lengthens(resumed: checkpoint.Checkpoint, epochs: int) -> bool:
     """Return whether more epochs are trained than were planned; not after early stopping."""
-    return epochs > resumed.planned and not resumed.ending.should_stop
+    is_longer = epochs > resumed.planned and UNLIMITED not in (epochs, resumed.planned)
+    return is_longer and not resumed.ending.should_stop
 
 
 def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, str]) -> Experiment:

@@ -10,6 +10,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint, RichProgressB
 from omegaconf import DictConfig
 
 from mops_lightning.config.build import accepted, build_as
+from mops_lightning.config.shortened import UNLIMITED
 from mops_lightning.errors import UserError
 
 STANDARD = ("learning_rate", "checkpoint", "progress", "pictures")
@@ -75,7 +76,9 @@ class EpochLines(Callback):
             is_score = name.startswith("val/") and name.endswith(f"/{self.score}")
             if name == "train/mean_loss" or (is_score and validated):
                 shown.append(f"{name} {float(value):.4f}")
-        epoch = f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
+        epoch = f"epoch {trainer.current_epoch + 1}"
+        if trainer.max_epochs != UNLIMITED:
+            epoch += f"/{trainer.max_epochs}"
         print("  ".join([epoch, *shown]), flush=True)
 
 

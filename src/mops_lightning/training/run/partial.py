@@ -5,8 +5,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import lightning as L
+from lightning.pytorch.callbacks.early_stopping import EarlyStoppingReason
 
-from mops_lightning.config.shortened import shortening
+from mops_lightning.config.shortened import planned_steps, shortening
 from mops_lightning.records.run_record import RunRecord
 
 OF_TEST = "tested on"
@@ -32,14 +33,23 @@ def note_training(trainer: L.Trainer, batches: int, record: RunRecord) -> None:
     if seen < batches:
         record.partial.append(f"trained on {seen} of {batches} batches of an epoch")
     of_epoch = math.ceil(seen / trainer.accumulate_grad_batches)
-    planned = of_epoch * settings["max_epochs"]
+    planned = planned_steps(settings, of_epoch)
     steps = trainer.global_step
-    if steps < planned and trainer.early_stopping_callback is None:
+    if steps < planned and not _has_stopped_early(trainer):
         record.partial.append(f"trained for {steps} of {planned} steps")
 
 
+def _has_stopped_early(trainer: L.Trainer) -> bool:
+    """Return whether early stopping ended the training, not a limit before it."""
+    reasons = [callback.stopping_reason for callback in trainer.early_stopping_callbacks]
+    return any(reason is not EarlyStoppingReason.NOT_STOPPED for reason in reasons)
+
+
 def note_test(trainer: L.Trainer, batches: int, record: RunRecord) -> None:
-    """Note a test of part of the ``batches``."""
+    """Note a test of part of the ``batches``, or without scores."""
+    if trainer.barebones:  # Lightning logs nothing, and scores are what is logged
+        record.partial.append(f"{OF_TEST} all clouds without scores (trainer.barebones)")
+        return
     tested = sum(trainer.num_test_batches)  # empty with a limit of 0
     if tested < batches:
         record.partial.append(f"{OF_TEST} {tested} of {batches} batches")

@@ -10,7 +10,7 @@ from filelock import AcquireReturnProxy, FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mops_lightning.config import distributed
-from mops_lightning.config.shortened import SHORTENS, shortening
+from mops_lightning.config.shortened import SHORTENS, UNLIMITED, shortening
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.filesystem import atomic_write, remove_temporary
@@ -96,6 +96,8 @@ def task_config(cfg: DictConfig) -> DictConfig:
     own = cfg.copy()
     with open_dict(own):
         if cfg.learn != "task":
+            if cfg.trainer.max_epochs == UNLIMITED:
+                own.trainer.pop("max_steps", None)  # the length of the sampler's training
             own.trainer.max_epochs = cfg.epochs.task
             own.optimizer = cfg.pretrain
             own.weights = "auto"

@@ -14,7 +14,7 @@ import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
 from lightning.pytorch.loggers import Logger
-from lightning.pytorch.profilers import AdvancedProfiler, SimpleProfiler
+from lightning.pytorch.profilers import AdvancedProfiler, PyTorchProfiler, SimpleProfiler
 from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config.build import accepted, build, build_as
@@ -48,7 +48,7 @@ HARMLESS = (
 )
 """Warnings about intended behaviour."""
 
-PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler}
+PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
 """Profilers with a report as text, by Lightning's names."""
 PROFILE = "profile"
 """Name of a profiler's report, behind its stage."""
@@ -108,12 +108,13 @@ def make_trainer(
     if cfg.get("logger") and not barebones:
         logger = _logger(cfg.logger, folder, _score(cfg, experiment))
     callbacks = _callbacks(cfg, folder, dataset, experiment, logged=bool(logger))
+    # An epoch of a small data set may be shorter than the logging interval.
+    log_every = max(1, min(LOG_EVERY, clouds // cfg.batch_size))
     defaults = {
         "default_root_dir": str(folder),
         "num_sanity_val_steps": 0,
         "enable_model_summary": False,
-        # An epoch of a small data set may be shorter than the logging interval.
-        "log_every_n_steps": max(1, min(LOG_EVERY, clouds // cfg.batch_size)),
+        "log_every_n_steps": 0 if barebones else log_every,
         "enable_progress_bar": any(isinstance(callback, ProgressBar) for callback in callbacks),
         "enable_checkpointing": any(isinstance(callback, Checkpoint) for callback in callbacks),
     }
