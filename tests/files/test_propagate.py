@@ -17,6 +17,8 @@ from tests.support.captured import captured, done, refused
 from tests.support.downsample import call as downsample
 from tests.support.downsample import refused as not_downsampled
 
+FIELD = ["--field", "label"]
+
 
 def call(*arguments):
     return captured(main, arguments)
@@ -168,6 +170,18 @@ def test_later_parts_may_have_larger_and_broken_numbers(target, tmp_path):
     np.testing.assert_array_equal(made["large"], large)
     name = "intensity_" if target == ".las" else "intensity"
     np.testing.assert_array_equal(made[name], rows["intensity"])
+
+
+def test_first_part_far_from_the_last_one_keeps_its_place(tmp_path):
+    """The whole-number steps of LAS must reach from one to the other."""
+    points = np.random.default_rng(1).random((120, 3))
+    points[:60] += [3_000_000, 5_000_000, 0]
+    np.save(tmp_path / "big.npy", points)
+    WRITERS[".npz"](tmp_path / "small.npz", Table(points[:3], {"label": np.arange(3)}))
+
+    done(main, [*(tmp_path / name for name in ("small.npz", "big.npy", "out.las")), *FIELD])
+
+    np.testing.assert_allclose(contents(tmp_path / "out.las").points, points, atol=0.01)
 
 
 def test_colours_are_averaged_and_labels_vote(tmp_path):

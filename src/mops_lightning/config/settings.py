@@ -265,7 +265,6 @@ _NOTHING = {"affects": Affects.NOTHING}
 HOW_IT_RUNS = (
     "_target_",
     "accelerator",
-    "barebones",
     "default_root_dir",
     "detect_anomaly",
     "devices",
@@ -304,6 +303,7 @@ INSIDE: dict[str, dict[str, Any]] = {
     **{f"trainer.{name}": _NOTHING for name in HOW_IT_RUNS},
     "trainer.log_every_n_steps": {**_NOTHING, "limits": TRAINER["log_every_n_steps"]},
     "trainer.limit_test_batches": {"affects": Affects.SCORES},
+    "trainer.barebones": {"affects": Affects.SCORES},  # it has none
 }
 """Settings inside groups: how they differ from their group."""
 

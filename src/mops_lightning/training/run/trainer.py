@@ -45,6 +45,7 @@ HARMLESS = (
     ".*isinstance.treespec, LeafSpec.*",  # Lightning 2.6 uses a name that torch 2.13 deprecates
     ".*GPU available but not used.*",  # trainer=cpu is a choice
     ".*AMP with fp16 is not supported on CPU.*",  # make_trainer raises an error
+    ".*`self.log.*` but `Trainer.barebones=True.` is configured.*",  # the run's last line says so
 )
 """Warnings about intended behaviour."""
 
