@@ -47,7 +47,7 @@ def training_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 def table_settings(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
     """Return the dotted settings in which the runs of one table must not differ.
 
-    A setting that the record's version did not have yet counts with its default.
+    A setting that is newer than the record has its default value.
     """
     from mops_lightning.data.loader import Augmentation  # imports torch
 

@@ -20,8 +20,8 @@ from mops_lightning.tree import dotted
 def as_trained(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -> DictConfig:
     """Return the checked configuration of an evaluation: the run's settings, then the user's.
 
-    Interpolations stay where they lead to the run's values, so that ``sampler.seed`` follows a
-    ``seed`` of the user.
+    An interpolation that resolves to the run's value is kept, so that ``sampler.seed`` follows the
+    ``seed`` that a user gives.
 
     Args:
         cfg: composed from the run's groups.
