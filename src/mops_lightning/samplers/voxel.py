@@ -47,11 +47,11 @@ class VoxelSampler(Sampler):
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return one point for each of m voxels of ``(B, N, 3)`` points."""
         detached = points.detach()
-        fullest = [rows[:m] for rows in fullest_voxels(detached, m)]
-        indices = torch.zeros(len(points), m, dtype=torch.int64)
-        for row, chosen in zip(indices, fullest, strict=True):
-            row[: len(chosen)] = torch.from_numpy(chosen)
-        indices = indices.to(points.device)
+        fullest = [chosen[:m] for chosen in fullest_voxels(detached, m)]
+        rows = np.zeros((len(points), m), np.int64)
+        for row, chosen in zip(rows, fullest, strict=True):
+            row[: len(chosen)] = chosen
+        indices = torch.from_numpy(rows).to(points.device)
         counts = torch.tensor([len(chosen) for chosen in fullest], device=points.device)
         if int(counts.min()) < m:
             indices = _filled(detached, indices, counts)
@@ -114,9 +114,8 @@ def _spans(points: Tensor) -> NDArray[np.floating]:
 
 def _scales(spans: NDArray[np.floating], m: int) -> NDArray[np.floating]:
     """Return the smallest number of voxels per side with at least m occupied voxels."""
-    kind = torch.from_numpy(spans[:0]).dtype
-    coarse = torch.full((len(spans),), COARSEST, dtype=kind)
-    fine = torch.full((len(spans),), FINEST, dtype=kind)
+    coarse = torch.from_numpy(np.full(len(spans), COARSEST, spans.dtype))
+    fine = torch.from_numpy(np.full(len(spans), FINEST, spans.dtype))
     clouds = [cloud.ravel() for cloud in spans]
     for step in range(BISECTIONS):
         middle = (coarse + fine) / 2
@@ -124,7 +123,8 @@ def _scales(spans: NDArray[np.floating], m: int) -> NDArray[np.floating]:
         if step in SORTING_STEPS:
             clouds = [_sorted(*pair) for pair in zip(clouds, scales, strict=True)]
         enough = torch.tensor(
-            [voxel_search.reaches(*pair, m) for pair in zip(clouds, scales, strict=True)]
+            [voxel_search.reaches(*pair, m) for pair in zip(clouds, scales, strict=True)],
+            device=coarse.device,
         )
         fine = torch.where(enough, middle, fine)
         coarse = torch.where(enough, coarse, middle)
