@@ -138,6 +138,19 @@ def test_switches_of_display_and_checks_work_and_change_no_result(tmp_path):
     assert not (tmp_path / "switched" / "checkpoints").exists()
 
 
+def test_plugin_is_used_and_one_that_writes_checkpoints_is_refused(tmp_path):
+    plugins = "lightning.pytorch.plugins"
+    double = f"+trainer.plugins._target_={plugins}.precision.DoublePrecision"
+    io = f"+trainer.plugins=[{{_target_: {plugins}.io.AsyncCheckpointIO}}]"
+
+    job(tmp_path / "double", "weights=null", double, "trainer.precision=null")
+
+    state = weights.read(tmp_path / "double" / weights.FILE)["state"]
+    assert state["queries.weight"].dtype == torch.float64
+    with pytest.raises(UserError, match="plugins: AsyncCheckpointIO cannot be used"):
+        job(tmp_path / "io", "weights=null", io)
+
+
 def test_log_every_n_steps_gives_one_point_for_so_many_steps(tmp_path):
     settings = [
         "weights=null",

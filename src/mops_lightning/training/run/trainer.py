@@ -11,11 +11,11 @@ from typing import Any
 
 import lightning as L
 import torch
-from lightning.fabric.plugins import TorchCheckpointIO
+from lightning.fabric.plugins import CheckpointIO, TorchCheckpointIO
 from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.profilers import AdvancedProfiler, PyTorchProfiler, SimpleProfiler
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from mops_lightning.config.build import accepted, build, build_as
 from mops_lightning.data.clouds import CloudDataset
@@ -119,9 +119,13 @@ def make_trainer(
         "enable_progress_bar": any(isinstance(callback, ProgressBar) for callback in callbacks),
         "enable_checkpointing": any(isinstance(callback, Checkpoint) for callback in callbacks),
     }
+    settings = given.copy()
+    with open_dict(settings):
+        for name in ("plugins", "profiler"):  # built here
+            settings.pop(name, None)
     trainer: L.Trainer = build_as(
         L.Trainer,
-        given,
+        settings,
         "trainer",
         logger=logger,
         callbacks=callbacks,
@@ -171,12 +175,22 @@ def _callbacks(
 
 
 def _plugins(given: DictConfig) -> list[Any]:
-    """Return the plugins that the settings name, and the one that writes checkpoints safely."""
+    """Return the plugins that the settings name, and the one that writes checkpoints safely.
+
+    Raises:
+        UserError: another plugin that writes checkpoints is named.
+    """
     named = given.get("plugins")
     if named is None:
         return [AtomicCheckpointIO()]
     several = named if OmegaConf.is_list(named) else [named]
     own = [build(node, "trainer.plugins") if OmegaConf.is_dict(node) else node for node in several]
+    for plugin in own:
+        if isinstance(plugin, CheckpointIO):
+            raise UserError(
+                f"trainer.plugins: {type(plugin).__name__} cannot be used, because checkpoints are "
+                "written with a checksum that resuming needs. Leave it out."
+            )
     return [*own, AtomicCheckpointIO()]
 
 
