@@ -57,6 +57,25 @@ def test_cloud_folder_crops_do_not_depend_on_other_files(folder):
     assert fewer.fingerprint != everything.fingerprint
 
 
+def test_cloud_folder_columns_name_those_of_bin_files(tmp_path):
+    xyz = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
+    for name in ("a", "b"):
+        np.insert(xyz, 0, 7.0, axis=1).tofile(tmp_path / f"{name}.bin")  # a constant comes first
+        WRITERS[".ply"](tmp_path / f"{name}.ply", Table(xyz.astype(np.float64)))
+    (tmp_path / "points").mkdir()
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.ply").rename(tmp_path / "points" / f"{name}.ply")
+        (tmp_path / f"{name}.bin").rename(tmp_path / "points" / f"{name}_named.bin")
+
+    settings = {"n_points": 300, "crops": 1, "crop": "whole", "test_share": 0.5}
+    data = cloud_folder(tmp_path, columns=["intensity", "x", "y", "z"], **settings)
+
+    expected = xyz - xyz.mean(0)
+    expected = expected / np.linalg.norm(expected, axis=1).max()
+    for cloud in torch.cat([data.train.points, data.test.points]).numpy():
+        np.testing.assert_allclose(np.sort(cloud, axis=0), np.sort(expected, axis=0), atol=1e-5)
+
+
 def test_cloud_folder_folders_are_classes_and_splits(tmp_path):
     for seed, name in enumerate(("tree/train/a", "tree/test/b", "car/train/c", "car/test/d")):
         write(tmp_path / f"{name}.ply", seed)
@@ -150,6 +169,9 @@ def test_cloud_folder_real_sequences(real_data):
         ({"n_points": 0}, "n_points must be at least 2, got 0"),
         ({"gap": -1}, "gap must be at least 0, got -1"),
         ({"seed": -1}, "seed must be at least 0, got -1"),
+        ({"columns": ["x", "y"]}, "columns must name all columns of a .bin file.*got 'x,y'"),
+        ({"columns": "x,y,z"}, "columns must name all columns.*got 'x,y,z'"),
+        ({"columns": list("xyz"), "crop": "surface", "crops": 1}, "columns must be null with"),
         ({"classes": ["clod"]}, "classes: unknown class 'clod'.*cloud"),
     ],
 )

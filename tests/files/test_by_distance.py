@@ -125,7 +125,9 @@ def test_map_of_a_spacing(scan, tmp_path):
         (["--spacing", "nan"], "--spacing must be a number above 0"),
         (["--spacing", 1, "--readout", "generated"], "--spacing keeps input points"),
         (["--voxel", 1, "--stratify", "row:share"], "--stratify shares a number of points"),
-        (["--voxel", 1, "--space", "z=2"], "--space is for --method fps and --spacing"),
+        (["--voxel", 1, "--space", "z=2"], "--space is for --method fps, --method poisson"),
+        (["--spacing", "5cm"], "--spacing must be a number above 0, in the file's unit, such as"),
+        (["--voxel", "10%"], "--voxel must be a number above 0, in the file's unit, such as"),
         (["--spacing", 1, "--space", "zz"], "has no column 'zz'"),
         (["--spacing", 1, "--space", "z=-1"], "--space must be columns with factors of at least 0"),
         (["--voxel", 1e-20], "is too small for coordinates"),
@@ -135,7 +137,7 @@ def test_map_of_a_spacing(scan, tmp_path):
         (["--m", "1.5", "--method", "fps"], "--m must be a whole number of at least 1, or a share"),
         (["--m", 5, "--method", "fps", "--stratify", "row"], "--stratify must be a column and"),
         (["--m", 5, "--method", "fps", "--stratify", "heat:share"], "'heat' must hold whole"),
-        (["--m", 5, "--method", "poisson", "--space", "z=2"], "--space is for --method fps"),
+        (["--m", 5, "--method", "random", "--space", "z=2"], "--space is for --method fps"),
     ],
 )
 def test_mistakes_are_one_line(options, words, scan, tmp_path):

@@ -48,6 +48,21 @@ def test_compare_writes_table_and_page(folder, tmp_path):
     assert "How to read this" in page
 
 
+def test_compare_columns_name_those_of_bin_files(folder, tmp_path):
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    WRITERS[".ply"](tmp_path / "scan.ply", Table(points.astype(np.float32).astype(float)))
+    np.insert(points, 0, 7.0, axis=1).astype(np.float32).tofile(tmp_path / "scan.bin")
+    arguments = ["--m", 30, "--methods", "fps"]
+
+    done(main, [tmp_path / "scan.ply", *arguments, "--out", tmp_path / "ply"])
+    named = [*arguments, "--columns", "intensity,x,y,z", "--out", tmp_path / "bin"]
+    done(main, [tmp_path / "scan.bin", *named])
+
+    tables = [(tmp_path / kind / "table.csv").read_text() for kind in ("ply", "bin")]
+    distances = [text.splitlines()[1].split(",")[4:6] for text in tables]
+    assert distances[0] == distances[1]
+
+
 def test_compare_keeps_an_earlier_comparison(folder, tmp_path):
     arguments = [folder / "one.ply", "--m", 30, "--methods", "random", "--out", tmp_path]
     assert call(*arguments)[0] == 0
@@ -73,6 +88,7 @@ def test_compare_page_opens_without_errors(folder, tmp_path, opened):
     [
         (["--m", 5, "--tile", 64], "give --weights"),
         (["--m", 5, "--methods", "fsp"], "--methods: unknown 'fsp'.*'fps'"),
+        (["--m", 5, "--columns", "x,y,z"], "--columns is for .bin files"),
         (["--m", 0], "--m must be"),
         (["--m", 701], "fewer than --m 701"),
         (["--m", 60, "--weights", "FOLDER"], "trained for up to 32 points, got 60"),

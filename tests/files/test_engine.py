@@ -92,7 +92,7 @@ def test_running_scheduler_equals_one_process(readout, client, scan, tmp_path):
 def test_broken_file_is_named(client, scan, tmp_path):
     (tmp_path / "in").mkdir()
     content = scan[0].read_bytes()
-    (tmp_path / "in" / "bad.ply").write_bytes(content[:-50])
+    (tmp_path / "in" / "bad.ply").write_bytes(content[: -3 * 28 - 1])  # a point has 28 bytes
     (tmp_path / "in" / "good.ply").write_bytes(content)
     settings = ["--weights", scan[0].parent, "--readout", "generated", "--chunk", 500]
     address = client.scheduler.address

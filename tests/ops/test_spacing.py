@@ -53,6 +53,15 @@ def test_keep_spaced_is_spaced_and_covers(cloud, spacing):
     assert distances[:, kept].min(1).max() < spacing
 
 
+@pytest.mark.parametrize(("spacing", "number"), [(1e-300, 2), (1e300, 1)])
+def test_keep_spaced_square_of_spacing_beyond_float64(spacing, number):
+    points = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+
+    kept = keep_spaced(points, spacing)
+
+    assert len(np.unique(points[kept], axis=0)) == len(kept) == number
+
+
 @pytest.mark.parametrize("cloud", CLOUDS)
 def test_keep_spaced_any_order_of_points_gives_the_same(cloud):
     points = CLOUDS[cloud]

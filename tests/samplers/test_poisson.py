@@ -30,7 +30,8 @@ def in_steps(points, m, weight=None):
     scale = 2.0 ** min(50, 62 - number.bit_length())
 
     def weights(cloud, others, bound):
-        squared = sum((cloud[..., axis] - others[..., axis]) ** 2 for axis in range(3))
+        axes = range(others.shape[-1])
+        squared = sum((cloud[..., axis] - others[..., axis]) ** 2 for axis in axes)
         return ((1 - squared.sqrt() / bound).clamp_min(0).square().square().square() * scale).long()
 
     kept = []
@@ -64,6 +65,14 @@ def test_eliminate_to_one_point_has_reach_of_bounding_box(rng):
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (40, 39), (40, 40), (300, 1), (300, 20), (300, 150)])
 def test_eliminate_equals_plain_form(n, m, kind, rng):
     points = cloud_of(kind, (2, n), torch.float32, rng)
+    assert torch.equal(eliminate(points, m), in_steps(points, m))
+
+
+@pytest.mark.parametrize("channels", [1, 2, 5])
+@pytest.mark.parametrize("m", [1, 20, 150])
+def test_eliminate_of_other_dimensions_equals_plain_form(m, channels, rng):
+    points = torch.randn(2, 300, channels, generator=rng, dtype=torch.float64)
+
     assert torch.equal(eliminate(points, m), in_steps(points, m))
 
 

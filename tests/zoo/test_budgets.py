@@ -8,7 +8,9 @@ import torch
 
 from mops_lightning import downsample
 from mops_lightning.errors import UserError
+from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.spacing import keep_spaced
+from mops_lightning.samplers.poisson import poisson_rows
 
 CLOUD = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 7
 
@@ -158,6 +160,17 @@ def test_space_makes_columns_count():
     scaled = points.astype(np.float64)[:, :3] * [1, 1, 2]
     expected = keep_spaced(scaled, 2.0)
     assert downsample(points, spacing=2.0, space=(1, 1, 2, 0))[1].tolist() == expected.tolist()
+
+
+def test_space_of_poisson_scales_the_columns():
+    points = np.concatenate([CLOUD.numpy(), CLOUD.numpy()[:, :1] ** 2], axis=1)
+    used = (points * [1, 1, 2, 3]).astype(np.float64)
+    sphere = UnitSphere.around(used).normalise(used)[None]
+
+    _, rows = downsample(points, 40, "poisson", space=(1, 1, 2, 3))
+
+    assert rows.tolist() == poisson_rows(sphere, 40)[0].tolist()
+    assert rows.tolist() != downsample(points, 40, "poisson")[1].tolist()
 
 
 def test_tile_keeps_m_points():

@@ -26,6 +26,7 @@ from mops_lightning.data.file_splits import (
     split_by_share,
     split_by_time,
 )
+from mops_lightning.data.formats.bin_columns import check_columns
 from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
 from mops_lightning.data.formats.registry import READABLE, read
 from mops_lightning.data.surfaces import VERSION, sample_surface
@@ -70,6 +71,7 @@ def cloud_folder(
     crop: Crop,
     crops: int,
     label: str | None = None,
+    columns: Sequence[str] | None = None,
 ) -> CloudDataset:
     """Read the clouds or meshes in a folder and its subfolders, one per file.
 
@@ -94,6 +96,8 @@ def cloud_folder(
         crops: number of clouds per file; 1 for ``surface``.
         label: column of the files that says to which part a point belongs, by a whole number, below
             0 if that is unknown; None: the points have no parts. Not with ``surface``.
+        columns: names of the columns of .bin files, which have no header; None: those that their
+            names imply. Not with ``surface``.
 
     Returns:
         Float32 clouds ``(S, n_points, 3)`` in the unit sphere, with the centroid at the origin, and
@@ -116,6 +120,10 @@ def cloud_folder(
         raise UserError(f"crops must be 1 with crop=surface, got {crops}.")
     if crop == "surface" and label is not None:
         raise UserError(f"label must be null with crop=surface, got {label!r}.")
+    if crop == "surface" and columns is not None:
+        raise UserError(f"columns must be null with crop=surface, got {list(columns)}.")
+    if columns is not None:
+        columns = check_columns("columns", columns)
 
     folder = Path(root).expanduser()
     suffixes = MESHES if crop == "surface" else READABLE
@@ -132,7 +140,7 @@ def cloud_folder(
         splits = _clouds_of_splits(contents, class_names, crops)
         fingerprint = _fingerprint_of_meshes(contents, n_points, seed, class_names)
         return CloudDataset(class_names, splits["train"], splits["test"], fingerprint, notes)
-    contents = _read_clouds(folder, files, n_points, crop, crops, seed, label)
+    contents = _read_clouds(folder, files, n_points, crop, crops, seed, label, columns)
     numbers = _known_numbers(contents)
     splits = _clouds_of_splits(contents, class_names, crops, numbers)
     dataset = make_dataset("clouds", splits, class_names, None, folder)
@@ -163,13 +171,14 @@ def _read_clouds(
     crops: int,
     seed: int,
     label: str | None,
+    columns: Sequence[str] | None,
 ) -> list[Content]:
     """Draw crops of every cloud."""
     contents = []
     for file in _with_progress(files):
         path = folder / file.name
         rng = np.random.default_rng(derive_seed(seed, zlib.crc32(str(file.name).encode())))
-        table = read(path, max(10_000, 8 * n_points), seed).finite()
+        table = read(path, max(10_000, 8 * n_points), seed, columns=columns).finite()
         drawn = random_crops(table.points, n_points, crops, crop, rng, path)
         numbers = None
         if label is not None:

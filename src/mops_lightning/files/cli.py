@@ -94,6 +94,7 @@ def _compare_arguments(add: Add) -> None:
     add("--m", type=int, nargs="+", required=True, help="numbers of points to keep")
     add("--weights", help=WEIGHTS)
     add("--methods", nargs="+", default=list(UNTRAINED), help="untrained methods; default: all")
+    add("--columns", metavar="X,Y,Z,...", help=COLUMNS)
     add("--tile", type=int, metavar="POINTS", help="the trained sampler by tiles, as in downsample")
     add("--out", type=Path, default=Path("compare"), help="folder to write; default: compare")
     add("--seed", type=int, default=0, help="seed of random choices")
@@ -106,6 +107,9 @@ def _compare(chosen: argparse.Namespace) -> None:
     for name in chosen.methods:
         if name not in UNTRAINED:
             raise UserError(f"--methods: unknown {name!r}.{did_you_mean(name, UNTRAINED)}")
+    columns = columns_of(chosen)
+    if columns and not any(path.suffix.lower() == ".bin" for path in chosen.files):
+        raise UserError("--columns is for .bin files, got none.")
     from mops_lightning.files import compare as comparison
     from mops_lightning.files.downsample import load_sampler
 
@@ -124,7 +128,7 @@ def _compare(chosen: argparse.Namespace) -> None:
         for options in methods.values():
             load_sampler(options)  # reports its mistakes before any file is read
     results = [
-        comparison.compare_file(path, m, methods, chosen.seed)
+        comparison.compare_file(path, m, methods, chosen.seed, columns)
         for path in chosen.files
         for m, methods in by_size.items()
     ]

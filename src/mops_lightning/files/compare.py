@@ -118,7 +118,13 @@ def options_by_method(
     return options
 
 
-def compare_file(path: Path, m: int, methods: dict[str, Options], seed: int) -> FileResult:
+def compare_file(
+    path: Path,
+    m: int,
+    methods: dict[str, Options],
+    seed: int,
+    columns: Sequence[str] | None = None,
+) -> FileResult:
     """Sample a file by all methods and measure the samples.
 
     Args:
@@ -126,11 +132,12 @@ def compare_file(path: Path, m: int, methods: dict[str, Options], seed: int) -> 
         m: number of points to keep.
         methods: from ``options_by_method``, for the same ``m``.
         seed: of a mesh's points.
+        columns: names of the columns of a .bin file; None: those that its name implies.
 
     Raises:
         UserError: the file holds no usable cloud, or too few points.
     """
-    table = read(path, max(SURFACE, 8 * m), seed).finite()
+    table = read(path, max(SURFACE, 8 * m), seed, columns=columns).finite()
     points, ground = table.points, table.columns.get(CLASSES, np.empty(0)) == GROUND
     check_size(path, len(points), m)
     results = []

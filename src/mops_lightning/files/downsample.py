@@ -27,6 +27,7 @@ from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.weights import check_positive
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fps import farthest_rows
+from mops_lightning.samplers.poisson import poisson_rows
 from mops_lightning.samplers.tiles import sample_by_tiles
 from mops_lightning.zoo.find_sampler import untrained
 from mops_lightning.zoo.load import load
@@ -259,20 +260,21 @@ def _rows_of_weighted(
     source: Path, table: Table, m: int, options: Options, weight: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
     if options.space is not None:
-        rows = _farthest_in_space(table, m, options, source, weight)
+        rows = _rows_in_space(table, m, options, source, weight)
         return rows, table.points[rows]
     return sample_cloud(table.points, load_sampler(options, m), m, options, source, weight)
 
 
-def _farthest_in_space(
+def _rows_in_space(
     table: Table, m: int, options: Options, source: Path, weight: NDArray[np.float64] | None
 ) -> NDArray[np.int64]:
-    """Choose farthest points by the columns that count."""
+    """Choose farthest points, or those of sample elimination, by the columns that count."""
     used = in_space(table, options.space, source)
     check_coordinates(source, used)
     points = UnitSphere.around(used).normalise(used)[None]
     weights = None if weight is None else torch.from_numpy(weight)[None]
-    return farthest_rows(points, m, options.seed, weight=weights)[0].numpy()
+    choose = poisson_rows if options.method == "poisson" else farthest_rows
+    return choose(points, m, options.seed, weight=weights)[0].numpy()
 
 
 def sample_cloud(

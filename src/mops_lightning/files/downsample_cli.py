@@ -12,7 +12,7 @@ from mops_lightning.data.formats.area import Area
 from mops_lightning.errors import UserError, one_line_endings
 from mops_lightning.files.arguments import COLUMNS, WEIGHTS, Add, columns_of, parsed
 from mops_lightning.files.engine import Engine
-from mops_lightning.files.options import Options, parse_size, parse_space
+from mops_lightning.files.options import Options, parse_distance, parse_size, parse_space
 from mops_lightning.files.strata import Strata
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.records.readout_names import GENERATED_READOUTS
@@ -48,14 +48,12 @@ def _budget_arguments(add: Add) -> None:
     )
     add(
         "--spacing",
-        type=float,
         metavar="DISTANCE",
         help="instead of --m: keep points of which no two are nearer, and to which every other "
         "point is nearer; in the file's unit",
     )
     add(
         "--voxel",
-        type=float,
         metavar="SIZE",
         help="instead of --m: keep of every cubic voxel the point nearest to the mean of its "
         "points, or with --readout generated the mean; in the file's unit",
@@ -71,7 +69,7 @@ def _budget_arguments(add: Add) -> None:
         "--space",
         metavar="COLUMN[=FACTOR],...",
         help="columns that count in distances beside x, y and z, scaled, such as intensity=0.01; "
-        "with --method fps and --spacing",
+        "with --method fps or poisson, and --spacing",
     )
 
 
@@ -207,6 +205,9 @@ def _options(chosen: argparse.Namespace) -> Options:
         field.name: getattr(chosen, field.name, None) for field in fields(Options)
     }
     values["m"] = None if chosen.m is None else parse_size(chosen.m)
+    for name in ("spacing", "voxel"):
+        if values[name] is not None:
+            values[name] = parse_distance(f"--{name}", values[name])
     values["space"] = None if chosen.space is None else parse_space(chosen.space)
     values["strata"] = None if chosen.stratify is None else Strata.parse(chosen.stratify)
     values["columns"] = columns_of(chosen)

@@ -155,8 +155,9 @@ class Options:
     def _check_space(self) -> None:
         if self.space is None:
             return
-        if self.method not in (None, "fps") or self.weights is not None or self.voxel is not None:
-            raise UserError("--space is for --method fps and --spacing.")
+        takes_space = self.method in (None, "fps", "poisson") and self.weights is None
+        if not takes_space or self.voxel is not None:
+            raise UserError("--space is for --method fps, --method poisson and --spacing.")
         if self.tile is not None and not self.is_by_distance:
             raise UserError("--space needs the whole cloud at once: leave --tile out.")
 
@@ -206,6 +207,20 @@ def parse_size(text: str) -> Size:
             f"100%, got {text}."
         )
     return share
+
+
+def parse_distance(name: str, text: str) -> float:
+    """Return the number of a command line's ``--spacing`` or ``--voxel``.
+
+    Raises:
+        UserError: it is none, such as ``5cm``.
+    """
+    try:
+        return float(text)
+    except ValueError:
+        raise UserError(
+            f"{name} must be a number above 0, in the file's unit, such as 0.05, got {text!r}."
+        ) from None
 
 
 def parse_space(text: str) -> tuple[tuple[str, float], ...]:

@@ -15,6 +15,9 @@ from mops_lightning.ops.voxels import group
 FINEST = 2.0**30
 """Most cells along an axis."""
 
+SMALLEST, LARGEST = 5e-324, float(np.finfo(np.float64).max)
+"""Range of squared spacings: equal points are always near, and finite ones can be."""
+
 
 def keep_spaced(
     points: NDArray[np.float64],
@@ -112,6 +115,6 @@ def _states(
         grouped.places,
         grouped.table,
         order,
-        spacing * spacing,
+        min(max(spacing * spacing, SMALLEST), LARGEST),
     )
     return states

@@ -102,7 +102,7 @@ def group(points: NDArray[np.float64], size: float) -> Grouped:
         UserError: the size is too small for the coordinates.
     """
     largest = float(np.abs(points).max(initial=0.0))
-    if largest >= FARTHEST * size:
+    if largest / FARTHEST >= size:  # the product could overflow
         raise UserError(
             f"voxel: {size:g} is too small for coordinates of up to {largest:g}. Use larger voxels."
         )

@@ -64,16 +64,27 @@ class PoissonSampler(Sampler):
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices, in seeded order."""
-        order = seeded_order(points, self.seed)
-        kept = eliminate(gather_points(points.detach(), order), m)
-        indices = order.gather(1, kept)
+        indices = poisson_rows(points, m, self.seed)
         return SampleOutput(gather_points(points, indices), indices, {})
 
     def sample_weighted(self, points: Tensor, m: int, weight: Tensor) -> Tensor:
         """Divide the crowding of every point by its weight, which the publication does not do."""
-        order = seeded_order(points, self.seed)
-        ordered = gather_points(points.detach(), order)
-        return order.gather(1, eliminate(ordered, m, weight.gather(1, order)))
+        return poisson_rows(points, m, self.seed, weight)
+
+
+def poisson_rows(points: Tensor, m: int, seed: int = 0, weight: Tensor | None = None) -> Tensor:
+    """Return the rows ``(B, m)`` that sample elimination keeps, in seeded order.
+
+    Args:
+        points: ``(B, N, C)``, finite.
+        m: number of points that remain, 1 ≤ m ≤ N.
+        seed: determines how ties are broken.
+        weight: ``(B, N)`` as for ``eliminate``.
+    """
+    order = seeded_order(points, seed)
+    ordered = gather_points(points.detach(), order)
+    shares = None if weight is None else weight.gather(1, order)
+    return order.gather(1, eliminate(ordered, m, shares))
 
 
 @torch.no_grad()
@@ -81,7 +92,7 @@ def eliminate(points: Tensor, m: int, weight: Tensor | None = None) -> Tensor:
     """Remove the most crowded point of every cloud until m remain; see ``PoissonSampler``.
 
     Args:
-        points: ``(B, N, 3)``, finite; the first point is removed in case of ties.
+        points: ``(B, N, C)``, finite; the first point is removed in case of ties.
         m: number of points that remain, 1 ≤ m ≤ N.
         weight: ``(B, N)``, above 0: the crowding of a point is divided by its weight.
 
@@ -128,11 +139,13 @@ def spacing_bound(points: Tensor, m: int) -> Tensor:
 def _eliminate_by_cells(
     points: NDArray[np.float64], m: int, reach: float, shares: NDArray[np.float64], scale: float
 ) -> NDArray[np.bool_]:
-    """Return whether each of ``(N, 3)`` points remains, by the compiled loops."""
-    low = points.min(0)
-    extent = float((points.max(0) - low).max())
+    """Return whether each of ``(N, C)`` points remains, by the compiled loops."""
+    points = np.pad(points, ((0, 0), (0, max(3 - points.shape[1], 0))))
+    coordinates = points[:, :3]  # points that are near are near in these, too
+    low = coordinates.min(0)
+    extent = float((coordinates.max(0) - low).max())
     side = max(reach, extent / FINEST) * (1 + 1e-9)
-    position = ((points - low) / side).astype(np.int64) + 1  # so that no neighbour is below 0
+    position = ((coordinates - low) / side).astype(np.int64) + 1  # no neighbour is below 0
     key = (position[:, 0] * 2 * FINEST + position[:, 1]) * 2 * FINEST + position[:, 2]
     order = key.argsort(kind="stable")
     cells, starts, cell_of = np.unique(key[order], return_index=True, return_inverse=True)
@@ -160,6 +173,9 @@ def _change(planes, starts, ends, near, point, sign, reach, scale, crowding):
             for i in range(starts[cell], ends[cell]):
                 dx, dy, dz = planes[0, i] - x, planes[1, i] - y, planes[2, i] - z
                 squared = dx * dx + dy * dy + dz * dz
+                for axis in range(3, len(planes)):
+                    difference = planes[axis, i] - planes[axis, point]
+                    squared += difference * difference
                 if squared <= limit:
                     share = max(1.0 - np.sqrt(squared) / reach, 0.0)
                     share *= share
@@ -180,7 +196,8 @@ def _remove_crowded(planes, order, starts, ends, cell_of, around, shares, m, rea
     """Remove the most crowded point until m remain.
 
     Args:
-        planes: ``(3, N)`` coordinates of points that are sorted by their cell; changed.
+        planes: ``(C, N)`` coordinates of points that are sorted by the cell of the first three;
+            changed.
         order: ``(N,)`` their rows; the lowest row is removed in case of ties.
         starts: ``(K,)`` first point of every cell.
         ends: ``(K,)`` the point after the last one of every cell.

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +18,7 @@ from mops_lightning.ops.voxels import representatives, voxel_means
 from mops_lightning.ops.weights import CURVATURE, check_positive, check_weight, curvature
 from mops_lightning.samplers.budget import as_size, check_distance, check_scales, number_of
 from mops_lightning.samplers.fps import FPSSampler, farthest_rows
+from mops_lightning.samplers.poisson import poisson_rows
 from mops_lightning.samplers.tiles import sample_by_tiles
 from mops_lightning.zoo.find_sampler import find_sampler
 
@@ -179,7 +181,7 @@ def to_distance(
         return clouds.join(samples, same_size=False)
     size = check_distance("voxel", voxel)
     if space is not None:
-        raise UserError("space is for fps and spacing; voxels are cubes of coordinates.")
+        raise UserError("space is for fps, poisson and spacing; voxels are cubes of coordinates.")
     if readout == "generated":
         if weight is not None:
             raise UserError("weight: the means of voxels take no weights.")
@@ -254,7 +256,7 @@ def to_number(
                 f"m must be at most the number of points N={len(cloud.points)}, got m={number}."
             )
         if space is not None:
-            return _farthest_in_space(cloud, number, space, start, seed or 0)
+            return _sample_in_space(cloud, number, str(method), space, start, seed or 0)
         sampler = find_sampler(method, number, cloud.points, start, seed)
         if tile is not None:
             columns = cloud.columns()[:, :3]
@@ -276,8 +278,10 @@ def to_number(
 def _check_space_and_tile(
     space: Any, tile: Any, method: str | Path, weight: Any, readout: str
 ) -> None:
-    if space is not None and method != "fps":
-        raise UserError(f"space is for method='fps' and spacing, got method={str(method)!r}.")
+    if space is not None and method not in ("fps", "poisson"):
+        raise UserError(
+            f"space is for method='fps', method='poisson' and spacing, got {str(method)!r}."
+        )
     if space is not None and tile is not None:
         raise UserError("give space or tile, not both.")
     if tile is None:
@@ -290,18 +294,19 @@ def _check_space_and_tile(
         raise UserError(f"tile keeps different input points: no readout {readout!r:.99}.")
 
 
-def _farthest_in_space(
-    cloud: Cloud, number: int, space: Any, start: int | str | None, seed: int
+def _sample_in_space(
+    cloud: Cloud, number: int, method: str, space: Any, start: int | str | None, seed: int
 ) -> Sample:
-    """Choose farthest points by the columns that count."""
+    """Choose farthest points, or those of sample elimination, by the columns that count."""
     FPSSampler(number, seed, start)  # checks the start
+    choose = poisson_rows if method == "poisson" else partial(farthest_rows, start=start)
     used = _in_space(cloud.columns(), space)
     points = UnitSphere.around(used).normalise(used)[None]
     weight = cloud.numbers()
     if weight is None:
-        return cloud.rows(farthest_rows(points, number, seed, start)[0].numpy())
+        return cloud.rows(choose(points, number, seed)[0].numpy())
     heavy = np.flatnonzero(weight)
     check_positive(len(heavy), number)
     weights = torch.from_numpy(weight[heavy])[None]
-    rows = farthest_rows(points[:, heavy], number, seed, start, weights)[0]
+    rows = choose(points[:, heavy], number, seed, weight=weights)[0]
     return cloud.rows(heavy[rows.numpy()])

@@ -55,7 +55,7 @@ def downsample(
         voxel: side of cubic voxels, of which each occupied one keeps the point nearest to the mean
             of its points. The grid starts at 0.
         space: one factor per column: distances are those of the columns times these factors. With
-            ``fps`` and ``spacing``.
+            ``fps``, ``poisson`` and ``spacing``.
         tile: cut every cloud into tiles of up to so many points (a balanced kd-tree), and sample
             each, as in training.
 

@@ -1,5 +1,7 @@
 """Names of the columns of .bin files, which have no header, as a user gives them."""
 
+from collections.abc import Sequence
+
 from mops_lightning.errors import UserError
 
 
@@ -9,10 +11,25 @@ def parse_columns(text: str) -> tuple[str, ...]:
     Raises:
         UserError: a name is missing or there twice.
     """
-    names = tuple(name.strip() for name in text.split(","))
-    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names) or "" in names:
+    return check_columns("--columns", [name.strip() for name in text.split(",")])
+
+
+def check_columns(setting: str, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the columns of .bin files.
+
+    Args:
+        setting: how the user gives them, for errors.
+        names: of all columns, in order.
+
+    Raises:
+        UserError: a name is missing or there twice.
+    """
+    is_list = not isinstance(names, str) and all(isinstance(name, str) for name in names)
+    is_complete = is_list and {"x", "y", "z"} <= set(names) and "" not in names
+    if not is_complete or len(set(names)) < len(names):
+        got = names if isinstance(names, str) else ",".join(map(str, names))
         raise UserError(
-            f"--columns must name all columns of a .bin file, each once, with x, y and z among "
-            f"them, such as x,y,z,intensity,ring; got {text!r}."
+            f"{setting} must name all columns of a .bin file, each once, with x, y and z among "
+            f"them, such as x,y,z,intensity,ring; got {got!r}."
         )
-    return names
+    return tuple(names)
