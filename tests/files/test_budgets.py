@@ -64,10 +64,23 @@ def test_total_of_a_folder(m, clouds, tmp_path):
     assert sizes == {"a": 30, "b": 15, "c": 5}
 
 
-def test_total_that_leaves_nothing_for_a_file_is_refused(clouds, tmp_path):
-    words = refused(clouds, tmp_path / "out", "--method", "random", "--m", 2, "--total")
+@pytest.mark.parametrize(("m", "numbers"), [(3, [1, 1, 1]), (5, [3, 1, 1]), (94, [90, 2, 2])])
+def test_total_keeps_a_point_of_every_file(m, numbers, tmp_path):
+    (tmp_path / "in").mkdir()
+    for name, number in (("a", 90), ("b", 2), ("c", 2)):
+        WRITERS[".ply"](tmp_path / "in" / f"{name}.ply", Table(RNG.normal(size=(number, 3))))
 
-    assert "--total: 2 points for all files leave none for" in words
+    done(tmp_path / "in", tmp_path / "out", "--method", "random", "--m", m, "--total")
+
+    sizes = [len(read(tmp_path / "out" / f"{name}.ply", 9, 0).points) for name in "abc"]
+    assert sizes == numbers
+
+
+@pytest.mark.parametrize("m", [2, 1001])
+def test_total_out_of_range_is_refused(m, clouds, tmp_path):
+    words = refused(clouds, tmp_path / "out", "--method", "random", "--m", m, "--total")
+
+    assert "--total: the 3 files hold 1,000 points; --m must be from one point per file" in words
 
 
 @pytest.mark.parametrize("extra", [[], ["--chunk", 300], ["--tile", 64], ["--weight", "row"]])

@@ -146,6 +146,17 @@ def test_mistakes_are_one_line(options, words, scan, tmp_path):
 
 
 @pytest.mark.parametrize("budget", ["--spacing", "--voxel"])
+@pytest.mark.parametrize("options", [[], ["--chunk", 7]])
+def test_weights_of_zero_are_named(budget, options, tmp_path):
+    WRITERS[".ply"](tmp_path / "in.ply", Table(RNG.normal(size=(20, 3)), {"w": np.zeros(20)}))
+    files = tmp_path / "in.ply", tmp_path / "out.ply"
+
+    words = refused(*files, budget, 1, "--weight", "w", *options)
+
+    assert f"--weight w of {files[0]}: all weights are 0" in words
+
+
+@pytest.mark.parametrize("budget", ["--spacing", "--voxel"])
 @pytest.mark.parametrize(
     ("name", "distance"), [("autzen_trim_7.las", 6), ("lone-star.copc.laz", 0.8)]
 )

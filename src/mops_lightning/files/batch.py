@@ -23,6 +23,7 @@ from mops_lightning.data.formats.registry import READABLE, WRITERS
 from mops_lightning.errors import UserError, as_line, one_line, printable
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
+from mops_lightning.files.strata import Strata
 from mops_lightning.filesystem import is_temporary
 from mops_lightning.ops.workers import start_worker
 from mops_lightning.samplers.budget import number_of
@@ -249,8 +250,10 @@ class Job(NamedTuple):
 def _sharing(jobs: list[Job]) -> list[Job]:
     """Share the number of points to keep among the files, in proportion to their points.
 
+    Every file keeps at least one point.
+
     Raises:
-        UserError: a file would keep none.
+        UserError: there are fewer points to keep than files, or fewer points in the files.
     """
     from mops_lightning.files.downsample import count_points
     from mops_lightning.samplers.tiles import shares
@@ -259,10 +262,17 @@ def _sharing(jobs: list[Job]) -> list[Job]:
     size = jobs[0].options.m
     assert size is not None
     total = number_of(size, sum(sizes))
-    numbers = shares(total, sizes).tolist() if sum(sizes) else [0] * len(sizes)
-    for job, number in zip(jobs, numbers, strict=True):
-        if number == 0:
-            raise UserError(f"--total: {total} points for all files leave none for {job.source}.")
+    if 0 in sizes:
+        raise UserError(f"{jobs[sizes.index(0)].source} holds no points.")
+    if not len(sizes) <= total <= sum(sizes):
+        raise UserError(
+            f"--total: the {len(sizes)} files hold {sum(sizes):,} points; --m must be from one "
+            f"point per file to that number, got {total:,}."
+        )
+    numbers = shares(total, sizes).tolist()
+    if 0 in numbers:
+        number_of_file = Strata("file", least=1).numbers(dict(enumerate(sizes)), total)
+        numbers = [number_of_file[place] for place in range(len(sizes))]
     return [
         job._replace(options=replace(job.options, m=number))
         for job, number in zip(jobs, numbers, strict=True)

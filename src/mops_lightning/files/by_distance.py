@@ -69,6 +69,8 @@ def keep_by_distance(
         kept, number = passes.spaced()
     else:
         kept, number = passes.in_voxels()
+    if not len(kept.points) and number and options.weight is not None:
+        raise BadCloudError(f"--weight {options.weight} of {source}: all weights are 0.")
     if not len(kept.points):
         raise BadCloudError(f"{source} holds no points that could be kept.")
     left_out = len(whole.points) if whole is not None else file.number
