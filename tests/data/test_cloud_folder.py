@@ -67,7 +67,7 @@ def test_cloud_folder_columns_name_those_of_bin_files(tmp_path):
         (tmp_path / f"{name}.ply").rename(tmp_path / "points" / f"{name}.ply")
         (tmp_path / f"{name}.bin").rename(tmp_path / "points" / f"{name}_named.bin")
 
-    settings = {"n_points": 300, "crops": 1, "crop": "whole", "test_share": 0.5}
+    settings: dict[str, Any] = {"n_points": 300, "crops": 1, "crop": "whole", "test_share": 0.5}
     data = cloud_folder(tmp_path, columns=["intensity", "x", "y", "z"], **settings)
 
     expected = xyz - xyz.mean(0)
