@@ -46,6 +46,43 @@ assert [model_file.read_card(path) for path in names.available().values()]
 """
 
 
+MISTAKE = """
+from mops_lightning.cli.main import main
+sys.argv[1:] = [{argument!r}]
+try:
+    main()
+except SystemExit as stop:
+    assert stop.code == 2
+assert not {{'torch', 'lightning', 'numba'}} & set(sys.modules)
+"""
+
+
+@pytest.mark.parametrize("argument", ["smapler=mops", "sampler.alhpa=1", "m=0", "optimizer.lr=-1"])
+def test_mistake_on_the_command_line_is_named_without_torch_and_lightning(argument, tmp_path):
+    command = f"import sys\n{MISTAKE.format(argument=argument)}"
+
+    done = subprocess.run(
+        [sys.executable, "-c", command], cwd=tmp_path, check=True, capture_output=True, text=True
+    )
+
+    assert done.stderr.startswith(f"mops_lightning: {argument.partition('=')[0]}")
+
+
+def test_help_alone_needs_no_hydra(tmp_path):
+    heavy = "{'torch', 'lightning', 'hydra', 'omegaconf'}"
+    code = (
+        "import sys\n"
+        "from mops_lightning.cli.main import main\n"
+        "sys.argv[1:] = ['--help']\n"
+        "main()\n"
+        f"assert not {heavy} & set(sys.modules)\n"
+    )
+
+    subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, check=True, stdout=subprocess.DEVNULL
+    )
+
+
 @pytest.mark.parametrize("code", [HELP, CARDS], ids=["help", "cards"])
 def test_help_and_cards_of_models_need_no_torch(code):
     command = f"import sys\n{code}assert 'torch' not in sys.modules"

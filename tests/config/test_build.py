@@ -1,8 +1,10 @@
 """Objects from nodes, and whose name an error of a constructor starts with."""
 
+import copy
 from typing import Any
 
 import pytest
+import torch
 from omegaconf import OmegaConf
 
 from mops_lightning.config.build import build
@@ -77,3 +79,21 @@ def test_build_without_the_package_names_it():
     node = OmegaConf.create({"_target_": "no_such_package_here.Thing"})
     with pytest.raises(UserError, match="needs a package that is not installed"):
         build(node, "logger")
+
+
+def test_build_partial_is_shared_by_copies_of_what_holds_it():
+    node = OmegaConf.create({"_target_": "torch.optim.Adam", "lr": 0.1, "_partial_": True})
+    makers = [build(node, "optimizer")]
+
+    copied = copy.deepcopy(makers)
+
+    assert copied[0] is makers[0]
+    assert copied[0]([torch.zeros(1, requires_grad=True)]).defaults["lr"] == 0.1
+
+
+def test_build_partial_holds_no_configuration_node():
+    node = OmegaConf.create({"_target_": "torch.optim.Adam", "lr": 0.1, "_partial_": True})
+
+    maker = build(node, "optimizer")
+
+    assert not [value for value in vars(maker).values() if OmegaConf.is_config(value)]

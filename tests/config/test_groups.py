@@ -30,6 +30,13 @@ def test_run_is_described_in_120_lines(chosen, tmp_path):
     assert len(out.splitlines()) <= 120
 
 
+def test_help_alone_is_the_text_that_hydra_makes(tmp_path):
+    alone = call(["--help"], tmp_path)
+    by_hydra = call(["--help", "m=8"], tmp_path)
+
+    assert alone == by_hydra
+
+
 def test_help_shows_every_key_and_choice(tmp_path):
     _, out, _ = call(["--help"], tmp_path)
     for name, setting in declared().items():

@@ -6,7 +6,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from mops_lightning.config.build import signature
+from mops_lightning.config.build import PASSED_ON, signature
 from mops_lightning.config.compose import compose
 from mops_lightning.config.groups import conf_dir
 from mops_lightning.config.validate import check, misfit
@@ -57,7 +57,8 @@ def test_compose_every_choice_fits_its_constructor(override):
         parameters = signature(node["_target_"], override)
         given = {key for key in node if not str(key).startswith("_")} - {"schedule"}
         assert given <= set(parameters), node["_target_"]
-        own = node["_target_"].startswith("mops_lightning.")
+        passes_on = node["_target_"] in PASSED_ON  # the arguments of a class of Lightning's
+        own = node["_target_"].startswith("mops_lightning.") and not passes_on
         several = (Parameter.VAR_KEYWORD, Parameter.VAR_POSITIONAL)
         named = {name: p for name, p in parameters.items() if p.kind not in several}
         named = {name: p for name, p in named.items() if own or p.default is p.empty}

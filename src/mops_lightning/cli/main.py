@@ -7,7 +7,6 @@ import os
 import re
 import sys
 from importlib import import_module
-from importlib.metadata import version
 from pathlib import Path
 
 from mops_lightning.errors import USER_ERROR, did_you_mean, end, quiet_on_closed_pipe
@@ -21,6 +20,9 @@ COMMANDS = {
     "export": "mops_lightning.cli.models.export",
 }
 """Subcommands and their functions of ``(arguments, prog)``."""
+
+HELP_ALONE = (["--help"], ["-h"])
+"""Command lines that are answered without Hydra."""
 
 WORD = re.compile(r"[^-+~=][^=]*")
 """An argument that is neither an option nor an override."""
@@ -41,7 +43,13 @@ def main() -> None:
     first = arguments[0] if arguments else ""
     with quiet_on_closed_pipe():
         if first == "--version":
+            from importlib.metadata import version
+
             print(f"mops_lightning {version('mops-lightning')}")
+        elif arguments in HELP_ALONE:
+            from mops_lightning.config import help
+
+            print(help.text())
         elif first in COMMANDS:
             module, _, function = COMMANDS[first].rpartition(".")
             getattr(import_module(module), function)(arguments[1:], f"{program()} {first}")

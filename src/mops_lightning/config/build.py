@@ -3,7 +3,8 @@
 import inspect
 import logging
 import re
-from functools import partial, update_wrapper
+from collections.abc import Callable
+from functools import update_wrapper
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -61,11 +62,50 @@ def build(node: Any, where: str = "", **extra: Any) -> Any:
         known = _known_cause(error, node, where)
         if known is None:
             raise
-        raise _with_path(known, node, where, tuple(extra)) from None
+        raise _with_path(known, _unresolved(node), where, tuple(extra)) from None
     if isinstance(node, DictConfig) and node.get("_partial_"):
-        # Its signature says whether it takes m or m_max.
-        return update_wrapper(partial(_call, made, node, where), made)
+        return Deferred(made, _unresolved(node), where)
     return made
+
+
+class Deferred:
+    """A target that is called later, with the settings of its node and further arguments.
+
+    Its signature is the target's: callers read there whether it takes ``m`` or ``m_max``.
+
+    Args:
+        function: calls the target with the settings.
+        node: the settings, unresolved.
+        where: the dotted path of the node in the configuration.
+    """
+
+    def __init__(self, function: Callable[..., Any], node: dict[str, Any], where: str) -> None:
+        update_wrapper(self, function)
+        self._function = function
+        self._node = node
+        self._where = where
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Call the target.
+
+        Raises:
+            UserError: it rejects an argument; the error names the setting.
+        """
+        try:
+            return self._function(*args, **kwargs)
+        except UserError as error:
+            named = list(signature(str(self._node["_target_"]), self._where))[: len(args)]
+            extra = (*named, *kwargs)
+            raise _with_path(error, self._node, self._where, extra) from error.__cause__
+        except REJECTIONS as error:
+            raise _rejected(error, self._node, self._where) from error
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Deferred":
+        """Return itself: it never changes, and what hydra-core 1.4 calls cannot be copied.
+
+        Lightning copies a module with all that it holds for a moving average of its weights.
+        """
+        return self
 
 
 def build_as(kind: type, node: DictConfig, where: str, **extra: Any) -> Any:
@@ -110,27 +150,25 @@ def _refused_by_lightning(cause: BaseException, where: str) -> UserError:
 
 def _rejected(cause: Exception, node: Any, where: str) -> UserError:
     """Return the error about a value that a constructor of another library rejects."""
-    target = node.get("_target_", node) if isinstance(node, DictConfig) else node
+    target = node.get("_target_", node)
     text = " ".join(str(cause).split())[:300].rstrip(".")
     return UserError(f"{where}: {target} does not take these settings: {text}.")
 
 
-def _call(function: Any, node: DictConfig, where: str, /, *args: Any, **kwargs: Any) -> Any:
-    try:
-        return function(*args, **kwargs)
-    except UserError as error:
-        named = list(signature(str(node["_target_"]), where))[: len(args)]
-        raise _with_path(error, node, where, (*named, *kwargs)) from error.__cause__
-    except REJECTIONS as error:
-        raise _rejected(error, node, where) from error
+def _unresolved(node: Any) -> dict[str, Any]:
+    """Return a node as a plain dict, with its interpolations as they are written."""
+    plain: Any = OmegaConf.to_container(node, resolve=False)
+    return dict(plain)
 
 
-def _with_path(error: UserError, node: Any, where: str, extra: tuple[str, ...]) -> UserError:
+def _with_path(
+    error: UserError, node: dict[str, Any], where: str, extra: tuple[str, ...]
+) -> UserError:
     """Put the setting's path in place of the argument that an error starts with.
 
     Args:
         error: as the constructor raised it.
-        node: the configuration of the object.
+        node: the configuration of the object, unresolved.
         where: its dotted path.
         extra: arguments that code gave, not the configuration.
     """
@@ -139,8 +177,7 @@ def _with_path(error: UserError, node: Any, where: str, extra: tuple[str, ...]) 
     from_code = name in extra and name not in node
     if not (where and name) or from_code or name not in signature(str(node["_target_"]), where):
         return error
-    raw = OmegaConf.to_container(node, resolve=False)
-    value = raw.get(name) if isinstance(raw, dict) else None
+    value = node.get(name)
     shared = re.fullmatch(r"\$\{(\w+)\}", value) if isinstance(value, str) else None
     setting = shared.group(1) if shared else f"{where}.{name}"
     return UserError(setting + str(error)[len(name) :])

@@ -4,7 +4,6 @@ A mistake becomes one line with the setting and the nearest known one.
 """
 
 import re
-import textwrap
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -20,7 +19,8 @@ from yaml import MarkedYAMLError, YAMLError  # type: ignore[import-untyped]
 from mops_lightning.config import settings
 from mops_lightning.config.build import signature
 from mops_lightning.config.given import check_overrides
-from mops_lightning.config.groups import PRESETS, choice_groups, conf_dir, is_offered
+from mops_lightning.config.groups import choice_groups, conf_dir, is_offered
+from mops_lightning.config.help import run_level_keys, selectable_groups
 from mops_lightning.config.overrides import key as key_of
 from mops_lightning.config.overrides import with_own_classes
 from mops_lightning.config.validate import AUGMENTATION, refusal
@@ -32,6 +32,8 @@ NAMED |= {"net": "task/net", "stages": "sampler@task.net.sampler"}
 """The groups whose choices are in ``names``, by name."""
 OWN = "own"
 """The choice of a group for a class of the user's own."""
+SET_IN_FULL = ("task", "dataset", "sampler")
+"""Groups whose files set every argument of the package's classes that a user may set."""
 AUGMENTED = ("augment.task", "augment.sampler")
 """Settings of the class ``AUGMENTATION``, which may be null."""
 
@@ -137,6 +139,8 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     cfg = _composed(groups, arguments)
     node, _, name = key.rpartition(".")
     target = AUGMENTATION if node in AUGMENTED else OmegaConf.select(cfg, f"{node}._target_")
+    if _is_set_in_full(node, target):
+        target = None
     with suppress(UserError):  # the class of a user's own file may not be importable
         if target and name in signature(str(target), node):
             return f"{key}: {target} accepts it, but no file sets it. Write +{key}=..."
@@ -149,6 +153,12 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
     leaves = dotted(OmegaConf.to_container(cfg, resolve=False))
     known = {*settings.declared(), *(one for one in leaves if "._" not in one)} - {key}
     return f"{key}: no such setting.{did_you_mean(key, known)} --cfg job shows all of them."
+
+
+def _is_set_in_full(node: str, target: str | None) -> bool:
+    """Return whether the files of a node set every argument: the class, and torch, can wait."""
+    is_of_package = str(target).startswith("mops_lightning.")
+    return is_of_package and node.partition(".")[0] in SET_IN_FULL
 
 
 def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
@@ -199,41 +209,6 @@ def tested_label(_root_: DictConfig) -> str:
     return "-".join(parts[-2:])  # of a cell of a sweep: the sweep and the cell
 
 
-def run_level_keys() -> str:
-    """Return the run-level keys with their texts, for ``--help``."""
-    shown = {name: one for name, one in settings.declared().items() if not one.group}
-    width = max(map(len, shown)) + 2
-    return "\n".join(
-        textwrap.fill(
-            one.help, 100, initial_indent=f"{name:<{width}}", subsequent_indent=" " * width
-        )
-        for name, one in shown.items()
-    )
-
-
-def selectable_groups() -> str:
-    """Return the groups that users choose from with their choices, one per line, for ``--help``.
-
-    Files for one choice in particular (``sampler/mops/``) and for combinations of groups
-    (``dataset_task/``) are left out: Hydra selects them.
-    """
-    from hydra._internal.config_repository import ConfigRepository
-    from hydra.core.global_hydra import GlobalHydra
-    from hydra.core.object_type import ObjectType
-
-    # Hydra resolves the text of --help twice per command, and the loader's own methods copy all
-    # configuration files for each group: 0.15 s each time.
-    files = ConfigRepository(GlobalHydra.instance().config_loader().get_search_path())
-    lines = []
-    chosen = [name for name, one in settings.declared().items() if one.group]
-    for top in (*chosen, *PRESETS):
-        choices = files.get_group_options(top)
-        inner = files.get_group_options(top, ObjectType.GROUP)
-        groups = [top, *(f"{top}/{name}" for name in inner if name not in choices)]
-        lines += [f"{group}: {', '.join(files.get_group_options(group))}" for group in groups]
-    return "\n".join(sorted(lines))
-
-
 RESOLVERS = (
     group_choices,
     run_label,
@@ -244,5 +219,6 @@ RESOLVERS = (
     min,
 )
 
+settings.register()
 for resolver in RESOLVERS:
     OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)

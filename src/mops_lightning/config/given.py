@@ -54,6 +54,8 @@ def _check(argument: str, name: str, override: "Override", groups: list[str]) ->
         raise UserError(f"{argument}: give true, false, or a list of loggers.")
     elif _chooses(name, value, groups):
         _check_choices(argument, name, override)
+    elif not override.is_sweep_override():
+        _check_limits(name, value)
 
 
 def _check_removal(argument: str, name: str, value: Any, groups: list[str]) -> None:
@@ -65,6 +67,19 @@ def _check_removal(argument: str, name: str, value: Any, groups: list[str]) -> N
         raise UserError(f"{argument}: {name} cannot be removed; {other}.")
     if group in groups and value is not None and not _is_choice(value, group):
         raise UserError(f"{argument}: write ~{name}.")
+
+
+def _check_limits(path: str, value: Any) -> None:
+    """Refuse a number outside of a setting's limits before anything heavy is imported.
+
+    All else may be converted or resolved, and is checked in the composed configuration.
+    """
+    is_declared = path in settings.declared() or path in settings.INSIDE
+    limits = settings.of(path).limits
+    if not is_declared or limits is None or not isinstance(value, int | float):
+        return
+    if not limits.fits(value):
+        raise limits.refusal(path, value)
 
 
 def _chooses(name: str, value: Any, groups: list[str]) -> bool:

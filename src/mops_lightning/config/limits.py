@@ -4,6 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from mops_lightning.errors import UserError, did_you_mean
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -18,6 +20,12 @@ class Limits:
     allowed: str
     fits: Callable[[Any], bool]
     choices: tuple[str, ...] = ()
+
+    def refusal(self, path: str, value: Any) -> UserError:
+        """Return the error about a value of a setting that does not fit."""
+        near = did_you_mean(str(value), self.choices) if self.choices else ""
+        hint = near.partition(" Allowed:")[0]
+        return UserError(f"{path} must be {self.allowed}, got {value!r}.{hint}")
 
 
 def whole(minimum: int) -> Limits:

@@ -11,8 +11,6 @@ from enum import Flag, auto
 from functools import cache
 from typing import Any, Literal, get_args
 
-from hydra.core.config_store import ConfigStore
-
 from mops_lightning.config.limits import ABOVE_ZERO, TRAINER, Limits, number, one_of, whole
 
 Learn = Literal["task", "sampler", "joint", "nothing"]
@@ -331,7 +329,6 @@ def _of(schema: type, path: str) -> Setting:
 
 def register() -> None:
     """Make the declaration known to Hydra as the schema that ``conf/config.yaml`` begins with."""
+    from hydra.core.config_store import ConfigStore  # the help text does without Hydra
+
     ConfigStore.instance().store("run_settings", SCHEMA)
-
-
-register()

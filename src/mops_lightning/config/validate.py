@@ -110,10 +110,10 @@ def _check_length(trainer: dict[str, Any]) -> None:
 def refusal(path: str, value: Any) -> UserError:
     """Return the error about a value that does not fit a setting's type or limits."""
     limits = settings.of(path).limits
+    if limits is not None:
+        return limits.refusal(path, value)
     hint = get_type_hints(settings.SCHEMA).get(path, Any)
-    allowed = limits.allowed if limits else misfit(value, hint)
-    near = did_you_mean(str(value), limits.choices) if limits and limits.choices else ""
-    return UserError(f"{path} must be {allowed}, got {value!r}.{near.partition(' Allowed:')[0]}")
+    return UserError(f"{path} must be {misfit(value, hint)}, got {value!r}.")
 
 
 def _check_table(value: Any, name: str) -> None:
@@ -136,7 +136,7 @@ def _check_limits(config: dict[str, Any]) -> None:
     for path in (*settings.declared(), *settings.INSIDE):
         limits, value = settings.of(path).limits, values.get(path, MISSING)
         if limits and value != MISSING and not limits.fits(value):
-            raise refusal(path, value)
+            raise limits.refusal(path, value)
     for path, value in values.items():
         for number in value if isinstance(value, list) else [value]:
             limit = 2**63 if isinstance(number, int) else float("inf")
