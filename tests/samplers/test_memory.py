@@ -68,7 +68,7 @@ for number in sizes:
 for number in sizes:
     path = Path(sys.argv[1]) / f"{number}.npy"
     reset_peak()
-    sample_by_chunks(path, sampler, 16, options, Engine())
+    sample_by_chunks(path, sampler, options, Engine())
     peaks.append(status("VmHWM"))
 print(peaks[1] - peaks[0])
 """
