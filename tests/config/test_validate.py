@@ -32,6 +32,7 @@ FROM_CODE = {
     *("params", "optimizer", "total_steps"),  # of optimizers and schedules
     *("net", "num_classes", "num_parts"),  # of tasks, nets and samplers
     *("m", "seed"),  # of baselines
+    "channels",  # of the stages' samplers
     *("save_dir", "checkpoint", "score", "batch", "titles", "folder"),  # of loggers and callbacks
 }
 """Arguments that code gives, not YAML: see training.run.build and training.run.trainer."""
