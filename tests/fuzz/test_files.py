@@ -17,15 +17,16 @@ from mops_lightning.data.formats import isolated
 from mops_lightning.errors import UserError
 from mops_lightning.zoo import model_file
 from tests.support import mutations
+from tests.support.fuzz_las import changed_copc
 from tests.support.fuzz_readers import outcome
 from tests.support.fuzz_seeds import changed_content, changed_glb, json_bytes, seeds
 
 FILES = int(os.environ.get("MOPS_FUZZ", "12"))
 KINDS = (
-    "bin", "checkpoint", "e57", "glb", "glb content", "hdf5", "las", "laz",
-    "names", "npy", "npz", "obj", "off", "pcd", "pcd ascii", "pictured clouds", "ply",
-    "ply ascii", "ply lists", "ply mesh", "pts", "ptx", "record", "record content", "spz", "stl",
-    "weights", "weights content", "xyz",
+    "bin", "checkpoint", "copc", "copc content", "e57", "glb", "glb content", "hdf5", "label",
+    "las", "laz", "names", "npy", "npz", "obj", "off", "pcd", "pcd ascii", "pictured clouds",
+    "ply", "ply ascii", "ply lists", "ply mesh", "ply packed", "pts", "ptx", "record",
+    "record content", "spz", "stl", "weights", "weights content", "xyz",
 )  # fmt: skip
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="the system has no timer")
@@ -78,6 +79,9 @@ def fuzzed(kind, made, number):
     if kind == "glb content":
         scenes = made["glb"][1]
         return changed_glb(random, scenes[random.integers(len(scenes))])
+    if kind == "copc content":
+        files = made["copc"][1]
+        return changed_copc(random, files[random.integers(len(files))])
     if kind == "record content":
         return json_bytes(changed_content(random, json.loads(made["record"][1][0])))
     others = made[kind][1]

@@ -10,6 +10,7 @@ READERS: dict[str, tuple] = {
     "names": ("mops_lightning.data.hdf5:read_names",),
     "weights": ("mops_lightning.zoo.load:load",),
     "checkpoint": ("mops_lightning.training.checkpoint:Checkpoint.read",),
+    "label": ("tests.support.fuzz_readers:read_labelled_scan",),
     "record": ("tests.support.fuzz_readers:read_record",),
     "pictured": ("mops_lightning.viz.figures:load_clouds",),
 }
@@ -32,16 +33,28 @@ def outcome(path, kind):
 
 
 def read_cloud(path):
+    from mops_lightning.data.formats.area import Area
     from mops_lightning.data.formats.registry import CHUNKED, open_cloud_file, read
 
-    if path.suffix in CHUNKED:
+    areas = (None, Area(level=1)) if path.name.endswith(".copc.laz") else (None,)
+    for area in areas:
+        if path.suffix not in CHUNKED:
+            continue
         try:
-            cloud = open_cloud_file(path)
+            cloud = open_cloud_file(path, area)
             for rows in cloud.row_ranges(max(cloud.number // 3, 1))[:4]:
                 cloud.read(rows)
         except UserError:
             pass
     read(path, 50, 0)
+
+
+def read_labelled_scan(path):
+    import numpy as np
+
+    scan = path.with_suffix(".bin")
+    np.ones((40, 4), "<f4").tofile(scan)
+    read_cloud(scan)
 
 
 def read_record(path):

@@ -18,6 +18,7 @@ from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.training.checkpoint import CHECKPOINT_KEY, sealed
 from mops_lightning.viz.figures import save_clouds
 from mops_lightning.zoo import weights
+from tests.support.fuzz_las import copc_file, las_file, laz_with_variable_chunks
 from tests.support.meshes import BOX, quantised_glb
 from tests.support.mutations import flip_bits
 from tests.support.records import record
@@ -43,12 +44,16 @@ def seeds(folder):
     made["ply mesh"] = (".ply", [BOX.export(file_type="ply"), made["ply"][1][0]])
     made["pcd ascii"] = (".pcd", [_pcd(points)])
     for suffix in (".las", ".laz"):
-        made[suffix[1:]] = (suffix, [_las(folder / f"a{suffix}", form) for form in (3, 6, 7)])
+        made[suffix[1:]] = (suffix, [las_file(folder / f"a{suffix}", form) for form in (3, 6, 7)])
     for suffix in (".off", ".obj", ".stl", ".glb"):
         made[suffix[1:]] = (suffix, [_bytes(BOX.export(file_type=suffix[1:]))])
     made["stl"][1].append(_bytes(BOX.export(file_type="stl_ascii")))
     made["glb"][1].append(_bytes(trimesh.Scene([BOX, BOX.copy()]).export(file_type="glb")))
+    made["laz"][1].append(laz_with_variable_chunks())
+    made["copc"] = (".copc.laz", [copc_file(folder / "a.copc.laz", form) for form in (3, 6, 7)])
     made["ply lists"] = (".ply", [_ply_with_lists()])
+    made["ply packed"] = (".ply", [_packed_splats(folder / "packed.ply", points)])
+    made["label"] = (".label", [(np.arange(40, dtype="<u4") << 15).tobytes()])
     made["pts"] = (".pts", [b"2\n1 2 3 -5 10 20 30\n4 5 6 7 8 9 10\n" * 9])
     made["ptx"] = (".ptx", [PTX, PTX * 2])
     made["e57"] = (".e57", [_e57(folder / "a.e57", points)])
@@ -103,15 +108,12 @@ def _pcd(points):
     return (head + "\n".join(" ".join(map(str, row)) for row in points)).encode()
 
 
-def _las(path, form):
-    import laspy
+def _packed_splats(path, points):
+    import gsply
 
-    header = laspy.LasHeader(point_format=form, version="1.4" if form > 5 else "1.2")
-    header.add_extra_dim(laspy.ExtraBytesParams("depth", "f4"))
-    cloud = laspy.LasData(header)
-    cloud.x, cloud.y, cloud.z = np.random.default_rng(form).uniform(0, 9, (3, 40))
-    cloud.write(path)
-    return path.read_bytes()
+    gsply.plywrite(path, _splats(points), compressed=True)
+    packed = path if path.exists() else path.with_name("packed.compressed.ply")
+    return packed.read_bytes()
 
 
 def _ply_with_lists():
@@ -145,7 +147,14 @@ def _e57(path, points):
 def _spz(path, points):
     import gsply
 
-    splats = gsply.GSData.from_arrays(
+    gsply.write_spz(path, _splats(points))
+    return path.read_bytes()
+
+
+def _splats(points):
+    import gsply
+
+    return gsply.GSData.from_arrays(
         means=points.astype(np.float32),
         scales=np.full((len(points), 3), -4, np.float32),
         quats=np.tile(np.array([1, 0, 0, 0], np.float32), (len(points), 1)),
@@ -153,8 +162,6 @@ def _spz(path, points):
         sh0=np.zeros((len(points), 3), np.float32),
         shN=np.zeros((len(points), 3, 3), np.float32),
     )
-    gsply.write_spz(path, splats)
-    return path.read_bytes()
 
 
 def _hdf5(path, options):

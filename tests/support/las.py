@@ -86,13 +86,20 @@ def header_fields(path: Path) -> dict[str, Any]:
 
 
 def records(content: bytes) -> list[tuple]:
-    """Return user, number, description and data of the records before the points."""
+    """Return user, number, description and data of the records before the points.
+
+    The smallest and largest numbers of extra dimensions are left out: they are those of the points.
+    """
     (place,) = struct.unpack_from("<H", content, 94)
     (number,) = struct.unpack_from("<I", content, 100)
     found = []
     for _ in range(number):
         user, identifier, length, text = struct.unpack_from("<2x16sHH32s", content, place)
-        found.append((user, identifier, text, content[place + 54 : place + 54 + length]))
+        data = bytearray(content[place + 54 : place + 54 + length])
+        if (user.rstrip(b"\0"), identifier) == (b"LASF_Spec", 4):
+            for start in range(0, length, 192):
+                data[start + 64 : start + 112] = bytes(48)
+        found.append((user, identifier, text, bytes(data)))
         place += 54 + length
     return found
 

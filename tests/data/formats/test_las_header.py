@@ -192,3 +192,84 @@ def test_columns_of_other_formats_become_dimensions(tmp_path):
     for name, column in zip(names, columns.values(), strict=True):
         np.testing.assert_array_equal(again[name], column)
     assert set(np.asarray(again.return_number)) == {1}
+
+
+NO_DATA, SMALLEST, LARGEST = 1, 2, 4
+EACH = NO_DATA | SMALLEST | LARGEST
+"""Bits of an extra dimension's options."""
+
+
+def with_range(path, name, kind, options, *numbers):
+    """Document no_data, the smallest and the largest number of an extra dimension."""
+    content = bytearray(path.read_bytes())
+    entry = content.index(name.encode().ljust(32, b"\0")) - 4
+    content[entry + 3] = content[entry + 3] & ~7 | options
+    for place, number in zip((40, 64, 88), numbers, strict=True):
+        struct.pack_into(kind, content, entry + place, *number)
+    path.write_bytes(content)
+
+
+def range_of(path, name, kind):
+    content = path.read_bytes()
+    entry = content.index(name.encode().ljust(32, b"\0")) - 4
+    return [struct.unpack_from(kind, content, entry + place) for place in (40, 64, 88)]
+
+
+@pytest.mark.parametrize("name", ["out.las", "out.laz", "out.copc.laz"])
+def test_ranges_of_extra_dimensions_are_those_of_the_points_that_are_kept(name, tmp_path):
+    path, out = tmp_path / "a.las", tmp_path / name
+    cloud = full_cloud(6)
+    cloud["Amplitude"].array[:] = np.arange(300)
+    cloud["Colors"][:] = np.arange(900).reshape(300, 3) % 256
+    cloud["height above ground"][:] = np.arange(300) - 10
+    cloud["height above ground"][50] = np.nan
+    cloud.write(path)
+    with_range(path, "Amplitude", "<Q", EACH, (50,), (0,), (299,))
+    with_range(path, "Colors", "<3Q", SMALLEST | LARGEST, (0, 0, 0), (0, 0, 0), (255, 255, 255))
+    with_range(path, "height above ground", "<d", SMALLEST | LARGEST, (0,), (-10,), (289,))
+    with_range(path, "long steps", "<q", 0, (0,), (7,), (8,))
+
+    write(out, read(path, 1, 0).take(np.arange(50, 60)))
+
+    assert range_of(out, "Amplitude", "<Q") == [(50,), (51,), (59,)]
+    assert range_of(out, "Colors", "<3Q") == [(0, 0, 0), (150, 151, 152), (177, 178, 179)]
+    assert range_of(out, "height above ground", "<d") == [(0,), (41,), (49,)]
+    assert range_of(out, "long steps", "<q") == [(0,), (7,), (8,)]
+
+
+@pytest.mark.parametrize("form", [4, 10])
+def test_waveforms_that_stay_beside_the_input_are_said(form, tmp_path, capsys):
+    full_cloud(form).write(tmp_path / "a.las")
+    table = read(tmp_path / "a.las", 1, 0)
+
+    write(tmp_path / "out.las", table)
+
+    said = capsys.readouterr().out
+    assert said.endswith(
+        "out.las: its waveforms are in the .wdp file beside the input: copy it, named like this "
+        "file\n"
+    )
+    write(tmp_path / "plain.las", table.without_attributes())
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("name", ["out.las", "out.copc.laz"])
+def test_another_grid_of_coordinates_is_said_with_the_largest_change(name, tmp_path, capsys):
+    points = np.array([[0, 0, 0], [2**30, 0.25, 0.5], [7, 1, 0.75]])
+    np.save(tmp_path / "a.npy", points)
+
+    write(tmp_path / name, read(tmp_path / "a.npy", 1, 0))
+
+    np.testing.assert_array_equal(laspy.read(tmp_path / name).xyz, np.rint(points))
+    assert capsys.readouterr().out.endswith(
+        f"{name}: coordinates are on a grid of 1, which changes them by up to 0.5\n"
+    )
+
+
+def test_coordinates_that_a_grid_holds_are_written_without_a_word(tmp_path, capsys):
+    np.save(tmp_path / "a.npy", np.array([[0, 0, 0], [1, 0.25, 0.5]], "f4"))
+
+    write(tmp_path / "out.las", read(tmp_path / "a.npy", 1, 0))
+
+    np.testing.assert_array_equal(laspy.read(tmp_path / "out.las").x, [0, 1])
+    assert capsys.readouterr().out == ""

@@ -51,7 +51,7 @@ WRITERS: dict[str, Callable[[Path, Table], list[str] | None]] = {
 }
 """Writers of clouds; they return in words what the file does not hold, if anything."""
 
-PART_WRITERS: dict[str, Callable[[Path, TableParts], None]] = {
+PART_WRITERS: dict[str, Callable[[Path, TableParts], list[str] | None]] = {
     ".ply": ply.write_parts,
     ".las": las.write_parts,
     ".laz": las.write_parts,
@@ -136,7 +136,7 @@ def write(path: Path, table: Table | TableParts) -> None:
     try:
         with atomic_write(path) as temporary:
             if isinstance(table, TableParts):
-                PART_WRITERS[suffix](temporary, table)
+                notes = PART_WRITERS[suffix](temporary, table)
             elif path.name.lower().endswith(scans.NUSCENES_SUFFIX):
                 notes = scans.write(temporary, table, scans.NUSCENES)
             else:

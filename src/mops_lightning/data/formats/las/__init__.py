@@ -72,26 +72,30 @@ def ranges_of_bytes(path: Path, area: Area) -> list[tuple[int, int]]:
     return copc.ranges_of_bytes(path, read_header(path), area)
 
 
-def write(path: Path, table: tables.Table) -> None:
-    """Write a LAS or LAZ file like the one that was read, or one of plain coordinates."""
-    write_parts(path, tables.TableParts.whole(table))
+def write(path: Path, table: tables.Table) -> list[str]:
+    """Write a LAS or LAZ file like the one that was read, or one of plain coordinates.
+
+    Returns:
+        What the file does not hold, in words; so do the other writers.
+    """
+    return write_parts(path, tables.TableParts.whole(table))
 
 
-def write_parts(path: Path, table: tables.TableParts) -> None:
+def write_parts(path: Path, table: tables.TableParts) -> list[str]:
     """Write a LAS or LAZ file part by part."""
     _check_installed(path)
-    writer.write_parts(path, table)
+    return writer.write_parts(path, table)
 
 
-def write_copc(path: Path, table: tables.Table) -> None:
+def write_copc(path: Path, table: tables.Table) -> list[str]:
     """Write a COPC file."""
-    write_copc_parts(path, tables.TableParts.whole(table))
+    return write_copc_parts(path, tables.TableParts.whole(table))
 
 
-def write_copc_parts(path: Path, table: tables.TableParts) -> None:
+def write_copc_parts(path: Path, table: tables.TableParts) -> list[str]:
     """Write a COPC file part by part."""
     _check_installed(path)
-    copc_writer.write_copc_parts(path, table)
+    return copc_writer.write_copc_parts(path, table)
 
 
 def _small(header: Header) -> Header:

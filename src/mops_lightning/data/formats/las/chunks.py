@@ -118,6 +118,7 @@ def _chunks(file: Any, header: Header) -> list[Chunk]:
     """Return the chunks of a file from its table, which does not know how full the last one is."""
     import lazrs
 
+    _check_table(file, header)
     file.seek(header.first)
     table = lazrs.read_chunk_table(file, lazrs.LazVlr(header.compression))
     left, start = header.number, header.first + 8  # after the place of the table
@@ -127,3 +128,16 @@ def _chunks(file: Any, header: Header) -> list[Chunk]:
         start += size
         left -= chunks[-1].number
     return chunks
+
+
+def _check_table(file: Any, header: Header) -> None:
+    """Reject many more chunks than points; lazrs may end the process for want of memory."""
+    file.seek(header.first)
+    (place,) = struct.unpack("<q", file.read(8))
+    if place < 0:  # at the end of the file
+        place = file.seek(-8, 2)
+        (place,) = struct.unpack("<q", file.read(8))
+    file.seek(max(place, 0))
+    _, number = struct.unpack("<2I", file.read(8))
+    if number > 2 * header.number + 1:
+        raise ValueError(f"its table has {number:,} chunks of {header.number:,} points")

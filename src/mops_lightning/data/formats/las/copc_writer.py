@@ -77,24 +77,25 @@ class Cells:
         self.stream.write(struct.pack("<q", place))
 
 
-def write_copc_parts(path: Path, table: TableParts) -> None:
-    """Write a COPC file; its points need not fit in memory.
+def write_copc_parts(path: Path, table: TableParts) -> list[str]:
+    """Write a COPC file, whose points need not fit in memory; return what it does not hold.
 
     Points of formats 0 to 3 become points of formats 6 and 7, which hold all of their dimensions.
     """
     form, parts = plan(path, table, copc=True)
-    header, summary = form.header, Summary(form.layout)
+    header = form.header
     record = compression(form.layout, variable=True)
     low, side = _cube(header, table)
 
-    def with_info(place: int, size: int) -> Header:
-        times = summary.times if place else (0.0, 0.0)
+    def with_info(place: int, size: int, times: tuple[float, float]) -> Header:
         info = INFO.pack(*low + side / 2, side / 2, side / GRID, place, size, *times)
         records = (Record.new(COPC, 1, info, "COPC info VLR"), *header.records, record)
         return replace(header, records=records)
 
     with path.open("wb+") as stream:
-        begin(stream, with_info(0, 0), compressed=True)
+        preliminary = with_info(0, 0, (0.0, 0.0))
+        summary = Summary(preliminary, form.layout)
+        begin(stream, preliminary, compressed=True)
         cells = Cells(stream, record, summary)
         scales, offsets = header.scales, header.offsets
         builder = Builder(low, side, scales, offsets, cells.add, path.parent)
@@ -103,11 +104,9 @@ def write_copc_parts(path: Path, table: TableParts) -> None:
         page = b"".join(cells.entries)
         place = stream.seek(0, 2) + EXTENDED_RECORD.size
         extended = [Record.new(COPC, HIERARCHY, page, "EPT hierarchy"), *header.extended]
-        final = with_info(place, len(page))
+        final = with_info(place, len(page), summary.times)
         finish(stream, final, True, summary, extended)
-        stream.seek(len(final.head))
-        for each in final.records:
-            stream.write(each.to_bytes())
+    return form.notes()
 
 
 def _cube(header: Header, table: TableParts) -> tuple[NDArray[np.float64], float]:

@@ -45,7 +45,7 @@ DEGREES = 0.006
 """Step of the angle in formats 6 to 10; older ones have whole degrees."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Plan:
     """What a file will be like.
 
@@ -53,11 +53,31 @@ class Plan:
         header: with the final records, but without counts, bounds and places.
         layout: of its points.
         names: the dimension of every column that is not packed.
+        has_waveforms: whether its points refer to waveforms in a file beside the input.
+        on_new_grid: whether its coordinates are those of a file, on another grid.
+        moved: largest change of a coordinate so far.
     """
 
     header: Header
     layout: Layout
     names: dict[str, str]
+    has_waveforms: bool = False
+    on_new_grid: bool = False
+    moved: float = 0.0
+
+    def notes(self) -> list[str]:
+        """Return what the file does not hold, when all points are packed."""
+        notes = []
+        if self.has_waveforms:
+            notes.append(
+                "its waveforms are in the .wdp file beside the input: copy it, named like this file"
+            )
+        if self.on_new_grid and self.moved:
+            notes.append(
+                f"coordinates are on a grid of {self.header.scales[0]:.2g}, which changes them by "
+                f"up to {self.moved:.2g}"
+            )
+        return notes
 
     def pack(self, table: Table) -> Rows:
         """Return the packed points ``(n,)`` of a part of the table."""
@@ -82,6 +102,8 @@ class Plan:
         axes = zip("XYZ", self.header.scales, self.header.offsets, table.points.T, strict=True)
         for axis, scale, offset, values in axes:
             rows[axis] = np.rint((values - offset) / scale)
+            change = np.abs(rows[axis] * scale + offset - values).max(initial=0.0)
+            self.moved = max(self.moved, float(change))
         for name in ("return_number", "number_of_returns"):
             self.layout.dimensions[name].set(rows, np.ones(len(rows), np.uint8))
 
@@ -124,7 +146,9 @@ def plan(path: Path, table: TableParts, copc: bool) -> tuple[Plan, Iterator[Tabl
         source, layout = _modern_header(with_wkt(source), layout)
     layout, names = layout.with_columns(columns)
     header = _with_records(source, layout)
-    return Plan(header, layout, names), chain([first], parts)
+    has_waveforms = packed is not None and header.format in WAVEFORM_FORMATS
+    on_new_grid = table.header is None and table.form.coordinates is not None
+    return Plan(header, layout, names, has_waveforms, on_new_grid), chain([first], parts)
 
 
 def _check(path: Path, header: Header, copc: bool, has_attributes: bool) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from mops_lightning.data.formats.las.header import LASZIP, Header, Record
 from mops_lightning.data.formats.las.layout import Layout, Rows
 from mops_lightning.data.formats.las.packing import plan
+from mops_lightning.data.formats.las.ranges import ExtraRanges
 from mops_lightning.data.formats.table import TableParts
 
 SOFTWARE = b"mops_lightning"
@@ -20,10 +21,11 @@ LEGACY_LIMIT = 2**32
 
 
 class Summary:
-    """What the header says of all points: numbers, bounds, and range of GPS times."""
+    """What the header says of all points: numbers, bounds, ranges of GPS times and extra bytes."""
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, header: Header, layout: Layout) -> None:
         self.layout = layout
+        self.ranges = ExtraRanges(header, layout)
         self.number = 0
         self.returns = np.zeros(16, np.int64)
         self.low = np.full(3, np.iinfo(np.int64).max)
@@ -33,6 +35,7 @@ class Summary:
     def add(self, rows: Rows) -> None:
         """Count points."""
         self.number += len(rows)
+        self.ranges.add(rows)
         returns = self.layout.dimensions["return_number"].get(rows)
         self.returns += np.bincount(returns, minlength=16)
         for place, axis in enumerate("XYZ"):
@@ -116,10 +119,10 @@ def compression(layout: Layout, variable: bool = False) -> Record:
     return Record.new("laszip encoded", LASZIP, bytes(data), "http://laszip.org")
 
 
-def write_parts(path: Path, table: TableParts) -> None:
-    """Write a LAS or LAZ file part by part."""
+def write_parts(path: Path, table: TableParts) -> list[str]:
+    """Write a LAS or LAZ file part by part; return what it does not hold."""
     form, parts = plan(path, table, copc=False)
-    header, summary = form.header, Summary(form.layout)
+    header, summary = form.header, Summary(form.header, form.layout)
     compressed = path.suffix.lower() == ".laz"
     if compressed:
         record = compression(form.layout)
@@ -132,6 +135,7 @@ def write_parts(path: Path, table: TableParts) -> None:
             points.write(part)
         points.close()
         finish(stream, header, compressed, summary, list(header.extended))
+    return form.notes()
 
 
 def _filled(parts: Iterator[Rows]) -> Iterator[Rows]:
@@ -152,7 +156,7 @@ def finish(
     summary: Summary,
     extended: list[Record],
 ) -> None:
-    """Write the records after the points, and the final header."""
+    """Write the records after the points, and the final header and records before them."""
     place = stream.seek(0, 2)
     for record in extended:
         stream.write(record.to_bytes(extended=True))
@@ -162,6 +166,8 @@ def finish(
         struct.pack_into("<QI", head, 235, place if extended else 0, len(extended))
     stream.seek(0)
     stream.write(head)
+    for record in summary.ranges.fill(header.records):
+        stream.write(record.to_bytes())
 
 
 def _head(header: Header, compressed: bool) -> bytearray:
