@@ -7,7 +7,7 @@ WORKERS ?= 3
 # Examples of each kind that `make fuzz` tries.
 EXAMPLES ?= 1000
 
-.PHONY: setup run test fuzz mutants check shape site clean
+.PHONY: setup run test test-newest fuzz mutants check shape site clean
 
 setup: .venv/.installed
 
@@ -22,6 +22,13 @@ run: setup
 
 test: setup
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+
+# The same with the newest versions that the requirements allow, in an environment of its own.
+test-newest:
+	test -x build/newest/bin/python || $(PYTHON) -m venv build/newest
+	build/newest/bin/python -m pip install --quiet --upgrade --upgrade-strategy eager -e '.[test]'
+	build/newest/bin/python -m pip list
+	build/newest/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 # The long round of tests/fuzz; `make test` contains a short one.
 fuzz: setup
