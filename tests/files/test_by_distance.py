@@ -8,10 +8,17 @@ import pytest
 
 from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
+from mops_lightning.files import by_distance
 from mops_lightning.ops.spacing import keep_spaced
 from tests.support.downsample import done, refused
 
 RNG = np.random.default_rng(0)
+
+
+@pytest.fixture(autouse=True)
+def short_ranges(monkeypatch):
+    """Read the small files of these tests in several ranges."""
+    monkeypatch.setattr(by_distance, "LEAST_CHUNK", 1)
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +150,29 @@ def test_map_of_a_spacing(scan, tmp_path):
 def test_mistakes_are_one_line(options, words, scan, tmp_path):
     assert words in refused(scan, tmp_path / "out.npz", *options)
     assert not (tmp_path / "out.npz").exists()
+
+
+@pytest.mark.parametrize("budget", ["--spacing", "--voxel"])
+def test_chunk_of_one_point_reads_longer_ranges(budget, tmp_path, monkeypatch):
+    monkeypatch.setattr(by_distance, "LEAST_CHUNK", 4096)
+    WRITERS[".ply"](tmp_path / "in.ply", Table(RNG.normal(size=(5000, 3))))
+    ranges: list[range] = []
+    monkeypatch.setattr(by_distance, "_read", watched(by_distance._read, ranges))
+    done(tmp_path / "in.ply", tmp_path / "whole.ply", budget, 2.5)
+    ranges.clear()
+
+    done(tmp_path / "in.ply", tmp_path / "parts.ply", budget, 2.5, "--chunk", 1)
+
+    assert (tmp_path / "parts.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    assert {*ranges} == {range(4096), range(4096, 5000)}
+
+
+def watched(read_part, ranges):
+    def read_range(cloud, options, rows):
+        ranges.append(rows)
+        return read_part(cloud, options, rows)
+
+    return read_range
 
 
 @pytest.mark.parametrize("budget", ["--spacing", "--voxel"])

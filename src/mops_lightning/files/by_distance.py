@@ -30,6 +30,9 @@ from mops_lightning.ops.voxels import Sums, Voxels, occupied, representatives, s
 from mops_lightning.ops.voxels import sum_columns as sum_in_voxels
 from mops_lightning.ops.weights import CURVATURE
 
+LEAST_CHUNK = 4096
+"""Fewest rows of a range: with a few, a spacing would read the file once for every kept point."""
+
 AVERAGED = {
     "red", "green", "blue", "nir", "alpha", "intensity", "r", "g", "b", "a",
     "diffuse_red", "diffuse_green", "diffuse_blue",
@@ -61,6 +64,8 @@ def keep_by_distance(
     check_unit(file.header, name, source)
     if options.chunk is not None and options.weight == CURVATURE:
         raise UserError("--weight curvature needs the whole cloud in memory: leave --chunk out.")
+    if options.chunk is not None:
+        options = replace(options, chunk=max(options.chunk, LEAST_CHUNK))
     # The header of a file is needed only where it is written.
     cloud = replace(file, header=None)
     ranges = file.row_ranges(options.chunk or max(file.number, 1))
