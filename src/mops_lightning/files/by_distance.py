@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from mops_lightning.data.formats.cloud_file import CloudFile
 from mops_lightning.data.formats.guard import BadCloudError, check_coordinates
 from mops_lightning.data.formats.registry import open_cloud_file
-from mops_lightning.data.formats.table import Column, Table, join_tables
+from mops_lightning.data.formats.table import Table, join_tables
 from mops_lightning.errors import UserError
 from mops_lightning.files.chunks import Outcome
+from mops_lightning.files.column_means import as_stored, averaged, renormalise, values_of
 from mops_lightning.files.column_weights import weights_of
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
@@ -32,17 +33,6 @@ from mops_lightning.ops.weights import CURVATURE
 
 LEAST_CHUNK = 4096
 """Fewest rows of a range: with a few, a spacing would read the file once for every kept point."""
-
-AVERAGED = {
-    "red", "green", "blue", "nir", "alpha", "intensity", "r", "g", "b", "a",
-    "diffuse_red", "diffuse_green", "diffuse_blue",
-}  # fmt: skip
-"""Columns of whole numbers that are quantities; others are names, of which there is no mean."""
-
-PACKED = {"rgb", "rgba"}
-"""Columns whose bits are colours (PCD)."""
-
-NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 
 
 def keep_by_distance(
@@ -256,27 +246,10 @@ def _found(cloud: CloudFile, options: Options, voxels: Voxels, rows: range) -> F
     return Found(part.table.take(kept), part.rows[kept], voxel, best.distances[voxel], weight)
 
 
-def _averaged(table: Table) -> list[str]:
-    """Return the names of columns that have a mean."""
-    return [
-        name
-        for name, column in table.columns.items()
-        if column.ndim == 1
-        and name.lower() not in PACKED
-        and (column.dtype.kind == "f" or name.lower() in AVERAGED)
-    ]
-
-
-def _values(table: Table, names: list[str]) -> NDArray[np.float64]:
-    if not names:
-        return np.empty((len(table.points), 0))
-    return np.stack([table.columns[name].astype(np.float64) for name in names], axis=1)
-
-
 def _largest(
     cloud: CloudFile, options: Options, names: list[str], rows: range
 ) -> NDArray[np.float64]:
-    values = _values(_read(cloud, options, rows).table, names)
+    values = values_of(_read(cloud, options, rows).table, names)
     finite: NDArray[np.float64] = np.abs(np.where(np.isfinite(values), values, 0.0))
     return finite.max(axis=0, initial=0.0)
 
@@ -291,7 +264,7 @@ def _column_sums(
 ) -> Sums:
     assert options.voxel is not None
     table = _read(cloud, options, rows).table
-    return sum_in_voxels(table.points, options.voxel, voxels, _values(table, names), scales)
+    return sum_in_voxels(table.points, options.voxel, voxels, values_of(table, names), scales)
 
 
 def _add(left: Sums, right: Sums) -> Sums:
@@ -359,7 +332,7 @@ class Passes(NamedTuple):
         """Return the means of all voxels; columns of names are those of the nearest points."""
         assert self.options.voxel is not None
         nearest = found.table.take(found.voxel.argsort())
-        names = _averaged(nearest)
+        names = averaged(nearest)
         columns = dict(nearest.columns)
         if names:
             largest: NDArray[np.float64] = reduce(np.maximum, self.over("scale", _largest, names))
@@ -368,26 +341,9 @@ class Passes(NamedTuple):
             sums: Sums = reduce(_add, work)
             means = sums.means(voxels.counts, scales)
             for name, values in zip(names, means.T, strict=True):
-                columns[name] = _as_stored(values, nearest.columns[name])
-        _renormalise(columns)
+                columns[name] = as_stored(values, nearest.columns[name])
+        renormalise(columns)
         is_alone = (voxels.counts == 1)[:, None]
         points = np.where(is_alone, nearest.points, voxels.means(self.options.voxel))
         form = replace(nearest.form, coordinates=None)
         return replace(nearest, points=points, columns=columns, form=form)
-
-
-def _as_stored(means: NDArray[np.float64], column: Column) -> Column:
-    if column.dtype.kind != "f":
-        means = np.rint(means)
-    return means.astype(column.dtype)
-
-
-def _renormalise(columns: dict[str, Column]) -> None:
-    """Scale normals to length 1; those that cancel out stay 0."""
-    for names in NORMALS:
-        if all(name in columns for name in names):
-            normals = np.stack([columns[name].astype(np.float64) for name in names], axis=1)
-            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-            normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
-            for name, values in zip(names, normals.T, strict=True):
-                columns[name] = values.astype(columns[name].dtype)
