@@ -5,13 +5,12 @@ A short round in the suite; ``make fuzz`` kills at every write and at random mom
 
 import contextlib
 import io
+import multiprocessing
 import os
 import random
 import signal
 import sys
-import tempfile
 import time
-import traceback
 from pathlib import Path
 
 import pytest
@@ -27,11 +26,14 @@ from tests.support.command_line import TINY
 
 LONG = int(os.environ.get("MOPS_FUZZ", "0"))
 """Command lines of the long round; a tenth of it: kills at random moments; 0: the short round."""
-pytestmark = [
-    pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork"),
-    # Python 3.12 warns of it in processes with threads, of which nothing is used here.
-    pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning"),
-]
+MOST_SECONDS = 300
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+
+# Children of a server that runs no threads and has imported all: a fork of the process of the tests
+# would inherit locks that threads of earlier tests held, and could wait for them for ever.
+PROCESSES = multiprocessing.get_context("forkserver" if hasattr(os, "fork") else "spawn")
+if hasattr(os, "fork"):
+    PROCESSES.set_forkserver_preload(["mops_lightning.cli.sweep", __name__])
 
 TWO_EPOCHS = [*TINY, "trainer.max_epochs=2", "epochs.task=2", "baselines={}"]
 
@@ -66,38 +68,33 @@ def results(folder):
     return found
 
 
-def attempt(folder, work, at_write=0, after=0.0):
+def attempt(folder, work, at_write=0, after=None):
     """Work in a process of its own; kill it before a write, or after some seconds.
 
     Returns:
         Its exit status, negative if it was killed, and the number of its writes.
     """
-    reader, writer = os.pipe()
-    child = os.fork()
-    if child == 0:
-        status = 1
-        try:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-            tempfile.tempdir = None
-            os.environ["TMPDIR"] = "/dev/shm" if Path("/dev/shm").is_dir() else str(folder)
-            writes = count_writes(folder, at_write)
-            with contextlib.redirect_stdout(io.StringIO()):
-                WORK[work](folder)
-            os.write(writer, str(len(writes)).encode())
-            status = 0
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            os._exit(status)
-    os.close(writer)
-    if after:
+    counts = PROCESSES.SimpleQueue()
+    child = PROCESSES.Process(target=in_child, args=(folder, work, at_write, counts))
+    child.start()
+    if after is not None:
         time.sleep(after)
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(child, signal.SIGKILL)
-    _, status = os.waitpid(child, 0)
-    with os.fdopen(reader) as pipe:
-        text = pipe.read()
-    return os.waitstatus_to_exitcode(status), int(text or 0)
+        child.kill()
+    child.join(MOST_SECONDS)
+    hangs = child.is_alive()
+    child.kill()
+    child.join()
+    assert not hangs, f"{work} did not end within {MOST_SECONDS} s"
+    return child.exitcode, counts.get() if child.exitcode == 0 else 0
+
+
+def in_child(folder, work, at_write, counts):
+    """Work, and send the number of writes."""
+    os.environ["TMPDIR"] = "/dev/shm" if Path("/dev/shm").is_dir() else str(folder)
+    writes = count_writes(folder, at_write)
+    with contextlib.redirect_stdout(io.StringIO()):
+        WORK[work](folder)
+    counts.put(len(writes))
 
 
 def count_writes(folder, kill_at):

@@ -88,9 +88,11 @@ def test_load_while_another_thread_draws_repeats_no_random_number():
 
     with ThreadPoolExecutor(1) as pool:
         pool.submit(draw)
-        for name in MODELS * 3:
-            load(name)
-        loaded.set()
+        try:
+            for name in MODELS * 3:
+                load(name)
+        finally:
+            loaded.set()  # or the pool would wait for ever
 
     assert len(drawn) > 10
     assert len(set(drawn)) == len(drawn)

@@ -1,5 +1,6 @@
 """Parsers in another process."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -62,6 +63,24 @@ def test_isolated_slow_parser_is_ended(path, monkeypatch):
     monkeypatch.setattr(module, "SECONDS", 1.0)
     with pytest.raises(UserError, match=r"a\.laz is broken: reading it took more than 1 s"):
         isolated(parse, path, "hang")
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+# Python 3.12 warns of a fork in a process with threads; the child here uses none.
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
+def test_isolated_in_forked_process_has_a_reader_of_its_own(path):
+    """As workers of a data loader are: two that share a reader would get each other's results."""
+    before = isolated(parse, path)
+    context = multiprocessing.get_context("fork")
+    readers = context.SimpleQueue()
+
+    child = context.Process(target=lambda: readers.put(isolated(parse, path)))
+    child.start()
+    child.join(60)
+
+    assert child.exitcode == 0
+    assert readers.get() not in (before, os.getpid())
+    assert isolated(parse, path) == before
 
 
 def test_isolated_process_ends_with_its_script(path):

@@ -36,6 +36,10 @@ COMMAND = (
 _idle: list[Popen[bytes]] = []
 """Processes that wait for their next call."""
 
+if hasattr(os, "register_at_fork"):
+    # Two processes that write to one reader would get each other's results.
+    os.register_at_fork(after_in_child=_idle.clear)
+
 
 def isolated(function: Callable[..., Result], path: Path, *arguments: Any) -> Result:
     """Return ``function(path, *arguments)``, called in another process.
