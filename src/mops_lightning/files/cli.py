@@ -18,8 +18,8 @@ binary .ply file may be larger than memory."""
 
 COMPARE = """Compare downsampling methods on your own files.
 
-Each file is sampled to m points by random, voxel, farthest point and Poisson-disk sampling and,
-with --weights, by a trained sampler. A table and a page with the clouds in 3-D show the chamfer and
+Each file is sampled to m points by every untrained method and, with --weights, by a trained
+sampler. A table and a page with the clouds in 3-D show the chamfer and
 Hausdorff distances to the full cloud, how evenly it is represented, and the time."""
 
 
