@@ -1,7 +1,10 @@
+from typing import Any
+
 import matplotlib.image
 import numpy as np
 import pytest
 import torch
+from mpl_toolkits.mplot3d import proj3d
 from PIL import Image
 from torch.nn import functional as F
 
@@ -126,3 +129,30 @@ def test_reconstruction_grid_thins_large_clouds_only(rng):
     most = figures.MAX_INPUT_POINTS
     assert counts == [[most], [most], [most, 8], [100]]
     assert figure.axes[3].texts[0].get_text() == "NRE 1.50"
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_view_upright_draws_the_upper_end_above_and_no_mirror_image(up):
+    turn = {"x": [2, 0, 1], "y": [0, 1, 2], "z": [1, 2, 0]}[up]
+    tripod = torch.zeros(1, 4, 3)  # the origin, and one step to the right, up and to the viewer
+    tripod[0, 1:] = torch.eye(3)[turn]
+    figure = figures.cloud_grid(tripod, {}, [""])
+
+    figures.view_upright(figure, up)
+
+    axes: Any = figure.axes[0]
+    drawn = figures.upright(tripod)[0]
+    flat = np.array([proj3d.proj_transform(*point, axes.get_proj())[:2] for point in drawn])
+    origin, right, above, front = flat
+    upwards = above - origin
+    assert upwards[1] > 10 * abs(upwards[0])
+    # Turned about the vertical, the other two keep their order: seen from above, anticlockwise.
+    assert np.linalg.det([front - origin, right - origin]) > 0
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_to_y_up_is_a_rotation_that_raises_the_vertical_axis(up):
+    turned = figures.to_y_up(torch.eye(3), up)
+
+    assert turned["xyz".index(up)].tolist() == [0, 1, 0]
+    assert torch.linalg.det(turned) == 1

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import torch
+
 from mops_lightning.training.run.pictures import clouds_to_draw
 from tests.support.training import small_dataset
 
@@ -14,8 +16,28 @@ def test_clouds_to_draw_spreads_over_the_classes():
     assert names == ["long", "round"]
     assert dataset.test.labels[chosen].tolist() == [0, 2]
     assert chosen.tolist() == [0, 2]  # the first of each class
-    assert clouds_to_draw(dataset, 9)[1] == ["long", "tall", "round"]
     assert clouds_to_draw(dataset, 1)[1] == ["long"]
+
+
+def test_clouds_to_draw_of_few_classes_spreads_over_the_clouds_of_each():
+    dataset = small_dataset()  # rows 0, 3, 6 and 9 are long, 1, 4 and 7 tall, 2, 5 and 8 round
+
+    chosen, names = clouds_to_draw(dataset, 5)
+
+    assert chosen.tolist() == [0, 9, 1, 7, 2]
+    assert names == ["long 1", "long 2", "tall 1", "tall 2", "round"]
+    assert len(clouds_to_draw(dataset, 99)[0]) == 10
+
+
+def test_clouds_to_draw_of_one_class_are_of_several_files():
+    dataset = small_dataset()
+    files = torch.tensor([0, 0, 0, 0, 1, 1, 1, 2, 2, 2])
+    crops = dataset.test._replace(labels=torch.zeros(10, dtype=torch.int64), sources=files)
+
+    chosen, names = clouds_to_draw(replace(dataset, class_names=("cloud",), test=crops), 3)
+
+    assert files[chosen].tolist() == [0, 1, 2]
+    assert names == ["cloud 1", "cloud 2", "cloud 3"]
 
 
 def test_clouds_to_draw_of_no_cloud_is_empty():
@@ -28,5 +50,5 @@ def test_clouds_to_draw_leaves_out_classes_without_test_clouds():
 
     chosen, names = clouds_to_draw(replace(dataset, test=test), 3)
 
-    assert names == ["tall", "round"]
-    assert test.labels[chosen].tolist() == [1, 2]
+    assert names == ["tall 1", "tall 2", "round"]
+    assert test.labels[chosen].tolist() == [1, 1, 2]

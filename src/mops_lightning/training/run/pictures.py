@@ -15,6 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from mops_lightning.data.clouds import CloudDataset
+from mops_lightning.errors import UserError
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.tasks.base import Task, figures_of
@@ -36,9 +37,20 @@ class CloudVisualization(Callback):
         batch: the test clouds to draw, as the task's ``step`` takes them.
         titles: one per cloud of the dataset.
         folder: the run's folder; PNGs go to ``pictures`` below it.
+        up: the vertical axis of the clouds, ``x``, ``y`` or ``z``, as in
+            ``Augmentation.rotate_up``; true and false mean y.
+
+    Raises:
+        UserError: there is no such axis.
     """
 
-    def __init__(self, batch: Any, titles: Sequence[str], folder: Path) -> None:
+    def __init__(
+        self, batch: Any, titles: Sequence[str], folder: Path, up: bool | str = "y"
+    ) -> None:
+        axis = "y" if isinstance(up, bool) else up
+        if axis not in drawing.AXES:
+            raise UserError(f"up must be x, y or z (the vertical axis), got {up!r:.99}.")
+        self.up = axis
         self.batch = batch
         self.titles = list(titles)
         self.folder = folder / "pictures"
@@ -68,10 +80,13 @@ class CloudVisualization(Callback):
         task: Any = module.task
         titles = cloud_titles(task, self.titles)
         if folder is not None and samples:
-            drawing.save_clouds(folder / drawing.CLOUDS, batch.points, samples, titles)
+            points = drawing.to_y_up(batch.points, self.up)
+            turned = {name: drawing.to_y_up(sample, self.up) for name, sample in samples.items()}
+            drawing.save_clouds(folder / drawing.CLOUDS, points, turned, titles)
             if isinstance(board, Board):
-                board.add_clouds(batch.points, samples, trainer.global_step)
+                board.add_clouds(points, turned, trainer.global_step)
         for name, figure in figures.items():
+            drawing.view_upright(figure, self.up)
             path = folder and drawing.save_figure(figure, folder / f"{name}.png")
             if board is None:
                 continue
@@ -142,15 +157,26 @@ def cloud_titles(task: Task, titles: Sequence[str]) -> list[str]:
 
 
 def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str]]:
-    """Choose test clouds of different classes, spread over all classes.
+    """Choose test clouds, spread over all classes and, of one class, over all its clouds.
+
+    Clouds of one file are next to each other, so that clouds of several files are chosen.
 
     Returns:
-        Rows of the test split, at most ``number``, and the names of their classes.
+        Rows of the test split, at most ``number``, and their titles: the names of their classes,
+        counted where a class has several clouds.
     """
     labels = dataset.test.labels
     classes = len(dataset.class_names)
     wanted = torch.linspace(0, classes - 1, min(max(number, 1), classes)).round().long()
-    rows = [int((labels == label).nonzero()[0]) for label in wanted.unique() if label in labels]
-    rows = rows[:number]
-    names = [dataset.class_names[int(labels[row])] for row in rows]
-    return torch.tensor(rows, dtype=torch.int64), names
+    present = [int(label) for label in wanted.unique() if label in labels][:number]
+    rows: list[int] = []
+    titles: list[str] = []
+    for place, label in enumerate(present):
+        members = (labels == label).nonzero()[:, 0]
+        share = number // len(present) + (1 if place < number % len(present) else 0)
+        spread = torch.linspace(0, len(members) - 1, min(share, len(members))).round().long()
+        chosen = members[spread].tolist()
+        name = dataset.class_names[label]
+        rows += chosen
+        titles += [name] if len(chosen) == 1 else [f"{name} {k}" for k in range(1, len(chosen) + 1)]
+    return torch.tensor(rows, dtype=torch.int64), titles
