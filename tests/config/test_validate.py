@@ -91,6 +91,7 @@ def test_rates_of_rival_samplers_fall_at_the_published_number_of_clouds():
         (["weights=run"], "weights=run means the run named by evaluate"),
         (["optimizer.schedule=3"], "optimizer.schedule must be settings, got 3"),
         (["+epochs.foo=1"], "epochs.foo: no such setting"),
+        (["epochs.task=???"], "^epochs.task must be set: try epochs.task=NUMBER"),
         (["augment.sampler=3"], "augment has settings of task and sampler, got sampler: 3"),
         (["+augment.all=1"], "augment has settings of task and sampler, got all: 1"),
         (["+augment.task.jiter=0"], "Did you mean 'jitter'"),

@@ -64,9 +64,11 @@ def check(cfg: DictConfig) -> None:
 
         corruptions.parse(plain["test_corruption"])
     _check_evaluation(plain)
-    for key in plain["epochs"]:
+    for key, number in plain["epochs"].items():
         if key not in settings.LEARN:
             raise UserError(f"epochs.{key}: no such setting.{did_you_mean(key, settings.LEARN)}")
+        if number == MISSING:
+            raise UserError(f"epochs.{key} must be set: try epochs.{key}=NUMBER.")
     for key, node in plain["augment"].items():
         if key not in ("task", "sampler") or not isinstance(node, dict | None):
             raise UserError(f"augment has settings of task and sampler, got {key}: {node!r}.")
