@@ -285,3 +285,20 @@ def test_real_copc_file_is_read_by_blocks(real_data):
     tables = [file.read(rows) for rows in file.row_ranges(100_000)]
 
     np.testing.assert_array_equal(np.concatenate([t.points for t in tables]), whole.xyz)
+
+
+@pytest.mark.parametrize("name", ["a.laz", "a.copc.laz"])
+def test_points_of_another_length_than_the_compressed_ones_are_broken(name, tmp_path):
+    path = tmp_path / name
+    points = np.random.default_rng(1).uniform(size=(90, 3))
+    write(path, Table(points))
+    content = bytearray(path.read_bytes())
+    record = read_header(path).compression
+    size_of_first_item = content.index(record) + 36
+    struct.pack_into("<H", content, size_of_first_item, 65535)
+    path.write_bytes(content)
+
+    with pytest.raises(UserError, match=r"the record of its compression has points of 655.. bytes"):
+        read(path, 9, 0)
+    with pytest.raises(UserError, match=r"the record of its compression has points of 655.. bytes"):
+        open_cloud_file(path).read(range(9))

@@ -1,9 +1,12 @@
 """Compressed splats, written by gsply."""
 
+import signal
+
 import gsply
 import numpy as np
 import pytest
 
+from mops_lightning.data.formats import isolated
 from mops_lightning.data.formats.registry import open_cloud_file, read, write
 from mops_lightning.errors import UserError
 
@@ -61,3 +64,19 @@ def test_splat_is_refused_with_a_converter(tmp_path):
 
     with pytest.raises(UserError, match=r"\.splat is not read. Convert it by SuperSplat"):
         read(tmp_path / "a.splat", 9, 0)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="the system has no timer")
+@pytest.mark.parametrize("suffix", [".spz", ".compressed.ply"])
+def test_time_to_compile_a_reader_is_not_time_to_read(suffix, splats, tmp_path, monkeypatch):
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".spz":
+        gsply.write_spz(path, splats)
+    else:
+        gsply.plywrite(path, splats, compressed=True)
+    isolated._end_all()  # so that a new process has to import numba
+    monkeypatch.setattr(isolated, "SECONDS", 0.0)
+
+    table = read(path, 9, 0)
+
+    assert len(table.points) == 300

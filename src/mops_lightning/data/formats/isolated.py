@@ -29,6 +29,9 @@ Result = TypeVar("Result")
 SECONDS, BYTES_PER_SECOND = 30.0, 200_000
 """A file may take this long, and longer if it is large."""
 
+COMPILING = 120.0
+"""A parser's code may take so many seconds more to compile; 20 on one busy core with numba."""
+
 COMMAND = (
     "import sys; sys.path[:] = {}; from mops_lightning.data.formats import isolated as i; i.serve()"
 )
@@ -41,18 +44,23 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_idle.clear)
 
 
-def isolated(function: Callable[..., Result], path: Path, *arguments: Any) -> Result:
+def isolated(
+    function: Callable[..., Result], path: Path, *arguments: Any, compiles: bool = False
+) -> Result:
     """Return ``function(path, *arguments)``, called in another process.
 
     Args:
         function: of a module that does not import torch, so that the process starts fast.
         path: the file that it parses.
         arguments: can be pickled, as can the result.
+        compiles: whether the parser compiles code at its first call, which takes time of its own.
 
     Raises:
         UserError: the function raised an error, or its process exceeded a limit or died.
     """
     seconds = SECONDS + path.stat().st_size / BYTES_PER_SECOND
+    if compiles:
+        seconds += COMPILING
     try:
         process = _idle.pop()
     except IndexError:

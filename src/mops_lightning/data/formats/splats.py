@@ -17,7 +17,7 @@ def read_spz(path: Path) -> Table:
     Raises:
         UserError: gsply is not installed, or the file is broken.
     """
-    return isolated(_parse_spz, path)
+    return isolated(_parse_spz, path, compiles=True)
 
 
 def read_compressed_ply(path: Path) -> Table:
@@ -26,7 +26,7 @@ def read_compressed_ply(path: Path) -> Table:
     Raises:
         UserError: gsply is not installed, or the file is broken.
     """
-    return isolated(_parse_ply, path)
+    return isolated(_parse_ply, path, compiles=True)
 
 
 def refuse_splat(path: Path) -> Table:

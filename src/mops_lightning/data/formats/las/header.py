@@ -22,6 +22,9 @@ EXTRA_BYTES, WAVEFORMS = 4, 65535
 LASZIP = 22204
 """Number of the record that describes the compression."""
 
+LASZIP_ITEMS, LASZIP_NUMBER, LASZIP_ITEM = 32, struct.Struct("<H"), struct.Struct("<3H")
+"""Place of the number of items in this record, and the items: type, size and version."""
+
 HEADER_BYTES = (227, 227, 227, 235, 375, 393)
 """Least bytes of the header of versions 1.0 to 1.5."""
 
@@ -152,11 +155,24 @@ class Header:
 
     @property
     def compression(self) -> bytes:
-        """The data of the record that describes the compression."""
-        for record in self.records:
-            if record.number == LASZIP and record.user == "laszip encoded":
-                return record.data
-        raise ValueError("no record describes its compression")
+        """The data of the record that describes the compression.
+
+        Raises:
+            ValueError: there is none, or its points have another length than the header's: lazrs
+                would decompress for minutes.
+        """
+        record = self.record("laszip encoded", LASZIP)
+        if record is None:
+            raise ValueError("no record describes its compression")
+        (number,) = LASZIP_NUMBER.unpack_from(record.data, LASZIP_ITEMS)
+        items = record.data[LASZIP_ITEMS + LASZIP_NUMBER.size :]
+        sizes = [size for _, size, _ in LASZIP_ITEM.iter_unpack(items[: number * LASZIP_ITEM.size])]
+        if len(sizes) < number or sum(sizes) != self.item:
+            raise ValueError(
+                f"the record of its compression has points of {sum(sizes)} bytes, its header of "
+                f"{self.item}"
+            )
+        return record.data
 
 
 def read_header(path: Path) -> Header:
