@@ -151,9 +151,8 @@ def _sweep(arguments: list[str]) -> str:
         return ""
     name = arguments[arguments.index("--config-name") + 1]
     for flag in ("--config-dir", "--config-name"):
-        if flag in arguments:
-            at = arguments.index(flag)
-            del arguments[at : at + 2]
+        at = arguments.index(flag)
+        del arguments[at : at + 2]
     return name
 
 

@@ -173,3 +173,16 @@ def test_added_points_are_where_they_should_be(clouds):
 def test_unknown_kind_or_severity_is_refused(clouds, spec, said):
     with pytest.raises(UserError, match=rf"test_corruption must be a kind.*{said}"):
         corrupt(clouds, spec)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_parts_are_kept_where_points_were_only_moved(clouds, kind):
+    parts = torch.arange(4 * N).view(4, N)
+
+    corrupted = corrupt(clouds._replace(parts=parts), f"{kind}-3")
+
+    if kind in MOVED:
+        assert corrupted.parts is not None
+        assert torch.equal(corrupted.parts, parts)
+    else:
+        assert corrupted.parts is None

@@ -38,7 +38,9 @@ def classes_of(path):
 
 
 @pytest.mark.parametrize("chunk", [[], ["--chunk", 200]])
-@pytest.mark.parametrize(("share", "number"), [("10%", 60), ("12.5%", 75), ("0.01%", 1)])
+@pytest.mark.parametrize(
+    ("share", "number"), [("10%", 60), ("12.5%", 75), ("0.25%", 2), ("0.01%", 1)]
+)
 def test_share_of_a_file(share, number, chunk, clouds, tmp_path):
     out = done(clouds / "a.ply", tmp_path / "out.ply", "--method", "fps", "--m", share, *chunk)
 
@@ -116,6 +118,20 @@ def test_space_makes_a_column_count(method, clouds, tmp_path):
 
     rows = read(tmp_path / "out.ply", 9, 0).columns["row"]
     assert abs(int(rows[0]) - int(rows[1])) >= 290
+
+
+def test_space_with_another_column_keeps_all_coordinates(tmp_path):
+    upright = np.zeros((100, 3))
+    upright[:, 2] = np.arange(100)
+    grey = np.resize([0, 1], 100).astype(np.uint8)
+    WRITERS[".ply"](tmp_path / "in.ply", Table(upright, {"grey": grey}))
+
+    options = ["--method", "fps", "--m", 9, "--space", "grey=0.01"]
+    done(tmp_path / "in.ply", tmp_path / "out.ply", *options)
+
+    kept = read(tmp_path / "out.ply", 9, 0).points
+    apart = np.abs(upright[:, 2, None] - kept[:, 2])
+    assert apart.min(axis=1).max() <= 100 / 8
 
 
 def test_killed_between_map_and_output_the_same_command_goes_on(clouds, tmp_path):

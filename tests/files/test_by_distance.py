@@ -1,5 +1,6 @@
 """Spacing and voxels of files: whole, in chunks, by Dask, in folders, with attributes and maps."""
 
+import struct
 from typing import Any
 
 import laspy
@@ -112,6 +113,19 @@ def test_voxel_means_average_quantities_and_renormalise_normals(scan, tmp_path):
     assert (voxel[np.searchsorted(whole.columns["row"], rows)] == np.arange(len(places))).all()
 
 
+def test_voxel_means_renormalise_normals_by_the_names_of_pcl(tmp_path):
+    points = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.3, 0.3, 0.3]])
+    normals = {"normal_x": [1.0, 0.0, 0.0], "normal_y": [0.0, 1.0, 0.0], "normal_z": [0.0] * 3}
+    columns = {name: np.array(values, np.float32) for name, values in normals.items()}
+    WRITERS[".pcd"](tmp_path / "in.pcd", Table(points, columns))
+
+    done(tmp_path / "in.pcd", tmp_path / "out.npz", "--voxel", 1, "--readout", "generated")
+
+    mean = read(tmp_path / "out.npz", 9, 0)
+    values = [float(mean.columns[name][0]) for name in normals]
+    assert values == pytest.approx([2**-0.5, 2**-0.5, 0.0])
+
+
 def test_map_of_a_spacing(scan, tmp_path):
     done(scan, tmp_path / "out.npz", "--spacing", 0.7, "--map", tmp_path / "map.npz")
 
@@ -201,6 +215,24 @@ def test_real_scans_in_chunks_equal_one_pass(name, distance, budget, real_data, 
     np.testing.assert_array_equal(parts.points, whole.points)
     for column, values in whole.columns.items():
         np.testing.assert_array_equal(parts.columns[column], values)
+
+
+@pytest.mark.parametrize(("kind", "is_refused"), [(2, True), (1, False)])
+def test_degrees_told_by_keys_of_geotiff_are_refused(kind, is_refused, tmp_path):
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.scales = np.full(3, 1e-7)
+    citation, model = (1026, 34737, 8, 0), (1024, 0, 1, kind)
+    keys = struct.pack("<12H", 1, 1, 0, 2, *model, *citation)
+    header.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", keys))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = RNG.uniform(8, 9, (3, 50))
+    las.write(tmp_path / "in.las")
+
+    if is_refused:
+        words = refused(tmp_path / "in.las", tmp_path / "out.las", "--voxel", 0.05)
+        assert f"the coordinates of {tmp_path / 'in.las'} are degrees" in words
+    else:
+        done(tmp_path / "in.las", tmp_path / "out.las", "--voxel", 0.05)
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,15 @@ def test_training_is_cpu_time_if_every_run_has_it(tmp_path):
     assert [row[-1] for row in found] == ["training (CPU)", "500 s", "300 s"]
 
 
+def test_training_is_wall_time_if_one_run_has_no_cpu_time(tmp_path):
+    path = put_cell(tmp_path, "mops", "mops", {"generated": 1.0})
+    edited(path, seconds={"total": 99.0, "fit": 90.0, "fit_cpu": 300.0})
+    path = put_cell(tmp_path, "snet", "snet", {"generated": 1.0})
+    edited(path, seconds={"total": 99.0, "fit": 80.0})
+    found = rows(table(tmp_path))
+    assert [row[-1] for row in found] == ["training (wall)", "80 s", "90 s"]
+
+
 def test_values_within_two_deviations_of_the_best_are_level(tmp_path):
     """The deviations of the best and of the value are 0.1; 0.15 away is level, 0.5 is not."""
     for seed, shift in enumerate((-0.1, 0.0, 0.1)):

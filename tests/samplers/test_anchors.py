@@ -140,3 +140,18 @@ def test_anchors_refuse_chunks_and_export(rng):
         stream_sample(net, lambda: torch.randn(50, 3, generator=rng).split(20))
     with pytest.raises(UserError, match="MOPSNet with anchors=fps cannot be exported"):
         GeneratedPoints(net)
+
+
+def test_untrained_columns_are_as_wide_as_the_spacing_of_their_points(rng):
+    plane = torch.rand(1, 4000, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.0])
+    widths = {}
+
+    for m in (16, 64):
+        net = small(m=m, anchor_width=0.5, tau_min=1.0).eval()
+        columns = net(plane).matrix.dense().detach()
+        means = columns.mT @ plane
+        apart = (plane[:, :, None] - means[:, None]).square().sum(3)
+        widths[m] = (columns * apart).sum(1).sqrt().median()
+
+    # A quarter of the points on the same plane are twice as far apart.
+    assert widths[16] / widths[64] == pytest.approx(2.0, rel=0.2)

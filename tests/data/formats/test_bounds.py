@@ -24,6 +24,15 @@ def grid(request, tmp_path):
     return path
 
 
+def test_bounds_without_z_keep_points_below_zero(tmp_path):
+    low_and_high = np.array([[1.0, 1.0, -7.0], [1.0, 1.0, 7.0], [9.0, 1.0, 0.0]])
+    write(tmp_path / "a.ply", Table(low_and_high))
+
+    inside = read(tmp_path / "a.ply", 1, 0, Area.parse("0,0,2,2", None, None))
+
+    assert inside.points[:, 2].tolist() == [-7.0, 7.0]
+
+
 def rows_between(low, high):
     """Return the points of the grid from low to high, both included, sorted."""
     axes = [range(first, last + 1) for first, last in zip(low, high, strict=True)]

@@ -1,1 +1,0 @@
-"""Comparing methods of downsampling by the registration of scans with small_gicp."""
