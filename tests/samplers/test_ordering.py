@@ -1,8 +1,16 @@
 import struct
 
+import numpy as np
 import torch
 
-from mops_lightning.samplers.ordering import FIRST, SECOND, STEP, point_hashes, seeded_order
+from mops_lightning.samplers.ordering import (
+    FIRST,
+    SECOND,
+    STEP,
+    compiled_hashes,
+    point_hashes,
+    seeded_order,
+)
 
 WORD = 2**64
 
@@ -36,4 +44,6 @@ def test_point_hashes_equal_plain_form(rng):
         for cloud, row in zip(points, hashes.tolist(), strict=True):
             assert [key % WORD for key in row] == plain_hashes(cloud, seed)
         assert torch.equal(point_hashes(points.double(), seed), hashes)
+        compiled = compiled_hashes(points, seed).view(np.int64)
+        assert torch.equal(torch.from_numpy(compiled), hashes)
         assert torch.equal(seeded_order(points, seed), hashes.argsort(1))

@@ -44,6 +44,28 @@ def test_voxel_equals_plain_search(m, rng):
             assert distances[voxel.index(index)] <= distances.min() * (1 + 1e-6)
 
 
+@pytest.mark.parametrize("name", ["clusters", "grid", "map"])
+def test_fullest_voxels_equal_plain_search(name, rng):
+    """Most positions settle in their voxels long before the last step."""
+    points = torch.randn(1, 900, 3, dtype=torch.float64, generator=rng)
+    clouds = {
+        "clusters": points * torch.rand(1, 900, 1, dtype=torch.float64, generator=rng) ** 4,
+        "grid": (points * 8).round() / 8,  # positions on the faces of voxels, and copies
+        "map": points * torch.tensor([90.0, 40.0, 3.0]) + torch.tensor([637e3, 851e3, 412.0]),
+    }
+    cloud = clouds[name]
+
+    rows = fullest_voxels(cloud, 300)[0].tolist()
+
+    members = plain_choice(cloud[0].tolist(), 300)
+    assert len(rows) >= 300
+    for row, voxel in zip(rows, members, strict=False):
+        mean = cloud[0][voxel].mean(0)
+        distances = (cloud[0][voxel] - mean).norm(dim=1)
+        assert row in voxel
+        assert distances[voxel.index(row)] <= distances.min() * (1 + 1e-6) + 1e-9
+
+
 def test_voxel_single_voxel_holds_all_points(rng):
     points = torch.randn(2, 40, 3, generator=rng)
     nearest = (points - points.mean(1, keepdim=True)).norm(dim=2).argmin(1)

@@ -15,7 +15,7 @@ jit: Any = partial(njit, **OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=Tr
 """Compile a function that only compiled functions call."""
 
 jit_inlined: Any = partial(jit, inline="always")
-"""Compile a function within its only caller, which takes less time than compiling it twice."""
+"""Compile a function within its callers: a call with arrays takes 40 ns."""
 
 
 @cast(Any, extending.intrinsic)

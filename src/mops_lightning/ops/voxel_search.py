@@ -8,7 +8,7 @@ has changed in another file.
 
 import numpy as np
 
-from mops_lightning.ops.jit import jit, jit_cached
+from mops_lightning.ops.jit import jit, jit_cached, jit_inlined
 
 MIX = -0x61C8864680B583EB
 """2⁶⁴ divided by the golden ratio, odd; the high bits of products are well mixed."""
@@ -24,19 +24,52 @@ def _key(x, y, z, scale):
 
 
 @jit_cached
-def reaches(spans, scale, m):
-    """Return whether at least m voxels are occupied.
+def in_unit_cube(points, tiny):
+    """Return points ``(3·N,)``, one after the other, in the unit cube around them.
+
+    Args:
+        points: of at least one point.
+        tiny: smallest side of the cube, of the same type.
+    """
+    low = points[:3].copy()
+    high = points[:3].copy()
+    for i in range(len(points) // 3):
+        for axis in range(3):
+            low[axis] = min(low[axis], points[3 * i + axis])
+            high[axis] = max(high[axis], points[3 * i + axis])
+    side = max(high[0] - low[0], high[1] - low[1], high[2] - low[2], tiny)
+    spans = np.empty_like(points)
+    for i in range(len(points) // 3):
+        for axis in range(3):
+            spans[3 * i + axis] = (points[3 * i + axis] - low[axis]) / side
+    return spans
+
+
+@jit_inlined
+def _enter(key, table, shift):
+    """Enter a key into a table, and return its slot, or -1 if the table holds it."""
+    mask = len(table) - 1
+    slot = ((key * MIX) >> shift) & mask  # the highest bits of a product depend on the whole key
+    while table[slot] >= 0 and table[slot] != key:
+        slot = (slot + 1) & mask
+    if table[slot] == key:
+        return -1
+    table[slot] = key
+    return slot
+
+
+@jit_cached
+def reaches(spans, scale, wanted, table, shift):
+    """Return whether at least so many voxels are occupied that a table does not hold.
 
     Args:
         spans: ``(3·N,)`` positions in the unit cube, one after the other.
         scale: number of voxels per side, of the same type.
-        m: number of voxels.
+        wanted: number of voxels, at least 1 and at most half the size of the table.
+        table: keys of other voxels, and -1 in free slots; it is left as it was.
+        shift: 64 less the number of bits of the table's size.
     """
-    size, shift = 1024, 54  # the highest bits of a product depend on all bits of the key
-    while size < 2 * m:
-        size *= 2
-        shift -= 1
-    table = np.full(size, -1, np.int64)
+    slots = np.empty(wanted, np.int64)
     known = 0
     last = -1
     for i in range(len(spans) // 3):
@@ -44,15 +77,51 @@ def reaches(spans, scale, m):
         if key == last:
             continue
         last = key
-        slot = ((key * MIX) >> shift) & (size - 1)
-        while table[slot] >= 0 and table[slot] != key:
-            slot = (slot + 1) & (size - 1)
-        if table[slot] < 0:
-            table[slot] = key
+        slot = _enter(key, table, shift)
+        if slot >= 0:
+            slots[known] = slot
             known += 1
-            if known == m:
-                return True
-    return False
+            if known == wanted:
+                break
+    for i in range(known):
+        table[slots[i]] = -1
+    return known == wanted
+
+
+@jit_cached
+def settle(spans, coarse, fine, table, shift):
+    """Enter into a table the voxels of positions that are in the same one at two scales.
+
+    A coordinate's voxel never decreases with the scale. Therefore these positions are in their
+    voxels at all scales between the two.
+
+    Args:
+        spans: as for ``reaches``.
+        coarse: the smaller scale.
+        fine: the larger scale.
+        table: keys of voxels; at most half of it will be in use.
+        shift: as for ``reaches``.
+
+    Returns:
+        The other positions, and the number of voxels that were entered.
+    """
+    others = np.empty_like(spans)
+    left = 0
+    entered = 0
+    last = -1
+    for i in range(len(spans) // 3):
+        x, y, z = spans[3 * i], spans[3 * i + 1], spans[3 * i + 2]
+        key = _key(x, y, z, coarse)
+        if key != _key(x, y, z, fine):
+            others[left] = x
+            others[left + 1] = y
+            others[left + 2] = z
+            left += 3
+        elif key != last:
+            last = key
+            if _enter(key, table, shift) >= 0:
+                entered += 1
+    return others[:left], entered
 
 
 @jit_cached
@@ -78,23 +147,6 @@ def group(spans, scale):
             known += 1
         cell_of[i] = table[slot]
     return cell_of, keys[:known]
-
-
-@jit_cached
-def sort_by_cell(spans, cell_of, known):
-    """Return the positions voxel by voxel, so that most keys are equal to the ones before them."""
-    starts = np.zeros(known + 1, np.int64)
-    for i in range(len(cell_of)):
-        starts[cell_of[i] + 1] += 1
-    for cell in range(known):
-        starts[cell + 1] += starts[cell]
-    ordered = np.empty_like(spans)
-    for i in range(len(cell_of)):
-        place = starts[cell_of[i]]
-        starts[cell_of[i]] += 1
-        for axis in range(3):
-            ordered[3 * place + axis] = spans[3 * i + axis]
-    return ordered
 
 
 @jit

@@ -65,15 +65,25 @@ def smallest(keys: Tensor, m: int) -> Tensor:
     return torch.from_numpy(np.take_along_axis(rows, order, 1))
 
 
-def _compiled_keys(points: Tensor, seed: int) -> NDArray[np.int64]:
-    """Return the keys of clouds on a CPU, without a sort of all of them."""
+def compiled_hashes(points: Tensor, seed: int) -> NDArray[np.uint64]:
+    """Return the bits of ``point_hashes`` of clouds on a CPU, several times as fast."""
     given = points.detach()
     if given.dtype not in (torch.float32, torch.float64):
         given = given.float()
     coordinates = given.contiguous().numpy()
     clouds, size, channels = coordinates.shape
     word = np.uint64((seed * STEP + 1) % WORD)
-    keys = kernel_order.point_keys(coordinates.reshape(-1), clouds, channels, word)
+    hashes: NDArray[np.uint64] = kernel_order.point_keys(
+        coordinates.reshape(-1), clouds, channels, word
+    )
+    return hashes.reshape(clouds, size)
+
+
+def _compiled_keys(points: Tensor, seed: int) -> NDArray[np.int64]:
+    """Return the keys of clouds on a CPU, without a sort of all of them."""
+    hashes = compiled_hashes(points, seed)
+    size = hashes.shape[1]
+    keys = hashes.reshape(-1)
     repeated = kernel_order.perhaps_repeated(keys)
     if len(repeated):
         order = np.lexsort((keys[repeated], repeated // size))  # stable: copies keep their order
@@ -87,7 +97,7 @@ def _compiled_keys(points: Tensor, seed: int) -> NDArray[np.int64]:
         if later.any():
             words = (values[later] + copy[later] * np.uint64(STEP)).view(np.int64)
             keys[rows[later]] = _scramble(torch.from_numpy(words)).numpy().view(np.uint64)
-    return keys.view(np.int64).reshape(clouds, size)
+    return keys.view(np.int64).reshape(hashes.shape)
 
 
 def point_hashes(points: Tensor, seed: int) -> Tensor:

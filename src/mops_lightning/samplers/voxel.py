@@ -9,15 +9,18 @@ from mops_lightning.ops import voxel_search
 from mops_lightning.ops.fps import farthest_point_fill
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.ordering import point_hashes, seeded_order
+from mops_lightning.samplers.ordering import compiled_hashes, seeded_order
 from mops_lightning.types import SampleOutput
 
 COARSEST, FINEST = -1.0, 20.0
 """Range of log₂(side of the cloud / side of a voxel): one voxel, and the precision of float32."""
 BISECTIONS = 24
 """Bisection steps; the relative error of the voxel size is about one in a million."""
-SORTING_STEPS = (5, 11)
-"""Bisection steps before which the points are sorted by voxels."""
+SETTLED = 0.25
+"""Difference of two scales between which most positions stay in their voxels."""
+
+Positions = NDArray[np.floating]
+"""Coordinates in a unit cube, one point after the other."""
 
 
 class VoxelSampler(Sampler):
@@ -80,60 +83,94 @@ def fullest_voxels(points: Tensor, m: int) -> list[NDArray[np.int64]]:
         For every cloud one row for each occupied voxel, in the order of descending numbers of
         points, then of ascending (x, y, z).
     """
-    spans = _spans(points)
-    hashes = point_hashes(points, 0).cpu().numpy()
+    on_cpu = points.detach().cpu()
+    exact = on_cpu.double().contiguous().numpy()
+    hashes = compiled_hashes(on_cpu, 0).view(np.int64)
+    spans = _spans(on_cpu)
     scales = _scales(spans, m)
-    exact = points.double().cpu().numpy()
     return [_fullest(*cloud) for cloud in zip(exact, spans, scales, hashes, strict=True)]
 
 
 def _fullest(
     points: NDArray[np.float64],
-    spans: NDArray[np.floating],
+    spans: Positions,
     scale: np.floating,
     hashes: NDArray[np.int64],
 ) -> NDArray[np.int64]:
-    cell_of, keys = voxel_search.group(spans.ravel(), scale)
+    cell_of, keys = voxel_search.group(spans, scale)
     bits = 61 - len(points).bit_length()
-    counts, rows = voxel_search.nearest_to_means(
-        np.ascontiguousarray(points).ravel(), cell_of, len(keys), hashes, bits
-    )
+    counts, rows = voxel_search.nearest_to_means(points.ravel(), cell_of, len(keys), hashes, bits)
     fullest: NDArray[np.int64] = rows[np.lexsort((keys, -counts))]
     return fullest
 
 
-def _spans(points: Tensor) -> NDArray[np.floating]:
-    """Return the ``(B, N, 3)`` positions of points in the unit cubes around their clouds."""
-    exact = points.to(torch.promote_types(points.dtype, torch.float32))
-    spans = exact - exact.amin(1, keepdim=True)
-    side = spans.amax(1, keepdim=True).amax(2, keepdim=True)
-    positions = spans / side.clamp_min(torch.finfo(spans.dtype).tiny)
-    array: NDArray[np.floating] = positions.contiguous().cpu().numpy()
-    return array
+def _spans(points: Tensor) -> list[Positions]:
+    """Return the positions ``(3·N,)`` of the points of every cloud in the unit cube around it."""
+    exact = points.to(torch.promote_types(points.dtype, torch.float32)).contiguous().numpy()
+    tiny = np.finfo(exact.dtype).tiny
+    return [voxel_search.in_unit_cube(cloud.ravel(), tiny) for cloud in exact]
 
 
-def _scales(spans: NDArray[np.floating], m: int) -> NDArray[np.floating]:
+def _scales(spans: list[Positions], m: int) -> Positions:
     """Return the smallest number of voxels per side with at least m occupied voxels."""
-    coarse = torch.from_numpy(np.full(len(spans), COARSEST, spans.dtype))
-    fine = torch.from_numpy(np.full(len(spans), FINEST, spans.dtype))
-    clouds = [cloud.ravel() for cloud in spans]
-    for step in range(BISECTIONS):
+    searches = [_Search(cloud, m) for cloud in spans]
+    coarse = np.full(len(spans), COARSEST, spans[0].dtype)
+    fine = np.full(len(spans), FINEST, spans[0].dtype)
+    for _ in range(BISECTIONS):
         middle = (coarse + fine) / 2
-        scales = middle.exp2().numpy()
-        if step in SORTING_STEPS:
-            clouds = [_sorted(*pair) for pair in zip(clouds, scales, strict=True)]
-        enough = torch.tensor(
-            [voxel_search.reaches(*pair, m) for pair in zip(clouds, scales, strict=True)],
-            device=coarse.device,
+        pairs = zip(searches, _powers_of_two(middle), strict=True)
+        is_enough = np.array([search.reaches(scale) for search, scale in pairs])
+        fine = np.where(is_enough, middle, fine)
+        coarse = np.where(is_enough, coarse, middle)
+    return _powers_of_two(fine)
+
+
+def _powers_of_two(exponents: Positions) -> Positions:
+    """Return 2ˣ as torch rounds it, which differs from NumPy's in the last bit."""
+    powers: Positions = torch.from_numpy(exponents).exp2().numpy()
+    return powers
+
+
+class _Search:
+    """Counts the occupied voxels of one cloud at the scales of a bisection.
+
+    Between two scales that differ little, most positions stay in their voxels. These voxels are
+    counted once, and those of the other positions at every step.
+
+    Args:
+        spans: ``(3·N,)`` positions in the unit cube.
+        m: smallest number of voxels.
+    """
+
+    def __init__(self, spans: Positions, m: int) -> None:
+        bits = max((4 * m).bit_length(), 10)
+        self.m = m
+        self.moving = spans
+        self.settled = np.full(2**bits, -1, np.int64)
+        self.shift = 64 - bits
+        self.wanted = m
+        self.coarse = spans.dtype.type(0)
+        self.fine = spans.dtype.type(2.0**FINEST)
+
+    def reaches(self, scale: np.floating) -> bool:
+        """Return whether at least m voxels are occupied; the answer bounds all later scales."""
+        is_enough = self._is_enough(scale)
+        if is_enough:
+            self.fine = scale
+        else:
+            self.coarse = scale
+        if self.fine - self.coarse < SETTLED:
+            self._settle()
+        return is_enough
+
+    def _is_enough(self, scale: np.floating) -> bool:
+        voxels_of_cube = (int(scale) + 1) ** 3
+        if voxels_of_cube < self.m:
+            return False
+        return bool(voxel_search.reaches(self.moving, scale, self.wanted, self.settled, self.shift))
+
+    def _settle(self) -> None:
+        self.moving, entered = voxel_search.settle(
+            self.moving, self.coarse, self.fine, self.settled, self.shift
         )
-        fine = torch.where(enough, middle, fine)
-        coarse = torch.where(enough, coarse, middle)
-    finest: NDArray[np.floating] = fine.exp2().numpy()
-    return finest
-
-
-def _sorted(spans: NDArray[np.floating], scale: np.floating) -> NDArray[np.floating]:
-    """Sort positions by voxels of about the final size: they are then counted faster."""
-    cell_of, keys = voxel_search.group(spans, scale)
-    ordered: NDArray[np.floating] = voxel_search.sort_by_cell(spans, cell_of, len(keys))
-    return ordered
+        self.wanted -= entered
