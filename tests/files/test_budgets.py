@@ -7,7 +7,7 @@ import pytest
 
 from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
-from tests.support.downsample import done, refused
+from tests.support.downsample import call, done, refused
 
 RNG = np.random.default_rng(0)
 
@@ -76,6 +76,25 @@ def test_total_keeps_a_point_of_every_file(m, numbers, tmp_path):
 
     sizes = [len(read(tmp_path / "out" / f"{name}.ply", 9, 0).points) for name in "abc"]
     assert sizes == numbers
+
+
+def test_total_lists_broken_files_and_goes_on(tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for name, number in (("a", 60), ("b", 30)):
+        WRITERS[".ply"](folder / f"{name}.ply", Table(RNG.normal(size=(number, 3))))
+    (folder / "broken.laz").write_bytes(b"LASF and nothing else")
+    (folder / "empty.xyz").write_text("")
+
+    status, out, err = call(folder, tmp_path / "out", "--method", "random", "--m", 9, "--total")
+
+    sizes = [len(read(tmp_path / "out" / f"{name}.ply", 9, 0).points) for name in "ab"]
+    assert sizes == [6, 3]
+    assert status == 1
+    assert "failed: " in err
+    assert "broken.laz" in err
+    assert "empty.xyz" in err
+    assert "4 files: 2 failed, 2 done; in" in out
 
 
 @pytest.mark.parametrize("m", [2, 1001])

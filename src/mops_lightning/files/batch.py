@@ -11,7 +11,6 @@ from collections.abc import Generator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
-from dataclasses import replace
 from multiprocessing import active_children, get_context
 from os.path import realpath  # unlike Path.resolve, it accepts loops of symbolic links
 from pathlib import Path
@@ -23,10 +22,9 @@ from mops_lightning.data.formats.registry import READABLE, WRITERS
 from mops_lightning.errors import UserError, as_line, one_line, printable
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
-from mops_lightning.files.strata import Strata
+from mops_lightning.files.total import Job, share_total
 from mops_lightning.filesystem import is_temporary
 from mops_lightning.ops.workers import start_worker
-from mops_lightning.samplers.budget import number_of
 
 if TYPE_CHECKING:
     from mops_lightning.files.chunks import Outcome
@@ -197,15 +195,16 @@ def process_folder(
         is_total: share ``options.m`` among all files, in proportion to their points.
     """
     jobs = [Job(source, output, options) for source, output in inputs.pairs]
+    number = len(jobs) + len(inputs.unreadable)
+    failures: dict[Path, UserError] = {}
     if is_total:
-        jobs = _sharing(jobs)
+        jobs, failures = share_total(jobs)
     todo = [job for job in jobs if options.overwrite or not job.target.exists()]
     if todo:
         target.mkdir(parents=True, exist_ok=True)
         if not os.access(target, os.W_OK):
             raise UserError(f"OUT: cannot write into {target}. Give another OUT.")
     done = dropped = 0
-    failures = {}
     results = _results(todo, workers, engine)
     with closing(results):  # ends the processes when the user interrupts
         for job, result in track(
@@ -230,53 +229,13 @@ def process_folder(
         words += f": {' '.join(_kinds(inputs.unreadable))}"
     if dropped:
         words += f"; {dropped:,} points without finite coordinates left out"
-    print(printable(f"{len(jobs) + len(inputs.unreadable)} files: {words}; in {target}"))
+    print(printable(f"{number} files: {words}; in {target}"))
     return len(failures)
 
 
 def _kinds(paths: list[Path]) -> list[str]:
     """Return the suffixes of files, or their names where they have none."""
     return sorted({path.suffix.lower() or path.name for path in paths})
-
-
-class Job(NamedTuple):
-    """One file to downsample: its input, its output, and how."""
-
-    source: Path
-    target: Path
-    options: Options
-
-
-def _sharing(jobs: list[Job]) -> list[Job]:
-    """Share the number of points to keep among the files, in proportion to their points.
-
-    Every file keeps at least one point.
-
-    Raises:
-        UserError: there are fewer points to keep than files, or fewer points in the files.
-    """
-    from mops_lightning.files.downsample import count_points
-    from mops_lightning.samplers.tiles import shares
-
-    sizes = [count_points(job.source, job.options) for job in jobs]
-    size = jobs[0].options.m
-    assert size is not None
-    total = number_of(size, sum(sizes))
-    if 0 in sizes:
-        raise UserError(f"{jobs[sizes.index(0)].source} holds no points.")
-    if not len(sizes) <= total <= sum(sizes):
-        raise UserError(
-            f"--total: the {len(sizes)} files hold {sum(sizes):,} points; --m must be from one "
-            f"point per file to that number, got {total:,}."
-        )
-    numbers = shares(total, sizes).tolist()
-    if 0 in numbers:
-        number_of_file = Strata("file", least=1).numbers(dict(enumerate(sizes)), total)
-        numbers = [number_of_file[place] for place in range(len(sizes))]
-    return [
-        job._replace(options=replace(job.options, m=number))
-        for job, number in zip(jobs, numbers, strict=True)
-    ]
 
 
 def _results(

@@ -22,11 +22,11 @@ from mops_lightning.data.formats.registry import open_cloud_file
 from mops_lightning.data.formats.table import Table, join_tables
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
-from mops_lightning.files.strata import count_classes
 from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.points import UnitSphere, largest_distance
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.strata import count_classes
 
 
 class Nearest(NamedTuple):

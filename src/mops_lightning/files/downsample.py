@@ -22,12 +22,12 @@ from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.files.propagate import write_map
 from mops_lightning.files.space import in_space
-from mops_lightning.files.strata import count_classes
 from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.weights import check_positive
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fps import farthest_rows
 from mops_lightning.samplers.poisson import poisson_rows
+from mops_lightning.samplers.strata import count_classes
 from mops_lightning.samplers.tiles import sample_by_tiles
 from mops_lightning.zoo.find_sampler import untrained
 from mops_lightning.zoo.load import load

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.budget import as_size, number_of
-from mops_lightning.zoo import clouds
+from mops_lightning.zoo.by_distance import to_distance
+from mops_lightning.zoo.by_number import Choice, to_number
 from mops_lightning.zoo.find_sampler import find_sampler
 
 
@@ -25,6 +26,8 @@ def downsample(
     voxel: float | None = None,
     space: Any = None,
     tile: int | None = None,
+    stratify: Any = None,
+    stratify_min: int | None = None,
 ) -> tuple[Any, Any]:
     """Downsample clouds by a method or a model, or to a spacing or one point per voxel.
 
@@ -58,6 +61,11 @@ def downsample(
             ``fps``, ``poisson`` and ``spacing``.
         tile: cut every cloud into tiles of up to so many points (a balanced kd-tree), and sample
             each, as in training.
+        stratify: the class of every point, a whole number: ``(N,)``, ``(B, N)`` or ``(P,)``, a list
+            for a list of clouds. Every class keeps its share of the m points, rounded by the
+            largest remainder, and is sampled on its own. Rows are ascending.
+        stratify_min: with ``stratify``, the number of points that every class keeps where it has
+            them. Classes with larger shares give the points.
 
     Returns:
         The points, and their indices in the input, or None for generated points; tensors or arrays
@@ -82,19 +90,25 @@ def downsample(
     _check_budgets(m, spacing, voxel)
     if start is not None and (method != "fps" or m is None):
         raise UserError(f"start is for method='fps', got method={str(method)!r}.")
+    _check_strata(m, stratify, stratify_min)
     if m is None:
-        return clouds.to_distance(
-            points, method, readout, batch, seed or 0, weight, spacing, voxel, space
-        )
+        return to_distance(points, method, readout, batch, seed or 0, weight, spacing, voxel, space)
     if not isinstance(m, list | tuple):
         m = as_size(m)
-    if space is None and tile is None and _is_plain(points, m, batch):
+    is_simple = space is None and tile is None and stratify is None
+    if is_simple and _is_plain(points, m, batch):
         number = number_of(m, points.shape[-2])
         sampler = find_sampler(method, number, points, start, seed)
         return sampler.downsample(points, number, readout, batch, weight)
-    return clouds.to_number(
-        points, m, method, readout, batch, start, seed, weight, space=space, tile=tile
-    )
+    choice = Choice(method, readout, start, seed, space, tile)
+    return to_number(points, m, batch, weight, choice, stratify, stratify_min)
+
+
+def _check_strata(m: Any, stratify: Any, stratify_min: Any) -> None:
+    if stratify is None and stratify_min is not None:
+        raise UserError("stratify_min needs stratify, the class of every point.")
+    if stratify is not None and m is None:
+        raise UserError("stratify shares m points among classes: no spacing or voxel.")
 
 
 def _check_budgets(m: Any, spacing: Any, voxel: Any) -> None:
