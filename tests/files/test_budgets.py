@@ -122,6 +122,17 @@ def test_stratify_least(extra, clouds, tmp_path):
     assert classes_of(tmp_path / "out.ply") == {1: 38, 4: 20, 9: 2}
 
 
+def test_stratify_with_chunk_draws_a_class_from_all_of_the_file(clouds, tmp_path):
+    options = ["--method", "random", "--m", 60, "--stratify", "class:share", "--chunk", 60]
+    done(clouds / "a.ply", tmp_path / "out.ply", *options)
+
+    kept = read(tmp_path / "out.ply", 9, 0)
+    rows = kept.columns["row"][kept.columns["classification"] == 1]  # of rows 120 to 599
+    assert rows.min() < 180
+    assert 320 < rows.mean() < 400
+    assert rows.max() > 540
+
+
 def test_stratify_more_than_m_is_refused(clouds, tmp_path):
     options = ["--method", "fps", "--m", 30, "--stratify", "class:min=20"]
 

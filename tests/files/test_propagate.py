@@ -250,6 +250,21 @@ def test_packed_colours_are_averaged_channel_by_channel(kind, tmp_path):
     ]
 
 
+def test_packed_colours_of_whole_numbers_are_carried_unmixed_without_mean(tmp_path):
+    line = np.arange(3.0)[:, None] * [1, 0, 0]
+    packed = np.array([200, 512], np.uint32)
+    WRITERS[".npz"](tmp_path / "big.npz", Table(line, {}))
+    WRITERS[".pcd"](tmp_path / "small.pcd", Table(line[[0, 2]], {"rgb": packed}))
+    files = [tmp_path / "small.pcd", tmp_path / "big.npz", tmp_path / "out.ply"]
+
+    done(main, [*files, "--field", "rgb", "--k", 2])
+
+    carried = contents(tmp_path / "out.ply").columns["rgb"].tolist()
+    assert carried[0] == 200
+    assert carried[1] in (200, 512)
+    assert carried[2] == 512
+
+
 def test_double_coordinates_near_the_origin_keep_every_bit(tmp_path):
     points = np.random.default_rng(1).random((50, 3))
     np.save(tmp_path / "big.npy", points)
