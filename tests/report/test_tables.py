@@ -219,3 +219,25 @@ def test_projected_points_are_a_fourth_figure_and_compete_with_generated_ones(tm
     assert "60.00 / **70.00** / **70.00** / **90.00**" in text
     assert "<u>80.00</u> / <u>50.00</u> / <u>50.00</u>" in text
     assert "generated / matched / completed (SampleNet: / projected) sets" in text
+
+
+def test_own_samplers_in_one_table_are_told_apart_by_class_setting_and_module(tmp_path):
+    samplers = [
+        {"_target_": "lab.Kmeans", "rounds": 1},
+        {"_target_": "lab.Kmeans", "rounds": 9},
+        {"_target_": "lab.Median"},
+        {"_target_": "old_lab.Median"},
+    ]
+    for place, sampler in enumerate(samplers):
+        values = {"test/sampled/accuracy": 0.1 * (place + 1)}
+        put(tmp_path / f"{place}", "own", 32, values, of=sampler)
+
+    text = table(tmp_path, mixed=True)
+
+    assert rows(text)[1:] == [
+        ["Kmeans rounds=1", "10.00"],
+        ["Kmeans rounds=9", "20.00"],
+        ["Median lab.Median", "30.00"],
+        ["Median old_lab.Median", "40.00"],
+    ]
+    assert "not shown" not in text

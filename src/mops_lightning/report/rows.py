@@ -62,8 +62,9 @@ class RowNames:
             rows[_on_net(record, net)].append(record)
         for name, of_row in rows.items():
             keys = _telling_apart(of_row, columns)
+            classes = {str((record.config["sampler"] or {}).get("_target_")) for record in of_row}
             for record in of_row:
-                self._names[record.folder] = " ".join([name, *_texts(record, keys)])
+                self._names[record.folder] = " ".join([name, *_texts(record, keys, classes)])
 
     def of(self, record: RunRecord) -> str:
         """Return the row of a record's own results."""
@@ -113,13 +114,22 @@ def _sizes(record: RunRecord) -> set[int]:
     }
 
 
-def _texts(record: RunRecord, keys: Sequence[str]) -> list[str]:
-    """Return arguments of a record's sampler as parts of a name; a class is its last name."""
+def _texts(record: RunRecord, keys: Sequence[str], classes: set[str]) -> list[str]:
+    """Return arguments of a record's sampler as parts of a name.
+
+    Args:
+        record: of a run.
+        keys: the arguments.
+        classes: of all samplers of the row; one is shown by its last name where that differs.
+    """
     settings = dotted(record.config["sampler"])
+    last_names = {name.rpartition(".")[2] for name in classes}
     texts = []
     for key in keys:
-        if key == "_target_":
+        if key == "_target_" and len(last_names) == len(classes):
             texts.append(str(settings.get(key)).rpartition(".")[2])
+        elif key == "_target_":
+            texts.append(str(settings.get(key)))
         else:
             texts.append(f"{key}={settings.get(key)}")
     return texts
