@@ -8,6 +8,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 import random
 import shutil
 from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,15 @@ SLOW_FILES = (
 
 Only the first file needs compiled loops: the others begin when it has written them to disk.
 """
+
+
+LIBRARIES = ("torch", "lightning", "hydra-core", "omegaconf", "torchmetrics", "numpy", "pandas")
+"""Libraries whose versions decide most often whether the tests pass."""
+
+
+def pytest_report_header() -> str:
+    """Return the line that says with which versions the tests ran."""
+    return "libraries: " + ", ".join(f"{name} {version(name)}" for name in LIBRARIES)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -151,8 +151,9 @@ def _sweep(arguments: list[str]) -> str:
         return ""
     name = arguments[arguments.index("--config-name") + 1]
     for flag in ("--config-dir", "--config-name"):
-        at = arguments.index(flag)
-        del arguments[at : at + 2]
+        if flag in arguments:
+            at = arguments.index(flag)
+            del arguments[at : at + 2]
     return name
 
 

@@ -94,6 +94,15 @@ def test_run_of_installed_copy_leaves_a_record(installed: Path, tmp_path: Path) 
     assert list(elsewhere.iterdir()) == []
 
 
+def test_sweep_of_installed_copy_is_found_by_its_name(installed: Path, tmp_path: Path) -> None:
+    shown = python(
+        *("-m", "mops_lightning", "--config-name", "ablation", "--cfg", "job"),
+        cwd=tmp_path,
+        path=installed,
+    )
+    assert "n_points: 256" in shown  # of this sweep alone
+
+
 def test_source_distribution_contains_every_tracked_file(tmp_path: Path) -> None:
     if not (ROOT / ".git").exists() or shutil.which("git") is None:
         pytest.skip("not a git checkout")

@@ -1,5 +1,6 @@
 # The public API, and the samplers that weights files may name (zoo/load.py).
 
+from .ops.coreset import coreset as coreset
 from .ops.emd import earth_movers_distance as earth_movers_distance
 from .ops.flat_fps import fps as fps
 from .ops.fps import farthest_point_sample as farthest_point_sample
@@ -11,11 +12,14 @@ from .ops.readout import complete as complete
 from .ops.readout import match as match
 from .ops.sampling_matrix import SamplingMatrix as SamplingMatrix
 from .samplers.base import Sampler as Sampler
+from .samplers.covariance import CovarianceSampler as CovarianceSampler
 from .samplers.critical_points import CriticalSampler as CriticalSampler
 from .samplers.fmops import FMOPSNet as FMOPSNet
 from .samplers.fps import FPSSampler as FPSSampler
 from .samplers.gumbel import GumbelSampler as GumbelSampler
+from .samplers.information import InformationSampler as InformationSampler
 from .samplers.mops import MOPSNet as MOPSNet
+from .samplers.normal_space import NormalSpaceSampler as NormalSpaceSampler
 from .samplers.poisson import PoissonSampler as PoissonSampler
 from .samplers.random import RandomSampler as RandomSampler
 from .samplers.samplenet import ProgressiveSampleNet as ProgressiveSampleNet

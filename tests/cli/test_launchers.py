@@ -30,7 +30,6 @@ def test_cells_run_side_by_side(name, tmp_path):
 
 
 def test_optuna_searches_and_keeps_every_trial(tmp_path):
-    pytest.importorskip("optuna", reason="the extra 'optuna' is not installed")
     search = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "sampler.alpha=interval(0.1,30)"]
     settings = [*TINY, "weights=null", "hydra.sweep.dir=trials"]
     command = ["-m", *search, *settings, "hydra.sweeper.direction=maximize"]
@@ -43,7 +42,6 @@ def test_optuna_searches_and_keeps_every_trial(tmp_path):
 
 
 def test_optuna_is_told_of_failed_trials_and_searches_on(tmp_path):
-    pytest.importorskip("optuna", reason="the extra 'optuna' is not installed")
     search = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=4", "hydra.sweeper.n_jobs=1"]
     choice = ["hydra.sweeper.sampler.seed=1", "optimizer.lr=choice(0.001,1e30)"]
     settings = [*TINY, "weights=null", "hydra.sweep.dir=trials", "hydra.sweeper.direction=maximize"]

@@ -11,10 +11,11 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from omegaconf import OmegaConf
 
 from mops_lightning.config import compose as composing
+from mops_lightning.config.groups import sweeps_dir
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.run import run as running
 from mops_lightning.training.run.build import build_parts
-from tests.config.test_sweeps import ROOT, SWEEPS, composed, grids
+from tests.config.test_sweeps import FOLDERS, SWEEPS, composed, grids
 from tests.support.command_line import call
 from tests.support.small_data import write_all
 
@@ -142,7 +143,9 @@ def test_sweep_runs_a_cell_from_the_command_line(name, roots, tmp_path):
     params = ["hydra.sweeper.params=null"]
     if "grids" in composed(name).hydra.sweeper:
         params.append("hydra.sweeper.grids=[{}]")
-    sweep = ["-m", "--config-dir", str(ROOT), "--config-name", name, f"out={tmp_path}/out"]
+    folder = FOLDERS[name]
+    own = [] if folder == sweeps_dir() else ["--config-dir", str(folder)]
+    sweep = ["-m", *own, "--config-name", name, f"out={tmp_path}/out"]
 
     status, out, err = call([*sweep, *free, *given, *params], tmp_path)
 

@@ -1,4 +1,4 @@
-"""The files below sweeps/: each composes, and names every cell apart."""
+"""The files of sweeps, also of the rivals: each composes, and names every cell apart."""
 
 import pickle
 from functools import cache
@@ -13,12 +13,18 @@ from omegaconf import OmegaConf
 
 import mops_lightning.config.compose  # noqa: F401  registers the resolvers
 from hydra_plugins.grid_sweeper import parsed
-from mops_lightning.config.groups import conf_dir
+from mops_lightning.config.groups import conf_dir, sweeps_dir
 from mops_lightning.config.validate import check
 from mops_lightning.tree import dotted
 
-ROOT = Path(__file__).parents[2] / "sweeps"
-SWEEPS = sorted(path.stem for path in ROOT.glob("*.yaml"))
+CHECKOUT = Path(__file__).parents[2]
+FOLDERS = {
+    path.stem: path.parent
+    for folder in (CHECKOUT / "sweeps", CHECKOUT / "benchmarks" / "rivals" / "conf")
+    for path in folder.glob("*.yaml")
+}
+"""The folder of every sweep, by its name."""
+SWEEPS = sorted(FOLDERS)
 ON_SHAPES = ("ablation", "segmentation")
 """Sweeps that use the procedural shapes without the overlay."""
 TESTS_ONLY = ("noise", "corruptions")
@@ -31,8 +37,8 @@ CELLS = (
 
 @cache
 def composed_once(name, overrides):
-    path = [f"hydra.searchpath=[file://{conf_dir()}]"]
-    with initialize_config_dir(str(ROOT), version_base="1.3"):
+    path = [f"hydra.searchpath=[file://{conf_dir()},file://{sweeps_dir()}]"]
+    with initialize_config_dir(str(FOLDERS[name]), version_base="1.3"):
         return pickle.dumps(compose(name, [*path, *overrides], return_hydra_config=True))
 
 

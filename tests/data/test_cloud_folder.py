@@ -47,6 +47,17 @@ def test_cloud_folder_reads_every_format_without_labels_and_each_file_for_one_sp
     assert not set(train.tolist()) & set(test.tolist())
 
 
+@pytest.mark.parametrize(("crop", "expected"), [("whole", 1), ("nearest", 32)])
+def test_cloud_folder_without_number_of_crops_draws_whole_clouds_once(tmp_path, crop, expected):
+    for seed in range(4):
+        write(tmp_path / f"scan_{seed}.ply", seed)
+
+    data = cloud_folder(tmp_path, n_points=64, crop=crop, crops=None)
+
+    assert len(data.train.points) == 3 * expected
+    assert len(data.test.points) == expected
+
+
 def test_cloud_folder_crops_do_not_depend_on_other_files(folder):
     everything = cloud_folder(folder, n_points=64, crops=2, crop="whole")
     (folder / "scan_3.npy").unlink()

@@ -8,7 +8,19 @@ from tests.support.downsample import call, done, refused
 
 
 @pytest.mark.parametrize(
-    "method", [["fps"], ["random"], ["voxel"], ["poisson"], ["serial"], ["fps", "--tile", 64]]
+    "method",
+    [
+        ["fps"],
+        ["random"],
+        ["voxel"],
+        ["poisson"],
+        ["serial"],
+        ["normal_space"],
+        ["covariance"],
+        ["information"],
+        ["fps", "--tile", 64],
+        ["information", "--tile", 64],
+    ],
 )
 def test_untrained_method_keeps_rows_of_the_file(method, folder, tmp_path):
     source, target = folder / "in" / "a.ply", tmp_path / "out.npz"

@@ -13,7 +13,7 @@ GENERATED = ["--weights", "weights.safetensors", "--readout", "generated"]
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--m", 5], "give --method fps|random|voxel|poisson|serial, or --weights MODEL"),
+        (["--m", 5], "give --method fps|random|voxel|poisson|serial|normal_space|covariance|"),
         (["--m", 5, "--method", "fps", "--weights", "w.pt"], "--weights or --method fps, not both"),
         (["--method", "fps"], "--m must be"),
         (["--m", 0, "--method", "fps"], "--m must be"),

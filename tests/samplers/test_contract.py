@@ -7,7 +7,7 @@ from mops_lightning import GumbelSampler, MOPSNet, Sampler, SNet
 from mops_lightning.errors import UserError
 from tests.support.samplers import SAMPLERS
 
-SEEDED = ["random", "fps", "poisson"]
+SEEDED = ["random", "fps", "poisson", "normal_space"]
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 B, N, M = 3, 60, 8
 

@@ -22,9 +22,10 @@ selector = import_module("benchmarks.rivals.selector")
     "choice", ["lightn", "csnet", "apes", "apes sampler.variant=global", "samble"]
 )
 def test_rival_trains_every_weight_and_ignores_order_of_points(choice, rng):
-    settings = [f"hydra.searchpath=[file://{conf_dir()}]", "m=6", *f"sampler={choice}".split()]
-    with initialize_config_dir(str(Path(__file__).parents[2] / "sweeps"), version_base="1.3"):
-        sampler = build(compose("noise", settings).sampler, "sampler")
+    rivals = Path(__file__).parents[2] / "benchmarks" / "rivals" / "conf"
+    settings = [f"hydra.searchpath=[file://{rivals}]", "m=6", *f"sampler={choice}".split()]
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        sampler = build(compose("config", settings).sampler, "sampler")
     points, order = torch.randn(3, 50, 3, generator=rng), torch.randperm(50, generator=rng)
     output = sampler(points)
     seen = output.points if output.soft_projected is None else output.soft_projected

@@ -7,11 +7,14 @@ import torch
 
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.covariance import CovarianceSampler
 from mops_lightning.samplers.critical_points import CriticalSampler
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.gumbel import GumbelSampler
+from mops_lightning.samplers.information import InformationSampler
 from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.normal_space import NormalSpaceSampler
 from mops_lightning.samplers.poisson import PoissonSampler
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
@@ -37,6 +40,9 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "voxel": lambda m: VoxelSampler(m),
     "poisson": lambda m, **kw: PoissonSampler(m, **kw),
     "serial": lambda m: SerialSampler(m),
+    "normal_space": lambda m, **kw: NormalSpaceSampler(m, **kw),
+    "covariance": lambda m: CovarianceSampler(m),
+    "information": lambda m: InformationSampler(m),
     "critical": lambda m, **kw: CriticalSampler(m, PointNetVanilla(3), **kw),
     "gumbel": lambda m: GumbelSampler(m, feature_channels=(8, 6)),
     "mops": lambda m: MOPSNet(m, **MOPS_LAYERS),

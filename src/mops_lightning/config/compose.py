@@ -19,7 +19,7 @@ from yaml import MarkedYAMLError, YAMLError  # type: ignore[import-untyped]
 from mops_lightning.config import settings
 from mops_lightning.config.build import signature
 from mops_lightning.config.given import check_overrides
-from mops_lightning.config.groups import choice_groups, conf_dir, is_offered
+from mops_lightning.config.groups import choice_groups, conf_dir, is_offered, sweeps_dir
 from mops_lightning.config.help import run_level_keys, selectable_groups
 from mops_lightning.config.overrides import key as key_of
 from mops_lightning.config.overrides import with_own_classes
@@ -95,7 +95,9 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
             return f"{cause.full_key}: {str(cause).splitlines()[0]}."
         if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
             if not cause.options:
-                return f"no file {cause.missing_cfg_file} in --config-dir."
+                name = cause.missing_cfg_file
+                hint = did_you_mean(name, [path.stem for path in sweeps_dir().glob("*.yaml")])
+                return f"--config-name {name}: no such file in --config-dir, conf or sweeps.{hint}"
             group, _, choice = cause.missing_cfg_file.rpartition("/")
             asked = [key_of(one) for one in arguments if one.endswith(f"={choice}")]
             key = next((one for one in asked if one.partition("@")[0] == group), group)

@@ -9,9 +9,19 @@ PRESETS = ("experiment", "debug")
 
 
 def conf_dir() -> Path:
-    """Return the folder with the Hydra groups: in the wheel, or at the top of a checkout."""
-    here = Path(__file__).resolve().parents[1]
-    return here / "conf" if (here / "conf").is_dir() else here.parents[1] / "conf"
+    """Return the folder with the Hydra groups."""
+    return _top() / "conf"
+
+
+def sweeps_dir() -> Path:
+    """Return the folder with the sweeps, each by ``--config-name``."""
+    return _top() / "sweeps"
+
+
+def _top() -> Path:
+    """Return the folder of both: the package in the wheel, or the top of a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    return package if (package / "conf").is_dir() else package.parents[1]
 
 
 def choice_groups() -> list[str]:

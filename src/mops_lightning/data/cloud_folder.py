@@ -16,7 +16,7 @@ from rich.progress import track
 from torch import Tensor
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, make_dataset
-from mops_lightning.data.crops import CROPS, Crop, random_crops
+from mops_lightning.data.crops import CROPS, CROPS_PER_FILE, Crop, random_crops
 from mops_lightning.data.file_splits import (
     SPLITS,
     SourceFile,
@@ -69,7 +69,7 @@ def cloud_folder(
     # No defaults: a record without these is evaluated with the values of its preset.
     test_frames: Literal["last"] | None,
     crop: Crop,
-    crops: int,
+    crops: int | None,
     label: str | None = None,
     columns: Sequence[str] | None = None,
 ) -> CloudDataset:
@@ -93,7 +93,8 @@ def cloud_folder(
         crop: ``nearest`` takes the points nearest to a drawn point, as the tiles of ``downsample
             --tile``; ``whole`` random points of the cloud; ``surface`` random points on the
             surface of a mesh, uniform by area.
-        crops: number of clouds per file; 1 for ``surface``.
+        crops: number of clouds per file; 1 for ``surface``. None: 32 crops, or one whole cloud,
+            which then counts once per epoch.
         label: column of the files that says to which part a point belongs, by a whole number, below
             0 if that is unknown; None: the points have no parts. Not with ``surface``.
         columns: names of the columns of .bin files, which have no header; None: those that their
@@ -108,7 +109,6 @@ def cloud_folder(
         UserError: an argument or a file is invalid, or a split is empty.
     """
     check_at_least(2, n_points=n_points)
-    check_at_least(1, crops=crops)
     check_at_least(0, seed=seed, gap=gap)
     if test_frames not in (None, "last"):
         raise UserError(f"test_frames must be last or null, got {test_frames!r}.")
@@ -116,6 +116,9 @@ def cloud_folder(
         raise UserError(f"test_share must be between 0 and 1, got {test_share}.")
     if crop not in CROPS:
         raise UserError(f"crop: unknown {crop!r}.{did_you_mean(crop, CROPS)}")
+    if crops is None:
+        crops = CROPS_PER_FILE[crop]
+    check_at_least(1, crops=crops)
     if crop == "surface" and crops != 1:
         raise UserError(f"crops must be 1 with crop=surface, got {crops}.")
     if crop == "surface" and label is not None:

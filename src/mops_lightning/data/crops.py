@@ -11,6 +11,13 @@ from mops_lightning.data.formats.guard import BadCloudError
 Crop = Literal["nearest", "whole", "surface"]
 CROPS = ("nearest", "whole", "surface")
 
+CROPS_PER_FILE = {
+    "nearest": 32,
+    "whole": 1,
+    "surface": 1,
+}
+"""Number of clouds that are drawn from a file, unless ``crops`` sets it."""
+
 DRAWS = 50
 """Crops that are drawn before a file is rejected because all points of a crop coincide."""
 

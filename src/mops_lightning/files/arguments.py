@@ -13,6 +13,9 @@ COLUMNS = (
     "x,y,z,intensity, in .pcd.bin files also ring"
 )
 
+COMPARED = ("table.csv", "compare.html")
+"""The files of a comparison."""
+
 Add = Callable[..., object]
 """``ArgumentParser.add_argument``."""
 

@@ -6,7 +6,9 @@ from os.path import realpath
 from pathlib import Path
 
 from mops_lightning.errors import UserError, did_you_mean, one_line_endings, printable
-from mops_lightning.files.arguments import COLUMNS, WEIGHTS, Add, columns_of, parsed
+from mops_lightning.files.arguments import COLUMNS, COMPARED, WEIGHTS, Add, columns_of, parsed
+from mops_lightning.files.icp.cli import add_arguments as add_icp_arguments
+from mops_lightning.files.icp.cli import compare_icp, refuse_icp_options
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.zoo.names import UNTRAINED
 
@@ -18,9 +20,13 @@ binary .ply file may be larger than memory."""
 
 COMPARE = """Compare downsampling methods on your own files.
 
-Each file is sampled to m points by random, voxel, farthest point and Poisson-disk sampling and,
-with --weights, by a trained sampler. A table and a page with the clouds in 3-D show the chamfer and
-Hausdorff distances to the full cloud, how evenly it is represented, and the time."""
+Each file is sampled to m points by every untrained method and, with --weights, by a trained
+sampler. A table and a page with the clouds in 3-D show the chamfer and
+Hausdorff distances to the full cloud, how evenly it is represented, and the time.
+
+With --task icp, FILE is one folder of scans. Halves of random crops, or with --poses consecutive
+frames, are aligned by small_gicp from m points of every method. The table shows the error of the
+rotation over ten draws, and the times."""
 
 
 def propagate(arguments: list[str], prog: str = "mops-lightning propagate") -> None:
@@ -90,21 +96,49 @@ def compare(arguments: list[str], prog: str = "mops-lightning compare") -> None:
 
 
 def _compare_arguments(add: Add) -> None:
-    add("files", metavar="FILE", type=Path, nargs="+", help="clouds or meshes")
+    add("files", metavar="FILE", type=Path, nargs="+", help="clouds or meshes; icp: one folder")
+    add(
+        "--task",
+        choices=("coverage", "icp"),
+        default="coverage",
+        help="what is measured: distances to the whole cloud (default), or registration",
+    )
     add("--m", type=int, nargs="+", required=True, help="numbers of points to keep")
     add("--weights", help=WEIGHTS)
-    add("--methods", nargs="+", default=list(UNTRAINED), help="untrained methods; default: all")
+    add("--methods", nargs="+", help="untrained methods; default: all")
     add("--columns", metavar="X,Y,Z,...", help=COLUMNS)
     add("--tile", type=int, metavar="POINTS", help="the trained sampler by tiles, as in downsample")
     add("--out", type=Path, default=Path("compare"), help="folder to write; default: compare")
     add("--seed", type=int, default=0, help="seed of random choices")
     add("--overwrite", action="store_true", help="replace an earlier comparison in --out")
+    add_icp_arguments(add)
 
 
 def _compare(chosen: argparse.Namespace) -> None:
     if chosen.weights is None and chosen.tile is not None:
         raise UserError("--tile is for the trained sampler: give --weights.")
-    for name in chosen.methods:
+    _check_out(chosen)
+    table = compare_icp(chosen) if chosen.task == "icp" else _compare_coverage(chosen)
+    print(table)
+    print(f"files in {chosen.out}/: {', '.join(COMPARED)}")
+
+
+def _check_out(chosen: argparse.Namespace) -> None:
+    """Reject a folder with other files, or with an earlier comparison without ``--overwrite``."""
+    if chosen.out.exists() and not chosen.out.is_dir():
+        raise UserError(f"--out must be a folder, got the file {chosen.out}.")
+    found = {path.name for path in chosen.out.glob("[!.]*")}
+    if other := sorted(found.difference(COMPARED)):
+        raise UserError(f"--out: {chosen.out} has other files, such as {other[0]}. Give a new one.")
+    if found and not chosen.overwrite:
+        raise UserError(f"--out: {chosen.out / max(found)} exists. Give another, or --overwrite.")
+
+
+def _compare_coverage(chosen: argparse.Namespace) -> str:
+    """Measure distances to the whole clouds, and return the table as text."""
+    refuse_icp_options(chosen)
+    names = chosen.methods or list(UNTRAINED)
+    for name in names:
         if name not in UNTRAINED:
             raise UserError(f"--methods: unknown {name!r}.{did_you_mean(name, UNTRAINED)}")
     columns = columns_of(chosen)
@@ -113,15 +147,8 @@ def _compare(chosen: argparse.Namespace) -> None:
     from mops_lightning.files import compare as comparison
     from mops_lightning.files.downsample import load_sampler
 
-    if chosen.out.exists() and not chosen.out.is_dir():
-        raise UserError(f"--out must be a folder, got the file {chosen.out}.")
-    found = {path.name for path in chosen.out.glob("[!.]*")}
-    if other := sorted(found.difference(comparison.FILES)):
-        raise UserError(f"--out: {chosen.out} has other files, such as {other[0]}. Give a new one.")
-    if found and not chosen.overwrite:
-        raise UserError(f"--out: {chosen.out / max(found)} exists. Give another, or --overwrite.")
     by_size = {
-        m: comparison.options_by_method(m, chosen.methods, chosen.weights, chosen.tile, chosen.seed)
+        m: comparison.options_by_method(m, names, chosen.weights, chosen.tile, chosen.seed)
         for m in chosen.m
     }
     for methods in by_size.values():
@@ -132,5 +159,4 @@ def _compare(chosen: argparse.Namespace) -> None:
         for path in chosen.files
         for m, methods in by_size.items()
     ]
-    print(comparison.write_comparison(results, chosen.out))
-    print(f"files in {chosen.out}/: {', '.join(comparison.FILES)}")
+    return comparison.write_comparison(results, chosen.out)

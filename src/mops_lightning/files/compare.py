@@ -19,6 +19,7 @@ from scipy.spatial import QhullError, cKDTree
 from mops_lightning.data.formats.guard import check_size
 from mops_lightning.data.formats.registry import read
 from mops_lightning.errors import UserError
+from mops_lightning.files.arguments import COMPARED
 from mops_lightning.files.downsample import SURFACE, load_sampler, sample_cloud
 from mops_lightning.files.options import Options
 from mops_lightning.filesystem import atomic_write
@@ -31,9 +32,6 @@ Points = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 TRAINED = "trained"
-
-FILES = ("table.csv", "compare.html")
-"""The files of a comparison."""
 
 COLUMNS = {
     "chamfer": ".4g", "hausdorff": ".4g", "density": ".2f", "ground": ".4g", "seconds": ".2f"
@@ -208,7 +206,7 @@ def write_comparison(results: Sequence[FileResult], folder: Path) -> str:
     grids = [_grid(result) for result in results]
     clouds = [_clouds(result) for result in results]
     page = render("compare", grids, clouds, MEANINGS, "How to read this", choice="File")
-    for name, content in zip(FILES, (_csv(results), page), strict=True):
+    for name, content in zip(COMPARED, (_csv(results), page), strict=True):
         with atomic_write(folder / name) as temporary:
             temporary.write_text(content, encoding="utf-8")
     return markdown(grids, MEANINGS)

@@ -19,12 +19,14 @@ from mops_lightning.files.by_distance import keep_by_distance
 from mops_lightning.files.chunks import Outcome, count_by_class, draw, sample_by_chunks
 from mops_lightning.files.column_weights import weights_of
 from mops_lightning.files.engine import Engine
+from mops_lightning.files.normal_columns import normals_of
 from mops_lightning.files.options import Options
 from mops_lightning.files.propagate import write_map
 from mops_lightning.files.space import in_space
 from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.weights import check_positive
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.by_normals import ByNormals
 from mops_lightning.samplers.fps import farthest_rows
 from mops_lightning.samplers.poisson import poisson_rows
 from mops_lightning.samplers.strata import count_classes
@@ -262,7 +264,21 @@ def _rows_of_weighted(
     if options.space is not None:
         rows = _rows_in_space(table, m, options, source, weight)
         return rows, table.points[rows]
-    return sample_cloud(table.points, load_sampler(options, m), m, options, source, weight)
+    sampler = load_sampler(options, m)
+    if isinstance(sampler, ByNormals) and options.tile is None:
+        rows = _rows_by_normals(table, sampler, m, source)
+        return rows, table.points[rows]
+    return sample_cloud(table.points, sampler, m, options, source, weight)
+
+
+def _rows_by_normals(table: Table, sampler: ByNormals, m: int, source: Path) -> NDArray[np.int64]:
+    """Choose points by the normals of the file, or where it has none by estimated ones."""
+    check_coordinates(source, table.points)
+    points = UnitSphere.around(table.points).normalise(table.points)[None]
+    normals = normals_of(table)
+    given = None if normals is None else torch.from_numpy(normals)[None]
+    rows: NDArray[np.int64] = sampler.rows(points, m, given)[0].numpy()
+    return rows
 
 
 def _rows_in_space(

@@ -13,6 +13,9 @@ UNTRAINED = {
     "voxel": "VoxelSampler",
     "poisson": "PoissonSampler",
     "serial": "SerialSampler",
+    "normal_space": "NormalSpaceSampler",
+    "covariance": "CovarianceSampler",
+    "information": "InformationSampler",
 }
 """Samplers without weights, public names of the package, by the name of the method."""
 SHIPPED = Path(__file__).parent / "models"

@@ -1,0 +1,182 @@
+"""``compare --task icp``: methods of downsampling by the registration of scans."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from mops_lightning.errors import UserError, check_at_least
+from mops_lightning.files.arguments import Add, columns_of
+
+REGISTRATIONS = ("plane", "gicp")
+
+CROPS = {"crops": 32, "points": 1024, "angle": 15.0, "shift": 0.1, "max_distance": 0.3}
+"""Defaults for crops, in radii of a crop."""
+
+FRAMES = {"angle": 2.0, "shift": 0.5, "max_distance": 1.0}
+"""Defaults for frames, in the files' unit."""
+
+ONLY_ICP = (
+    "poses",
+    "sample_target",
+    "draws",
+    "crops",
+    "points",
+    "motions",
+    "angle",
+    "shift",
+    "max_distance",
+    "registration",
+)
+"""Options of this task alone."""
+
+
+def add_arguments(add: Add) -> None:
+    """Declare the options that ``--task icp`` alone has."""
+    add("--draws", type=int, metavar="N", help="icp: draws of crops and starts; default: 10")
+    add(
+        "--poses",
+        type=Path,
+        metavar="FILE",
+        help="icp: align consecutive frames, whose poses are here, a line each (KITTI or TUM), "
+        "instead of halves of crops",
+    )
+    add(
+        "--sample-target",
+        action="store_true",
+        default=None,
+        help="icp: sample the target like the source; small_gicp then estimates its normals from "
+        "the sample. Default: all points of the target",
+    )
+    add("--crops", type=int, metavar="N", help="icp: crops of every scan and draw; default: 32")
+    add("--points", type=int, metavar="N", help="icp: points of a crop; default: 1024")
+    add("--motions", type=int, metavar="N", help="icp: starts of every pair; default: 1")
+    add(
+        "--angle",
+        type=float,
+        metavar="DEGREES",
+        help="icp: largest angle of a start; default: 15, of frames 2",
+    )
+    add(
+        "--shift",
+        type=float,
+        metavar="DISTANCE",
+        help="icp: largest shift of a start; default: 0.1 of a crop's radius, of frames 0.5",
+    )
+    add(
+        "--max-distance",
+        type=float,
+        metavar="DISTANCE",
+        help="icp: of corresponding points; default: 0.3 of a crop's radius, of frames 1",
+    )
+    add(
+        "--registration",
+        nargs="+",
+        choices=REGISTRATIONS,
+        help="icp: point-to-plane ICP, GICP; default: both",
+    )
+
+
+def refuse_icp_options(chosen: argparse.Namespace) -> None:
+    """Reject options that have no effect without ``--task icp``.
+
+    Raises:
+        UserError: there is one.
+    """
+    for name in ONLY_ICP:
+        if getattr(chosen, name) is not None:
+            raise UserError(f"--{name.replace('_', '-')} is for --task icp.")
+
+
+def compare_icp(chosen: argparse.Namespace) -> str:
+    """Compare methods by registration, write the files and return the table as text.
+
+    Raises:
+        UserError: an argument or a file is invalid.
+    """
+    _fill_defaults(chosen)
+    from mops_lightning.files.icp.align import small_gicp
+    from mops_lightning.files.icp.measure import Setup, compare_by_icp
+    from mops_lightning.files.icp.methods import NAMES, methods_of
+    from mops_lightning.files.icp.pairs import read_points, scans_of
+    from mops_lightning.files.icp.tables import write_scores
+
+    small_gicp()  # reports that it is missing before any file is read
+    setup = Setup(
+        sizes=chosen.m,
+        methods=methods_of(chosen.methods or NAMES, chosen.weights, chosen.tile),
+        registrations=chosen.registration,
+        draws=chosen.draws,
+        motions=chosen.motions,
+        angle=chosen.angle,
+        shift=chosen.shift,
+        max_distance=chosen.max_distance,
+        is_target_sampled=bool(chosen.sample_target),
+        seed=chosen.seed,
+    )
+    columns = columns_of(chosen)
+    surface = max(10_000, 8 * (chosen.points or max(chosen.m)))
+    scans = [
+        (path, read_points(path, chosen.seed, columns, surface))
+        for path in scans_of(_folder(chosen))
+    ]
+    pairs_of_draw = _pairs(chosen, scans)
+    scores = []
+    for score in compare_by_icp(pairs_of_draw, setup):
+        scores.append(score)
+        _show_progress(score.draw, setup.draws)
+    kind = "scans" if chosen.poses is None else "frames"
+    draws = f"{setup.draws} draws of {scores[0].pairs} alignments"
+    source = f"{len(scans)} {kind} of {_folder(chosen)}: {draws}"
+    return write_scores(scores, source, chosen.out)
+
+
+def _folder(chosen: argparse.Namespace) -> Path:
+    if len(chosen.files) != 1:
+        raise UserError(f"--task icp takes one folder of scans, got {len(chosen.files)} paths.")
+    folder: Path = chosen.files[0]
+    return folder
+
+
+def _pairs(chosen: argparse.Namespace, scans: list) -> Callable[[int], list]:
+    """Return the function that gives the pairs of a draw."""
+    from mops_lightning.files.icp.pairs import crop_pairs, frame_pairs
+    from mops_lightning.seeding import derive_seed
+
+    if chosen.poses is not None:
+        pairs = frame_pairs(scans, chosen.poses)
+        return lambda draw: pairs
+    draw_crops = partial(crop_pairs, scans, chosen.points, chosen.crops)
+    return lambda draw: draw_crops(derive_seed(chosen.seed, draw))
+
+
+def _fill_defaults(chosen: argparse.Namespace) -> None:
+    """Set what was not given, and check what was.
+
+    Raises:
+        UserError: a value is out of range.
+    """
+    defaults = CROPS if chosen.poses is None else FRAMES
+    if chosen.poses is not None:
+        for name in ("crops", "points"):
+            if getattr(chosen, name) is not None:
+                raise UserError(f"--{name} is for crops: leave it out with --poses.")
+    common = {"draws": 10, "motions": 1, "registration": list(REGISTRATIONS)}
+    for name, value in (common | defaults).items():
+        if getattr(chosen, name) is None:
+            setattr(chosen, name, value)
+    for name in ("draws", "motions", "crops", "points"):
+        number = getattr(chosen, name)
+        least = 20 if name == "points" else 1
+        if number is not None and number < least:
+            raise UserError(f"--{name} must be at least {least}, got {number}.")
+    check_at_least(0, **{"--angle": chosen.angle, "--shift": chosen.shift})
+    if not 0 < chosen.max_distance < float("inf"):
+        raise UserError(f"--max-distance must be a number above 0, got {chosen.max_distance}.")
+
+
+def _show_progress(draw: int, draws: int) -> None:
+    """Show on a terminal how many draws are done."""
+    if sys.stderr.isatty():
+        print(f"\rdraw {draw + 1} of {draws}", end="", file=sys.stderr, flush=True)

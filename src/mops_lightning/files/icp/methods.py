@@ -1,0 +1,135 @@
+"""Methods of downsampling for registration: those of the package, and small_gicp's own filter."""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.files.downsample import load_sampler, sample_cloud
+from mops_lightning.files.icp.align import small_gicp
+from mops_lightning.files.options import Options
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.fps import FARTHEST
+from mops_lightning.zoo.find_sampler import untrained
+from mops_lightning.zoo.names import UNTRAINED
+
+Points = NDArray[np.float64]
+
+FPS_FARTHEST, FILTER, TRAINED = "fps_farthest", "small_gicp_voxel", "trained"
+
+NAMES = (*UNTRAINED, FPS_FARTHEST, FILTER)
+"""Methods without training: ``fps_farthest`` starts at the point farthest from the mean."""
+
+BISECTIONS = 40
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Chosen points.
+
+    Attributes:
+        points: ``(k, 3)``; k is m but for small_gicp's filter, which keeps at most m.
+        seconds: processor time of the sampling.
+    """
+
+    points: Points
+    seconds: float
+
+
+class Method(ABC):
+    """One way to choose points, by its name in the table."""
+
+    name: str
+
+    @abstractmethod
+    def sample(self, points: Points, m: int, seed: int, path: Path) -> Sample:
+        """Choose m of points ``(N, 3)`` of a file."""
+
+
+class ByName(Method):
+    """A sampler that needs no training."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def sample(self, points: Points, m: int, seed: int, path: Path) -> Sample:
+        """Choose m of points ``(N, 3)``."""
+        return _timed(points, m, self._sampler(m, seed), Options(m, method="fps"), path)
+
+    def _sampler(self, m: int, seed: int) -> Sampler:
+        if self.name == FPS_FARTHEST:
+            return untrained("fps", m, seed, start=FARTHEST)
+        return untrained(self.name, m, seed)
+
+
+class ByWeights(Method):
+    """A trained sampler, whose completed sets are taken."""
+
+    name = TRAINED
+
+    def __init__(self, weights: str, tile: int | None) -> None:
+        self.weights = weights
+        self.tile = tile
+
+    def options(self, m: int) -> Options:
+        """Return the options of sampling m points."""
+        return Options(m, self.weights, tile=self.tile)
+
+    def sample(self, points: Points, m: int, seed: int, path: Path) -> Sample:
+        """Choose m of points ``(N, 3)``; the seed has no effect."""
+        options = self.options(m)
+        return _timed(points, m, load_sampler(options), options, path)
+
+
+class VoxelFilter(Method):
+    """The voxel filter of small_gicp, which returns the means of voxels.
+
+    The smallest voxels of which at most m are occupied are found by bisection. Only the filter at
+    this size is timed, since a user of the filter gives a size.
+    """
+
+    name = FILTER
+
+    def sample(self, points: Points, m: int, seed: int, path: Path) -> Sample:
+        """Return at most m means of points ``(N, 3)``; the seed has no effect."""
+        library = small_gicp()
+        extent = float(np.ptp(points, axis=0).max()) or 1.0
+        fine, coarse = extent / 2**19, 2 * extent  # small_gicp's voxels have 21 bits along an axis
+        for _ in range(BISECTIONS):
+            middle = np.sqrt(fine * coarse)
+            if library.voxelgrid_sampling(points, middle).size() > m:
+                fine = middle
+            else:
+                coarse = middle
+        began = time.process_time()
+        means = library.voxelgrid_sampling(points, coarse).points()
+        return Sample(np.ascontiguousarray(means[:, :3]), time.process_time() - began)
+
+
+def methods_of(names: Sequence[str], weights: str | None, tile: int | None) -> list[Method]:
+    """Return the methods of a comparison.
+
+    Raises:
+        UserError: a name is unknown.
+    """
+    methods: list[Method] = []
+    for name in names:
+        if name not in NAMES:
+            raise UserError(f"--methods: unknown {name!r}.{did_you_mean(name, NAMES)}")
+        methods.append(VoxelFilter() if name == FILTER else ByName(name))
+    if weights is not None:
+        methods.append(ByWeights(weights, tile))
+    return methods
+
+
+def _timed(points: Points, m: int, sampler: Sampler, options: Options, path: Path) -> Sample:
+    began = time.process_time()
+    rows, chosen = sample_cloud(points, sampler, m, options, path)
+    seconds = time.process_time() - began
+    assert rows is not None  # completed sets are rows
+    return Sample(chosen, seconds)

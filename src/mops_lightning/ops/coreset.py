@@ -1,0 +1,175 @@
+"""Points of a pair of clouds that stand for all of them in one step of registration."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mops_lightning.errors import UserError
+from mops_lightning.ops.caratheodory import same_sum
+from mops_lightning.ops.normals import estimate_normals
+
+LEAST = 29
+"""Least number of points: 21 entries of H, 6 of b, the error and the number of residuals."""
+
+Array = NDArray[np.float64]
+
+
+class Coreset(NamedTuple):
+    """Points with weights.
+
+    Attributes:
+        rows: ``(k,)`` int64 rows of the source, ascending.
+        weights: ``(k,)`` above 0; their sum is the number of residuals.
+    """
+
+    rows: NDArray[np.int64]
+    weights: Array
+
+
+class Residuals(NamedTuple):
+    """Point-to-plane residuals of a source.
+
+    Attributes:
+        rows: ``(n,)`` rows of the source that have a target point.
+        values: ``(n,)`` distances from the planes of the nearest target points, signed.
+        jacobians: ``(n, 6)`` their derivatives by a turn about the mean of the target (radians),
+            then a shift, both after the pose.
+    """
+
+    rows: NDArray[np.int64]
+    values: Array
+    jacobians: Array
+
+
+def coreset(
+    source: Any,
+    target: Any,
+    pose: Any,
+    m: int,
+    *,
+    normals: Any = None,
+    max_distance: float = np.inf,
+) -> Coreset:
+    """Choose points and weights of a source with which a Gauss–Newton step is that of all points.
+
+    Koide et al., "Exact Point Cloud Downsampling for Fast and Accurate Global Trajectory
+    Optimization", IROS 2023 (arXiv 2307.02948): the weighted Hessian H = Σ w J Jᵀ, b = Σ w J r and
+    error Σ w r² of the chosen point-to-plane residuals equal those of all residuals, up to
+    rounding. Equality holds for the correspondences at this pose, and for turns about any centre.
+    It is not a sample of the shape: points are chosen for the sums alone.
+
+    Args:
+        source: ``(N, 3)`` points, an array or a tensor; one cloud, no batch ``(B, N, 3)``.
+        target: ``(K, 3)`` points.
+        pose: ``(4, 4)`` rigid motion from source to target, at which residuals are taken.
+        m: largest number of points, at least 29.
+        normals: ``(K, 3)`` unit normals of the target; None: they are estimated.
+        max_distance: source points without a target point within it have no residual; in the
+            clouds' unit.
+
+    Returns:
+        At most ``m`` rows of the source, and their weights. All residuals with weight 1 where there
+        are no more than ``m``.
+
+    Raises:
+        UserError: an argument has a wrong shape or value, or no source point is near the target.
+
+    Example:
+        >>> import numpy as np
+        >>> from mops_lightning import coreset
+        >>> points = np.random.default_rng(0).random((1000, 3))
+        >>> rows, weights = coreset(points[:500], points[500:], np.eye(4), 29)
+        >>> len(rows) <= 29, round(float(weights.sum()))
+        (True, 500)
+    """
+    if isinstance(m, bool) or not isinstance(m, int) or m < LEAST:
+        raise UserError(f"m must be a whole number of at least {LEAST}, got {m!r}.")
+    found = point_to_plane(source, target, pose, normals, max_distance)
+    number = len(found.rows)
+    if number <= m:
+        return Coreset(found.rows, np.ones(number))
+    vectors = _summands(found)
+    parts = m // LEAST
+    chosen = []
+    weights = []
+    for part in range(parts):
+        places = np.arange(part, number, parts)
+        keep = len(range(part, m, parts))
+        rows, values = same_sum(vectors[places], keep)
+        chosen.append(places[rows])
+        weights.append(values)
+    places = np.concatenate(chosen)
+    order = np.argsort(places)
+    return Coreset(found.rows[places[order]], np.concatenate(weights)[order])
+
+
+def point_to_plane(
+    source: Any, target: Any, pose: Any, normals: Any = None, max_distance: float = np.inf
+) -> Residuals:
+    """Return the residuals of all source points at a pose; see ``coreset`` for the arguments."""
+    points = _cloud("source", source)
+    plane_points = _cloud("target", target)
+    motion = _motion(pose)
+    if not max_distance > 0:
+        raise UserError(f"max_distance must be above 0, got {max_distance}.")
+    directions = estimate_normals(plane_points)
+    if normals is not None:
+        directions = _cloud("normals", normals)
+    if directions.shape != plane_points.shape:
+        raise UserError(
+            f"normals must be one per target point, {plane_points.shape}, got {directions.shape}."
+        )
+    # Around the mean: products with coordinates of a map would lose digits.
+    centre = plane_points.mean(0)
+    plane_points = plane_points - centre
+    moved = points @ motion[:3, :3].T + (motion[:3, 3] - centre)
+    neighbours: Any = cKDTree(plane_points).query(moved)
+    distance, nearest = neighbours
+    rows = np.flatnonzero(distance <= max_distance)
+    if not len(rows):
+        raise UserError("no source point is within max_distance of the target at this pose.")
+    across = directions[nearest[rows]]
+    values = np.einsum("ni,ni->n", across, moved[rows] - plane_points[nearest[rows]])
+    jacobians = np.concatenate([np.cross(moved[rows], across), across], axis=1)
+    return Residuals(rows, values, jacobians)
+
+
+def _summands(found: Residuals) -> Array:
+    """Return what each residual adds to H (its upper triangle), b and the error, ``(n, 28)``."""
+    upper = np.triu_indices(6)
+    products = found.jacobians[:, upper[0]] * found.jacobians[:, upper[1]]
+    slopes = found.jacobians * found.values[:, None]
+    return np.column_stack([products, slopes, np.square(found.values)])
+
+
+def _cloud(name: str, value: Any) -> Array:
+    """Return finite points ``(N, 3)`` in float64."""
+    if hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()
+    try:
+        points = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        raise UserError(f"{name} must be numbers (N, 3), got {type(value).__name__}.") from None
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise UserError(f"{name} must have shape (N, 3), N at least 1, got {points.shape}.")
+    if not np.isfinite(points).all():
+        raise UserError(f"{name} must be finite, got NaN or infinity.")
+    return points
+
+
+def _motion(pose: Any) -> Array:
+    """Return a rigid motion ``(4, 4)`` in float64."""
+    if hasattr(pose, "detach"):
+        pose = pose.detach().cpu().numpy()
+    motion: Array = np.asarray(pose, np.float64)
+    is_rigid = motion.shape == (4, 4) and np.allclose(
+        motion[:3, :3] @ motion[:3, :3].T, np.eye(3), atol=1e-3
+    )
+    if not is_rigid or not np.allclose(motion[3], [0, 0, 0, 1]):
+        raise UserError(
+            "pose must be a (4, 4) rigid motion: a rotation, a shift, and (0, 0, 0, 1) below; got "
+            f"shape {motion.shape}."
+        )
+    return motion

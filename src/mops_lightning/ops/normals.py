@@ -1,0 +1,38 @@
+"""Normals of the surface from which points were sampled."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mops_lightning.ops.kernel_normals import plane_normals
+
+NEIGHBOURS = 12
+"""Nearest points of a plane fit, the point itself included."""
+
+PART = 2**16
+"""Number of points whose neighbourhoods are in memory at a time."""
+
+
+def estimate_normals(
+    points: NDArray[np.float64], neighbours: int = NEIGHBOURS
+) -> NDArray[np.float64]:
+    """Return the unit normals of planes through the nearest points, of either sign.
+
+    Hoppe et al., "Surface Reconstruction from Unorganized Points", SIGGRAPH 1992: the direction of
+    least variance, found by Jacobi's method.
+
+    Args:
+        points: ``(N, 3)`` finite, N ≥ 1.
+        neighbours: number of nearest points, the point itself included.
+
+    Returns:
+        ``(N, 3)``. Of points on a line, one of the directions across; of equal points, (0, 0, 1).
+    """
+    centred = points - points.mean(0)
+    tree = cKDTree(centred)
+    normals = np.empty_like(centred)
+    for start in range(0, len(points), PART):
+        part = centred[start : start + PART]
+        nearest = np.asarray(tree.query(part, k=min(neighbours, len(points)))[1], np.int64)
+        normals[start : start + PART] = plane_normals(centred, nearest.reshape(len(part), -1))
+    return normals

@@ -1,0 +1,105 @@
+"""Points that hold a pose in point-to-plane registration.
+
+A small motion, rotation r and translation t, moves point p along its normal n by ⟨p × n, r⟩ +
+⟨n, t⟩. The vectors v = (p × n, n) of the points therefore say which motions a sample resists:
+Σ v vᵀ is the information matrix of the pose, and the Hessian of ICP.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mops_lightning.ops.kernel_stability import cover_least_held, grow_information
+
+PRIOR = 1e-3
+"""Information about every direction before the first point, in units of that of one point."""
+
+CELLS = 5
+"""Cells along each axis of a face of the cube of normals; odd, so that an axis is inside a cell."""
+
+
+def plane_rows(points: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the vectors (p × n, n) ``(N, 6)`` of points around their mean, scaled.
+
+    The mean distance from the centre is 1, so that a turn by one radian and a shift by one unit
+    move the points equally far (Gelfand et al. 2003).
+
+    Args:
+        points: ``(N, 3)``.
+        normals: ``(N, 3)``, of either sign.
+    """
+    centred = points - points.mean(0)
+    scale = float(np.linalg.norm(centred, axis=1).mean()) or 1.0
+    return np.concatenate([np.cross(centred / scale, normals), normals], axis=1)
+
+
+def stable_places(rows: NDArray[np.float64], m: int) -> NDArray[np.int64]:
+    """Choose m points that hold all six directions of motion about equally.
+
+    Gelfand, Ikemoto, Rusinkiewicz and Levoy, "Geometrically Stable Sampling for the ICP Algorithm",
+    3DIM 2003: the directions are the eigenvectors of Σ v vᵀ over all points. The next point is the
+    one with the largest ⟨v, x⟩² for the direction x whose sum over the chosen points is smallest.
+
+    Args:
+        rows: ``(N, 6)`` from ``plane_rows``.
+        m: number of points, at most N.
+
+    Returns:
+        ``(m,)`` places, in the order of choice; of equal points the lowest place.
+    """
+    covariance = np.einsum("ni,nj->ij", rows, rows)  # the same sum for any number of threads
+    directions = np.linalg.eigh(covariance)[1]
+    squares = np.square(np.einsum("ni,ij->nj", rows, directions))
+    orders = np.argsort(-squares.T, axis=1, kind="stable")
+    places: NDArray[np.int64] = cover_least_held(squares, orders, m)
+    return places
+
+
+def informative_places(rows: NDArray[np.float64], m: int) -> NDArray[np.int64]:
+    """Choose m points, each of which raises the log determinant of the information matrix most.
+
+    The gain is submodular, so that the greedy choice has at least 1 − 1/e of the largest gain of
+    any m points (Nemhauser, Wolsey and Fisher, Mathematical Programming 1978).
+
+    Args:
+        rows: ``(N, 6)`` from ``plane_rows``.
+        m: number of points, at most N.
+
+    Returns:
+        ``(m,)`` places, in the order of choice; of equal gains the lowest place.
+    """
+    places: NDArray[np.int64] = grow_information(np.ascontiguousarray(rows), PRIOR, m)
+    return places
+
+
+def places_by_direction(normals: NDArray[np.float64], m: int) -> NDArray[np.int64]:
+    """Choose m points whose normals are spread over all directions.
+
+    Rusinkiewicz and Levoy, "Efficient Variants of the ICP Algorithm", 3DIM 2001: normals are put
+    into buckets by their direction, and the buckets give points in turn. Here, a bucket is a cell
+    on the faces of a cube, in equal angles, and a normal and its opposite are in the same one.
+
+    Args:
+        normals: ``(N, 3)``, in the order in which a bucket gives its points.
+        m: number of points, at most N.
+
+    Returns:
+        ``(m,)`` places: the first points of all buckets, then the second ones, …; within a round in
+        the order of the points.
+    """
+    bucket = _buckets(normals)
+    by_bucket = np.argsort(bucket, kind="stable")
+    counts = np.bincount(bucket)
+    starts = np.cumsum(counts) - counts
+    rounds = np.empty(len(normals), np.int64)
+    rounds[by_bucket] = np.arange(len(normals)) - starts[bucket[by_bucket]]
+    return np.argsort(rounds, kind="stable")[:m]
+
+
+def _buckets(normals: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the cell ``(N,)`` of every normal on the cube, 0 to 3·CELLS² − 1."""
+    face = np.abs(normals).argmax(1)
+    along = np.take_along_axis(normals, face[:, None], 1)[:, 0]
+    others = np.take_along_axis(normals, (face[:, None] + [1, 2]) % 3, 1)
+    angles = np.arctan(others / along[:, None]) / (np.pi / 4)  # from -1 to 1
+    cells = np.clip(((angles + 1) / 2 * CELLS).astype(np.int64), 0, CELLS - 1)
+    return (face * CELLS + cells[:, 0]) * CELLS + cells[:, 1]

@@ -1,0 +1,42 @@
+"""Samplers by normals take the normals of a file, where it has them."""
+
+import numpy as np
+import pytest
+
+from mops_lightning.data.formats.registry import WRITERS, read
+from mops_lightning.data.formats.table import Table
+from mops_lightning.files.downsample import downsample_file
+from mops_lightning.files.options import Options
+
+UP = {"nx": 0.0, "ny": 0.0, "nz": 1.0}
+
+
+def sampled(tmp_path, columns):
+    """Sample a flat cloud of which three points have another normal."""
+    points = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * [1, 1, 0]
+    filled = {name: np.full(200, value, np.float32) for name, value in UP.items()} | columns
+    WRITERS[".ply"](tmp_path / "in.ply", Table(points, filled))
+    options = Options(6, method="normal_space", coordinates_only=False)
+    downsample_file(tmp_path / "in.ply", tmp_path / "out.ply", options)
+    return read(tmp_path / "out.ply", 1, 0)
+
+
+def test_normal_space_takes_points_by_the_normals_of_the_file(tmp_path):
+    across = np.zeros(200, np.float32)
+    across[[3, 50, 150]] = 2.0
+
+    kept = sampled(tmp_path, {"nx": across, "nz": np.float32(across == 0)})
+
+    assert np.count_nonzero(kept.columns["nx"]) == 3
+
+
+@pytest.mark.parametrize("wrong", [0.0, np.nan])
+def test_normals_are_estimated_where_a_point_of_the_file_has_none(tmp_path, wrong):
+    up = np.ones(200, np.float32)
+    up[7] = wrong
+    across = np.zeros(200, np.float32)
+    across[[3, 50, 150]] = 2.0
+
+    kept = sampled(tmp_path, {"nx": across * (up > 0), "nz": up * (across == 0)})
+
+    assert np.count_nonzero(kept.columns["nx"] == 2) < 3

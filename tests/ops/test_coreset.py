@@ -1,0 +1,136 @@
+"""Exact coresets of point-to-plane residuals."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mops_lightning import coreset
+from mops_lightning.errors import UserError
+from mops_lightning.ops.caratheodory import same_sum
+from mops_lightning.ops.normals import estimate_normals
+
+
+def surface(number, seed):
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-3, 3, (2, number))
+    return np.stack([x, y, np.sin(x) + np.cos(2 * y) / 2 + rng.normal(0, 0.02, number)], 1)
+
+
+def pose_of(turn, shift):
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+    pose[:3, 3] = shift
+    return pose
+
+
+def plain_sums(source, target, pose, rows, weights):
+    """Add up H, b and the error, residual by residual, about the origin of the target."""
+    normals, tree = estimate_normals(target), cKDTree(target)
+    hessian, slope, error = np.zeros((6, 6)), np.zeros(6), 0.0
+    for row, weight in zip(rows, weights, strict=True):
+        moved = pose[:3, :3] @ source[row] + pose[:3, 3]
+        nearest = tree.query(moved)[1]
+        residual = normals[nearest] @ (moved - target[nearest])
+        jacobian = np.concatenate([np.cross(moved, normals[nearest]), normals[nearest]])
+        hessian += weight * np.outer(jacobian, jacobian)
+        slope += weight * jacobian * residual
+        error += weight * residual**2
+    return hessian, slope, error
+
+
+@pytest.mark.parametrize("m", [29, 40, 100, 300])
+def test_coreset_has_the_sums_of_all_residuals(m):
+    source, target = surface(1500, 0), surface(1200, 1)
+    pose = pose_of([0.05, -0.1, 0.2], [0.1, 0.2, -0.1])
+
+    rows, weights = coreset(source, target, pose, m)
+
+    every = plain_sums(source, target, pose, range(1500), np.ones(1500))
+    found = plain_sums(source, target, pose, rows, weights)
+    assert len(rows) == len(set(rows.tolist())) <= m
+    assert (weights > 0).all()
+    assert weights.sum() == pytest.approx(1500, rel=1e-9)
+    for kept, whole in zip(found, every, strict=True):
+        assert kept == pytest.approx(whole, rel=1e-9, abs=1e-9 * np.abs(whole).max())
+
+
+def test_coreset_gives_the_gauss_newton_step_of_all_points_in_map_coordinates():
+    place = np.array([4e5, 5e6, 100.0])
+    source, target = surface(1500, 0), surface(1200, 1) + place
+    pose = pose_of([0.05, -0.1, 0.2], place + np.array([0.1, 0.2, -0.1]))
+
+    rows, weights = coreset(source, target, pose, 29)
+
+    near = pose_of([0.05, -0.1, 0.2], [0.1, 0.2, -0.1])
+    every = plain_sums(source, target - place, near, range(1500), np.ones(1500))
+    found = plain_sums(source, target - place, near, rows, weights)
+    whole = np.linalg.solve(every[0], every[1])
+    assert np.linalg.solve(found[0], found[1]) == pytest.approx(whole, rel=1e-7)
+
+
+def test_coreset_of_a_plane_has_its_sums_though_its_hessian_is_singular():
+    rng = np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(-1, 1, (800, 2)), np.zeros(800)])
+    pose = pose_of([0.01, 0, 0], [0, 0, 0.1])
+
+    rows, weights = coreset(flat[:400], flat[400:], pose, 29)
+
+    every = plain_sums(flat[:400], flat[400:], pose, range(400), np.ones(400))
+    found = plain_sums(flat[:400], flat[400:], pose, rows, weights)
+    for kept, whole in zip(found, every, strict=True):
+        assert kept == pytest.approx(whole, rel=1e-9, abs=1e-9 * np.abs(whole).max())
+
+
+def test_coreset_takes_tensors_normals_and_leaves_out_far_points():
+    source, target = surface(300, 0), surface(300, 1)
+    source[:100] += 50.0
+    up = np.repeat([[0.0, 0, 1]], 300, axis=0)
+
+    rows, weights = coreset(
+        torch.from_numpy(source), target, torch.eye(4), 40, normals=up, max_distance=1.0
+    )
+
+    assert rows.min() >= 100
+    assert weights.sum() == pytest.approx(200)
+
+
+def test_coreset_returns_all_points_where_there_are_few():
+    points = surface(25, 0)
+
+    rows, weights = coreset(points, points, np.eye(4), 29)
+
+    assert rows.tolist() == list(range(25))
+    assert weights.tolist() == [1.0] * 25
+
+
+def test_same_sum_of_numbers_on_a_line_is_two_of_them():
+    vectors = np.arange(100.0)[:, None]
+
+    rows, weights = same_sum(vectors, 2)
+
+    assert len(rows) <= 2
+    assert weights.sum() == pytest.approx(100)
+    assert weights @ vectors[rows, 0] == pytest.approx(4950)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"m": 28}, "m must be a whole number of at least 29, got 28"),
+        ({"m": 29.0}, "m must be a whole number of at least 29, got 29.0"),
+        ({"source": np.zeros((5, 2))}, r"source must have shape \(N, 3\).* got \(5, 2\)"),
+        ({"target": np.full((5, 3), np.nan)}, "target must be finite"),
+        ({"pose": np.eye(3)}, r"pose must be a \(4, 4\) rigid motion"),
+        ({"pose": 2 * np.eye(4)}, r"pose must be a \(4, 4\) rigid motion"),
+        ({"normals": np.ones((4, 3))}, r"normals must be one per target point, \(50, 3\)"),
+        ({"max_distance": 0.0}, "max_distance must be above 0, got 0.0"),
+        ({"pose": pose_of([0, 0, 0], [99, 0, 0]), "max_distance": 1.0}, "no source point is"),
+    ],
+)
+def test_coreset_names_a_wrong_argument(changed, message):
+    arguments = {"source": surface(50, 0), "target": surface(50, 1), "pose": np.eye(4), "m": 29}
+
+    with pytest.raises(UserError, match=message):
+        coreset(**(arguments | changed))
