@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import libraries
 import measure
 import numpy as np
 import torch
@@ -81,13 +82,15 @@ def rows(kind: str, number: int, distance: float, cases: dict[str, Call], rounds
     ]
 
 
-def page(results: list[Any]) -> str:
+def page(results: list[Any], versions: dict[str, str]) -> str:
     """Return the results as a table."""
+    libraries_used = ", ".join(f"{name} {version}" for name, version in versions.items())
     lines = [
         "# Voxels and spacings",
         "",
         "Points on a unit sphere in random order. Processor time of one thread on a busy machine; "
-        "medians; spread: distance between the quartiles. `python benchmarks/budgets.py`",
+        "medians; spread: distance between the quartiles. Libraries: "
+        f"{libraries_used}. `python benchmarks/budgets.py`",
         "",
         "| budget | function | N | distance | ms | spread |",
         "|---|---|--:|--:|--:|--:|",
@@ -116,11 +119,12 @@ def main() -> None:
     for number, spacing in SPACINGS:
         cases = spacing_cases(sphere(number), spacing)
         results += rows("spacing", number, spacing, cases, chosen.rounds)
-    chosen.out.with_suffix(".json").write_text(
-        json.dumps({"machine": measure.machine(), "cases": results}, indent=1) + "\n"
-    )
-    chosen.out.with_suffix(".md").write_text(page(results))
-    print(page(results))
+    versions = libraries.versions()
+    record = {"machine": measure.machine(), "libraries": versions, "cases": results}
+    chosen.out.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n")
+    text = page(results, versions)
+    chosen.out.with_suffix(".md").write_text(text)
+    print(text)
 
 
 if __name__ == "__main__":

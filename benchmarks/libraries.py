@@ -33,7 +33,16 @@ def installed(name: str) -> Any:
 def versions() -> dict[str, str]:
     """Return the versions of the installed libraries, by their names in pip."""
     found = {}
-    for name in ("scipy", "numba", "fpsample", "open3d", "open3d-cpu", "point-cloud-utils"):
+    names = (
+        "scipy",
+        "numba",
+        "fpsample",
+        "open3d",
+        "open3d-cpu",
+        "point-cloud-utils",
+        "small_gicp",
+    )
+    for name in names:
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

@@ -171,7 +171,7 @@ def test_written_laz_is_read_by_copclib(form, tmp_path):
 def test_columns_of_other_formats_become_dimensions(tmp_path):
     points = np.random.default_rng(0).random((20, 3))
     columns = {
-        "classification": np.arange(20) + 20,  # too large for five bits
+        "classification": np.arange(20) + 250,  # too large for eight bits
         "a name of more than thirty-two bytes, cut": np.arange(20.0),
         "a name of more than thirty-two bytes, too": np.arange(20) - 5,
         "flag": np.arange(20) % 2 == 0,

@@ -41,6 +41,7 @@ class Extra:
         count: how many numbers it has per point.
         scales: of each number, or None.
         offsets: of each number, or None.
+        documented: whether the file says what its bytes mean.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Extra:
     count: int = 1
     scales: tuple[float, ...] | None = None
     offsets: tuple[float, ...] | None = None
+    documented: bool = True
 
     @property
     def size(self) -> int:
@@ -59,15 +61,19 @@ class Extra:
 
         It takes bits 8 and 16 of their number for those of a scale and an offset.
         """
+        if self.documented:
+            yield self
+            return
         for start in range(0, self.count, PIECE):
             name = self.name if start == 0 else f"{self.name}_{start}"
             yield replace(self, name=name, count=min(PIECE, self.count - start))
 
     def to_bytes(self) -> bytes:
-        """Return the entry of a plain dimension of one number, or of undocumented bytes."""
+        """Return the entry of a dimension without scales, or of undocumented bytes."""
         type_, options = 0, self.count
-        if self.count == 1:
-            type_, options = TYPES.index(self.kind.lstrip("<|")) + 1, 0
+        if self.documented:
+            type_ = 1 + TYPES.index(self.kind.lstrip("<|")) + len(TYPES) * (self.count - 1)
+            options = 0
         numbers = (0.0,) * 6
         return EXTRA.pack(type_, options, self.name.encode(), *numbers, b"")
 
@@ -197,23 +203,56 @@ class Layout:
             return np.array_equal(dimension.get(rows), values, equal_nan=floats)
         return False
 
-    def with_columns(self, columns: Mapping[str, NDArray[Any]]) -> tuple["Layout", dict[str, str]]:
+    def with_columns(
+        self,
+        columns: Mapping[str, NDArray[Any]],
+        arrays: Mapping[str, tuple[str, ...]] | None = None,
+    ) -> tuple["Layout", dict[str, str]]:
         """Add dimensions for columns that the layout lacks, or cannot hold exactly.
+
+        Args:
+            columns: numbers of every column ``(any,)``.
+            arrays: names of arrays, and the columns of each; those of two or three become one
+                dimension.
 
         Returns:
             The layout, and the dimension of every column.
         """
-        added: list[Extra] = []
+        names = {
+            name: name
+            for name, values in columns.items()
+            if name in self.dimensions and self.holds(name, values)
+        }
+        array_of = self._new_arrays(columns, arrays or {})
+        parts_of: dict[str, tuple[str, ...]] = {}
         taken = dict.fromkeys(self.dimensions)
-        names: dict[str, str] = {}
+        added: list[Extra] = []
         for name, values in columns.items():
-            if name in self.dimensions and self.holds(name, values):
-                names[name] = name
+            if name in names or any(name in parts for parts in parts_of.values()):
                 continue
-            names[name] = free_name(name, taken)
-            taken[names[name]] = None
-            added.append(Extra(names[name], _kind(values)))
-        return Layout(self.format, (*self.extra, *added)), names
+            wanted, parts = array_of.get(name, (name, (name,)))
+            own = free_name(wanted, taken)
+            taken[own] = None
+            parts_of[f"extra {len(self.extra) + len(added)}"] = parts
+            added.append(Extra(own, _kind(values), len(parts)))
+        layout = Layout(self.format, (*self.extra, *added))
+        for dimension_name, dimension in layout.dimensions.items():
+            if dimension.field in parts_of:
+                part = parts_of[dimension.field][dimension.element or 0]
+                names[part] = dimension_name
+        return layout, names
+
+    def _new_arrays(
+        self, columns: Mapping[str, NDArray[Any]], arrays: Mapping[str, tuple[str, ...]]
+    ) -> dict[str, tuple[str, tuple[str, ...]]]:
+        """Return the array of every column that can be one dimension with its neighbours."""
+        array_of: dict[str, tuple[str, tuple[str, ...]]] = {}
+        for name, parts in arrays.items():
+            new = [columns[part] for part in parts if part in columns]
+            is_whole = len(new) == len(parts) and self.dimensions.keys().isdisjoint(parts)
+            if is_whole and len(parts) in (2, 3) and len({values.dtype for values in new}) == 1:
+                array_of |= dict.fromkeys(parts, (name, parts))
+        return array_of
 
 
 def _extra_dimension(place: int, extra: Extra, element: int) -> Dimension:
@@ -256,7 +295,7 @@ def layout_of(header: Header) -> Layout:
     extra = documented_extra(header)
     left -= sum(dimension.size for dimension in extra)
     if left:
-        extra.append(Extra("ExtraBytes", "u1", left))
+        extra.append(Extra("ExtraBytes", "u1", left, documented=False))
     return Layout(header.format, tuple(extra))
 
 
@@ -283,7 +322,7 @@ def _documented(data: bytes) -> Iterator[Extra]:
             return
         text = name.split(b"\0")[0].decode(errors="replace")
         if type_ == 0:
-            extra = Extra(text, "u1", options)
+            extra = Extra(text, "u1", options, documented=False)
         else:
             count = 1 + (type_ - 1) // len(TYPES)
             scales = tuple(numbers[:count]) if options & SCALED else None

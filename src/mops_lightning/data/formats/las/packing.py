@@ -1,7 +1,7 @@
 """Tables as the packed points of a file to write, and the header of that file."""
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import date
 from itertools import chain
@@ -30,7 +30,7 @@ from mops_lightning.data.formats.las.layout import (
     is_extra,
     layout_of,
 )
-from mops_lightning.data.formats.table import Table, TableParts
+from mops_lightning.data.formats.table import Column, Table, TableParts
 
 INSIDE = 1 << 1
 """Bit of the global encoding: the waveforms are inside of the file."""
@@ -40,6 +40,9 @@ WAVEFORM_FORMATS = (4, 5, 9, 10)
 
 MODERN = {0: 6, 1: 6, 2: 7, 3: 7}
 """The formats of LAS 1.4 that hold all dimensions of older ones."""
+
+OLD_FORMAT = 3
+"""The format of LAS 1.2 with times and colours."""
 
 DEGREES = 0.006
 """Step of the angle in formats 6 to 10; older ones have whole degrees."""
@@ -137,14 +140,14 @@ def plan(path: Path, table: TableParts, copc: bool) -> tuple[Plan, Iterator[Tabl
     if packed is not None:
         columns = {name: table.columns[name] for name in packed.changes}
     if table.header is None:
-        source = _new_header(table, copc)
+        source = _new_header(table, copc or _needs_modern(table.columns))
     else:
         source = table.header
         _check(path, source, copc, packed is not None)
     layout = layout_of(source)
     if copc:
         source, layout = _modern_header(with_wkt(source), layout)
-    layout, names = layout.with_columns(columns)
+    layout, names = layout.with_columns(columns, table.form.arrays)
     header = _with_records(source, layout)
     has_waveforms = packed is not None and header.format in WAVEFORM_FORMATS
     on_new_grid = table.header is None and table.form.coordinates is not None
@@ -170,11 +173,24 @@ def _check(path: Path, header: Header, copc: bool, has_attributes: bool) -> None
         )
 
 
-def _new_header(table: TableParts, copc: bool) -> Header:
-    """Make the header of a file that does not come from one of LAS: 1.2, or 1.4 for COPC."""
-    minor = 4 if copc else 2
+def _needs_modern(columns: Mapping[str, Column]) -> bool:
+    """Return whether LAS 1.4 has a dimension for a number that 1.2 has not, such as class 64."""
+    old = Layout(OLD_FORMAT)
+    new = Layout(MODERN[OLD_FORMAT])
+    return any(
+        name in old.dimensions
+        and name in new.dimensions
+        and new.holds(name, values)
+        and not old.holds(name, values)
+        for name, values in columns.items()
+    )
+
+
+def _new_header(table: TableParts, modern: bool) -> Header:
+    """Make the header of a file that does not come from one of LAS: 1.2, or 1.4."""
+    minor = 4 if modern else 2
     size = HEADER_BYTES[minor]
-    form, encoding = (7, WKT) if copc else (3, 0)
+    form, encoding = (MODERN[OLD_FORMAT], WKT) if modern else (OLD_FORMAT, 0)
     today = date.today()
     item = Layout(form).standard.itemsize
     extent = float(np.ptp(table.corners, axis=0).max())
