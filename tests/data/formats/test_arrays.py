@@ -48,7 +48,7 @@ def test_npz_arrays_become_dimensions_of_las_and_arrays_again(kind, tmp_path):
     np.savez(tmp_path / "in.npz", **arrays)
     path = tmp_path / f"cloud.{kind}"
 
-    WRITERS[path.suffix](path, read(tmp_path / "in.npz", 9, 0))
+    WRITERS[f".{kind}"](path, read(tmp_path / "in.npz", 9, 0))
     WRITERS[".npz"](tmp_path / "back.npz", read(path, 9, 0))
 
     second = laspy.read(path)
