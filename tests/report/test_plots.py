@@ -10,13 +10,18 @@ from tests.support.reports import put, put_cell
 
 @pytest.mark.parametrize(("far", "kind"), [(3.0, Normalize), (12000.0, LogNorm)])
 def test_heat_maps_have_a_colour_scale_per_sampler(far, kind, tmp_path):
-    for sampler, keys in (("mops", ("alpha", "tau")), ("samplenet", ("beta", "gamma"))):
-        for down, across in ((1, 1), (1, 2), (2, 1), (2, 2)):
-            corner = sampler == "samplenet" and down + across == 4
-            values = {"generated": far if corner else 1.0 + across, "matched": 2.0}
-            settings = dict(zip(keys, (down, across), strict=True))
-            put_cell(tmp_path, f"{sampler}{down}{across}", sampler, values, of=settings)
+    for down, across in ((1, 1), (1, 2), (2, 1), (2, 2)):
+        name = f"{down}{across}"
+        values = {"generated": 1.0 + across, "matched": 2.0}
+        settings = {"alpha": down, "tau": across}
+        put_cell(tmp_path, f"mops{name}", "mops", values, of=settings)
+        if name == "22":
+            values["generated"] = far
+        settings = {"beta": down, "gamma": across}
+        put_cell(tmp_path, f"samplenet{name}", "samplenet", values, of=settings)
+
     figure = plots(build_report(tmp_path))["nre_cd_planes"]
+
     scales = {axis.get_title(): axis.images[0].norm for axis in figure.axes if axis.images}
     assert type(scales["samplenet, generated"]) is kind
     assert scales["samplenet, generated"].vmax == far
@@ -31,22 +36,31 @@ def test_curves_show_values_by_size(tmp_path):
     for m in (8, 32):
         put(tmp_path, "fps", m, {"test/sampled/accuracy": m / 100})
         put(tmp_path, "mops", m, {"test/generated/accuracy": m / 50, "test/matched/accuracy": 0.5})
+
     (figure,) = plots(build_report(tmp_path)).values()
-    panels: list[list[Any]] = [list(axes.containers) for axes in figure.axes]
-    first, second, third = panels
-    fps, mops = first
-    assert fps.lines[0].get_ydata().tolist() == [8, 32]
-    assert mops.lines[0].get_ydata().tolist() == [16, 64]
-    assert second[1].lines[0].get_ydata().tolist() == [50, 50]
-    assert len(third) == 1  # no run has completed sets of MOPS-Net
+
+    generated, matched, completed = figure.axes
+    assert curves_of(generated) == [[8, 32], [16, 64]]  # FPS, MOPS-Net
+    assert curves_of(matched) == [[8, 32], [50, 50]]
+    assert curves_of(completed) == [[8, 32]]  # no run has completed sets of MOPS-Net
     grids = [axes.xaxis.get_gridlines()[0].get_visible() for axes in figure.axes]
     assert grids == [True, True, True]
 
 
+def curves_of(axes: Any) -> list[list[float]]:
+    """The heights of all curves of a panel."""
+    return [container.lines[0].get_ydata().tolist() for container in axes.containers]
+
+
 def test_curves_have_a_panel_for_projected_points_where_there_are_any(tmp_path):
     for m in (8, 32):
-        scores = {"generated": 0.5, "matched": 0.6, "completed": 0.7, "projected": m / 100}
-        put(tmp_path, "samplenet", m, {f"test/{name}/accuracy": v for name, v in scores.items()})
+        scores = {
+            "test/generated/accuracy": 0.5,
+            "test/matched/accuracy": 0.6,
+            "test/completed/accuracy": 0.7,
+            "test/projected/accuracy": m / 100,
+        }
+        put(tmp_path, "samplenet", m, scores)
         put(tmp_path, "fps", m, {"test/sampled/accuracy": 0.4})
 
     (figure,) = plots(build_report(tmp_path)).values()
@@ -57,5 +71,4 @@ def test_curves_have_a_panel_for_projected_points_where_there_are_any(tmp_path):
         "completed",
         "projected",
     ]
-    drawn: list[Any] = list(figure.axes[3].containers)
-    assert [8, 32] in [container.lines[0].get_ydata().tolist() for container in drawn]
+    assert [8, 32] in curves_of(figure.axes[3])

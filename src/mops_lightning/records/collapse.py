@@ -23,12 +23,13 @@ def distinct_points(record: RunRecord) -> dict[int, float]:
     Args:
         record: of a run; those without a generating sampler have no such number.
     """
-    found: dict[int, float] = {}
-    for name, value in record.metrics.items():
-        parts = parse_metric_name(name)
-        if parts and parts.metric == UNIQUE and value is not None:
-            found[parts.m or record.config["m"]] = value
-    return found
+    counts: dict[int, float] = {}
+    for key, value in record.metrics.items():
+        name = parse_metric_name(key)
+        if name is None or name.metric != UNIQUE or value is None:
+            continue
+        counts[name.m or record.config["m"]] = value
+    return counts
 
 
 def collapsed(record: RunRecord) -> dict[int, float]:

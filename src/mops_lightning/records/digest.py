@@ -16,14 +16,15 @@ def digest_of(plain: dict[str, Any]) -> str:
     Args:
         plain: the record as plain data, with None for NaN and infinity.
     """
-    content = {
-        name: value
-        for name, value in plain.items()
-        if name not in NOT_COVERED and not _is_empty(value)
-    }
+    content = {}
+    for name, value in plain.items():
+        if name not in NOT_COVERED and not _is_empty(value):
+            content[name] = value
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()
 
 
 def _is_empty(value: Any) -> bool:
-    return value is None or value is False or (isinstance(value, str | list | dict) and not value)
+    if isinstance(value, str | list | dict):
+        return not value
+    return value is None or value is False

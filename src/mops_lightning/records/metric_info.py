@@ -22,8 +22,9 @@ def foreign_metrics(metrics: Iterable[tuple[str, object]]) -> dict[str, dict[str
     """
     described = {}
     for name, metric in metrics:
-        is_own = type(metric).__module__.startswith(PACKAGE) and getattr(metric, "name", "") == name
-        if not is_own:
+        is_of_package = type(metric).__module__.startswith(PACKAGE)
+        is_known = is_of_package and getattr(metric, "name", "") == name
+        if not is_known:
             described[name] = MetricInfo.of(name, metric).as_dict()
     return described
 
@@ -55,9 +56,10 @@ def _package_metrics() -> dict[str, MetricInfo]:
     from mops_lightning.metrics import classification, reconstruction, registration, sampled_set
     from mops_lightning.metrics.base import TableMetric
 
-    return {
-        value.name: MetricInfo.of(value.name, value)
-        for module in (classification, reconstruction, registration, sampled_set)
-        for value in vars(module).values()
-        if isinstance(value, type) and issubclass(value, TableMetric) and hasattr(value, "name")
-    }
+    infos = {}
+    for module in (classification, reconstruction, registration, sampled_set):
+        for value in vars(module).values():
+            is_metric = isinstance(value, type) and issubclass(value, TableMetric)
+            if is_metric and hasattr(value, "name"):
+                infos[value.name] = MetricInfo.of(value.name, value)
+    return infos

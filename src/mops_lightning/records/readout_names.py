@@ -20,6 +20,9 @@ FULL = "full"
 ROWS = (*GENERATED_READOUTS, PROJECTED, INDEX_READOUT, FULL)
 """Readouts in the order of tables, after the baselines."""
 
+NO_READOUTS = ("loss", "matrix")
+"""Names in the place of a readout's: of losses, and of the sampling matrix."""
+
 
 class MetricName(NamedTuple):
     """The parts of a test metric's name.
@@ -35,6 +38,11 @@ class MetricName(NamedTuple):
     metric: str
 
 
+def size_prefix(m: int | None) -> str:
+    """Return ``m32/`` for 32, and an empty string for None."""
+    return "" if m is None else f"m{m}/"
+
+
 def parse_metric_name(name: str) -> MetricName | None:
     """Split a name such as ``test/m32/generated/accuracy`` or ``test/generated/accuracy``.
 
@@ -43,8 +51,16 @@ def parse_metric_name(name: str) -> MetricName | None:
     """
     first, *parts = name.split("/")
     m = None
-    if len(parts) == 3 and parts[0][:1] == "m" and parts[0][1:].isdecimal():
-        m = int(parts.pop(0)[1:])
-    if first != "test" or len(parts) != 2 or parts[0] in ("loss", "matrix"):
+    if len(parts) == 3 and _is_size(parts[0]):
+        m = int(parts[0][1:])
+        parts = parts[1:]
+    if first != "test" or len(parts) != 2:
         return None
-    return MetricName(m, parts[0], parts[1])
+    readout, metric = parts
+    if readout in NO_READOUTS:
+        return None
+    return MetricName(m, readout, metric)
+
+
+def _is_size(part: str) -> bool:
+    return part.startswith("m") and part[1:].isdecimal()

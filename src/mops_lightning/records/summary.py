@@ -1,18 +1,23 @@
 """The end of a run's output: a table of its test results and the paths of its files."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.collapse import collapse_line, collapsed, distinct_points
 from mops_lightning.records.metric_info import in_summary_order, metric_info
-from mops_lightning.records.readout_names import FULL, ROWS, parse_metric_name
+from mops_lightning.records.readout_names import FULL, GENERATED, MATCHED, ROWS, parse_metric_name
 from mops_lightning.records.run_record import FILE, Names, RunRecord
 
 OWN = "own"
 """Name of a group whose class the user names on the command line."""
+
+DISTINCT = "distinct points"
+"""Label of the numbers of distinct points of a sampler that has collapsed."""
 
 OF_TEST_CLOUDS = ("test_noise_std", "test_corruption")
 """Settings that change the test clouds; in reports, their values give the columns of a table."""
@@ -33,14 +38,42 @@ def closing_lines(folder: Path, record: RunRecord, console: Console | None = Non
         console.print(table)
         if line := collapse_line(record):
             console.print(line, soft_wrap=True, highlight=False)
+    status = f"{record.status} in {record.seconds['total']:.0f} s"
+    if record.partial:
+        status += f", but {' and '.join(record.partial)}"
     files = ", ".join([FILE, *sorted(record.files.values())])
-    seconds = record.seconds["total"]
-    partial = f", but {' and '.join(record.partial)}" if record.partial else ""
-    console.print(
-        f"{record.status} in {seconds:.0f} s{partial}; files in {folder}/: {files}",
-        soft_wrap=True,
-        highlight=False,
-    )
+    console.print(f"{status}; files in {folder}/: {files}", soft_wrap=True, highlight=False)
+
+
+@dataclass(frozen=True)
+class _Results:
+    """The content of the closing table.
+
+    Attributes:
+        what: for the title: what its values are, or of how many points.
+        columns: the metric of every column, by the name of a metric or by size.
+        rows: value by column, by readout.
+        by_size: whether columns are sizes.
+    """
+
+    what: str
+    columns: dict[Any, MetricInfo]
+    rows: dict[str, dict[Any, float | None]]
+    by_size: bool
+
+    def titles(self) -> list[str]:
+        """Return the titles of the columns."""
+        if self.by_size:
+            return [f"m={size}" for size in self.columns]
+        return [metric.title for metric in self.columns.values()]
+
+    def cells(self, readout: str) -> list[str]:
+        """Return the values of a readout as texts, empty for those that it does not have."""
+        texts = []
+        for column, metric in self.columns.items():
+            value = self.rows[readout].get(column)
+            texts.append("" if value is None else metric.format(value))
+        return texts
 
 
 def results_table(record: RunRecord) -> tuple[str, Table]:
@@ -49,50 +82,72 @@ def results_table(record: RunRecord) -> tuple[str, Table]:
     Baselines come first, full clouds last; the latter hold for every size.
     """
     config = record.config
-    names = shown_names(config)
     score = parse_metric_name(record.score_name)
-    by_size = score.metric if score and score.m else None
-    rows: dict[str, dict[str, float | None]] = {}
-    for name, value in record.metrics.items():
-        parts = parse_metric_name(name)
-        if parts and by_size in (None, parts.metric):
-            column = f"m={parts.m}" if by_size else parts.metric
-            rows.setdefault(parts.readout, {})[column] = value
-    rows = dict(sorted(rows.items(), key=lambda row: ROWS.index(row[0]) if row[0] in ROWS else -1))
-    if by_size:
-        info = metric_info(by_size, [record])
-        columns = {size: (size, info) for size in next(iter(rows.values()))}
-        rows[FULL] = dict.fromkeys(columns, next(iter(rows[FULL].values())))
-        what = info.title
+    if score is not None and score.m is not None:
+        results = _by_size(record, score.metric)
     else:
-        # Metrics of the task only: a full cloud has no metrics of the sampled set.
-        infos = in_summary_order(metric_info(name, [record]) for name in rows.get(FULL, {}))
-        columns = {info.name: (info.title, info) for info in infos}
-        what = "all points" if config.get("learn") == "task" else f"m={config['m']}"
+        results = _by_metric(record)
+    has_collapsed = bool(collapsed(record))
+    own_column = has_collapsed and not results.by_size
     table = Table()
     table.add_column("sampled by")
-    for head, _ in columns.values():
-        table.add_column(head, justify="right")
-    found = collapsed(record)
-    if found and not by_size:
-        table.add_column("distinct points", justify="right")
-    for readout, row in rows.items():
-        cells = [
-            "" if (value := row.get(column)) is None else info.format(value)
-            for column, (_, info) in columns.items()
-        ]
+    for title in results.titles():
+        table.add_column(title, justify="right")
+    if own_column:
+        table.add_column(DISTINCT, justify="right")
+    for readout in sorted(results.rows, key=_row_key):
+        cells = results.cells(readout)
         if not any(cells):  # it has metrics of the sampled set only
             continue
-        if found and not by_size and readout in ("generated", "matched"):
-            cells.append(f"{found[config['m']]:.1f}")
+        if own_column and readout in (GENERATED, MATCHED):
+            cells.append(f"{collapsed(record)[config['m']]:.1f}")
         table.add_row(_label(readout, config), *cells)
-    if found and by_size:
-        distinct = distinct_points(record)
-        counts = [f"{distinct[m]:.1f}" for m in (int(column[2:]) for column in columns)]
-        table.add_row("distinct points", *counts)
-    title = f"{names['task']} by {names['net']}, {names['dataset']}, {what}, test"
+    if has_collapsed and results.by_size:
+        counts = distinct_points(record)
+        table.add_row(DISTINCT, *(f"{counts[size]:.1f}" for size in results.columns))
+    names = shown_names(config)
+    title = f"{names['task']} by {names['net']}, {names['dataset']}, {results.what}, test"
     changed = [f"{name}={config[name]}" for name in OF_TEST_CLOUDS if config.get(name)]
     return ", ".join([title, *changed]), table
+
+
+def _by_size(record: RunRecord, metric: str) -> _Results:
+    """Return the values of a metric at every size."""
+    info = metric_info(metric, [record])
+    rows: dict[str, dict[Any, float | None]] = {}
+    full = None
+    for key, value in record.metrics.items():
+        name = parse_metric_name(key)
+        if name is None or name.metric != metric:
+            continue
+        if name.readout == FULL:
+            full = value
+        else:
+            rows.setdefault(name.readout, {})[name.m] = value
+    first = min(rows, key=_row_key)
+    columns = dict.fromkeys(rows[first], info)
+    rows[FULL] = dict.fromkeys(columns, full)
+    return _Results(info.title, columns, rows, by_size=True)
+
+
+def _by_metric(record: RunRecord) -> _Results:
+    """Return the values of all metrics of the task."""
+    rows: dict[str, dict[Any, float | None]] = {}
+    for key, value in record.metrics.items():
+        name = parse_metric_name(key)
+        if name is not None:
+            rows.setdefault(name.readout, {})[name.metric] = value
+    # Metrics of the task only: a full cloud has no metrics of the sampled set.
+    infos = in_summary_order(metric_info(name, [record]) for name in rows.get(FULL, {}))
+    columns = {info.name: info for info in infos}
+    is_task_alone = record.config.get("learn") == "task"
+    what = "all points" if is_task_alone else f"m={record.config['m']}"
+    return _Results(what, columns, rows, by_size=False)
+
+
+def _row_key(readout: str) -> int:
+    """Return a key that sorts readouts as tables do, baselines first."""
+    return ROWS.index(readout) if readout in ROWS else -1
 
 
 def shown_names(config: dict[str, Any]) -> Names:
@@ -101,18 +156,16 @@ def shown_names(config: dict[str, Any]) -> Names:
     A group whose class the user named on the command line is shown by this class, so that two
     classes have two names.
     """
-    task = config["task"]
     nodes = {
-        "task": task,
-        "net": task.get("net"),
+        "task": config["task"],
+        "net": config["task"].get("net"),
         "dataset": config["dataset"],
         "sampler": config.get("sampler"),
     }
     names: Any = dict(config["names"])
     for group, node in nodes.items():
-        target = (node or {}).get("_target_")
-        if target and names[group] == OWN:
-            names[group] = str(target).rpartition(".")[2]
+        if node and names[group] == OWN and node.get("_target_"):
+            names[group] = str(node["_target_"]).rpartition(".")[2]
     return names
 
 
@@ -122,8 +175,10 @@ def sampler_name(config: dict[str, Any]) -> str:
     A MOPS-Net with anchors is ``mops anchored``, FPS from the farthest point ``fps from farthest``.
     """
     sampler = config.get("sampler") or {}
-    anchored = " anchored" if sampler.get("anchors") else ""
-    return shown_names(config)["sampler"] + anchored + _start(sampler)
+    name = shown_names(config)["sampler"]
+    if sampler.get("anchors"):
+        name += " anchored"
+    return name + _start(sampler)
 
 
 def baseline_name(config: dict[str, Any], name: str) -> str:
@@ -136,8 +191,11 @@ def baseline_name(config: dict[str, Any], name: str) -> str:
 
 
 def _start(sampler: dict[str, Any]) -> str:
+    """Return the start point of FPS as the end of a name; empty if it is not set."""
     start = sampler.get("start")
-    return "" if start is None else f" from {start if isinstance(start, str) else f'row {start}'}"
+    if start is None:
+        return ""
+    return f" from {start}" if isinstance(start, str) else f" from row {start}"
 
 
 def _label(readout: str, config: dict[str, Any]) -> str:

@@ -13,6 +13,11 @@ from mops_lightning.report.provenance import collapses, edited, provenance, with
 from mops_lightning.report.tables import Table, make_table
 from mops_lightning.report.text import Grid
 
+NOT_COMPARABLE = (
+    "{} groups of runs are not comparable and have tables of their own. "
+    "--mixed joins groups that differ in commit or settings only."
+)
+
 
 @dataclass(frozen=True)
 class Report:
@@ -53,14 +58,12 @@ def build_report(folder: Path, metrics: Iterable[str] = (), mixed: bool = False)
     else:
         parts = net_groups(found.done, mixed)
         texts = [nets_grid(part, wanted) for part in parts]
-    remarks = [*_about_runs(found, of_samplers or found.done, tables), *edited(found.done)]
+    remarks = _about_runs(found, of_samplers or found.done, tables)
+    remarks += edited(found.done)
     if len(parts) > 1:
-        remarks += [
-            "",
-            f"{len(parts)} groups of runs are not comparable and have tables of their own. "
-            "--mixed joins groups that differ in commit or settings only.",
-        ]
-    return Report(found, tables, texts, [*remarks, *without_result(found)])
+        remarks += ["", NOT_COMPARABLE.format(len(parts))]
+    remarks += without_result(found)
+    return Report(found, tables, texts, remarks)
 
 
 def _tables(parts: list[Group], wanted: list[str], known: set[str]) -> list[Table]:
@@ -74,9 +77,11 @@ def _tables(parts: list[Group], wanted: list[str], known: set[str]) -> list[Tabl
     tables = []
     for part in parts:
         tested = collect.tested_metrics(part.records)
-        for metric in wanted or [collect.score(part.records)]:
+        metrics = wanted or [collect.score(part.records)]
+        for metric in metrics:
             # A metric of one task only has tables for it; make_table refuses an unknown one.
-            if metric in tested or metric not in known:
+            is_of_other_task = metric in known and metric not in tested
+            if not is_of_other_task:
                 tables.append(make_table(part, metric, _net(part)))
     return tables
 
@@ -86,18 +91,21 @@ def _net(group: Group) -> str:
     if group.column == "net":
         return ""
     trained = [record for record in group.records if not weightless(record)]
-    return collect.names((trained or group.records)[0])["net"]
+    records = trained or group.records
+    return collect.names(records[0])["net"]
 
 
 def _about_runs(found: collect.Found, shown: list[RunRecord], tables: list[Table]) -> list[str]:
     """Return how the runs of the tables' tasks were made, and which are hidden by a later one."""
     tasks = {collect.names(record)["task"] for record in shown}
-    same_task = [record for record in found.done if collect.names(record)["task"] in tasks]
+    of_tasks = [record for record in found.done if collect.names(record)["task"] in tasks]
     nets = {table.net for table in tables}
-    hidden = sorted({folder for table in tables for folder in table.hidden})
     net = nets.pop() if len(nets) == 1 else ""
-    return [
-        *provenance(same_task, net),
-        *collapses(same_task, net),
-        *(f"- {run}: not shown; a later run has the same row, column and seed" for run in hidden),
-    ]
+    hidden: set[str] = set()
+    for table in tables:
+        hidden.update(table.hidden)
+    lines = provenance(of_tasks, net)
+    lines += collapses(of_tasks, net)
+    for run in sorted(hidden):
+        lines.append(f"- {run}: not shown; a later run has the same row, column and seed")
+    return lines

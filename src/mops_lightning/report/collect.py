@@ -10,6 +10,9 @@ from mops_lightning.records.readout_names import FULL, parse_metric_name
 from mops_lightning.records.run_record import ASIDE, FAILED, Names, RunRecord
 from mops_lightning.records.summary import sampler_name, shown_names
 
+MAX_LISTED = 3
+"""Most runs that an error lists."""
+
 
 @dataclass(frozen=True)
 class Found:
@@ -40,43 +43,51 @@ def collect(folder: Path) -> Found:
         elif record.status == "completed" and not record.partial:
             done.append(replace(record, folder=str(place)))
         else:
-            reasons = " and ".join(record.partial) or record.error
-            undone[str(place)] = record.status + (f": {reasons}" if reasons else "")
+            undone[str(place)] = _why_undone(record)
     if not done and not undone:
         raise UserError(
             f"{folder}: no {run_record.FILE} or {run_record.MANY} found. Give the folder of a run "
             "or a sweep."
         )
     if not done:
-        listed = "; ".join(f"{run} ({why})" for run, why in list(undone.items())[:3])
+        reasons = [f"{run} ({why})" for run, why in undone.items()]
+        listed = "; ".join(reasons[:MAX_LISTED])
         raise UserError(f"{folder}: none of its {len(undone)} runs has a full result: {listed}.")
     return Found(done, undone)
 
 
+def _why_undone(record: RunRecord) -> str:
+    """Return the status of a run without a full result, with the reasons if it tells them."""
+    reasons = " and ".join(record.partial) or record.error
+    return f"{record.status}: {reasons}" if reasons else record.status
+
+
 def _records(folder: Path) -> list[tuple[Path, RunRecord | str]]:
     """Return the folder of every run, sorted, with its record or the reason why it has none."""
-    found: dict[Path, RunRecord | str] = {}
+    records: dict[Path, RunRecord | str] = {}
     for path in folder.rglob(run_record.MANY):
         for number, line in enumerate(_lines(path), 1):
             place = f"{path}, line {number}"
             try:
                 record = run_record.from_json(line, place)
-                found[path.parent / record.folder] = record
+                records[path.parent / record.folder] = record
             except UserError as error:
-                found[Path(place)] = str(error)
+                records[Path(place)] = str(error)
     paths = [*folder.rglob(run_record.FILE), *folder.rglob(FAILED)]
     for run in {path.parent for path in paths if ASIDE not in path.parts}:
         try:
-            found[run] = run_record.read(run)
+            records[run] = run_record.read(run)
         except UserError as error:
             failure = "\n".join(_lines(run / FAILED)).strip()  # the last start of a sweep's cell
-            found[run] = failure or str(error)
-    return sorted(found.items(), key=lambda item: item[0])
+            records[run] = failure or str(error)
+    return [(place, records[place]) for place in sorted(records)]
 
 
 def _lines(path: Path) -> list[str]:
     """Return the lines of a regular file; other files give none."""
-    return path.read_text(errors="replace").splitlines() if path.is_file() else []
+    if not path.is_file():
+        return []
+    return path.read_text(errors="replace").splitlines()
 
 
 def names(record: RunRecord) -> Names:
@@ -86,13 +97,19 @@ def names(record: RunRecord) -> Names:
 
 def trained_with(record: RunRecord) -> str:
     """Return whether the task net was trained with the sampler, also in an evaluated run."""
-    learn = record.evaluated.learn if record.evaluated else record.config["learn"]
+    learn = record.config["learn"]
+    if record.evaluated:
+        learn = record.evaluated.learn
     return "joint" if learn == "joint" else "sampler alone"
 
 
 def recorded_recipe(record: RunRecord) -> dict[str, Any]:
     """Return the recipe that a record's sampler was trained by, with its name; {}: the paper's."""
-    return record.recipe or (record.evaluated and record.evaluated.recipe) or {}
+    if record.recipe:
+        return record.recipe
+    if record.evaluated and record.evaluated.recipe:
+        return record.evaluated.recipe
+    return {}
 
 
 def sampler_row(record: RunRecord) -> str:
@@ -101,13 +118,14 @@ def sampler_row(record: RunRecord) -> str:
     That is ``anchored`` for a MOPS-Net with anchors, its recipe unless it is the paper's, and the
     number of task nets that it was trained under if there were several.
     """
-    parts = [sampler_name(record.config)]
+    row = sampler_name(record.config)
     recipe = recorded_recipe(record).get("name")
     if recipe and recipe != "paper":  # the paper's is recorded where a setting of it was changed
-        parts.append(recipe)
-    if others := record.config.get("other_nets"):
-        parts.append(f"{1 + len(others)} nets")
-    return " ".join(str(part) for part in parts if part)
+        row += f" {recipe}"
+    others = record.config.get("other_nets")
+    if others:
+        row += f" {1 + len(others)} nets"
+    return row.strip()
 
 
 def training_time(found: list[RunRecord]) -> tuple[str, list[float | None]]:
@@ -115,10 +133,13 @@ def training_time(found: list[RunRecord]) -> tuple[str, list[float | None]]:
 
     They are CPU time if all runs have recorded it, otherwise wall time.
     """
+    head = "training (wall)"
+    stage = "fit"
     trained = [record for record in found if "fit" in record.seconds]
     if trained and all("fit_cpu" in record.seconds for record in trained):
-        return "training (CPU)", [record.seconds.get("fit_cpu") for record in found]
-    return "training (wall)", [record.seconds.get("fit") for record in found]
+        head = "training (CPU)"
+        stage = "fit_cpu"
+    return head, [record.seconds.get(stage) for record in found]
 
 
 def epochs(record: RunRecord) -> int | None:
@@ -135,11 +156,19 @@ def seed(record: RunRecord) -> int:
 
 def tested_metrics(found: list[RunRecord]) -> set[str]:
     """Return the names of the metrics that a sampled set of a record was tested by."""
-    parts = (parse_metric_name(name) for record in found for name in record.metrics)
-    return {one.metric for one in parts if one and one.readout != FULL}
+    metrics = set()
+    for record in found:
+        for key in record.metrics:
+            name = parse_metric_name(key)
+            if name is not None and name.readout != FULL:
+                metrics.add(name.metric)
+    return metrics
 
 
 def score(found: list[RunRecord]) -> str:
     """Return the name of the records' main metric; empty if none names it."""
-    names = (parts.metric for record in found if (parts := parse_metric_name(record.score_name)))
-    return next(names, "")
+    for record in found:
+        name = parse_metric_name(record.score_name)
+        if name is not None:
+            return name.metric
+    return ""

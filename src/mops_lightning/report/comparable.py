@@ -14,6 +14,9 @@ from mops_lightning.report import collect
 from mops_lightning.report.collect import epochs, recorded_recipe, sampler_row, seed, trained_with
 from mops_lightning.tree import dotted
 
+IN_ROWS_OF_NETS = ("task.net.", "sampler.")
+"""Settings in which the runs of a table of nets may differ."""
+
 
 @dataclass(frozen=True)
 class Group:
@@ -35,7 +38,9 @@ class Group:
     @property
     def settings(self) -> list[str]:
         """The dotted settings that give the columns, and the rows of heat maps."""
-        keys = {key for pair in self.planes.values() for key in pair} | {self.column}
+        keys = {self.column}
+        for pair in self.planes.values():
+            keys.update(pair)
         return sorted(keys - {"m", "net"})
 
     @property
@@ -54,34 +59,48 @@ def groups(found: list[RunRecord], mixed: bool = False) -> list[Group]:
         found: completed records.
         mixed: whether runs of different commits and settings may be in one table.
     """
-    result = []
+    by_net = []
     for group in _split([Group(found)], "task", _task):
-        trained = [record for record in group.records if not weightless(record)]
-        nets = {(collect.names(record)["net"], record.task_weights_sha256) for record in trained}
-        if len(nets) > 1 and not group.joint and all(one.evaluated for one in group.records):
-            result.append(replace(group, column="net"))
+        if _tests_several_nets(group):
+            by_net.append(replace(group, column="net"))
         else:
-            result += _split([group], "net", _trained)
-    result = _by_content(result, "data", "dataset_fingerprint")
-    result = _by_content(result, "task weights", "task_weights_sha256")
+            by_net += _split([group], "net", _trained)
+    by_data = _by_content(by_net, "data", "dataset_fingerprint")
+    comparable = _by_content(by_data, "task weights", "task_weights_sha256")
     if not mixed:
-        result = _split(result, "commit", lambda record: (commit(record),))
-    return [one for group in result for one in _with_layout(group, mixed)]
+        comparable = _split(comparable, "commit", _commit)
+    result = []
+    for group in comparable:
+        result += _with_layout(group, mixed)
+    return result
+
+
+def _tests_several_nets(group: Group) -> bool:
+    """Return whether all runs test samplers again, under several trained nets."""
+    if group.joint or not all(record.evaluated for record in group.records):
+        return False
+    nets = set()
+    for record in group.records:
+        if not weightless(record):
+            nets.add((collect.names(record)["net"], record.task_weights_sha256))
+    return len(nets) > 1
 
 
 def net_groups(found: list[RunRecord], mixed: bool = False) -> list[Group]:
     """Split records of task nets, which were tested on full clouds, into groups; see ``groups``."""
-    result = _split([Group(found)], "task", lambda record: _task(record)[:2])
-    if len({record.config["dataset"].get("n_points") for record in found}) == 1:
-        result = _by_content(result, "data", "dataset_fingerprint")
+    by_task = _split([Group(found)], "task", _task_and_dataset)
+    sizes = {record.config["dataset"].get("n_points") for record in found}
+    if len(sizes) == 1:
+        by_task = _by_content(by_task, "data", "dataset_fingerprint")
     if mixed:
-        return result
-    parts = []
-    for group in _split(result, "commit", lambda record: (commit(record),)):
-        keys = varying(group.records)
-        keys = [key for key in keys if not key.startswith(("task.net.", "sampler."))]
-        parts += _by_settings(group, dict.fromkeys(map(_row, group.records), keys))
-    return parts
+        return by_task
+    result = []
+    for group in _split(by_task, "commit", _commit):
+        # A net's settings give it a row of its own.
+        keys = [key for key in varying(group.records) if not key.startswith(IN_ROWS_OF_NETS)]
+        rows = [_row(record) for record in group.records]
+        result += _by_settings(group, dict.fromkeys(rows, keys))
+    return result
 
 
 def _split(
@@ -96,30 +115,36 @@ def _split(
     """
     result = []
     for group in found:
-        parts: dict[Any, list[RunRecord]] = {}
+        by_key: dict[tuple[str, ...], list[RunRecord]] = {}
+        shared = []
         for record in group.records:
-            parts.setdefault(key(record), []).append(record)
-        shared = parts.pop(None, [])
-        for part, records in parts.items():
-            about = _about(group, what, _differing(part, list(parts)))
-            result.append(replace(group, records=[*records, *shared], about=about))
-        if not parts:
+            texts = key(record)
+            if texts is None:
+                shared.append(record)
+            else:
+                by_key.setdefault(texts, []).append(record)
+        if not by_key:
             result.append(group)
+        for texts, records in by_key.items():
+            about = _about(group, what, _differing(texts, list(by_key)))
+            result.append(replace(group, records=[*records, *shared], about=about))
     return result
 
 
-def _differing(part: tuple[str, ...], parts: list[tuple[str, ...]]) -> list[str]:
+def _differing(texts: tuple[str, ...], keys: list[tuple[str, ...]]) -> list[str]:
     """Return the texts of a key at the places where keys differ."""
-    places = zip(*parts, strict=True)
-    return [text for text, texts in zip(part, places, strict=True) if len(set(texts)) > 1]
+    differing = []
+    for place, text in enumerate(texts):
+        if any(key[place] != text for key in keys):
+            differing.append(text)
+    return differing
 
 
 def _about(group: Group, what: str, differing: list[str]) -> str:
     """Return how a part of a group differs from the other groups."""
     if not differing:
         return group.about
-    texts = [text for text in (what, *differing) if text]
-    about = " ".join(texts)
+    about = " ".join(text for text in (what, *differing) if text)
     return f"{group.about}; {about}" if group.about else about
 
 
@@ -137,8 +162,9 @@ def _by_content(found: list[Group], what: str, name: str) -> list[Group]:
 
     result = []
     for group in found:
-        several_nets = name == "task_weights_sha256" and (group.column == "net" or group.joint)
-        if several_nets or _agree(group.records, name):
+        has_several_nets = group.column == "net" or group.joint
+        may_differ = name == "task_weights_sha256" and has_several_nets
+        if may_differ or _agree(group.records, name):
             result.append(group)
         else:
             result += _split([group], what, start_of_digest)
@@ -147,12 +173,18 @@ def _by_content(found: list[Group], what: str, name: str) -> list[Group]:
 
 def _agree(found: list[RunRecord], name: str) -> bool:
     """Return whether runs have the same value of a field, or one for each seed of all samplers."""
-    rows = [(collect.names(one)["sampler"], seed(one), getattr(one, name)) for one in found]
-    runs = pd.DataFrame(rows, columns=["sampler", "seed", "value"]).dropna()
+    runs = pd.DataFrame(
+        {
+            "sampler": [collect.names(record)["sampler"] for record in found],
+            "seed": [seed(record) for record in found],
+            "value": [getattr(record, name) for record in found],
+        }
+    ).dropna()
     if runs["value"].nunique() <= 1:
         return True
-    seeds = runs.groupby("sampler")["seed"].agg(frozenset)
-    return seeds.nunique() == 1 and (runs.groupby("seed")["value"].nunique() == 1).all()
+    seeds_of_samplers = runs.groupby("sampler")["seed"].agg(frozenset)
+    values_of_seeds = runs.groupby("seed")["value"].nunique()
+    return seeds_of_samplers.nunique() == 1 and (values_of_seeds == 1).all()
 
 
 def _with_layout(group: Group, mixed: bool) -> list[Group]:
@@ -166,22 +198,58 @@ def _with_layout(group: Group, mixed: bool) -> list[Group]:
     for record in group.records:
         rows.setdefault(_row(record), []).append(record)
     different = {row: varying(records) for row, records in rows.items()}
-    keys = sorted({key for one in different.values() for key in one})
+    keys = set()
+    for of_row in different.values():
+        keys.update(of_row)
     if group.column == "net" or not keys:
         return [group]
-    line = len(keys) == 1 and (_numeric(group.records, keys) or keys[0] in OF_TEST_CLOUDS)
-    plane = all(len(one) == 2 and _numeric(rows[row], one) for row, one in different.items())
+    column = _column(group, keys)
+    planes = _planes(rows, different)
+    if column is None and planes is None:
+        return [group] if mixed else _by_settings(group, different)
     sizes = {record.config["m"] for record in group.records}
-    if mixed and (len(sizes) > 1 or not (line or plane)):
-        return [group]
-    if not (line or plane):
-        return _by_settings(group, different)
     if len(sizes) > 1:
-        parts = _split([group], "m", lambda record: (str(record.config["m"]),))
-        return [one for part in parts for one in _with_layout(part, mixed)]
-    if line:
-        return [replace(group, column=keys[0])]
-    return [replace(group, planes={sampler: pair for (sampler, _), pair in different.items()})]
+        return [group] if mixed else _by_size(group)
+    if column is not None:
+        return [replace(group, column=column)]
+    assert planes is not None
+    return [replace(group, planes=planes)]
+
+
+def _column(group: Group, keys: set[str]) -> str | None:
+    """Return the only setting in which the runs of rows differ, if its values make columns."""
+    if len(keys) != 1:
+        return None
+    (key,) = keys
+    if key in OF_TEST_CLOUDS or _are_numbers(group.records, [key]):
+        return key
+    return None
+
+
+def _planes(
+    rows: dict[tuple[str, str], list[RunRecord]], different: dict[tuple[str, str], list[str]]
+) -> dict[str, list[str]] | None:
+    """Return the two settings in which the runs of each sampler differ; None if one has others.
+
+    Args:
+        rows: the runs of every row.
+        different: the settings in which they differ.
+    """
+    planes = {}
+    for row, keys in different.items():
+        if len(keys) != 2 or not _are_numbers(rows[row], keys):
+            return None
+        sampler, _ = row
+        planes[sampler] = keys
+    return planes
+
+
+def _by_size(group: Group) -> list[Group]:
+    """Split a group by the sizes of its runs, and choose the layouts of the tables."""
+    result = []
+    for part in _split([group], "m", lambda record: (str(record.config["m"]),)):
+        result += _with_layout(part, mixed=False)
+    return result
 
 
 def _by_settings(group: Group, different: dict[tuple[str, str], list[str]]) -> list[Group]:
@@ -196,16 +264,22 @@ def _by_settings(group: Group, different: dict[tuple[str, str], list[str]]) -> l
 
 def varying(found: list[RunRecord]) -> list[str]:
     """Return the dotted settings in which records of one sampler differ."""
-    flat = [considered(record) for record in found]
-    keys = sorted({key for one in flat for key in one})
-    return [key for key in keys if len({_text(one.get(key)) for one in flat}) > 1]
+    values: dict[str, set[str]] = {}
+    settings = [considered(record) for record in found]
+    for key in {key for of_run in settings for key in of_run}:
+        values[key] = {_text(of_run.get(key)) for of_run in settings}
+    return sorted(key for key, texts in values.items() if len(texts) > 1)
 
 
 def considered(record: RunRecord) -> dict[str, Any]:
     """Return the settings that are compared, with dotted keys, and the epochs trained."""
-    learn = record.evaluated.learn if record.evaluated else record.config["learn"]
-    settings = {**table_settings(record.config, learn), **dotted(recorded_recipe(record), "recipe")}
-    return {**settings, "trainer.max_epochs": epochs(record)}
+    learn = record.config["learn"]
+    if record.evaluated:
+        learn = record.evaluated.learn
+    settings = table_settings(record.config, learn)
+    settings |= dotted(recorded_recipe(record), "recipe")
+    settings["trainer.max_epochs"] = epochs(record)
+    return settings
 
 
 def value(record: RunRecord, key: str) -> Any:
@@ -224,18 +298,27 @@ def _row(record: RunRecord) -> tuple[str, str]:
 
 
 def _task(record: RunRecord) -> tuple[str, ...]:
+    resample = record.config["task"].get("resample")
+    return *_task_and_dataset(record), f"resample={resample}"
+
+
+def _task_and_dataset(record: RunRecord) -> tuple[str, ...]:
     names = collect.names(record)
-    return names["task"], names["dataset"], f"resample={record.config['task'].get('resample')}"
+    return names["task"], names["dataset"]
 
 
 def _trained(record: RunRecord) -> tuple[str, ...] | None:
     """Return what the task nets of a table share; None for a net without weights."""
     if weightless(record):
         return None
-    task = record.config["task"]
-    learned = trained_with(record)
-    settings = f"task.net={json.dumps(with_defaults(task.get('net')), sort_keys=True)}"
-    return collect.names(record)["net"], settings, f"learn={learned}"
+    net = with_defaults(record.config["task"].get("net"))
+    settings = json.dumps(net, sort_keys=True)
+    name = collect.names(record)["net"]
+    return name, f"task.net={settings}", f"learn={trained_with(record)}"
+
+
+def _commit(record: RunRecord) -> tuple[str, ...]:
+    return (commit(record),)
 
 
 def commit(record: RunRecord) -> str:
@@ -243,9 +326,17 @@ def commit(record: RunRecord) -> str:
     return (record.git["commit"] or "unknown")[:10]
 
 
-def _numeric(found: list[RunRecord], keys: list[str]) -> bool:
-    values = [value(record, key) for record in found for key in keys]
-    return all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
+def _are_numbers(found: list[RunRecord], keys: list[str]) -> bool:
+    """Return whether the values of settings are numbers in all records."""
+    for record in found:
+        settings = considered(record)
+        if not all(_is_number(settings.get(key)) for key in keys):
+            return False
+    return True
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _text(value: Any) -> str:

@@ -1,5 +1,6 @@
 """From a table's values to its texts: by size, by another setting, as planes of two, or by net."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import pandas as pd
@@ -24,21 +25,19 @@ MAX_COLUMNS = 8
 def grids(table: Table) -> list[Grid]:
     """Return the texts of a table, with the values of full clouds."""
     if table.group.planes:
-        planes = [_plane(table, row) for row in sorted(table.planes, key=sort_key)]
-        planes[-1].below += _full_lines(table)
+        texts = [_plane(table, row) for row in sorted(table.planes, key=sort_key)]
+        texts[-1].below += _full_lines(table)
     elif table.group.column == "net":
-        planes = [_by_net(table)]
+        texts = [_by_net(table)]
     else:
-        planes = [_by_column(table)]
-    planes[-1].below += [
-        *_level_line(table),
-        *_unchanged_lines(table),
-        *dirty_line(table.values["dirty"].any()),
-    ]
+        texts = [_by_column(table)]
+    texts[-1].below += _level_line(table)
+    texts[-1].below += _unchanged_lines(table)
+    texts[-1].below += dirty_line(table.values["dirty"].any())
     if table.group.about:
-        for grid in planes:
+        for grid in texts:
             grid.title += f" ({table.group.about})"
-    return planes
+    return texts
 
 
 def _level_line(table: Table) -> list[str]:
@@ -90,29 +89,43 @@ def _by_column(table: Table) -> Grid:
         theirs = _paper_cells(published, _sampler_of(table, row), columns)
         if costs:
             line.append(costs.get(row, ""))
-            theirs = theirs and [*theirs, ""]
         rows.append(line)
         if theirs:
+            if costs:
+                theirs.append("")
             rows.append([PAPER, *theirs])
             below = [published["note"]] if "note" in published else []
+    head = ["sampled by", *(f"{group.column}={column}" for column in columns)]
+    if costs:
+        head.append(collect.training_time(group.records)[0])
+    title = f"Test {table.metric.title}: {table.names['task']} on {table.names['dataset']}"
     if is_by_size:
         below += _full_lines(table)
     else:
         rows.append(["all points", *_full_cells(table, columns)])
+        title += f", m={table.sizes},"
+    title += f" under {table.net}; {_sets(table)}"
     if not is_by_size and len(columns) > MAX_COLUMNS:
-        head = [group.column, *(row[0] for row in rows)]
-        values = zip(*(row[1:] for row in rows), strict=True)
-        rows = [[str(column), *line] for column, line in zip(columns, values, strict=True)]
-    else:
-        head = ["sampled by", *(f"{group.column}={column}" for column in columns)]
-        if costs:
-            head.append(collect.training_time(group.records)[0])
-    size = "" if is_by_size else f", m={table.sizes},"
-    title = (
-        f"Test {table.metric.title}: {table.names['task']} on {table.names['dataset']}{size} "
-        f"under {table.net}; {_sets(table)}"
-    )
+        head, rows = _turned(group.column, columns, rows)
     return Grid(title, head, rows, below)
+
+
+def _turned(
+    setting: str, columns: Sequence[Any], rows: Sequence[Sequence[Any]]
+) -> tuple[list[str], list[list]]:
+    """Return the head and the rows of a table whose columns become rows.
+
+    Args:
+        setting: whose values give the columns.
+        columns: its values.
+        rows: a label each, and a cell for each value.
+    """
+    labels = [row[0] for row in rows]
+    turned: list[list] = []
+    for place, column in enumerate(columns, 1):
+        cells = [row[place] for row in rows]
+        turned.append([str(column), *cells])
+    return [setting, *labels], turned
 
 
 def _sampler_of(table: Table, row: str) -> str:
@@ -126,28 +139,34 @@ def _sampler_of(table: Table, row: str) -> str:
 
 def _paper_cells(published: dict[str, Any], sampler: str, columns: list[Any]) -> list[str]:
     """Return the paper's values of a sampler by size; empty if it has none of them."""
-    theirs = published.get("rows", {}).get(sampler, {})
-    cells = [theirs.get(str(column), []) for column in columns]
-    if not any(cells):
-        return []
-    return [" / ".join(f"{value:.2f}" for value in cell) for cell in cells]
+    by_size = published.get("rows", {}).get(sampler, {})
+    cells = []
+    for column in columns:
+        values = by_size.get(str(column), [])
+        cells.append(" / ".join(f"{value:.2f}" for value in values))
+    return cells if any(cells) else []
 
 
 def _full_cells(table: Table, columns: list[Any]) -> list[str]:
     """Return the values of full clouds by column."""
     full = table.full[table.full["metric"] == table.metric.name]
-    texts = full.groupby("column")["value"].last().map(table.metric.format).to_dict()
+    by_column = full.groupby("column")["value"].last()
+    texts = by_column.map(table.metric.format).to_dict()
     return [texts.get(column, "") for column in columns]
 
 
 def _by_net(table: Table) -> Grid:
     """Return the scores of the same samples under several nets: size and sampler by net."""
     cells = table.cells(["m", "row"])
-    columns = sorted(cells.columns, key=lambda label: ("of the training" not in label, label))
-    places = sorted(cells.index, key=lambda place: (-place[0], sort_key(place[1])))
-    rows: list[list] = [[str(m), row, *cells.loc[(m, row), columns]] for m, row in places]
+    columns = sorted(cells.columns, key=_net_key)
+    places = sorted(cells.index, key=_place_key)
+    rows: list[list] = []
+    for m, row in places:
+        rows.append([str(m), row, *cells.loc[(m, row), columns]])
     metric = table.full_metric
-    label = f"all points ({metric.title})" if table.metric.full_cloud_metric else "all points"
+    label = "all points"
+    if table.metric.full_cloud_metric:
+        label += f" ({metric.title})"
     full = table.full[table.full["metric"] == metric.name]
     # Figures differ by seed where data depend on it; equal ones are of the same data.
     tested = full.drop_duplicates(["net", "value"]).groupby("net")["value"]
@@ -160,15 +179,31 @@ def _by_net(table: Table) -> Grid:
     return Grid(title, ["m", "sampled by", *columns], rows)
 
 
+def _net_key(label: str) -> tuple[bool, str]:
+    """Return a key that sorts nets by name, the net of the samplers' training first."""
+    is_other = "of the training" not in label
+    return is_other, label
+
+
+def _place_key(place: tuple[int, str]) -> Any:
+    """Return a key that sorts sizes and rows, the largest size first."""
+    m, row = place
+    return -m, sort_key(row)
+
+
 def _plane(table: Table, row: str) -> Grid:
     """Return the grid of a sampler: rows are one setting's values, columns the other's.
 
     Below it is the range of its values by readout, a measure of sensitivity.
     """
     down, across = (key.rpartition(".")[2] for key in table.planes[row])
-    cells = table.cells(["row", "down"]).loc[row].sort_index().sort_index(axis=1)
-    cells = cells.loc[:, (cells != "").any()]
-    lines = [[f"{left:g}", *line] for left, line in zip(cells.index, cells.to_numpy(), strict=True)]
+    of_row = table.cells(["row", "down"]).loc[row]
+    in_order = of_row.sort_index().sort_index(axis=1)
+    is_used = (in_order != "").any()
+    cells = in_order.loc[:, is_used]
+    lines: list[list] = []
+    for left, line in zip(cells.index, cells.to_numpy(), strict=True):
+        lines.append([f"{left:g}", *line])
     spreads = [_spread(table, row, readout) for readout in table.readouts(row)]
     title = (
         f"Test {table.metric.title} of {row}: {table.names['task']} on {table.names['dataset']}, "
@@ -183,8 +218,10 @@ def _spread(table: Table, row: str, readout: str) -> str:
     means = table.of(row, readout)["mean"]
     low = means.min()
     high = means.max()
-    ends = f"{readout} {table.metric.format(low)} to {table.metric.format(high)}"
-    return f"{ends} (factor {high / low:.3g})" if low > 0 else ends
+    text = f"{readout} {table.metric.format(low)} to {table.metric.format(high)}"
+    if low > 0:
+        text += f" (factor {high / low:.3g})"
+    return text
 
 
 def _costs(table: Table) -> dict[str, str]:
@@ -195,30 +232,36 @@ def _costs(table: Table) -> dict[str, str]:
     runs = pd.DataFrame(
         {
             "row": [table.row_names.of(record) for record in records],
-            "m": [record.config["sampler"].get("m_max", record.config["m"]) for record in records],
+            "m": [_trained_size(record) for record in records],
             "seconds": collect.training_time(records)[1],
         }
     )
-    costs = runs.dropna().groupby(["row", "m"])["seconds"].mean().groupby("row").sum()
+    of_trainings = runs.dropna().groupby(["row", "m"])["seconds"].mean()
+    costs = of_trainings.groupby("row").sum()
     return costs.map("{:,.0f} s".format).to_dict()
+
+
+def _trained_size(record: RunRecord) -> int:
+    """Return the largest size that a record's sampler was trained for."""
+    return record.config["sampler"].get("m_max", record.config["m"])
 
 
 def _full_lines(table: Table) -> list[str]:
     """Return a line for each task net with its value on full clouds."""
     metric = table.full_metric
-    label = f"{metric.title} " if table.metric.full_cloud_metric else ""
-    theirs = _published(table, full_clouds=True)
+    published = _published(table, full_clouds=True)
     lines = []
     for record in sorted(table.group.records, key=_by_row_and_size):
         figure = record.metrics.get(f"test/{FULL}/{metric.name}")
         if figure is None:
             continue
         net = collect.names(record)["net"]
-        is_published = net == table.net and "full" in theirs
-        compared = f" (the paper: {theirs['full']:.2f})" if is_published else ""
-        lines.append(
-            f"{net} on all points{_after_joint(record)}: {label}{metric.format(figure)}{compared}."
-        )
+        text = metric.format(figure)
+        if table.metric.full_cloud_metric:
+            text = f"{metric.title} {text}"
+        if net == table.net and "full" in published:
+            text += f" (the paper: {published['full']:.2f})"
+        lines.append(f"{net} on all points{_after_joint(record)}: {text}.")
     return list(dict.fromkeys(lines))
 
 
@@ -230,18 +273,31 @@ def _after_joint(record: RunRecord) -> str:
     """Return the sampler that a net was trained with, as a part of a sentence; empty if alone."""
     if collect.trained_with(record) != "joint":
         return ""
-    tested = [parse_metric_name(name) for name in record.metrics]
-    has_sizes = any(name.m for name in tested if name)
-    size = "" if has_sizes else f", m={record.config['m']}"
-    return f" after joint training with {collect.sampler_row(record)}{size}"
+    text = f" after joint training with {collect.sampler_row(record)}"
+    if not _has_several_sizes(record):
+        text += f", m={record.config['m']}"
+    return text
+
+
+def _has_several_sizes(record: RunRecord) -> bool:
+    """Return whether a run tested its sampler at several sizes."""
+    for key in record.metrics:
+        name = parse_metric_name(key)
+        if name is not None and name.m is not None:
+            return True
+    return False
 
 
 def _published(table: Table, full_clouds: bool = False) -> dict[str, Any]:
     """Return the paper's table; empty if it has none, and for test clouds that were changed."""
     records = table.group.records
-    if any(record.config.get(key) for record in records for key in OF_TEST_CLOUDS):
+    if any(_changes_test_clouds(record) for record in records):
         return {}
     metric = table.full_metric if full_clouds else table.metric
-    joint = collect.trained_with(records[0]) == "joint"
+    is_joint = collect.trained_with(records[0]) == "joint"
     names = table.names
-    return paper.published(names["task"], table.net, names["dataset"], metric.name, joint)
+    return paper.published(names["task"], table.net, names["dataset"], metric.name, is_joint)
+
+
+def _changes_test_clouds(record: RunRecord) -> bool:
+    return any(record.config.get(key) for key in OF_TEST_CLOUDS)

@@ -1,6 +1,7 @@
 """A table of task nets: their results on full clouds, their sizes and costs."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
@@ -17,6 +18,12 @@ from mops_lightning.report.collect import score, seed, training_time
 from mops_lightning.report.tables import DIRTY, dirty_line, over_seeds
 from mops_lightning.report.text import PAPER, Grid
 from mops_lightning.tree import dotted
+
+BYTES = 4
+"""Bytes of a parameter in float32."""
+
+CLASS = "._target_"
+"""End of the key of a class, which is shown by its name."""
 
 NAMES = {"points": "points after stages"}
 """Settings of a net whose names have another meaning in the table."""
@@ -37,56 +44,116 @@ def nets_grid(group: comparable.Group, metrics: Sequence[str] = ()) -> Grid:
         UserError: no record has a metric.
     """
     found = sorted(group.records, key=lambda record: record.started)
-    names = collect.names(found[0])
     infos = _metrics(found, metrics)
-    shown = _settings(found)
-    settings = pd.DataFrame(shown).drop(columns=[*BY_RUN], errors="ignore")
-    keys = [key for key in sorted(settings) if settings[key].dropna().map(str).nunique() > 1]
-    runs = settings[keys].apply(_sortable).assign(points=[_points(one) for one in found])
-    runs = runs.assign(net=[collect.names(one)["net"] for one in found])
-    runs = runs.assign(record=found, settings=shown)
-    place = ["points", *keys, "net"]
-    runs["seed"] = [seed(one) for one in found]
-    last = runs.groupby([*place, "seed"], sort=False, dropna=False).tail(1)
-    nets = last.sort_values(place, na_position="first").groupby(place, sort=False, dropna=False)
-    lines = [
-        _row([*of_net["record"]], map(of_net["settings"].iloc[0].get, keys), infos)
-        for _, of_net in nets
-    ]
-    titles = (info.title for info in infos)
+    settings = _settings(found)
+    keys = _distinguishing(settings)
+    rows = _by_row(found, settings, keys)
+    titles = [info.title for info in infos]
     head = ["net", *keys, "points", *titles, "MB", training_time(found)[0], PAPER]
+    lines = [row.cells(infos) for row in rows]
     table = pd.DataFrame(lines, columns=head)
     # Not every table has costs and figures of the paper.
-    table = table.drop(columns=[name for name in head[-2:] if not any(table[name])])
+    for optional in head[-2:]:
+        if not any(table[optional]):
+            table = table.drop(columns=optional)
+    names = collect.names(found[0])
     title = f"No sampler was tested; {names['task']} on {names['dataset']} from all points."
-    title += f" ({group.about})" if group.about else ""
+    if group.about:
+        title += f" ({group.about})"
     below = dirty_line(any(record.git["dirty"] for record in found))
     return Grid(title, list(table), table.to_numpy().tolist(), below)
 
 
-def _sortable(values: pd.Series) -> pd.Series:
-    """Return numbers as they are, and other values as texts."""
-    return values if is_numeric_dtype(values) else values.map(str, na_action="ignore")
+@dataclass
+class _Row:
+    """A row of the table.
 
+    Attributes:
+        settings: of the net, in the order of the table's columns.
+        records: of its runs, one for each seed, sorted by start.
+    """
 
-def _row(records: list[RunRecord], settings: Iterable[Any], metrics: list[MetricInfo]) -> list[str]:
-    """Return the cells of one net, over all its seeds."""
-    first = records[0]
-    label = [collect.names(first)["net"], *settings, _points(first)]
-    texts = ["" if value is None else str(value) for value in label]
-    for metric in metrics:
-        values = pd.Series([one.metrics.get(f"test/{FULL}/{metric.name}") for one in records])
+    settings: list[Any]
+    records: list[RunRecord]
+
+    def cells(self, metrics: list[MetricInfo]) -> list[str]:
+        """Return the texts of the row, over all its seeds."""
+        first = self.records[0]
+        label = [collect.names(first)["net"], *self.settings, _points(first)]
+        texts = ["" if value is None else str(value) for value in label]
+        texts += [self._score(metric) for metric in metrics]
+        texts.append(_megabytes(first))
+        texts.append(_cost(self.records))
+        texts.append(_paper(first))
+        return texts
+
+    def _score(self, metric: MetricInfo) -> str:
+        """Return the cell of a metric; empty if no run has it."""
+        key = f"test/{FULL}/{metric.name}"
+        values = pd.Series([record.metrics.get(key) for record in self.records])
         count = values.count()
-        text = over_seeds(metric, values.mean(), values.std()) if count else ""
+        if not count:
+            return ""
+        text = over_seeds(metric, values.mean(), values.std())
         if count > 1:
             text += f" (n={count})"
-        if count and any(record.git["dirty"] for record in records):
+        if any(record.git["dirty"] for record in self.records):
             text += f" {DIRTY}"
-        texts.append(text)
-    size = first.parameters.get("task")
-    cost = pd.Series(training_time(records)[1], dtype=float).mean()
-    texts.append("" if size is None else f"{4e-6 * size:.1f}")
-    return [*texts, "" if pd.isna(cost) else f"{cost:,.0f} s", _paper(first)]
+        return text
+
+
+def _megabytes(record: RunRecord) -> str:
+    """Return the size of a record's net in float32; empty if it is not known."""
+    parameters = record.parameters.get("task")
+    return "" if parameters is None else f"{BYTES * parameters / 1e6:.1f}"
+
+
+def _cost(records: list[RunRecord]) -> str:
+    """Return the mean time of trainings; empty if none was recorded."""
+    seconds = pd.Series(training_time(records)[1], dtype=float).mean()
+    return "" if pd.isna(seconds) else f"{seconds:,.0f} s"
+
+
+def _distinguishing(settings: list[dict[str, Any]]) -> list[str]:
+    """Return the settings that differ between nets, sorted; those of single runs are left out."""
+    table = pd.DataFrame(settings).drop(columns=[*BY_RUN], errors="ignore")
+    keys = []
+    for key in sorted(table):
+        values = table[key].dropna().map(str)
+        if values.nunique() > 1:
+            keys.append(key)
+    return keys
+
+
+def _by_row(found: list[RunRecord], settings: list[dict[str, Any]], keys: list[str]) -> list[_Row]:
+    """Return the rows, sorted by number of points and settings.
+
+    Args:
+        found: the records, sorted by start.
+        settings: of every record's net.
+        keys: the settings that have columns.
+    """
+    runs = pd.DataFrame(settings)[keys].apply(_sortable)
+    runs["points"] = [_points(record) for record in found]
+    runs["net"] = [collect.names(record)["net"] for record in found]
+    runs["seed"] = [seed(record) for record in found]
+    runs["number"] = range(len(found))
+    place = ["points", *keys, "net"]
+    last = runs.groupby([*place, "seed"], sort=False, dropna=False).tail(1)
+    in_order = last.sort_values(place, na_position="first")
+    rows = []
+    for _, of_net in in_order.groupby(place, sort=False, dropna=False):
+        numbers = list(of_net["number"])
+        first = settings[numbers[0]]
+        rows.append(_Row([first.get(key) for key in keys], [found[number] for number in numbers]))
+    return rows
+
+
+def _sortable(values: pd.Series) -> pd.Series:
+    """Return numbers as they are, and other values as texts."""
+    if is_numeric_dtype(values):
+        return values
+    return values.map(str, na_action="ignore")
 
 
 def _settings(found: list[RunRecord]) -> list[dict[str, Any]]:
@@ -94,22 +161,33 @@ def _settings(found: list[RunRecord]) -> list[dict[str, Any]]:
 
     Settings of the training differ between runs of one net and seed, and are set in every record.
     """
-    same: dict[tuple[str, ...], list[RunRecord]] = {}
     nets = [_net(record) for record in found]
-    for record, net in zip(found, nets, strict=True):
-        place = collect.names(record)["net"], net, _points(record), seed(record)
-        same.setdefault(tuple(map(str, place)), []).append(record)
-    trainings = sorted(
-        key
-        for key in {key for runs in same.values() for key in comparable.varying(runs)}
-        if all(comparable.value(record, key) is not None for record in found)
-    )
+    trainings = _trainings(found, nets)
     for record, net in zip(found, nets, strict=True):
         for key in trainings:
-            name = key.removesuffix("._target_")
             text = comparable.value(record, key)
-            net[name] = text if name == key else text.rpartition(".")[2]
+            if key.endswith(CLASS):
+                net[key.removesuffix(CLASS)] = text.rpartition(".")[2]
+            else:
+                net[key] = text
     return nets
+
+
+def _trainings(found: list[RunRecord], nets: list[dict[str, Any]]) -> list[str]:
+    """Return the settings of trainings in which runs of one net and seed differ, sorted."""
+    same: dict[tuple[str, ...], list[RunRecord]] = {}
+    for record, net in zip(found, nets, strict=True):
+        place = (collect.names(record)["net"], str(net), str(_points(record)), str(seed(record)))
+        same.setdefault(place, []).append(record)
+    different: set[str] = set()
+    for runs in same.values():
+        different.update(comparable.varying(runs))
+    settings = [comparable.considered(record) for record in found]
+    return sorted(key for key in different if _is_set_in_all(key, settings))
+
+
+def _is_set_in_all(key: str, settings: list[dict[str, Any]]) -> bool:
+    return all(of_run.get(key) is not None for of_run in settings)
 
 
 def _net(record: RunRecord) -> dict[str, Any]:
@@ -118,10 +196,19 @@ def _net(record: RunRecord) -> dict[str, Any]:
     for key, value in dotted(_arguments(record)).items():
         part, _, name = key.rpartition(".")
         if name == "_target_":
-            net |= {part: str(value).split(".")[-2:][0]} if part else {}
+            if part:
+                net[part] = _module(str(value))
+        elif part and value is None:
+            net[NAMES.get(key, key)] = "none"
         else:
-            net[NAMES.get(key, key)] = "none" if part and value is None else value
+            net[NAMES.get(key, key)] = value
     return net
+
+
+def _module(target: str) -> str:
+    """Return the name of the module of a class, such as ``fps`` of ``….samplers.fps.FPS``."""
+    path, _, name = target.rpartition(".")
+    return path.rpartition(".")[2] if path else name
 
 
 def _arguments(record: RunRecord) -> dict[str, Any]:
@@ -134,8 +221,12 @@ def _points(record: RunRecord) -> int | None:
 
 def _metrics(found: list[RunRecord], requested: Sequence[str]) -> list[MetricInfo]:
     """Return the metrics of full clouds: the requested ones, or all of the closing table."""
-    names = {name for record in found for name in record.metrics}
-    known = {name.rsplit("/", 1)[1] for name in names if name.startswith(f"test/{FULL}/")}
+    prefix = f"test/{FULL}/"
+    known = set()
+    for record in found:
+        for key in record.metrics:
+            if key.startswith(prefix):
+                known.add(key.rpartition("/")[2])
     for name in requested:
         if name not in known:
             raise UserError(f"--metric: no run has {name!r}.{did_you_mean(name, known)}")
@@ -146,13 +237,14 @@ def _metrics(found: list[RunRecord], requested: Sequence[str]) -> list[MetricInf
 
 
 def _paper(record: RunRecord) -> str:
+    """Return the paper's figures for the same net; empty if it has none."""
     names = collect.names(record)
-    points = _points(record)
-    values = None
     if names["task"] == "reconstruction":
-        values = paper.net(names["net"], _arguments(record).get("pieces"), points)
-    if values:
-        return " / ".join(f"{value:g}" for value in values)
+        pieces = _arguments(record).get("pieces")
+        values = paper.net(names["net"], pieces, _points(record))
+        if values:
+            return " / ".join(f"{value:g}" for value in values)
     metric = score([record])
-    theirs = paper.published(names["task"], names["net"], names["dataset"], metric).get("full")
-    return "" if theirs is None else f"{theirs:.2f}"
+    table = paper.published(names["task"], names["net"], names["dataset"], metric)
+    figure = table.get("full")
+    return "" if figure is None else f"{figure:.2f}"

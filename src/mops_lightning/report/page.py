@@ -86,18 +86,26 @@ def _policy(script: str, plotly: str) -> str:
 
     WebGL in plotly compiles functions, for which it needs ``unsafe-eval``.
     """
-    digests = (hashlib.sha256(text.encode()).digest() for text in (script, plotly) if text)
-    allowed = " ".join(f"'sha256-{base64.b64encode(one).decode()}'" for one in digests)
-    evaluates = " 'unsafe-eval'" if plotly else ""
+    allowed = [_hash(script)]
+    if plotly:
+        allowed += [_hash(plotly), "'unsafe-eval'"]
     return (
-        f"default-src 'none'; script-src {allowed}{evaluates}; style-src 'unsafe-inline'; "
+        f"default-src 'none'; script-src {' '.join(allowed)}; style-src 'unsafe-inline'; "
         "img-src data: blob:"
     )
 
 
+def _hash(script: str) -> str:
+    """Return the hash of a script, as a policy names it."""
+    digest = hashlib.sha256(script.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode()}'"
+
+
 def _remark(line: str) -> str:
-    text = html.escape(line.removeprefix("- "))
-    return f"<li>{text}</li>" if line.startswith("- ") else f"</ul><p>{text}</p><ul>"
+    """Return a remark as an item of the list, or as a paragraph that interrupts it."""
+    if line.startswith("- "):
+        return f"<li>{html.escape(line.removeprefix('- '))}</li>"
+    return f"</ul><p>{html.escape(line)}</p><ul>"
 
 
 def _table(grid: Grid) -> str:
@@ -106,20 +114,31 @@ def _table(grid: Grid) -> str:
         texts = [marked(cell, html.escape, "<b>{}</b>", "<u>{}</u>") for cell in cells]
         if cells[0] == PAPER:
             # Part of the row above, so that sorting keeps them together.
-            rows[-1] = [
-                f"{ours}<small>{theirs.strip('*')}</small>" if theirs else ours
-                for ours, theirs in zip(rows[-1], texts, strict=True)
-            ]
+            rows[-1] = _with_papers(rows[-1], texts)
         else:
             rows.append(texts)
-    head = "".join(f"<th>{html.escape(name.strip('*'))}</th>" for name in grid.head)
-    body = "\n".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>" for cells in rows)
-    below = "".join(f"<p>{html.escape(line)}</p>" for line in grid.below)
+    names = [html.escape(name.strip("*")) for name in grid.head]
+    head = _tagged("th", names)
+    body = "\n".join(f"<tr>{_tagged('td', cells)}</tr>" for cells in rows)
+    below = _tagged("p", [html.escape(line) for line in grid.below])
     return (
         f"<p>{html.escape(grid.title)}</p>\n"
         f'<div class="wide"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{body}</tbody></table></div>\n{below}"
     )
+
+
+def _with_papers(ours: Sequence[str], theirs: Sequence[str]) -> list[str]:
+    """Return the cells of a row with the paper's in small type below them."""
+    cells = []
+    for cell, published in zip(ours, theirs, strict=True):
+        small = f"<small>{published.strip('*')}</small>" if published else ""
+        cells.append(cell + small)
+    return cells
+
+
+def _tagged(tag: str, texts: Sequence[str]) -> str:
+    return "".join(f"<{tag}>{text}</{tag}>" for text in texts)
 
 
 def _image(path: Path) -> str:
@@ -129,26 +148,34 @@ def _image(path: Path) -> str:
 
 def _clouds(report: Report, folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """Return the clouds that the runs have saved, as plain data, and a line for damaged files."""
-    found: list[dict[str, Any]] = []
+    groups: list[dict[str, Any]] = []
     damaged: list[str] = []
-    colours = {INPUT: INPUT_COLOUR, **COLOURS}
     for record in report.found.done:
         path = Path(record.folder) / record.files.get("clouds", "")
-        if not path.is_file() or len(found) == MAX_RUNS:
+        if not path.is_file() or len(groups) == MAX_RUNS:
             continue
+        name = str(Path(record.folder).relative_to(folder))
         try:
-            titles, arrays = load_clouds(path)
+            groups.append(_group_of_clouds(path, name))
         except (OSError, UserError) as error:
             damaged.append(f"- {error}")
-            continue
-        found.append(
-            {
-                "name": str(Path(record.folder).relative_to(folder)),
-                "titles": titles,
-                "points": {name: a.astype(float).round(3).tolist() for name, a in arrays.items()},
-                "colours": {name: f"rgb{colours.get(name, COLOURS['sampled'])}" for name in arrays},
-                # Completed sets contain the matched points and would hide them.
-                "hidden": ["completed"],
-            }
-        )
-    return found, damaged
+    return groups, damaged
+
+
+def _group_of_clouds(path: Path, name: str) -> dict[str, Any]:
+    """Return the clouds of a run's file as plain data; see ``render``."""
+    colours = {INPUT: INPUT_COLOUR, **COLOURS}
+    titles, arrays = load_clouds(path)
+    points = {}
+    shown_in = {}
+    for readout, array in arrays.items():
+        points[readout] = array.astype(float).round(3).tolist()
+        shown_in[readout] = f"rgb{colours.get(readout, COLOURS['sampled'])}"
+    return {
+        "name": name,
+        "titles": titles,
+        "points": points,
+        "colours": shown_in,
+        # Completed sets contain the matched points and would hide them.
+        "hidden": ["completed"],
+    }

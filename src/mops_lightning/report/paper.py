@@ -21,11 +21,11 @@ def published(
         ``rows``: sampler → size → values of generated, matched and completed sets, or one value;
         ``full``, if the paper gives it: the value on all points.
     """
-    wanted = (task, dataset, metric, joint)
-    for one in published_tables().values():
-        of_table = (one["task"], one.get("dataset"), one.get("metric"), one.get("joint", False))
-        if of_table == wanted and one.get("net", net) == net:
-            return one
+    wanted = {"task": task, "dataset": dataset, "metric": metric, "net": net, "joint": joint}
+    for table in published_tables().values():
+        given = {"dataset": None, "metric": None, "net": net, "joint": False} | table
+        if all(given[name] == value for name, value in wanted.items()):
+            return table
     return {}
 
 
@@ -37,5 +37,8 @@ def net(name: str, pieces: int | None, n_points: int | None) -> list[float] | No
         pieces: M of M-FoldingNet; FoldingNet has 1.
         n_points: points of the clouds.
     """
-    key = str(pieces) if name in ("foldingnet", "mfoldingnet") else name
-    return published_tables()["frameworks"]["nets"].get(key, {}).get(str(n_points))
+    nets = published_tables()["frameworks"]["nets"]
+    if name in ("foldingnet", "mfoldingnet"):
+        name = str(pieces)
+    by_points = nets.get(name, {})
+    return by_points.get(str(n_points))

@@ -1,5 +1,6 @@
 """Curves and heat maps of a report."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from mops_lightning.report.rows import sort_key
 from mops_lightning.report.tables import Table
 from mops_lightning.viz.figures import new_figure
 
-COLOURS = (*(f"C{i}" for i in range(10)), *(colormaps["Dark2"](i) for i in range(8)))
+COLOURS: list[Any] = [f"C{number}" for number in range(10)]
+COLOURS += [colormaps["Dark2"](number) for number in range(8)]
 """Of curves, in the order of the rows."""
 
 LOG_SCALE_RATIO = 20
@@ -26,14 +28,20 @@ def plots(report: Report) -> dict[str, Figure]:
     """Return the figures of a report by file name without suffix."""
     figures: dict[str, Figure] = {}
     for table in report.tables:
-        name = table.metric.name
         group = table.group
-        if group.column == "net" or not (group.planes or len(table.columns()) > 1):
-            continue
-        kind, draw = ("planes", heat_maps) if group.planes else ("curves", curves)
-        others = sum(other.startswith(f"{name}_{kind}") for other in figures)  # of other groups
-        figures[f"{name}_{kind}{f'_{others + 1}' if others else ''}"] = draw(table)
+        if group.planes:
+            name = _new_name(f"{table.metric.name}_planes", figures)
+            figures[name] = heat_maps(table)
+        elif group.column != "net" and len(table.columns()) > 1:
+            name = _new_name(f"{table.metric.name}_curves", figures)
+            figures[name] = curves(table)
     return figures
+
+
+def _new_name(name: str, figures: Mapping[str, Figure]) -> str:
+    """Return a name, with a number behind it if other groups have figures of this name."""
+    others = [other for other in figures if other.startswith(name)]
+    return f"{name}_{len(others) + 1}" if others else name
 
 
 def curves(table: Table) -> Figure:
@@ -46,39 +54,49 @@ def curves(table: Table) -> Figure:
     readouts = list(GENERATED_READOUTS)
     if PROJECTED in set(table.values["readout"]):
         readouts.append(PROJECTED)
-    if wide := len(columns) > MAX_COLUMNS:
+    is_wide = len(columns) > MAX_COLUMNS
+    if is_wide:
         figure = new_figure(0.16 * len(columns) + 2, 2.2 * len(readouts) + 1)
         panels = figure.subplots(len(readouts), 1, sharex=True)
     else:
         figure = new_figure(4.2 * len(readouts), 3.4)
         panels = figure.subplots(1, len(readouts), sharey=True)
+    ticks = [column if isinstance(column, str) else f"{column:g}" for column in columns]
     for axis, readout in zip(panels, readouts, strict=True):
-        for number, name in enumerate(table.rows()):
-            dashed = INDEX_READOUT in table.readouts(name)
-            values = table.of(name, INDEX_READOUT if dashed else readout).sort_values("column")
-            if values.empty:
-                continue
-            axis.errorbar(
-                [columns.index(x) for x in values["column"]],
-                values["mean"] * table.metric.scale,
-                yerr=values["std"].fillna(0.0) * table.metric.scale,
-                label=name,
-                color=COLOURS[number % len(COLOURS)],
-                linestyle="--" if dashed else "-",
-                marker="o",
-                markersize=3,
-                capsize=2,
-            )
+        _draw_curves(axis, table, readout, columns)
         axis.set(title=readout, xlabel=table.group.column, ylabel=table.metric.title)
-        axis.set_xticks(
-            range(len(columns)), [one if isinstance(one, str) else f"{one:g}" for one in columns]
-        )
-        if wide:
+        axis.set_xticks(range(len(columns)), ticks)
+        if is_wide:
             axis.tick_params(axis="x", rotation=90)
         axis.grid(alpha=0.3)
         axis.label_outer()
     panels[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
+
+
+def _draw_curves(axis: Any, table: Table, readout: str, columns: Sequence[Any]) -> None:
+    """Draw a curve for each row of a table into the panel of a readout."""
+    scale = table.metric.scale
+    for number, name in enumerate(table.rows()):
+        style = "-"
+        shown = readout
+        if INDEX_READOUT in table.readouts(name):
+            style = "--"
+            shown = INDEX_READOUT
+        values = table.of(name, shown).sort_values("column")
+        if values.empty:
+            continue
+        axis.errorbar(
+            [columns.index(column) for column in values["column"]],
+            values["mean"] * scale,
+            yerr=values["std"].fillna(0.0) * scale,
+            label=name,
+            color=COLOURS[number % len(COLOURS)],
+            linestyle=style,
+            marker="o",
+            markersize=3,
+            capsize=2,
+        )
 
 
 def heat_maps(table: Table) -> Figure:
@@ -94,10 +112,13 @@ def heat_maps(table: Table) -> Figure:
     panels = figure.subplots(len(names), width, squeeze=False)
     for line, name in zip(panels, names, strict=True):
         down, across = (key.split(".")[-1] for key in planes[name])
-        norm = _colour_scale(table.values.loc[table.values["row"] == name, "mean"] * scale)
+        of_row = table.values[table.values["row"] == name]
+        norm = _colour_scale(of_row["mean"] * scale)
         for axis, readout in zip(line, table.readouts(name), strict=False):
-            plane = table.of(name, readout).pivot(index="down", columns="column", values="mean")
-            image = _heat_map(axis, plane.sort_index().sort_index(axis=1) * scale, norm)
+            values = table.of(name, readout)
+            plane = values.pivot(index="down", columns="column", values="mean")
+            in_order = plane.sort_index().sort_index(axis=1)
+            image = _heat_map(axis, in_order * scale, norm)
             axis.set(xlabel=across, ylabel=down, title=f"{name}, {readout}")
         figure.colorbar(image, ax=line, label=table.metric.title)
     return figure
@@ -115,11 +136,12 @@ def _colour_scale(means: pd.Series) -> Normalize:
 
 def _heat_map(axis: Any, plane: pd.DataFrame, norm: Normalize) -> Any:
     """Draw a plane with its numbers; return the image."""
-    for (i, j), one in np.ndenumerate(plane.to_numpy()):
-        if not np.isnan(one):
-            colour = "white" if norm(one) < 0.5 else "black"
-            text = f"{one:.4g}" if one < 1e4 else f"{one:,.0f}"
-            axis.text(j, i, text, ha="center", va="center", color=colour, fontsize=7)
+    for (row, column), value in np.ndenumerate(plane.to_numpy()):
+        if np.isnan(value):
+            continue
+        text = f"{value:.4g}" if value < 1e4 else f"{value:,.0f}"
+        colour = "white" if norm(value) < 0.5 else "black"
+        axis.text(column, row, text, ha="center", va="center", color=colour, fontsize=7)
     axis.set_xticks(range(plane.shape[1]), [f"{x:g}" for x in plane.columns])
     axis.set_yticks(range(plane.shape[0]), [f"{y:g}" for y in plane.index])
     return axis.imshow(plane.to_numpy(), norm=norm, origin="lower", aspect="auto")

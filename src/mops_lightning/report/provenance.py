@@ -24,15 +24,21 @@ def provenance(found: list[RunRecord], net: str) -> list[str]:
         found: completed records.
         net: the table's task net; other nets are named.
     """
-    rows = [(_kind(record, net), _way(record), Path(record.folder).name) for record in found]
-    made = pd.DataFrame(rows, columns=["kind", "way", "folder"])
+    made = pd.DataFrame(
+        {
+            "kind": [_kind(record, net) for record in found],
+            "way": [_way(record) for record in found],
+            "folder": [Path(record.folder).name for record in found],
+        }
+    )
     lines = []
     for kind, runs in made.groupby("kind", sort=False):
         ways = runs.groupby("way", sort=False)["folder"]
         for way, folders in ways:
-            is_named = len(ways) > 1 and len(folders) <= MAX_NAMED
-            listed = f" ({', '.join(folders)})" if is_named else ""
-            lines.append(f"- {kind}{listed}: {way}")
+            made_so = str(kind)
+            if len(ways) > 1 and len(folders) <= MAX_NAMED:
+                made_so += f" ({', '.join(folders)})"
+            lines.append(f"- {made_so}: {way}")
     return lines
 
 
@@ -52,18 +58,19 @@ def collapses(found: list[RunRecord], net: str) -> list[str]:
         found: completed records.
         net: the table's task net; other nets are named.
     """
-    counts: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    advices: dict[str, str] = {}
+    of_kinds: dict[str, list[RunRecord]] = defaultdict(list)
     for record in found:
-        for m, count in collapsed(record).items():
-            kind = _kind(record, net)
-            counts[kind][m].append(count)
-            advices[kind] = advice(record)
+        if collapsed(record):
+            of_kinds[_kind(record, net)].append(record)
     lines = []
-    for kind, by_size in counts.items():
-        means = [f"{mean(values):.1f} of {m}" for m, values in sorted(by_size.items())]
+    for kind, records in of_kinds.items():
+        counts: dict[int, list[float]] = defaultdict(list)
+        for record in records:
+            for m, count in collapsed(record).items():
+                counts[m].append(count)
+        means = [f"{mean(counts[m]):.1f} of {m}" for m in sorted(counts)]
         shown = ", ".join(means)
-        text = f"collapsed: only {shown} matched points are distinct. {advices[kind]}."
+        text = f"collapsed: only {shown} matched points are distinct. {advice(records[-1])}."
         lines.append(f"- {kind}: {text}")
     return lines
 
@@ -79,8 +86,11 @@ def without_result(found: collect.Found) -> list[str]:
 
 
 def _kind(record: RunRecord, net: str) -> str:
+    """Return what a run trained or tested: a net, or a sampler with its net."""
     own_net = collect.names(record)["net"]
-    kind = own_net if record.config["learn"] == "task" else collect.sampler_row(record)
+    kind = collect.sampler_row(record)
+    if record.config["learn"] == "task":
+        kind = own_net
     if own_net not in (net, kind):
         kind += f" under {own_net}"
     if collect.trained_with(record) == "joint" and "fit" in record.seconds:
@@ -89,14 +99,16 @@ def _kind(record: RunRecord, net: str) -> str:
 
 
 def _way(record: RunRecord) -> str:
-    threads = "thread" if record.threads == 1 else "threads"
-    changes = " with changes" if record.git["dirty"] else ""
+    """Return how long, where and from which code a run was made."""
+    threads = "1 thread" if record.threads == 1 else f"{record.threads} threads"
+    code = f"commit {commit(record)}"
+    if record.git["dirty"]:
+        code += " with changes"
+    facts = [_length(record), f"seed {collect.seed(record)}", str(record.device), threads, code]
     tags = record.config.get("tags")
-    tagged = f", tags {' '.join(tags)}" if tags else ""
-    return (
-        f"{_length(record)}, seed {collect.seed(record)}, {record.device}, "
-        f"{record.threads} {threads}, commit {commit(record)}{changes}{tagged}"
-    )
+    if tags:
+        facts.append(f"tags {' '.join(tags)}")
+    return ", ".join(facts)
 
 
 def _length(record: RunRecord) -> str:

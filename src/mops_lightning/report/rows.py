@@ -77,8 +77,8 @@ class RowNames:
         """Return the row of a value: its run's sampler, or a baseline of the run."""
         if readout in (*READOUTS, FULL):
             return self.of(record)
-        prefix = _on_net(record, self.net).removesuffix(collect.sampler_row(record))  # "dgcnn on "
-        return prefix + baseline_name(record.config, readout)
+        on_net = _on_net(record, self.net).removesuffix(collect.sampler_row(record))
+        return on_net + baseline_name(record.config, readout)  # such as "dgcnn on fps"
 
 
 def _on_net(record: RunRecord, net: str) -> str:
@@ -98,23 +98,35 @@ def _telling_apart(records: Sequence[RunRecord], columns: Sequence[str]) -> list
         place = tuple(repr(settings.get(key.removeprefix("sampler."))) for key in columns)
         for m in _sizes(record):
             cells[place, m].append(settings)
-    found = set()
-    for several in cells.values():
-        for key in {key for settings in several for key in settings}:
-            if len({repr(settings.get(key)) for settings in several}) > 1:
-                found.add(key)
+    different: set[str] = set()
+    for of_cell in cells.values():
+        different |= _different(of_cell)
     own = {key.removeprefix("sampler.") for key in columns}
-    return sorted(found - own - set(NOT_IN_NAMES))
+    return sorted(different - own - set(NOT_IN_NAMES))
+
+
+def _different(several: Sequence[dict[str, Any]]) -> set[str]:
+    """Return the keys whose values differ between settings."""
+    keys: set[str] = set()
+    for settings in several:
+        keys.update(settings)
+    different = set()
+    for key in keys:
+        values = {repr(settings.get(key)) for settings in several}
+        if len(values) > 1:
+            different.add(key)
+    return different
 
 
 def _sizes(record: RunRecord) -> set[int]:
     """Return the sizes that a run tested its sampler at."""
-    names = [parse_metric_name(name) for name in record.metrics]
-    return {
-        record.config["m"] if name.m is None else name.m
-        for name in names
-        if name and name.readout in READOUTS
-    }
+    sizes = set()
+    for key in record.metrics:
+        name = parse_metric_name(key)
+        if name is None or name.readout not in READOUTS:
+            continue
+        sizes.add(record.config["m"] if name.m is None else name.m)
+    return sizes
 
 
 def _texts(record: RunRecord, keys: Sequence[str], classes: set[str]) -> list[str]:
@@ -140,16 +152,16 @@ def _texts(record: RunRecord, keys: Sequence[str], classes: set[str]) -> list[st
 
 def net_labels(found: Sequence[RunRecord]) -> list[str]:
     """Return a name for the task net of each record, other names for other weights."""
-    labels: list[str] = []
     digests: dict[str, set[str | None]] = defaultdict(set)
     for record in found:
+        digests[_net_label(record)].add(record.task_weights_sha256)
+    labels = []
+    for record in found:
         label = _net_label(record)
+        if len(digests[label]) > 1:
+            label += f" {str(record.task_weights_sha256)[:8]}"
         labels.append(label)
-        digests[label].add(record.task_weights_sha256)
-    return [
-        f"{label} {str(record.task_weights_sha256)[:8]}" if len(digests[label]) > 1 else label
-        for label, record in zip(labels, found, strict=True)
-    ]
+    return labels
 
 
 def _net_label(record: RunRecord) -> str:

@@ -49,7 +49,8 @@ class Cell(NamedTuple):
     suffix: str = ""
 
     def __str__(self) -> str:
-        return " / ".join(part.text for part in self.parts) + self.suffix
+        texts = [part.text for part in self.parts]
+        return " / ".join(texts) + self.suffix
 
 
 @dataclass
@@ -113,7 +114,8 @@ class Table:
 
     def of(self, row: str, readout: str) -> pd.DataFrame:
         """Return the values of a row and a readout."""
-        return self.values[(self.values["row"] == row) & (self.values["readout"] == readout)]
+        of_row = self.values[self.values["row"] == row]
+        return of_row[of_row["readout"] == readout]
 
     def cells(self, index: Sequence[str]) -> pd.DataFrame:
         """Return the cells by columns of ``values`` and by ``column``; empty texts for none."""
@@ -122,11 +124,17 @@ class Table:
         return cells.unstack("column", fill_value="")
 
     def _cell(self, values: pd.DataFrame) -> Cell:
-        by_readout = {value.readout: value for value in values.itertuples()}
-        present: list[Any] = [by_readout[name] for name in READOUTS if name in by_readout]
-        parts = [Part(over_seeds(self.metric, one.mean, one.std), one.rank) for one in present]
-        seeds = max(int(one.count_) for one in present)
-        suffix = f" (n={seeds})" if seeds > 1 else ""
+        by_readout: dict[str, Any] = {value.readout: value for value in values.itertuples()}
+        parts = []
+        for name in READOUTS:
+            if name in by_readout:
+                value = by_readout[name]
+                text = over_seeds(self.metric, value.mean, value.std)
+                parts.append(Part(text, value.rank))
+        seeds = int(values["count_"].max())
+        suffix = ""
+        if seeds > 1:
+            suffix += f" (n={seeds})"
         if values["dirty"].any():
             suffix += f" {DIRTY}"
         return Cell(tuple(parts), suffix)
@@ -144,26 +152,31 @@ def make_table(group: Group, metric: str, net: str) -> Table:
         UserError: no record has the metric.
     """
     rows = RowNames(group.records, net, group.settings)
-    long = _placed(long_form(group.records, rows, group.settings), group, rows)
-    values = _tested(long, metric, group)
-    later = _replaced_later(values)
+    long = long_form(group.records, rows, group.settings)
+    placed = _placed(long, group, rows)
+    values = _tested(placed, metric, group)
+    is_replaced = _replaced_later(values)
+    cells = _over_seeds(values[~is_replaced])
     info = metric_info(metric, group.records)
+    hidden = values.loc[is_replaced & values["own"], "folder"]
     return Table(
         metric=info,
         group=group,
         net=net,
         row_names=rows,
-        values=ranked(_over_seeds(values[~later]), info),
-        full=long[long["readout"] == FULL],
-        hidden=sorted(set(values.loc[later & values["own"], "folder"])),
+        values=ranked(cells, info),
+        full=placed[placed["readout"] == FULL],
+        hidden=sorted(set(hidden)),
     )
 
 
 def _planes(group: Group, rows: RowNames) -> dict[str, list[str]]:
     """Return the two settings of every row's heat map."""
-    if not group.planes:
-        return {}
-    return {rows.of(record): group.planes[sampler_row(record)] for record in group.records}
+    planes: dict[str, list[str]] = {}
+    if group.planes:
+        for record in group.records:
+            planes[rows.of(record)] = group.planes[sampler_row(record)]
+    return planes
 
 
 def _placed(long: pd.DataFrame, group: Group, rows: RowNames) -> pd.DataFrame:
@@ -189,11 +202,11 @@ def _tested(long: pd.DataFrame, metric: str, group: Group) -> pd.DataFrame:
     Raises:
         UserError: there is none.
     """
-    values = long[(long["metric"] == metric) & (long["readout"] != FULL)].copy()
+    is_shown = (long["metric"] == metric) & (long["readout"] != FULL)
+    values = long[is_shown].copy()
     if values.empty:
-        raise UserError(
-            f"--metric: no run has {metric!r}.{did_you_mean(metric, set(long['metric']))}"
-        )
+        hint = did_you_mean(metric, set(long["metric"]))
+        raise UserError(f"--metric: no run has {metric!r}.{hint}")
     values["own"] = values["readout"].isin(READOUTS)
     if group.settings:
         at_own_size = values["m"] == values["size"]
@@ -228,8 +241,9 @@ def over_seeds(metric: MetricInfo, mean: float, std: float) -> str:
     if pd.isna(std):
         return text
     # As many decimals as the mean has, at least two.
-    places = len(text.partition(".")[2]) if "e" not in text else 0
-    return f"{text} ± {metric.scale * std:.{max(places, 2)}f}"
+    decimals = "" if "e" in text else text.partition(".")[2]
+    places = max(len(decimals), 2)
+    return f"{text} ± {metric.scale * std:.{places}f}"
 
 
 def dirty_line(is_dirty: bool) -> list[str]:

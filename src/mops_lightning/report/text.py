@@ -43,7 +43,10 @@ def marked(cell: str | Cell, escape: Callable[[str], str], best: str, second: st
     if isinstance(cell, str):
         return escape(cell)
     marks = {BEST: best, SECOND: second}
-    texts = (marks.get(part.rank, "{}").format(escape(part.text)) for part in cell.parts)
+    texts = []
+    for part in cell.parts:
+        mark = marks.get(part.rank, "{}")
+        texts.append(mark.format(escape(part.text)))
     return " / ".join(texts) + escape(cell.suffix)
 
 
@@ -51,15 +54,30 @@ def markdown(grids: list[Grid], remarks: list[str]) -> str:
     """Return all tables and the remarks."""
     lines: list[str] = []
     for grid in grids:
-        title, *below = map(_escaped, (grid.title, *grid.below))
-        lines += [title, "", _line(grid.head), "|---|" + "--:|" * (len(grid.head) - 1)]
-        lines += [*map(_line, grid.rows), "", *below, *([""] if below else [])]
-    return printable("\n".join([*lines, *map(_escaped, remarks)]) + "\n")
+        lines += [_escaped(grid.title), ""]
+        lines += [_line(grid.head), _rule(len(grid.head))]
+        lines += [_line(row) for row in grid.rows]
+        lines.append("")
+        if grid.below:
+            lines += [_escaped(line) for line in grid.below]
+            lines.append("")
+    lines += [_escaped(remark) for remark in remarks]
+    return printable("\n".join(lines) + "\n")
 
 
 def _line(cells: Sequence[str | Cell]) -> str:
-    texts = (one if one == PAPER else marked(one, _escaped, "**{}**", "<u>{}</u>") for one in cells)
-    return f"| {' | '.join(map(str, texts))} |"
+    return f"| {' | '.join(_cell(cell) for cell in cells)} |"
+
+
+def _cell(cell: str | Cell) -> str:
+    if cell == PAPER:
+        return PAPER
+    return marked(cell, _escaped, "**{}**", "<u>{}</u>")
+
+
+def _rule(columns: int) -> str:
+    """Return the line under the head, which aligns all columns but the first to the right."""
+    return "|---|" + "--:|" * (columns - 1)
 
 
 SPECIAL = {ord(letter): f"&#{ord(letter)};" for letter in "&|<*`["}
@@ -86,14 +104,20 @@ def latex(grids: list[Grid], remarks: list[str]) -> str:
     r"""Return all tables as ``tabular`` environments, for ``\input``; remarks as comments."""
     parts = ["% needs \\usepackage{booktabs}\n"]
     for grid in grids:
-        body = "\n".join(f"{' & '.join(map(_tex_cell, cells))} \\\\" for cells in grid.rows)
-        parts.append(
-            "\\begin{table}\n\\centering\n"
-            f"\\caption{{{_tex(grid.title)}}}\n"
-            f"\\begin{{tabular}}{{l{'r' * (len(grid.head) - 1)}}}\n\\toprule\n"
-            f"{' & '.join(map(_tex, grid.head))} \\\\\n\\midrule\n{body}\n\\bottomrule\n"
-            "\\end{tabular}\n\\end{table}\n" + _comments(grid.below)
-        )
+        lines = [
+            r"\begin{table}",
+            r"\centering",
+            rf"\caption{{{_tex(grid.title)}}}",
+            rf"\begin{{tabular}}{{l{'r' * (len(grid.head) - 1)}}}",
+            r"\toprule",
+            _tex_line(grid.head),
+            r"\midrule",
+            *(_tex_line(row) for row in grid.rows),
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+        ]
+        parts.append("\n".join(lines) + "\n" + _comments(grid.below))
     return "\n".join(parts) + _comments(remarks)
 
 
@@ -101,14 +125,16 @@ def _comments(lines: list[str]) -> str:
     return "".join(f"% {_ascii(' '.join(line.split()))}\n" for line in lines)
 
 
-def _tex_cell(cell: str | Cell) -> str:
-    return marked(cell, _tex, r"\textbf{{{}}}", r"\underline{{{}}}")
+def _tex_line(cells: Sequence[str | Cell]) -> str:
+    texts = [marked(cell, _tex, r"\textbf{{{}}}", r"\underline{{{}}}") for cell in cells]
+    return f"{' & '.join(texts)} \\\\"
 
 
 def _tex(text: str) -> str:
     if text.startswith("*") and text.endswith("*"):
         return f"\\emph{{{_tex(text[1:-1])}}}"
-    return "".join(TEX.get(letter) or _ascii(letter) for letter in " ".join(text.splitlines()))
+    line = " ".join(text.splitlines())
+    return "".join(TEX.get(letter) or _ascii(letter) for letter in line)
 
 
 def _ascii(text: str) -> str:
