@@ -10,8 +10,8 @@ import pytest
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from omegaconf import OmegaConf
 
-from mops_lightning.config import compose as composing
 from mops_lightning.config.groups import sweeps_dir
+from mops_lightning.config.overrides import key as key_of
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.run import run as running
 from mops_lightning.training.run.build import build_parts
@@ -111,10 +111,10 @@ def cells_of(name):
 @pytest.mark.parametrize("name", SWEEPS)
 def test_sweep_builds_the_parts_of_each_kind_of_cell(name, roots, tmp_path):
     given = settings_of(name, roots)
-    fixed = {composing.key_of(argument) for argument in given}
+    fixed = {key_of(argument) for argument in given}
     kinds: dict[tuple[str, ...], list[str]] = {}
     for cell in cells_of(name):
-        free = [one for one in cell if composing.key_of(one) not in fixed]
+        free = [one for one in cell if key_of(one) not in fixed]
         # Cells that differ in numbers or corruptions only are built from the same classes.
         kind = tuple(one for one in free if not re.search(r"=[-+.e\d]+$|^test_", one))
         kinds.setdefault(kind, free)
@@ -132,14 +132,14 @@ def test_sweep_builds_the_parts_of_each_kind_of_cell(name, roots, tmp_path):
 @pytest.mark.parametrize("name", SWEEPS)
 def test_sweep_runs_a_cell_from_the_command_line(name, roots, tmp_path):
     given = settings_of(name, roots)
-    fixed = {composing.key_of(argument) for argument in given}
+    fixed = {key_of(argument) for argument in given}
     cells = [
         cell
         for cell in cells_of(name)
         if not any(one.startswith(("learn=task", "recipe.warm_start=$", "seed=1")) for one in cell)
     ]
     cell = min(cells or cells_of(name), key=_size)
-    free = [one for one in cell if composing.key_of(one) not in fixed]
+    free = [one for one in cell if key_of(one) not in fixed]
     params = ["hydra.sweeper.params=null"]
     if "grids" in composed(name).hydra.sweeper:
         params.append("hydra.sweeper.grids=[{}]")

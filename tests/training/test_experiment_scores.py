@@ -1,7 +1,9 @@
 """Which points every score is computed from, through Lightning's trainer and by their outcome."""
 
 import math
+from collections import defaultdict
 from itertools import pairwise
+from statistics import mean
 
 import pytest
 import torch
@@ -28,12 +30,13 @@ BASELINES = {"fps": FPSSampler, "random": RandomSampler, "voxel": VoxelSampler}
 def sampler(request):
     """A sampler whose generated points are spread, but so little that some matches repeat."""
     torch.manual_seed(0)
-    made = SAMPLERS[request.param](8)
+    sampler = SAMPLERS[request.param](8)
     with torch.no_grad():
-        for name, weight in made.named_parameters():
+        for name, weight in sampler.named_parameters():
+            factor = 4 if name.startswith("queries") else 1.5
             if weight.ndim == 2:
-                weight.mul_(4 if name.startswith("queries") else 1.5)
-    return made.eval()
+                weight.mul_(factor)
+    return sampler.eval()
 
 
 def experiment(sampler, m=8, **settings):
@@ -49,115 +52,159 @@ def expected_points(sampler, cloud, m):
     sampled = sampler(cloud[None], m)
     if not sampler.generates:
         return {"sampled": cloud[sampled.indices[0]]}
-    squares = (sampled.points[0][:, None] - cloud).square().sum(2)
+    generated = sampled.points[0]
+    squares = (generated[:, None] - cloud).square().sum(2)
     rows = squares.argmin(1).tolist()
     filled = plain_farthest(cloud, dict.fromkeys(rows), m)
-    sets = {"generated": sampled.points[0], "matched": cloud[rows], "completed": cloud[filled]}
+    sets = {
+        "generated": generated,
+        "matched": cloud[rows],
+        "completed": cloud[filled],
+    }
     if isinstance(sampler, SampleNet):
-        sets["projected"] = torch.stack(
-            [plain_projected(q, cloud, sampler) for q in sets["generated"]]
-        )
+        projected = [plain_projected(query, cloud, sampler) for query in generated]
+        sets["projected"] = torch.stack(projected)
     return sets
 
 
 def plain_projected(query, cloud, sampler):
     """The mean of the k points nearest to a query, weighted by the learned temperature."""
     squares = (query - cloud).square().sum(1).tolist()
-    nearest = sorted(range(len(cloud)), key=squares.__getitem__)[: sampler.k]
+    rows = sorted(range(len(cloud)), key=squares.__getitem__)
+    nearest = rows[: sampler.k]
     scale = float(sampler.temperature) ** 2
-    weights = [math.exp((squares[nearest[0]] - squares[row]) / scale) for row in nearest]
-    total = sum(weights)
-    return sum(weight / total * cloud[row] for weight, row in zip(weights, nearest, strict=True))
+    weights = {}
+    for row in nearest:
+        farther = squares[row] - squares[nearest[0]]
+        weights[row] = math.exp(-farther / scale)
+    total = sum(weights.values())
+    return sum(weight / total * cloud[row] for row, weight in weights.items())
 
 
 def expected_scores(module, clouds, sizes, baselines=BASELINES):
     """The mean fingerprint of every readout and baseline at every size."""
-    sums: dict[str, list[float]] = {}
+    prints: dict[str, list[float]] = defaultdict(list)
     for cloud in clouds:
         for m in sizes:
             prefix = f"m{m}/" if len(sizes) > 1 else ""
             sets = expected_points(module.sampler, cloud, m)
-            sets |= {name: make(m)(cloud[None]).points[0] for name, make in baselines.items()}
+            for name, make in baselines.items():
+                sets[name] = make(m)(cloud[None]).points[0]
             for name, points in sets.items():
                 assert points.shape == (m, 3)
-                score = float(module.task.net(points[None]))
-                sums.setdefault(f"{prefix}{name}", []).append(score)
+                prints[f"{prefix}{name}"].append(fingerprint(module, points))
         if baselines:
-            sums.setdefault("full", []).append(float(module.task.net(cloud[None])))
-    return {name: sum(values) / len(clouds) for name, values in sums.items()}
+            prints["full"].append(fingerprint(module, cloud))
+    return {name: mean(values) for name, values in prints.items()}
+
+
+def fingerprint(module, points):
+    return float(module.task.net(points[None]))
 
 
 def scores(trainer):
     """The logged fingerprints, by readout."""
-    return {
-        name.removesuffix("/fingerprint"): float(value)
-        for name, value in trainer.callback_metrics.items()
-        if name.endswith("/fingerprint")
-    }
+    found = {}
+    for name, value in trainer.callback_metrics.items():
+        readout, _, metric = name.rpartition("/")
+        if metric == "fingerprint":
+            found[readout] = float(value)
+    return found
 
 
 def assert_distinct(values):
     """Assert that no two scores are so near that a test could take one for the other."""
-    values = sorted(values)
-    assert all(after - before > 1e-3 for before, after in pairwise(values)), values
+    in_order = sorted(values)
+    for before, after in pairwise(in_order):
+        assert after - before > 1e-3, in_order
 
 
 def test_test_scores_each_readout_from_its_own_points(sampler, calls):
     data = numbered_clouds()
-    module, trainer = experiment(sampler), quiet_trainer(1)
+    module = experiment(sampler)
+    trainer = quiet_trainer(1)
+
     results = trainer.test(module, CloudLoader(data.test, 4), verbose=False)
+
     assert results == [{name: float(value) for name, value in trainer.callback_metrics.items()}]
-    got = scores(trainer)
-    want = expected_scores(module, data.test.points, module.sizes)
-    want = {f"test/{name}": value for name, value in want.items()}
-    # A sampler and the baseline of its kind return the same points; voxels share no match; what
-    # Gumbel subset sampling generates in the test are input points.
-    same: dict[type, tuple[str, ...]] = {FPSSampler: ("fps",), RandomSampler: ("random",)}
-    same |= {VoxelSampler: ("voxel", "completed"), GumbelSampler: ("matched",)}
-    twins = same.get(type(sampler), ())
-    if isinstance(getattr(sampler, "queries", None), LocalAnchors):
-        twins = ("matched", "completed")  # columns of three entries stay next to their anchors
-    assert_distinct(v for name, v in want.items() if name.rsplit("/")[-1] not in twins)
-    assert got == pytest.approx(want, abs=1e-4)
-    for m in module.sizes if sampler.generates else ():
-        sets = [expected_points(sampler, cloud, m)["matched"] for cloud in data.test.points]
-        counted = sum(len(rows.unique(dim=0)) for rows in sets) / len(sets)
-        size = f"m{m}/" if sampler.flexible else ""
-        found = trainer.callback_metrics[f"test/{size}matched/unique_points"]
-        assert found == pytest.approx(counted)
+    expected = expected_scores(module, data.test.points, module.sizes)
+    twins = twins_of(sampler)
+    assert_distinct(v for name, v in expected.items() if name.rsplit("/")[-1] not in twins)
+    assert scores(trainer) == pytest.approx(with_prefix("test/", expected), abs=1e-4)
+    if sampler.generates:
+        assert_distinct_points(trainer, sampler, data.test.points, module.sizes)
     main = "generated" if sampler.generates else "sampled"
     own_size = "m8/" if sampler.flexible else ""
     assert module.score_name == f"test/{own_size}{main}/fingerprint"
     for call in calls:
-        assert torch.equal(call.clouds, data.test.points[torch.tensor(call.labels) - 1000])
+        rows = torch.tensor(call.labels) - 1000
+        assert torch.equal(call.clouds, data.test.points[rows])
     assert not any(call.training for call in calls)
+
+
+def twins_of(sampler):
+    """The readouts and baselines whose points may equal those of another."""
+    if isinstance(getattr(sampler, "queries", None), LocalAnchors):
+        return ("matched", "completed")  # columns of three entries stay next to their anchors
+    twins: dict[type, tuple[str, ...]] = {
+        FPSSampler: ("fps",),
+        RandomSampler: ("random",),
+        VoxelSampler: ("voxel", "completed"),  # voxels share no match
+        GumbelSampler: ("matched",),  # it generates input points in the test
+    }
+    return twins.get(type(sampler), ())
+
+
+def with_prefix(prefix, values):
+    return {f"{prefix}{name}": value for name, value in values.items()}
+
+
+def assert_distinct_points(trainer, sampler, clouds, sizes):
+    """Assert that the distinct matched points are counted at every size."""
+    for m in sizes:
+        counts = []
+        for cloud in clouds:
+            matched = expected_points(sampler, cloud, m)["matched"]
+            counts.append(len(matched.unique(dim=0)))
+        size = f"m{m}/" if sampler.flexible else ""
+        counted = trainer.callback_metrics[f"test/{size}matched/unique_points"]
+        assert counted == pytest.approx(mean(counts))
 
 
 @pytest.mark.parametrize("sampler", ["mops", "samplenet-progressive", "fps"], indirect=True)
 def test_validation_scores_readouts_at_own_size(sampler):
-    data, m = numbered_clouds(), 5 if sampler.flexible else 8
-    module, trainer = experiment(sampler, m), quiet_trainer(1)
-    trainer.validate(module, CloudLoader(data.train, 3), verbose=False)
-    want = expected_scores(module, data.train.points, (m,), baselines={})
-    assert_distinct(want.values())
-    want = {f"val/{name}": value for name, value in want.items()}
-    assert scores(trainer) == pytest.approx(want, abs=1e-4)
+    clouds = numbered_clouds().train
+    m = 5 if sampler.flexible else 8
+    module = experiment(sampler, m)
+    trainer = quiet_trainer(1)
+
+    trainer.validate(module, CloudLoader(clouds, 3), verbose=False)
+
+    expected = expected_scores(module, clouds.points, (m,), baselines={})
+    assert_distinct(expected.values())
+    assert scores(trainer) == pytest.approx(with_prefix("val/", expected), abs=1e-4)
 
 
 @pytest.mark.parametrize("sampler", ["fmops", "fps"], indirect=True)
 def test_loss_of_each_size_is_that_of_main_readout(sampler):
-    data = numbered_clouds()
-    module, trainer = experiment(sampler), quiet_trainer(1)
-    trainer.test(module, CloudLoader(data.test, 4), verbose=False)
-    want = {}
+    clouds = numbered_clouds().test
+    module = experiment(sampler)
+    trainer = quiet_trainer(1)
+
+    trainer.test(module, CloudLoader(clouds, 4), verbose=False)
+
+    main = "generated" if sampler.generates else "sampled"
+    expected = {}
     for m in (5, 8):
-        main = "generated" if sampler.generates else "sampled"
-        points = [expected_points(sampler, cloud, m)[main] for cloud in data.test.points]
+        points = [expected_points(sampler, cloud, m)[main] for cloud in clouds.points]
         loss = module.task.net(torch.stack(points)).square().mean()
-        want[f"test/m{m}/loss/task"] = float(loss)
-    assert_distinct(want.values())
-    got = {name: float(v) for name, v in trainer.callback_metrics.items() if "/loss/" in name}
-    assert got == pytest.approx(want, rel=1e-4)
+        expected[f"test/m{m}/loss/task"] = float(loss)
+    losses = {}
+    for name, value in trainer.callback_metrics.items():
+        if "/loss/" in name:
+            losses[name] = float(value)
+    assert_distinct(expected.values())
+    assert losses == pytest.approx(expected, rel=1e-4)
 
 
 def test_scores_loss_of_nan_is_nan():

@@ -22,6 +22,7 @@ from tests.support.training import quiet_trainer
 
 MOPS: dict[str, Any] = {"feature_channels": (8, 6), "rho_channels": (12, 10), "alpha": 2.0}
 STILL = partial(torch.optim.SGD, lr=0.0)
+ONE_STEP: dict[str, Any] = {"limit_train_batches": 1, "limit_val_batches": 0}
 SNET: dict[str, Any] = {"feature_channels": (8, 6), "head_channels": (12,), "alpha": 2.0}
 
 
@@ -33,39 +34,57 @@ def fitted(sampler, epochs=1, task=None, recipe=None, augment=None, others=(), *
     trainer = quiet_trainer(epochs, **extra)
     train = CloudLoader(data.train, 4, shuffle=True, augment=augment, drop_last=True)
     trainer.fit(module, train, CloudLoader(data.test, 10))
-    return module, {name: float(value) for name, value in trainer.callback_metrics.items()}
+    return module, metrics_of(trainer)
+
+
+def metrics_of(trainer):
+    return {name: float(value) for name, value in trainer.callback_metrics.items()}
+
+
+def sizes_of(calls):
+    return [call.points.shape[1] for call in calls]
 
 
 def test_step_uses_temperature_of_its_progress():
     sampler = noting(MOPSNet, 8, tau_min=0.2, **MOPS)
+
     fitted(sampler, epochs=2)
-    seen = [(training, output.matrix.tau) for training, _, output in sampler.samples]
-    want = [(True, 0.2 ** (step / 7)) for step in range(8)]  # 2 epochs of 4 batches
-    want = [*want[:4], (False, 0.2), *want[4:], (False, 0.2)]
-    assert [phase for phase, _ in seen] == [phase for phase, _ in want]
-    assert [value for _, value in seen] == pytest.approx([value for _, value in want])
+
+    in_training = [training for training, _, _ in sampler.samples]
+    temperatures = [output.matrix.tau for _, _, output in sampler.samples]
+    annealed = [0.2 ** (step / 7) for step in range(8)]  # 2 epochs of 4 batches
+    assert in_training == [True] * 4 + [False] + [True] * 4 + [False]
+    assert temperatures == pytest.approx([*annealed[:4], 0.2, *annealed[4:], 0.2])
+
+
+def plain_projected(generated, clouds):
+    """The projection on the 3 nearest points at a temperature of 0.7."""
+    distances, rows = k_nearest(generated, clouds, 3)
+    cloud = torch.arange(len(clouds))[:, None, None]
+    weights = torch.softmax(-distances / 0.7**2, 2)
+    return (weights[..., None] * clouds[cloud, rows]).sum(2)
 
 
 @pytest.mark.parametrize("kind", [SampleNet, ProgressiveSampleNet])
 def test_task_net_of_samplenet_gets_projected_points_in_training_only(kind, calls):
     sampler = noting(kind, 8, k=3, **SNET)
     torch.nn.init.constant_(sampler.temperature, 0.7)
+
     fitted(sampler)
+
     trained = [output for training, _, output in sampler.samples if training]
-    sizes = sampler.training_sizes()
+    sizes = list(sampler.training_sizes())
     steps = [call for call in calls if call.training]
-    assert [call.points.shape[1] for call in steps] == [m for _ in trained for m in sizes]
-    for number, output in enumerate(trained):
-        for call, m in zip(steps[number * len(sizes) :], sizes, strict=False):
-            distances, rows = k_nearest(output.points[:, :m], call.clouds, 3)
-            near = call.clouds[torch.arange(4)[:, None, None], rows]
-            weights = torch.softmax(-distances / 0.7**2, 2)
-            projected = (weights[..., None] * near).sum(2)
-            torch.testing.assert_close(call.points, projected)
-            assert (call.points - output.points[:, :m]).abs().max() > 0.1
+    assert sizes_of(steps) == sizes * len(trained)
+    outputs = [output for output in trained for _ in sizes]
+    for call, output in zip(steps, outputs, strict=True):
+        m = call.points.shape[1]
+        generated = output.points[:, :m]
+        torch.testing.assert_close(call.points, plain_projected(generated, call.clouds))
+        assert (call.points - generated).abs().max() > 0.1
     (scored,) = [output for training, _, output in sampler.samples if not training]
     assert scored.soft_projected is None
-    generated, matched, _, projected = (call.points for call in calls if not call.training)
+    generated, matched, _, projected = [call.points for call in calls if not call.training]
     assert torch.equal(generated, scored.points)
     assert not torch.equal(generated, matched)
     assert not torch.equal(projected, generated)
@@ -86,44 +105,57 @@ PROGRESSIVE = partial(noting, ProgressiveSampleNet, 16, **SNET)
 )
 def test_losses_over_sizes_are_summed_or_averaged(how, make, name, loss, calls):
     sampler = make(size_reduction=how)
-    module, logged = fitted(sampler, limit_train_batches=1, limit_val_batches=0)
+
+    module, logged = fitted(sampler, **ONE_STEP)
+
     ((_, clouds, output),) = sampler.samples
-    sizes = [call.points.shape[1] for call in calls]
+    sizes = sizes_of(calls)
     assert len(sizes) > 2
     assert sizes == sorted(set(sizes))
-    share = 1 / len(sizes) if how == "mean" else 1
     with torch.no_grad():
-        own = sum(2 * loss(clouds, output.points[:, :m]) for m in sizes) * share
-        task = sum(module.task.net(call.points).square().mean() for call in calls) * share
-    assert logged[f"train/loss/{name}"] == pytest.approx(float(own), rel=1e-4)
-    assert logged["train/loss/task"] == pytest.approx(float(task), rel=1e-4)
+        of_sampler = [2 * loss(clouds, output.points[:, :m]) for m in sizes]
+        prints = [module.task.net(call.points) for call in calls]
+    own = float(sum(of_sampler))
+    task = float(sum(one.square().mean() for one in prints))
+    if how == "mean":
+        own /= len(sizes)
+        task /= len(sizes)
+    assert logged[f"train/loss/{name}"] == pytest.approx(own, rel=1e-4)
+    assert logged["train/loss/task"] == pytest.approx(task, rel=1e-4)
+    total = logged["train/loss/total"]
     parts = [value for key, value in logged.items() if key.startswith("train/loss/")]
-    assert 2 * logged["train/loss/total"] == pytest.approx(sum(parts), rel=1e-4)
-    assert logged["train/mean_loss"] == pytest.approx(logged["train/loss/total"], rel=1e-4)
-    assert logged["loss"] == pytest.approx(logged["train/loss/total"], rel=1e-4)
+    assert 2 * total == pytest.approx(sum(parts), rel=1e-4)
+    assert logged["train/mean_loss"] == pytest.approx(total, rel=1e-4)
+    assert logged["loss"] == pytest.approx(total, rel=1e-4)
     assert logged.get("train/tau") == (1.0 if isinstance(sampler, FMOPSNet) else None)
     readout = "projected" if isinstance(sampler, SampleNet) else "generated"
-    prints = torch.stack([module.task.net(call.points).detach() for call in calls]).mean()
-    assert logged[f"train/{readout}/fingerprint"] == pytest.approx(float(prints), abs=1e-4)
+    mean = float(torch.stack(prints).mean())
+    assert logged[f"train/{readout}/fingerprint"] == pytest.approx(mean, abs=1e-4)
 
 
 def test_straight_through_losses_are_means_over_generated_and_matched_points(calls):
     recipe = Recipe(straight_through=0.0)
-    one_step = {"limit_train_batches": 1, "limit_val_batches": 0}
-    module, logged = fitted(noting(MOPSNet, 8, **MOPS), recipe=recipe, **one_step)
-    generated, matched = (call.points for call in calls)
+
+    module, logged = fitted(noting(MOPSNet, 8, **MOPS), recipe=recipe, **ONE_STEP)
+
+    generated, matched = [call.points for call in calls]
     clouds = calls[0].clouds
     torch.testing.assert_close(matched, gather_points(clouds, match(generated, clouds)))
-    losses = [float(module.task.net(points).square().mean()) for points in (generated, matched)]
-    assert logged["train/loss/task"] == pytest.approx(sum(losses) / 2, rel=1e-4)
-    assert abs(losses[0] - losses[1]) > 0.1
-    scored = float(module.task.net(generated).mean())
+    prints = module.task.net(generated)
+    of_generated = float(prints.square().mean())
+    of_matched = float(module.task.net(matched).square().mean())
+    mean = (of_generated + of_matched) / 2
+    assert abs(of_generated - of_matched) > 0.1
+    assert logged["train/loss/task"] == pytest.approx(mean, rel=1e-4)
+    scored = float(prints.mean())
     assert logged["train/generated/fingerprint"] == pytest.approx(scored, abs=1e-4)
 
 
 def test_straight_through_begins_at_its_share_of_the_training(calls):
     recipe = Recipe(straight_through=0.5)
+
     fitted(noting(MOPSNet, 8, **MOPS), recipe=recipe, limit_val_batches=0)
+
     assert len(calls) == 1 + 1 + 2 + 2  # of 4 steps
 
 
@@ -153,40 +185,52 @@ def test_distillation_targets_are_whole_clouds_and_features_of_seen_points(augme
         task=ComparedTask(FingerprintOfMaxima()),
         recipe=Recipe(train_points=20, distillation=3.0, feature_distillation=0.5),
         augment=augment,
-        limit_train_batches=1,
-        limit_val_batches=0,
+        **ONE_STEP,
     )
+
     ((_, seen, output),) = sampler.samples
     (call,) = calls
-    assert (seen.shape[1], call.clouds.shape[1]) == (20, 40)
+    assert seen.shape[1] == 20
+    assert call.clouds.shape[1] == 40
     assert (module.distillation.table is None) == (augment is not None)
     with torch.no_grad():
-        apart = (module.task.net(output.points) - module.task.net(call.clouds)).square().mean()
-        found, wanted = (points.relu().amax(1) for points in (output.points, seen))
-    relative = ((found - wanted).square().sum(1) / wanted.square().sum(1)).mean()
-    assert logged["train/loss/distillation"] == pytest.approx(3 * float(apart), rel=1e-4)
-    assert logged["train/loss/feature_distillation"] == pytest.approx(float(relative) / 2, rel=1e-4)
+        predicted = module.task.net(output.points)
+        target = module.task.net(call.clouds)
+        features = output.points.relu().amax(1)
+        reference = seen.relu().amax(1)
+    apart = float((predicted - target).square().mean())
+    squares = (features - reference).square().sum(1)
+    relative = float((squares / reference.square().sum(1)).mean())
+    assert logged["train/loss/distillation"] == pytest.approx(3 * apart, rel=1e-4)
+    assert logged["train/loss/feature_distillation"] == pytest.approx(relative / 2, rel=1e-4)
 
 
 def test_losses_under_several_nets_are_means_and_scores_of_the_first(calls):
-    first, other = FingerprintOfMaxima(), FingerprintOfMaxima()
+    first = FingerprintOfMaxima()
+    other = FingerprintOfMaxima()
     torch.nn.init.constant_(other.weight, 2.5)
+
+    of_first = logged_under(first)
+    of_other = logged_under(other)
+    of_both = logged_under(first, other)
+
+    for key in ("train/loss/task", "train/loss/feature_distillation"):
+        mean = (of_first[key] + of_other[key]) / 2
+        assert of_both[key] == pytest.approx(mean, rel=1e-4)
+    assert of_first["train/loss/task"] != pytest.approx(of_other["train/loss/task"], rel=0.1)
+    scores = [name for name in of_first if "loss" not in name]
+    assert [of_both[name] for name in scores] == [of_first[name] for name in scores]
+
+
+def logged_under(*nets):
+    """The metrics of a training under several frozen nets."""
     recipe = Recipe(distillation=3.0, feature_distillation=0.5, straight_through=0.0)
-    logged = {}
-    for nets in ((first,), (other,), (first, other)):
-        task, *others = map(ComparedTask, nets)
-        module, logged[nets] = fitted(
-            noting(MOPSNet, 8, **MOPS), task=task, others=others, recipe=recipe, epochs=2
-        )
-        assert not any(net.weight.requires_grad for net in nets)
-        assert not any(one.training for one in module.other_tasks)
-    one, two, both = logged.values()
-    for name in ("task", "feature_distillation"):
-        values = [found[f"train/loss/{name}"] for found in (one, two, both)]
-        assert values[2] == pytest.approx((values[0] + values[1]) / 2, rel=1e-4)
-    assert one["train/loss/task"] != pytest.approx(two["train/loss/task"], rel=0.1)
-    own = [name for name in one if "/loss/" not in name and "loss" not in name]
-    assert [both[name] for name in own] == [one[name] for name in own]
+    task, *others = [ComparedTask(net) for net in nets]
+    sampler = noting(MOPSNet, 8, **MOPS)
+    module, logged = fitted(sampler, task=task, others=others, recipe=recipe, epochs=2)
+    assert not any(net.weight.requires_grad for net in nets)
+    assert not any(other.training for other in module.other_tasks)
+    return logged
 
 
 def test_nets_drawn_in_a_step_are_compared_with_predictions_of_the_first(calls):
@@ -202,21 +246,25 @@ def test_nets_drawn_in_a_step_are_compared_with_predictions_of_the_first(calls):
     tasks = [NotedTask(Fingerprint()) for _ in range(4)]
     for number, task in enumerate(tasks):
         torch.nn.init.constant_(next(task.net.parameters()), 1 + number)
+    first, *others = tasks
     recipe = Recipe(distillation=3.0, nets_per_step=2)
-    _, logged = fitted(
-        noting(MOPSNet, 8, **MOPS), epochs=2, task=tasks[0], others=tasks[1:], recipe=recipe
-    )
-    steps = [used[i : i + 3] for i in range(0, len(used), 3)]
-    drawn = [[tasks.index(task) for task, *_ in step] for step in steps]
-    assert len(drawn) == 8
-    assert all(step[0] == 0 and len(set(step)) == 3 for step in drawn)
-    assert {number for step in drawn for number in step} == {0, 1, 2, 3}
+    sampler = noting(MOPSNet, 8, **MOPS)
+
+    _, logged = fitted(sampler, epochs=2, task=first, others=others, recipe=recipe)
+
+    numbers = [tasks.index(task) for task, _, _ in used]
+    assert len(numbers) == 8 * 3
+    assert numbers[::3] == [0] * 8
+    for one, other in zip(numbers[1::3], numbers[2::3], strict=True):
+        assert one != other
+        assert 0 not in (one, other)
+    assert set(numbers) == {0, 1, 2, 3}
+    apart = 0.0
     with torch.no_grad():
-        apart = [
-            (task.net(points) - tasks[0].net(clouds)).square().mean()
-            for task, points, clouds in steps[-1]
-        ]
-    assert logged["train/loss/distillation"] == pytest.approx(float(sum(apart)), rel=1e-4)
+        for task, points, clouds in used[-3:]:
+            difference = task.net(points) - first.net(clouds)
+            apart += float(difference.square().mean())
+    assert logged["train/loss/distillation"] == pytest.approx(apart, rel=1e-4)
 
 
 class InTests(recording.MeanFingerprint):
@@ -227,13 +275,18 @@ class InTests(recording.MeanFingerprint):
 
 class WithMoreInTests(RecordingTask):
     def metrics(self, training=False):
-        return collection(recording.MeanFingerprint(), *([] if training else [InTests()]))
+        if training:
+            return collection(recording.MeanFingerprint())
+        return collection(recording.MeanFingerprint(), InTests())
 
 
 def test_training_logs_means_over_clouds_of_uneven_batches():
     module = Experiment(WithMoreInTests(Fingerprint()), None, "task", STILL)
-    data, trainer = numbered_clouds(), quiet_trainer(1, limit_val_batches=0)
+    data = numbered_clouds()
+    trainer = quiet_trainer(1, limit_val_batches=0)
+
     trainer.fit(module, CloudLoader(data.train, 6), CloudLoader(data.test, 4))
+
     prints = module.task.net(data.train.points).detach()
     logged = trainer.callback_metrics
     torch.testing.assert_close(logged["train/mean_loss"], prints.square().mean())
@@ -247,12 +300,15 @@ def test_training_logs_means_over_clouds_of_uneven_batches():
 
 def test_random_numbers_of_a_step_depend_on_epoch_and_step(calls):
     for _ in range(2):
-        fitted(noting(FMOPSNet, 16, size_sampling="uniform", **MOPS), 2, limit_val_batches=0)
-    sizes = [call.points.shape[1] for call in calls]
-    first, second, *again = (sizes[start : start + 4] for start in range(0, 16, 4))
-    assert again == [first, second]
-    assert first != second
-    assert len(set(first)) > 1
+        sampler = noting(FMOPSNet, 16, size_sampling="uniform", **MOPS)
+        fitted(sampler, epochs=2, limit_val_batches=0)
+
+    sizes = sizes_of(calls)
+    first_epoch = sizes[:4]
+    second_epoch = sizes[4:8]
+    assert sizes[8:] == first_epoch + second_epoch
+    assert first_epoch != second_epoch
+    assert len(set(first_epoch)) > 1
 
 
 def test_schedule_sets_rate_of_each_step_of_the_run():
@@ -260,40 +316,51 @@ def test_schedule_sets_rate_of_each_step_of_the_run():
 
     def optimizer(parameters):
         made = torch.optim.SGD(parameters, lr=1e-3)
-        made.register_step_pre_hook(lambda one, *_: rates.append(one.param_groups[0]["lr"]))
+        made.register_step_pre_hook(note_rate)
         return made
+
+    def note_rate(made, *_):
+        rates.append(made.param_groups[0]["lr"])
 
     schedule = partial(exponential, end_lr=1e-5)
     module = Experiment(RecordingTask(Fingerprint()), None, "task", optimizer, schedule)
     data = numbered_clouds()
-    loaders = CloudLoader(data.train, 4, shuffle=True), CloudLoader(data.test, 4)
-    quiet_trainer(2, limit_val_batches=0).fit(module, *loaders)
-    # 2 epochs of 4 batches.
-    assert rates == pytest.approx([1e-3 * 0.01 ** (step / 7) for step in range(8)])
+    train = CloudLoader(data.train, 4, shuffle=True)
+
+    quiet_trainer(2, limit_val_batches=0).fit(module, train, CloudLoader(data.test, 4))
+
+    wanted = [1e-3 * 0.01 ** (step / 7) for step in range(8)]  # 2 epochs of 4 batches
+    assert rates == pytest.approx(wanted)
 
 
 @pytest.mark.parametrize("learn", ["sampler", "joint", "task"])
 def test_step_follows_the_gradient_of_the_total_loss(learn, calls):
-    task, sampler = RecordingTask(Fingerprint()), MOPSNet(8, **MOPS)
-    before = copy.deepcopy((task, sampler))
+    task = RecordingTask(Fingerprint())
+    sampler = MOPSNet(8, **MOPS)
+    old_task, old_sampler = copy.deepcopy((task, sampler))
     trained = None if learn == "task" else sampler
     module = Experiment(task, trained, learn, partial(torch.optim.SGD, lr=0.01))
     data = numbered_clouds()
-    trainer = quiet_trainer(1, limit_train_batches=1, limit_val_batches=0)
-    trainer.fit(module, CloudLoader(data.train, 4, shuffle=True), CloudLoader(data.test, 4))
+    train = CloudLoader(data.train, 4, shuffle=True)
+
+    quiet_trainer(1, **ONE_STEP).fit(module, train, CloudLoader(data.test, 4))
+
     ((_, clouds, _, _),) = calls
-    old_task, old_sampler = before
-    output = old_sampler.train()(clouds)
-    points = clouds if learn == "task" else output.points
-    loss = old_task.net(points).square().mean()
-    if learn != "task":
-        loss = loss + 2 * subset_loss(clouds, points)
+    if learn == "task":
+        loss = old_task.net(clouds).square().mean()
+    else:
+        points = old_sampler.train()(clouds).points
+        loss = old_task.net(points).square().mean() + 2 * subset_loss(clouds, points)
     loss.backward()
-    for old, new, learns in (
-        (old_task, task, learn != "sampler"),
-        (old_sampler, sampler, learn != "task"),
-    ):
-        for was, now in zip(old.parameters(), new.parameters(), strict=True):
-            gradient = was.grad if learns else torch.zeros_like(was)
-            assert gradient is not None
-            torch.testing.assert_close(now.detach(), was.detach() - 0.01 * gradient)
+    assert_stepped(old_task, task, learn != "sampler")
+    assert_stepped(old_sampler, sampler, learn != "task")
+
+
+def assert_stepped(old, new, learns):
+    """Assert one step of gradient descent with a rate of 0.01, or none."""
+    for before, after in zip(old.parameters(), new.parameters(), strict=True):
+        expected = before.detach()
+        if learns:
+            assert before.grad is not None
+            expected = expected - 0.01 * before.grad
+        torch.testing.assert_close(after.detach(), expected)

@@ -55,10 +55,14 @@ def _add(arguments: list[str], prog: str) -> list[str]:
     chosen = parser.parse_args(arguments)
     from mops_lightning.zoo import publish
 
-    name, own = chosen.name, os.environ.get(names.VARIABLE)
-    folder = chosen.folder or (names.folders()[0] if own else None)
+    name = chosen.name
+    folder = chosen.folder
     if folder is None:
-        raise UserError(f"give --folder FOLDER, or set ${names.VARIABLE} to a folder of models.")
+        if not os.environ.get(names.VARIABLE):
+            raise UserError(
+                f"give --folder FOLDER, or set ${names.VARIABLE} to a folder of models."
+            )
+        folder = names.folders()[0]
     path = publish.add(
         chosen.run,
         name,
@@ -75,8 +79,8 @@ def _add(arguments: list[str], prog: str) -> list[str]:
     ]
     if record["config"]["learn"] != "task" and "task_weights" not in record["files"]:
         lines.append(f"Its task net is not a model: evaluate={name} also needs weights=FILE.")
-    found = names.available().get(name)
-    if found is None or not found.samefile(path):
+    present = names.available().get(name)
+    if present is None or not present.samefile(path):
         lines.append(f"To find it by name, set {names.VARIABLE}={folder}.")
     return lines
 
@@ -93,45 +97,72 @@ def _table() -> list[str]:
         task = card["record"]["config"]["names"]["task"]
         licence = card["licence"].partition(";")[0]
         rows.append((name, task, _sizes(card), _figures(card), licence, _megabytes(path)))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        lines.append("  ".join(cells).rstrip())
     return lines + unreadable
 
 
 def _card(path: Path) -> list[str]:
     card = model_file.read_card(path)
     record = card["record"]
-    config, commit = record["config"], record["git"]["commit"]
+    config = record["config"]
     chosen = config["names"]
-    alone = config["learn"] == "task"
-    classes = config["dataset"].get("classes")
-    data = chosen["dataset"] + (f" ({', '.join(map(str, classes))})" if classes else "")
-    points = config["dataset"].get("n_points")
-    wide = f", wide layers in {card['precision']}" if card["precision"] != "float32" else ""
+    if config["learn"] == "task":
+        net = f"{chosen['net']} (task net)"
+    else:
+        net = f"{chosen['sampler']} (sampler)"
     lines = {
         "name": card["name"],
-        "net": f"{chosen['net']} (task net)" if alone else f"{chosen['sampler']} (sampler)",
+        "net": net,
         "task": f"{chosen['task']} by {chosen['net']}",
         "sizes": _sizes(card),
         "input": "clouds in the unit sphere (centroid at the origin, largest distance from it 1)",
         "test figures": _figures(card),
-        "data": data + (f", {points} points per cloud in training" if points else ""),
+        "data": _data(config),
         "recipe": " ".join(record["overrides"]) or "the defaults",
         "epochs": str(config["trainer"]["max_epochs"]),
         "seed": str(record["seed"]),
-        "commit": (commit or "unknown") + (" (changed)" if record["git"]["dirty"] else ""),
+        "commit": _commit(record),
         "task net": record["files"].get("task_weights", "").partition(names.PIN)[0],
         "classes": ", ".join(card["classes"]),
         "licence": card["licence"],
         "notes": card["notes"],
-        "file": f"{path}, {_megabytes(path)} MB{wide}",
+        "file": _file(path, card),
         "sha256": f"{card['sha256']} (of the tensors)",
     }
-    width = max(map(len, lines)) + 2
-    return [f"{key:<{width}}{' '.join(value.split())}" for key, value in lines.items() if value]
+    width = max(len(key) for key in lines) + 2
+    shown = []
+    for key, value in lines.items():
+        if value:
+            shown.append(key.ljust(width) + " ".join(value.split()))
+    return shown
+
+
+def _data(config: dict[str, Any]) -> str:
+    """Return the name of the data of a training, with the classes and points that it chose."""
+    text = str(config["names"]["dataset"])
+    classes = config["dataset"].get("classes")
+    points = config["dataset"].get("n_points")
+    if classes:
+        text += f" ({', '.join(map(str, classes))})"
+    if points:
+        text += f", {points} points per cloud in training"
+    return text
+
+
+def _commit(record: dict[str, Any]) -> str:
+    text = record["git"]["commit"] or "unknown"
+    return f"{text} (changed)" if record["git"]["dirty"] else text
+
+
+def _file(path: Path, card: dict[str, Any]) -> str:
+    text = f"{path}, {_megabytes(path)} MB"
+    if card["precision"] != "float32":
+        text += f", wide layers in {card['precision']}"
+    return text
 
 
 def _sizes(card: dict[str, Any]) -> str:

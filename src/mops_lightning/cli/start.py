@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mops_lightning.cli.effect import check_effect
 from mops_lightning.config import distributed, overrides, settings
-from mops_lightning.config.compose import explain
+from mops_lightning.config.explain import explain
 from mops_lightning.errors import USER_ERROR, UserError, end, end_in_one_line, line_about, one_line
 from mops_lightning.zoo import names
 
@@ -95,8 +95,7 @@ def _is_from_lightning(error: Exception) -> bool:
 
 def _is_for_lightning(path: str) -> bool:
     """Return whether a setting is an argument of one of Lightning's classes."""
-    is_checked_by_us = path in settings.INSIDE and settings.of(path).limits is not None
-    return path.startswith(LIGHTNING) and not is_checked_by_us
+    return path.startswith(LIGHTNING) and settings.limits(path) is None
 
 
 def check_paths(cfg: DictConfig) -> None:

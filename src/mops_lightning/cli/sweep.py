@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.cli.start import line_about_run
 from mops_lightning.config import settings
-from mops_lightning.config.settings import Affects
+from mops_lightning.config.declaration import Affects
 from mops_lightning.errors import Interrupted, UserError, as_line, one_line
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.records import run_record
@@ -46,46 +46,63 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
     Raises:
         Interrupted: the user stopped the sweep.
     """
-    from mops_lightning.training.run.run import STARTED, checked, claim, run
-
     try:
         with lock(folder):
-            (folder / FAILED).unlink(missing_ok=True)
-            remove_temporary(folder)
-            if (folder / ASIDE / MOVING).is_dir():
-                _move_aside(folder)  # an earlier start was killed in the middle of it
-            cfg = checked(cfg, overrides)  # an evaluation has the settings of its run
-            earlier = _earlier(cfg, folder)
-            status, score = earlier or ("killed", math.nan)
-            if status == "completed":
-                log.info(f"{folder}: already completed, score {score:.6g}")
-                return score
-            if earlier:
-                _move_aside(folder)
-            if (folder / ASIDE).is_dir():
-                checkpoint = _checkpoint(cfg, folder)
-                if checkpoint and cfg.ckpt_path is None:
-                    cfg.ckpt_path = str(checkpoint)
-                action = f"resuming from {cfg.ckpt_path}" if cfg.ckpt_path else "starting again"
-                log.info(f"{folder}: the last attempt was {status}; {action}")
-            # A process that was killed before it wrote a record left this file.
-            (folder / STARTED).unlink(missing_ok=True)
-            claim(folder)
-            new = run(cfg, folder, overrides, claimed=True).score
-            return math.nan if new is None else float(new)
+            return _run_or_repeat(cfg, folder, overrides)
     except (Interrupted, BrokenPipeError):
         raise
     except Timeout:
         log.warning(f"{folder}: skipped, because another process runs this cell")
     except Exception as error:
-        text = line_about_run(error, overrides)
-        if text is None:
-            log.exception(f"{folder} failed")
-        else:
-            log.error(as_line(f"{folder} failed: {text}"))
-        with suppress(OSError):  # the disk may be full
-            (folder / FAILED).write_text(f"{text or one_line(error)}\n")
+        _note_failure(error, folder, overrides)
     return math.nan
+
+
+def _run_or_repeat(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
+    """Run a cell whose folder is locked, unless it is completed, and return its score."""
+    from mops_lightning.training.run.run import STARTED, checked, claim, run
+
+    (folder / FAILED).unlink(missing_ok=True)
+    remove_temporary(folder)
+    if (folder / ASIDE / MOVING).is_dir():
+        _move_aside(folder)  # an earlier start was killed in the middle of it
+    cfg = checked(cfg, overrides)  # an evaluation has the settings of its run
+    status = "killed"
+    earlier = _earlier(cfg, folder)
+    if earlier is not None:
+        if earlier.status == "completed":
+            score = _number(earlier.score)
+            log.info(f"{folder}: already completed, score {score:.6g}")
+            return score
+        status = earlier.status
+        _move_aside(folder)
+    if (folder / ASIDE).is_dir():
+        checkpoint = _checkpoint(cfg, folder)
+        if checkpoint and cfg.ckpt_path is None:
+            cfg.ckpt_path = str(checkpoint)
+        action = f"resuming from {cfg.ckpt_path}" if cfg.ckpt_path else "starting again"
+        log.info(f"{folder}: the last attempt was {status}; {action}")
+    # A process that was killed before it wrote a record left this file.
+    (folder / STARTED).unlink(missing_ok=True)
+    claim(folder)
+    return _number(run(cfg, folder, overrides, claimed=True).score)
+
+
+def _number(score: float | None) -> float:
+    """Return a score, NaN for none."""
+    return math.nan if score is None else float(score)
+
+
+def _note_failure(error: Exception, folder: Path, overrides: list[str]) -> None:
+    """Say in the log and in the cell's folder why the cell failed."""
+    text = line_about_run(error, overrides)
+    if text is None:
+        log.exception(f"{folder} failed")
+        text = one_line(error)
+    else:
+        log.error(as_line(f"{folder} failed: {text}"))
+    with suppress(OSError):  # the disk may be full
+        (folder / FAILED).write_text(f"{text}\n")
 
 
 def lock(folder: Path) -> FileLock:
@@ -97,8 +114,8 @@ def lock(folder: Path) -> FileLock:
     return FileLock(folder / ".lock", timeout=0)
 
 
-def _earlier(cfg: DictConfig, folder: Path) -> tuple[str, float] | None:
-    """Return status and score of the record in the cell's folder.
+def _earlier(cfg: DictConfig, folder: Path) -> RunRecord | None:
+    """Return the record in the cell's folder.
 
     Raises:
         UserError: it is damaged, or has other settings.
@@ -109,25 +126,27 @@ def _earlier(cfg: DictConfig, folder: Path) -> tuple[str, float] | None:
     different = _differences(cfg, record)
     if different:
         # The setting itself, not one that is derived from it.
-        key = min(different, key=lambda one: (one.count("."), one))
-        ours, other = different[key]
+        key = min(different, key=lambda path: (path.count("."), path))
+        present, recorded = different[key]
         raise UserError(
-            f"its result has other settings: {key} was {other}, got {ours}. Give the sweep another "
-            f"folder with hydra.sweep.dir=FOLDER; if {key} is swept, add it to hydra.sweep.subdir; "
-            "or move the cell's folder away."
+            f"its result has other settings: {key} was {recorded}, got {present}. "
+            f"Give the sweep another folder with hydra.sweep.dir=FOLDER; if {key} is swept, "
+            "add it to hydra.sweep.subdir; or move the cell's folder away."
         )
-    return record.status, math.nan if record.score is None else record.score
+    return record
 
 
 def _differences(cfg: DictConfig, record: RunRecord) -> dict[str, tuple[Any, Any]]:
     """Return the dotted settings that differ but must not: the present and the earlier value."""
-    mine = dotted(OmegaConf.to_container(cfg, resolve=True))
-    theirs = dotted(record.config)
-    return {
-        key: (mine.get(key), theirs.get(key))
-        for key in {**mine, **theirs}
-        if mine.get(key) != theirs.get(key) and settings.of(key).affects is not Affects.NOTHING
-    }
+    present = dotted(OmegaConf.to_container(cfg, resolve=True))
+    recorded = dotted(record.config)
+    different = {}
+    for key in {**present, **recorded}:
+        values = (present.get(key), recorded.get(key))
+        affects_results = settings.of(key).affects is not Affects.NOTHING
+        if values[0] != values[1] and affects_results:
+            different[key] = values
+    return different
 
 
 def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
@@ -137,7 +156,7 @@ def _checkpoint(cfg: DictConfig, folder: Path) -> Path | None:
     """
     from mops_lightning.training.checkpoint import CHECKPOINT
 
-    for attempt in sorted(_attempts(folder), key=lambda path: int(path.name), reverse=True):
+    for attempt in sorted(_attempts(folder), key=_attempt_number, reverse=True):
         try:
             record = run_record.read(attempt)
         except UserError:
@@ -154,6 +173,10 @@ def _attempts(folder: Path) -> list[Path]:
     return [path for path in (folder / ASIDE).glob("*") if path.name.isdigit()]
 
 
+def _attempt_number(path: Path) -> int:
+    return int(path.name)
+
+
 def _move_aside(folder: Path) -> None:
     """Move an attempt into a numbered folder.
 
@@ -162,8 +185,9 @@ def _move_aside(folder: Path) -> None:
     """
     moving = folder / ASIDE / MOVING
     moving.mkdir(parents=True, exist_ok=True)
-    paths = [path for path in folder.iterdir() if path.name not in STAYS]
-    for path in sorted(paths, key=lambda path: path.name == run_record.FILE):
-        path.rename(moving / path.name)
-    numbers = [int(path.name) for path in _attempts(folder)]
+    names = {path.name for path in folder.iterdir()} - {*STAYS}
+    record = names & {run_record.FILE}
+    for name in (*sorted(names - record), *record):
+        (folder / name).rename(moving / name)
+    numbers = [_attempt_number(path) for path in _attempts(folder)]
     moving.rename(folder / ASIDE / str(max(numbers, default=0) + 1))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mops_lightning import errors
-from mops_lightning.config.compose import explain
+from mops_lightning.config.explain import explain
 from mops_lightning.config.given import check_overrides
 from mops_lightning.config.groups import conf_dir
 from mops_lightning.config.overrides import as_typed, key, readable, with_home, with_own_classes
@@ -48,18 +48,7 @@ def _run() -> None:
     # Makes Hydra raise instead of printing its own shortened traceback.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
-        if "${" in str(Path.cwd()):
-            raise errors.UserError(
-                "the path of the current folder contains ${, which Hydra resolves. Use another."
-            )
-        sys.argv[1:] = flags_first(sys.argv[1:])
-        check_overrides(sys.argv[1:])
-        if any(key(argument) == "evaluate" for argument in sys.argv[1:]):
-            from mops_lightning.training.evaluation import command_line
-
-            sys.argv[1:] = command_line(sys.argv[1:])
-        readables = [with_home(readable(argument)) for argument in sys.argv[1:]]
-        sys.argv[1:] = with_own_classes(readables)
+        sys.argv[1:] = _for_hydra(sys.argv[1:])
         app = hydra.main(config_path=str(conf_dir()), config_name="config", version_base="1.3")
         app(_job)()
     except Exception as error:
@@ -68,11 +57,34 @@ def _run() -> None:
         of_hydra = HydraException | OmegaConfBaseException | YAMLError | UnicodeDecodeError
         if isinstance(error, of_hydra):
             errors.end(NAME, explain(error, sys.argv[1:]), errors.USER_ERROR)
-        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-        raised_in = frame.f_globals["__name__"]
-        if type(error) is ValueError and raised_in.startswith(ONE_LINE_FROM):
+        if type(error) is ValueError and _module_of(error).startswith(ONE_LINE_FROM):
             errors.end(NAME, " ".join(str(error).split()), errors.USER_ERROR)
         errors.end_in_one_line(NAME, error)
+
+
+def _module_of(error: Exception) -> str:
+    """Return the name of the module that raised an error."""
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    return str(frame.f_globals["__name__"])
+
+
+def _for_hydra(arguments: list[str]) -> list[str]:
+    """Return the user's arguments in the form that Hydra reads.
+
+    Raises:
+        UserError: there is a mistake in them.
+    """
+    if "${" in str(Path.cwd()):
+        raise errors.UserError(
+            "the path of the current folder contains ${, which Hydra resolves. Use another."
+        )
+    arguments = flags_first(arguments)
+    check_overrides(arguments)
+    if any(key(argument) == "evaluate" for argument in arguments):
+        from mops_lightning.training.evaluation import command_line
+
+        arguments = command_line(arguments)
+    return with_own_classes([with_home(readable(argument)) for argument in arguments])
 
 
 def flags_first(arguments: list[str]) -> list[str]:

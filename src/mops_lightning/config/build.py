@@ -3,7 +3,7 @@
 import inspect
 import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import update_wrapper
 from typing import Any
 
@@ -48,12 +48,7 @@ def build(node: Any, where: str = "", **extra: Any) -> Any:
     from hydra.errors import InstantiationException
     from hydra.utils import instantiate
 
-    below: dict[str, Any] = {}
-    for key in node if isinstance(node, DictConfig) else ():
-        name = str(key)
-        child = None if OmegaConf.is_missing(node, key) else node[key]
-        if name not in extra and isinstance(child, DictConfig) and "_target_" in child:
-            below[name] = build(child, f"{where}.{name}" if where else name)
+    below = _built_below(node, where, extra)
     try:
         made = instantiate(node, **below, **extra, _convert_="all")
     except (InstantiationException, *REJECTIONS) as error:
@@ -66,6 +61,22 @@ def build(node: Any, where: str = "", **extra: Any) -> Any:
     if isinstance(node, DictConfig) and node.get("_partial_"):
         return Deferred(made, _unresolved(node), where)
     return made
+
+
+def _built_below(node: Any, where: str, extra: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the objects that the nodes below a node describe, except those that code gives."""
+    built: dict[str, Any] = {}
+    if not isinstance(node, DictConfig):
+        return built
+    for key in node:
+        name = str(key)
+        if name in extra or OmegaConf.is_missing(node, key):
+            continue
+        child = node[key]
+        if isinstance(child, DictConfig) and "_target_" in child:
+            path = f"{where}.{name}" if where else name
+            built[name] = build(child, path)
+    return built
 
 
 class Deferred:
@@ -108,13 +119,27 @@ class Deferred:
         return self
 
 
-def build_as(kind: type, node: DictConfig, where: str, **extra: Any) -> Any:
+def build_as(
+    kind: type,
+    node: DictConfig,
+    where: str,
+    offered: Mapping[str, Any] | None = None,
+    **extra: Any,
+) -> Any:
     """Make the object that a node describes, which must be of a class; see ``build``.
+
+    Args:
+        kind: the class.
+        node: a configuration with ``_target_``.
+        where: the dotted path of the node in the configuration.
+        offered: further arguments by name, of which the constructor is given those that it takes.
+        **extra: further arguments of the constructor.
 
     Raises:
         UserError: also if it is of another class.
     """
-    made = build(node, where, **extra)
+    taken = {name: value for name, value in (offered or {}).items() if takes(node, name)}
+    made = build(node, where, **taken, **extra)
     if not isinstance(made, kind):
         raise UserError(
             f"{where}: {node.get('_target_')} must return a {kind.__name__}, got "
@@ -172,21 +197,24 @@ def _with_path(
         where: its dotted path.
         extra: arguments that code gave, not the configuration.
     """
-    found = re.match(r"([A-Za-z_]\w*)(?![\w.])", str(error))
-    name = found.group(1) if found else ""
-    from_code = name in extra and name not in node
-    if not (where and name) or from_code or name not in signature(str(node["_target_"]), where):
+    text = str(error)
+    argument = re.match(r"([A-Za-z_]\w*)(?![\w.])", text)
+    if argument is None or not where:
         return error
-    value = node.get(name)
-    shared = re.fullmatch(r"\$\{(\w+)\}", value) if isinstance(value, str) else None
-    setting = shared.group(1) if shared else f"{where}.{name}"
-    return UserError(setting + str(error)[len(name) :])
+    name = argument.group(1)
+    is_from_code = name in extra and name not in node
+    if is_from_code or name not in signature(str(node["_target_"]), where):
+        return error
+    setting = f"{where}.{name}"
+    shared = re.fullmatch(r"\$\{(\w+)\}", str(node.get(name)))
+    if shared:
+        setting = shared.group(1)
+    return UserError(setting + text[len(name) :])
 
 
-def accepted(node: DictConfig, offered: dict[str, Any]) -> dict[str, Any]:
-    """Return the offered arguments that a node's constructor takes."""
-    parameters = signature(str(node["_target_"]), "")
-    return {name: value for name, value in offered.items() if name in parameters}
+def takes(node: DictConfig, name: str) -> bool:
+    """Return whether a node's constructor has an argument of this name."""
+    return name in signature(str(node["_target_"]), "")
 
 
 def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
@@ -213,16 +241,21 @@ def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
             continue
         own = _own_signature(vars(cls)["__init__"])
         own.pop("self", None)
-        rest = [name for name, p in own.items() if p.kind is p.VAR_KEYWORD]
-        named = {name: p for name, p in own.items() if name not in rest}
+        named = _without_keywords(own)
+        passes_on = len(named) < len(own)
         if parameters:  # what a base must be given, the class above gives it
-            named = {name: p for name, p in named.items() if p.default is not p.empty}
+            named = {name: one for name, one in named.items() if one.default is not one.empty}
         parameters = {**named, **parameters}
-        if not rest:
+        if not passes_on:
             return parameters
     if target in PASSED_ON:
         return {**signature(PASSED_ON[target], where), **parameters}
     return {**parameters, **own}  # the target takes any further argument
+
+
+def _without_keywords(parameters: dict[str, inspect.Parameter]) -> dict[str, inspect.Parameter]:
+    """Return parameters without ``**kwargs``, by which a class passes arguments to its bases."""
+    return {name: one for name, one in parameters.items() if one.kind is not one.VAR_KEYWORD}
 
 
 def _own_signature(function: Any) -> dict[str, inspect.Parameter]:

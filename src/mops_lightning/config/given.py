@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from mops_lightning.config import settings
+from mops_lightning.config.declaration import Setting
 from mops_lightning.config.groups import choice_groups
 from mops_lightning.config.overrides import key as key_of
 from mops_lightning.config.overrides import parse_override
@@ -35,7 +36,8 @@ def check_overrides(arguments: Sequence[str]) -> None:
     for argument in arguments:
         override = parse_override(argument)
         name = key_of(argument)
-        if name.partition(".")[0] == "names":
+        top = name.partition(".")[0]
+        if top == "names":
             raise UserError(f"{argument}: names follow from the chosen groups. Leave it out.")
         if override is not None:
             _check(argument, name, override, groups)
@@ -46,8 +48,8 @@ def _check(argument: str, name: str, override: "Override", groups: list[str]) ->
     if not name:
         raise UserError(f"{argument!r} has no key. Settings are KEY=VALUE.")
     value: Any = override.value()
-    if override.is_range_sweep() and abs(value.stop - value.start) > MOST_VALUES * abs(value.step):
-        raise UserError(f"{argument}: more than 100,000 values. Give fewer.")
+    if override.is_range_sweep():
+        _check_range(argument, value)
     if override.is_delete():
         _check_removal(argument, name, value, groups)
     elif name == "hydra.verbose" and type(value) in (int, float, dict, type(None)):
@@ -58,13 +60,22 @@ def _check(argument: str, name: str, override: "Override", groups: list[str]) ->
         _check_limits(name, value)
 
 
+def _check_range(argument: str, swept: Any) -> None:
+    """Refuse a range of more values than any sweep has."""
+    length = abs(swept.stop - swept.start)
+    if length > MOST_VALUES * abs(swept.step):
+        raise UserError(f"{argument}: more than 100,000 values. Give fewer.")
+
+
 def _check_removal(argument: str, name: str, value: Any, groups: list[str]) -> None:
     """Check the removal of a setting or of a choice, such as ``~logger``."""
     group = name.partition("@")[0]
-    declared = settings.declared().get(group)
-    if declared is not None and declared.group and not declared.nullable:
-        other = f"choose another one with {name}=NAME{OTHERWISE.get(name, '')}"
-        raise UserError(f"{argument}: {name} cannot be removed; {other}.")
+    setting = settings.declared().get(group, Setting(nullable=True))
+    if setting.group and not setting.nullable:
+        hint = OTHERWISE.get(name, "")
+        raise UserError(
+            f"{argument}: {name} cannot be removed; choose another one with {name}=NAME{hint}."
+        )
     if group in groups and value is not None and not _is_choice(value, group):
         raise UserError(f"{argument}: write ~{name}.")
 
@@ -74,11 +85,9 @@ def _check_limits(path: str, value: Any) -> None:
 
     All else may be converted or resolved, and is checked in the composed configuration.
     """
-    is_declared = path in settings.declared() or path in settings.INSIDE
-    limits = settings.of(path).limits
-    if not is_declared or limits is None or not isinstance(value, int | float):
-        return
-    if not limits.fits(value):
+    limits = settings.limits(path)
+    is_number = isinstance(value, int | float)
+    if limits is not None and is_number and not limits.fits(value):
         raise limits.refusal(path, value)
 
 
@@ -93,13 +102,17 @@ def _chooses(name: str, value: Any, groups: list[str]) -> bool:
 def _check_choices(argument: str, name: str, override: "Override") -> None:
     """Check that a group is set to the name of a choice, or swept over names."""
     value: Any = override.value()
+    if name == "baselines" and value == {}:  # none
+        return
     values = [value]
-    if override.is_sweep_override():
-        values = value.list if override.is_choice_sweep() else []
+    if override.is_choice_sweep():
+        values = value.list
+    elif override.is_sweep_override():
+        return
     group = name.partition("@")[0]
-    has_no_baseline = name == "baselines" and value == {}
-    if not has_no_baseline and not all(_is_choice(one, group) for one in values):
-        raise UserError(f"{argument}: choose one with {name}=NAME{OTHERWISE.get(name, '')}.")
+    if not all(_is_choice(choice, group) for choice in values):
+        hint = OTHERWISE.get(name, "")
+        raise UserError(f"{argument}: choose one with {name}=NAME{hint}.")
 
 
 def _is_choice(value: Any, group: str) -> bool:

@@ -12,6 +12,9 @@ from mops_lightning.config.groups import PRESETS, conf_dir
 if TYPE_CHECKING:
     from hydra.core.config_search_path import ConfigSearchPath
 
+WIDTH = 100
+"""Characters of a line."""
+
 TEXT = "hydra/help/mops.yaml"
 """The file with the text, in ``conf/``."""
 
@@ -32,14 +35,17 @@ def text() -> str:
 
 def run_level_keys() -> str:
     """Return the run-level keys with their texts."""
-    shown = {name: one for name, one in settings.declared().items() if not one.group}
-    width = max(map(len, shown)) + 2
-    return "\n".join(
-        textwrap.fill(
-            one.help, 100, initial_indent=f"{name:<{width}}", subsequent_indent=" " * width
-        )
-        for name, one in shown.items()
-    )
+    texts = {}
+    for name, setting in settings.declared().items():
+        if not setting.group:
+            texts[name] = setting.help
+    width = max(len(name) for name in texts) + 2
+    paragraphs = []
+    for name, text in texts.items():
+        head = name.ljust(width)
+        indent = " " * width
+        paragraphs.append(textwrap.fill(text, WIDTH, initial_indent=head, subsequent_indent=indent))
+    return "\n".join(paragraphs)
 
 
 def selectable_groups() -> str:
@@ -50,12 +56,15 @@ def selectable_groups() -> str:
     """
     folders = _folders()
     lines = []
-    chosen = [name for name, one in settings.declared().items() if one.group]
-    for top in (*chosen, *PRESETS):
+    tops = [name for name, setting in settings.declared().items() if setting.group]
+    for top in (*tops, *PRESETS):
         choices = _choices(folders, top)
-        inner = _subgroups(folders, top)
-        groups = [top, *(f"{top}/{name}" for name in inner if name not in choices)]
-        lines += [f"{group}: {', '.join(_choices(folders, group))}" for group in groups]
+        lines.append(f"{top}: {', '.join(choices)}")
+        for name in _subgroups(folders, top):
+            if name in choices:  # files for this choice in particular
+                continue
+            group = f"{top}/{name}"
+            lines.append(f"{group}: {', '.join(_choices(folders, group))}")
     return "\n".join(sorted(lines))
 
 
@@ -69,17 +78,28 @@ def _folders() -> list[Path]:
         return [conf_dir()]
     # The loader's own methods copy all configuration files for each group: 0.15 s each time.
     search_path: ConfigSearchPath = GlobalHydra.instance().config_loader().get_search_path()
-    paths = [str(entry.path) for entry in search_path.get_path()]
-    files = [path.removeprefix("file://") for path in paths]
-    return [Path(path) for path in files if "://" not in path]
+    folders = []
+    for entry in search_path.get_path():
+        path = str(entry.path).removeprefix("file://")
+        if "://" not in path:
+            folders.append(Path(path))
+    return folders
 
 
 def _choices(folders: list[Path], group: str) -> list[str]:
     """Return the names of the files of a group in all folders."""
-    return sorted({path.stem for folder in folders for path in (folder / group).glob("*.yaml")})
+    names = set()
+    for folder in folders:
+        for path in (folder / group).glob("*.yaml"):
+            names.add(path.stem)
+    return sorted(names)
 
 
 def _subgroups(folders: list[Path], group: str) -> list[str]:
     """Return the names of the folders in a group in all folders."""
-    inside = [path for folder in folders for path in (folder / group).glob("*")]
-    return sorted({path.name for path in inside if path.is_dir()})
+    names = set()
+    for folder in folders:
+        for path in (folder / group).glob("*"):
+            if path.is_dir():
+                names.add(path.name)
+    return sorted(names)

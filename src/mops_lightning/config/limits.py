@@ -23,31 +23,35 @@ class Limits:
 
     def refusal(self, path: str, value: Any) -> UserError:
         """Return the error about a value of a setting that does not fit."""
-        near = did_you_mean(str(value), self.choices) if self.choices else ""
-        hint = near.partition(" Allowed:")[0]
+        hint = ""
+        if self.choices:
+            hint, _, _ = did_you_mean(str(value), self.choices).partition(" Allowed:")
         return UserError(f"{path} must be {self.allowed}, got {value!r}.{hint}")
 
 
 def whole(minimum: int) -> Limits:
     """Allow whole numbers of at least ``minimum``."""
-    return Limits(
-        f"a whole number of at least {minimum}", lambda x: type(x) is int and x >= minimum
-    )
+
+    def fits(value: Any) -> bool:
+        return type(value) is int and value >= minimum
+
+    return Limits(f"a whole number of at least {minimum}", fits)
 
 
 def number(allowed: str, fits: Callable[[float], bool]) -> Limits:
     """Allow finite numbers in a range."""
-    return Limits(
-        f"a number {allowed}",
-        lambda x: isinstance(x, int | float) and abs(x) < float("inf") and fits(x),
-    )
+
+    def fits_and_is_finite(value: Any) -> bool:
+        is_finite = isinstance(value, int | float) and abs(value) < float("inf")
+        return is_finite and fits(value)
+
+    return Limits(f"a number {allowed}", fits_and_is_finite)
 
 
 def one_of(*choices: str, others: tuple[Any, ...] = ()) -> Limits:
     """Allow named choices, and ``others`` that are other spellings of them."""
-    return Limits(
-        f"one of {', '.join(choices)}", lambda x: x in choices or x in others, choices=choices
-    )
+    allowed = (*choices, *others)
+    return Limits(f"one of {', '.join(choices)}", lambda x: x in allowed, choices)
 
 
 ABOVE_ZERO = number("above 0", lambda x: x > 0)

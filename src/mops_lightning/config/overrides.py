@@ -26,12 +26,17 @@ def parse_override(argument: str) -> "Override | None":
     Returns:
         None for an option and for text that is not an override.
     """
-    return None if argument.startswith("-") else _parsed(argument) or _parsed(_quoted(argument))
+    if argument.startswith("-"):
+        return None
+    return _parsed(argument) or _parsed(_quoted(argument))
 
 
 def readable(argument: str) -> str:
     """Return an override in a form that Hydra reads, with its value quoted if need be."""
-    return _quoted(argument) if key(argument) and not _parsed(argument) else argument
+    is_readable = _parsed(argument) is not None
+    if is_readable or not key(argument):
+        return argument
+    return _quoted(argument)
 
 
 def key(argument: str) -> str:
@@ -39,8 +44,9 @@ def key(argument: str) -> str:
     override = parse_override(argument)
     if override is None:
         return ""
-    package = f"@{override.package}" if override.package is not None else ""
-    return f"{override.key_or_group}{package}"
+    if override.package is None:
+        return str(override.key_or_group)
+    return f"{override.key_or_group}@{override.package}"
 
 
 def path(argument: str) -> str:
@@ -58,12 +64,18 @@ def with_own_classes(arguments: list[str]) -> list[str]:
     """
     keys = [key(argument) for argument in arguments]
     places = [place for place in OWN if f"{place}._target_" in keys]
-    chosen = [f"{OWN[place]}=own" for place in places if OWN[place] not in keys]
     below = tuple(f"{place}." for place in places)
-    return [
-        f"++{argument.lstrip('+')}" if name.startswith(below) and argument[0] != "~" else argument
-        for argument, name in zip(arguments, keys, strict=True)
-    ] + chosen
+    result = []
+    for argument, name in zip(arguments, keys, strict=True):
+        is_removal = argument.startswith("~")
+        if name.startswith(below) and not is_removal:
+            result.append(f"++{argument.lstrip('+')}")
+        else:
+            result.append(argument)
+    for place in places:
+        if OWN[place] not in keys:
+            result.append(f"{OWN[place]}=own")
+    return result
 
 
 def with_home(argument: str) -> str:
@@ -73,16 +85,19 @@ def with_home(argument: str) -> str:
         UserError: there is no such user.
     """
     override = parse_override(argument)
-    swept = override is None or override.is_sweep_override()
-    value = None if override is None or swept else override.value()
-    if key(argument) not in FOLDERS or not str(value).startswith("~"):
+    if override is None or override.is_sweep_override() or key(argument) not in FOLDERS:
+        return argument
+    folder = str(override.value())
+    if not folder.startswith("~"):
         return argument
     try:
-        return f"{argument.partition('=')[0]}={quote(str(Path(str(value)).expanduser()))}"
+        path = str(Path(folder).expanduser())
     except RuntimeError:
         raise UserError(
-            f"{argument}: no user has this name. For a folder, write ./{value}"
+            f"{argument}: no user has this name. For a folder, write ./{folder}"
         ) from None
+    name = argument.partition("=")[0]
+    return f"{name}={quote(path)}"
 
 
 def as_typed(arguments: Any) -> list[str]:

@@ -7,76 +7,16 @@ than its group.
 """
 
 from dataclasses import dataclass, field, fields, replace
-from enum import Flag, auto
 from functools import cache
 from typing import Any, Literal, get_args
 
+from mops_lightning.config.declaration import Affects, InEvaluation, Setting, Training
 from mops_lightning.config.limits import ABOVE_ZERO, TRAINER, Limits, number, one_of, whole
 
 Learn = Literal["task", "sampler", "joint", "nothing"]
 LEARN = get_args(Learn)
 """The choices of ``learn``."""
-RECIPE_OF_TASK_NETS = ("train_points", "all_points_from", "ema_span")
-"""Settings of ``recipe`` that also serve a task net trained on an index sampler's points."""
 WITH_SAMPLER = ("sampler", "joint", "nothing")
-
-
-class Affects(Flag):
-    """The effect of a setting.
-
-    ``TRAINING`` is what is learned: such a setting belongs to the identity of a resumed run and to
-    the key of a cached task net. ``SCORES`` is what is measured on the test clouds. Settings that
-    affect ``NOTHING`` may differ between two starts of a sweep.
-    """
-
-    NOTHING = 0
-    TRAINING = auto()
-    SCORES = auto()
-    RESULTS = TRAINING | SCORES
-
-
-@dataclass(frozen=True)
-class Setting:
-    """One setting.
-
-    Attributes:
-        help: its text in ``--help``.
-        affects: what it changes.
-        limits: the values it takes; None: all of its type.
-        learn: the values of ``learn`` with which it counts; None: with all; (): with none.
-        group: whether it is a group of choices, which ``--help`` lists elsewhere.
-        nullable: whether it may be removed or null.
-        per_learn: whether it has one entry for learn=task and one for training a sampler.
-        by_content: whether a run is identified by the content of the files that it names.
-        repeat: whether ``evaluate=RUN`` takes it from RUN; None: if it affects anything.
-        compare: whether ``report`` refuses runs in one table that differ in it; None: if it
-            affects anything.
-    """
-
-    help: str = ""
-    affects: Affects = Affects.RESULTS
-    limits: Limits | None = None
-    learn: tuple[str, ...] | None = None
-    group: bool = False
-    nullable: bool = False
-    per_learn: bool = False
-    by_content: bool = False
-    repeat: bool | None = None
-    compare: bool | None = None
-
-    def counts(self, learn: str) -> bool:
-        """Return whether it makes a difference with this value of ``learn``."""
-        return self.learn is None or learn in self.learn
-
-    @property
-    def repeated(self) -> bool:
-        """Whether ``evaluate=RUN`` takes it from RUN."""
-        return bool(self.affects) if self.repeat is None else self.repeat
-
-    @property
-    def compared(self) -> bool:
-        """Whether ``report`` compares it."""
-        return bool(self.affects) if self.compare is None else self.compare
 
 
 def setting(default: Any, text: str, affects: Affects = Affects.RESULTS, **more: Any) -> Any:
@@ -126,6 +66,7 @@ class RunSettings:
         0,
         "seed of weights, order, augmentation and procedural data",
         limits=whole(0),
+        evaluation=InEvaluation.CHANGES,  # of index samplers and procedural data
         compare=False,
     )
     weights: str | None = setting(
@@ -135,6 +76,7 @@ class RunSettings:
         nullable=True,
         by_content=True,
         repeat=False,
+        evaluation=InEvaluation.CHANGES,
         compare=False,
     )
     pretrain_from: str | None = setting(
@@ -142,6 +84,8 @@ class RunSettings:
         "weights, as for weights=, that the training of the task net by weights=auto starts from",
         Affects.TRAINING,
         nullable=True,
+        serves=Training.FIRST,
+        evaluation=InEvaluation.FOR_NEW_NET,
         compare=False,
     )
     other_nets: Any = setting(
@@ -154,6 +98,7 @@ class RunSettings:
         ),
         learn=("sampler",),
         nullable=True,
+        serves=Training.SAMPLER,
         by_content=True,
         compare=False,  # the number is a part of the row's name
     )
@@ -162,12 +107,14 @@ class RunSettings:
         "resume training: last (newest run of these settings), a run folder or a .ckpt file",
         Affects.NOTHING,
         nullable=True,
+        evaluation=InEvaluation.STAYS,
     )
     evaluate: str | None = setting(
         None,
         "test this run or model again, with other sizes=, dataset= or weights=; trains nothing",
         nullable=True,
         repeat=False,
+        evaluation=InEvaluation.CHANGES,
         compare=False,
     )
     task_lr_scale: float = setting(
@@ -181,12 +128,14 @@ class RunSettings:
         32,
         "clouds per batch",
         limits=whole(2),  # BatchNorm cannot learn from one cloud
+        evaluation=InEvaluation.CHANGES,
     )
     val_fraction: float = setting(
         0.05,
         "share of the training clouds held out for the curves under val/; never trained on",
         Affects.TRAINING,
         limits=number("of at least 0 and below 1", lambda x: 0 <= x < 1),
+        evaluation=InEvaluation.FOR_NEW_NET,
     )
     test_noise_std: float = setting(
         0.0,
@@ -226,6 +175,7 @@ class RunSettings:
         "number of epochs for each value of learn; trainer.max_epochs takes its value from here",
         Affects.NOTHING,
         repeat=True,
+        evaluation=InEvaluation.FOR_NEW_NET,
     )
     augment: Any = setting(
         None,
@@ -233,26 +183,50 @@ class RunSettings:
         Affects.TRAINING,
         per_learn=True,
         repeat=True,
+        evaluation=InEvaluation.FOR_NEW_NET,
     )
     # The recipe in force is compared by a field of the record: index samplers have no recipe.
-    recipe: Any = group(Affects.TRAINING, learn=("sampler", "joint"), repeat=False, compare=False)
+    recipe: Any = group(
+        Affects.TRAINING,
+        learn=("sampler", "joint"),
+        serves=Training.SAMPLER,
+        repeat=False,
+        compare=False,
+    )
     pretrain: Any = setting(
         None,
         "optimizer with which weights=auto trains the task net, for epochs.task epochs",
         learn=WITH_SAMPLER,
+        serves=Training.FIRST,
+        evaluation=InEvaluation.FOR_NEW_NET,
         compare=False,
     )
     # Baselines have their own rows in reports.
-    baselines: Any = group(Affects.SCORES, learn=WITH_SAMPLER, compare=False)
+    baselines: Any = group(
+        Affects.SCORES,
+        learn=WITH_SAMPLER,
+        serves=Training.SAMPLER,  # they are tested beside learned samplers
+        compare=False,
+    )
     names: Any = setting(
         None, "the chosen groups' names; derived, not to be set", Affects.SCORES, compare=False
     )
-    task: Any = group()
-    dataset: Any = group(by_content=True, compare=False)
-    sampler: Any = group(learn=WITH_SAMPLER)
-    optimizer: Any = group(Affects.TRAINING, repeat=False)
-    trainer: Any = group(Affects.TRAINING, repeat=False, compare=False)
-    callbacks: Any = group(Affects.TRAINING, repeat=False, compare=False)
+    # An evaluation chooses the number of points (task.resample), another net with weights=, other
+    # data, and what a sampler's training does not depend on; see ``training/as_trained.py``.
+    task: Any = group(evaluation=InEvaluation.CHANGES)
+    dataset: Any = group(by_content=True, evaluation=InEvaluation.CHANGES, compare=False)
+    sampler: Any = group(learn=WITH_SAMPLER, evaluation=InEvaluation.CHANGES)
+    optimizer: Any = group(
+        Affects.TRAINING,
+        serves=Training.TASK_NET | Training.JOINT | Training.SAMPLER,
+        repeat=False,
+    )
+    trainer: Any = group(
+        Affects.TRAINING, repeat=False, evaluation=InEvaluation.CHANGES, compare=False
+    )
+    callbacks: Any = group(
+        Affects.TRAINING, repeat=False, evaluation=InEvaluation.CHANGES, compare=False
+    )
     logger: Any = group(Affects.NOTHING, nullable=True)
 
 
@@ -260,6 +234,12 @@ SCHEMA: type = RunSettings
 """The declaration in use."""
 
 _NOTHING = {"affects": Affects.NOTHING}
+_STAYS = {"evaluation": InEvaluation.STAYS}
+_FOR_NEW_NET = {"evaluation": InEvaluation.FOR_NEW_NET}
+_OF_SAMPLED_POINTS = {"serves": Training.JOINT | Training.SAMPLER}
+_OF_STAGES = {**_NOTHING, **_STAYS, "learn": ()}
+"""What several settings inside groups have in common."""
+
 HOW_IT_RUNS = (
     "_target_",
     "accelerator",
@@ -287,18 +267,29 @@ INSIDE: dict[str, dict[str, Any]] = {
     "sampler.m_max": {"compare": False},
     "sampler.seed": {"compare": False},
     "sampler.threshold": {"affects": Affects.SCORES},
-    **{f"task.net.sampler.{size}": {**_NOTHING, "learn": ()} for size in ("m", "m_max")},
+    "task.net.sampler.m": _OF_STAGES,
+    "task.net.sampler.m_max": _OF_STAGES,
     "names.stages": _NOTHING,  # the class of the stages' sampler counts
-    "recipe.task_points": {"learn": None},
+    "recipe.task_points": {"learn": None, "serves": Training.FIRST | Training.TASK_NET},
+    "recipe.train_points": _OF_SAMPLED_POINTS,
+    "recipe.all_points_from": _OF_SAMPLED_POINTS,
+    "recipe.ema_span": _OF_SAMPLED_POINTS,
     "optimizer.lr": {"limits": ABOVE_ZERO},
     "pretrain.lr": {"limits": ABOVE_ZERO},
     # Before trainer.max_epochs, so that an error names the setting that it takes its value from.
     "epochs.task": {"limits": whole(1)},
-    "epochs.sampler": {"limits": whole(0)},
-    "epochs.joint": {"limits": whole(0)},
+    "epochs.sampler": {**_STAYS, "limits": whole(0)},
+    "epochs.joint": {**_STAYS, "limits": whole(0)},
+    "augment.sampler": _STAYS,
     "logger.flush_logs_every_n_steps": {"limits": whole(1)},
     **{f"trainer.{name}": {"limits": limits} for name, limits in TRAINER.items()},
     **{f"trainer.{name}": _NOTHING for name in HOW_IT_RUNS},
+    "trainer.max_epochs": {**_STAYS, "limits": TRAINER["max_epochs"]},
+    "trainer.gradient_clip_algorithm": _FOR_NEW_NET,
+    "trainer.accumulate_grad_batches": {
+        **_FOR_NEW_NET,
+        "limits": TRAINER["accumulate_grad_batches"],
+    },
     "trainer.log_every_n_steps": {**_NOTHING, "limits": TRAINER["log_every_n_steps"]},
     "trainer.limit_test_batches": {"affects": Affects.SCORES},
     "trainer.barebones": {"affects": Affects.SCORES},  # it has none
@@ -316,15 +307,21 @@ def of(path: str) -> Setting:
     return _of(SCHEMA, path)
 
 
+def limits(path: str) -> Limits | None:
+    """Return the limits of a setting; None for one without, and for one that is not declared."""
+    is_declared = path in declared() or path in INSIDE
+    return of(path).limits if is_declared else None
+
+
 @cache
 def _of(schema: type, path: str) -> Setting:
-    top = {one.name: one.metadata["setting"] for one in fields(schema)}
-    found = top.get(path.partition(".")[0], Setting())
+    tops = {declaration.name: declaration.metadata["setting"] for declaration in fields(schema)}
+    setting: Setting = tops.get(path.partition(".")[0], Setting())
     for inner, changes in INSIDE.items():
         if path == inner or path.startswith(f"{inner}."):
             # A run is evaluated with its groups as they were.
-            found = replace(found, **{"repeat": found.repeated, **changes})
-    return found
+            setting = replace(setting, **{"repeat": setting.repeated, **changes})
+    return setting
 
 
 def register() -> None:

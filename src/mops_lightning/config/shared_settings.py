@@ -7,7 +7,6 @@ from typing import Any
 
 from mops_lightning.config import settings
 from mops_lightning.config.build import signature
-from mops_lightning.config.settings import Affects
 from mops_lightning.errors import UserError
 from mops_lightning.tree import dotted
 
@@ -25,11 +24,14 @@ def effective(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, node in config.items():
         if settings.of(name).per_learn and isinstance(node, dict):
-            node = node.get("task" if learn == "task" else "sampler")
+            entry = "task" if learn == "task" else "sampler"
+            node = node.get(entry)
             if node is None:  # no augmentation
                 continue
-        flat |= dotted(node, name)
-    return {path: value for path, value in flat.items() if settings.of(path).counts(learn)}
+        for path, value in dotted(node, name).items():
+            if settings.of(path).counts(learn):
+                flat[path] = value
+    return flat
 
 
 def training_settings(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -37,11 +39,12 @@ def training_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 
     Left out are those that are identified by the content of files; see ``Setting.by_content``.
     """
-    return {
-        path: value
-        for path, value in effective(config, config["learn"]).items()
-        if Affects.TRAINING in settings.of(path).affects and not settings.of(path).by_content
-    }
+    identifying = {}
+    for path, value in effective(config, config["learn"]).items():
+        setting = settings.of(path)
+        if setting.affects_training and not setting.by_content:
+            identifying[path] = value
+    return identifying
 
 
 def table_settings(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
@@ -51,14 +54,16 @@ def table_settings(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
     """
     from mops_lightning.data.loader import Augmentation  # imports torch
 
-    defaults: dict[str, Any] = {
-        one.name: one.default
-        for one in fields(settings.SCHEMA)
-        if one.default is not None and not one.metadata["setting"].group
-    }
+    no_augmentation = asdict(Augmentation())
+    defaults: dict[str, Any] = {}
+    for declaration in fields(settings.SCHEMA):
+        is_group = declaration.metadata["setting"].group
+        if declaration.default is not None and not is_group:
+            defaults[declaration.name] = declaration.default
+    defaults["augment"] = {"task": no_augmentation, "sampler": no_augmentation}
     known = {name: node for name, node in config.items() if name in settings.declared()}
-    defaults["augment"] = dict.fromkeys(("task", "sampler"), asdict(Augmentation()))
-    flat = effective(defaults, learn) | effective(with_defaults(known), learn)
+    flat = effective(defaults, learn)
+    flat |= effective(with_defaults(known), learn)
     return {path: value for path, value in flat.items() if settings.of(path).compared}
 
 
@@ -70,8 +75,12 @@ def with_defaults(node: Any) -> Any:
     """
     if not isinstance(node, dict):
         return node
-    filled = {name: with_defaults(child) for name, child in node.items()}
-    return {**_defaults(str(node["_target_"])), **filled} if "_target_" in node else filled
+    filled = {}
+    if "_target_" in node:
+        filled.update(_defaults(str(node["_target_"])))
+    for name, child in node.items():
+        filled[name] = with_defaults(child)
+    return filled
 
 
 @cache
@@ -83,7 +92,10 @@ def _defaults(target: str) -> dict[str, Any]:
         parameters = signature(target, "")
     except UserError:  # an earlier version had it
         return {}
-    plain = {name: one.default for name, one in parameters.items() if one.default is not one.empty}
-    return {
-        name: list(value) if isinstance(value, tuple) else value for name, value in plain.items()
-    }
+    defaults = {}
+    for name, parameter in parameters.items():
+        value = parameter.default
+        if value is parameter.empty:
+            continue
+        defaults[name] = list(value) if isinstance(value, tuple) else value
+    return defaults

@@ -3,6 +3,7 @@
 Checked are names, types and run-level limits. The range of an argument is checked by its class.
 """
 
+import math
 import re
 from inspect import Parameter
 from types import UnionType
@@ -43,13 +44,30 @@ def check(cfg: DictConfig) -> None:
         UserError: an unknown key (the nearest known one is named), a value out of range, or a
             ``_target_`` that cannot be imported or does not take one of its arguments.
     """
+    _check_top_level(cfg)
+    # Resolved once: OmegaConf parses an interpolation each time it is read.
+    plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    _check_corruption(plain["test_corruption"])
+    _check_evaluation(plain)
+    _check_epochs(plain["epochs"])
+    _check_augmentation(plain["augment"])
+    for name, setting in settings.declared().items():
+        if setting.counts(plain["learn"]):
+            _check_node(plain.get(name), name)
+    _check_limits(plain)
+    if plain["learn"] != "nothing":
+        _check_length(plain["trainer"])
+
+
+def _check_top_level(cfg: DictConfig) -> None:
+    """Refuse unknown and removed settings, before any of them is read."""
     declared = settings.declared()
     for key in map(str, cfg):
         if key not in declared:
-            hint = did_you_mean(key, declared)
-            raise UserError(f"{key}: no such setting.{hint}")
+            raise UserError(f"{key}: no such setting.{did_you_mean(key, declared)}")
     for name, setting in declared.items():
-        if name not in cfg or (cfg.get(name) is None and not setting.nullable):
+        is_removed = name not in cfg or (cfg.get(name) is None and not setting.nullable)
+        if is_removed:
             raise UserError(f"{name} cannot be removed. Choose another one with {name}=...")
         if setting.group or name in TABLES:
             _check_table(cfg.get(name), name)
@@ -57,30 +75,32 @@ def check(cfg: DictConfig) -> None:
         raise UserError("task.net cannot be removed. Choose another one with task/net=NAME.")
     if cfg.learn not in settings.LEARN:  # trainer.max_epochs is looked up by it
         raise refusal("learn", cfg.learn)
-    # Resolved once: OmegaConf parses an interpolation each time it is read.
-    plain: Any = OmegaConf.to_container(cfg, resolve=True)
-    if plain["test_corruption"] is not None:
-        from mops_lightning.data import corruptions  # imports torch, which --help does without
 
-        corruptions.parse(plain["test_corruption"])
-    _check_evaluation(plain)
-    for key, number in plain["epochs"].items():
+
+def _check_corruption(corruption: str | None) -> None:
+    if corruption is None:
+        return
+    from mops_lightning.data import corruptions  # imports torch, which --help does without
+
+    corruptions.parse(corruption)
+
+
+def _check_epochs(epochs: dict[str, Any]) -> None:
+    for key, number in epochs.items():
         if key not in settings.LEARN:
             raise UserError(f"epochs.{key}: no such setting.{did_you_mean(key, settings.LEARN)}")
         if number == MISSING:
             raise UserError(f"epochs.{key} must be set: try epochs.{key}=NUMBER.")
-    for key, node in plain["augment"].items():
+
+
+def _check_augmentation(augment: dict[str, Any]) -> None:
+    for key, node in augment.items():
         if key not in ("task", "sampler") or not isinstance(node, dict | None):
             raise UserError(f"augment has settings of task and sampler, got {key}: {node!r}.")
+        where = f"augment.{key}"
         described = {**(node or {}), "_target_": AUGMENTATION}
-        _check_node(described, f"augment.{key}")
-        build(OmegaConf.create(described), f"augment.{key}")  # the class checks its values
-    for name, setting in declared.items():
-        if setting.counts(plain["learn"]):
-            _check_node(plain.get(name), name)
-    _check_limits(plain)
-    if cfg.learn != "nothing":
-        _check_length(plain["trainer"])
+        _check_node(described, where)
+        build(OmegaConf.create(described), where)  # the class checks its values
 
 
 def _check_length(trainer: dict[str, Any]) -> None:
@@ -136,14 +156,26 @@ def _check_limits(config: dict[str, Any]) -> None:
     """Refuse values outside of limits, NaN, infinity and whole numbers beyond 64 bits."""
     values = dotted(config)
     for path in (*settings.declared(), *settings.INSIDE):
-        limits, value = settings.of(path).limits, values.get(path, MISSING)
-        if limits and value != MISSING and not limits.fits(value):
+        limits = settings.limits(path)
+        value = values.get(path, MISSING)
+        if limits is None or value == MISSING:
+            continue
+        if not limits.fits(value):
             raise limits.refusal(path, value)
     for path, value in values.items():
-        for number in value if isinstance(value, list) else [value]:
-            limit = 2**63 if isinstance(number, int) else float("inf")
-            if isinstance(number, int | float) and not abs(number) < limit:  # NaN neither
+        several = value if isinstance(value, list) else [value]
+        for number in several:
+            if not _is_usable(number):
                 raise UserError(f"{path} must be finite and below 2**63, got {number!r:.30}.")
+
+
+def _is_usable(value: Any) -> bool:
+    """Return whether a number is finite and fits 64 bits; other values are usable."""
+    if isinstance(value, int):
+        return abs(value) < 2**63
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return True
 
 
 def _check_evaluation(config: dict[str, Any]) -> None:
@@ -166,30 +198,43 @@ def _check_node(node: Any, where: str) -> None:
     if node.get("_target_", "") in (None, MISSING):
         raise UserError(f"{where}._target_ must be set: give {where}._target_=MODULE.CLASS.")
     if "_target_" in node:
-        parameters = signature(str(node["_target_"]), where)
-        takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
-        for key in node:
-            name = str(key)
-            if name == "schedule" and where in OPTIMIZERS:
-                if not isinstance(node[key], dict | None):
-                    raise UserError(f"{where}.schedule must be settings, got {node[key]!r}.")
-                continue  # built separately
-            if not name.startswith("_") and name not in parameters and not takes_any:
-                raise UserError(
-                    f"{where}: {node['_target_']} takes no setting {name!r}."
-                    f"{did_you_mean(name, parameters)}"
-                )
-            if node[key] == MISSING:
-                raise UserError(f"{where}.{name} must be set: try {where}.{name}=VALUE.")
-            built = isinstance(node[key], dict) and "_target_" in node[key]
-            if name in parameters and not built:
-                wanted = misfit(node[key], parameters[name].annotation)
-                if wanted == "Callable" and name == "sampler":  # of the stages of a net
-                    wanted = f"chosen by sampler@{where}.sampler=NAME"
-                if wanted:
-                    raise UserError(f"{where}.{name} must be {wanted}, got {node[key]!r}.")
-    for key in node:
-        _check_node(node[key], f"{where}.{key!s}")
+        _check_arguments(node, where)
+    for key, child in node.items():
+        _check_node(child, f"{where}.{key!s}")
+
+
+def _check_arguments(node: dict[Any, Any], where: str) -> None:
+    """Compare the settings of a node with the signature of its ``_target_``."""
+    parameters = signature(str(node["_target_"]), where)
+    takes_any = any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+    for key, value in node.items():
+        name = str(key)
+        path = f"{where}.{name}"
+        if name == "schedule" and where in OPTIMIZERS:  # built separately
+            if not isinstance(value, dict | None):
+                raise UserError(f"{path} must be settings, got {value!r}.")
+            continue
+        is_known = name.startswith("_") or name in parameters or takes_any
+        if not is_known:
+            raise UserError(
+                f"{where}: {node['_target_']} takes no setting {name!r}."
+                f"{did_you_mean(name, parameters)}"
+            )
+        if value == MISSING:
+            raise UserError(f"{path} must be set: try {path}=VALUE.")
+        if name in parameters:
+            _check_type(value, parameters[name].annotation, path)
+
+
+def _check_type(value: Any, annotation: Any, path: str) -> None:
+    """Refuse a value that does not fit the type of its argument; objects are built later."""
+    if isinstance(value, dict) and "_target_" in value:
+        return
+    wanted = misfit(value, annotation)
+    if wanted == "Callable" and path.endswith(".sampler"):  # of the stages of a net
+        wanted = f"chosen by sampler@{path}=NAME"
+    if wanted:
+        raise UserError(f"{path} must be {wanted}, got {value!r}.")
 
 
 def misfit(value: Any, annotation: Any) -> str | None:
@@ -203,18 +248,34 @@ def misfit(value: Any, annotation: Any) -> str | None:
         Such as "a whole number or null"; None where the value fits. A wrong text of several fixed
         ones fits: the constructor names the nearest right one.
     """
-    if get_origin(annotation) in (Union, UnionType):  # no setting is a tensor or a Path
-        parts = [(one, getattr(one, "__name__", "")) for one in get_args(annotation)]
-        plain = tuple(one for one, name in parts if name not in ("Tensor", "Path"))
-        annotation = Union[plain]  # noqa: UP007
     if annotation is Parameter.empty:
         return None
     try:
-        msgspec.convert(value, annotation)
+        msgspec.convert(value, _as_setting(annotation))
     except msgspec.ValidationError as error:
-        if expected := re.match("Expected `([^`]+)`", str(error)):
-            words = " or ".join(WORDS.get(word, word) for word in expected[1].split(" | "))
-            return f"a list, each of it {words}" if "`$[" in str(error) else words
-    except TypeError:
+        return _in_words(str(error))
+    except TypeError:  # msgspec does not know the annotation
         pass
     return None
+
+
+def _as_setting(annotation: Any) -> Any:
+    """Return an annotation without the types that no setting has: tensors and paths."""
+    if get_origin(annotation) not in (Union, UnionType):
+        return annotation
+    kept = []
+    for kind in get_args(annotation):
+        if getattr(kind, "__name__", "") not in ("Tensor", "Path"):
+            kept.append(kind)
+    return Union[tuple(kept)]  # noqa: UP007
+
+
+def _in_words(message: str) -> str | None:
+    """Return what a message of msgspec expects, in words."""
+    expected = re.match("Expected `([^`]+)`", message)
+    if expected is None:
+        return None
+    kinds = expected[1].split(" | ")
+    words = " or ".join(WORDS.get(kind, kind) for kind in kinds)
+    is_about_item = "`$[" in message
+    return f"a list, each of it {words}" if is_about_item else words

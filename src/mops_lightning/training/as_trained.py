@@ -9,7 +9,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mops_lightning.config import overrides, settings
 from mops_lightning.config.build import signature
-from mops_lightning.config.settings import Affects
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
@@ -33,9 +32,7 @@ def as_trained(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -> Di
     """
     chosen = trained.choices()
     changed = [overrides.path(argument) for argument in arguments if argument not in chosen]
-    for path in map(overrides.path, trained.record.overrides):
-        if is_special(path) and is_repeated(path) and path not in changed:
-            raise trained.not_accepted(path)
+    _check_special(trained, changed)
     try:
         merged = _recorded(cfg, trained)
         sampler = _plain(merged.sampler)
@@ -45,12 +42,25 @@ def as_trained(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -> Di
         check(merged)
     except (UserError, OmegaConfBaseException) as error:
         text = str(error).splitlines()[0]
-        if any(text.startswith(path) for path in changed):
+        is_about_change = text.startswith(tuple(changed))
+        if is_about_change:
             raise
         raise UserError(f"{KEY}: the record of {trained.name}: {text}") from None
     if not trained.trained_task_net:
         _check_sampler(sampler, _plain(merged.sampler), trained.name)
     return merged
+
+
+def _check_special(trained: TrainedRun, changed: list[str]) -> None:
+    """Refuse a record whose user named a class, unless the user of this evaluation names one.
+
+    Raises:
+        UserError: there is one.
+    """
+    for argument in trained.record.overrides:
+        path = overrides.path(argument)
+        if is_special(path) and is_repeated(path) and path not in changed:
+            raise trained.not_accepted(path)
 
 
 def _check_sampler(old: dict[str, Any], new: dict[str, Any], name: str) -> None:
@@ -60,13 +70,18 @@ def _check_sampler(old: dict[str, Any], new: dict[str, Any], name: str) -> None:
         UserError: a setting differs.
     """
     for key in sorted({*old, *new}):
-        used, chosen = old.get(key), new.get(key)
-        if used != chosen and Affects.TRAINING in settings.of(f"sampler.{key}").affects:
-            hint = " For other sizes of a flexible sampler give sizes=[...]." if key == "m" else ""
-            raise UserError(
-                f"{KEY}: sampler.{key} must be {used}, as in {name}, got {chosen}. "
-                f"Leave it out, or train a sampler with it.{hint}"
-            )
+        path = f"sampler.{key}"
+        used = old.get(key)
+        given = new.get(key)
+        if used == given or not settings.of(path).affects_training:
+            continue
+        hint = ""
+        if key == "m":
+            hint = " For other sizes of a flexible sampler give sizes=[...]."
+        raise UserError(
+            f"{KEY}: {path} must be {used}, as in {name}, got {given}. "
+            f"Leave it out, or train a sampler with it.{hint}"
+        )
 
 
 def _plain(node: DictConfig) -> Any:
@@ -80,16 +95,24 @@ def _recorded(cfg: DictConfig, trained: TrainedRun) -> DictConfig:
     """
     recorded = _leaves(trained.record.config)
     present = _leaves(OmegaConf.to_container(cfg, resolve=False))
-    interpolated = {path for path, value in present.items() if "${" in str(value)}
-    fixed = {path: value for path, value in recorded.items() if path not in interpolated}
-    new = [path for path in present if path not in recorded and path not in interpolated]
+    values = {}
+    results = {}  # of interpolations
+    for path, value in recorded.items():
+        if "${" in str(present.get(path)):
+            results[path] = value
+        else:
+            values[path] = value
+    new = []
+    for path, value in present.items():
+        if path not in recorded and "${" not in str(value):
+            new.append(path)
     merged = deepcopy(cfg)
     with open_dict(merged):
         _drop_new_baselines(merged, trained.record)
         _check_trusted(recorded, trained)
-        _take_values(merged, cfg, fixed, trained.record)
+        _take_values(merged, cfg, values, trained.record)
         _take_defaults(merged, new)
-        _take_other_results(merged, {path: recorded[path] for path in interpolated & {*recorded}})
+        _take_other_results(merged, results)
     return merged
 
 
@@ -108,7 +131,7 @@ def _check_trusted(recorded: dict[str, Any], trained: TrainedRun) -> None:
         UserError: there is one.
     """
     for path, value in recorded.items():
-        has_plain_names = all(map(NAME.fullmatch, path.split(".")))
+        has_plain_names = all(NAME.fullmatch(part) for part in path.split("."))
         if not has_plain_names or _names_code(value):
             raise trained.not_accepted(path)
 
@@ -143,23 +166,28 @@ def _take_other_results(merged: DictConfig, recorded: dict[str, Any]) -> None:
 
 def _leaves(config: Any) -> dict[str, Any]:
     """Return the settings that an evaluation repeats, by dotted path, without classes."""
-    return {
-        path: value
-        for path, value in dotted(config).items()
-        if is_repeated(path) and not is_special(path)
-    }
+    leaves = {}
+    for path, value in dotted(config).items():
+        if is_repeated(path) and not is_special(path):
+            leaves[path] = value
+    return leaves
 
 
 def _node_of(cfg: DictConfig, path: str) -> tuple[Any, str]:
     """Return the node of a setting, empty if there is none, and the setting's name in it."""
     where, _, name = path.rpartition(".")
     node = OmegaConf.select(cfg, where)
-    return node if isinstance(node, DictConfig) else {}, name
+    if not isinstance(node, DictConfig):
+        node = {}
+    return node, name
 
 
 def _parameters(node: Any, path: str) -> dict[str, Parameter]:
     """Return the arguments of the class that a setting's node describes, if any."""
-    return signature(str(node["_target_"]), path.rpartition(".")[0]) if "_target_" in node else {}
+    if "_target_" not in node:
+        return {}
+    where = path.rpartition(".")[0]
+    return signature(str(node["_target_"]), where)
 
 
 def _restore(merged: DictConfig, cfg: DictConfig, path: str) -> None:
@@ -177,7 +205,8 @@ def _restore(merged: DictConfig, cfg: DictConfig, path: str) -> None:
 def _names_code(value: Any) -> bool:
     """Return whether a value holds a special key such as ``_target_``, or an interpolation."""
     if isinstance(value, dict):
-        return any(str(key).startswith("_") or _names_code(item) for key, item in value.items())
+        has_special_key = any(str(key).startswith("_") for key in value)
+        return has_special_key or any(_names_code(item) for item in value.values())
     if isinstance(value, list):
-        return any(map(_names_code, value))
+        return any(_names_code(item) for item in value)
     return "${" in str(value)

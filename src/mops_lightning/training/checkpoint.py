@@ -45,9 +45,10 @@ def checkpoint_identity(config: dict[str, Any], fingerprint: str) -> dict[str, s
     parts = {**training_settings(config), "dataset": fingerprint}
     if config["weights"] not in (None, "auto", "run"):
         parts["weights"] = _sha256("weights", config["weights"])
-    others = config.get("other_nets") if config["learn"] == "sampler" else None
-    for number, name in enumerate(others or [], 1):
-        parts[f"other_nets.{number}"] = _sha256("other_nets", name)
+    if config["learn"] == "sampler":
+        others = config.get("other_nets") or []
+        for number, name in enumerate(others, 1):
+            parts[f"other_nets.{number}"] = _sha256("other_nets", name)
     return {name: json.dumps(value, sort_keys=True) for name, value in parts.items()}
 
 
@@ -133,7 +134,10 @@ def find_checkpoint(name: str, out: Path, identity: dict[str, str]) -> Checkpoin
         UserError: there is no such checkpoint, it belongs to other settings, or it has more epochs
             than ``trainer.max_epochs``.
     """
-    checkpoint = _newest(out, identity) if name == "last" else _named(name, identity)
+    if name == "last":
+        checkpoint = _newest(out, identity)
+    else:
+        checkpoint = _named(name, identity)
     epochs = int(json.loads(identity[LENGTH]))
     if epochs != UNLIMITED and epochs < checkpoint.done:
         raise UserError(
@@ -157,7 +161,8 @@ def _named(name: str, identity: dict[str, str]) -> Checkpoint:
     different = _different(checkpoint.identity, identity)
     if different:
         key = different[0]
-        old, new = (values.get(key, "not set") for values in (checkpoint.identity, identity))
+        old = checkpoint.identity.get(key, "not set")
+        new = identity.get(key, "not set")
         raise UserError(
             f"ckpt_path: {path} is from a run with other settings ({', '.join(different)}); "
             f"{key} is {new} here and {old} there. "
@@ -168,8 +173,8 @@ def _named(name: str, identity: dict[str, str]) -> Checkpoint:
 
 def _newest(out: Path, identity: dict[str, str]) -> Checkpoint:
     """Return the newest checkpoint of these settings below ``out``."""
-    found = [path for path in out.glob(f"**/checkpoints/{CHECKPOINT}") if path.is_file()]
-    paths = sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)
+    paths = [path for path in out.glob(f"**/checkpoints/{CHECKPOINT}") if path.is_file()]
+    paths.sort(key=_time_written, reverse=True)
     for path in paths:
         with suppress(weights.Damaged):
             checkpoint = Checkpoint.read(path)
@@ -181,9 +186,17 @@ def _newest(out: Path, identity: dict[str, str]) -> Checkpoint:
     )
 
 
+def _time_written(path: Path) -> float:
+    return path.stat().st_mtime
+
+
 def _different(old: dict[str, str], new: dict[str, str]) -> list[str]:
-    names = [name for name in {**new, **old} if name != LENGTH]
-    return [name for name in names if old.get(name) != new.get(name)]
+    """Return the parts in which two identities differ, except the length of the training."""
+    different = []
+    for name in {**new, **old}:
+        if name != LENGTH and old.get(name) != new.get(name):
+            different.append(name)
+    return different
 
 
 def sealed(content: bytes) -> bytes:
@@ -202,7 +215,8 @@ def read_sealed(path: Path) -> Any:
         Damaged: it is not a checkpoint, or was changed.
     """
     written = path.read_bytes()
-    content, seal = written[:-SEAL_BYTES], written[-SEAL_BYTES:]
+    content = written[:-SEAL_BYTES]
+    seal = written[-SEAL_BYTES:]
     if hashlib.sha256(content).digest() != seal:
         raise weights.damaged(path, "expected a checkpoint as this program wrote it")
     try:

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mops_lightning.config import overrides, settings
-from mops_lightning.config.compose import NAMED
+from mops_lightning.config.declaration import InEvaluation
+from mops_lightning.config.labels import NAMED
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
@@ -21,31 +22,15 @@ OF_RUN = "run"
 """``weights=run``: the task net that the evaluated run was trained with."""
 NAME = re.compile(r"[A-Za-z0-9_-]+")
 """A choice of a group, or a part of a setting's name."""
+UNFINISHED = {
+    "failed": "failed",
+    "interrupted": "was interrupted",
+    "running": "is still running or was killed",
+}
+"""The states of runs that are not completed, as parts of a sentence."""
 
-OF_SAMPLER = (
-    "learn",
-    "experiment",
-    "optimizer",
-    "task_lr_scale",
-    "recipe",
-    "trainer.max_epochs",
-    "epochs.sampler",
-    "augment.sampler",
-    "other_nets",
-)
-"""Settings of the training of a sampler."""
-OF_TRAINING = (
-    *OF_SAMPLER,
-    "pretrain",
-    "pretrain_from",
-    "val_fraction",
-    "augment",
-    "epochs",
-    "ckpt_path",
-    "trainer.gradient_clip_algorithm",
-    "trainer.accumulate_grad_batches",
-)
-"""Settings of any training."""
+NOT_OF_TASK_NETS = ("m", "weights")
+"""Settings of the test of a sampler that also count in other runs of ``learn=task``."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +69,7 @@ class TrainedRun:
             hint = "Give a completed run."
             if (place / "checkpoints" / CHECKPOINT).is_file():
                 hint = f"Finish it with its own command and ckpt_path={place}."
-            state = {"failed": "failed", "running": "is still running or was killed"}
-            raise UserError(f"{KEY}: {place} {state.get(record.status, 'was interrupted')}. {hint}")
+            raise UserError(f"{KEY}: {place} {UNFINISHED[record.status]}. {hint}")
         if "weights" not in record.files:
             raise UserError(
                 f"{KEY}: {place} trained nothing, or its weights were not kept; "
@@ -105,11 +89,15 @@ class TrainedRun:
             UserError: the record chooses a file by a path.
         """
         used = self.record.config["names"]  # a sweep's file may choose them
-        groups = {name: group for name, group in NAMED.items() if name != "recipe"}
-        chosen = [f"{group}={used[name]}" for name, group in groups.items() if used.get(name)]
+        chosen = []
+        for name, group in NAMED.items():
+            is_of_training = name == "recipe"
+            if used.get(name) and not is_of_training:
+                chosen.append(f"{group}={used[name]}")
         for argument in self.record.overrides:
             key = overrides.key(argument)
-            if ("/" in key or "@" in key) and is_repeated(overrides.path(argument)):
+            is_choice = "/" in key or "@" in key
+            if is_choice and is_repeated(overrides.path(argument)):
                 chosen.append(overrides.readable(argument))
         for argument in chosen:
             override = overrides.parse_override(argument)
@@ -146,8 +134,10 @@ def command_line(arguments: list[str]) -> list[str]:
         UserError: RUN is not a completed run that trained something.
     """
     named = [argument for argument in arguments if overrides.key(argument) == KEY]
-    name = _run_named(named[-1]) if named else None
-    if not name:
+    if not named:
+        return arguments
+    name = _run_named(named[-1])
+    if name is None:
         return arguments
     path = Path(name).expanduser()
     trained = TrainedRun.read(str(path) if path.exists() else name)
@@ -155,15 +145,16 @@ def command_line(arguments: list[str]) -> list[str]:
     run = f"{KEY}={overrides.quote(trained.name)}"
     of_evaluation = [*trained.choices(), f"learn={learn}", f"weights={OF_RUN}", run]
     # The processes of one run are started with what has been added here.
-    rest = [one for one in arguments if one not in named and one not in of_evaluation]
+    added = [*named, *of_evaluation]
+    rest = [argument for argument in arguments if argument not in added]
     _check_given(rest, trained)
     paths = [overrides.path(argument) for argument in rest]
-    inserted = [
-        argument
-        for argument in of_evaluation
-        if not any(covers(path, overrides.path(argument)) for path in paths)
-    ]
-    return [*rest, *inserted]
+    for argument in of_evaluation:
+        place = overrides.path(argument)
+        is_given = any(covers(given, place) for given in paths)
+        if not is_given:
+            rest.append(argument)
+    return rest
 
 
 def _run_named(argument: str) -> str | None:
@@ -186,17 +177,16 @@ def _check_given(arguments: list[str], trained: TrainedRun) -> None:
         UserError: a setting does not apply.
     """
     used = trained.record.config["names"]
-    # weights=auto may train a task net, which has its own settings.
-    inert = OF_SAMPLER if "weights=auto" in arguments else OF_TRAINING
+    has_new_net = "weights=auto" in arguments
     for argument in arguments:
         path = overrides.path(argument)
-        if settings.of(path).learn == () or any(covers(setting, path) for setting in inert):
+        if not _may_change(path, has_new_net):
             raise UserError(
                 f"{argument}: has no effect with {KEY}, which trains nothing. Leave it out, or "
                 f"train with the settings of {trained.name} and without {KEY}."
             )
-        of_sampler = path in ("m", "sizes", "weights") or covers("sampler", path)
-        if trained.trained_task_net and of_sampler:
+        is_of_sampler = path in NOT_OF_TASK_NETS or not settings.of(path).counts("task")
+        if trained.trained_task_net and is_of_sampler:
             raise UserError(
                 f"{argument}: has no effect with {KEY}={trained.name}, which trained a task net "
                 "alone. To test a sampler with it, evaluate the sampler's run with "
@@ -207,6 +197,24 @@ def _check_given(arguments: list[str], trained: TrainedRun) -> None:
                 f"{KEY}: {trained.name} was trained with {path}={used[path]}, got {argument}. "
                 f"Leave {path} out, or give another run."
             )
+
+
+def _may_change(path: str, has_new_net: bool) -> bool:
+    """Return whether an evaluation may change a setting; unknown ones are refused later.
+
+    Args:
+        path: of the setting.
+        has_new_net: whether the evaluation trains another task net.
+    """
+    top = path.partition(".")[0]
+    if top == "experiment":  # a training of its own
+        return False
+    if top not in settings.declared():
+        return True
+    how = settings.of(path).in_evaluation
+    if how is InEvaluation.FOR_NEW_NET:
+        return has_new_net
+    return how is InEvaluation.CHANGES
 
 
 def covers(path: str, other: str) -> bool:

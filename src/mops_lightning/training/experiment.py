@@ -17,7 +17,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from mops_lightning.config.settings import Learn
 from mops_lightning.errors import UserError
 from mops_lightning.ops.precision import full_precision, restrict_autocast_to_pointwise
-from mops_lightning.records.readout_names import FULL, PROJECTED
+from mops_lightning.records.readout_names import FULL, PROJECTED, size_prefix
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
@@ -29,7 +29,11 @@ from mops_lightning.training.scores import Scores
 from mops_lightning.types import Batch, SampleOutput
 
 TEST = "test/"
-"""Prefix of the test metrics."""
+VALIDATION = "val/"
+"""Prefixes of the metrics of a stage."""
+
+ALL_POINTS = 0
+"""The size of a step that trains the task net alone, without sampling."""
 
 
 class Experiment(L.LightningModule):
@@ -77,9 +81,12 @@ class Experiment(L.LightningModule):
         super().__init__()
         if sampler is None and learn != "task":
             raise UserError(f"learn={learn} needs a sampler; only learn=task works without one.")
+        if learn == "task":
+            sampler = None
+            baselines = {}
         self.task: Task = task
-        self.sampler = None if learn == "task" else sampler
-        self.baselines = nn.ModuleDict({} if learn == "task" else dict(baselines or {}))
+        self.sampler = sampler
+        self.baselines = nn.ModuleDict(dict(baselines or {}))
         self.learn = learn
         self.make_optimizer = make_optimizer
         self.make_schedule = make_schedule
@@ -88,18 +95,25 @@ class Experiment(L.LightningModule):
         self.task_lr_scale = task_lr_scale
         self.recipe = recipe or Recipe()
         self.other_tasks = nn.ModuleList(other_tasks)
-        tasks = [task, *other_tasks]
-        self.distillation = Distillation(tasks, self.recipe) if learn == "sampler" else None
+        self.distillation: Distillation | None = None
+        if learn == "sampler":
+            self.distillation = Distillation([task, *other_tasks], self.recipe)
         self.total_steps = 1
         self.test_logger = test_logger
         for module in self._frozen():
             module.requires_grad_(False)
-        self.m: int = m or (self.sampler.m if self.sampler is not None else 0)
+        own_size = 0 if sampler is None else sampler.m
+        self.m: int = m or own_size
         self.sizes = tuple(sizes or (self.m,))
-        self.prefixes = {m: f"m{m}/" if len(self.sizes) > 1 else "" for m in self.sizes}
-        self.main_readout, *others = names_of_readouts(self.sampler)
-        score = task.full_score or task.score if self.sampler is None else task.score
-        self.score_name = f"test/{self.prefixes.get(self.m, '')}{self.main_readout}/{score}"
+        self.prefixes = dict.fromkeys(self.sizes, "")
+        if len(self.sizes) > 1:
+            self.prefixes = {size: size_prefix(size) for size in self.sizes}
+        self.main_readout, *others = names_of_readouts(sampler)
+        score = task.score
+        if sampler is None and task.full_score:
+            score = task.full_score
+        prefix = self.prefixes.get(self.m, "")
+        self.score_name = f"{TEST}{prefix}{self.main_readout}/{score}"
         names = dict.fromkeys([self.main_readout, *others, *self.baselines, FULL])
         self.scores = Scores(task.metrics, names, self.prefixes.values())
         self.train_scores = task.metrics(training=True)
@@ -115,6 +129,11 @@ class Experiment(L.LightningModule):
             module.eval()
         return self
 
+    @property
+    def trainable(self) -> bool:
+        """Whether any parameter learns; an index sampler under a frozen net has none."""
+        return any(parameter.requires_grad for parameter in self.parameters())
+
     def _frozen(self) -> list[nn.Module]:
         frozen: list[nn.Module] = [*self.baselines.values(), *self.other_tasks]
         if self.learn in ("sampler", "nothing"):
@@ -127,12 +146,7 @@ class Experiment(L.LightningModule):
         """Build the optimizer of what learns, and its schedule over all steps of the run."""
         if self.make_optimizer is None:
             raise UserError("This experiment was built without an optimizer: it can only test.")
-        groups = []
-        for name, module in (("sampler", self.sampler), ("task", self.task)):
-            learned = [p for p in module.parameters() if p.requires_grad] if module else []
-            if learned:
-                groups.append({"params": learned, "name": name})
-        optimizer = self.make_optimizer(groups)
+        optimizer = self.make_optimizer(self._learned())
         for group in optimizer.param_groups:
             if self.learn == "joint" and group["name"] == "task":
                 group["lr"] *= self.task_lr_scale
@@ -141,6 +155,18 @@ class Experiment(L.LightningModule):
             return optimizer
         schedule = self.make_schedule(optimizer, total_steps=self.total_steps)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def _learned(self) -> list[dict[str, Any]]:
+        """Return the parameters that learn as groups of an optimizer, by module."""
+        modules = {"sampler": self.sampler, "task": self.task}
+        groups: list[dict[str, Any]] = []
+        for name, module in modules.items():
+            if module is None:
+                continue
+            learned = [parameter for parameter in module.parameters() if parameter.requires_grad]
+            if learned:
+                groups.append({"params": learned, "name": name})
+        return groups
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the run's identity; refuse a state that would replace the last finite one."""
@@ -163,8 +189,9 @@ class Experiment(L.LightningModule):
         if self.distillation is not None:
             self.distillation.start(loader, self.device, _dtype(self))
         if hasattr(loader, "load_state_dict"):
-            begun = self.trainer.fit_loop.epoch_loop.batch_progress.current.ready
-            position = begun if begun < len(loader) else 0
+            position = self.trainer.fit_loop.epoch_loop.batch_progress.current.ready
+            if position >= len(loader):
+                position = 0
             loader.load_state_dict({"epoch": self.current_epoch, "position": position})
 
     def on_train_epoch_start(self) -> None:
@@ -197,7 +224,9 @@ class Experiment(L.LightningModule):
         Raises:
             Diverged: a loss is NaN or infinite.
         """
-        sizes = (0,) if self.sampler is None else self.sampler.training_sizes()
+        sizes: Sequence[int] = (ALL_POINTS,)
+        if self.sampler is not None:
+            sizes = self.sampler.training_sizes()
         rank = self.global_rank
         if rank:  # processes draw the same sizes, but different random numbers
             torch.manual_seed(derive_seed(self.seed, self.current_epoch, batch_idx, rank))
@@ -205,21 +234,32 @@ class Experiment(L.LightningModule):
             available = batch.points.shape[1]
             n = self.recipe.points_at(self._progress, available, max(sizes))
             seen = draw_points(batch, n)
-            targets = self.distillation.targets(batch, seen) if self.distillation else None
+            targets = None
+            if self.distillation is not None:
+                targets = self.distillation.targets(batch, seen)
             outputs = self._sample(seen, sizes)
             terms: dict[str, list[Tensor]] = defaultdict(list)
             for m in sizes:
                 for name, value in self._losses(batch, seen, outputs[m], targets).items():
                     terms[name].append(value)
-            mean = self.sampler is not None and self.sampler.size_reduction == "mean"
-            share = 1 / len(sizes) if mean else 1.0
-            losses = {name: torch.stack(values).sum() * share for name, values in terms.items()}
+            losses = self._over_sizes(terms, len(sizes))
             total = torch.stack(list(losses.values())).sum()
         check_finite({"the loss": total}, self.global_step, self.trainer.strategy)
-        soft = outputs[sizes[0]].soft_projected
-        readout = self.main_readout if soft is None else PROJECTED
+        first = outputs[sizes[0]]
+        readout = self.main_readout if first.soft_projected is None else PROJECTED
         self._log_training({**losses, "total": total}, readout, len(batch.points))
         return total
+
+    def _over_sizes(self, terms: Mapping[str, list[Tensor]], sizes: int) -> dict[str, Tensor]:
+        """Return the sum of each loss term over the step's sizes, or its mean.
+
+        Args:
+            terms: the values of every term; a sampler may have one at some sizes only.
+            sizes: their number.
+        """
+        is_mean = self.sampler is not None and self.sampler.size_reduction == "mean"
+        share = 1 / sizes if is_mean else 1.0
+        return {name: torch.stack(values).sum() * share for name, values in terms.items()}
 
     def _losses(
         self, batch: Batch, seen: Tensor, sampled: SampleOutput, targets: Targets | None
@@ -229,15 +269,14 @@ class Experiment(L.LightningModule):
         The first two are means over the step's task nets. The task's target is the whole batch,
         also where the sampler has seen a part of its points.
         """
-        soft = sampled.soft_projected
-        inputs = [sampled.points if soft is None else soft]
+        inputs = [sampled.points]
+        if sampled.soft_projected is not None:
+            inputs = [sampled.soft_projected]
         if self.recipe.sees_matched(self._progress):
             inputs.append(straight_through(sampled.points, seen))
-        terms: dict[str, Tensor] = {}
         tasks: list[Any] = [self.task, *self.other_tasks]
-        numbers = list(range(len(tasks)))
-        if drawn := self.recipe.nets_per_step:
-            numbers = [0, *(torch.randperm(len(self.other_tasks))[:drawn] + 1).tolist()]
+        numbers = self._nets_of_step()
+        terms: dict[str, Tensor] = {}
         for points, number in product(inputs, numbers):
             task = tasks[number]
             result = task.step(batch, points)
@@ -247,8 +286,18 @@ class Experiment(L.LightningModule):
             if self.distillation is not None and targets is not None:
                 losses |= self.distillation.losses(number, points, result.output, targets)
             for name, value in losses.items():
-                terms[name] = terms.get(name, 0) + value / (len(inputs) * len(numbers))
+                share = value / (len(inputs) * len(numbers))
+                terms[name] = terms.get(name, 0) + share
         return {**terms, **sampled.losses}
+
+    def _nets_of_step(self) -> list[int]:
+        """Return the numbers of the task nets of this step: 0 is the run's own."""
+        others = len(self.other_tasks)
+        drawn = self.recipe.nets_per_step
+        if not drawn:
+            return list(range(1 + others))
+        rows = torch.randperm(others)[:drawn] + 1
+        return [0, *rows.tolist()]
 
     def _log_training(self, losses: dict[str, Tensor], readout: str, clouds: int) -> None:
         for name, value in losses.items():
@@ -268,8 +317,8 @@ class Experiment(L.LightningModule):
         with full_precision(self.device.type):
             outputs = self._sample(batch.points, (self.m,))
             samples = readouts(batch.points, outputs, self.sampler)[self.m]
-            self._score("val/", batch, {"": samples})
-            self._score_sets("val/", {self.m: ""}, batch.points, outputs)
+            self._score(VALIDATION, batch, {"": samples})
+            self._score_sets(VALIDATION, {self.m: ""}, batch.points, outputs)
 
     def test_step(self, batch: Batch, batch_idx: int) -> None:
         """Score the learned readouts and the baselines at every size, and the full clouds."""
@@ -295,21 +344,25 @@ class Experiment(L.LightningModule):
             batch: the clouds.
             sets: points by readout, by prefix of a size.
         """
-        clouds, logger = len(batch.points), self.test_logger if stage == TEST else None
-        samples = {
-            (prefix, readout): points
-            for prefix, by_readout in sets.items()
-            for readout, points in by_readout.items()
-        }
+        clouds = len(batch.points)
+        logged: dict[str, Any] = {"batch_size": clouds, "logger": self._logs(stage)}
+        samples: dict[tuple[str, str], Tensor] = {}
+        for prefix, by_readout in sets.items():
+            for readout, points in by_readout.items():
+                samples[prefix, readout] = points
         for (prefix, readout), result in self.task.scores(batch, samples).items():
             for name, metric in self.scores.update_readout(f"{prefix}{readout}", result).items():
-                self.log(f"{stage}{name}", metric, batch_size=clouds, logger=logger)
+                self.log(f"{stage}{name}", metric, **logged)
             if readout != self.main_readout:
                 continue
             for name, value in result.losses.items():
                 key = f"{stage}{prefix}loss/{name}"
-                mean, place = self.scores.update_loss(key, value, clouds), f"scores.losses.{key}"
-                self.log(key, mean, batch_size=clouds, metric_attribute=place, logger=logger)
+                mean = self.scores.update_loss(key, value, clouds)
+                self.log(key, mean, metric_attribute=f"scores.losses.{key}", **logged)
+
+    def _logs(self, stage: str) -> bool | None:
+        """Return whether the metrics of a stage go to the loggers; None: if there is one."""
+        return self.test_logger if stage == TEST else None
 
     def _score_sets(
         self,
@@ -321,12 +374,15 @@ class Experiment(L.LightningModule):
         """Update and log the metrics of the sampled sets themselves."""
         if self.sampler is None:
             return
-        logger = self.test_logger if stage == TEST else None
+        logs = self._logs(stage)
         updated = self.scores.update_sets(points, outputs, self.sampler.nested, prefixes)
         for name, metric in updated.items():
-            self.log(f"{stage}{name}", metric, batch_size=len(points), logger=logger)
+            self.log(f"{stage}{name}", metric, batch_size=len(points), logger=logs)
 
 
 def _dtype(module: nn.Module) -> torch.dtype:
     """Return the type of a module's weights, which ``trainer.precision=bf16-true`` lowers."""
-    return next((p.dtype for p in module.parameters() if p.is_floating_point()), torch.float32)
+    for parameter in module.parameters():
+        if parameter.is_floating_point():
+            return parameter.dtype
+    return torch.float32

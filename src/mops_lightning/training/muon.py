@@ -42,10 +42,16 @@ class MuonAdam(Optimizer):
         self.matrices: list[list[Tensor]] = []
         others: list[dict[str, Any]] = []
         for group in self.param_groups:
-            wide = [p for p in group["params"] if p.ndim == 2 and min(p.shape) >= smallest]
-            known = {id(p) for p in wide}
-            self.matrices.append(wide)
-            others.append({"params": [p for p in group["params"] if id(p) not in known]})
+            matrices = []
+            rest = []
+            for parameter in group["params"]:
+                is_wide = parameter.ndim == 2 and min(parameter.shape) >= smallest
+                if is_wide:
+                    matrices.append(parameter)
+                else:
+                    rest.append(parameter)
+            self.matrices.append(matrices)
+            others.append({"params": rest})
         self.adam = Adam(others, lr=lr, betas=betas)
 
     @torch.no_grad()
@@ -84,11 +90,17 @@ def orthogonalised(matrix: Tensor) -> Tensor:
     Args:
         matrix: ``(R, C)``; not zero.
     """
-    wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
-    x = wide.to(torch.bfloat16) if matrix.is_cuda else wide
+    rows, columns = matrix.shape
+    is_tall = rows > columns
+    x = matrix.T if is_tall else matrix
+    if matrix.is_cuda:
+        x = x.to(torch.bfloat16)
     x = x / x.norm().clamp_min(1e-7)
     a, b, c = NEWTON_SCHULZ
     for _ in range(ITERATIONS):
         gram = x @ x.T
-        x = torch.addmm(x, torch.addmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
-    return (x if wide is matrix else x.T).to(matrix)
+        polynomial = torch.addmm(gram, gram, gram, beta=b, alpha=c)
+        x = torch.addmm(x, polynomial, x, beta=a)
+    if is_tall:
+        x = x.T
+    return x.to(matrix)

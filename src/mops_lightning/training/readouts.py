@@ -52,7 +52,10 @@ def readouts(
         return {m: {name: output.points} for m, output in outputs.items()}
     if sampler.nested:
         return _nested_readouts(points, outputs, sampler)
-    return {m: _generated_readouts(points, out.points, sampler) for m, out in outputs.items()}
+    samples = {}
+    for m, output in outputs.items():
+        samples[m] = _generated_readouts(points, output.points, sampler)
+    return samples
 
 
 def _nested_readouts(
@@ -64,30 +67,34 @@ def _nested_readouts(
     """
     generated = outputs[max(outputs)].points
     rows = match(generated, points)
-    projected = sampler.project(generated, points) if sampler.projects else None
-    return {
-        m: _sets(
-            points, output.points, rows[:, :m], None if projected is None else projected[:, :m]
-        )
-        for m, output in outputs.items()
-    }
+    samples = {}
+    for m, output in outputs.items():
+        samples[m] = _chosen(points, output.points, rows[:, :m])
+    if sampler.projects:
+        projected = sampler.project(generated, points)
+        for m, sets in samples.items():
+            sets[PROJECTED] = projected[:, :m]
+    return samples
 
 
 def _generated_readouts(points: Tensor, generated: Tensor, sampler: Sampler) -> dict[str, Tensor]:
     """Return the readouts of one sample ``(B, m, 3)``."""
-    projected = sampler.project(generated, points) if sampler.projects else None
-    return _sets(points, generated, match(generated, points), projected)
+    sets = _chosen(points, generated, match(generated, points))
+    if sampler.projects:
+        sets[PROJECTED] = sampler.project(generated, points)
+    return sets
 
 
-def _sets(
-    points: Tensor, generated: Tensor, rows: Tensor, projected: Tensor | None
-) -> dict[str, Tensor]:
-    """Return the points of every readout, from the rows ``(B, m)`` of the matched points."""
-    sets = {
+def _chosen(points: Tensor, generated: Tensor, rows: Tensor) -> dict[str, Tensor]:
+    """Return the generated points, and the matched and completed ones.
+
+    Args:
+        points: ``(B, N, 3)`` the clouds.
+        generated: ``(B, m, 3)``.
+        rows: ``(B, m)`` of the matched points.
+    """
+    return {
         GENERATED: generated,
         MATCHED: gather_points(points, rows),
         COMPLETED: gather_points(points, complete(rows, points)),
     }
-    if projected is not None:
-        sets[PROJECTED] = projected
-    return sets

@@ -33,12 +33,16 @@ def one_cycle(optimizer: Optimizer, total_steps: int, warmup: float = 0.3) -> La
     def factor(step: int) -> float:
         step = min(step, last)
         if step < peak:
-            low, part = START_FACTOR, 1 - step / peak
-        else:
-            low, part = END_FACTOR, (step - peak) / max(last - peak, 1)
-        return low + (1 - low) * (1 + math.cos(math.pi * part)) / 2
+            return _half_cosine(START_FACTOR, 1 - step / peak)
+        return _half_cosine(END_FACTOR, (step - peak) / max(last - peak, 1))
 
     return LambdaLR(optimizer, factor)
+
+
+def _half_cosine(low: float, share: float) -> float:
+    """Return a factor that falls from 1 to ``low`` while the share of the way rises from 0 to 1."""
+    height = (1 + math.cos(math.pi * share)) / 2
+    return low + (1 - low) * height
 
 
 def exponential(optimizer: Optimizer, total_steps: int, end_lr: float) -> LambdaLR:
@@ -54,8 +58,15 @@ def exponential(optimizer: Optimizer, total_steps: int, end_lr: float) -> Lambda
     """
     if end_lr <= 0:
         raise UserError(f"end_lr must be positive, got {end_lr}.")
-    ratio = end_lr / optimizer.param_groups[0]["lr"]
-    return LambdaLR(optimizer, lambda step: ratio ** min(step / max(total_steps - 1, 1), 1.0))
+    first_lr = optimizer.param_groups[0]["lr"]
+    ratio = end_lr / first_lr
+    last = max(total_steps - 1, 1)
+
+    def factor(step: int) -> float:
+        share = min(step / last, 1.0)
+        return ratio**share
+
+    return LambdaLR(optimizer, factor)
 
 
 def step_decay(
@@ -79,5 +90,11 @@ def step_decay(
         raise UserError(f"every must be at least 1, got {every}.")
     if not 0 < factor <= 1:
         raise UserError(f"factor must be above 0 and at most 1, got {factor}.")
-    first = optimizer.param_groups[0]["lr"]
-    return LambdaLR(optimizer, lambda step: max(factor ** (step // every), floor_lr / first))
+    first_lr = optimizer.param_groups[0]["lr"]
+    lowest = floor_lr / first_lr
+
+    def decayed(step: int) -> float:
+        decays = step // every
+        return max(factor**decays, lowest)
+
+    return LambdaLR(optimizer, decayed)

@@ -1,6 +1,7 @@
 """The metrics by which validation and test score readouts and sampled sets."""
 
 from collections.abc import Callable, Iterable, Mapping
+from itertools import product
 
 from torch import Tensor, nn
 from torchmetrics import MeanMetric, Metric, MetricCollection
@@ -28,13 +29,13 @@ class Scores(nn.Module):
         prefixes: Iterable[str],
     ) -> None:
         super().__init__()
-        prefixes = dict.fromkeys(("", *prefixes))
-        self.readouts = nn.ModuleDict(
-            {f"{prefix}{name}": make_metrics() for name in readouts for prefix in prefixes}
-        )
-        self.sets = nn.ModuleDict(
-            {f"{prefix}{name}": cls() for name, cls in SET_METRICS.items() for prefix in prefixes}
-        )
+        prefixes = list(dict.fromkeys(["", *prefixes]))
+        self.readouts = nn.ModuleDict()
+        for name, prefix in product(readouts, prefixes):
+            self.readouts[f"{prefix}{name}"] = make_metrics()
+        self.sets = nn.ModuleDict()
+        for (name, cls), prefix in product(SET_METRICS.items(), prefixes):
+            self.sets[f"{prefix}{name}"] = cls()
         self.losses = nn.ModuleDict()  # the task's first result brings their names
 
     def update_readout(self, key: str, result: TaskOutput) -> dict[str, Metric]:
@@ -71,12 +72,15 @@ class Scores(nn.Module):
             prefixes: by size.
         """
         # The largest nested set contains all smaller ones, so it is measured once for all.
-        groups = {max(outputs): tuple(outputs)} if nested else {m: (m,) for m in outputs}
+        groups: dict[int, tuple[int, ...]] = {m: (m,) for m in outputs}
+        if nested:
+            groups = {max(outputs): tuple(outputs)}
         updated: dict[str, Metric] = {}
         for largest, sizes in groups.items():
             output = outputs[largest]
             for name, cls in SET_METRICS.items():
-                for m, values in (cls.measure(points, output, sizes) or {}).items():
+                measured = cls.measure(points, output, sizes) or {}
+                for m, values in measured.items():
                     key = f"{prefixes[m]}{name}"
                     mean = self.sets[key]
                     assert isinstance(mean, cls)

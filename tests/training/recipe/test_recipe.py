@@ -19,7 +19,7 @@ from mops_lightning.tasks.registration import Registration
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.distillation import feature_distance, pooled_features
 from mops_lightning.training.recipe.moving_average import MovingAverage
-from mops_lightning.training.recipe.recipe import Recipe, draw_points, reached, straight_through
+from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through
 from mops_lightning.types import Batch
 from tests.support.recording import Fingerprint, RecordingTask, noting
 from tests.support.training import quiet_trainer, small_dataset
@@ -30,18 +30,22 @@ POINTS = 48
 def trained(recipe, epochs=2, **more):
     """Train on 24 clouds in batches of 6."""
     sampler = noting(MOPSNet, 8, feature_channels=(8, 8), rho_channels=(16, 8))
-    task, adam = Classification(PointNetVanilla(3), 3), partial(torch.optim.Adam, lr=1e-2)
+    task = Classification(PointNetVanilla(3), 3)
+    adam = partial(torch.optim.Adam, lr=1e-2)
     module = Experiment(task, sampler, make_optimizer=adam, recipe=recipe)
     data = small_dataset(points=POINTS)
-    trainer = quiet_trainer(epochs, **more)
-    trainer.fit(module, CloudLoader(data.train, 6, shuffle=True), CloudLoader(data.test, 6))
+    train = CloudLoader(data.train, 6, shuffle=True)
+    quiet_trainer(epochs, **more).fit(module, train, CloudLoader(data.test, 6))
     return module
 
 
 def numbers_seen(module, training):
     """How many points the sampler was given in each step."""
-    samples = module.sampler.samples
-    return [points.shape[1] for phase, points, _ in samples if phase == training]
+    numbers = []
+    for in_training, points, _ in module.sampler.samples:
+        if in_training == training:
+            numbers.append(points.shape[1])
+    return numbers
 
 
 def test_recipe_paper_is_the_default_and_differs_from_fast(composed):
@@ -52,12 +56,22 @@ def test_recipe_paper_is_the_default_and_differs_from_fast(composed):
 
 def test_task_points_are_drawn_for_task_net_alone(calls):
     data = small_dataset(points=POINTS)
-    recipe, task = Recipe(task_points=16), RecordingTask(Fingerprint())
+    recipe = Recipe(task_points=16)
+    task = RecordingTask(Fingerprint())
     module = Experiment(task, None, "task", torch.optim.Adam, recipe=recipe)
+
     quiet_trainer(1).fit(module, CloudLoader(data.train, 6), CloudLoader(data.test, 6))
-    seen = {(call.training, call.points.shape[1]) for call in calls}
-    assert seen == {(True, 16), (False, POINTS)}
-    assert set(numbers_seen(trained(recipe, 1), True)) == {POINTS}
+
+    in_training = {call.points.shape[1] for call in calls if call.training}
+    in_validation = {call.points.shape[1] for call in calls if not call.training}
+    assert in_training == {16}
+    assert in_validation == {POINTS}
+
+
+def test_task_points_are_not_drawn_for_a_sampler():
+    module = trained(Recipe(task_points=16), epochs=1)
+
+    assert set(numbers_seen(module, training=True)) == {POINTS}
 
 
 @pytest.fixture(scope="module")
@@ -92,23 +106,31 @@ def test_recipe_accepts_limits():
 
 
 def test_shares_of_the_training_include_their_first_step():
-    recipe = Recipe(train_points=64, all_points_from=0.5)
-    assert [recipe.points_at(progress, 1024, 8) for progress in (0.49, 0.5)] == [64, 1024]
-    assert [reached(0.25, progress) for progress in (0.24, 0.25)] == [False, True]
-    assert not reached(Recipe().straight_through, 1.0)
+    recipe = Recipe(train_points=64, all_points_from=0.5, straight_through=0.25)
+
+    assert recipe.points_at(0.49, 1024, 8) == 64
+    assert recipe.points_at(0.5, 1024, 8) == 1024
+    assert not recipe.sees_matched(0.24)
+    assert recipe.sees_matched(0.25)
+    assert not Recipe().sees_matched(1.0)
 
 
 def test_training_sees_drawn_points_then_all_and_validation_always_all():
     module = trained(Recipe(train_points=20, all_points_from=0.5))
-    assert numbers_seen(module, True) == [20] * 4 + [POINTS] * 4
-    assert set(numbers_seen(module, False)) == {POINTS}
+
+    assert numbers_seen(module, training=True) == [20] * 4 + [POINTS] * 4
+    assert set(numbers_seen(module, training=False)) == {POINTS}
 
 
 def test_points_at_is_at_least_twice_the_sample_or_as_many_as_for_a_task_net_alone():
     recipe = Recipe(train_points=256, task_points=128)
-    assert [recipe.points_at(0, 1024, m) for m in (32, 200, 800)] == [256, 400, 1024]
+
+    assert recipe.points_at(0, 1024, 32) == 256
+    assert recipe.points_at(0, 1024, 200) == 400
+    assert recipe.points_at(0, 1024, 800) == 1024
     assert Recipe().points_at(0, 1024, 32) == 1024
-    assert [recipe.points_at(0, number, 0) for number in (1024, 100)] == [128, 100]
+    assert recipe.points_at(0, 1024, 0) == 128
+    assert recipe.points_at(0, 100, 0) == 100
     assert Recipe(train_points=64).points_at(0, 1024, 0) == 1024
 
 
@@ -116,7 +138,10 @@ def test_draw_points_returns_distinct_rows_new_in_every_draw():
     cloud = torch.arange(POINTS * 3.0).view(1, POINTS, 3)
     batch = Batch(cloud.repeat(2, 1, 1), torch.zeros(2))
     torch.manual_seed(0)
-    first, second = (draw_points(batch, 30)[..., 0] / 3 for _ in range(2))
+
+    first = draw_points(batch, 30)[..., 0] / 3
+    second = draw_points(batch, 30)[..., 0] / 3
+
     for rows in (*first, *second):
         assert len(rows.unique()) == 30
         assert set(rows.tolist()) <= set(range(POINTS))
@@ -127,23 +152,27 @@ def test_draw_points_returns_distinct_rows_new_in_every_draw():
 
 def test_draw_points_keeps_the_rows_of_a_pair():
     points = torch.randn(3, POINTS, 3)
-    pairs = Registration(PCRNet()).make_batch(
-        points, [torch.Generator().manual_seed(i) for i in range(3)]
-    )
+    generators = [torch.Generator().manual_seed(seed) for seed in range(3)]
+    pairs = Registration(PCRNet()).make_batch(points, generators)
+
     drawn = draw_points(pairs, 10)
+
     source, target = drawn.chunk(2)
     full_source, full_target = pairs.points.chunk(2)
-    rows = [torch.cdist(a, b).argmin(2) for a, b in ((source, full_source), (target, full_target))]
-    assert torch.equal(*rows)
+    rows_of_source = torch.cdist(source, full_source).argmin(2)
+    rows_of_target = torch.cdist(target, full_target).argmin(2)
+    assert torch.equal(rows_of_source, rows_of_target)
 
 
 def test_straight_through_has_matched_values_and_gradients_of_generated():
     points = torch.randn(2, POINTS, 3)
     generated = (points[:, :5] + 1e-3).requires_grad_()
-    found = straight_through(generated, points)
-    torch.testing.assert_close(found, points[:, :5])
-    weight = torch.randn_like(found)
-    (found * weight).sum().backward()
+    weight = torch.randn(2, 5, 3)
+
+    matched = straight_through(generated, points)
+    (matched * weight).sum().backward()
+
+    torch.testing.assert_close(matched.detach(), points[:, :5])
     torch.testing.assert_close(generated.grad, weight)
 
 
@@ -155,9 +184,10 @@ def test_moving_average_ends_with_the_average_of_all_steps():
             steps.append(pl_module.sampler.queries.weight.detach().clone())
             super().on_train_batch_end(trainer, pl_module, *args)
 
-    span = 0.5
-    module = trained(Recipe(), callbacks=[Watch(span)])
-    decay = 1 - 1 / (span * len(steps))
+    module = trained(Recipe(), callbacks=[Watch(0.5)])
+
+    assert len(steps) == 8
+    decay = 1 - 1 / (0.5 * 8)
     expected = steps[0]
     for weights in steps[1:]:
         expected = decay * expected + (1 - decay) * weights
@@ -176,20 +206,26 @@ def test_moving_average_keeps_frozen_net_and_counters_of_batches():
                     buffer.fill_(6140)
             assert self._average_model is not None
             self._average_model.module.load_state_dict(pl_module.state_dict())
-            before.update({k: v.clone() for k, v in pl_module.task.state_dict().items()})
+            for name, value in pl_module.task.state_dict().items():
+                before[name] = value.clone()
 
     module = trained(Recipe(), callbacks=[Count(0.7)])
+
     after = module.task.state_dict()
     assert any(name.endswith("num_batches_tracked") for name in before)
-    assert all(torch.equal(after[name], value) for name, value in before.items())
-    counters = [b for b in module.sampler.buffers() if not b.is_floating_point()]
+    for name, value in before.items():
+        assert torch.equal(after[name], value), name
+    counters = [buffer for buffer in module.sampler.buffers() if not buffer.is_floating_point()]
     assert {int(counter) for counter in counters} == {module.total_steps}
 
 
 def test_feature_distance_is_relative_to_the_reference():
-    found = torch.tensor([[1.0, 2.0], [0.0, 3.0]])
+    features = torch.tensor([[1.0, 2.0], [0.0, 3.0]])
     reference = torch.tensor([[3.0, 4.0], [0.0, 3.0]])
-    assert feature_distance(found, reference) == pytest.approx((8 / 25 + 0) / 2)
+
+    distance = feature_distance(features, reference)
+
+    assert distance == pytest.approx((8 / 25 + 0) / 2)
 
 
 def test_feature_distillation_of_net_without_point_features_raises():

@@ -24,38 +24,51 @@ def run(tmp_path, name, *overrides):
 
 def test_sampler_of_another_size_continues_from_a_run(tmp_path):
     status, out, err = run(tmp_path, "first", "sampler=mops", "m=8")
+
     assert (status, err) == (0, "")
     assert "Warm start: the first" in out
-    first = tmp_path / "first" / "weights.safetensors"
-    still = "optimizer.lr=1e-12"
-    folder = first.parent
-    status, out, _ = run(tmp_path, "second", "m=5", f"recipe.warm_start={folder}", still)
+
+    folder = tmp_path / "first"
+    start = f"recipe.warm_start={folder}"
+    status, out, _ = run(tmp_path, "second", "m=5", start, "optimizer.lr=1e-12")
+
     assert status == 0
     assert f"tensors are copies of {folder}." in out
-    one, two = (
-        weights.read(tmp_path / name / "weights.safetensors") for name in ("first", "second")
-    )
-    rows = two["state"]["queries.weight"]
-    torch.testing.assert_close(rows, one["state"]["queries.weight"][:5])
+    first = weights.read(folder / "weights.safetensors")
+    second = weights.read(tmp_path / "second" / "weights.safetensors")
+    rows = first["state"]["queries.weight"][:5]
+    torch.testing.assert_close(second["state"]["queries.weight"], rows)
     record = json.loads((tmp_path / "second" / "result.json").read_text())
-    assert record["warm_start"]["sha256"] == one["sha256"]
-    status, _, err = run(tmp_path, "third", "sampler=snet", f"recipe.warm_start={first}")
+    assert record["warm_start"]["sha256"] == first["sha256"]
+
+    start = f"recipe.warm_start={folder / 'weights.safetensors'}"
+    status, _, err = run(tmp_path, "third", "sampler=snet", start)
+
     assert status != 0
     assert "recipe.warm_start: no tensor of" in err
-    status, _, err = run(tmp_path, "fourth", f"recipe.warm_start={tmp_path / 'nothing.pt'}")
+
+    start = f"recipe.warm_start={tmp_path / 'nothing.pt'}"
+    status, _, err = run(tmp_path, "fourth", start)
+
     assert status != 0
     assert "recipe.warm_start: no file" in err
 
 
 def test_copy_pointwise_layers_copies_until_shapes_differ():
-    source, target = PointMLP([3, 8, 8, 16, 32]), PointFeatures(PointMLP([3, 8, 8, 16, 16]))
+    source = PointMLP([3, 8, 8, 16, 32])
     source(POINTS)  # moves the running statistics
-    before = copy.deepcopy(target.state_dict())
-    assert copy_pointwise_layers(nn.Sequential(nn.Linear(3, 3), source), target, POINTS) == 3
-    theirs, mine = source.layers.state_dict(), target.mlp.layers.state_dict()
-    for name, value in mine.items():
-        same = int(name.split(".")[0]) < 9  # three times linear layer, BatchNorm and ReLU
-        expected = theirs[name] if same else before[f"mlp.layers.{name}"]
+    target = PointFeatures(PointMLP([3, 8, 8, 16, 16]))
+    before = copy.deepcopy(target.mlp.layers.state_dict())
+    net = nn.Sequential(nn.Linear(3, 3), source)
+
+    copied = copy_pointwise_layers(net, target, POINTS)
+
+    assert copied == 3
+    original = source.layers.state_dict()
+    for name, value in target.mlp.layers.state_dict().items():
+        layer = int(name.split(".")[0])
+        is_copied = layer < 9  # three times linear layer, BatchNorm and ReLU
+        expected = original[name] if is_copied else before[name]
         assert torch.equal(value, expected), name
     with torch.no_grad():
         next(source.parameters()).zero_()
@@ -63,26 +76,38 @@ def test_copy_pointwise_layers_copies_until_shapes_differ():
 
 
 def test_copy_pointwise_layers_without_batch_norm_computes_the_same():
-    source, target = PointMLP([3, 8, 8, 16], norm=False), PointMLP([3, 8, 8, 16])
-    assert copy_pointwise_layers(source, target, POINTS) == 3
+    source = PointMLP([3, 8, 8, 16], norm=False)
+    target = PointMLP([3, 8, 8, 16])
+
+    copied = copy_pointwise_layers(source, target, POINTS)
+
+    assert copied == 3
     for mode in (False, True):  # in training, with the statistics of the same points
         target.train(mode)
         torch.testing.assert_close(target(POINTS), source(POINTS), rtol=1e-4, atol=1e-5)
 
 
 def test_copy_pointwise_layers_without_counterpart_copies_none():
-    assert copy_pointwise_layers(nn.Linear(3, 8), PointMLP([3, 8]), POINTS) == 0
-    assert copy_pointwise_layers(PointMLP([3, 8]), PointMLP([3, 4]), POINTS) == 0
-    assert copy_pointwise_layers(PointMLP([3, 8]), PointMLP([3, 8], norm=False), POINTS) == 0
+    normed = PointMLP([3, 8])
+    plain = PointMLP([3, 8], norm=False)
+    narrow = PointMLP([3, 4])
+
+    assert copy_pointwise_layers(nn.Linear(3, 8), normed, POINTS) == 0
+    assert copy_pointwise_layers(normed, narrow, POINTS) == 0
+    assert copy_pointwise_layers(normed, plain, POINTS) == 0
 
 
 def test_copy_tensors_takes_the_rows_that_both_have():
-    large, small = MOPSNet(12, **SIZES), MOPSNet(8, **SIZES)
-    for source, target in ((large, small), (small, large)):
-        target = copy.deepcopy(target)
+    large = MOPSNet(12, **SIZES)
+    small = MOPSNet(8, **SIZES)
+    for source, other in ((large, small), (small, large)):
+        target = copy.deepcopy(other)
         before = copy.deepcopy(target.state_dict())
         state = source.state_dict()
-        assert set(copy_tensors(state, target)) == set(state)
+
+        copied = copy_tensors(state, target)
+
+        assert set(copied) == set(state)
         rows = target.queries.weight
         assert torch.equal(rows[:8], source.queries.weight[:8])
         assert torch.equal(rows[8:], before["queries.weight"][8:])
@@ -90,8 +115,12 @@ def test_copy_tensors_takes_the_rows_that_both_have():
 
 
 def test_copy_tensors_leaves_other_shapes_and_names():
-    source, target = nn.Linear(3, 4), nn.Linear(5, 4)
+    source = nn.Linear(3, 4)
+    target = nn.Linear(5, 4)
     before = target.weight.clone()
-    assert copy_tensors(source.state_dict(), target) == ["bias"]
+
+    copied = copy_tensors(source.state_dict(), target)
+
+    assert copied == ["bias"]
     assert torch.equal(target.weight, before)
     assert copy_tensors({"other": torch.ones(4)}, target) == []

@@ -1,7 +1,9 @@
 import time
+from typing import Any
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import Interrupted, UserError
@@ -12,9 +14,13 @@ from mops_lightning.training.run.whole import recorded
 from tests.support.command_line import job
 
 
+def plain(overrides: list[str]) -> Any:
+    return OmegaConf.to_container(compose(overrides), resolve=True)
+
+
 def test_recorded_running_then_completed(tmp_path):
     before = time.perf_counter()
-    with recorded(compose(["seed=4"]), tmp_path, ["seed=4"]) as record:
+    with recorded(plain(["seed=4"]), tmp_path, ["seed=4"]) as record:
         assert run_record.read(tmp_path).status == "running"
         record.metrics["test/generated/accuracy"] = 0.5
     found = run_record.read(tmp_path)
@@ -33,7 +39,7 @@ def test_recorded_running_then_completed(tmp_path):
     ],
 )
 def test_recorded_exception_is_written_and_raised(raised, status, error, tmp_path):
-    with pytest.raises(type(raised)), recorded(compose(), tmp_path, []):
+    with pytest.raises(type(raised)), recorded(plain([]), tmp_path, []):
         raise raised
     found = run_record.read(tmp_path)
     assert (found.status, found.error) == (status, error)

@@ -20,8 +20,11 @@ from tests.support.training import small_dataset
 
 def test_make_trainer_writes_checkpoints_atomically_and_shows_no_version(tmp_path):
     experiment = Experiment(Classification(PointNetVanilla(3), 3), learn="task")
-    cfg = compose([*(one for one in TINY if not one.startswith("logger")), "logger=tensorboard"])
+    settings = [setting for setting in TINY if setting != "logger=none"]
+    cfg = compose([*settings, "logger=tensorboard"])
+
     trainer = module.make_trainer(cfg, tmp_path, small_dataset(), experiment, clouds=8)
+
     assert isinstance(trainer.strategy.checkpoint_io, module.AtomicCheckpointIO)
     assert trainer.logger is not None
     assert trainer.logger.log_dir is not None
@@ -31,17 +34,23 @@ def test_make_trainer_writes_checkpoints_atomically_and_shows_no_version(tmp_pat
 
 def test_save_checkpoint_on_full_disk_keeps_previous(tmp_path):
     path = tmp_path / "checkpoints" / "last.ckpt"
-    module.AtomicCheckpointIO().save_checkpoint({"epoch": 1}, path)
+    writer = module.AtomicCheckpointIO()
+    writer.save_checkpoint({"epoch": 1}, path)
+
     with full_disk(), pytest.raises(OSError, match="too large"):
-        module.AtomicCheckpointIO().save_checkpoint({"big": torch.zeros(9999)}, path)
+        writer.save_checkpoint({"big": torch.zeros(9999)}, path)
+
     assert torch.load(path) == {"epoch": 1}
-    assert [one.name for one in path.parent.iterdir()] == ["last.ckpt"]
+    assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
 
 
 def test_save_checkpoint_does_not_use_tmpdir(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
-    module.AtomicCheckpointIO().save_checkpoint({"epoch": 2}, tmp_path / "last.ckpt")
-    assert torch.load(tmp_path / "last.ckpt") == {"epoch": 2}
+    path = tmp_path / "last.ckpt"
+
+    module.AtomicCheckpointIO().save_checkpoint({"epoch": 2}, path)
+
+    assert torch.load(path) == {"epoch": 2}
 
 
 @pytest.mark.parametrize(("platform", "options"), [("linux", 3), ("win32", 0)])
@@ -50,5 +59,7 @@ def test_keep_freed_memory_sets_options_of_linux(monkeypatch, platform, options)
     library = SimpleNamespace(mallopt=lambda *option: called.append(option))
     monkeypatch.setattr(ctypes, "CDLL", lambda name: library)
     monkeypatch.setattr(sys, "platform", platform)
+
     module.keep_freed_memory()
+
     assert len(called) == options

@@ -84,7 +84,8 @@ class Distillation:
             output: the task net's output for it.
             targets: see ``targets``.
         """
-        losses, task = {}, self.tasks[number]
+        losses = {}
+        task = self.tasks[number]
         if targets.prediction is not None:
             apart = task.disagreement(output, targets.prediction).mean()
             losses["distillation"] = self.recipe.distillation * apart
@@ -92,7 +93,8 @@ class Distillation:
             if number not in targets.features:
                 with torch.no_grad():
                     targets.features[number] = pooled_features(task.net, targets.seen)
-            apart = feature_distance(pooled_features(task.net, points), targets.features[number])
+            features = pooled_features(task.net, points)
+            apart = feature_distance(features, targets.features[number])
             losses["feature_distillation"] = self.recipe.feature_distillation * apart
         return losses
 

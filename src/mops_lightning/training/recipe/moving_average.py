@@ -26,12 +26,13 @@ class MovingAverage(WeightAveraging):
         average = get_ema_multi_avg_fn(1 - 1 / max(steps, 1.0))
 
         def update(averaged: Any, current: Any, number: Any) -> None:
-            if averaged[0].is_floating_point():
-                # The average keeps 32 bits beside weights in 16 (trainer.precision=bf16-true).
-                alike = [one.to(mean.dtype) for one, mean in zip(current, averaged, strict=True)]
-                average(averaged, alike, number)
-            else:  # counters of batches: an average is cut off, also one of equal numbers
+            if not averaged[0].is_floating_point():
+                # Counters of batches: an average is cut off, also one of equal numbers.
                 torch._foreach_copy_(averaged, current)
+                return
+            # The average keeps 32 bits beside weights in 16 (trainer.precision=bf16-true).
+            pairs = zip(averaged, current, strict=True)
+            average(averaged, [weight.to(mean.dtype) for mean, weight in pairs], number)
 
         self._average_model.multi_avg_fn = update
 

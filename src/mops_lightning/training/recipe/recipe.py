@@ -57,9 +57,9 @@ class Recipe:
     def __post_init__(self) -> None:
         """Check the attributes."""
         for name in ("train_points", "task_points", "nets_per_step"):
-            points = getattr(self, name)
-            if points is not None and points < 1:
-                raise UserError(f"{name} must be at least 1 or null, got {points}.")
+            number = getattr(self, name)
+            if number is not None and number < 1:
+                raise UserError(f"{name} must be at least 1 or null, got {number}.")
         for name in ("all_points_from", "straight_through", "ema_span"):
             share = getattr(self, name)
             if share is not None and not 0 <= share <= 1:

@@ -14,6 +14,9 @@ from mops_lightning.zoo import names, weights
 CLOUDS = 64
 """Clouds whose statistics BatchNorm takes where the task net has none."""
 
+NAMED = 3
+"""Most tensors that a sentence names."""
+
 Block = tuple[nn.Linear, nn.BatchNorm1d | None]
 
 
@@ -37,8 +40,10 @@ def warm_start_sampler(
     if isinstance(source, str):
         return _from_file(source, sampler)
     copied = copy_pointwise_layers(net, sampler, clouds[:CLOUDS])
-    text = f"the first {copied} layers are copies of the task net's"
-    return {"layers": copied}, text if copied else "no layer is like one of the task net's"
+    text = "no layer is like one of the task net's"
+    if copied:
+        text = f"the first {copied} layers are copies of the task net's"
+    return {"layers": copied}, text
 
 
 def _from_file(name: str, sampler: nn.Module) -> tuple[dict[str, Any], str]:
@@ -66,9 +71,11 @@ def _from_file(name: str, sampler: nn.Module) -> tuple[dict[str, Any], str]:
     tensors = list(sampler.state_dict())
     text = f"{len(copied)} of {len(tensors)} tensors are copies of {name}"
     # Between samplers with and without anchors, the last layer is not copied.
-    new = [tensor for tensor in tensors if tensor not in copied]
-    if new:
-        text += f"; not copied: {', '.join(new[:3])}{', ...' if new[3:] else ''}"
+    left = [tensor for tensor in tensors if tensor not in copied]
+    if left:
+        text += f"; not copied: {', '.join(left[:NAMED])}"
+    if len(left) > NAMED:
+        text += ", ..."
     return numbers, text
 
 
@@ -89,27 +96,42 @@ def copy_pointwise_layers(source: nn.Module, target: nn.Module, points: Tensor) 
     Returns:
         The number of linear layers copied; 0 if a net has no ``PointMLP``.
     """
-    rows, copied = points.flatten(0, 1), 0
-    for (original, norm), (layer, own_norm) in zip(_blocks(source), _blocks(target), strict=False):
-        same = original.weight.shape == layer.weight.shape
-        if not same or (norm is not None and own_norm is None):
+    rows = points.flatten(0, 1)
+    copied = 0
+    for original, block in zip(_blocks(source), _blocks(target), strict=False):
+        if not _fits(original, block):
             break
-        layer.weight.copy_(original.weight)
-        if layer.bias is not None and original.bias is not None:
-            layer.bias.copy_(original.bias)
-        if own_norm is not None:
-            if norm is not None:
-                own_norm.load_state_dict(norm.state_dict())
-            else:
-                _undo(own_norm, layer(rows), original.bias)
-        rows = layer(rows)
-        if own_norm is not None:
-            rows = nn.functional.batch_norm(
-                rows, own_norm.running_mean, own_norm.running_var, own_norm.weight, own_norm.bias
-            )
-        rows = rows.relu_()
+        rows = _copy_block(original, block, rows)
         copied += 1
     return copied
+
+
+def _fits(source: Block, target: Block) -> bool:
+    """Return whether a layer, and its BatchNorm if it has one, can be copied to another."""
+    original, norm = source
+    layer, own_norm = target
+    has_place_for_norm = norm is None or own_norm is not None
+    return original.weight.shape == layer.weight.shape and has_place_for_norm
+
+
+def _copy_block(source: Block, target: Block, rows: Tensor) -> Tensor:
+    """Copy a layer with its BatchNorm; return its output for ``rows``."""
+    original, norm = source
+    layer, own_norm = target
+    layer.weight.copy_(original.weight)
+    if layer.bias is not None and original.bias is not None:
+        layer.bias.copy_(original.bias)
+    output = layer(rows)
+    if own_norm is None:
+        return output.relu_()
+    if norm is not None:
+        own_norm.load_state_dict(norm.state_dict())
+    else:
+        _undo(own_norm, output, original.bias)
+    normalized = nn.functional.batch_norm(
+        output, own_norm.running_mean, own_norm.running_var, own_norm.weight, own_norm.bias
+    )
+    return normalized.relu_()
 
 
 @torch.no_grad()
@@ -129,7 +151,9 @@ def copy_tensors(source: dict[str, Tensor], target: nn.Module) -> list[str]:
     copied = []
     for name, tensor in target.state_dict().items():
         values = source.get(name)
-        if values is None or values.shape[1:] != tensor.shape[1:] or values.ndim != tensor.ndim:
+        if values is None or values.ndim != tensor.ndim:
+            continue
+        if values.shape[1:] != tensor.shape[1:]:
             continue
         if tensor.ndim == 0:
             tensor.copy_(values)
@@ -142,13 +166,23 @@ def copy_tensors(source: dict[str, Tensor], target: nn.Module) -> list[str]:
 
 def _blocks(net: nn.Module) -> list[Block]:
     """Return the linear layers of a net's first ``PointMLP``, each with its BatchNorm."""
-    stack = next((m.layers for m in net.modules() if isinstance(m, PointMLP)), nn.Sequential())
     blocks: list[Block] = []
-    for layer, following in pairwise([*stack, None]):
-        if isinstance(layer, nn.Linear):
-            norm = following if isinstance(following, nn.BatchNorm1d) else None
-            blocks.append((layer, norm))
+    for layer, following in pairwise([*_layers(net), None]):
+        if not isinstance(layer, nn.Linear):
+            continue
+        if isinstance(following, nn.BatchNorm1d):
+            blocks.append((layer, following))
+        else:
+            blocks.append((layer, None))
     return blocks
+
+
+def _layers(net: nn.Module) -> list[nn.Module]:
+    """Return the layers of a net's first ``PointMLP``; none if it has none."""
+    for module in net.modules():
+        if isinstance(module, PointMLP):
+            return list(module.layers)
+    return []
 
 
 def _undo(norm: nn.BatchNorm1d, rows: Tensor, bias: Tensor | None) -> None:
@@ -159,4 +193,6 @@ def _undo(norm: nn.BatchNorm1d, rows: Tensor, bias: Tensor | None) -> None:
     norm.running_mean.copy_(mean)
     norm.running_var.copy_(variance)
     norm.weight.copy_((variance + norm.eps).sqrt())
-    norm.bias.copy_(mean if bias is None else mean + bias)
+    norm.bias.copy_(mean)
+    if bias is not None:
+        norm.bias.add_(bias)

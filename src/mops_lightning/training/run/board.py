@@ -64,11 +64,10 @@ class Board(TensorBoardLogger):
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Log values under the names of their curves."""
-        named = {
-            curve_name(name, self.score): value
-            for name, value in metrics.items()
-            if name != "epoch"
-        }
+        named = {}
+        for name, value in metrics.items():
+            if name != "epoch":
+                named[curve_name(name, self.score)] = value
         super().log_metrics(named, step)
 
     @rank_zero_only
@@ -85,11 +84,10 @@ class Board(TensorBoardLogger):
             scores: the metrics that stand beside the settings.
             step: of the training.
         """
-        figures = sorted(record.metrics.items())
-        rows = [f"| {name} | {value:.6g} |" for name, value in figures]
-        self.experiment.add_text(
-            "test", "\n".join(["| metric | value |", "|---|--:|", *rows]), step
-        )
+        lines = ["| metric | value |", "|---|--:|"]
+        for name, value in sorted(record.metrics.items()):
+            lines.append(f"| {name} | {value:.6g} |")
+        self.experiment.add_text("test", "\n".join(lines), step)
         _, *session = hparams({**board_settings(record), **scores}, {})
         for summary in session:
             self.experiment.file_writer.add_summary(summary)
@@ -107,7 +105,8 @@ class Board(TensorBoardLogger):
         grey = torch.tensor(INPUT_COLOUR).expand(cloud.shape)
         for name, sample in samples.items():
             own = sample.detach().cpu().float()
-            colour = torch.tensor(COLOURS.get(name, COLOURS["sampled"])).expand(own.shape)
+            rgb = COLOURS.get(name, COLOURS["sampled"])
+            colour = torch.tensor(rgb).expand(own.shape)
             self.experiment.add_mesh(
                 f"clouds/{name}",
                 torch.cat([cloud, own], dim=1),
@@ -126,19 +125,25 @@ def curve_name(name: str, score: str) -> str:
     """
     if name in OTHERS:
         return f"curves/{OTHERS[name]}"
-    parts = re.fullmatch(rf"val/(m\d+/)?(\w+)/{re.escape(score)}", name)
-    if parts is None or parts[2] not in ORDER:
+    parts = re.fullmatch(rf"val/(?:(m\d+)/)?(\w+)/{re.escape(score)}", name)
+    if parts is None:
         return name
-    size = f", {parts[1][:-1]}" if parts[1] else ""
-    return f"curves/{1 + ORDER.index(parts[2])} val {score}, {parts[2]}{size}"
+    size, readout = parts.groups()
+    if readout not in ORDER:
+        return name
+    place = 1 + ORDER.index(readout)
+    curve = f"curves/{place} val {score}, {readout}"
+    return f"{curve}, {size}" if size else curve
 
 
 def board_settings(record: RunRecord) -> dict[str, Any]:
     """Return the settings by which runs are told apart: the groups' names, and what was changed."""
     config = dotted(record.config)
+    named: dict[str, Any] = dict(shown_names(record.config))
     changed = [override.lstrip("+~").partition("=")[0] for override in record.overrides]
-    shown = {key: config[key] for key in (*ALWAYS_SHOWN, *changed) if key in config}
-    named: dict[str, Any] = {**shown_names(record.config), **shown}
+    for key in (*ALWAYS_SHOWN, *changed):
+        if key in config:
+            named[key] = config[key]
     if record.config.get("tags"):
         named["tags"] = ", ".join(record.config["tags"])
     return {key: _plain(value) for key, value in named.items()}

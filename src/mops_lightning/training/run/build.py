@@ -15,8 +15,8 @@ Besides the settings of its node, a constructor is offered these values, by argu
 | ``name``, ``save_dir`` | loggers | empty, the run's folder |
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,9 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
-from mops_lightning.config import distributed
-from mops_lightning.config.build import accepted, build, build_as
-from mops_lightning.config.settings import RECIPE_OF_TASK_NETS
+from mops_lightning.config import distributed, settings
+from mops_lightning.config.build import build_as, takes
+from mops_lightning.config.declaration import Training
 from mops_lightning.config.shortened import UNLIMITED
 from mops_lightning.data.clouds import CloudDataset, Clouds, check_parts
 from mops_lightning.data.loader import Augmentation, CloudLoader
@@ -50,6 +50,11 @@ AUTO = "auto"
 MORE_POINTS = (
     "Lower it, or give clouds of more points (dataset.n_points; for pairs also task.resample)."
 )
+
+
+def has_weights(module: nn.Module) -> bool:
+    """Return whether a module has weights."""
+    return any(True for _ in module.parameters())
 
 
 @dataclass(frozen=True)
@@ -80,14 +85,13 @@ class Parts:
 
     @property
     def trains(self) -> bool:
-        """Whether anything is trained; an index sampler under a frozen net has no parameters."""
-        learns = any(p.requires_grad for p in self.experiment.parameters())
-        return learns and self.trained is None
+        """Whether anything is trained."""
+        return self.experiment.trainable and self.trained is None
 
     @property
     def has_task_weights(self) -> bool:
         """Whether the task net has weights."""
-        return any(True for _ in self.experiment.task.parameters())
+        return has_weights(self.experiment.task)
 
     @property
     def last_checkpoint(self) -> Path | None:
@@ -101,6 +105,20 @@ class Parts:
     def part(self) -> tuple[int, int]:
         """Rank of this process and number of processes."""
         return self.trainer.global_rank, self.trainer.world_size
+
+    def train_loader(self) -> CloudLoader:
+        """Return a loader of the clouds to train on, augmented, in a new order in every epoch."""
+        overfits = self.cfg.trainer.get("overfit_batches")
+        return CloudLoader(
+            self.train,
+            self.cfg.batch_size,
+            shuffle=not overfits,  # the same first batches in every epoch
+            augment=augmentation(self.cfg),
+            make_batch=self.experiment.task.make_batch,
+            drop_last=True,
+            seed=self.cfg.seed,
+            part=self.part,
+        )
 
     def score_loader(self, clouds: Clouds) -> CloudLoader:
         """Return a loader whose batches are the same in every epoch and for every sampler."""
@@ -121,33 +139,58 @@ def build_parts(
         UserError: settings that do not fit each other, the data or the checkpoint to resume.
     """
     identity = checkpoint.checkpoint_identity(record.config, dataset.fingerprint)
+    _note_data(dataset, record)
     resumed = None
     if cfg.ckpt_path is not None:
         resumed = checkpoint.find_checkpoint(cfg.ckpt_path, Path(cfg.out), identity)
-    record.dataset_fingerprint = dataset.fingerprint
-    record.train_clouds, record.test_clouds = len(dataset.train.labels), len(dataset.test.labels)
-    record.class_names = list(dataset.class_names)
-    record.part_names = list(dataset.part_names)
-    record.dataset_facts = dataset.notes
-    record.resumed_from = None if resumed is None else str(resumed.path)
-    record.lengthened = resumed is not None and _lengthens(resumed, cfg.trainer.max_epochs)
+        record.resumed_from = str(resumed.path)
+        record.lengthened = _lengthens(resumed, cfg.trainer.max_epochs)
     train, held_out = split(dataset.train, cfg.val_fraction, cfg.seed)
     experiment = make_experiment(cfg, dataset, identity)
     trainer = make_trainer(cfg, folder, dataset, experiment, len(train.labels))
     parts = Parts(cfg, folder, dataset, train, held_out, experiment, trainer, resumed, trained)
     validated = len(held_out.labels) if parts.trains else 0
-    distributed.check_shares(cfg.batch_size, record.test_clouds, validated, trainer.world_size)
+    tested = len(dataset.test.labels)
+    distributed.check_shares(cfg.batch_size, tested, validated, trainer.world_size)
+    _check_weights(parts)
+    record.device = _device_name(trainer)
+    return parts
+
+
+def _note_data(dataset: CloudDataset, record: RunRecord) -> None:
+    """Describe the data in the record."""
+    record.dataset_fingerprint = dataset.fingerprint
+    record.train_clouds = len(dataset.train.labels)
+    record.test_clouds = len(dataset.test.labels)
+    record.class_names = list(dataset.class_names)
+    record.part_names = list(dataset.part_names)
+    record.dataset_facts = dataset.notes
+
+
+def _check_weights(parts: Parts) -> None:
+    """Refuse weights for a task net without any, and a test of an untrained sampler.
+
+    Raises:
+        UserError: such a setting is given.
+    """
+    cfg = parts.cfg
     if not parts.has_task_weights and cfg.weights not in (None, "auto", OF_RUN):
         raise UserError(
             f"weights: {cfg.names.net} has no weights to load, got {cfg.weights}. "
             "Give weights=null."
         )
-    learned = experiment.sampler is not None and experiment.sampler.learned
-    if cfg.learn == "nothing" and learned and not cfg.evaluate:
+    sampler = parts.experiment.sampler
+    is_untrained = sampler is not None and sampler.learned and not cfg.evaluate
+    if cfg.learn == "nothing" and is_untrained:
         raise UserError("learn=nothing needs a trained sampler: give its run with evaluate=RUN.")
-    root = trainer.strategy.root_device
-    record.device = torch.cuda.get_device_name(root) if root.type == "cuda" else root.type
-    return parts
+
+
+def _device_name(trainer: L.Trainer) -> str:
+    """Return the name of the GPU, or the kind of another device."""
+    device = trainer.strategy.root_device
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return str(device.type)
 
 
 def _lengthens(resumed: checkpoint.Checkpoint, epochs: int) -> bool:
@@ -168,27 +211,29 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         UserError: a setting that its part or the data do not allow.
     """
     L.seed_everything(derive_seed(cfg.seed, 0) % 2**32, verbose=False)
-    of_task, of_net = _numbers(cfg, dataset)
-    own_net = build_as(nn.Module, cfg.task.net, "task.net", **of_net)
-    task: Task = build_as(Task, cfg.task, "task", net=own_net, **of_task)
+    task = _make_task(cfg, dataset)
     # Another seed: the sampler's initial weights must not depend on the task net's size.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
-    # For samplers that select points by the task net's features.
-    net = {"net": task.net}
-    own = accepted(cfg.sampler, net)
-    sampler = build_as(Sampler, cfg.sampler, "sampler", **own) if cfg.learn != "task" else None
+    of_task = {"net": task.net}  # for samplers that select points by the task net's features
+    sampler: Sampler | None = None
+    if cfg.learn != "task":
+        sampler = build_as(Sampler, cfg.sampler, "sampler", of_task)
     # Pairs may have fewer points than the clouds they are drawn from.
-    one = CloudLoader(dataset.test, 1, make_batch=task.make_batch).batch_of(torch.tensor([0]))
-    points = one.points.shape[1]
-    sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, points, training=cfg.learn != "nothing")
+    loader = CloudLoader(dataset.test, 1, make_batch=task.make_batch)
+    cloud = loader.batch_of(torch.tensor([0])).points[:1]
+    trains = cfg.learn != "nothing"
+    sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, cloud.shape[1], training=trains)
     baselines: dict[str, Sampler] = {}
+    others: Sequence[Task] = ()
     if sampler is not None and sampler.learned:
-        baselines = _make_baselines(cfg, max(sizes), net)
-        _try_baselines(baselines, one.points[:1])
+        baselines = _make_baselines(cfg, max(sizes), of_task)
+        _try_baselines(baselines, cloud)
+        others = other_tasks(cfg, dataset)
     elif sampler is not None and sampler.flexible:
-        sampler = build(cfg.sampler, "sampler", m=max(sizes), **own)
+        sampler = build_as(Sampler, cfg.sampler, "sampler", of_task, m=max(sizes))
     check_optimizers(cfg)
     makers = OptimizerMakers.of(cfg.optimizer, "optimizer")
+    recipe = build_as(Recipe, cfg.recipe, "recipe")
     return Experiment(
         task,
         sampler,
@@ -201,34 +246,56 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         sizes=sizes,
         m=cfg.m,
         task_lr_scale=cfg.task_lr_scale,
-        other_tasks=other_tasks(cfg, dataset) if sampler is not None and sampler.learned else (),
+        other_tasks=others,
         test_logger=False,  # stages.test logs them, as one table
-        recipe=_in_force(build_as(Recipe, cfg.recipe, "recipe"), sampler, cfg.learn),
+        recipe=_in_force(recipe, sampler, cfg.learn),
     )
 
 
-def _numbers(cfg: DictConfig, dataset: CloudDataset) -> tuple[dict[str, int], dict[str, int]]:
-    """Return the numbers of classes or parts that the task and its net take, or refuse them."""
-    offered = {"num_classes": len(dataset.class_names), "num_parts": len(dataset.part_names)}
-    of_task, of_net = accepted(cfg.task, offered), accepted(cfg.task.net, offered)
-    if of_task and of_net and not of_task.keys() & of_net.keys():
+def _make_task(cfg: DictConfig, dataset: CloudDataset) -> Task:
+    """Build the task and its net for the classes or parts of the data.
+
+    Raises:
+        UserError: net, task and data do not fit each other.
+    """
+    offered = {
+        "num_classes": len(dataset.class_names),
+        "num_parts": len(dataset.part_names),
+    }
+    _check_fits(cfg, dataset, offered)
+    net = build_as(nn.Module, cfg.task.net, "task.net", offered)
+    task: Task = build_as(Task, cfg.task, "task", offered, net=net)
+    return task
+
+
+def _check_fits(cfg: DictConfig, dataset: CloudDataset, offered: Mapping[str, int]) -> None:
+    """Refuse a net of another task, and data without the parts that a task needs.
+
+    Raises:
+        UserError: net, task and data do not fit each other.
+    """
+    of_task = [name for name in offered if takes(cfg.task, name)]
+    of_net = [name for name in offered if takes(cfg.task.net, name)]
+    is_of_other_task = of_task and of_net and not set(of_task) & set(of_net)
+    if is_of_other_task:
         raise UserError(
             f"task/net={cfg.names.net} takes {', '.join(of_net)}, but task={cfg.names.task} gives "
             f"{', '.join(of_task)}. Choose a net of this task (docs/tasks.md)."
         )
-    if cfg.test_corruption and "num_parts" in of_task and dataset.test.parts is None:
+    if "num_parts" not in of_task:
+        return
+    if cfg.test_corruption and dataset.test.parts is None:
         raise UserError(
             f"test_corruption={cfg.test_corruption} adds or removes points, whose parts nobody "
             "knows. Give jitter, rotation, scaling, shear or distortion."
         )
-    if "num_parts" in of_task:
-        check_parts(dataset)
-    return of_task, of_net
+    check_parts(dataset)
 
 
 def augmentation(cfg: DictConfig) -> Augmentation:
     """Return the augmentation of this run; joint training has the sampler's."""
-    return Augmentation(**(cfg.augment["task" if cfg.learn == "task" else "sampler"] or {}))
+    of = "task" if cfg.learn == "task" else "sampler"
+    return Augmentation(**(cfg.augment[of] or {}))
 
 
 def split(clouds: Clouds, fraction: float, seed: int) -> tuple[Clouds, Clouds]:
@@ -239,11 +306,14 @@ def split(clouds: Clouds, fraction: float, seed: int) -> tuple[Clouds, Clouds]:
     Returns:
         The clouds to train on and the held-out clouds, each in their original order.
     """
-    sources = torch.arange(len(clouds.labels)) if clouds.sources is None else clouds.sources
+    sources = clouds.sources
+    if sources is None:
+        sources = torch.arange(len(clouds.labels))
     names = sources.unique()
     order = torch.randperm(len(names), generator=generator(seed, 2))
-    chosen = torch.isin(sources, names[order[: round(len(names) * fraction)]])
-    return clouds.take(~chosen), clouds.take(chosen)
+    number = round(len(names) * fraction)
+    is_held_out = torch.isin(sources, names[order[:number]])
+    return clouds.take(~is_held_out), clouds.take(is_held_out)
 
 
 def sizes_to_test(
@@ -268,17 +338,47 @@ def sizes_to_test(
     """
     if sampler is None:
         return ()
-    listed = [] if sizes == AUTO else list(map(int, sizes))
+    if sizes == AUTO:
+        _check_largest({"m": m}, sampler, n_points, training)
+        return _usual_sizes(m, sampler, n_points)
+    listed = [int(size) for size in sizes]
     wanted = tuple(sorted({m, *listed}))
     if not sampler.flexible and wanted != (m,):
         raise UserError(
             f"sizes: this sampler returns {m} points only, got sizes={listed}. "
             "Train one that returns any number, such as sampler=fmops, or run with -m m=8,16,32."
         )
-    largest = {"m": m, "sizes": wanted[-1]}
+    _check_largest({"m": m, "sizes": wanted[-1]}, sampler, n_points, training)
+    return wanted
+
+
+def _usual_sizes(m: int, sampler: Sampler, n_points: int) -> tuple[int, ...]:
+    """Return ``m``, and the standard sizes that a multi-size sampler and the clouds allow."""
+    if not (sampler.flexible and sampler.learned):
+        return (m,)
+    most = min(sampler.m, n_points)
+    standard = [size for size in STANDARD if size <= most]
+    return tuple(sorted({m, *standard}))
+
+
+def _check_largest(
+    largest: Mapping[str, int], sampler: Sampler, n_points: int, training: bool
+) -> None:
+    """Refuse sizes that the sampler or the clouds do not allow.
+
+    Args:
+        largest: the largest size that a setting requests, by its name.
+        sampler: the sampler.
+        n_points: N of the test clouds.
+        training: whether the sampler is trained, which includes its largest size.
+
+    Raises:
+        UserError: a size is too large.
+    """
+    requested = dict(largest)
     if sampler.learned and training:
-        largest["sampler.m_max"] = sampler.m
-    for name, size in largest.items():
+        requested["sampler.m_max"] = sampler.m
+    for name, size in requested.items():
         if size > n_points:
             raise UserError(
                 f"{name} must be at most the {n_points} points of a cloud, got {size}. "
@@ -289,11 +389,6 @@ def sizes_to_test(
                 f"{name} must be at most sampler.m_max={sampler.m}, got {size}. "
                 f"Lower it, or train with sampler.m_max={size}."
             )
-    if sizes == AUTO:
-        most = min(sampler.m, n_points)
-        more = STANDARD if sampler.flexible and sampler.learned else ()
-        return tuple(sorted({m, *(size for size in more if size <= most)}))
-    return wanted
 
 
 def _in_force(recipe: Recipe, sampler: Sampler | None, learn: str) -> Recipe:
@@ -302,18 +397,26 @@ def _in_force(recipe: Recipe, sampler: Sampler | None, learn: str) -> Recipe:
         return Recipe(task_points=recipe.task_points)
     if sampler.learned:
         return replace(recipe, task_points=None)
+    if learn != "joint":
+        return Recipe()
     # A task net that is trained on the sampler's points sees as many clouds as with a learned one.
-    kept = {name: getattr(recipe, name) for name in RECIPE_OF_TASK_NETS} if learn == "joint" else {}
+    kept = {}
+    for name, value in asdict(recipe).items():
+        if settings.of(f"recipe.{name}").is_of(Training.JOINT):
+            kept[name] = value
     return Recipe(**kept)
 
 
-def _make_baselines(cfg: DictConfig, m: int, net: dict[str, Any]) -> dict[str, Sampler]:
+def _make_baselines(cfg: DictConfig, m: int, of_task: Mapping[str, Any]) -> dict[str, Sampler]:
     """Build the index samplers for ``m`` points, with the run's seed unless they have their own."""
-    baselines = {}
+    baselines: dict[str, Sampler] = {}
     for name, node in cfg.baselines.items():
-        if node:
-            own = accepted(node, net if "seed" in node else {**net, "seed": cfg.seed})
-            baselines[str(name)] = build_as(Sampler, node, f"baselines.{name}", m=m, **own)
+        if not node:
+            continue
+        offered = dict(of_task)
+        if "seed" not in node:
+            offered["seed"] = cfg.seed
+        baselines[str(name)] = build_as(Sampler, node, f"baselines.{name}", offered, m=m)
     return baselines
 
 

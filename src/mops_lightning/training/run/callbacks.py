@@ -9,7 +9,7 @@ import lightning as L
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, RichProgressBar
 from omegaconf import DictConfig
 
-from mops_lightning.config.build import accepted, build_as
+from mops_lightning.config.build import build_as
 from mops_lightning.config.shortened import UNLIMITED
 from mops_lightning.errors import UserError
 
@@ -30,8 +30,9 @@ class CPUTime(Callback):
     @property
     def seconds(self) -> float:
         """CPU seconds of this process and its threads, at the end those of the training."""
-        since = 0.0 if self.start is None else time.process_time() - self.start
-        return self.before + since
+        if self.start is None:
+            return self.before
+        return self.before + time.process_time() - self.start
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Start counting."""
@@ -39,7 +40,8 @@ class CPUTime(Callback):
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Stop counting."""
-        self.before, self.start = self.seconds, None
+        self.before = self.seconds
+        self.start = None
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a checkpoint keeps."""
@@ -127,5 +129,5 @@ def build_callbacks(nodes: DictConfig, offered: dict[str, Any], logged: bool) ->
         where = f"callbacks.{name}"
         if "_target_" not in node:
             raise UserError(f"{where}: give its class as {where}._target_=MODULE.CLASS.")
-        built.append(build_as(Callback, node, where, **accepted(node, offered)))
+        built.append(build_as(Callback, node, where, offered))
     return built

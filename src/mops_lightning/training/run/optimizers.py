@@ -35,8 +35,9 @@ class OptimizerMakers:
         arguments: Any = OmegaConf.to_container(node, resolve=True)
         of_schedule = arguments.pop("schedule", None)
         optimizer = _maker(arguments, where)
-        schedule = _maker(of_schedule, f"{where}.schedule") if of_schedule else None
-        return cls(optimizer, schedule)
+        if not of_schedule:
+            return cls(optimizer, None)
+        return cls(optimizer, _maker(of_schedule, f"{where}.schedule"))
 
     def check(self) -> None:
         """Make an optimizer of one parameter, so that mistakes end the run before any training.
@@ -44,13 +45,15 @@ class OptimizerMakers:
         Raises:
             UserError: an argument is wrong.
         """
-        optimizer = self.optimizer([torch.nn.Parameter(torch.zeros(1))])
+        parameter = torch.nn.Parameter(torch.zeros(1))
+        optimizer = self.optimizer([parameter])
         if self.schedule is not None:
             self.schedule(optimizer, total_steps=2)
 
 
 def _maker(arguments: dict[str, Any], where: str) -> Callable[..., Any]:
-    maker: Callable[..., Any] = build(OmegaConf.create({**arguments, "_partial_": True}), where)
+    node = OmegaConf.create({**arguments, "_partial_": True})
+    maker: Callable[..., Any] = build(node, where)
     return maker
 
 

@@ -2,7 +2,7 @@
 
 from omegaconf import DictConfig
 
-from mops_lightning.config.build import accepted, build_as
+from mops_lightning.config.build import build_as, takes
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.tasks.base import Task
@@ -16,22 +16,28 @@ def other_tasks(cfg: DictConfig, dataset: CloudDataset) -> list[Task]:
         UserError: a file holds no task net, or one of another task or of other classes; or
             ``recipe.nets_per_step`` is more than there are.
     """
-    drawn, given = cfg.recipe.nets_per_step or 0, len(cfg.other_nets or ())
-    if drawn > given:
+    names = list(cfg.other_nets or ())
+    drawn = cfg.recipe.nets_per_step or 0
+    if drawn > len(names):
         raise UserError(
-            f"recipe.nets_per_step={drawn}: there are {given} other_nets. Give more, or null."
+            f"recipe.nets_per_step={drawn}: there are {len(names)} other_nets. Give more, or null."
         )
-    tasks: list[Task] = []
-    for name in cfg.other_nets or () if cfg.learn == "sampler" else ():
-        from mops_lightning.zoo.load import read_net  # imports every net
+    if cfg.learn != "sampler":
+        return []
+    try:
+        return [_task_with_net(name, cfg, dataset) for name in names]
+    except UserError as error:
+        raise UserError(f"other_nets: {error}") from None
 
-        try:
-            if accepted(cfg.task, {"num_parts": 0}):
-                raise UserError("no file can name a net of segmentation. Leave other_nets out.")
-            net, classes = read_net(name)
-            known = accepted(cfg.task, {"num_classes": len(dataset.class_names)})
-            tasks.append(build_as(Task, cfg.task, "task", net=net, **known))
-            check_names(classes, tasks[-1], dataset, name)
-        except UserError as error:
-            raise UserError(f"other_nets: {error}") from None
-    return tasks
+
+def _task_with_net(name: str, cfg: DictConfig, dataset: CloudDataset) -> Task:
+    """Build the run's task with the net of a file, a model or a run."""
+    from mops_lightning.zoo.load import read_net  # imports every net
+
+    if takes(cfg.task, "num_parts"):
+        raise UserError("no file can name a net of segmentation. Leave other_nets out.")
+    net, classes = read_net(name)
+    offered = {"num_classes": len(dataset.class_names)}
+    task: Task = build_as(Task, cfg.task, "task", offered, net=net)
+    check_names(classes, task, dataset, name)
+    return task

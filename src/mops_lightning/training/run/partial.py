@@ -28,8 +28,7 @@ def note_training(trainer: L.Trainer, batches: int, record: RunRecord) -> None:
     for name in ("fast_dev_run", "overfit_batches"):
         if settings.get(name):
             record.partial.append(f"tried with trainer.{name}={settings[name]}")
-    skipped = trainer.limit_train_batches == 0
-    seen = 0 if skipped else int(trainer.num_training_batches)
+    seen = _seen_batches(trainer)
     if seen < batches:
         record.partial.append(f"trained on {seen} of {batches} batches of an epoch")
     of_epoch = math.ceil(seen / trainer.accumulate_grad_batches)
@@ -39,10 +38,19 @@ def note_training(trainer: L.Trainer, batches: int, record: RunRecord) -> None:
         record.partial.append(f"trained for {steps} of {planned} steps")
 
 
+def _seen_batches(trainer: L.Trainer) -> int:
+    """Return the batches of an epoch that were trained on."""
+    if trainer.limit_train_batches == 0:
+        return 0
+    return int(trainer.num_training_batches)
+
+
 def _has_stopped_early(trainer: L.Trainer) -> bool:
     """Return whether early stopping ended the training, not a limit before it."""
-    reasons = [callback.stopping_reason for callback in trainer.early_stopping_callbacks]
-    return any(reason is not EarlyStoppingReason.NOT_STOPPED for reason in reasons)
+    for callback in trainer.early_stopping_callbacks:
+        if callback.stopping_reason is not EarlyStoppingReason.NOT_STOPPED:
+            return True
+    return False
 
 
 def note_test(trainer: L.Trainer, batches: int, record: RunRecord) -> None:
@@ -62,7 +70,8 @@ def note_task_net(config: Mapping[str, Any], record: RunRecord) -> None:
         config: of the run that trained the net, from its weights file.
         record: to fill.
     """
-    if reasons := shortening(config):
+    reasons = shortening(config)
+    if reasons:
         record.partial.append(f"used a task net trained with {' '.join(reasons)}")
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import lightning as L
 import numpy as np
@@ -58,66 +58,81 @@ class CloudVisualization(Callback):
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Draw into TensorBoard every tenth of the run."""
         every = max((trainer.max_epochs or 1) // 10, 1)
-        if trainer.current_epoch % every == 0:
-            self._draw(trainer, pl_module, None)
+        board = _board(trainer)
+        if board is None or trainer.current_epoch % every != 0:
+            return
+        drawn = self._drawn(trainer, pl_module, scores=None)
+        for name, figure in drawn.figures.items():
+            drawing.view_upright(figure, self.up)
+            board.experiment.add_figure(_tag(name), figure, trainer.global_step)
 
     def on_test_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Draw into TensorBoard and as PNG."""
-        self._draw(trainer, pl_module, self.folder)
-
-    def _draw(self, trainer: L.Trainer, module: L.LightningModule, folder: Path | None) -> None:
-        """Draw with the nets as they are; PNGs and baselines only where there is a folder."""
-        board = trainer.logger if isinstance(trainer.logger, TensorBoardLogger) else None
-        if not trainer.is_global_zero or (board is None and folder is None):
+        if not trainer.is_global_zero:
             return
+        board = _board(trainer)
+        drawn = self._drawn(trainer, pl_module, scores=trainer.callback_metrics)
+        if drawn.samples:
+            path = self.folder / drawing.CLOUDS
+            points = drawing.to_y_up(drawn.points, self.up)
+            samples = {}
+            for name, sample in drawn.samples.items():
+                samples[name] = drawing.to_y_up(sample, self.up)
+            drawing.save_clouds(path, points, samples, drawn.titles)
+            if isinstance(board, Board):
+                board.add_clouds(points, samples, trainer.global_step)
+        for name, figure in drawn.figures.items():
+            drawing.view_upright(figure, self.up)
+            path = drawing.save_figure(figure, self.folder / f"{name}.png")
+            if board is not None:  # it shows the saved file: a second drawing takes as long
+                pixels = np.asarray(Image.open(path).convert("RGB"))
+                step = trainer.global_step
+                board.experiment.add_image(_tag(name), pixels, step, dataformats="HWC")
+
+    @torch.no_grad()
+    def _drawn(
+        self, trainer: L.Trainer, module: Any, scores: Mapping[str, Tensor] | None
+    ) -> "_Drawn":
+        """Draw the clouds with the nets as they are.
+
+        Args:
+            trainer: its precision and device are used.
+            module: the experiment.
+            scores: test metrics by name; None before the test. Baselines do not change in
+                training, so they are drawn once, with the scores.
+        """
         training = module.training
         module.eval()
         converted = trainer.precision_plugin.convert_input(self.batch)
         batch = move_data_to_device(converted, module.device)
-        scores = trainer.callback_metrics if folder is not None else None
-        figures, samples = self._figures(module, batch, scores)
-        module.train(training)
-        task: Any = module.task
-        titles = cloud_titles(task, self.titles)
-        if folder is not None and samples:
-            points = drawing.to_y_up(batch.points, self.up)
-            turned = {name: drawing.to_y_up(sample, self.up) for name, sample in samples.items()}
-            drawing.save_clouds(folder / drawing.CLOUDS, points, turned, titles)
-            if isinstance(board, Board):
-                board.add_clouds(points, turned, trainer.global_step)
-        for name, figure in figures.items():
-            drawing.view_upright(figure, self.up)
-            path = folder and drawing.save_figure(figure, folder / f"{name}.png")
-            if board is None:
-                continue
-            tag = f"pictures/{name}"  # a group behind the curves
-            if path is None:
-                board.experiment.add_figure(tag, figure, trainer.global_step)
-            else:  # what was drawn already
-                pixels = np.asarray(Image.open(path).convert("RGB"))
-                board.experiment.add_image(tag, pixels, trainer.global_step, dataformats="HWC")
-
-    @torch.no_grad()
-    def _figures(
-        self, module: Any, batch: Any, scores: Mapping[str, Tensor] | None
-    ) -> tuple[dict[str, Figure], dict[str, Tensor]]:
-        """Return the figures by name, and the coordinates of the sampler's readouts.
-
-        Args:
-            module: the experiment.
-            batch: the clouds.
-            scores: test metrics by name; None before the test.
-        """
-        points, sampler, m = batch.points, module.sampler, module.m
-        # Baselines do not change in training, so they are drawn once, at the end.
-        baselines = () if scores is None else module.baselines.items()
-        methods = {name: baseline(points, m).points for name, baseline in baselines}
-        if sampler is None:
-            return figures_of(module.task, batch, {**methods, FULL: points}, self.titles), {}
-        output = sampler(points, m)
-        samples = readouts(points, {m: output}, sampler)[m]
-        figures = figures_of(module.task, batch, {**methods, **samples}, self.titles)
         titles = cloud_titles(module.task, self.titles)
+        methods: dict[str, Tensor] = {}
+        if scores is not None:
+            for name, baseline in module.baselines.items():
+                methods[name] = baseline(batch.points, module.m).points
+        if module.sampler is None:
+            methods[FULL] = batch.points
+            figures = figures_of(module.task, batch, methods, self.titles)
+            drawn = _Drawn(figures, batch.points, {}, titles)
+        else:
+            drawn = self._with_sampler(module, batch, methods, scores)
+        module.train(training)
+        return drawn
+
+    def _with_sampler(
+        self,
+        module: Any,
+        batch: Any,
+        methods: Mapping[str, Tensor],
+        scores: Mapping[str, Tensor] | None,
+    ) -> "_Drawn":
+        """Draw the readouts of the sampler beside the samples of other methods."""
+        points = batch.points
+        m = module.m
+        output = module.sampler(points, m)
+        samples = readouts(points, {m: output}, module.sampler)[m]
+        titles = cloud_titles(module.task, self.titles)
+        figures = figures_of(module.task, batch, {**methods, **samples}, self.titles)
         if scores is not None:
             main = {**methods, module.main_readout: samples[module.main_readout]}
             figures["comparison"] = self._comparison(module, points, main, scores)
@@ -126,7 +141,7 @@ class CloudVisualization(Callback):
         if matrix is not None and points.shape[1] * matrix.m <= DENSE_PIXELS:
             first = matrix.first_cloud()
             figures["matrix"] = drawing.matrix_figure(first.dense()[0], first.gram()[0], titles[0])
-        return figures, samples
+        return _Drawn(figures, points, samples, titles)
 
     def _comparison(
         self,
@@ -141,12 +156,41 @@ class CloudVisualization(Callback):
         labels = {module.main_readout: type(module.sampler).__name__, FULL: "all points"}
         captions = {}
         for name in (*samples, FULL):
+            captions[name] = labels.get(name, name)
             prefix = "" if name == FULL else module.prefixes[module.m]
             score = scores.get(f"test/{prefix}{name}/{info.name}")
-            value = "" if score is None else f": {info.format(float(score))} {info.unit}"
-            captions[name] = labels.get(name, name) + value
+            if score is not None:
+                captions[name] += f": {info.format(float(score))} {info.unit}"
         drawn = {name: chosen[shown] for name, chosen in samples.items()}
         return drawing.comparison(points[shown], drawn, captions)
+
+
+class _Drawn(NamedTuple):
+    """What was drawn.
+
+    Attributes:
+        figures: by name.
+        points: ``(K, N, 3)`` the clouds.
+        samples: the coordinates of the sampler's readouts; empty without a sampler.
+        titles: one per cloud.
+    """
+
+    figures: dict[str, Figure]
+    points: Tensor
+    samples: dict[str, Tensor]
+    titles: list[str]
+
+
+def _board(trainer: L.Trainer) -> TensorBoardLogger | None:
+    """Return the logger that shows pictures, in the process that writes them."""
+    logger = trainer.logger
+    if trainer.is_global_zero and isinstance(logger, TensorBoardLogger):
+        return logger
+    return None
+
+
+def _tag(name: str) -> str:
+    return f"pictures/{name}"  # a group behind the curves
 
 
 def cloud_titles(task: Task, titles: Sequence[str]) -> list[str]:
@@ -167,16 +211,26 @@ def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str
     """
     labels = dataset.test.labels
     classes = len(dataset.class_names)
-    wanted = torch.linspace(0, classes - 1, min(max(number, 1), classes)).round().long()
-    present = [int(label) for label in wanted.unique() if label in labels][:number]
+    wanted = _spread(classes, max(number, 1))
+    present = [label for label in wanted.tolist() if label in labels][:number]
     rows: list[int] = []
     titles: list[str] = []
     for place, label in enumerate(present):
+        share = number // len(present)
+        if place < number % len(present):
+            share += 1
         members = (labels == label).nonzero()[:, 0]
-        share = number // len(present) + (1 if place < number % len(present) else 0)
-        spread = torch.linspace(0, len(members) - 1, min(share, len(members))).round().long()
-        chosen = members[spread].tolist()
-        name = dataset.class_names[label]
+        chosen = members[_spread(len(members), share)].tolist()
         rows += chosen
-        titles += [name] if len(chosen) == 1 else [f"{name} {k}" for k in range(1, len(chosen) + 1)]
+        name = dataset.class_names[label]
+        if len(chosen) == 1:
+            titles.append(name)
+        else:
+            titles += [f"{name} {count}" for count in range(1, len(chosen) + 1)]
     return torch.tensor(rows, dtype=torch.int64), titles
+
+
+def _spread(available: int, number: int) -> Tensor:
+    """Return at most ``number`` different rows of ``available`` ones, spread over all."""
+    rows = torch.linspace(0, available - 1, min(number, available))
+    return rows.round().long().unique()

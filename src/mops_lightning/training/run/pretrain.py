@@ -45,7 +45,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, run_folder: Path) -> Pa
     if cfg.weights in (None, OF_RUN) or cfg.ckpt_path is not None:
         return None
     if cfg.weights == "auto" and cfg.learn == "task":
-        return cfg.pretrain_from and weights.of_task_net(cfg.pretrain_from)
+        return _start(cfg.pretrain_from)
     if cfg.weights != "auto":
         return weights.of_task_net(cfg.weights)
     folder = cache_folder(cfg, dataset)
@@ -70,21 +70,28 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, run_folder: Path) -> Pa
 
 def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
     """Train the task net of a run in a folder, or resume its interrupted training there."""
-    epochs = cfg.epochs.task
+    epochs = "1 epoch" if cfg.epochs.task == 1 else f"{cfg.epochs.task} epochs"
     print(
         f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it "
-        f"first, {epochs} {'epoch' if epochs == 1 else 'epochs'}. Cache: {folder}",
+        f"first, {epochs}. Cache: {folder}",
         flush=True,
     )
     own = task_config(cfg)
-    if (folder / "checkpoints" / CHECKPOINT).is_file():
+    is_resumed = (folder / "checkpoints" / CHECKPOINT).is_file()
+    if is_resumed:
         own.ckpt_path = str(folder)
     try:
-        with recorded(own, folder, []) as record:
-            start = task_weights(own, dataset, folder)
-            train_and_test(build_parts(own, folder, dataset, record), record, start)
+        with recorded(_plain(own), folder, []) as record:
+            start = None if is_resumed else _start(cfg.pretrain_from)
+            parts = build_parts(own, folder, dataset, record)
+            train_and_test(parts, record, start)
     except (KeyboardInterrupt, Interrupted):
         raise Interrupted("The same command resumes the task net's training.") from None
+
+
+def _start(pretrain_from: str | None) -> Path | None:
+    """Return the file that the training of a task net starts from; None: as initialised."""
+    return None if pretrain_from is None else weights.of_task_net(pretrain_from)
 
 
 def _plain(cfg: DictConfig) -> Any:
@@ -101,10 +108,12 @@ def task_config(cfg: DictConfig) -> DictConfig:
             own.trainer.max_epochs = cfg.epochs.task
             own.optimizer = cfg.pretrain
             own.weights = "auto"
-            for name in set(cfg.callbacks) - set(STANDARD):  # such as early stopping on a score
-                del own.callbacks[name]
+            for name in cfg.callbacks:
+                if name not in STANDARD:  # such as early stopping on a score
+                    del own.callbacks[name]
         own.learn = "task"
-        own.trainer.devices, own.trainer.strategy = 1, "auto"
+        own.trainer.devices = 1
+        own.trainer.strategy = "auto"
         own.ckpt_path = None
         own.evaluate = None
     return own
@@ -128,20 +137,25 @@ def add_to_cache(parts: Parts, record: RunRecord) -> None:
     learning rates differed; not from one that started from given weights; and not from several
     devices: the BatchNorm statistics of each cover its share of the data only.
     """
-    cfg = parts.cfg
-    if cfg.learn != "task" or not parts.trains or parts.trainer.world_size > 1:
+    if not _is_for_cache(parts, record):
         return
-    if record.partial or shortening(record.config):
-        return
-    if cfg.weights not in (None, "auto"):
-        return
-    if parts.resumed is not None and parts.resumed.planned != cfg.trainer.max_epochs:
-        return
-    target = cache_folder(cfg, parts.dataset) / FILE
+    target = cache_folder(parts.cfg, parts.dataset) / FILE
     if not target.is_file():
         remove_temporary(target.parent, below=False)
         with atomic_write(target) as temporary:
             shutil.copyfile(parts.folder / FILE, temporary)
+
+
+def _is_for_cache(parts: Parts, record: RunRecord) -> bool:
+    """Return whether a run trained a task net as ``weights=auto`` would; see ``add_to_cache``."""
+    cfg = parts.cfg
+    if cfg.learn != "task" or not parts.trains or parts.trainer.world_size > 1:
+        return False
+    if record.partial or shortening(record.config):
+        return False
+    if cfg.weights not in (None, "auto"):
+        return False
+    return parts.resumed is None or parts.resumed.planned == cfg.trainer.max_epochs
 
 
 def _lock(folder: Path, net: str) -> AcquireReturnProxy:

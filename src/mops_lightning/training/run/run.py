@@ -3,8 +3,9 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from mops_lightning.config import distributed
 from mops_lightning.config.build import build_as
@@ -47,7 +48,8 @@ def run(
         cfg = checked(cfg, overrides or [])
         if leads:
             claim(folder)
-    with sigterm_as_ctrl_c(), recorded(cfg, folder, overrides or []) as record:
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    with sigterm_as_ctrl_c(), recorded(settings, folder, overrides or [], writes=leads) as record:
         with record.timed("data"):
             dataset = _load_data(cfg)
         parts = build_parts(cfg, folder, dataset, record, trained)
@@ -96,7 +98,8 @@ def claim(folder: Path) -> None:
 def _load_data(cfg: DictConfig) -> CloudDataset:
     """Load both splits and corrupt the test clouds."""
     dataset: CloudDataset = build_as(CloudDataset, cfg.dataset, "dataset")
-    if warning := scale_warning(dataset):
+    warning = scale_warning(dataset)
+    if warning:
         print(warning, file=sys.stderr)
     test = dataset.test
     if cfg.test_corruption:

@@ -1,7 +1,7 @@
 """The stages of a run whose parts are built: load weights, warm start, fit, test, save."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +12,6 @@ from omegaconf import OmegaConf
 from torch import nn
 
 from mops_lightning.data.clouds import CloudDataset
-from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.nets.by_run import BY_RUN
 from mops_lightning.records.collapse import collapsed
@@ -24,7 +23,7 @@ from mops_lightning.training.evaluation import KEY, OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.recipe.warm_start import warm_start_sampler
-from mops_lightning.training.run.build import Parts, augmentation
+from mops_lightning.training.run.build import Parts, has_weights
 from mops_lightning.training.run.callbacks import CPUTime
 from mops_lightning.training.run.ending import KeepsEnding
 from mops_lightning.training.run.partial import (
@@ -66,7 +65,8 @@ def load_weights(parts: Parts, record: RunRecord, task_weights: Path | None) -> 
 
 def _load_task_net(parts: Parts, record: RunRecord, path: Path) -> None:
     """Load the task net from a file, and say in which settings its training differed."""
-    task, cfg = parts.experiment.task, parts.cfg
+    task = parts.experiment.task
+    cfg = parts.cfg
     is_start = cfg.learn == "task" and cfg.weights == "auto"
     setting = "pretrain_from" if is_start else "weights"
     try:
@@ -94,7 +94,9 @@ def _different_net(recorded: dict[str, Any], net: dict[str, Any]) -> list[str]:
     different = []
     for name, value in dotted(net).items():
         path = f"task.net.{name}"
-        if name not in BY_RUN and path in before and before[path] != value:
+        if name in BY_RUN or path not in before:
+            continue
+        if before[path] != value:
             different.append(f"{path}={before[path]}")
     return different
 
@@ -116,24 +118,25 @@ def load_trained(
     Raises:
         UserError: settings, classes or files do not match the run.
     """
-    record, name = trained.record, trained.name
-    own_data = record.dataset_fingerprint == dataset.fingerprint
-    if task_net and not own_data:
-        outputs = getattr(record, str(experiment.task.output_names), None)
-        check_names(outputs, experiment.task, dataset, f"{KEY}: {name}")
-    module = experiment.task if trained.trained_task_net else experiment.sampler
+    record = trained.record
+    task = experiment.task
+    is_own_data = record.dataset_fingerprint == dataset.fingerprint
+    if task_net and not is_own_data:
+        outputs = getattr(record, str(task.output_names), None)
+        check_names(outputs, task, dataset, f"{KEY}: {trained.name}")
+    module = task if trained.trained_task_net else experiment.sampler
     assert module is not None  # learn=nothing builds a sampler
-    has_weights = any(True for _ in experiment.task.parameters())
+    needs_task_net = task_net and not trained.trained_task_net and has_weights(task)
     try:
         content = weights.load_into(module, weights.of_run(trained.place))
-        if task_net and has_weights and not trained.trained_task_net:
+        if needs_task_net:
             if "task_weights" not in record.files:
                 raise UserError("it comes without its task net. Give weights=FILE.")
-            weights.load_into(experiment.task, weights.of_run(trained.place, "task_weights"))
+            weights.load_into(task, weights.of_run(trained.place, "task_weights"))
     except UserError as error:
-        raise UserError(f"{KEY}: {name} cannot be loaded: {error}") from None
+        raise UserError(f"{KEY}: {trained.name} cannot be loaded: {error}") from None
     return Evaluated(
-        run=name,
+        run=trained.name,
         commit=record.git["commit"],
         max_epochs=record.config["trainer"]["max_epochs"],
         learn=record.config["learn"],
@@ -146,12 +149,13 @@ def load_trained(
 
 def warm_start(parts: Parts, record: RunRecord) -> None:
     """Start the sampler from copies of other weights, unless the run is resumed."""
-    task, sampler = parts.experiment.task, parts.experiment.sampler
+    sampler = parts.experiment.sampler
     source = parts.experiment.recipe.warm_start
     if sampler is None or not source or parts.resumed is not None:
         return
+    net = parts.experiment.task.net
     points = parts.dataset.train.points
-    record.warm_start, text = warm_start_sampler(source, sampler, task.net, points)
+    record.warm_start, text = warm_start_sampler(source, sampler, net, points)
     if parts.trainer.is_global_zero:
         print(f"Warm start: {text}.")
 
@@ -162,43 +166,54 @@ def fit(parts: Parts, record: RunRecord) -> None:
     Raises:
         UserError: too little data, or training that diverged.
     """
-    cfg, trainer, experiment = parts.cfg, parts.trainer, parts.experiment
-    recipe = experiment.recipe
-    if recipe != Recipe():
-        named = {"name": cfg.names.recipe, **asdict(recipe)}
-        only_task = {"task_points": recipe.task_points}
-        record.recipe = only_task if experiment.sampler is None else named
-    resumed = parts.resumed.path if parts.resumed else None
-    task, clouds = experiment.task, len(parts.train.labels)
-    if clouds < 2 * trainer.world_size:
-        raise UserError(
-            f"val_fraction={cfg.val_fraction} leaves {clouds} training "
-            f"{'cloud' if clouds == 1 else 'clouds'}; "
-            "at least two are needed for each device. Lower it, or give more data."
-        )
-    loader = CloudLoader(
-        parts.train,
-        cfg.batch_size,
-        shuffle=not cfg.trainer.get("overfit_batches"),  # the same first batches in every epoch
-        augment=augmentation(cfg),
-        make_batch=task.make_batch,
-        drop_last=True,
-        seed=cfg.seed,
-        part=parts.part,
-    )
+    trainer = parts.trainer
+    experiment = parts.experiment
+    resumed = parts.resumed
+    record.recipe = _recipe_in_force(parts)
+    _check_enough_clouds(parts)
+    loader = parts.train_loader()
     validation = parts.score_loader(parts.held_out) if len(parts.held_out.labels) else None
+    checkpoint = None if resumed is None else resumed.path
     with _interruptible():
-        trainer.fit(experiment, loader, validation, ckpt_path=resumed)
+        trainer.fit(experiment, loader, validation, ckpt_path=checkpoint)
     check_finite(dict(experiment.state_dict()), trainer.global_step, trainer.strategy)
     record.seconds["fit_cpu"] = round(callback_of(trainer, CPUTime).seconds, 3)
     note_training(trainer, len(loader), record)
     show_profile(parts.folder, "fit")
     record.validation = dict(callback_of(trainer, KeepsEnding).validation(trainer))
-    if parts.resumed and parts.resumed.steps == trainer.global_step and trainer.is_global_zero:
+    if resumed is None or resumed.steps != trainer.global_step:
+        return
+    if trainer.is_global_zero:
         print(
-            f"{parts.resumed.path}: this training had ended after {parts.resumed.done} epochs; "
+            f"{resumed.path}: this training had ended after {resumed.done} epochs; "
             "nothing was added to it."
         )
+
+
+def _recipe_in_force(parts: Parts) -> dict[str, Any] | None:
+    """Return the recipe of the training for the record; None for the paper's."""
+    recipe = parts.experiment.recipe
+    if recipe == Recipe():
+        return None
+    if parts.experiment.sampler is None:
+        return {"task_points": recipe.task_points}
+    return {"name": parts.cfg.names.recipe, **asdict(recipe)}
+
+
+def _check_enough_clouds(parts: Parts) -> None:
+    """Refuse a training with fewer than two clouds for each device.
+
+    Raises:
+        UserError: there are too few.
+    """
+    clouds = len(parts.train.labels)
+    if clouds >= 2 * parts.trainer.world_size:
+        return
+    noun = "cloud" if clouds == 1 else "clouds"
+    raise UserError(
+        f"val_fraction={parts.cfg.val_fraction} leaves {clouds} training {noun}; "
+        "at least two are needed for each device. Lower it, or give more data."
+    )
 
 
 def callback_of(trainer: L.Trainer, kind: type[Kind]) -> Kind:
@@ -209,23 +224,30 @@ def callback_of(trainer: L.Trainer, kind: type[Kind]) -> Kind:
 
 def test(parts: Parts, record: RunRecord) -> None:
     """Score all test clouds."""
-    experiment, trainer = parts.experiment, parts.trainer
+    experiment = parts.experiment
+    trainer = parts.trainer
     loader = parts.score_loader(parts.dataset.test)
     with _interruptible():
         trainer.test(experiment, loader, verbose=False)
     note_test(trainer, len(loader), record)
     show_profile(parts.folder, "test")
     record.metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
-    parsed = {name: parse_metric_name(name) for name in record.metrics}
-    scores = {  # of every readout, at the run's own size
-        name: record.metrics[name]
-        for name, key in parsed.items()
-        if key and key.metric == experiment.task.score and key.m in (None, experiment.m)
-    }
-    log_test(trainer, record, scores)
+    log_test(trainer, record, _main_scores(experiment, record.metrics))
     if experiment.learn in ("sampler", "nothing") and parts.has_task_weights:
         # A resumed run has its task net from the checkpoint, not from a weights file.
         record.task_weights_sha256 = weights.digest(experiment.task.state_dict())
+
+
+def _main_scores(experiment: Experiment, metrics: Mapping[str, float]) -> dict[str, float]:
+    """Return the scores of all readouts at the run's own size, by log key."""
+    scores = {}
+    for name, value in metrics.items():
+        key = parse_metric_name(name)
+        if key is None or key.metric != experiment.task.score:
+            continue
+        if key.m in (None, experiment.m):
+            scores[name] = value
+    return scores
 
 
 @contextmanager
@@ -240,8 +262,9 @@ def _interruptible() -> Iterator[None]:
 def _check_scores(parts: Parts, metrics: dict[str, float]) -> None:
     """Refuse a test whose score or losses are not finite, though the weights are."""
     for name, value in metrics.items():
-        judged = name == parts.experiment.score_name or name.split("/")[-2] == "loss"
-        if judged and not math.isfinite(value):
+        is_loss = name.split("/")[-2] == "loss"
+        is_judged = is_loss or name == parts.experiment.score_name
+        if is_judged and not math.isfinite(value):
             if parts.trains:
                 raise Diverged(f"training diverged: {name} is {value}.")
             raise UserError(f"{name} is {value}. Check the data and the weights.")
@@ -249,31 +272,42 @@ def _check_scores(parts: Parts, metrics: dict[str, float]) -> None:
 
 def save(parts: Parts, record: RunRecord) -> None:
     """Record the files and scores of the run, and save the trained weights."""
-    cfg, experiment = parts.cfg, parts.experiment
-    task, sampler = experiment.task, experiment.sampler
+    experiment = parts.experiment
     for kind, name in OUTPUTS.items():
         if (parts.folder / name).exists():
             record.files[kind] = name
     record.score = record.metrics.get(experiment.score_name)
     record.collapsed = {str(m): count for m, count in collapsed(record).items()}
-    modules: dict[str, nn.Module | None] = {"task": task, "sampler": sampler}
     record.score_name = experiment.score_name
-    record.metric_info = foreign_metrics(task.metrics().items())
+    record.metric_info = foreign_metrics(experiment.task.metrics().items())
     record.processes = parts.trainer.world_size
-    record.parameters = {
-        name: sum(parameter.numel() for parameter in module.parameters())
-        for name, module in modules.items()
-        if module is not None
-    }
+    record.parameters = {"task": _size(experiment.task)}
+    if experiment.sampler is not None:
+        record.parameters["sampler"] = _size(experiment.sampler)
     _check_scores(parts, record.metrics)
-    if not parts.trains:
-        return
-    files = {weights.FILE: task if cfg.learn == "task" else sampler}
-    if cfg.learn != "task" and parts.has_task_weights:
-        files[f"task_{weights.FILE}"] = task
+    if parts.trains:
+        _save_weights(parts, record)
+
+
+def _size(module: nn.Module) -> int:
+    """Return the number of parameters."""
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def _save_weights(parts: Parts, record: RunRecord) -> None:
+    """Save the weights of the trained net, and beside a sampler's those of its task net."""
+    task = parts.experiment.task
+    sampler = parts.experiment.sampler
+    files: dict[str, nn.Module] = {}
+    if sampler is None:
+        files[weights.FILE] = task
+    else:
+        files[weights.FILE] = sampler
+        if parts.has_task_weights:
+            files[f"task_{weights.FILE}"] = task
     for name, module in files.items():
-        assert module is not None  # only learn=task has no sampler
-        outputs = task.output_names if module is task else None
-        names = getattr(parts.dataset, outputs) if outputs else ()
-        weights.save(parts.folder / name, module, record.config, record.metrics, names)
+        classes: tuple[str, ...] = ()
+        if module is task and task.output_names:
+            classes = getattr(parts.dataset, task.output_names)
+        weights.save(parts.folder / name, module, record.config, record.metrics, classes)
         record.files[Path(name).stem] = name

@@ -17,7 +17,7 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.profilers import AdvancedProfiler, PyTorchProfiler, SimpleProfiler
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from mops_lightning.config.build import accepted, build, build_as
+from mops_lightning.config.build import build, build_as
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
@@ -51,6 +51,8 @@ HARMLESS = (
 
 PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
 """Profilers with a report as text, by Lightning's names."""
+BUILT_HERE = ("plugins", "profiler")
+"""Arguments of the trainer whose settings may describe objects."""
 PROFILE = "profile"
 """Name of a profiler's report, behind its stage."""
 LOG_EVERY = 10
@@ -104,34 +106,38 @@ def make_trainer(
     _silence_lightning()
     keep_freed_memory()
     given = cfg.trainer
-    barebones = bool(given.get("barebones"))
+    score = _score(experiment)
     logger: Any = False
-    if cfg.get("logger") and not barebones:
-        logger = _logger(cfg.logger, folder, _score(cfg, experiment))
-    callbacks = _callbacks(cfg, folder, dataset, experiment, logged=bool(logger))
-    # An epoch of a small data set may be shorter than the logging interval.
-    log_every = max(1, min(LOG_EVERY, clouds // cfg.batch_size))
+    if cfg.get("logger") and not given.get("barebones"):
+        logger = _logger(cfg.logger, folder, score)
+    callbacks = [
+        *_moving_average(experiment),  # before the callbacks that save it
+        *_chosen_callbacks(cfg, folder, dataset, experiment, logged=bool(logger)),
+        _stop(given, folder),
+        CPUTime(),
+        KeepsEnding(),
+    ]
     defaults = {
         "default_root_dir": str(folder),
         "num_sanity_val_steps": 0,
         "enable_model_summary": False,
-        "log_every_n_steps": 0 if barebones else log_every,
+        "log_every_n_steps": _log_every(given, clouds // cfg.batch_size),
         "enable_progress_bar": any(isinstance(callback, ProgressBar) for callback in callbacks),
         "enable_checkpointing": any(isinstance(callback, Checkpoint) for callback in callbacks),
     }
     settings = given.copy()
     with open_dict(settings):
-        for name in ("plugins", "profiler"):  # built here
+        for name in BUILT_HERE:
             settings.pop(name, None)
     trainer: L.Trainer = build_as(
         L.Trainer,
         settings,
         "trainer",
+        offered={name: value for name, value in defaults.items() if name not in given},
         logger=logger,
         callbacks=callbacks,
         plugins=_plugins(given),
         profiler=_profiler(given, folder),
-        **{name: value for name, value in defaults.items() if name not in given},
     )
     if given.get("precision") == "16-mixed" and trainer.precision != "16-mixed":
         raise UserError(
@@ -141,37 +147,62 @@ def make_trainer(
     return trainer
 
 
-def _callbacks(
+def _log_every(trainer: DictConfig, steps_of_epoch: int) -> int:
+    """Return the steps between two points of a curve; 0 for no curves, as barebones wants."""
+    if trainer.get("barebones"):
+        return 0
+    # An epoch of a small data set may be shorter than the logging interval.
+    return max(1, min(LOG_EVERY, steps_of_epoch))
+
+
+def _moving_average(experiment: Experiment) -> list[Callback]:
+    """Return the recipe's moving average of the weights, if it has one."""
+    span = experiment.recipe.ema_span
+    return [MovingAverage(span)] if span else []
+
+
+def _chosen_callbacks(
     cfg: DictConfig, folder: Path, dataset: CloudDataset, experiment: Experiment, logged: bool
 ) -> list[Callback]:
-    """Build the callbacks of a run: its own, and those that every run has."""
-    task, trainer = experiment.task, cfg.trainer
-    score = _score(cfg, experiment)
-    path = folder / "checkpoints" / CHECKPOINT
-    offered = {"folder": folder, "checkpoint": path, "score": score}
+    """Build the callbacks that the settings list, without those that the trainer's exclude."""
+    score = _score(experiment)
+    offered: dict[str, Any] = {
+        "folder": folder,
+        "checkpoint": _checkpoint(folder),
+        "score": score,
+    }
     if cfg.pictures:
         from mops_lightning.training.run.pictures import clouds_to_draw  # imports matplotlib
 
         rows, titles = clouds_to_draw(dataset, cfg.pictures)
-        batch = CloudLoader(dataset.test, cfg.batch_size, make_batch=task.make_batch).batch_of(rows)
-        offered |= {"batch": batch, "titles": titles}
-    chosen = build_callbacks(cfg.callbacks, offered, logged=logged)
-    barebones = trainer.get("barebones")
-    if barebones or trainer.get("enable_progress_bar") is False:
-        bars = [callback for callback in chosen if isinstance(callback, ProgressBar)]
-        lines = EpochLines(score)
-        chosen = [lines if callback in bars else callback for callback in chosen]
-    if barebones or trainer.get("enable_checkpointing") is False:
-        chosen = [callback for callback in chosen if not isinstance(callback, Checkpoint)]
-        stop = StopBetweenSteps(None)
-    elif trainer.get("fast_dev_run"):
-        stop = StopBetweenSteps(None)
-    else:
-        stop = StopWithCheckpoint(path)
-    span = experiment.recipe.ema_span
-    average = [MovingAverage(span)] if span else []
-    # The average comes before the callbacks that save it.
-    return [*average, *chosen, stop, CPUTime(), KeepsEnding()]
+        make_batch = experiment.task.make_batch
+        loader = CloudLoader(dataset.test, cfg.batch_size, make_batch=make_batch)
+        offered["batch"] = loader.batch_of(rows)
+        offered["titles"] = titles
+    chosen: list[Callback] = []
+    for callback in build_callbacks(cfg.callbacks, offered, logged=logged):
+        if isinstance(callback, ProgressBar) and not _has(cfg.trainer, "enable_progress_bar"):
+            chosen.append(EpochLines(score))
+        elif not isinstance(callback, Checkpoint) or _has(cfg.trainer, "enable_checkpointing"):
+            chosen.append(callback)
+    return chosen
+
+
+def _has(trainer: DictConfig, name: str) -> bool:
+    """Return whether the trainer has a part; ``trainer.barebones`` leaves all out."""
+    return trainer.get(name) is not False and not trainer.get("barebones")
+
+
+def _checkpoint(folder: Path) -> Path:
+    return folder / "checkpoints" / CHECKPOINT
+
+
+def _stop(trainer: DictConfig, folder: Path) -> Callback:
+    """Return the callback for Ctrl-C, which writes a checkpoint where the run writes any."""
+    writes = _has(trainer, "enable_checkpointing") and not trainer.get("fast_dev_run")
+    if writes:
+        return StopWithCheckpoint(_checkpoint(folder))
+    return StopBetweenSteps(None)
 
 
 def _plugins(given: DictConfig) -> list[Any]:
@@ -184,14 +215,17 @@ def _plugins(given: DictConfig) -> list[Any]:
     if named is None:
         return [AtomicCheckpointIO()]
     several = named if OmegaConf.is_list(named) else [named]
-    own = [build(node, "trainer.plugins") if OmegaConf.is_dict(node) else node for node in several]
-    for plugin in own:
+    plugins = []
+    for plugin in several:
+        if OmegaConf.is_dict(plugin):
+            plugin = build(plugin, "trainer.plugins")
         if isinstance(plugin, CheckpointIO):
             raise UserError(
                 f"trainer.plugins: {type(plugin).__name__} cannot be used, because checkpoints are "
                 "written with a checksum that resuming needs. Leave it out."
             )
-    return [*own, AtomicCheckpointIO()]
+        plugins.append(plugin)
+    return [*plugins, AtomicCheckpointIO()]
 
 
 def _profiler(given: DictConfig, folder: Path) -> Any:
@@ -211,22 +245,23 @@ def show_profile(folder: Path, stage: str) -> None:
         print(path.read_text().strip())
 
 
-def _score(cfg: DictConfig, experiment: Experiment) -> str:
+def _score(experiment: Experiment) -> str:
     """Return the metric that is shown during the training."""
     task = experiment.task
-    if cfg.learn == "task" and task.full_score:
+    if experiment.learn == "task" and task.full_score:
         return task.full_score
     return task.score
 
 
 def _logger(node: DictConfig, folder: Path, score: str) -> Any:
     """Build the logger, which writes into the run's folder itself unless it has a name."""
-    offered = accepted(node, {"name": "", "score": score})
+    offered = {"name": "", "score": score}
     below = LOGGER_FOLDERS.get(node["_target_"].rpartition(".")[2])
     if below is not None:
-        offered |= {"name": below, "version": ""}  # the progress bar would show a version
+        offered["name"] = below
+        offered["version"] = ""  # the progress bar would show a version
     unset = {name: value for name, value in offered.items() if name not in node}
-    return build_as(Logger, node, "logger", save_dir=str(folder), **unset)
+    return build_as(Logger, node, "logger", unset, save_dir=str(folder))
 
 
 def finish_loggers(trainer: L.Trainer) -> None:
@@ -270,8 +305,11 @@ def log_test(trainer: L.Trainer, record: RunRecord, scores: dict[str, float]) ->
 def _logged_settings(config: dict[str, Any]) -> dict[str, Any]:
     """Return the settings that distinguish runs, with dotted keys."""
     keys = ("names", "sampler", "optimizer", "augment", "m", "learn", "seed", "batch_size")
-    leaves = dotted({key: config[key] for key in keys})
-    flat = {key: leaf for key, leaf in leaves.items() if not key.rpartition(".")[2].startswith("_")}
+    flat = {}
+    for path, value in dotted({key: config[key] for key in keys}).items():
+        _, _, name = path.rpartition(".")
+        if not name.startswith("_"):
+            flat[path] = value
     flat["max_epochs"] = config["trainer"]["max_epochs"]
     if config.get("tags"):
         flat["tags"] = ", ".join(config["tags"])

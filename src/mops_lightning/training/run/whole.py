@@ -5,9 +5,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
-from mops_lightning.config import distributed
 from mops_lightning.errors import Interrupted, UserError, closed_outputs
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
@@ -36,33 +33,31 @@ def train_and_test(parts: Parts, record: RunRecord, task_weights: Path | None) -
         if parts.trainer.is_global_zero:
             stages.save(parts, record)
     except Diverged as error:
-        last = parts.last_checkpoint
-        kept = f" The last finite checkpoint is {last}." if last else ""
-        raise UserError(
-            f"{error} No weights were saved.{kept} Try a lower learning rate (optimizer.lr) or "
-            "other weights of the losses."
-        ) from None
+        text = f"{error} No weights were saved."
+        if parts.last_checkpoint:
+            text += f" The last finite checkpoint is {parts.last_checkpoint}."
+        text += " Try a lower learning rate (optimizer.lr) or other weights of the losses."
+        raise UserError(text) from None
     finally:
         finish_loggers(parts.trainer)
 
 
 @contextmanager
-def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[RunRecord]:
+def recorded(
+    config: dict[str, Any], folder: Path, overrides: list[str], writes: bool = True
+) -> Iterator[RunRecord]:
     """Write ``result.json`` when the block begins and when it ends, however it ends.
 
-    Only the first process of a run writes.
-
     Args:
-        cfg: a composed configuration.
+        config: the run's settings as plain data.
         folder: the run's folder.
         overrides: what the user changed.
+        writes: whether this process does; of several, only the first one.
 
     Yields:
         The record, for the block to fill.
     """
-    config: Any = OmegaConf.to_container(cfg, resolve=True)
-    record = RunRecord.begin(config, overrides, cfg.seed)
-    writes = not distributed.is_worker_rank(cfg)
+    record = RunRecord.begin(config, overrides, config["seed"])
     if writes:
         run_record.write(folder, record)
     try:
@@ -70,11 +65,12 @@ def recorded(cfg: DictConfig, folder: Path, overrides: list[str]) -> Iterator[Ru
             yield record
         record.status = "completed"
     except (KeyboardInterrupt, Interrupted) as stop:
-        record.status, record.error = "interrupted", str(stop) or "interrupted"
+        record.status = "interrupted"
+        record.error = str(stop) or "interrupted"
         raise
     except BaseException as error:
-        stopped = isinstance(error, BrokenPipeError) and closed_outputs()
-        record.status = "interrupted" if stopped else "failed"
+        has_no_reader = isinstance(error, BrokenPipeError) and closed_outputs()
+        record.status = "interrupted" if has_no_reader else "failed"
         record.error = f"{type(error).__name__}: {error}"
         raise
     finally:
