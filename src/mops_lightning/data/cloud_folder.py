@@ -119,12 +119,8 @@ def cloud_folder(
     if crops is None:
         crops = CROPS_PER_FILE[crop]
     check_at_least(1, crops=crops)
-    if crop == "surface" and crops != 1:
-        raise UserError(f"crops must be 1 with crop=surface, got {crops}.")
-    if crop == "surface" and label is not None:
-        raise UserError(f"label must be null with crop=surface, got {label!r}.")
-    if crop == "surface" and columns is not None:
-        raise UserError(f"columns must be null with crop=surface, got {list(columns)}.")
+    if crop == "surface":
+        _check_surface(crops, label, columns)
     if columns is not None:
         columns = check_columns("columns", columns)
 
@@ -149,6 +145,16 @@ def cloud_folder(
     dataset = make_dataset("clouds", splits, class_names, None, folder)
     part_names = tuple(str(number) for number in numbers.tolist())
     return replace(dataset, notes=notes, part_names=part_names)
+
+
+def _check_surface(crops: int, label: str | None, columns: Sequence[str] | None) -> None:
+    """Refuse what points on the surface of a mesh do not have."""
+    if crops != 1:
+        raise UserError(f"crops must be 1 with crop=surface, got {crops}.")
+    if label is not None:
+        raise UserError(f"label must be null with crop=surface, got {label!r}.")
+    if columns is not None:
+        raise UserError(f"columns must be null with crop=surface, got {list(columns)}.")
 
 
 def _read_meshes(
