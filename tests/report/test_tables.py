@@ -4,20 +4,29 @@ from tests.support.records import NAMES, evaluated
 from tests.support.reports import edited, put, put_cell, rows, table
 
 
+def our_rows(text):
+    """The cells of all rows but those of the paper."""
+    return [row for row in rows(text) if "paper" not in row[0]]
+
+
 def test_cells_run_of_many_sizes_fills_columns(tmp_path):
     metrics = {"test/full/accuracy": 0.9}
     for m in (8, 32):
-        metrics |= {f"test/m{m}/{name}/accuracy": m / 100 for name in ("generated", "matched")}
-        metrics |= {f"test/m{m}/fps/accuracy": m / 200, f"test/m{m}/matrix/nonzero_percent": 3.0}
+        metrics[f"test/m{m}/generated/accuracy"] = m / 100
+        metrics[f"test/m{m}/matched/accuracy"] = m / 100
+        metrics[f"test/m{m}/fps/accuracy"] = m / 200
+        metrics[f"test/m{m}/matrix/nonzero_percent"] = 3.0
     put(tmp_path, "fmops", 32, metrics)
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
-    ours = [row for row in rows(table(tmp_path)) if "paper" not in row[0]]
-    assert ours == [
+
+    assert our_rows(table(tmp_path)) == [
         ["sampled by", "m=32", "m=8"],
         ["fps", "30.00", "4.00"],  # its own run replaces a baseline's values
         ["fmops", "32.00 / 32.00", "8.00 / 8.00"],
     ]
+
     put(tmp_path, "fmops", 8, {"test/generated/accuracy": 0.8})
+
     text = table(tmp_path)
     assert ["fmops", "32.00 / 32.00", "80.00"] in rows(text)
     assert "fmops-32-pointnet: not shown; a later run has the same row" in text
@@ -25,7 +34,9 @@ def test_cells_run_of_many_sizes_fills_columns(tmp_path):
 
 def test_cells_of_several_seeds_show_mean_and_deviation(tmp_path):
     for seed, value in enumerate((1.0, 2.0, 3.0)):
-        put_cell(tmp_path, f"{seed}", "mops", {"generated": value, "matched": 1.5}, seed=seed)
+        values = {"generated": value, "matched": 1.5}
+        put_cell(tmp_path, f"{seed}", "mops", values, seed=seed)
+
     assert rows(table(tmp_path))[1][:2] == ["mops", "2 ± 1.00 / 1.5 ± 0.00 (n=3)"]
 
 
@@ -33,24 +44,35 @@ def test_evaluations_count_by_the_seeds_of_their_runs(tmp_path):
     for seed in (0, 1):
         metrics = {"test/generated/accuracy": 0.5 + seed / 10}
         put(tmp_path / f"{seed}", "mops", 32, metrics, evaluated=evaluated(seed=seed))
+
     assert rows(table(tmp_path))[1][1] == "55.00 ± 7.07 (n=2)"
 
 
 def test_later_of_two_equal_runs_counts(tmp_path):
-    for name, value, hour in (("b", 0.3, "02"), ("a", 0.4, "03")):
-        started = f"2026-01-01T{hour}:00:00+00:00"
-        put(tmp_path / name, "fps", 32, {"test/sampled/accuracy": value}, started=started)
+    first = "2026-01-01T02:00:00+00:00"
+    second = "2026-01-01T03:00:00+00:00"
+    put(tmp_path / "b", "fps", 32, {"test/sampled/accuracy": 0.3}, started=first)
+    put(tmp_path / "a", "fps", 32, {"test/sampled/accuracy": 0.4}, started=second)
+
     text = table(tmp_path)
     assert ["fps", "40.00"] in rows(text)
     assert f"- {tmp_path}/b/fps-32-pointnet: not shown" in text
 
 
 def test_best_is_bold_and_second_underlined(tmp_path):
-    for name, value in (("mops", 0.8), ("snet", 0.7), ("samplenet", 0.8), ("gumbel", 0.6)):
-        put(tmp_path, name, 32, {"test/generated/accuracy": value, "test/completed/accuracy": 0.5})
+    accuracies = {"mops": 0.8, "snet": 0.7, "samplenet": 0.8, "gumbel": 0.6}
+    for name, value in accuracies.items():
+        metrics = {"test/generated/accuracy": value, "test/completed/accuracy": 0.5}
+        put(tmp_path, name, 32, metrics)
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.9})
+
     text = table(tmp_path)
-    lines = dict(line.strip("| ").split(" | ", 1) for line in text.splitlines() if ".00" in line)
+
+    lines = {}
+    for line in text.splitlines():
+        if ".00" in line:
+            name, _, cells = line.strip("| ").partition(" | ")
+            lines[name] = cells
     assert lines["fps"] == "**90.00**"  # competes with completed sets
     assert lines["mops"] == lines["samplenet"] == "**80.00** / <u>50.00</u>"
     assert lines["snet"] == "<u>70.00</u> / <u>50.00</u>"
@@ -58,19 +80,24 @@ def test_best_is_bold_and_second_underlined(tmp_path):
 
 
 def test_training_is_summed_over_sizes_for_one_seed(tmp_path):
-    for number, (m, seed) in enumerate(((8, 0), (32, 0), (8, 1), (32, 1), (64, 0))):
-        put_cell(tmp_path, f"{number}", "mops", {"generated": 1.0}, m=m, seed=seed, cost=1000.0)
+    for m, seed in ((8, 0), (32, 0), (8, 1), (32, 1), (64, 0)):
+        name = f"m{m}-seed{seed}"
+        put_cell(tmp_path, name, "mops", {"generated": 1.0}, m=m, seed=seed, cost=1000.0)
     put_cell(tmp_path, "snet", "snet", {"generated": 2.0}, cost=700.4)
-    found = rows(table(tmp_path))
-    assert [row[-1] for row in found] == ["training (wall)", "700 s", "3,000 s"]
+
+    costs = [row[-1] for row in rows(table(tmp_path))]
+
+    assert costs == ["training (wall)", "700 s", "3,000 s"]
 
 
 def test_training_is_cpu_time_if_every_run_has_it(tmp_path):
     for name, seconds in (("mops", 300.0), ("snet", 500.0)):
         path = put_cell(tmp_path, name, name, {"generated": 1.0})
         edited(path, seconds={"total": 99.0, "fit": 90.0, "fit_cpu": seconds})
-    found = rows(table(tmp_path))
-    assert [row[-1] for row in found] == ["training (CPU)", "500 s", "300 s"]
+
+    costs = [row[-1] for row in rows(table(tmp_path))]
+
+    assert costs == ["training (CPU)", "500 s", "300 s"]
 
 
 def test_training_is_wall_time_if_one_run_has_no_cpu_time(tmp_path):
@@ -84,16 +111,23 @@ def test_training_is_wall_time_if_one_run_has_no_cpu_time(tmp_path):
 
 def test_values_within_two_deviations_of_the_best_are_level(tmp_path):
     """The deviations of the best and of the value are 0.1; 0.15 away is level, 0.5 is not."""
-    for seed, shift in enumerate((-0.1, 0.0, 0.1)):
-        for name, value in (("mops", 1.0), ("fmops", 1.15), ("snet", 1.5), ("samplenet", 1.6)):
-            values = {"generated": value + shift}
+    means = {"mops": 1.0, "fmops": 1.15, "snet": 1.5, "samplenet": 1.6}
+    for name, mean in means.items():
+        for seed, shift in enumerate((-0.1, 0.0, 0.1)):
+            values = {"generated": mean + shift}
             put_cell(tmp_path, f"{name}{seed}", name, values, seed=seed)
+
     text = table(tmp_path)
-    for marked in ("**1 ± 0.10**", "**1.15 ± 0.10**", "<u>1.5 ± 0.10</u>", "| 1.6 ± 0.10"):
-        assert marked in text
+
+    assert "**1 ± 0.10**" in text
+    assert "**1.15 ± 0.10**" in text
+    assert "<u>1.5 ± 0.10</u>" in text
+    assert "| 1.6 ± 0.10" in text
     assert "those level with it, less than two standard deviations over seeds away" in text
+
     for path in tmp_path.glob("*[12]"):
         shutil.rmtree(path)
+
     text = table(tmp_path)
     assert "**0.9**" in text
     assert "<u>1.05</u>" in text
@@ -104,8 +138,11 @@ def test_equal_cells_are_named(tmp_path):
     for alpha in (1, 10, 100):
         values = {"generated": 1.037, "matched": 1.035}
         put_cell(tmp_path, f"a{alpha}", "mops", values, of={"alpha": alpha})
-        put_cell(tmp_path, f"b{alpha}", "snet", {"generated": float(alpha)}, of={"alpha": alpha})
+        values = {"generated": float(alpha)}
+        put_cell(tmp_path, f"b{alpha}", "snet", values, of={"alpha": alpha})
+
     text = table(tmp_path)
+
     assert "All 3 cells of mops are equal: the settings that differ changed no figure." in text
     assert "cells of snet" not in text
 
@@ -138,15 +175,13 @@ def test_value_with_a_spread_of_its_own_is_level_with_a_best_of_one_seed(tmp_pat
 
 def test_nets_for_different_largest_sizes_have_rows_of_their_own(tmp_path):
     for largest, value in ((128, 0.8), (512, 0.7)):
-        metrics = {f"test/m{m}/generated/accuracy": value for m in (8, 32)}
+        metrics = {"test/m8/generated/accuracy": value, "test/m32/generated/accuracy": value}
         of = {"m_max": largest, "alpha": 1}
         put(tmp_path / f"{largest}", "fmops", 32, metrics, of=of, config={"weights": "auto"})
     put(tmp_path / "other size", "mops", 32, {"test/generated/accuracy": 0.9}, of={"m": 32})
     put(tmp_path / "other size", "mops", 8, {"test/generated/accuracy": 0.5}, of={"m": 8})
 
-    found = [row for row in rows(table(tmp_path)) if "paper" not in row[0]]
-
-    assert found == [
+    assert our_rows(table(tmp_path)) == [
         ["sampled by", "m=32", "m=8"],
         ["mops", "90.00", "50.00"],
         ["fmops m_max=128", "80.00", "80.00"],
@@ -165,9 +200,7 @@ def test_mixed_table_keeps_samplers_apart_that_would_share_a_cell(tmp_path):
         metrics = {"test/generated/accuracy": alpha / 20}
         put(tmp_path / name, sampler, m, metrics, of={"alpha": alpha, "m": m})
 
-    found = [row for row in rows(table(tmp_path, mixed=True)) if "paper" not in row[0]]
-
-    assert found[1:] == [
+    assert our_rows(table(tmp_path, mixed=True))[1:] == [
         ["snet alpha=1.0", "", "5.00"],
         ["snet alpha=10.0", "", "50.00"],
         ["mops", "50.00", "5.00"],
@@ -209,10 +242,19 @@ def test_own_task_and_net_are_named_in_titles(tmp_path):
 
 
 def test_projected_points_are_a_fourth_figure_and_compete_with_generated_ones(tmp_path):
-    samplenet = {"generated": 0.6, "matched": 0.7, "completed": 0.7, "projected": 0.9}
-    put(tmp_path, "samplenet", 32, {f"test/{name}/accuracy": v for name, v in samplenet.items()})
-    mops = {"generated": 0.8, "matched": 0.5, "completed": 0.5}
-    put(tmp_path, "mops", 32, {f"test/{name}/accuracy": v for name, v in mops.items()})
+    samplenet = {
+        "test/generated/accuracy": 0.6,
+        "test/matched/accuracy": 0.7,
+        "test/completed/accuracy": 0.7,
+        "test/projected/accuracy": 0.9,
+    }
+    put(tmp_path, "samplenet", 32, samplenet)
+    mops = {
+        "test/generated/accuracy": 0.8,
+        "test/matched/accuracy": 0.5,
+        "test/completed/accuracy": 0.5,
+    }
+    put(tmp_path, "mops", 32, mops)
 
     text = table(tmp_path)
 

@@ -25,20 +25,32 @@ from tests.support.command_line import TINY, call, done, job
 def note_at_each_step(monkeypatch, what):
     """Collect what a function of the experiment returns in each step, before its update."""
     noted = []
-    monkeypatch.setattr(Experiment, "on_before_zero_grad", lambda self, _: noted.append(what(self)))
+
+    def note(experiment, _):
+        noted.append(what(experiment))
+
+    monkeypatch.setattr(Experiment, "on_before_zero_grad", note)
     return noted
 
 
 def test_samplers_inside_a_net_end_their_training_at_the_tested_temperature(tmp_path, monkeypatch):
-    net = ["task/net=hierarchical", "sampler@task.net.sampler=mops"]
-    small = ["task.net.points=[16,8]", "task.net.channels=[8,8,8]", "task.net.k=4"]
+    settings = [
+        "learn=task",
+        "task/net=hierarchical",
+        "sampler@task.net.sampler=mops",
+        "task.net.points=[16,8]",
+        "task.net.channels=[8,8,8]",
+        "task.net.k=4",
+        "trainer.max_epochs=2",
+    ]
 
     def temperatures(experiment):
-        return [m.tau for m in experiment.task.modules() if isinstance(m, Sampler)]
+        samplers = [part for part in experiment.task.modules() if isinstance(part, Sampler)]
+        return [sampler.tau for sampler in samplers]
 
     taus = note_at_each_step(monkeypatch, temperatures)
 
-    job(tmp_path / "run", "learn=task", *net, *small, "trainer.max_epochs=2")
+    job(tmp_path / "run", *settings)
 
     assert len(taus) == 4
     assert taus[0] == [1.0, 1.0]
@@ -47,8 +59,13 @@ def test_samplers_inside_a_net_end_their_training_at_the_tested_temperature(tmp_
 
 @pytest.mark.parametrize("optimizer", ["muon", "one_cycle"])
 def test_state_of_the_optimizer_survives_a_stop(optimizer, tmp_path, monkeypatch):
-    arguments = [*TINY, "weights=null", "baselines={}", f"optimizer={optimizer}"]
-    arguments.append("trainer.max_epochs=3")
+    arguments = [
+        *TINY,
+        "weights=null",
+        "baselines={}",
+        f"optimizer={optimizer}",
+        "trainer.max_epochs=3",
+    ]
     done([*arguments, "hydra.run.dir=unbroken"], tmp_path)
 
     def stop_in_fourth_step(self, _):
@@ -62,16 +79,18 @@ def test_state_of_the_optimizer_survives_a_stop(optimizer, tmp_path, monkeypatch
 
     done([*arguments, "hydra.run.dir=resumed", "ckpt_path=stopped"], tmp_path)
 
-    first, second = (
-        weights.read(tmp_path / name / weights.FILE)["sha256"] for name in ("unbroken", "resumed")
-    )
-    assert first == second
+    unbroken = weights.read(tmp_path / "unbroken" / weights.FILE)
+    resumed = weights.read(tmp_path / "resumed" / weights.FILE)
+    assert unbroken["sha256"] == resumed["sha256"]
 
 
 def test_moving_average_covers_the_statistics_of_batchnorm(tmp_path, monkeypatch):
     def statistics(experiment):
-        buffers = dict(experiment.sampler.named_buffers())
-        return {name: value.clone() for name, value in buffers.items() if "running" in name}
+        running = {}
+        for name, value in experiment.sampler.named_buffers():
+            if "running" in name:
+                running[name] = value.clone()
+        return running
 
     seen = note_at_each_step(monkeypatch, statistics)
 
@@ -110,7 +129,10 @@ def test_scaling_shrinks_axes_as_well_as_it_stretches_them():
 
 
 def test_stretch_of_the_augmentation_goes_both_ways(rng):
-    factors = Augmentation(stretch=1.5)(torch.ones(500, 1, 3), rng)
+    augment = Augmentation(stretch=1.5)
+
+    factors = augment(torch.ones(500, 1, 3), rng)
+
     assert 1 / 1.5 <= float(factors.min()) < 0.7
     assert 1.45 < float(factors.max()) <= 1.5
 
@@ -130,31 +152,39 @@ class Shifted(nn.Module):
 
 
 def test_features_are_compared_with_those_of_the_same_net(rng):
-    tasks = [Segmentation(Shifted(shift), num_parts=2) for shift in (0.0, 5.0)]
+    shifts = (0.0, 5.0)
+    tasks = [Segmentation(Shifted(shift), num_parts=2) for shift in shifts]
     distillation = Distillation(tasks, Recipe(feature_distillation=2.0))
-    cloud, sample = torch.rand(4, 30, 3, generator=rng), torch.rand(4, 8, 3, generator=rng)
+    cloud = torch.rand(4, 30, 3, generator=rng)
+    sample = torch.rand(4, 8, 3, generator=rng)
     targets = Targets(None, cloud)
 
-    found = [
-        float(distillation.losses(number, sample, None, targets)["feature_distillation"])
-        for number in (0, 1)
-    ]
+    for number, shift in enumerate(shifts):
+        losses = distillation.losses(number, sample, None, targets)
 
-    for value, shift in zip(found, (0.0, 5.0), strict=True):
-        own, reference = sample.amax(1) + shift, cloud.amax(1) + shift
-        apart = (own - reference).square().sum(1) / reference.square().sum(1)
-        assert value == pytest.approx(2 * float(apart.mean()), rel=1e-5)
+        own = sample.amax(1) + shift
+        reference = cloud.amax(1) + shift
+        squares = (own - reference).square().sum(1)
+        relative = float((squares / reference.square().sum(1)).mean())
+        assert float(losses["feature_distillation"]) == pytest.approx(2 * relative, rel=1e-5)
 
 
 def test_number_of_neighbours_of_segmentation_changes_its_result(tmp_path):
-    settings = ["task=segmentation", "task.net.points=[16,8]", "sampler=fps", "weights=null"]
-    settings.append("dataset.classes=[lamp]")
-    losses = {}
-    for k in (1, 3):
-        record = job(tmp_path / str(k), *settings, f"task.k={k}")
-        assert record.config["task"]["k"] == k
-        losses[k] = record.metrics["test/loss/cross_entropy"]
-    assert losses[1] != losses[3]
+    settings = [
+        "task=segmentation",
+        "task.net.points=[16,8]",
+        "sampler=fps",
+        "weights=null",
+        "dataset.classes=[lamp]",
+    ]
+
+    one = job(tmp_path / "1", *settings, "task.k=1")
+    three = job(tmp_path / "3", *settings, "task.k=3")
+
+    assert one.config["task"]["k"] == 1
+    assert three.config["task"]["k"] == 3
+    loss = "test/loss/cross_entropy"
+    assert one.metrics[loss] != three.metrics[loss]
 
 
 def test_one_neighbour_gives_a_point_the_part_of_its_nearest_sample(rng):
@@ -168,11 +198,12 @@ def test_one_neighbour_gives_a_point_the_part_of_its_nearest_sample(rng):
     task = Segmentation(Net(), num_parts=2, k=1)
     parts = torch.zeros(2, 40, dtype=torch.int64)
 
-    found = task.predict(Batch(cloud, torch.zeros(2), None, parts), sample)
+    predicted = task.predict(Batch(cloud, torch.zeros(2), None, parts), sample)
 
     nearest = torch.cdist(cloud, sample).argmin(2)
-    expected = torch.stack([sample[b, nearest[b], :2] for b in range(2)])
-    torch.testing.assert_close(found, expected)
+    for number in range(2):
+        expected = sample[number, nearest[number], :2]
+        torch.testing.assert_close(predicted[number], expected)
 
 
 def test_head_of_a_hierarchical_net_reads_maxima_of_all_stages_and_the_mean_of_the_last(rng):

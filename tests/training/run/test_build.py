@@ -18,18 +18,27 @@ BASELINE = "+baselines.critical._target_=mops_lightning.samplers.critical_points
 
 
 def test_factory_gives_task_net_to_samplers_that_need_it():
-    for overrides in (["sampler=critical", "sizes=[4,16]"], ["m=16", BASELINE]):
-        made: Any = make_experiment(compose([*overrides, "m=8"]), small_dataset(), {})
-        sampler = made.baselines["critical"] if len(made.baselines) else made.sampler
-        assert isinstance(sampler, CriticalSampler)
-        assert sampler._net == (made.task.net,)
-        assert not any(name.startswith(("sampler.net", "baselines")) for name in made.state_dict())
+    own = experiment("sampler=critical", "sizes=[4,16]")
+    with_baseline = experiment(BASELINE)
+
+    assert_holds_net(own.sampler, own)
+    assert_holds_net(with_baseline.baselines["critical"], with_baseline)
+
+
+def experiment(*overrides: str) -> Any:
+    return make_experiment(compose([*overrides, "m=8"]), small_dataset(), {})
+
+
+def assert_holds_net(sampler, made):
+    """Assert that a sampler uses the task net without owning its weights."""
+    assert isinstance(sampler, CriticalSampler)
+    assert sampler._net == (made.task.net,)
+    assert not any(name.startswith(("sampler.net", "baselines")) for name in made.state_dict())
 
 
 def test_factory_first_weights_of_sampler_depend_on_seed_and_not_on_task_net():
     def first(*overrides):
-        made: Any = make_experiment(compose([*overrides, "m=8"]), small_dataset(), {})
-        return next(made.sampler.parameters())
+        return next(experiment(*overrides).sampler.parameters())
 
     assert torch.equal(first(), first("task/net=dgcnn"))
     assert not torch.equal(first(), first("seed=1"))
@@ -37,10 +46,11 @@ def test_factory_first_weights_of_sampler_depend_on_seed_and_not_on_task_net():
 
 def test_factory_baseline_has_the_seed_of_the_run_or_its_own():
     points = small_dataset().test.points[:2]
+    expected = RandomSampler(8, seed=3)(points).points
+
     for seed in ("seed=3", "+baselines.random.seed=3"):
-        made: Any = make_experiment(compose([seed, "m=8"]), small_dataset(), {})
-        chosen = made.baselines["random"](points).points
-        assert torch.equal(chosen, RandomSampler(8, seed=3)(points).points)
+        baseline = experiment(seed).baselines["random"]
+        assert torch.equal(baseline(points).points, expected)
 
 
 def test_factory_refuses_start_of_a_baseline_outside_of_the_clouds():
@@ -51,44 +61,88 @@ def test_factory_refuses_start_of_a_baseline_outside_of_the_clouds():
 
 @pytest.mark.parametrize("learn", ["task", "sampler"])
 def test_factory_recipe_without_its_settings_is_that_of_the_publication(learn):
-    recipe = compose().recipe.items()
-    # Hydra deletes no key that is null.
-    named = [name for name, value in recipe if value is not None and name != "_target_"]
-    assert len(named) > 3
-    cfg = compose([*(f"~recipe.{name}" for name in named), f"learn={learn}", "m=8"])
-    assert make_experiment(cfg, small_dataset(), {}).recipe == Recipe()
+    removals = []
+    for name, value in compose().recipe.items():
+        if value is not None and name != "_target_":  # Hydra deletes no key that is null
+            removals.append(f"~recipe.{name}")
+    assert len(removals) > 3
+
+    made = experiment(*removals, f"learn={learn}")
+
+    assert made.recipe == Recipe()
 
 
-@pytest.mark.parametrize("learn", ["joint", "sampler"])
-def test_factory_recipe_of_index_sampler_serves_a_task_net_that_learns(learn):
+@pytest.mark.parametrize(
+    ("learn", "expected"),
+    [
+        ("joint", Recipe(train_points=20, ema_span=0.3)),
+        ("sampler", Recipe()),
+    ],
+)
+def test_factory_recipe_of_index_sampler_serves_a_task_net_that_learns(learn, expected):
     given = ["recipe.train_points=20", "recipe.ema_span=0.3", f"learn={learn}", "sampler=fps"]
-    made = make_experiment(compose([*given, "m=8"]), small_dataset(), {})
-    expected = Recipe(train_points=20, ema_span=0.3) if learn == "joint" else Recipe()
-    assert made.recipe == expected
+
+    assert experiment(*given).recipe == expected
 
 
-def test_factory_segmentation_needs_data_with_parts(capsys):
-    cfg = compose(["task=segmentation", "m=8", "task.net.points=[16,8]"])
-    made: Any = make_experiment(cfg, small_dataset(), {})
-    assert made.task.num_parts == made.task.net.head[-1].out_features == 2
-    with pytest.raises(UserError, match=r"2 to 1000 parts, got none\. .* dataset\.label=COLUMN"):
-        make_experiment(cfg, replace(small_dataset(), part_names=()), {})
+SEGMENTATION = ["task=segmentation", "m=8"]
+
+
+def test_factory_segmentation_has_the_parts_of_the_data():
+    made = experiment(*SEGMENTATION, "task.net.points=[16,8]")
+
+    assert made.task.num_parts == 2
+    assert made.task.net.head[-1].out_features == 2
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        ((), r"2 to 1000 parts, got none\. .* dataset\.label=COLUMN"),
+        (("",) * 1001, "2 to 1000 parts, got 1001"),
+    ],
+)
+def test_factory_segmentation_refuses_data_of_no_or_too_many_parts(names, said):
+    data = replace(small_dataset(), part_names=names)
+
+    with pytest.raises(UserError, match=said):
+        make_experiment(compose(SEGMENTATION), data, {})
+
+
+def test_factory_segmentation_refuses_test_points_of_no_known_part(capsys):
+    cfg = compose([*SEGMENTATION, "task.net.points=[16,8]"])
     data: Any = small_dataset()
-    with pytest.raises(UserError, match="2 to 1000 parts, got 1001"):
-        make_experiment(cfg, replace(data, part_names=("",) * 1001), {})
-    unknown = data.test._replace(parts=torch.full_like(data.test.parts, -1))
+    unknown = torch.full_like(data.test.parts, -1)
+
     with pytest.raises(UserError, match="no test point has a known part"):
-        make_experiment(cfg, replace(data, test=unknown), {})
-    make_experiment(cfg, replace(data, test=unknown._replace(parts=unknown.parts + 1)), {})
+        make_experiment(cfg, replace(data, test=data.test._replace(parts=unknown)), {})
+
+    first_part = unknown + 1
+    make_experiment(cfg, replace(data, test=data.test._replace(parts=first_part)), {})
     assert f"no test point of part {data.part_names[1]}" in capsys.readouterr().err
+
+
+def test_factory_segmentation_refuses_corruptions_that_change_the_number_of_points():
+    data: Any = small_dataset()
     assert corrupt(data.test, "shear-1").parts is data.test.parts
-    cfg = compose(["task=segmentation", "m=8", "test_corruption=cutout-1"])
+    cfg = compose([*SEGMENTATION, "test_corruption=cutout-1"])
+
     with pytest.raises(UserError, match=r"test_corruption=cutout-1 adds or removes points"):
         make_experiment(cfg, replace(data, test=corrupt(data.test, "cutout-1")), {})
-    of_parts = "hierarchical_segmentation"
-    for task, net in (("segmentation", "pointnet"), ("classification", of_parts)):
-        with pytest.raises(UserError, match=rf"task/net={net} takes .*, but task={task} gives"):
-            make_experiment(compose([f"task={task}", f"task/net={net}"]), data, {})
+
+
+@pytest.mark.parametrize(
+    ("task", "net"),
+    [
+        ("segmentation", "pointnet"),
+        ("classification", "hierarchical_segmentation"),
+    ],
+)
+def test_factory_refuses_net_of_another_task(task, net):
+    cfg = compose([f"task={task}", f"task/net={net}"])
+
+    with pytest.raises(UserError, match=rf"task/net={net} takes .*, but task={task} gives"):
+        make_experiment(cfg, small_dataset(), {})
 
 
 def rows(part, whole):
@@ -98,32 +152,48 @@ def rows(part, whole):
 
 def test_split_holds_out_fraction_in_order():
     clouds = small_dataset(train=20).train
+
     train, held_out = split(clouds, 0.2, seed=5)
-    kept, out = rows(train.points, clouds.points), rows(held_out.points, clouds.points)
+
+    kept = rows(train.points, clouds.points)
+    out = rows(held_out.points, clouds.points)
     assert len(out) == 4
     assert sorted([*kept, *out]) == list(range(20))
-    assert (kept, out) == (sorted(kept), sorted(out))
+    assert kept == sorted(kept)
+    assert out == sorted(out)
     assert torch.equal(held_out.labels, clouds.labels[out])
     # The stream of random numbers stays, so that old runs can be repeated.
-    assert out == sorted(torch.randperm(20, generator=generator(5, 2))[:4].tolist())
-    assert [len(part.points) for part in split(clouds, 0.0, seed=5)] == [20, 0]
+    drawn = torch.randperm(20, generator=generator(5, 2))[:4]
+    assert out == sorted(drawn.tolist())
+
+
+def test_split_of_no_share_holds_out_nothing():
+    train, held_out = split(small_dataset(train=20).train, 0.0, seed=5)
+
+    assert len(train.points) == 20
+    assert len(held_out.points) == 0
 
 
 def test_split_holds_out_whole_sources():
     clouds = small_dataset(train=20).train
     clouds = clouds._replace(sources=torch.arange(5).repeat_interleave(4))
-    sources = split(clouds, 0.4, seed=5)[1].sources
-    assert sources is not None
-    assert sources.unique(return_counts=True)[1].tolist() == [4, 4]
+
+    _, held_out = split(clouds, 0.4, seed=5)
+
+    assert held_out.sources is not None
+    _, counts = held_out.sources.unique(return_counts=True)
+    assert counts.tolist() == [4, 4]
 
 
 def test_augmentation_of_joint_training_is_that_of_the_sampler():
     changed = ["augment.task.jitter=0.01", "+augment.sampler.jitter=0.02"]
-    found = {
-        learn: augmentation(compose([*changed, f"learn={learn}"])).jitter
-        for learn in ("task", "sampler", "joint")
-    }
-    assert found == {"task": 0.01, "sampler": 0.02, "joint": 0.02}
+
+    jitter = {}
+    for learn in ("task", "sampler", "joint"):
+        cfg = compose([*changed, f"learn={learn}"])
+        jitter[learn] = augmentation(cfg).jitter
+
+    assert jitter == {"task": 0.01, "sampler": 0.02, "joint": 0.02}
 
 
 @pytest.mark.parametrize(
