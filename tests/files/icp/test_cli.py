@@ -68,7 +68,7 @@ def test_crops_give_a_row_for_every_method_size_registration_and_draw(scans, tmp
     voxels = [float(row["points"]) for row in rows if row["method"] == "small_gicp_voxel"]
     assert all(10 <= number <= 40 for number in voxels)
     printed = capsys.readouterr().out
-    assert "plane, 16 points, 2 scans of " in printed
+    assert "plane, 16 points: 2 draws of 4 alignments" in printed
     assert "against fps_farthest" in printed
     assert printed.endswith(f"files in {out}/: table.csv, compare.html\n")
 
@@ -100,7 +100,7 @@ def test_frames_with_poses_are_aligned_to_the_true_motion(tmp_path, capsys):
     assert [row["method"] for row in rows] == ["all points", "covariance"] * 2
     assert max(float(row["degrees"]) for row in rows) < 0.5
     assert max(float(row["shift"]) for row in rows) < 0.05
-    assert "300 points, 3 frames of " in capsys.readouterr().out
+    assert "plane, 300 points: 2 draws of 2 alignments" in capsys.readouterr().out
 
 
 def test_target_is_sampled_where_that_is_asked_for(scans, tmp_path):

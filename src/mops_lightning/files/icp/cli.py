@@ -1,7 +1,6 @@
 """``compare --task icp``: methods of downsampling by the registration of scans."""
 
 import argparse
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -122,14 +121,8 @@ def compare_icp(chosen: argparse.Namespace) -> str:
         for path in scans_of(_folder(chosen))
     ]
     pairs_of_draw = _pairs(chosen, scans)
-    scores = []
-    for score in compare_by_icp(pairs_of_draw, setup):
-        scores.append(score)
-        _show_progress(score.draw, setup.draws)
-    kind = "scans" if chosen.poses is None else "frames"
-    draws = f"{setup.draws} draws of {scores[0].pairs} alignments"
-    source = f"{len(scans)} {kind} of {_folder(chosen)}: {draws}"
-    return write_scores(scores, source, chosen.out)
+    scores = list(compare_by_icp(pairs_of_draw, setup))
+    return write_scores(scores, chosen.out)
 
 
 def _folder(chosen: argparse.Namespace) -> Path:
@@ -174,9 +167,3 @@ def _fill_defaults(chosen: argparse.Namespace) -> None:
     check_at_least(0, **{"--angle": chosen.angle, "--shift": chosen.shift})
     if not 0 < chosen.max_distance < float("inf"):
         raise UserError(f"--max-distance must be a number above 0, got {chosen.max_distance}.")
-
-
-def _show_progress(draw: int, draws: int) -> None:
-    """Show on a terminal how many draws are done."""
-    if sys.stderr.isatty():
-        print(f"\rdraw {draw + 1} of {draws}", end="", file=sys.stderr, flush=True)

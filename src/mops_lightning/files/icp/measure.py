@@ -6,6 +6,8 @@ from statistics import fmean, median
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
 
 from mops_lightning.errors import UserError
 from mops_lightning.files.icp.align import (
@@ -111,7 +113,9 @@ def compare_by_icp(pairs_of_draw: Callable[[int], list[Pair]], setup: Setup) -> 
     Raises:
         UserError: a size is out of range for a pair.
     """
-    for draw in range(setup.draws):
+    console = Console(stderr=True)
+    draws = range(setup.draws)
+    for draw in track(draws, "Draws", console=console, disable=not console.is_terminal):
         pairs = pairs_of_draw(draw)
         check_sizes(pairs, setup.sizes)
         seed = derive_seed(setup.seed, draw)

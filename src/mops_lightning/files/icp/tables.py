@@ -30,7 +30,7 @@ HEAD = [
 
 MEANINGS = [
     "Every figure is the mean over the draws, ± the standard deviation between draws. All methods "
-    "see the same pairs and starts.",
+    "of a draw see the same pairs and starts.",
     "- rotation error: median angle between the pose that is found and the true one. "
     f"below {ALIGNED:g} deg: share of smaller errors, better when higher.",
     f"- against {RIVAL}: how much larger the rotation error is, draw by draw.",
@@ -41,49 +41,57 @@ MEANINGS = [
 ]
 
 
-def write_scores(scores: Sequence[Score], source: str, folder: Path) -> str:
-    """Write the table of every draw and the page, and return the means over draws as text.
-
-    Args:
-        scores: of all draws.
-        source: what was aligned, for the captions.
-        folder: where to write.
-    """
+def write_scores(scores: Sequence[Score], folder: Path) -> str:
+    """Write the table of every draw and the page, and return the means over draws as text."""
     frame = pd.DataFrame([asdict(score) for score in scores])
-    grids = [
-        _grid(frame[chosen], registration, m, source)
-        for registration in frame.registration.unique()
-        for m in frame.m.unique()
-        if (chosen := (frame.registration == registration) & (frame.m == m)).any()
-    ]
-    page = render("compare", grids, [], MEANINGS, "How to read this")
+    page = render("compare", grids_of(frame), [], MEANINGS, "How to read this")
     csv = frame.to_csv(index=False, lineterminator="\n")
     for name, content in zip(COMPARED, (csv, page), strict=True):
         with atomic_write(folder / name) as temporary:
             temporary.write_text(content, encoding="utf-8")
-    return markdown(grids, MEANINGS)
+    return as_text(frame)
 
 
-def _grid(frame: pd.DataFrame, registration: str, m: int, source: str) -> Grid:
+def as_text(frame: pd.DataFrame) -> str:
+    """Return the means over draws as text.
+
+    Args:
+        frame: columns of ``Score``, such as those of ``table.csv``.
+    """
+    return markdown(grids_of(frame), MEANINGS)
+
+
+def grids_of(frame: pd.DataFrame) -> list[Grid]:
+    """Return a table for every registration and number of points; see ``as_text``."""
+    grids = []
+    for registration in frame.registration.unique():
+        by_registration = frame[frame.registration == registration]
+        for m in by_registration.m.unique():
+            grids.append(_grid(by_registration[by_registration.m == m], registration, m))
+    return grids
+
+
+def _grid(frame: pd.DataFrame, registration: str, m: int) -> Grid:
     size = f"{m:,} points" if m else "all points"
-    title = f"{registration}, {size}, {source}"
+    draws, pairs = frame.draw.nunique(), frame.pairs.iloc[0]
+    title = f"{registration}, {size}: {draws} draws of {pairs} alignments"
     rival = frame[frame.method == RIVAL].degrees
     rows = []
     for method in frame.method.unique():
-        draws = frame[frame.method == method]
+        by_draw = frame[frame.method == method]
         against = "-"
         if len(rival) and method != RIVAL:
-            against = _spread(draws.degrees.to_numpy() / rival.to_numpy() - 1, 100, "+.1f")
+            against = _spread(by_draw.degrees.to_numpy() / rival.to_numpy() - 1, 100, "+.1f")
         rows.append(
             [
                 method,
-                f"{draws.points.mean():,.0f}",
-                _spread(draws.degrees, 1, ".2f"),
+                f"{by_draw.points.mean():,.0f}",
+                _spread(by_draw.degrees, 1, ".2f"),
                 against,
-                _spread(draws.aligned, 100, ".1f"),
-                _spread(draws["shift"], 1, ".4f"),
-                f"{1000 * draws.sampling.mean():.2f}",
-                f"{1000 * draws.aligning.mean():.2f}",
+                _spread(by_draw.aligned, 100, ".1f"),
+                _spread(by_draw["shift"], 1, ".4f"),
+                f"{1000 * by_draw.sampling.mean():.2f}",
+                f"{1000 * by_draw.aligning.mean():.2f}",
             ]
         )
     return Grid(title, HEAD, rows)

@@ -1,0 +1,47 @@
+"""The table of a comparison by registration, from its records."""
+
+import pandas as pd
+
+from mops_lightning.files.icp.tables import grids_of
+
+
+def score(draw, method, degrees):
+    return {
+        "draw": draw,
+        "registration": "plane",
+        "m": 16,
+        "method": method,
+        "degrees": degrees,
+        "aligned": 0.25,
+        "shift": 0.5,
+        "points": 16.0,
+        "sampling": 0.001,
+        "aligning": 0.002,
+        "pairs": 4,
+    }
+
+
+def test_grid_has_means_spreads_and_paired_differences():
+    frame = pd.DataFrame(
+        [
+            score(0, "fps_farthest", 1.0),
+            score(0, "random", 2.0),
+            score(1, "fps_farthest", 3.0),
+            score(1, "random", 3.0),
+        ]
+    )
+
+    (grid,) = grids_of(frame)
+
+    assert grid.title == "plane, 16 points: 2 draws of 4 alignments"
+    common = ["25.0 ± 0.0", "0.5000 ± 0.0000", "1.00", "2.00"]
+    assert grid.rows == [
+        ["fps_farthest", "16", "2.00 ± 1.41", "-", *common],
+        ["random", "16", "2.50 ± 0.71", "+50.0 ± 70.7", *common],
+    ]
+
+
+def test_grid_of_one_draw_without_farthest_points_has_no_spread():
+    (grid,) = grids_of(pd.DataFrame([score(0, "random", 2.0)]))
+
+    assert grid.rows[0][:4] == ["random", "16", "2.00", "-"]
