@@ -9,11 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
 from mops_lightning.config.compose import compose
 from mops_lightning.config.overrides import key as key_of
+from mops_lightning.files.cli import compare_arguments
+from mops_lightning.files.icp.tables import as_text
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.report.build import build_report
 from mops_lightning.report.text import markdown
@@ -71,6 +74,14 @@ class Command:
     @property
     def is_report(self) -> bool:
         return self.arguments[0] == "report"
+
+    @property
+    def is_comparison(self) -> bool:
+        return self.arguments[0] == "compare"
+
+    @property
+    def is_run(self) -> bool:
+        return not self.is_report and not self.is_comparison
 
 
 def commands() -> list[Command]:
@@ -157,7 +168,7 @@ def _sweep(arguments: list[str]) -> str:
     return name
 
 
-@pytest.mark.parametrize("command", [one for one in COMMANDS if not one.is_report], ids=str)
+@pytest.mark.parametrize("command", [one for one in COMMANDS if one.is_run], ids=str)
 def test_command_of_a_page_starts(command, roots, tmp_path):
     arguments = list(command.arguments)
     sweep = _sweep(arguments)
@@ -191,6 +202,21 @@ def test_table_comes_from_its_records_by_its_command(command, monkeypatch):
 
     text = markdown(report.grids, report.remarks)
     assert text == (ROOT / folder / "table.md").read_text()
+
+
+@pytest.mark.parametrize("command", [one for one in COMMANDS if one.is_comparison], ids=str)
+def test_comparison_of_a_page_is_understood(command):
+    chosen = compare_arguments(command.arguments[1:], "compare")
+
+    assert chosen.task == "icp"
+    assert chosen.m
+
+
+@pytest.mark.parametrize("record", sorted((ROOT / "results/own_scans/icp").glob("*.csv")), ids=str)
+def test_table_of_registration_comes_from_its_records(record):
+    text = as_text(pd.read_csv(record))
+
+    assert text == record.with_suffix(".md").read_text()
 
 
 @pytest.mark.parametrize("folder", TABLES_WITHOUT_COMMAND)

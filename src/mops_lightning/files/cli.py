@@ -92,7 +92,12 @@ def _propagate(chosen: argparse.Namespace) -> None:
 def compare(arguments: list[str], prog: str = "mops-lightning compare") -> None:
     """Write the table and the page, and print the table; arguments as for ``downsample``."""
     with one_line_endings(prog):
-        _compare(parsed(arguments, prog, COMPARE, _compare_arguments))
+        _compare(compare_arguments(arguments, prog))
+
+
+def compare_arguments(arguments: list[str], prog: str) -> argparse.Namespace:
+    """Parse the arguments of ``compare``."""
+    return parsed(arguments, prog, COMPARE, _compare_arguments)
 
 
 def _compare_arguments(add: Add) -> None:
