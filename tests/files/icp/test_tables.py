@@ -36,12 +36,12 @@ def test_grid_has_means_spreads_and_paired_differences():
     assert grid.title == "plane, 16 points: 2 draws of 4 alignments"
     common = ["25.0 ± 0.0", "0.5000 ± 0.0000", "1.00", "2.00"]
     assert grid.rows == [
-        ["fps_farthest", "16", "2.00 ± 1.41", "-", *common],
-        ["random", "16", "2.50 ± 0.71", "+50.0 ± 70.7", *common],
+        ["fps_farthest", "16", "2.000 ± 1.414", "-", *common],
+        ["random", "16", "2.500 ± 0.707", "+50.0 ± 70.7", *common],
     ]
 
 
 def test_grid_of_one_draw_without_farthest_points_has_no_spread():
     (grid,) = grids_of(pd.DataFrame([score(0, "random", 2.0)]))
 
-    assert grid.rows[0][:4] == ["random", "16", "2.00", "-"]
+    assert grid.rows[0][:4] == ["random", "16", "2.000", "-"]

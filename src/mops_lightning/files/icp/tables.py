@@ -86,7 +86,7 @@ def _grid(frame: pd.DataFrame, registration: str, m: int) -> Grid:
             [
                 method,
                 f"{by_draw.points.mean():,.0f}",
-                _spread(by_draw.degrees, 1, ".2f"),
+                _spread(by_draw.degrees, 1, ".3f"),
                 against,
                 _spread(by_draw.aligned, 100, ".1f"),
                 _spread(by_draw["shift"], 1, ".4f"),
