@@ -32,7 +32,8 @@ def in_steps(points, m, weight=None):
     def weights(cloud, others, bound):
         axes = range(others.shape[-1])
         squared = sum((cloud[..., axis] - others[..., axis]) ** 2 for axis in axes)
-        return ((1 - squared.sqrt() / bound).clamp_min(0).square().square().square() * scale).long()
+        shares = squared.sqrt() * bound.reciprocal()
+        return ((1 - shares).clamp_min(0).square().square().square() * scale).long()
 
     kept = []
     shares = torch.ones(points.shape[:2]) if weight is None else weight.amin() / weight

@@ -287,10 +287,10 @@ def _rows_in_space(
     """Choose farthest points, or those of sample elimination, by the columns that count."""
     used = in_space(table, options.space, source)
     check_coordinates(source, used)
-    points = UnitSphere.around(used).normalise(used)[None]
     weights = None if weight is None else torch.from_numpy(weight)[None]
     choose = poisson_rows if options.method == "poisson" else farthest_rows
-    return choose(points, m, options.seed, weight=weights)[0].numpy()
+    points = torch.from_numpy(used)[None]
+    return choose(points, m, options.seed, weight=weights, in_sphere=True)[0].numpy()
 
 
 def sample_cloud(
@@ -321,10 +321,12 @@ def sample_cloud(
     if options.tile is not None:
         rows = sample_by_tiles(points, options.tile, m, sampler)
         return rows, points[rows]
-    sphere = UnitSphere.around(points)
     weights = None if weight is None else torch.from_numpy(weight)[None]
-    new, found = sampler.select(options.readout, sphere.normalise(points)[None], m, weights)
+    sphere = None if sampler.any_unit else UnitSphere.around(points)
+    given = torch.from_numpy(points) if sphere is None else sphere.normalise(points)
+    new, found = sampler.select(options.readout, given[None], m, weights)
     if found is None:
+        assert sphere is not None  # generated points are in it
         return None, sphere.restore(new[0])
     rows = found[0].numpy()
     return rows, points[rows]

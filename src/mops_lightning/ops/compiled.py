@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mops_lightning.ops import kernel_neighbours, kernels
-from mops_lightning.ops.farthest import farthest_rows
+from mops_lightning.ops.farthest import farthest_rows, rows_from_start
+from mops_lightning.ops.keys import SeededOrder
 from mops_lightning.ops.points import distance_dtype
 
 NEAREST_LEAF = 256
@@ -34,7 +35,6 @@ def farthest(
     counts: Tensor,
     m: int,
     factors: Tensor | None = None,
-    ranks: Tensor | None = None,
 ) -> Tensor | None:
     """Fill up rows of every cloud by farthest points; see ``ops.farthest.farthest_rows``."""
     if points.device.type != "cpu" or points.numel() == 0:
@@ -45,7 +45,27 @@ def farthest(
         counts.numpy(),
         m,
         None if factors is None else factors.numpy(),
-        None if ranks is None else ranks.numpy(),
+        threads=torch.get_num_threads(),
+    )
+    return None if rows is None else torch.from_numpy(rows)
+
+
+def farthest_from_start(
+    points: Tensor,
+    m: int,
+    order: SeededOrder,
+    start: int | str | None = None,
+    weight: Tensor | None = None,
+) -> Tensor | None:
+    """Return farthest points of every cloud; see ``ops.farthest.rows_from_start``."""
+    if points.device.type != "cpu" or points.numel() == 0:
+        return None
+    rows = rows_from_start(
+        points.detach().to(distance_dtype(points)).numpy(),
+        m,
+        order,
+        start,
+        None if weight is None else weight.double().numpy(),
         torch.get_num_threads(),
     )
     return None if rows is None else torch.from_numpy(rows)

@@ -1,12 +1,13 @@
 """Farthest points of NumPy arrays, by the loops of ``ops.kernel_farthest``; without torch."""
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mops_lightning.ops import kernel_farthest
+from mops_lightning.ops.keys import SeededOrder, seed_word, seeded_keys, unit_spheres
 
 LEAF = 1024
 """Maximum number of points of a leaf of the tree: more leaves exclude more points, larger ones
@@ -18,6 +19,12 @@ SPARSE, SPARSE_LEAF = 100, 4096
 THREADS_MIN_WORK = 2**22
 """Minimum number of distances in a batch, estimated, for using several threads."""
 
+LEAST_FACTOR = 1e-200
+"""Least squared weight: products of a chosen point, whose distance is -1, must be below 0."""
+
+FARTHEST: Final = "farthest"
+"""Start at the point farthest from the mean."""
+
 Array = NDArray[Any]
 Rows = NDArray[np.int64]
 
@@ -28,7 +35,7 @@ def farthest_rows(
     counts: Rows,
     m: int,
     factors: Array | None = None,
-    ranks: Array | None = None,
+    order: SeededOrder | None = None,
     threads: int = 1,
 ) -> Rows | None:
     """Fill up rows of every cloud to m by the points that are farthest from the rows before.
@@ -36,10 +43,11 @@ def farthest_rows(
     Args:
         points: ``(B, N, C)`` float32 or float64.
         given: ``(B, G)`` rows, G ≤ m; the first ``counts[b]`` of cloud b are the given rows.
-        counts: ``(B,)``, from 1 to G.
+        counts: ``(B,)``, from 0 to G. Without given rows, the first row is that of the order.
         m: number of rows, at most N.
         factors: ``(B, N)`` float64 above 0 of the squared distances in the choice; None: 1.
-        ranks: ``(B, N)`` int64: the lowest rank wins a tie, then the lowest row; None: the row.
+        order: which point comes first, and is chosen in case of ties; None: the lowest row. Keys
+            are computed at the first tie.
         threads: maximum number of threads.
 
     Returns:
@@ -51,52 +59,130 @@ def farthest_rows(
     chosen = np.empty((clouds, m), np.int64)
     chosen[:, : given.shape[1]] = given
     reached = np.array(counts, np.int64)
-    no_factors, no_ranks = np.empty((clouds, 0)), np.empty((clouds, 0), np.int64)
-    arrays = (
-        points,
-        chosen,
-        reached,
-        no_factors if factors is None else np.ascontiguousarray(factors),
-        no_ranks if ranks is None else np.ascontiguousarray(ranks),
-    )
+    factors = np.empty((clouds, 0)) if factors is None else np.ascontiguousarray(factors)
     workers = min(threads, clouds) if m * n * clouds >= THREADS_MIN_WORK else 1
     if workers == 1:
-        finite = _fill(*arrays)
+        finite = _fill(points, chosen, reached, factors, order)
     else:
-        parts = zip(*(np.array_split(array, workers) for array in arrays), strict=True)
+        parts = np.array_split(np.arange(clouds), workers)
+        slices = [slice(part[0], part[-1] + 1) for part in parts]
+
+        def fill(part: slice) -> bool:
+            return _fill(points[part], chosen[part], reached[part], factors[part], order)
+
         with ThreadPoolExecutor(workers) as pool:
-            finite = all(pool.map(lambda part: _fill(*part), parts))
+            finite = all(pool.map(fill, slices))
     if not finite:
         return None
     for cloud in np.flatnonzero(reached < m):
-        order = None if ranks is None else ranks[cloud]
-        _fill_with_copies(chosen[cloud], int(reached[cloud]), n, order)
+        _fill_with_copies(chosen[cloud], int(reached[cloud]), points[cloud : cloud + 1], order)
     return chosen
 
 
-def _fill(points: Array, chosen: Array, counts: Array, factors: Array, ranks: Array) -> bool:
+def rows_from_start(
+    points: Array,
+    m: int,
+    order: SeededOrder,
+    start: int | str | None = None,
+    weight: Array | None = None,
+    threads: int = 1,
+) -> Rows | None:
+    """Return rows ``(B, m)`` of farthest points in the order of choice.
+
+    Args:
+        points: ``(B, N, C)`` float32 or float64.
+        m: number of rows, at most N.
+        order: breaks ties and, without ``start``, determines the first point.
+        start: the first point of every cloud: a row, ``FARTHEST`` for the point farthest from the
+            mean, or None for that of the order, with weights for the heaviest point.
+        weight: ``(B, N)`` finite and above 0: factors of the distances.
+        threads: maximum number of threads.
+
+    Returns:
+        ``(B, m)`` distinct rows, or None if a coordinate is not finite.
+    """
+    clouds = len(points)
+    if start is None and weight is None:
+        given = np.empty((clouds, 0), np.int64)
+    elif isinstance(start, int):
+        given = np.full((clouds, 1), start)
+    elif start == FARTHEST:
+        if not np.isfinite(points).all():
+            return None
+        given = _first_of_largest(_squares_from_mean(points), points, order)
+    else:
+        assert weight is not None
+        given = _first_of_largest(weight, points, order)
+    counts = np.full(clouds, given.shape[1])
+    factors = None if weight is None else squared_factors(weight)
+    return farthest_rows(points, given, counts, m, factors, order, threads)
+
+
+def squared_factors(weight: Array) -> NDArray[np.float64]:
+    """Return the factors ``(B, N)`` of squared distances for weights of distances."""
+    relative = weight.astype(np.float64) / weight.max(1, keepdims=True)
+    factors: NDArray[np.float64] = np.maximum(np.square(relative), LEAST_FACTOR)
+    return factors
+
+
+def _squares_from_mean(points: Array) -> NDArray[np.float64]:
+    """Return the squared distances ``(B, N)`` of points from their cloud's mean."""
+    centres = unit_spheres(points)[:, None, :-1]
+    squares = np.zeros(points.shape[:2])
+    with np.errstate(over="ignore"):  # infinite squares are largest, too
+        for axis in range(points.shape[2]):
+            squares += np.square(points[..., axis] - centres[..., axis])
+    return squares
+
+
+def _first_of_largest(values: Array, points: Array, order: SeededOrder) -> Rows:
+    """Return the rows ``(B, 1)`` of the largest values; the lowest key wins a tie."""
+    is_largest = values == values.max(1, keepdims=True)
+    if (is_largest.sum(1) == 1).all():
+        return is_largest.argmax(1)[:, None]
+    keys = seeded_keys(points, order)
+    return np.where(is_largest, keys, np.iinfo(keys.dtype).max).argmin(1)[:, None]
+
+
+def _fill(
+    points: Array, chosen: Array, counts: Array, factors: Array, order: SeededOrder | None
+) -> bool:
     """Call the compiled loops, which write to ``chosen`` and ``counts``."""
     _, n, channels = points.shape
     leaf = SPARSE_LEAF if n > SPARSE * chosen.shape[1] else LEAF
+    ranking, word = kernel_farthest.BY_ROW, seed_word(0)
+    if order is not None:
+        in_sphere, by_keys = kernel_farthest.BY_KEYS_IN_SPHERE, kernel_farthest.BY_KEYS
+        ranking = in_sphere if order.in_sphere else by_keys
+        word = seed_word(order.seed)
     finite: bool = kernel_farthest.farthest(
         points.reshape(-1),
         chosen.reshape(-1),
         counts,
         factors.reshape(-1),
-        ranks.reshape(-1),
+        ranking,
+        word,
         channels,
         leaf,
     )
     return finite
 
 
-def _fill_with_copies(chosen: Array, reached: int, n: int, ranks: Array | None) -> None:
-    """Fill up with points whose distance is 0, in the order in which they win a tie."""
-    left = np.ones(n, np.bool_)
+def _fill_with_copies(chosen: Array, reached: int, cloud: Array, order: SeededOrder | None) -> None:
+    """Fill up with points whose distance is 0, in the order in which they win a tie.
+
+    Args:
+        chosen: ``(m,)`` rows.
+        reached: number of rows that are chosen.
+        cloud: ``(1, N, C)``.
+        order: see ``farthest_rows``.
+    """
+    left = np.ones(cloud.shape[1], np.bool_)
     left[chosen[:reached]] = False
     copies = np.flatnonzero(left)
-    if ranks is not None:
-        copies = copies[np.argsort(ranks[copies], kind="stable")]
+    if order is not None:
+        keys = seeded_keys(cloud, order)[0]
+        copies = copies[np.argsort(keys[copies], kind="stable")]
     chosen[reached:] = copies[: len(chosen) - reached]
 
 

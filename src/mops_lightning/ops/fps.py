@@ -7,10 +7,8 @@ from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops import compiled
+from mops_lightning.ops.farthest import LEAST_FACTOR
 from mops_lightning.ops.points import gather_points, to_planes
-
-LEAST_FACTOR = 1e-200
-"""Least squared weight: products of a chosen point, whose distance is -1, must be below 0."""
 
 
 def farthest_point_sample(
@@ -104,16 +102,14 @@ def farthest(
     if weight is not None:
         relative = weight.double() / weight.double().amax(1, keepdim=True)
         factors = relative.square().clamp_min(LEAST_FACTOR)
-    rows = compiled.farthest(points, given, counts, m, factors, ranks)
-    if rows is not None:
-        return rows
     if ranks is not None:  # in the order of the ranks, the lowest row wins a tie
         order = ranks.argsort(dim=1, stable=True)
         ordered = gather_points(points, order)
         factors = None if factors is None else factors.gather(1, order)
         given = order.argsort(1).gather(1, given)
         return order.gather(1, _on_device(ordered, given, counts, m, factors))
-    return _on_device(points, given, counts, m, factors)
+    rows = compiled.farthest(points, given, counts, m, factors)
+    return _on_device(points, given, counts, m, factors) if rows is None else rows
 
 
 def _on_device(

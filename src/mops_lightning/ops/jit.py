@@ -66,12 +66,12 @@ def jit_sums(function: Any) -> Any:
         return njit(function, **OPTIONS, fastmath=order)
 
 
-def jit_cached_with(module: ModuleType) -> Any:
-    """Compile as ``jit_cached`` does a function that calls compiled functions of another module.
+def jit_cached_with(*modules: ModuleType) -> Any:
+    """Compile as ``jit_cached`` does a function that calls compiled functions of other modules.
 
-    Numba does not notice a change of the other file: the name of the compiled form holds its hash.
+    Numba does not notice a change of other files: the name of the compiled form holds their hash.
     """
-    source = Path(str(module.__file__)).read_bytes()
+    source = b"".join(Path(str(module.__file__)).read_bytes() for module in modules)
 
     def decorate(function: Any) -> Any:
         function.__qualname__ += f"_{hashlib.sha256(source).hexdigest()[:12]}"

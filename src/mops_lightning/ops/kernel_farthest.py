@@ -4,7 +4,7 @@
 
 import numpy as np
 
-from mops_lightning.ops import kernels
+from mops_lightning.ops import kernel_keys, kernels
 from mops_lightning.ops.jit import (
     bits_float,
     float_bits,
@@ -13,9 +13,9 @@ from mops_lightning.ops.jit import (
     jit_inlined,
     multiply_add,
 )
+from mops_lightning.ops.kernel_keys import ranks_of, to_planes
 from mops_lightning.ops.kernels import (
     FANOUT,
-    all_finite,
     build_tree,
     distance_to_box,
     place_of,
@@ -25,9 +25,13 @@ from mops_lightning.ops.kernels import (
 BLOCK = 128
 """Number of distances that are compared at a time."""
 
+BY_ROW, BY_KEYS, BY_KEYS_IN_SPHERE = 0, 1, 2
+"""What comes first and wins a tie: the lowest row, or the lowest key of the given points or of
+those in the unit sphere."""
 
-@jit_cached_with(kernels)
-def farthest(points, chosen, counts, factors, ranks, channels, leaf):
+
+@jit_cached_with(kernels, kernel_keys)
+def farthest(points, chosen, counts, factors, ranking, word, channels, leaf):
     """Repeatedly choose the point that is farthest from all points chosen before it.
 
     Distances in the type of the coordinates find the candidates of a choice. Where there are
@@ -36,12 +40,12 @@ def farthest(points, chosen, counts, factors, ranks, channels, leaf):
     Args:
         points: ``(B·N·C,)`` coordinates, one point after the other.
         chosen: ``(B·M,)`` rows; the first ``counts`` of a cloud are given, the others are written.
-        counts: ``(B,)`` number of given rows, at least 1. The number of chosen rows is written: it
-            is below M where all points that are left are copies of chosen ones.
+        counts: ``(B,)`` number of given rows; at least 1 with ``BY_ROW``. The number of chosen rows
+            is written: it is below M where all points that are left are copies of chosen ones.
         factors: ``(B·N,)`` float64, above 0: the point with the largest product of factor and
             squared distance is chosen; or ``(0,)``.
-        ranks: ``(B·N,)`` int64: the lowest rank is chosen in case of ties; or ``(0,)``: the lowest
-            row.
+        ranking: ``BY_ROW``, ``BY_KEYS`` or ``BY_KEYS_IN_SPHERE``.
+        word: the seed of the keys, mixed.
         channels: C.
         leaf: maximum number of points of a leaf.
 
@@ -52,37 +56,43 @@ def farthest(points, chosen, counts, factors, ranks, channels, leaf):
     size, steps = len(points) // (clouds * channels), len(chosen) // clouds
     for cloud in range(clouds):
         start, stop = cloud * size, (cloud + 1) * size
-        planes = _to_planes(points[start * channels : stop * channels], channels)
-        if not all_finite(planes):
+        given = points[start * channels : stop * channels]
+        planes, largest = to_planes(given, channels)
+        if not largest < np.inf:
             return False
-        weights = factors[start:stop] if len(factors) else factors
-        order = ranks[start:stop] if len(ranks) else ranks
+        ranks = np.empty(0, np.int64)
         rows = chosen[cloud * steps : (cloud + 1) * steps]
-        counts[cloud] = _choose(planes, rows, counts[cloud], weights, order, channels, leaf)
+        if counts[cloud] == 0:
+            ranks = ranks_of(planes, channels, largest, word, ranking == BY_KEYS_IN_SPHERE, True)
+            rows[0] = _first_of_lowest(ranks)
+            counts[cloud] = 1
+        weights = factors[start:stop] if len(factors) else factors
+        counts[cloud] = _choose(
+            given, planes, rows, counts[cloud], weights, ranking, word, ranks, channels, leaf
+        )
     return True
 
 
 @jit
-def _to_planes(points, channels):
-    """Return coordinates one channel after the other."""
-    size = len(points) // channels
-    planes = np.empty(len(points), points.dtype)
-    if channels == 3:  # a constant stride is vectorised
-        x, y, z = planes[:size], planes[size : 2 * size], planes[2 * size :]
-        for i in range(size):
-            x[i] = points[3 * i]
-            y[i] = points[3 * i + 1]
-            z[i] = points[3 * i + 2]
-    else:
-        for axis in range(channels):
-            for i in range(size):
-                planes[axis * size + i] = points[channels * i + axis]
-    return planes
+def _first_of_lowest(ranks):
+    lowest = ranks[0]
+    for i in range(len(ranks)):
+        lowest = min(lowest, ranks[i])
+    return place_of(ranks, lowest)
+
+
+@jit
+def _ranks_of_given(points, channels, word, in_sphere):
+    planes, largest = to_planes(points, channels)
+    return ranks_of(planes, channels, largest, word, in_sphere, True)
 
 
 @jit_inlined
-def _choose(planes, chosen, given, factors, ranks, channels, leaf):
-    """Choose farthest points of one cloud; arguments as for ``farthest``."""
+def _choose(points, planes, chosen, given, factors, ranking, word, ranks, channels, leaf):
+    """Choose farthest points of one cloud; arguments as for ``farthest``.
+
+    Keys are computed at the first tie, unless the first point needed them: ``ranks`` is ``(0,)``.
+    """
     size, steps = len(planes) // channels, len(chosen)
     rows, nodes, boxes = build_tree(planes, channels, leaf)
     known = len(nodes) // 4
@@ -113,6 +123,8 @@ def _choose(planes, chosen, given, factors, ranks, channels, leaf):
                 exact[i] = min(exact[i], low) if seen[i] else low
                 seen[i] = step
                 gain = exact[i] * factors[i] if len(factors) else exact[i]
+                if gain == best and ranking != BY_ROW and len(ranks) == 0:
+                    ranks = _ranks_of_given(points, channels, word, ranking == BY_KEYS_IN_SPHERE)
                 if gain > best or (gain == best and _precedes(rows, ranks, i, place)):
                     best, place = gain, np.int64(i)
             if best == 0:

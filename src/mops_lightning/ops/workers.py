@@ -1,11 +1,22 @@
-"""A pool of worker processes that do not import torch, so that they start fast."""
+"""Threads, and a pool of worker processes that do not import torch, so that they start fast."""
 
 import os
 import signal
+import sys
 import threading
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from multiprocessing import get_context, parent_process
+
+
+def number_of_threads() -> int:
+    """Return torch's number of threads, or that of processors, without importing torch."""
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        threads: int = torch.get_num_threads()
+        return threads
+    limit = os.environ.get("OMP_NUM_THREADS", "")
+    return int(limit) if limit.isdecimal() and int(limit) else os.cpu_count() or 1
 
 
 @cache

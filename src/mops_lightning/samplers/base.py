@@ -13,8 +13,9 @@ from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.precision import restrict_autocast_to_pointwise
 from mops_lightning.ops.readout import READOUTS, select
+from mops_lightning.samplers.checks import check_dtype, check_points
 from mops_lightning.samplers.fused import PART, FusedMOPSNet
-from mops_lightning.samplers.ragged import select_points
+from mops_lightning.samplers.ragged import Select, select_in_unit_sphere, select_points
 from mops_lightning.types import SampleOutput
 
 Chunks = Callable[[], Iterable[Tensor]]
@@ -61,6 +62,10 @@ class Sampler(nn.Module):
     nested: bool = False
     """Whether the sample of a smaller size is the first part of the sample of a larger one."""
 
+    any_unit: bool = False
+    """Whether ``choose_rows`` takes clouds in any unit, so that ``downsample`` and the command line
+    need not move them into the unit sphere first."""
+
     streams: bool = False
     """Whether clouds can be sampled in chunks (``stream_sample``), by ``fused``."""
 
@@ -103,6 +108,8 @@ class Sampler(nn.Module):
     ) -> tuple[Any, Any]:
         """Sample clouds in their own unit: normalised as in training, sampled, mapped back.
 
+        Samplers with ``any_unit`` choose among the given coordinates instead.
+
         Args:
             points: ``(N, 3)``, ``(B, N, 3)``, or ``(P, 3)`` with ``batch``; a tensor or an array.
             m: number of points to return of each cloud; None means ``self.m``.
@@ -140,16 +147,25 @@ class Sampler(nn.Module):
         if weight is not None:
             self.check_weighted(readout)
 
-        return select_points(partial(self.select, readout), points, m, batch, weight)
+        select: Select = partial(self.select, readout)
+        if not self.any_unit:
+            select = partial(select_in_unit_sphere, select)
+        return select_points(select, points, m, batch, weight)
 
     @torch.no_grad()
     def select(
         self, readout: str, clouds: Tensor, m: int, weight: Tensor | None = None
     ) -> tuple[Tensor, Tensor | None]:
-        """Sample clouds ``(B, N, 3)`` in the unit sphere; see ``downsample``.
+        """Sample clouds ``(B, N, 3)``; see ``downsample``.
 
-        Weights ``(B, N)`` are above 0. Returns the points ``(B, m, 3)``, and their rows or None.
+        Unless the sampler has ``any_unit``, the clouds are in the unit sphere. Weights ``(B, N)``
+        are above 0. Returns the points ``(B, m, 3)``, and their rows or None.
         """
+        if self.any_unit:
+            self.check_m(m)
+            check_points(clouds, at_least=m)
+            rows = self.choose_rows(clouds, m, weight)
+            return gather_points(clouds, rows), rows
         if weight is not None and not self.generates:
             check_points(clouds, at_least=m)
             rows = self.sample_weighted(clouds, m, weight)
@@ -203,6 +219,14 @@ class Sampler(nn.Module):
     def sample_weighted(self, points: Tensor, m: int, weight: Tensor) -> Tensor:
         """Return rows ``(B, m)`` of checked input, chosen by positive weights ``(B, N)``."""
         raise NotImplementedError  # see check_weighted
+
+    def choose_rows(self, points: Tensor, m: int, weight: Tensor | None = None) -> Tensor:
+        """Return rows ``(B, m)`` of checked clouds ``(B, N, 3)`` in any unit; see ``any_unit``.
+
+        The rows are those of the clouds in the unit sphere, unless distances tie up to the rounding
+        of these to float32: ties are those of the given coordinates.
+        """
+        raise NotImplementedError
 
     def check_weighted(self, readout: str) -> None:
         """Check that the sampler takes weights.
@@ -277,43 +301,6 @@ class Sampler(nn.Module):
             raise UserError(
                 f"m must be {self.m}, the size this {type(self).__name__} was made for, got {m}."
             )
-
-
-def check_points(points: Tensor, at_least: int = 1, finite: bool = True) -> None:
-    """Check that an argument is a batch of clouds with enough points.
-
-    Args:
-        points: must be ``(B, N, 3)``, floating point and finite.
-        at_least: smallest N allowed.
-        finite: whether to check for NaN and infinity. Training on a GPU relies on the check in
-            data loading.
-
-    Raises:
-        UserError: the argument is invalid.
-    """
-    if not isinstance(points, Tensor):
-        raise UserError(f"points must be a torch.Tensor, got {type(points).__name__}.")
-    shape = tuple(points.shape)
-    if points.ndim != 3 or points.shape[-1] != 3:
-        raise UserError(f"points must have shape (B, N, 3), got {shape}.")
-    if not points.is_floating_point():
-        raise UserError(f"points must be floating point, got {points.dtype}.")
-    if points.shape[0] == 0 or points.shape[1] == 0:
-        raise UserError(f"points must have at least one cloud and one point, got shape {shape}.")
-    if points.shape[1] < at_least:
-        raise UserError(f"m must be at most the number of points N={shape[1]}, got m={at_least}.")
-    if finite and not bool(torch.isfinite(points).all()):
-        raise UserError("points must be finite, got NaN or infinity.")
-
-
-def check_dtype(points: Tensor, weights: torch.dtype) -> None:
-    """Check that points have the dtype of a sampler's weights.
-
-    Raises:
-        UserError: they have another one.
-    """
-    if points.dtype != weights:
-        raise UserError(f"points must be {weights} like the sampler's weights, got {points.dtype}.")
 
 
 def stream_sample(sampler: Sampler, chunks: Chunks, m: int | None = None) -> Tensor:

@@ -1,19 +1,17 @@
 """Farthest point sampling (FPS), a baseline in the paper's tables."""
 
-from typing import Final
-
 import torch
 from torch import Tensor
 
 from mops_lightning.errors import UserError
+from mops_lightning.ops import compiled
+from mops_lightning.ops.farthest import FARTHEST
 from mops_lightning.ops.fps import farthest
+from mops_lightning.ops.keys import SeededOrder
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.ordering import seeded_keys
+from mops_lightning.samplers.ordering import exact_mean, seeded_keys
 from mops_lightning.types import SampleOutput
-
-FARTHEST: Final = "farthest"
-"""Start at the point farthest from the mean."""
 
 
 class FPSSampler(Sampler):
@@ -45,6 +43,7 @@ class FPSSampler(Sampler):
 
     flexible = True
     nested = True
+    any_unit = True
 
     def __init__(self, m: int, seed: int = 0, start: int | str | None = None) -> None:
         super().__init__(m)
@@ -70,6 +69,10 @@ class FPSSampler(Sampler):
         """
         return farthest_rows(points, m, self.seed, self.start, weight)
 
+    def choose_rows(self, points: Tensor, m: int, weight: Tensor | None = None) -> Tensor:
+        """Choose as ``sample`` and ``sample_weighted`` do, in any unit."""
+        return farthest_rows(points, m, self.seed, self.start, weight, in_sphere=True)
+
 
 def farthest_rows(
     points: Tensor,
@@ -77,15 +80,17 @@ def farthest_rows(
     seed: int = 0,
     start: int | str | None = None,
     weight: Tensor | None = None,
+    in_sphere: bool = False,
 ) -> Tensor:
     """Return rows ``(B, m)`` of farthest points in the order of choice.
 
     Args:
-        points: ``(B, N, 3)``.
+        points: ``(B, N, C)``.
         m: number of points.
         seed: of the order that breaks ties and, without ``start``, determines the first point.
         start: the first point, as for ``FPSSampler``.
         weight: ``(B, N)`` as for ``farthest_point_sample``.
+        in_sphere: take the order of the clouds in the unit sphere; see ``ops.keys.SeededOrder``.
 
     Raises:
         UserError: ``start`` is at least N.
@@ -93,7 +98,11 @@ def farthest_rows(
     n = points.shape[1]
     if isinstance(start, int) and start >= n:
         raise UserError(f"start must be less than the number of points N={n}, got {start}.")
-    keys = seeded_keys(points, seed)
+    order = SeededOrder(seed, in_sphere)
+    rows = compiled.farthest_from_start(points, m, order, start, weight)
+    if rows is not None:
+        return rows
+    keys = seeded_keys(points, seed, in_sphere)
     if isinstance(start, int):
         first = torch.full((len(points),), start, device=points.device)
     elif start == FARTHEST:
@@ -109,10 +118,7 @@ def farthest_rows(
 def _squares_from_mean(points: Tensor) -> Tensor:
     """Return the float64 squared distances ``(B, N)`` of points ``(B, N, C)`` from their mean."""
     exact = points.double()
-    # Sums of integers do not depend on the order of the points.
-    largest = exact.abs().amax((1, 2), keepdim=True).clamp_min(torch.finfo(exact.dtype).tiny)
-    units = 2.0 ** (62 - points.shape[1].bit_length() - largest.log2().ceil())
-    centre = (exact * units).round().long().sum(1, keepdim=True) / units / points.shape[1]
+    centre = exact_mean(exact)
     squares = torch.zeros_like(exact[..., 0])
     for axis in range(points.shape[2]):
         squares += (exact[..., axis] - centre[..., axis]).square()

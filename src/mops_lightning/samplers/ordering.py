@@ -10,14 +10,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.ops import kernel_order
+from mops_lightning.ops import keys
+from mops_lightning.ops.keys import STEP, WORD, SeededOrder
+from mops_lightning.ops.points import distance_dtype
 
-WORD = 2**64
-STEP = 0x9E3779B97F4A7C15  # 2⁶⁴ divided by the golden ratio, odd
+SUM_BITS = 51
+"""Bits of the integers of which a mean is computed."""
+
 FIRST, SECOND = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB  # the multipliers of SplitMix64
 
 
-def seeded_order(points: Tensor, seed: int) -> Tensor:
+def seeded_order(points: Tensor, seed: int, in_sphere: bool = False) -> Tensor:
     """Return a random order of the points of every cloud.
 
     The resulting sequence of points does not depend on the order of the input, on the other clouds
@@ -27,22 +30,29 @@ def seeded_order(points: Tensor, seed: int) -> Tensor:
     Args:
         points: ``(B, N, C)`` floating point.
         seed: any integer.
+        in_sphere: see ``ops.keys.SeededOrder``.
 
     Returns:
         ``(B, N)`` int64 permutations.
     """
-    keys = seeded_keys(points, seed)
-    if keys.is_cpu:  # NumPy's vectorised sort is several times faster than torch's
-        return torch.from_numpy(np.argsort(keys.numpy(), axis=1, kind="stable"))
-    return keys.argsort(dim=1, stable=True)
+    random = seeded_keys(points, seed, in_sphere)
+    if random.is_cpu:  # NumPy's vectorised sort is several times faster than torch's
+        return torch.from_numpy(np.argsort(random.numpy(), axis=1, kind="stable"))
+    return random.argsort(dim=1, stable=True)
 
 
-def seeded_keys(points: Tensor, seed: int) -> Tensor:
+def seeded_keys(points: Tensor, seed: int, in_sphere: bool = False) -> Tensor:
     """Return the random keys ``(B, N)`` int64 whose order is ``seeded_order``."""
-    if points.is_cpu:
-        return torch.from_numpy(_compiled_keys(points, seed))
-    keys = point_hashes(points.detach(), seed)
-    values, order = keys.sort(dim=1, stable=True)
+    given = points.detach()
+    if given.is_cpu:
+        numbers = given.to(distance_dtype(given)).numpy()
+        return torch.from_numpy(keys.seeded_keys(numbers, SeededOrder(seed, in_sphere)))
+    return _keys_on_device(in_unit_sphere(given) if in_sphere else given, seed)
+
+
+def _keys_on_device(points: Tensor, seed: int) -> Tensor:
+    hashes = point_hashes(points, seed)
+    values, order = hashes.sort(dim=1, stable=True)
     equal = values[:, 1:] == values[:, :-1]
     if bool(equal.any()):
         place = torch.arange(points.shape[1], device=points.device).expand_as(order)
@@ -51,8 +61,32 @@ def seeded_keys(points: Tensor, seed: int) -> Tensor:
         copy = place - begin.cummax(1).values
         # First copies keep their keys, so that clouds without copies do not depend on the batch.
         values = torch.where(copy > 0, _scramble(values + copy * _signed(STEP)), values)
-        keys = torch.empty_like(keys).scatter_(1, order, values)
-    return keys
+        hashes = torch.empty_like(hashes).scatter_(1, order, values)
+    return hashes
+
+
+def in_unit_sphere(points: Tensor) -> Tensor:
+    """Return clouds ``(B, N, C)`` in the unit sphere, float32, as ``ops.keys`` hashes them."""
+    exact = points.double()
+    centred = exact - exact_mean(exact)
+    squares = torch.zeros_like(exact[..., :1])
+    for axis in range(points.shape[2]):
+        squares += centred[..., axis : axis + 1].square()
+    radius = squares.amax(1, keepdim=True).sqrt()
+    return (centred / torch.where(radius > 0, radius, 1.0)).float()
+
+
+def exact_mean(points: Tensor) -> Tensor:
+    """Return the means ``(B, 1, C)`` of float64 points, which do not depend on their order.
+
+    They are means of integers of 51 bits.
+    """
+    largest = points.abs().amax((1, 2), keepdim=True)
+    units = torch.ldexp(torch.ones_like(largest), SUM_BITS - torch.frexp(largest).exponent)
+    whole = (points * units.clamp_max(2.0**1000)).round().long()
+    high = (whole >> 26).sum(1, keepdim=True).double()
+    low = (whole & (2**26 - 1)).sum(1, keepdim=True).double()
+    return (high * 2.0**26 + low) / points.shape[1] / units
 
 
 def smallest(keys: Tensor, m: int) -> Tensor:
@@ -68,36 +102,8 @@ def smallest(keys: Tensor, m: int) -> Tensor:
 def compiled_hashes(points: Tensor, seed: int) -> NDArray[np.uint64]:
     """Return the bits of ``point_hashes`` of clouds on a CPU, several times as fast."""
     given = points.detach()
-    if given.dtype not in (torch.float32, torch.float64):
-        given = given.float()
-    coordinates = given.contiguous().numpy()
-    clouds, size, channels = coordinates.shape
-    word = np.uint64((seed * STEP + 1) % WORD)
-    hashes: NDArray[np.uint64] = kernel_order.point_keys(
-        coordinates.reshape(-1), clouds, channels, word
-    )
-    return hashes.reshape(clouds, size)
-
-
-def _compiled_keys(points: Tensor, seed: int) -> NDArray[np.int64]:
-    """Return the keys of clouds on a CPU, without a sort of all of them."""
-    hashes = compiled_hashes(points, seed)
-    size = hashes.shape[1]
-    keys = hashes.reshape(-1)
-    repeated = kernel_order.perhaps_repeated(keys)
-    if len(repeated):
-        order = np.lexsort((keys[repeated], repeated // size))  # stable: copies keep their order
-        rows = repeated[order]
-        values = keys[rows]
-        starts = np.ones(len(rows), np.bool_)
-        starts[1:] = (values[1:] != values[:-1]) | (rows[1:] // size != rows[:-1] // size)
-        place = np.arange(len(rows))
-        copy = (place - np.maximum.accumulate(np.where(starts, place, 0))).astype(np.uint64)
-        later = copy > 0
-        if later.any():
-            words = (values[later] + copy[later] * np.uint64(STEP)).view(np.int64)
-            keys[rows[later]] = _scramble(torch.from_numpy(words)).numpy().view(np.uint64)
-    return keys.view(np.int64).reshape(hashes.shape)
+    numbers = given.to(distance_dtype(given)).numpy()
+    return keys.point_hashes(numbers, seed).view(np.uint64)
 
 
 def point_hashes(points: Tensor, seed: int) -> Tensor:

@@ -1,21 +1,18 @@
 """Poisson-disk sampling by sample elimination, with exactly m points.
 
-Numba compiles the loops, which visit the points of neighbouring cells only. They run on the CPU,
-for clouds on other devices, too.
+The compiled loops visit the points of neighbouring cells only. They run on the CPU, for clouds on
+other devices, too.
 """
 
-# mypy: disable-error-code="no-untyped-def"
-
 import itertools
-from heapq import heapify, heappop, heapreplace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mops_lightning.ops import kernel_elimination
 from mops_lightning.ops.fps import farthest_point_sample
-from mops_lightning.ops.jit import jit, jit_cached
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import seeded_order
@@ -57,6 +54,7 @@ class PoissonSampler(Sampler):
     """
 
     flexible = True
+    any_unit = True
 
     def __init__(self, m: int, seed: int = 0) -> None:
         super().__init__(m)
@@ -71,8 +69,18 @@ class PoissonSampler(Sampler):
         """Divide the crowding of every point by its weight, which the publication does not do."""
         return poisson_rows(points, m, self.seed, weight)
 
+    def choose_rows(self, points: Tensor, m: int, weight: Tensor | None = None) -> Tensor:
+        """Choose as ``sample`` and ``sample_weighted`` do, in any unit."""
+        return poisson_rows(points, m, self.seed, weight, in_sphere=True)
 
-def poisson_rows(points: Tensor, m: int, seed: int = 0, weight: Tensor | None = None) -> Tensor:
+
+def poisson_rows(
+    points: Tensor,
+    m: int,
+    seed: int = 0,
+    weight: Tensor | None = None,
+    in_sphere: bool = False,
+) -> Tensor:
     """Return the rows ``(B, m)`` that sample elimination keeps, in seeded order.
 
     Args:
@@ -80,8 +88,9 @@ def poisson_rows(points: Tensor, m: int, seed: int = 0, weight: Tensor | None = 
         m: number of points that remain, 1 ≤ m ≤ N.
         seed: determines how ties are broken.
         weight: ``(B, N)`` as for ``eliminate``.
+        in_sphere: take the order of the clouds in the unit sphere; see ``ops.keys.SeededOrder``.
     """
-    order = seeded_order(points, seed)
+    order = seeded_order(points, seed, in_sphere)
     ordered = gather_points(points.detach(), order)
     shares = None if weight is None else weight.gather(1, order)
     return order.gather(1, eliminate(ordered, m, shares))
@@ -148,87 +157,22 @@ def _eliminate_by_cells(
     position = ((coordinates - low) / side).astype(np.int64) + 1  # no neighbour is below 0
     key = (position[:, 0] * 2 * FINEST + position[:, 1]) * 2 * FINEST + position[:, 2]
     order = key.argsort(kind="stable")
-    cells, starts, cell_of = np.unique(key[order], return_index=True, return_inverse=True)
+    ordered = key[order]
+    starts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    cells = ordered[starts]
     around = np.empty((len(cells), 27), np.int32)
     for column, (x, y, z) in enumerate(itertools.product((-1, 0, 1), repeat=3)):
         wanted = cells + ((x * 2 * FINEST + y) * 2 * FINEST + z)
         place = np.minimum(np.searchsorted(cells, wanted), len(cells) - 1)
         around[:, column] = np.where(cells[place] == wanted, place, -1)
-    planes = np.ascontiguousarray(points[order].T)
-    ends = np.append(starts[1:], len(points))
-    remains: NDArray[np.bool_] = _remove_crowded(
-        planes, order, starts, ends, cell_of, around, shares, m, reach, scale
+    remains: NDArray[np.bool_] = kernel_elimination.eliminate(
+        np.ascontiguousarray(points[order].T).ravel(),
+        order,
+        np.append(starts, len(points)),
+        around.ravel(),
+        shares[order] if len(shares) else shares,
+        m,
+        reach,
+        scale,
     )
-    return remains
-
-
-@jit
-def _change(planes, starts, ends, near, point, sign, reach, scale, crowding):
-    """Add a point's weights to the crowding of all points around it, and return their sum."""
-    limit = reach * reach * (1 + 1e-12) + 2.3e-308  # weights beyond are 0, whatever the rounding
-    x, y, z = planes[0, point], planes[1, point], planes[2, point]
-    total = np.int64(0)
-    for cell in near:
-        if cell >= 0:
-            for i in range(starts[cell], ends[cell]):
-                dx, dy, dz = planes[0, i] - x, planes[1, i] - y, planes[2, i] - z
-                squared = dx * dx + dy * dy + dz * dz
-                for axis in range(3, len(planes)):
-                    difference = planes[axis, i] - planes[axis, point]
-                    squared += difference * difference
-                if squared <= limit:
-                    share = max(1.0 - np.sqrt(squared) / reach, 0.0)
-                    share *= share
-                    share *= share
-                    weight = np.int64(share * share * scale)
-                    crowding[i] += sign * weight
-                    total += weight
-    return total
-
-
-@jit
-def _shared(crowding, shares, row):
-    return np.int64(crowding * shares[row]) if len(shares) else np.int64(crowding)
-
-
-@jit_cached
-def _remove_crowded(planes, order, starts, ends, cell_of, around, shares, m, reach, scale):
-    """Remove the most crowded point until m remain.
-
-    Args:
-        planes: ``(C, N)`` coordinates of points that are sorted by the cell of the first three;
-            changed.
-        order: ``(N,)`` their rows; the lowest row is removed in case of ties.
-        starts: ``(K,)`` first point of every cell.
-        ends: ``(K,)`` the point after the last one of every cell.
-        cell_of: ``(N,)`` cell of every point.
-        around: ``(K, 27)`` cells with all points nearer than ``reach``; -1 for none.
-        shares: ``(N,)`` factors of the crowding of every row, from 0 to 1; or ``(0,)``.
-        m: number of points that remain.
-        reach: distance from which weights are 0, positive.
-        scale: factor of the weights before they are truncated to integers.
-
-    Returns:
-        ``(N,)`` whether each row remains.
-    """
-    size = len(order)
-    crowding, remains = np.zeros(size, np.int64), np.ones(size, np.bool_)
-    for i in range(size):
-        # Weights are symmetric, so their sum is the crowding of the point itself.
-        near, zero = around[cell_of[i]], np.int64(0)
-        total = _change(planes, starts, ends, near, i, zero, reach, scale, crowding)
-        crowding[i] = total
-    heap = [(-_shared(crowding[i], shares, order[i]), order[i], i) for i in range(size)]
-    heapify(heap)
-    for _ in range(size - m):
-        key, row, point = heap[0]
-        while -key != _shared(crowding[point], shares, row):
-            # Crowding only falls: a key is an upper bound, and is corrected when it is the largest.
-            heapreplace(heap, (-_shared(crowding[point], shares, row), row, point))
-            key, row, point = heap[0]
-        heappop(heap)
-        remains[row] = False
-        near = around[cell_of[point]]
-        _change(planes, starts, ends, near, point, np.int64(-1), reach, scale, crowding)
-        planes[0, point] = np.inf  # no later weight reaches it
     return remains

@@ -12,9 +12,8 @@ from mops_lightning.ops.points import as_tensor, cloud_sizes, gather_points
 from mops_lightning.ops.weights import CURVATURE, check_positive, check_weight, curvature
 
 Select = Callable[[Tensor, int, Tensor | None], tuple[Tensor, Tensor | None]]
-"""``select(points, m, weight)`` maps ``(B, N, 3)`` float32 in the unit sphere, with weights
-``(B, N)`` above 0 or None, to points ``(B, m, 3)`` and their rows ``(B, m)``, None for generated
-points."""
+"""``select(points, m, weight)`` maps ``(B, N, 3)``, with weights ``(B, N)`` above 0 or None, to
+points ``(B, m, 3)`` and their rows ``(B, m)``, None for generated points."""
 
 Weight = Tensor | str | None
 """Weights of at least 0, or ``"curvature"``."""
@@ -27,7 +26,7 @@ and ``(m,)`` of one cloud, ``(B, m, 3)`` and ``(B, m)`` of a batch."""
 def select_points(
     select: Select, points: Any, m: int, batch: Any = None, weight: Any = None
 ) -> tuple[Any, Any]:
-    """Move clouds into the unit sphere, select points, and map them back.
+    """Select points of clouds in their own unit.
 
     Args:
         select: see ``Select``. The other arguments and the result are as in
@@ -108,6 +107,12 @@ def _selected(select: Select, points: Tensor, m: int, weight: Weight) -> Sample:
         weight = _computed(weight, points)
     if weight is not None and not bool(weight.all()):
         return _without_zeros(select, points, m, weight)
+    chosen, rows = select(points, m, weight)
+    return chosen if rows is None else gather_points(points, rows), rows
+
+
+def select_in_unit_sphere(select: Select, points: Tensor, m: int, weight: Tensor | None) -> Sample:
+    """Move clouds into the unit sphere, as float32, select points, and map them back."""
     exact = points.double()
     centre = exact.mean(1, keepdim=True)
     centred = exact - centre
@@ -116,9 +121,7 @@ def _selected(select: Select, points: Tensor, m: int, weight: Weight) -> Sample:
     radius = (x * x + y * y + z * z).amax(1).sqrt()[:, None, None]
     radius = torch.where(radius > 0, radius, 1.0)
     chosen, rows = select(centred.div_(radius).float(), m, weight)
-    if rows is not None:
-        return gather_points(points, rows), rows
-    return (chosen.double() * radius + centre).to(points.dtype), None
+    return (chosen.double() * radius + centre).to(points.dtype), rows
 
 
 def _computed(word: str, points: Tensor) -> Tensor:

@@ -31,6 +31,7 @@ class RandomSampler(Sampler):
 
     flexible = True
     nested = True
+    any_unit = True
     spreads = False
 
     def __init__(self, m: int, seed: int = 0) -> None:
@@ -48,8 +49,19 @@ class RandomSampler(Sampler):
         Efraimidis and Spirakis, "Weighted random sampling with a reservoir", Information Processing
         Letters 2006, as times of exponential clocks: ``torch.multinomial`` takes up to 2²⁴ points.
         """
-        order = seeded_order(points, self.seed)
-        generator = torch.Generator().manual_seed(self.seed)
-        times = torch.empty(points.shape[1], dtype=torch.float64).exponential_(generator=generator)
-        times = times.to(points.device) / weight.double().gather(1, order)
-        return order.gather(1, times.argsort(1)[:, :m])
+        return _drawn(seeded_order(points, self.seed), m, weight, self.seed)
+
+    def choose_rows(self, points: Tensor, m: int, weight: Tensor | None = None) -> Tensor:
+        """Choose as ``sample`` and ``sample_weighted`` do, in any unit."""
+        if weight is None:
+            return smallest(seeded_keys(points, self.seed, in_sphere=True), m)
+        order = seeded_order(points, self.seed, in_sphere=True)
+        return _drawn(order, m, weight, self.seed)
+
+
+def _drawn(order: Tensor, m: int, weight: Tensor, seed: int) -> Tensor:
+    """Draw rows ``(B, m)`` by weights ``(B, N)``, from seeded orders ``(B, N)``."""
+    generator = torch.Generator().manual_seed(seed)
+    times = torch.empty(order.shape[1], dtype=torch.float64).exponential_(generator=generator)
+    times = times.to(order.device) / weight.double().gather(1, order)
+    return order.gather(1, times.argsort(1)[:, :m])

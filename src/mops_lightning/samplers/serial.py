@@ -35,23 +35,35 @@ class SerialSampler(Sampler):
     """
 
     flexible = True
+    any_unit = True
     spreads = False
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices, along the curve."""
-        along = along_curve(points)
-        n = points.shape[1]
-        indices = along[:, (torch.arange(m, device=points.device) * 2 + 1) * n // (2 * m)]
+        indices = _every_kth(along_curve(points), m)
         return SampleOutput(gather_points(points, indices), indices, {})
 
+    def choose_rows(self, points: Tensor, m: int, weight: Tensor | None = None) -> Tensor:
+        """Choose as ``sample`` does, in any unit; without weights."""
+        return _every_kth(along_curve(points, in_sphere=True), m)
 
-def along_curve(points: Tensor) -> Tensor:
-    """Return the rows ``(B, N)`` in the order of the curve; the seeded order breaks ties."""
+
+def _every_kth(along: Tensor, m: int) -> Tensor:
+    """Return m rows ``(B, m)`` at equal distances among rows ``(B, N)``."""
+    places = torch.arange(m, device=along.device) * 2 + 1
+    return along[:, places * along.shape[1] // (2 * m)]
+
+
+def along_curve(points: Tensor, in_sphere: bool = False) -> Tensor:
+    """Return the rows ``(B, N)`` in the order of the curve; the seeded order breaks ties.
+
+    ``in_sphere``: take the order of the clouds in the unit sphere; see ``ops.keys.SeededOrder``.
+    """
     codes = morton_codes(points).numpy()
     order = np.argsort(codes, axis=1)
     ordered = np.take_along_axis(codes, order, 1)
     if (ordered[:, 1:] == ordered[:, :-1]).any():
-        keys = seeded_keys(points, seed=0).cpu().numpy()
+        keys = seeded_keys(points, 0, in_sphere).cpu().numpy()
         order = np.lexsort((keys, codes), axis=1)
     return torch.from_numpy(order).to(points.device)
 

@@ -65,12 +65,19 @@ def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler) -> Rows
         for first in range(0, len(places) if number else 0, step):
             batch = places[first : first + step]
             clouds = [points[tiles[place]] for place in batch]
-            stacked = torch.stack([UnitSphere.around(one).normalise(one) for one in clouds])
+            stacked = torch.stack([_as_input(sampler, one) for one in clouds])
             rows = sample_tiles(sampler, stacked, number)
             for place, chosen in zip(batch, rows, strict=True):
                 selected[place] = tiles[place][chosen]
     kept = np.concatenate(selected)
     return np.sort(kept[thin(points[kept], m)])
+
+
+def _as_input(sampler: Sampler, points: Points) -> Tensor:
+    """Return a tile ``(n, 3)`` as the sampler takes it."""
+    if sampler.any_unit:
+        return torch.from_numpy(points)
+    return UnitSphere.around(points).normalise(points)
 
 
 def balanced_tiles(points: Points, size: int) -> list[Rows]:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.points import UnitSphere, as_tensor
+from mops_lightning.ops.points import as_tensor
 from mops_lightning.ops.weights import check_positive
 from mops_lightning.samplers.budget import as_size, number_of
 from mops_lightning.samplers.fps import FPSSampler, farthest_rows
@@ -78,14 +78,14 @@ class Choice:
         if self.method == "poisson":
             choose = poisson_rows
         used = cloud.in_space(self.space)
-        points = UnitSphere.around(used).normalise(used)[None]
+        points = torch.from_numpy(np.ascontiguousarray(used))[None]
         weight = cloud.numbers()
         if weight is None:
-            return cloud.rows(choose(points, number, seed)[0].numpy())
+            return cloud.rows(choose(points, number, seed, in_sphere=True)[0].numpy())
         heavy = np.flatnonzero(weight)
         check_positive(len(heavy), number)
         weights = torch.from_numpy(weight[heavy])[None]
-        rows = choose(points[:, heavy], number, seed, weight=weights)[0]
+        rows = choose(points[:, heavy], number, seed, weight=weights, in_sphere=True)[0]
         return cloud.rows(heavy[rows.numpy()])
 
 

@@ -1,15 +1,16 @@
-"""Downsampling by the name of a method or of a model, to a number, a spacing or voxels."""
+"""Downsampling by the name of a method or of a model, to a number, a spacing or voxels.
+
+Farthest points of an array are chosen without importing torch.
+"""
 
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
+import numpy as np
 
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.budget import as_size, number_of
-from mops_lightning.zoo.by_distance import to_distance
-from mops_lightning.zoo.by_number import Choice, to_number
-from mops_lightning.zoo.find_sampler import find_sampler
+from mops_lightning.zoo import farthest
 
 
 def downsample(
@@ -31,7 +32,8 @@ def downsample(
 ) -> tuple[Any, Any]:
     """Downsample clouds by a method or a model, or to a spacing or one point per voxel.
 
-    Give exactly one of ``m``, ``spacing`` and ``voxel``. A method or model gets every cloud in the
+    Give exactly one of ``m``, ``spacing`` and ``voxel``. ``random``, ``serial``, ``fps`` and
+    ``poisson`` choose among the given coordinates; other methods and models get every cloud in the
     unit sphere, as in training, and the result is mapped back.
 
     Args:
@@ -91,10 +93,19 @@ def downsample(
     if start is not None and (method != "fps" or m is None):
         raise UserError(f"start is for method='fps', got method={str(method)!r}.")
     _check_strata(m, stratify, stratify_min)
+    if m is not None and not isinstance(m, list | tuple):
+        m = as_size(m)
+    is_whole = batch is None and space is None and tile is None and stratify is None
+    if method == "fps" and readout == "completed" and is_whole and weight is None:
+        sample = farthest.downsample(points, m, seed or 0, start)
+        if sample is not None:
+            return sample
+    from mops_lightning.zoo.by_distance import to_distance
+    from mops_lightning.zoo.by_number import Choice, to_number
+    from mops_lightning.zoo.find_sampler import find_sampler
+
     if m is None:
         return to_distance(points, method, readout, batch, seed or 0, weight, spacing, voxel, space)
-    if not isinstance(m, list | tuple):
-        m = as_size(m)
     is_simple = space is None and tile is None and stratify is None
     if is_simple and _is_plain(points, m, batch):
         number = number_of(m, points.shape[-2])
@@ -126,7 +137,7 @@ def _is_plain(points: Any, m: Any, batch: Any) -> bool:
     is_share = isinstance(m, float)
     if isinstance(m, list | tuple) or (is_share and batch is not None):
         return False
-    is_floating = points.is_floating_point() if isinstance(points, Tensor) else (
-        points.dtype.kind == "f"
-    )  # fmt: skip
+    is_floating = (
+        points.dtype.kind == "f" if isinstance(points, np.ndarray) else points.is_floating_point()
+    )
     return is_floating and len(points.shape) in (2, 3) and points.shape[-1] == 3

@@ -1,0 +1,271 @@
+"""Keys of points, by which a seed orders them, in loops that numba compiles.
+
+A key is a hash of the point's coordinates, of the seed and of the whole cloud; ``ops.keys`` says
+how. ``ops.kernel_farthest`` computes keys, too. Coordinates are read in blocks, which stay in the
+fastest cache while each axis is visited.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+
+import math
+
+import numpy as np
+
+from mops_lightning.ops.jit import bits_float, float_bits, jit, jit_cached
+
+FIRST, SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+"""The multipliers of SplitMix64."""
+
+STEP = np.uint64(0x9E3779B97F4A7C15)
+"""2⁶⁴ divided by the golden ratio, odd."""
+
+ONE = np.uint64(1)
+
+BLOCK = 512
+"""Number of points of a block."""
+
+SUM_BITS = 51
+"""Bits of the integers of which a mean is computed."""
+
+SHIFT = 1.5 * 2.0**52
+"""Added to a number below 2⁵¹, it leaves an integer in the lower bits."""
+
+FILTER_KEYS = 8
+"""Keys per word of 64 bits of the first filter for copies: about one key in 60 passes it."""
+
+
+@jit
+def to_planes(points, channels):
+    """Return coordinates one channel after the other, and the largest absolute value.
+
+    The latter is NaN or infinite if any coordinate is.
+    """
+    size = len(points) // channels
+    planes = np.empty(len(points), points.dtype)
+    top = float_bits(points.dtype.type(0))
+    if channels == 3:  # a constant stride is vectorised
+        x, y, z = planes[:size], planes[size : 2 * size], planes[2 * size :]
+        for i in range(size):
+            x[i] = points[3 * i]
+            y[i] = points[3 * i + 1]
+            z[i] = points[3 * i + 2]
+    else:
+        for axis in range(channels):
+            for i in range(size):
+                planes[axis * size + i] = points[channels * i + axis]
+    for i in range(len(planes)):
+        top = max(top, float_bits(abs(planes[i])))
+    return planes, np.float64(bits_float(top, planes[0]))
+
+
+@jit
+def measure_sphere(planes, channels, largest, sphere):
+    """Write the centre and the radius of a cloud's unit sphere to ``(C + 1,)`` numbers.
+
+    The mean is that of integers, whose sum does not depend on the order of the points.
+    """
+    size = len(planes) // channels
+    unit = math.ldexp(1.0, min(SUM_BITS - math.frexp(largest)[1], 1000))
+    for axis in range(channels):
+        line = planes[axis * size : (axis + 1) * size]
+        high = low = np.int64(0)
+        for begin in range(0, size, BLOCK):
+            part, total = line[begin : begin + BLOCK], np.int64(0)
+            for i in range(len(part)):
+                total += float_bits(np.float64(part[i]) * unit + SHIFT) - float_bits(SHIFT)
+            high += total >> 32
+            low += total & np.int64(0xFFFFFFFF)
+        sphere[axis] = (np.float64(high) * 2.0**32 + np.float64(low)) / size / unit
+    squares, largest_bits = np.empty(BLOCK), float_bits(0.0)
+    for begin in range(0, size, BLOCK):
+        part = squares[: min(BLOCK, size - begin)]
+        for axis in range(channels):
+            line, centre = planes[axis * size + begin : axis * size + begin + BLOCK], sphere[axis]
+            if axis == 0:
+                for i in range(len(part)):
+                    offset = line[i] - centre
+                    part[i] = offset * offset
+            else:
+                for i in range(len(part)):
+                    offset = line[i] - centre
+                    part[i] += offset * offset
+        for i in range(len(part)):
+            largest_bits = max(largest_bits, float_bits(part[i]))
+    radius = math.sqrt(bits_float(largest_bits, 0.0))
+    sphere[channels] = radius if radius > 0 else 1.0
+
+
+@jit
+def _xor_shift(word, shift):
+    return word ^ (word >> np.uint64(shift))
+
+
+@jit
+def _scramble(word):
+    """Make every bit of the result depend on every bit of a word (SplitMix64's finalizer)."""
+    word = _xor_shift(word, 30) * FIRST
+    word = _xor_shift(word, 27) * SECOND
+    return _xor_shift(word, 31)
+
+
+@jit
+def _with_value(key, value):
+    """Return a key that depends on one more coordinate."""
+    return _xor_shift((key ^ np.uint64(float_bits(value + 0.0))) * FIRST, 32)  # -0 becomes 0
+
+
+@jit
+def write_keys(planes, channels, word, sphere, keys):
+    """Write the keys ``(N,)`` uint64 of a cloud.
+
+    Args:
+        planes: ``(C·N,)`` coordinates, one channel after the other.
+        channels: C.
+        word: the seed, mixed.
+        sphere: ``(C + 1,)`` from ``measure_sphere``, to hash the points of the unit sphere in
+            float32; or ``(0,)``, to hash the given coordinates.
+        keys: where to write.
+    """
+    size = len(keys)
+    total = np.uint64(0)
+    for begin in range(0, size, BLOCK):
+        part = keys[begin : begin + BLOCK]
+        for i in range(len(part)):
+            part[i] = word
+        for axis in range(channels):
+            line = planes[axis * size + begin : axis * size + begin + BLOCK]
+            if len(sphere):
+                centre, radius = sphere[axis], sphere[channels]
+                for i in range(len(part)):
+                    value = np.float64(np.float32((line[i] - centre) / radius))
+                    part[i] = _with_value(part[i], value)
+            else:
+                for i in range(len(part)):
+                    part[i] = _with_value(part[i], np.float64(line[i]))
+        for i in range(len(part)):
+            total += _xor_shift(part[i], 29) * SECOND
+    for i in range(size):
+        keys[i] = _scramble(keys[i] + total)
+
+
+@jit
+def _bits_of(key):
+    """Return two bits of a word."""
+    return ONE << (key & np.uint64(63)) | ONE << (key >> np.uint64(6) & np.uint64(63))
+
+
+@jit
+def _filter(number):
+    """Return an empty filter for a number of keys: its length is a power of two."""
+    words = 8
+    while words * FILTER_KEYS < number:
+        words *= 2
+    return np.zeros(words, np.uint64)
+
+
+@jit
+def _change_copies(keys):
+    """Give every later occurrence of a key ``(N,)`` a key of its own, in place.
+
+    Two filters find the keys that may occur again, and a few others, without a sort.
+    """
+    seen = _filter(len(keys))
+    mask = np.uint64(len(seen) - 1)
+    later, count = np.empty(len(keys), np.int64), 0
+    for row in range(len(keys)):
+        at, bits = np.int64(keys[row] >> np.uint64(40) & mask), _bits_of(keys[row])
+        word = seen[at]
+        seen[at] = word | bits
+        if word & bits == bits:
+            later[count] = row
+            count += 1
+    if count == 0:
+        return
+    wanted = _filter(4 * count)
+    mask = np.uint64(len(wanted) - 1)
+    for k in range(count):
+        key = keys[later[k]]
+        wanted[np.int64(key >> np.uint64(40) & mask)] |= _bits_of(key)
+    count = 0
+    for row in range(len(keys)):
+        bits = _bits_of(keys[row])
+        if wanted[np.int64(keys[row] >> np.uint64(40) & mask)] & bits == bits:
+            later[count] = row
+            count += 1
+    _change_copies_among(keys, later, count)
+
+
+@jit
+def _change_copies_among(keys, rows, count):
+    """Change later occurrences of keys in some of the rows, which ascend."""
+    slots = 16
+    while slots < 2 * count:
+        slots *= 2
+    mask = np.uint64(slots - 1)
+    first, copies = np.empty(slots, np.uint64), np.zeros(slots, np.int64)
+    for k in range(count):
+        key = keys[rows[k]]
+        slot = np.int64(key >> np.uint64(20) & mask)
+        while copies[slot] and first[slot] != key:
+            slot = (slot + 1) & (slots - 1)
+        if copies[slot]:
+            keys[rows[k]] = _scramble(key + np.uint64(copies[slot]) * STEP)
+        first[slot] = key
+        copies[slot] += 1
+
+
+@jit
+def ranks_of(planes, channels, largest, word, in_sphere, distinct):
+    """Return the keys ``(N,)`` of one cloud as int64; arguments as for the functions above."""
+    keys = np.empty(len(planes) // channels, np.uint64)
+    sphere = np.empty(channels + 1 if in_sphere else 0)
+    if in_sphere:
+        measure_sphere(planes, channels, largest, sphere)
+    write_keys(planes, channels, word, sphere, keys)
+    if distinct:
+        _change_copies(keys)
+    return keys.view(np.int64)
+
+
+@jit_cached
+def keys_of(points, clouds, channels, word, in_sphere, distinct):
+    """Return the keys ``(B·N,)`` int64 of finite clouds.
+
+    Args:
+        points: ``(B·N·C,)`` coordinates, one point after the other.
+        clouds: B.
+        channels: C.
+        word: the seed, mixed.
+        in_sphere: whether to hash the points of the unit sphere.
+        distinct: whether later copies of a point get keys of their own.
+    """
+    keys = np.empty(len(points) // channels, np.int64)
+    size = len(keys) // clouds
+    for cloud in range(clouds):
+        start, stop = cloud * size, (cloud + 1) * size
+        planes, largest = to_planes(points[start * channels : stop * channels], channels)
+        ranks = ranks_of(planes, channels, largest, word, in_sphere, distinct)
+        for i in range(size):  # the assignment of a slice takes seconds to compile
+            keys[start + i] = ranks[i]
+    return keys
+
+
+@jit_cached
+def are_finite(values):
+    """Return whether all of ``(N,)`` values are finite."""
+    top = float_bits(values.dtype.type(0))
+    for i in range(len(values)):
+        top = max(top, float_bits(abs(values[i])))
+    return bits_float(top, values[0]) < np.inf
+
+
+@jit_cached
+def spheres_of(points, clouds, channels):
+    """Return the centres and radii ``(B·(C + 1),)`` of finite clouds; arguments as above."""
+    spheres = np.empty(clouds * (channels + 1))
+    size = len(points) // clouds
+    for cloud in range(clouds):
+        planes, largest = to_planes(points[cloud * size : (cloud + 1) * size], channels)
+        sphere = spheres[cloud * (channels + 1) : (cloud + 1) * (channels + 1)]
+        measure_sphere(planes, channels, largest, sphere)
+    return spheres

@@ -1,0 +1,50 @@
+"""Checks of the clouds that samplers get."""
+
+import torch
+from torch import Tensor
+
+from mops_lightning.errors import UserError
+from mops_lightning.ops.keys import are_finite
+
+
+def check_points(points: Tensor, at_least: int = 1, finite: bool = True) -> None:
+    """Check that an argument is a batch of clouds with enough points.
+
+    Args:
+        points: must be ``(B, N, 3)``, floating point and finite.
+        at_least: smallest N allowed.
+        finite: whether to check for NaN and infinity. Training on a GPU relies on the check in
+            data loading.
+
+    Raises:
+        UserError: the argument is invalid.
+    """
+    if not isinstance(points, Tensor):
+        raise UserError(f"points must be a torch.Tensor, got {type(points).__name__}.")
+    shape = tuple(points.shape)
+    if points.ndim != 3 or points.shape[-1] != 3:
+        raise UserError(f"points must have shape (B, N, 3), got {shape}.")
+    if not points.is_floating_point():
+        raise UserError(f"points must be floating point, got {points.dtype}.")
+    if points.shape[0] == 0 or points.shape[1] == 0:
+        raise UserError(f"points must have at least one cloud and one point, got shape {shape}.")
+    if points.shape[1] < at_least:
+        raise UserError(f"m must be at most the number of points N={shape[1]}, got m={at_least}.")
+    if finite and not _are_finite(points):
+        raise UserError("points must be finite, got NaN or infinity.")
+
+
+def _are_finite(points: Tensor) -> bool:
+    if points.is_cpu and points.dtype in (torch.float32, torch.float64):
+        return are_finite(points.detach().numpy())
+    return bool(torch.isfinite(points).all())
+
+
+def check_dtype(points: Tensor, weights: torch.dtype) -> None:
+    """Check that points have the dtype of a sampler's weights.
+
+    Raises:
+        UserError: they have another one.
+    """
+    if points.dtype != weights:
+        raise UserError(f"points must be {weights} like the sampler's weights, got {points.dtype}.")

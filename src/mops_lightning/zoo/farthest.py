@@ -1,0 +1,88 @@
+"""Farthest points of arrays and tensors of coordinates, with nothing around the compiled loops.
+
+The rows are those of ``FPSSampler.downsample``. Arrays are sampled without importing torch.
+"""
+
+import sys
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mops_lightning.ops.farthest import FARTHEST, rows_from_start
+from mops_lightning.ops.keys import SeededOrder
+from mops_lightning.ops.workers import number_of_threads
+from mops_lightning.samplers.budget import Size, number_of
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+def downsample(
+    points: Any, size: Size | Any, seed: int, start: int | str | None
+) -> tuple[Any, Any] | None:
+    """Choose farthest points of one cloud or a batch.
+
+    Args:
+        points: ``(N, 3)`` or ``(B, N, 3)``, an array or a tensor on the CPU.
+        size: number of points, or their share.
+        seed: see ``downsample``.
+        start: see there.
+
+    Returns:
+        The points and their rows, or None for input of another kind, or that is invalid.
+    """
+    array = _as_array(points)
+    if array is None or not isinstance(size, int | float):
+        return None
+    m = number_of(size, array.shape[-2])
+    if not 1 <= m <= array.shape[-2] or len(array) == 0 or not _is_start(start, array.shape[-2]):
+        return None
+    clouds = array if array.ndim == 3 else array[None]
+    rows = rows_from_start(clouds, m, SeededOrder(seed, True), start, threads=number_of_threads())
+    if rows is None:
+        return None
+    given = rows if array.ndim == 3 else rows[0]
+    if isinstance(points, np.ndarray):
+        return _gathered(array, given), given
+    return _tensors(points, given)
+
+
+def _as_array(points: Any) -> NDArray[Any] | None:
+    """Return the coordinates as an array that shares the memory, or None for other input."""
+    if isinstance(points, np.ndarray):
+        array = np.asarray(points)  # without subclasses, such as np.memmap
+    else:
+        torch = sys.modules.get("torch")
+        if torch is None or not isinstance(points, torch.Tensor) or not points.is_cpu:
+            return None
+        if points.dtype not in (torch.float32, torch.float64) or points.is_sparse:
+            return None
+        array = points.detach().numpy()
+    is_float = array.dtype in (np.float32, np.float64) and array.dtype.isnative
+    if not is_float or array.ndim not in (2, 3) or array.shape[-1] != 3:
+        return None
+    return array
+
+
+def _is_start(start: Any, number: int) -> bool:
+    """Return whether a first point is valid, of so many points."""
+    if isinstance(start, int) and not isinstance(start, bool):
+        return 0 <= start < number
+    return start is None or (isinstance(start, str) and start == FARTHEST)
+
+
+def _gathered(array: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
+    if array.ndim == 2:
+        return array[rows]
+    return np.take_along_axis(array, rows[..., None], 1)
+
+
+def _tensors(points: "Tensor", rows: NDArray[np.int64]) -> "tuple[Tensor, Tensor]":
+    import torch
+
+    indices = torch.from_numpy(rows)
+    if points.ndim == 2:
+        return points.detach()[indices], indices
+    places = indices[..., None].expand(-1, -1, points.shape[2])
+    return points.detach().gather(1, places), indices

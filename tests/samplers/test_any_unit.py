@@ -1,0 +1,112 @@
+"""Samplers that need no unit sphere choose as in it, in any unit, order and place."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning import FPSSampler, RandomSampler, downsample
+from mops_lightning.files.downsample import sample_cloud
+from mops_lightning.files.options import Options
+from mops_lightning.ops.points import UnitSphere
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.ordering import in_unit_sphere
+from mops_lightning.zoo.find_sampler import untrained
+from tests.support.clouds import cloud_of
+
+METHODS = ["fps", "random", "serial", "poisson"]
+
+
+def sampler_of(method, m, seed):
+    sampler = untrained(method, m, seed)
+    assert sampler.any_unit
+    return sampler
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("number", [50, 600])
+def test_rows_are_those_of_the_cloud_in_the_unit_sphere(method, number, rng):
+    points = torch.randn(3, number, 3, generator=rng) * 40 + 7
+    sampler = sampler_of(method, 20, 3)
+
+    _, rows = sampler.downsample(points)
+
+    assert torch.equal(rows, sampler(in_unit_sphere(points)).indices)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", ["sphere", "grid", "copies", "one point", "offset", "outlier"])
+def test_points_do_not_depend_on_the_order_of_the_input(method, kind, rng):
+    points = cloud_of(kind, (1, 300), torch.float64, rng)[0]
+    shuffled = points[torch.randperm(300, generator=rng)]
+
+    chosen = downsample(points, 40, method)[0]
+
+    assert torch.equal(downsample(shuffled, 40, method)[0], chosen)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_points_of_a_map_are_chosen_alike_in_python_and_by_the_command_line(method, rng):
+    points = torch.rand(500, 3, generator=rng, dtype=torch.float64) * 90
+    points += torch.tensor([637_012.25, 5_851_993.5, 411.0], dtype=torch.float64)
+
+    _, rows = downsample(points, 30, method, seed=0 if method == "serial" else 8)
+
+    options = Options(30, method=method, seed=8)
+    by_file, kept = sample_cloud(
+        points.numpy(), sampler_of(method, 30, 8), 30, options, Path("map.las")
+    )
+    assert by_file is not None
+    assert by_file.tolist() == rows.tolist()
+    assert (kept == points.numpy()[by_file]).all()
+
+
+@pytest.mark.parametrize("start", [None, 17, "farthest"])
+@pytest.mark.parametrize("kind", ["sphere", "grid", "copies", "one point", "huge", "tiny"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_arrays_tensors_and_the_sampler_give_the_same_rows(start, kind, dtype, rng):
+    points = cloud_of(kind, (2, 200), dtype, rng)
+    expected = FPSSampler(50, 5, start).downsample(points)[1]
+
+    tensors, rows = downsample(points, 50, seed=5, start=start)
+    arrays, array_rows = downsample(points.numpy(), 50, seed=5, start=start)
+
+    assert torch.equal(rows, expected)
+    assert array_rows.tolist() == expected.tolist()
+    assert torch.equal(tensors, points.gather(1, rows[..., None].expand(-1, -1, 3)))
+    assert (arrays == tensors.numpy()).all()
+    alone = downsample(points[1].numpy(), 50, seed=5, start=start)[1]
+    assert alone.tolist() == expected[1].tolist()
+
+
+def test_exact_ties_of_the_given_coordinates_are_ties():
+    steps = torch.arange(6, dtype=torch.float32)
+    grid = torch.cartesian_prod(steps, steps, steps) + 1000
+
+    moved = downsample(grid.double() * 0.5, 60, seed=2)[1]
+
+    assert torch.equal(downsample(grid.double(), 60, seed=2)[1], moved)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+def test_coordinates_that_are_not_finite_are_refused(method, number):
+    points = np.zeros((40, 3), np.float32)
+    points[21, 2] = number
+
+    with pytest.raises(Exception, match="points must be finite, got NaN or infinity"):
+        downsample(points, 8, method)
+
+
+def test_samplers_of_nets_get_the_unit_sphere(rng):
+    class FirstPoints(Sampler):
+        def sample(self, points, m):
+            assert points.norm(dim=2).amax() <= 1 + 1e-6
+            return RandomSampler(m)(points)
+
+    points = torch.randn(1, 60, 3, generator=rng) * 1000
+    rows = FirstPoints(6).downsample(points)[1]
+
+    sphere = UnitSphere.around(points[0].double().numpy()).normalise(points[0].double().numpy())
+    assert torch.equal(rows, RandomSampler(6)(sphere[None]).indices)
