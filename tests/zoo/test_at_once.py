@@ -139,3 +139,12 @@ def resident() -> int:
     """Return the memory of this process in bytes."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGESIZE")
+
+
+def test_farthest_points_of_an_array_need_no_torch():
+    code = (
+        "import sys, numpy as np; from mops_lightning import downsample; "
+        "downsample(np.eye(3), 2); assert 'torch' not in sys.modules"
+    )
+
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)

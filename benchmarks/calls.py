@@ -1,0 +1,174 @@
+"""``python benchmarks/calls.py``: the calls that users make, beside the loop and other libraries.
+
+Processor time of one thread; the calls of a row take turns. *Loop* is the compiled loop alone, from
+a given first point. Clouds are unit spheres in float32. Libraries that are not installed are left
+out: fpsample, torch-quickfps, torch-fps, point-cloud-utils. Set OMP_NUM_THREADS=1.
+"""
+
+import argparse
+import json
+import time
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import measure
+import numpy as np
+import torch
+from cases import cloud
+from libraries import Calls, installed
+from torch import Tensor
+
+from mops_lightning import downsample, fps
+from mops_lightning.ops.farthest import farthest_rows
+
+FARTHEST = (
+    (1, 1024, 32),
+    (1, 1024, 512),
+    (1, 10_000, 1024),
+    (1, 40_960, 4096),
+    (1, 100_000, 1024),
+    (1, 1_000_000, 1000),
+    (32, 1024, 32),
+    (32, 1024, 512),
+)
+"""Numbers of clouds, of points, and of points to keep."""
+
+OTHERS = (
+    ("random", 100_000, 1000),
+    ("serial", 100_000, 1000),
+    ("poisson", 100_000, 1000),
+    ("poisson", 100_000, 10_000),
+)
+"""Methods, numbers of points, and of points to keep."""
+
+HEIGHTS = (3, 5, 7)
+"""Heights of the trees of the libraries; the fastest one counts."""
+
+LIBRARIES = ("fpsample", "torch-quickfps", "torch-fps", "point-cloud-utils", "numba")
+
+SIMPLE = 2**26
+"""Most distances for a library that computes all of them."""
+
+
+def farthest_calls(points: Tensor, m: int) -> Calls:
+    """Return the calls that choose m farthest points of clouds ``(B, N, 3)``."""
+    clouds, number, _ = points.shape
+    array = points.numpy()
+    given, counts = np.zeros((clouds, 1), np.int64), np.ones(clouds, np.int64)
+    flat, batch = points.flatten(0, 1), torch.arange(clouds).repeat_interleave(number)
+    form = points[0] if clouds == 1 else points
+    calls: Calls = {
+        "loop": partial(farthest_rows, array, given, counts, m),
+        "downsample": partial(downsample, form, m),
+        "downsample, array": partial(downsample, form.numpy(), m),
+        "fps": partial(fps, flat, batch if clouds > 1 else None, (m - 0.5) / number),
+    }
+    if fpsample := installed("fpsample"):
+        for height in HEIGHTS:
+            choose = partial(_each, fpsample.bucket_fps_kdline_sampling, array, m, height)
+            calls[f"fpsample, height {height}"] = choose
+    if quick := installed("torch_quickfps"):
+        for height in HEIGHTS:
+            calls[f"torch-quickfps, height {height}"] = partial(quick.sample, points, m, height)
+    if clouds * number * m <= SIMPLE and (simple := installed("torch_fps")):
+        valid = torch.ones(points.shape[:2], dtype=torch.bool)
+        calls["torch-fps"] = partial(simple.farthest_point_sampling, points, valid, m)
+    return calls
+
+
+def _each(choose: Any, clouds: Any, m: int, height: int) -> list[Any]:
+    return [cloud[choose(cloud, m, height)] for cloud in clouds]
+
+
+def other_calls(method: str, number: int, m: int) -> Calls:
+    """Return the calls that choose m points by another method."""
+    points = cloud(number)[0]
+    calls: Calls = {"downsample": partial(downsample, points, m, method)}
+    if method == "poisson" and (utils := installed("point_cloud_utils")):
+        reduce = utils.downsample_point_cloud_poisson_disk
+        array = points.numpy().astype(np.float64)
+        calls["point-cloud-utils, about m"] = partial(
+            reduce, array, -1, target_num_samples=m, random_seed=1
+        )
+    return calls
+
+
+def timed(names: dict[str, Any], calls: Calls, rounds: int) -> list[dict[str, Any]]:
+    """Time the calls in turn; of a library with several heights the fastest one is kept."""
+    rows: dict[str, dict[str, Any]] = {}
+    for name, timing in measure.interleaved(calls, rounds).items():
+        call = name.partition(", height")[0]
+        if call not in rows or timing.median < rows[call]["seconds"]:
+            spread = timing.high - timing.low
+            row = {"call": call, "seconds": timing.median, "spread": spread, "rounds": rounds}
+            rows[call] = names | row
+    return list(rows.values())
+
+
+def page(record: dict[str, Any]) -> str:
+    """Return the results as a table."""
+    git = record["machine"]["git"]
+    changes = " with changes" if git["dirty"] else ""
+    versions = ", ".join(f"{name} {number}" for name, number in record["others"].items())
+    lines = [
+        "# Calls",
+        "",
+        f"{record['machine']['cpu']}, one thread, processor time on a busy machine, medians of "
+        f"{record['rounds']} rounds; spread: distance between the quartiles. Commit "
+        f"{git['commit'][:10]}{changes}; {versions}. `python benchmarks/calls.py`",
+        "",
+        "| method | points | call | ms | spread |",
+        "|---|---|---|--:|--:|",
+    ]
+    for row in record["cases"]:
+        times = f"{row['clouds']} x " if row["clouds"] > 1 else ""
+        lines.append(
+            f"| {row['method']} | {times}{row['N']:,} → {row['m']:,} | {row['call']} | "
+            f"{1e3 * row['seconds']:.3g} | {1e3 * row['spread']:.2g} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _versions() -> dict[str, str]:
+    """Return the versions of the installed libraries."""
+    versions = {}
+    for name in LIBRARIES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions
+
+
+def main() -> None:
+    """Measure, and write the record and the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/cpu_calls"))
+    chosen = parser.parse_args()
+    torch.set_num_threads(1)
+    measure.clock = time.process_time
+    cases = []
+    for clouds, number, m in FARTHEST:
+        names = {"method": "fps", "clouds": clouds, "N": number, "m": m}
+        cases += timed(names, farthest_calls(cloud(number, clouds), m), chosen.rounds)
+        print(cases[-1], flush=True)
+    for method, number, m in OTHERS:
+        names = {"method": method, "clouds": 1, "N": number, "m": m}
+        cases += timed(names, other_calls(method, number, m), chosen.rounds)
+        print(cases[-1], flush=True)
+    record = {
+        "machine": measure.machine(),
+        "others": _versions(),
+        "rounds": chosen.rounds,
+        "cases": cases,
+    }
+    chosen.out.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n")
+    chosen.out.with_suffix(".md").write_text(page(record))
+    print(page(record))
+
+
+if __name__ == "__main__":
+    main()
