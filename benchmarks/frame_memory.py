@@ -27,7 +27,7 @@ def memory(name: str) -> int:
 def measure(frame: Path, m: int, name: str) -> str:
     """Return a row of the table, in this process."""
     points = read_points(frame, 0, None, 10_000)
-    (method,) = methods_of([name], None, None)
+    (method,) = methods_of([name], None, None, [m])
     method.sample(points[:FEW], min(m, FEW), 0, frame)
     before = memory("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the peak begins again

@@ -103,6 +103,16 @@ def test_frames_with_poses_are_aligned_to_the_true_motion(tmp_path, capsys):
     assert "plane, 300 points: 2 draws of 2 alignments" in capsys.readouterr().out
 
 
+def test_trained_sampler_is_compared_by_its_completed_sets(scans, tmp_path):
+    called("--task", "icp", scans, "--m", 20, "--draws", 1, "--crops", 1, "--points", 300,
+           "--methods", "random", "--weights", "fmops.modelnet40-m512",
+           "--out", tmp_path / "out")  # fmt: skip
+
+    rows = [row for row in rows_of(tmp_path / "out") if row["method"] == "trained"]
+    assert [row["registration"] for row in rows] == ["plane", "gicp"]
+    assert {row["points"] for row in rows} == {"20.0"}
+
+
 def test_target_is_sampled_where_that_is_asked_for(scans, tmp_path):
     degrees = []
     for number, words in enumerate(([], ["--sample-target"])):
@@ -126,6 +136,8 @@ def test_target_is_sampled_where_that_is_asked_for(scans, tmp_path):
         (["--m", 20, "--angle", -1], "--angle must be at least 0, got -1.0"),
         (["--m", 20, "--max-distance", 0], "--max-distance must be a number above 0, got 0.0"),
         (["--m", 20, "--tile", 100], "--tile is for the trained sampler"),
+        (["--m", 20, "--weights", "nowhere.pt"], "--weights: no file nowhere.pt"),
+        (["--m", 600, "--weights", "fmops.modelnet40-m512"], "trained for up to 512 points"),
         (["--m", 20, "--poses", "no.txt", "--crops", 3], "--crops is for crops"),
         (["--m", 20, "--poses", "no.txt"], "no.txt cannot be read as text"),
     ],

@@ -104,7 +104,7 @@ def compare_icp(chosen: argparse.Namespace) -> str:
     small_gicp()  # reports that it is missing before any file is read
     setup = Setup(
         sizes=chosen.m,
-        methods=methods_of(chosen.methods or NAMES, chosen.weights, chosen.tile),
+        methods=methods_of(chosen.methods or NAMES, chosen.weights, chosen.tile, chosen.m),
         registrations=chosen.registration,
         draws=chosen.draws,
         motions=chosen.motions,

@@ -111,11 +111,13 @@ class VoxelFilter(Method):
         return Sample(np.ascontiguousarray(means[:, :3]), time.process_time() - began)
 
 
-def methods_of(names: Sequence[str], weights: str | None, tile: int | None) -> list[Method]:
+def methods_of(
+    names: Sequence[str], weights: str | None, tile: int | None, sizes: Sequence[int]
+) -> list[Method]:
     """Return the methods of a comparison.
 
     Raises:
-        UserError: a name is unknown.
+        UserError: a name is unknown, or the trained sampler does not choose one of the sizes.
     """
     methods: list[Method] = []
     for name in names:
@@ -123,7 +125,10 @@ def methods_of(names: Sequence[str], weights: str | None, tile: int | None) -> l
             raise UserError(f"--methods: unknown {name!r}.{did_you_mean(name, NAMES)}")
         methods.append(VoxelFilter() if name == FILTER else ByName(name))
     if weights is not None:
-        methods.append(ByWeights(weights, tile))
+        trained = ByWeights(weights, tile)
+        for m in sizes:
+            load_sampler(trained.options(m))
+        methods.append(trained)
     return methods
 
 
