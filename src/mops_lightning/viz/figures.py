@@ -38,13 +38,13 @@ LARGE_MARKER_SAMPLES = 256
 CLOUDS = "clouds.npz"
 INPUT = "input"
 TITLES = "titles"
-AXES: dict[str, dict[str, Any]] = {
+VIEWS: dict[str, dict[str, Any]] = {
     "x": {"vertical_axis": "x", "elev": 35, "azim": -60},
     "y": {"vertical_axis": "z", "elev": 18, "azim": -60},
     "z": {"vertical_axis": "y", "elev": -35, "azim": -60, "roll": 180},
 }
-"""The view of a figure whose points have a vertical axis. ``upright`` has turned y to matplotlib's
-z, and z to its negative y, which a picture that is turned over shows upwards."""
+"""Matplotlib's view of clouds by their vertical axis. All clouds are drawn as ``upright`` turns
+them: y becomes matplotlib's z, and z its negative y. A roll of 180° therefore shows z upwards."""
 MAX_INPUT_POINTS = 8192
 """Most input points drawn or saved of a cloud: more are indistinguishable. All samples are."""
 
@@ -220,11 +220,11 @@ def frame_cloud(axes: Axes3D, cloud: np.ndarray) -> None:
     axes.set_axis_off()
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_visible(False)  # matplotlib measures the ticks of hidden axes, too
-    axes.view_init(**AXES["y"])
+    axes.view_init(**VIEWS["y"])
 
 
 def view_upright(figure: Figure, up: str) -> None:
-    """Look at all clouds of a figure, which were drawn as y up, with another vertical axis.
+    """Turn the view of all clouds of a figure, which are drawn with y up, to their vertical axis.
 
     Args:
         figure: of this module or of ``task_results``.
@@ -232,11 +232,11 @@ def view_upright(figure: Figure, up: str) -> None:
     """
     for axes in figure.axes:
         if isinstance(axes, Axes3D):
-            axes.view_init(**AXES[up])
+            axes.view_init(**VIEWS[up])
 
 
 def to_y_up(points: Tensor, up: str) -> Tensor:
-    """Turn points ``(..., 3)`` whose vertical axis is ``x``, ``y`` or ``z``."""
+    """Rotate points ``(..., 3)`` so that their vertical axis ``x``, ``y`` or ``z`` becomes y."""
     x, y, z = points.unbind(-1)
     turned = {"x": (-y, x, z), "y": (x, y, z), "z": (x, z, -y)}
     return torch.stack(turned[up], -1)

@@ -20,6 +20,9 @@ from tests.support.copc import write_copc
 RECORDS, NUMBER, EVLRS, LONG_NUMBER = 100, 107, 243, 247
 """Places of counts in the header."""
 
+NUMBER_OF_ITEMS, LENGTH_OF_FIRST_ITEM = 32, 36
+"""Places in the record that describes the compression."""
+
 
 def las_cloud(header, number, low=0, high=9):
     cloud = laspy.LasData(header)
@@ -287,18 +290,36 @@ def test_real_copc_file_is_read_by_blocks(real_data):
     np.testing.assert_array_equal(np.concatenate([t.points for t in tables]), whole.xyz)
 
 
-@pytest.mark.parametrize("name", ["a.laz", "a.copc.laz"])
-def test_points_of_another_length_than_the_compressed_ones_are_broken(name, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "length"),
+    [
+        ("a.laz", 65535 + 8 + 6),  # the first item, the GPS time and the colour
+        ("a.copc.laz", 65535 + 6),
+    ],
+)
+def test_laz_with_compressed_points_of_another_length_is_broken(name, length, tmp_path):
     path = tmp_path / name
     points = np.random.default_rng(1).uniform(size=(90, 3))
     write(path, Table(points))
     content = bytearray(path.read_bytes())
-    record = read_header(path).compression
-    size_of_first_item = content.index(record) + 36
-    struct.pack_into("<H", content, size_of_first_item, 65535)
+    record = content.index(read_header(path).compression)
+    struct.pack_into("<H", content, record + LENGTH_OF_FIRST_ITEM, 65535)
+    path.write_bytes(content)
+    message = f"the record of its compression has points of {length} bytes"
+
+    with pytest.raises(UserError, match=message):
+        read(path, 9, 0)
+    with pytest.raises(UserError, match=message):
+        open_cloud_file(path).read(range(9))
+
+
+def test_laz_with_fewer_items_than_announced_is_broken(tmp_path):
+    path = tmp_path / "a.laz"
+    write(path, Table(np.random.default_rng(1).uniform(size=(90, 3))))
+    content = bytearray(path.read_bytes())
+    record = content.index(read_header(path).compression)
+    struct.pack_into("<H", content, record + NUMBER_OF_ITEMS, 999)
     path.write_bytes(content)
 
-    with pytest.raises(UserError, match=r"the record of its compression has points of 655.. bytes"):
+    with pytest.raises(UserError, match="compression is too short for 999 items"):
         read(path, 9, 0)
-    with pytest.raises(UserError, match=r"the record of its compression has points of 655.. bytes"):
-        open_cloud_file(path).read(range(9))

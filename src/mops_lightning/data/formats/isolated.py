@@ -30,7 +30,7 @@ SECONDS, BYTES_PER_SECOND = 30.0, 200_000
 """A file may take this long, and longer if it is large."""
 
 COMPILING = 120.0
-"""A parser's code may take so many seconds more to compile; 20 on one busy core with numba."""
+"""Seconds more for a parser that compiles its code: numba took 18 to 27 on one busy core."""
 
 COMMAND = (
     "import sys; sys.path[:] = {}; from mops_lightning.data.formats import isolated as i; i.serve()"
@@ -53,7 +53,7 @@ def isolated(
         function: of a module that does not import torch, so that the process starts fast.
         path: the file that it parses.
         arguments: can be pickled, as can the result.
-        compiles: whether the parser compiles code at its first call, which takes time of its own.
+        compiles: whether the parser compiles its code at the first call and gets more time for it.
 
     Raises:
         UserError: the function raised an error, or its process exceeded a limit or died.

@@ -48,7 +48,7 @@ class CloudVisualization(Callback):
         self, batch: Any, titles: Sequence[str], folder: Path, up: bool | str = "y"
     ) -> None:
         axis = "y" if isinstance(up, bool) else up
-        if axis not in drawing.AXES:
+        if axis not in drawing.VIEWS:
             raise UserError(f"up must be x, y or z (the vertical axis), got {up!r:.99}.")
         self.up = axis
         self.batch = batch

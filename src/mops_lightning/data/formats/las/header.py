@@ -22,8 +22,13 @@ EXTRA_BYTES, WAVEFORMS = 4, 65535
 LASZIP = 22204
 """Number of the record that describes the compression."""
 
-LASZIP_ITEMS, LASZIP_NUMBER, LASZIP_ITEM = 32, struct.Struct("<H"), struct.Struct("<3H")
-"""Place of the number of items in this record, and the items: type, size and version."""
+ITEMS_PLACE = 32
+"""Byte of this record at which the number of items begins; the items of a point follow it."""
+
+ITEMS_NUMBER = struct.Struct("<H")
+
+ITEM = struct.Struct("<3H")
+"""An item: its type, its length in bytes and its version."""
 
 HEADER_BYTES = (227, 227, 227, 235, 375, 393)
 """Least bytes of the header of versions 1.0 to 1.5."""
@@ -164,15 +169,32 @@ class Header:
         record = self.record("laszip encoded", LASZIP)
         if record is None:
             raise ValueError("no record describes its compression")
-        (number,) = LASZIP_NUMBER.unpack_from(record.data, LASZIP_ITEMS)
-        items = record.data[LASZIP_ITEMS + LASZIP_NUMBER.size :]
-        sizes = [size for _, size, _ in LASZIP_ITEM.iter_unpack(items[: number * LASZIP_ITEM.size])]
-        if len(sizes) < number or sum(sizes) != self.item:
+        length = _length_of_compressed_point(record.data)
+        if length != self.item:
             raise ValueError(
-                f"the record of its compression has points of {sum(sizes)} bytes, its header of "
+                f"the record of its compression has points of {length} bytes, its header of "
                 f"{self.item}"
             )
         return record.data
+
+
+def _length_of_compressed_point(data: bytes) -> int:
+    """Return the length of a point in bytes: the sum over its items.
+
+    Args:
+        data: of the record that describes the compression.
+
+    Raises:
+        ValueError: it ends before its last item.
+    """
+    start = ITEMS_PLACE + ITEMS_NUMBER.size
+    if len(data) < start:
+        raise ValueError("the record of its compression is too short")
+    (number,) = ITEMS_NUMBER.unpack_from(data, ITEMS_PLACE)
+    items = data[start : start + number * ITEM.size]
+    if len(items) < number * ITEM.size:
+        raise ValueError(f"the record of its compression is too short for {number} items")
+    return sum(length for _, length, _ in ITEM.iter_unpack(items))
 
 
 def read_header(path: Path) -> Header:
