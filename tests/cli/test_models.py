@@ -49,6 +49,18 @@ def test_models_add_publishes_a_run(tmp_path, monkeypatch):
     assert "exists" in call("add", tmp_path / "run", "fmops.mine")[2]
 
 
+def test_models_add_keeps_notes_for_the_card(tmp_path, monkeypatch):
+    write_run(tmp_path / "run")
+    monkeypatch.setenv(names.VARIABLE, str(tmp_path / "models"))
+    notes = "Give clouds with z up."
+
+    done(main, ["add", tmp_path / "run", "fmops.mine", "--notes", notes], COMMAND)
+    card = done(main, ["fmops.mine"], COMMAND)
+
+    shown = dict(line.split(maxsplit=1) for line in card.splitlines())
+    assert shown["notes"] == notes
+
+
 def test_models_lists_readable_files_next_to_a_damaged_one(tmp_path, monkeypatch):
     (tmp_path / "fmops.damaged.safetensors").write_bytes(b"none")
     monkeypatch.setenv(names.VARIABLE, str(tmp_path))

@@ -75,6 +75,20 @@ def test_run_cell_failed_is_repeated(start, tmp_path, caplog):
     assert run_record.read(tmp_path / "cell" / ASIDE / "1").status == "failed"
 
 
+def test_run_cell_failed_with_checkpoint_starts_again(start, tmp_path):
+    longer = ["sampler=mops", "weights=null", "trainer.max_epochs=2"]
+    score = start(*longer)
+    whole = run_record.read(tmp_path / "cell")
+    failed = {**whole.plain(), "status": "failed", "score": None}
+    (tmp_path / "cell" / run_record.FILE).write_text(json.dumps(failed))
+    assert (tmp_path / "cell" / "checkpoints" / "last.ckpt").is_file()
+
+    again = start(*longer)
+
+    assert again == score
+    assert run_record.read(tmp_path / "cell").resumed_from is None
+
+
 def test_run_cell_interrupted_resumes_to_same_result(start, tmp_path):
     longer = ["sampler=mops", "weights=null", "trainer.max_epochs=2"]
     score = start(*longer)

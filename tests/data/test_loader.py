@@ -69,6 +69,8 @@ def test_augmentation_stretches_and_shifts_every_axis_of_a_cloud(rng):
         assert low - 1e-3 < drawn.min() < low + 0.05
         assert high - 0.05 < drawn.max() < high + 1e-3
         assert drawn.mean().item() == pytest.approx((low + high) / 2, abs=0.05)
+        of_axes = torch.corrcoef(drawn.T) - torch.eye(3)
+        assert of_axes.abs().max() < 0.2  # every axis has factors and shifts of its own
 
 
 def test_augmentation_equals_written_out_formulas():

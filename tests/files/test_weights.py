@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mops_lightning.data.formats.registry import read
+from mops_lightning.files.column_weights import weights_of
 from tests.support.downsample import call, done
 
 SPLAT = [
@@ -39,6 +40,25 @@ def test_splat_is_pruned_by_opacity_with_all_properties(method, splat, tmp_path)
     assert len(kept) == len({row.tobytes() for row in kept})
     assert {row.tobytes() for row in kept} <= {row.tobytes() for row in rows}
     assert (kept[:, SPLAT.index("opacity")] > 0).mean() > 0.9
+
+
+def test_splat_keeps_transparent_points_where_there_is_room(splat, tmp_path):
+    path, rows = splat  # 200 of its 400 points have a logit below 0
+
+    done(path, tmp_path / "small.ply", "--method", "fps", "--m", 350, "--weight", "opacity")
+
+    kept = read(tmp_path / "small.ply", 9, 0).columns["opacity"]
+    assert np.unique(kept, return_counts=True)[1].tolist() == [150, 200]
+
+
+@pytest.mark.parametrize("logit", [-6.0, 0.0, 6.0])
+def test_weight_of_a_splat_is_its_opacity(logit, splat):
+    path, _ = splat
+    table = read(path, 9, 0).with_columns({"opacity": np.full(400, logit, np.float32)})
+
+    weight = weights_of(table, "opacity", path)
+
+    assert weight == pytest.approx(1 / (1 + np.exp(-logit)))
 
 
 def test_completed_set_is_filled_up_by_weight(folder, tmp_path):

@@ -21,6 +21,15 @@ def test_pcrnet_has_published_layers():
     assert not any(isinstance(m, torch.nn.BatchNorm1d) for m in PCRNet().modules())
 
 
+def test_pcrnet_untrained_leaves_clouds_without_extent_as_they_are():
+    at_origin = torch.zeros(2, 9, 3)  # all features are 0, only the last bias is left
+
+    motion = net()(at_origin, at_origin)
+
+    assert motion.quaternion.tolist() == [[1, 0, 0, 0]] * 2
+    assert motion.translation.tolist() == [[0, 0, 0]] * 2
+
+
 @pytest.mark.parametrize("iterations", [1, 3])
 def test_pcrnet_is_independent_of_order_and_batch(iterations, rng):
     module = net(iterations=iterations)

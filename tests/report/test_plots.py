@@ -52,6 +52,21 @@ def curves_of(axes: Any) -> list[list[float]]:
     return [container.lines[0].get_ydata().tolist() for container in axes.containers]
 
 
+def test_curves_have_error_bars_in_the_unit_of_the_values(tmp_path):
+    for seed, accuracy in enumerate((0.5, 0.7)):
+        for m in (8, 32):
+            folder = tmp_path / str(seed)
+            put(folder, "fps", m, {"test/sampled/accuracy": accuracy}, seed=seed)
+
+    (figure,) = plots(build_report(tmp_path)).values()
+
+    bars: Any = figure.axes[0].containers[0]
+    low, high = bars.lines[1]
+    deviation = 100 * 0.2 / 2**0.5  # over two seeds, in percent
+    assert low.get_ydata() == pytest.approx([60 - deviation] * 2)
+    assert high.get_ydata() == pytest.approx([60 + deviation] * 2)
+
+
 def test_curves_have_a_panel_for_projected_points_where_there_are_any(tmp_path):
     for m in (8, 32):
         scores = {

@@ -24,6 +24,17 @@ def test_fps_sampler_uses_start(rng):
         FPSSampler(4, start=9)(torch.zeros(1, 9, 3))
 
 
+def test_fps_sampler_with_weights_starts_at_the_heaviest_point(rng):
+    points = torch.randn(20, 50, 3, generator=rng)
+    weight = torch.rand(20, 50, generator=rng)
+
+    chosen = FPSSampler(3).sample_weighted(points, 3, weight)
+    from_row = FPSSampler(3, start=7).sample_weighted(points, 3, weight)
+
+    assert torch.equal(chosen[:, 0], weight.argmax(1))
+    assert from_row[:, 0].tolist() == [7] * 20
+
+
 def test_fps_sampler_farthest_start_moves_with_the_cloud(rng):
     points = torch.randn(3, 50, 3, generator=rng)
     sampler = FPSSampler(12, start="farthest")

@@ -42,6 +42,20 @@ def scored(module, given, points):
     return module.scores(given, {"": points})[""]
 
 
+def test_scores_of_large_clouds_have_a_finer_assignment_than_training(rng):
+    module = Reconstruction(AutoEncoder(300, 8, (8, 8)), exact_up_to=299).eval()
+    given = batch(rng, points=300)
+
+    trained = module.step(given, given.points).predictions.emd
+    found = scored(module, given, given.points).predictions.emd
+
+    built = module.net(given.points)
+    expected = earth_movers_distance(built, given.points, block=128, rounds=8)
+    torch.testing.assert_close(found, expected)
+    assert (found < trained).all()
+    assert (earth_movers_distance(built, given.points) <= found).all()
+
+
 def values_of(module, result):
     metrics = module.metrics()
     metrics.update(result.predictions, result.targets)

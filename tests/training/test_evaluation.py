@@ -158,6 +158,16 @@ def test_evaluation_record_chooses_no_folder_to_write_and_no_part_of_training(pa
     assert same == evaluated(run)
 
 
+def test_evaluation_record_starts_no_download(tmp_path):
+    overrides = ("sampler=fmops", "sampler.m_max=32", "dataset=modelnet40", "out=o", "cache=c")
+    evil = write_run(tmp_path / "evil", overrides, {"dataset.download": True})
+
+    repeated = evaluated(evil)
+
+    assert repeated.dataset.download is False
+    assert evaluated(evil, "dataset.download=true").dataset.download is True
+
+
 @pytest.mark.parametrize(
     "argument",
     [

@@ -80,6 +80,18 @@ def test_voxel_keeps_one_point_of_each():
     assert len(points) == len(places)
 
 
+def test_voxel_with_weights_keeps_the_heaviest_point_of_each():
+    points = np.array([[0.1, 0.5, 0.5], [0.5, 0.5, 0.5], [0.9, 0.5, 0.5], [1.5, 0.5, 0.5]])
+    weight = np.array([3.0, 1.0, 5.0, 1.0])
+    of_middle = np.array([1.0, 1.0, 1.0, 1.0])
+
+    _, heavy = downsample(points, voxel=1.0, weight=weight)
+    _, nearest = downsample(points, voxel=1.0, weight=of_middle)
+
+    assert heavy.tolist() == [2, 3]
+    assert nearest.tolist() == [1, 3]
+
+
 def test_voxel_generated_returns_means_of_all_columns():
     points = np.array([[0.1, 0.1, 0.1, 4.0], [0.3, 0.5, 0.9, 6.0], [1.5, 0.5, 0.5, 1.0]])
 
