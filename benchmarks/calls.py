@@ -8,6 +8,7 @@ out: fpsample, torch-quickfps, torch-fps, point-cloud-utils. Set OMP_NUM_THREADS
 import argparse
 import json
 import time
+from collections.abc import Iterator
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -29,9 +30,9 @@ FARTHEST = (
     (1, 10_000, 1024),
     (1, 40_960, 4096),
     (1, 100_000, 1024),
-    (1, 1_000_000, 1000),
     (32, 1024, 32),
     (32, 1024, 512),
+    (1, 1_000_000, 1000),
 )
 """Numbers of clouds, of points, and of points to keep."""
 
@@ -150,24 +151,27 @@ def main() -> None:
     chosen = parser.parse_args()
     torch.set_num_threads(1)
     measure.clock = time.process_time
-    cases = []
-    for clouds, number, m in FARTHEST:
-        names = {"method": "fps", "clouds": clouds, "N": number, "m": m}
-        cases += timed(names, farthest_calls(cloud(number, clouds), m), chosen.rounds)
-        print(cases[-1], flush=True)
-    for method, number, m in OTHERS:
-        names = {"method": method, "clouds": 1, "N": number, "m": m}
-        cases += timed(names, other_calls(method, number, m), chosen.rounds)
-        print(cases[-1], flush=True)
-    record = {
+    record: dict[str, Any] = {
         "machine": measure.machine(),
         "others": _versions(),
         "rounds": chosen.rounds,
-        "cases": cases,
+        "cases": [],
     }
-    chosen.out.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n")
-    chosen.out.with_suffix(".md").write_text(page(record))
+    for names, calls in _rows():
+        record["cases"] += timed(names, calls, chosen.rounds)
+        chosen.out.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n")
+        chosen.out.with_suffix(".md").write_text(page(record))
     print(page(record))
+
+
+def _rows() -> Iterator[tuple[dict[str, Any], Calls]]:
+    """Yield what each row measures, and its calls; the rows that take longest come last."""
+    for clouds, number, m in FARTHEST:
+        names = {"method": "fps", "clouds": clouds, "N": number, "m": m}
+        yield names, farthest_calls(cloud(number, clouds), m)
+    for method, number, m in OTHERS:
+        names = {"method": method, "clouds": 1, "N": number, "m": m}
+        yield names, other_calls(method, number, m)
 
 
 if __name__ == "__main__":
