@@ -87,3 +87,16 @@ def test_curves_have_a_panel_for_projected_points_where_there_are_any(tmp_path):
         "projected",
     ]
     assert [8, 32] in curves_of(figure.axes[3])
+
+
+def test_curves_have_a_legend_of_all_rows(tmp_path):
+    for m in (8, 32):
+        generated = {"test/generated/accuracy": 0.5}
+        put(tmp_path, "mops", m, generated)
+        put(tmp_path, "samplenet", m, {**generated, "test/projected/accuracy": 0.7})
+        put(tmp_path, "fps", m, {"test/sampled/accuracy": 0.4})
+
+    (figure,) = plots(build_report(tmp_path)).values()
+
+    legend: Any = figure.axes[-1].get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["fps", "samplenet", "mops"]

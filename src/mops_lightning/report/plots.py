@@ -70,7 +70,7 @@ def curves(table: Table) -> Figure:
             axis.tick_params(axis="x", rotation=90)
         axis.grid(alpha=0.3)
         axis.label_outer()
-    panels[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    _add_legend(panels)
     return figure
 
 
@@ -97,6 +97,17 @@ def _draw_curves(axis: Any, table: Table, readout: str, columns: Sequence[Any]) 
             markersize=3,
             capsize=2,
         )
+
+
+def _add_legend(panels: Sequence[Any]) -> None:
+    """Name the curves of all panels beside the last one, which may lack some of them."""
+    curve_of: dict[str, Any] = {}
+    for axis in panels:
+        curves_of_panel, names = axis.get_legend_handles_labels()
+        curve_of |= zip(names, curves_of_panel, strict=True)
+    panels[-1].legend(
+        curve_of.values(), curve_of.keys(), fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5)
+    )
 
 
 def heat_maps(table: Table) -> Figure:
