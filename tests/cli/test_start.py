@@ -69,6 +69,7 @@ def test_second_run_in_folder_writes_nothing(tmp_path):
         (["task_lr_scale=0.1"], "with learn=sampler"),
         (["weights=null", "pretrain.lr=0.1"], "with weights=null"),
         (["weights=null", "pretrain_from=x"], "with weights=null"),
+        (["weights=null", "recipe.task_points=64"], "with weights=null"),
     ],
 )
 def test_setting_of_a_part_that_the_run_lacks_is_refused(settings, said):

@@ -187,15 +187,68 @@ def test_evaluation_setting_without_effect_raises(run, argument):
             evaluated(run, argument, *more)
 
 
-def test_evaluation_sampler_for_a_task_net_alone_raises(tmp_path):
+CHANGED: list[tuple[str, Any]] = [
+    ("m", 4),
+    ("sizes", [4, 16]),
+    ("seed", 5),
+    ("weights", None),
+    ("dataset.n_points", 32),
+    ("batch_size", 2),
+    ("test_noise_std", 0.1),
+    ("test_corruption", "shear-3"),
+    ("sampler.threshold", 0.5),
+    ("baselines.fps", None),
+    ("pictures", 1),
+    ("tags", ["again"]),
+    ("out", "elsewhere"),
+    ("trainer.precision", "32-true"),
+    ("logger", None),
+]
+"""What an evaluation may change, each with another value than the run's."""
+
+
+@pytest.mark.parametrize(("path", "value"), CHANGED)
+def test_evaluation_takes_changes_of_what_is_tested_and_how(run, path, value):
+    argument = f"{path}={json.dumps(value)}"
+    if path == "logger":
+        argument = "logger=none"
+
+    assert OmegaConf.select(evaluated(run, argument), path) == value
+
+
+@pytest.mark.parametrize(
+    "argument",
+    [
+        "sampler=fps",
+        "sampler.m_max=8",
+        "++sampler.alpha=3",
+        "weights=null",
+        "m=8",
+        "sizes=[8]",
+        "baselines.fps=null",
+    ],
+)
+def test_evaluation_sampler_for_a_task_net_alone_raises(tmp_path, argument):
     run = write_run(tmp_path / "run", [*OVERRIDES, "learn=task"])
-    known = ("sampler=fps", "sampler.m_max=8", "++sampler.alpha=3", "weights=null")
-    for argument in (*known, "m=8", "sizes=[8]"):
-        with pytest.raises(UserError, match=r"has no effect .* trained a task net alone\. To test"):
-            evaluated(run, argument)
+
+    with pytest.raises(UserError, match=r"has no effect .* trained a task net alone\. To test"):
+        evaluated(run, argument)
 
 
-def test_evaluation_pretraining_takes_its_settings(run):
-    with pytest.raises(UserError, match=r"epochs.task=2: has no effect"):
-        evaluated(run, "epochs.task=2")
-    assert evaluated(run, "epochs.task=2", "weights=auto").epochs.task == 2
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("epochs.task", 2),
+        ("pretrain.lr", 0.5),
+        ("val_fraction", 0.2),
+        ("augment.task.jitter", 0.5),
+        ("trainer.accumulate_grad_batches", 2),
+    ],
+)
+def test_evaluation_pretraining_takes_its_settings(run, path, value):
+    argument = f"++{path}={value}"
+
+    with pytest.raises(UserError, match=r"has no effect with evaluate, which trains nothing"):
+        evaluated(run, argument)
+
+    assert OmegaConf.select(evaluated(run, argument, "weights=auto"), path) == value

@@ -14,6 +14,12 @@ from mops_lightning.report import collect
 from mops_lightning.report.collect import epochs, recorded_recipe, sampler_row, seed, trained_with
 from mops_lightning.tree import dotted
 
+Row = tuple[str, str]
+"""A row of a table: its sampler and its task net."""
+
+Key = Callable[[RunRecord], tuple[str, ...] | None]
+"""What a record is sorted by; None for a record that belongs to every group."""
+
 IN_ROWS_OF_NETS = ("task.net.", "sampler.")
 """Settings in which the runs of a table of nets may differ."""
 
@@ -103,9 +109,7 @@ def net_groups(found: list[RunRecord], mixed: bool = False) -> list[Group]:
     return result
 
 
-def _split(
-    found: list[Group], what: str, key: Callable[[RunRecord], tuple[str, ...] | None]
-) -> list[Group]:
+def _split(found: list[Group], what: str, key: Key) -> list[Group]:
     """Split groups by the parts of a key; records whose key is None are in every group.
 
     Args:
@@ -194,7 +198,7 @@ def _with_layout(group: Group, mixed: bool) -> list[Group]:
     other setting, columns are its values; if in two, each sampler gets a heat map. A group that
     differs in more is split, unless ``mixed``.
     """
-    rows: dict[tuple[str, str], list[RunRecord]] = {}
+    rows: dict[Row, list[RunRecord]] = {}
     for record in group.records:
         rows.setdefault(_row(record), []).append(record)
     different = {row: varying(records) for row, records in rows.items()}
@@ -227,7 +231,7 @@ def _column(group: Group, keys: set[str]) -> str | None:
 
 
 def _planes(
-    rows: dict[tuple[str, str], list[RunRecord]], different: dict[tuple[str, str], list[str]]
+    rows: dict[Row, list[RunRecord]], different: dict[Row, list[str]]
 ) -> dict[str, list[str]] | None:
     """Return the two settings in which the runs of each sampler differ; None if one has others.
 
@@ -252,7 +256,7 @@ def _by_size(group: Group) -> list[Group]:
     return result
 
 
-def _by_settings(group: Group, different: dict[tuple[str, str], list[str]]) -> list[Group]:
+def _by_settings(group: Group, different: dict[Row, list[str]]) -> list[Group]:
     """Split a group by the settings in which the runs of a row differ; other rows are shared."""
 
     def about(record: RunRecord) -> tuple[str, ...] | None:
@@ -293,7 +297,7 @@ def weightless(record: RunRecord) -> bool:
     return not trains and record.task_weights_sha256 is None
 
 
-def _row(record: RunRecord) -> tuple[str, str]:
+def _row(record: RunRecord) -> Row:
     return sampler_row(record), collect.names(record)["net"]
 
 

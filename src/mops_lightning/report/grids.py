@@ -98,7 +98,7 @@ def _by_column(table: Table) -> Grid:
     head = ["sampled by", *(f"{group.column}={column}" for column in columns)]
     if costs:
         head.append(collect.training_time(group.records)[0])
-    title = f"Test {table.metric.title}: {table.names['task']} on {table.names['dataset']}"
+    title = f"Test {table.metric.title}: {table.subject}"
     if is_by_size:
         below += _full_lines(table)
     else:
@@ -174,7 +174,7 @@ def _by_net(table: Table) -> Grid:
     rows.append(["", label, *(means.get(net, "") for net in columns)])
     title = (
         f"Test {table.metric.title} of the same samples under several task nets: "
-        f"{table.names['task']} on {table.names['dataset']}; {_sets(table)}"
+        f"{table.subject}; {_sets(table)}"
     )
     return Grid(title, ["m", "sampled by", *columns], rows)
 
@@ -205,9 +205,10 @@ def _plane(table: Table, row: str) -> Grid:
     for left, line in zip(cells.index, cells.to_numpy(), strict=True):
         lines.append([f"{left:g}", *line])
     spreads = [_spread(table, row, readout) for readout in table.readouts(row)]
+    readouts = " / ".join(table.readouts(row))
     title = (
-        f"Test {table.metric.title} of {row}: {table.names['task']} on {table.names['dataset']}, "
-        f"m={table.sizes}, under {table.net}; {' / '.join(table.readouts(row))} sets."
+        f"Test {table.metric.title} of {row}: {table.subject}, m={table.sizes}, "
+        f"under {table.net}; {readouts} sets."
     )
     head = [f"{down} \\ {across}", *(f"{value:g}" for value in cells.columns)]
     return Grid(title, head, lines, [f"Spread over the plane of {row}: {', '.join(spreads)}."])
@@ -218,7 +219,8 @@ def _spread(table: Table, row: str, readout: str) -> str:
     means = table.of(row, readout)["mean"]
     low = means.min()
     high = means.max()
-    text = f"{readout} {table.metric.format(low)} to {table.metric.format(high)}"
+    shown = table.metric.format
+    text = f"{readout} {shown(low)} to {shown(high)}"
     if low > 0:
         text += f" (factor {high / low:.3g})"
     return text

@@ -144,8 +144,9 @@ def _by_row(found: list[RunRecord], settings: list[dict[str, Any]], keys: list[s
     rows = []
     for _, of_net in in_order.groupby(place, sort=False, dropna=False):
         numbers = list(of_net["number"])
-        first = settings[numbers[0]]
-        rows.append(_Row([first.get(key) for key in keys], [found[number] for number in numbers]))
+        of_first = settings[numbers[0]]
+        values = [of_first.get(key) for key in keys]
+        rows.append(_Row(values, [found[number] for number in numbers]))
     return rows
 
 
@@ -175,9 +176,10 @@ def _settings(found: list[RunRecord]) -> list[dict[str, Any]]:
 
 def _trainings(found: list[RunRecord], nets: list[dict[str, Any]]) -> list[str]:
     """Return the settings of trainings in which runs of one net and seed differ, sorted."""
-    same: dict[tuple[str, ...], list[RunRecord]] = {}
+    same: dict[str, list[RunRecord]] = {}
     for record, net in zip(found, nets, strict=True):
-        place = (collect.names(record)["net"], str(net), str(_points(record)), str(seed(record)))
+        name = collect.names(record)["net"]
+        place = repr([name, net, _points(record), seed(record)])
         same.setdefault(place, []).append(record)
     different: set[str] = set()
     for runs in same.values():

@@ -83,6 +83,11 @@ class Table:
         return shown_names(self.group.records[0].config)
 
     @property
+    def subject(self) -> str:
+        """The task and the data, for titles."""
+        return f"{self.names['task']} on {self.names['dataset']}"
+
+    @property
     def sizes(self) -> str:
         """The sizes of the runs."""
         sizes = {record.config["m"] for record in self.group.records}
