@@ -1,6 +1,5 @@
 """The declaration of settings, and a made-up setting that everything finds there."""
 
-import json
 import re
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +10,9 @@ from omegaconf import OmegaConf
 from mops_lightning.cli.sweep import run_cell
 from mops_lightning.config import settings
 from mops_lightning.config.compose import compose
-from mops_lightning.config.settings import Affects, RunSettings, number, setting
+from mops_lightning.config.declaration import Affects, Training
+from mops_lightning.config.limits import number
+from mops_lightning.config.settings import RunSettings, setting
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.report.build import build_report
@@ -20,7 +21,7 @@ from mops_lightning.training.checkpoint import checkpoint_identity
 from mops_lightning.training.evaluation import TrainedRun, command_line
 from mops_lightning.training.run.pretrain import cache_folder
 from tests.support.command_line import TINY, call
-from tests.support.reports import put_cell
+from tests.support.reports import edited, put_cell
 from tests.support.training import small_dataset
 
 DATA = small_dataset(train=4, test=4)
@@ -60,7 +61,9 @@ def test_made_up_setting_is_shown_by_help_and_validated(affects, tmp_path):
 
 def test_made_up_setting_of_training_is_in_identity_and_cache_key(affects):
     trains = affects is Affects.TRAINING
-    plain, changed = compose(), compose(["haste=2"])
+    plain = compose()
+    changed = compose(["haste=2"])
+
     assert ("haste" in identity_of(plain)) == trains
     assert (identity_of(plain) != identity_of(changed)) == trains
     assert (cache_folder(plain, DATA) != cache_folder(changed, DATA)) == trains
@@ -76,21 +79,26 @@ def test_made_up_setting_that_affects_results_may_not_differ_in_a_sweep(affects,
 
 def test_made_up_setting_that_affects_results_is_repeated_by_evaluate(affects, tmp_path):
     path = put_cell(tmp_path, "run", "mops", {"generated": 1.0})
-    record = json.loads(path.read_text())
     config: Any = OmegaConf.to_container(compose(), resolve=True)
-    changes = {"config": {**config, "haste": 2.0}, "files": {"weights": "weights.safetensors"}}
-    path.write_text(json.dumps({**record, **changes}))
+    config["haste"] = 2.0
+    edited(path, config=config, files={"weights": "weights.safetensors"})
+
     chosen = command_line([f"evaluate={path.parent}"])
     cfg = as_trained(compose(chosen), TrainedRun.read(str(path.parent)), chosen)
+
     assert (cfg.haste == 2) == (affects is not Affects.NOTHING)
 
 
 def test_made_up_setting_that_affects_results_makes_columns_of_a_report(affects, tmp_path):
     for haste in (1.0, 2.0):
         put_cell(tmp_path, f"a{haste}", "mops", {"generated": haste}, haste=haste, m=8)
-    columns = ["m=8"] if affects is Affects.NOTHING else ["haste=1.0", "haste=2.0"]
+
     head = build_report(tmp_path).grids[0].head
-    assert head[: len(columns) + 1] == ["sampled by", *columns]
+
+    if affects is Affects.NOTHING:
+        assert head[:2] == ["sampled by", "m=8"]
+    else:
+        assert head[:3] == ["sampled by", "haste=1.0", "haste=2.0"]
 
 
 @pytest.mark.parametrize(
@@ -107,8 +115,26 @@ def test_made_up_setting_that_affects_results_makes_columns_of_a_report(affects,
     ],
 )
 def test_of_a_path_gives_the_nearest_declaration(path, affects, repeated, compared):
-    found = settings.of(path)
-    assert (found.affects, found.repeated, found.compared) == (affects, repeated, compared)
+    declared = settings.of(path)
+
+    assert declared.affects == affects
+    assert declared.repeated == repeated
+    assert declared.compared == compared
+
+
+@pytest.mark.parametrize(
+    ("path", "trainings"),
+    [
+        ("recipe.distillation", Training.SAMPLER),
+        ("recipe.ema_span", Training.JOINT | Training.SAMPLER),
+        ("recipe.task_points", Training.FIRST | Training.TASK_NET),
+        ("pretrain.lr", Training.FIRST),
+        ("optimizer.lr", Training.TASK_NET | Training.JOINT | Training.SAMPLER),
+        ("batch_size", None),
+    ],
+)
+def test_of_a_path_says_which_trainings_it_serves(path, trainings):
+    assert settings.of(path).serves == trainings
 
 
 def test_defaults_of_the_schema_are_the_composed_values():

@@ -8,7 +8,8 @@ from mops_lightning.training.schedules import exponential, one_cycle, step_decay
 
 
 def rates(make, steps, lr=1.0, **settings):
-    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=lr)
+    parameter = torch.nn.Parameter(torch.zeros(1))
+    optimizer = torch.optim.SGD([parameter], lr=lr)
     schedule = make(optimizer, steps, **settings)
     seen = []
     for _ in range(steps):
@@ -18,10 +19,18 @@ def rates(make, steps, lr=1.0, **settings):
     return seen
 
 
-def test_exponential_spans_first_to_last_rate_and_step_decay_stops_at_floor():
+def test_exponential_spans_first_to_last_rate():
     seen = rates(exponential, 101, lr=5e-4, end_lr=1e-5)
-    assert [seen[0], seen[50], seen[-1]] == pytest.approx([5e-4, (5e-4 * 1e-5) ** 0.5, 1e-5])
+
+    geometric_mean = (5e-4 * 1e-5) ** 0.5
+    assert seen[0] == pytest.approx(5e-4)
+    assert seen[50] == pytest.approx(geometric_mean)
+    assert seen[100] == pytest.approx(1e-5)
+
+
+def test_step_decay_halves_the_rate_down_to_its_floor():
     seen = rates(step_decay, 10, every=2, factor=0.5, floor_lr=0.2)
+
     assert seen == pytest.approx([1, 1, 0.5, 0.5, 0.25, 0.25, 0.2, 0.2, 0.2, 0.2])
 
 
@@ -33,7 +42,8 @@ def test_step_decay_floor_is_a_rate_and_no_share_of_the_first_one():
 
 def test_exponential_ends_at_the_rate_of_the_first_group_and_stays_there():
     """In joint training, the second group is the task net's, with a rate of its own."""
-    sampler, task = (torch.nn.Parameter(torch.zeros(1)) for _ in range(2))
+    sampler = torch.nn.Parameter(torch.zeros(1))
+    task = torch.nn.Parameter(torch.zeros(1))
     groups = [{"params": [sampler], "lr": 1e-2}, {"params": [task], "lr": 1e-3}]
     optimizer = torch.optim.SGD(groups)
     schedule = exponential(optimizer, 5, end_lr=1e-4)
@@ -58,20 +68,26 @@ def test_one_cycle_equals_torch():
         optimizer.step()
         if len(want) < 51:
             reference.step()
-    seen = rates(one_cycle, 51)
-    assert seen == pytest.approx(want)
+
+    assert rates(one_cycle, 51) == pytest.approx(want)
 
 
 @pytest.mark.parametrize(
     ("make", "name", "value"),
     [
-        *((one_cycle, "warmup", value) for value in (-0.1, 2.0)),
+        (one_cycle, "warmup", -0.1),
+        (one_cycle, "warmup", 2.0),
         (exponential, "end_lr", 0.0),
         (step_decay, "every", 0),
-        *((step_decay, "factor", value) for value in (0.0, 2.0)),
+        (step_decay, "factor", 0.0),
+        (step_decay, "factor", 2.0),
     ],
 )
 def test_schedule_argument_out_of_range_raises(make, name, value):
-    others = {"every": 2, "factor": 0.5, "floor_lr": 0.0} if make is step_decay else {}
+    settings: dict[str, Any] = {}
+    if make is step_decay:
+        settings = {"every": 2, "factor": 0.5, "floor_lr": 0.0}
+    settings[name] = value
+
     with pytest.raises(UserError, match=f"^{name} must be .*, got {value}"):
-        rates(make, 5, **{**others, name: value})
+        rates(make, 5, **settings)
