@@ -202,7 +202,6 @@ CHANGED: list[tuple[str, Any]] = [
     ("tags", ["again"]),
     ("out", "elsewhere"),
     ("trainer.precision", "32-true"),
-    ("logger", None),
 ]
 """What an evaluation may change, each with another value than the run's."""
 
@@ -210,10 +209,14 @@ CHANGED: list[tuple[str, Any]] = [
 @pytest.mark.parametrize(("path", "value"), CHANGED)
 def test_evaluation_takes_changes_of_what_is_tested_and_how(run, path, value):
     argument = f"{path}={json.dumps(value)}"
-    if path == "logger":
-        argument = "logger=none"
 
     assert OmegaConf.select(evaluated(run, argument), path) == value
+
+
+def test_evaluation_takes_another_logger(run):
+    target = evaluated(run, "logger=csv").logger._target_
+
+    assert target == compose(["logger=csv"]).logger._target_
 
 
 @pytest.mark.parametrize(
