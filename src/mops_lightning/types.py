@@ -1,7 +1,8 @@
 """Types that data, samplers, tasks and metrics exchange, and the letters of their shapes.
 
 ``B`` clouds in a batch, ``N`` input points, ``M`` sampled points, ``C`` channels, ``S`` shapes in
-a split. Points are float32 ``(B, N, 3)`` in the unit sphere, without unit.
+a split. Points are float32 ``(B, N, 3 + C)``: x, y and z in the unit sphere, without unit, then
+channels, most often none (see ``channels``).
 """
 
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
@@ -20,7 +21,7 @@ class Batch(NamedTuple):
     """One batch of clouds.
 
     Attributes:
-        points: ``(B, N, 3)``.
+        points: ``(B, N, 3 + C)``.
         labels: ``(B,)`` int64 class numbers.
         rows: ``(B,)`` int64 rows of the clouds in their split, or None.
         parts: ``(B, N)`` int64 part numbers of the points, or ``UNKNOWN``; or None.
@@ -41,8 +42,8 @@ class PairBatch(NamedTuple):
     """One batch of pairs for registration.
 
     Attributes:
-        points: ``(2B, N, 3)`` all sources, then all targets, each with its centroid at the origin;
-            one tensor, so that a sampler processes all clouds in one pass.
+        points: ``(2B, N, 3 + C)`` all sources, then all targets, each with its centroid at the
+            origin; one tensor, so that a sampler processes all clouds in one pass.
         centroids: ``(2B, 3)`` the subtracted centroids.
         quaternion: ``(B, 4)`` rotation of the true motion from source to target, scalar first.
         translation: ``(B, 3)`` its translation. Both refer to the clouds before centring.
@@ -63,11 +64,11 @@ class SampleOutput(NamedTuple):
     """The output of every sampler; a NamedTuple, which device transfer and collation support.
 
     Attributes:
-        points: ``(B, M, 3)`` the sampled points.
+        points: ``(B, M, 3 + C)`` the sampled points.
         indices: ``(B, M)`` int64 rows of the input, or None when the points are generated.
         losses: the sampler's own weighted loss terms, to add to the task loss.
         matrix: the sampling matrix S that generated the points, or None.
-        soft_projected: ``(B, M, 3)`` points on which the task net is trained in place of
+        soft_projected: ``(B, M, 3 + C)`` points on which the task net is trained in place of
             ``points``, or None; only in training. See ``Sampler.project`` for the readout.
 
     Examples:
@@ -122,4 +123,4 @@ class PointFeatureNet(Protocol):
     """
 
     def point_features(self, points: Tensor) -> Tensor:
-        """Map ``(B, N, 3)`` points to non-negative features ``(B, N, C)``."""
+        """Map ``(B, N, 3 + C)`` points to non-negative features ``(B, N, C)``."""

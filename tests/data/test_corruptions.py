@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.data.corruptions import KINDS, corrupt
 from mops_lightning.errors import UserError
@@ -186,3 +187,69 @@ def test_parts_are_kept_where_points_were_only_moved(clouds, kind):
         assert torch.equal(corrupted.parts, parts)
     else:
         assert corrupted.parts is None
+
+
+NORMALS = PointChannels(
+    [Channel("intensity"), Channel("normal_x"), Channel("normal_y"), Channel("normal_z")]
+)
+
+
+def with_channels(clouds):
+    """Points of spheres with their rows as intensity, and their normals."""
+    places = torch.nn.functional.normalize(clouds.points, dim=2)
+    rows = torch.arange(N).expand(4, N)[..., None].float()
+    return clouds._replace(points=torch.cat([places, rows, places], 2))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_coordinates_are_corrupted_as_without_channels(clouds, kind):
+    given = with_channels(clouds)
+    bare = given._replace(points=given.points[..., :3].contiguous())
+
+    corrupted = corrupt(given, f"{kind}-3", NORMALS).points
+
+    torch.testing.assert_close(corrupted[..., :3], corrupt(bare, f"{kind}-3").points)
+
+
+@pytest.mark.parametrize("kind", SHRUNK)
+def test_removal_keeps_the_channels_of_points(clouds, kind):
+    given = with_channels(clouds)
+
+    corrupted = corrupt(given, f"{kind}-3", NORMALS).points
+
+    for cloud, before in zip(corrupted, given.points, strict=True):
+        assert torch.equal(cloud, before[cloud[:, 3].long()])
+
+
+@pytest.mark.parametrize("kind", GROWN)
+def test_added_points_have_the_channels_of_points_of_the_cloud(clouds, kind):
+    given = with_channels(clouds)
+
+    corrupted = corrupt(given, f"{kind}-3", NORMALS).points
+
+    for cloud, before in zip(corrupted, given.points, strict=True):
+        assert torch.equal(cloud[:N], before)
+        assert torch.equal(cloud[N:, 4:], before[cloud[N:, 3].long(), 4:])
+
+
+def test_rotation_turns_normals(clouds):
+    corrupted = corrupt(with_channels(clouds), "rotation-5", NORMALS).points
+
+    torch.testing.assert_close(corrupted[..., 4:], corrupted[..., :3], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["scaling", "shear"])
+def test_linear_map_keeps_normals_normal_to_the_surface(clouds, kind):
+    given = with_channels(clouds)
+
+    corrupted = corrupt(given, f"{kind}-5", NORMALS).points
+
+    # Tangents of the sphere, mapped as differences of points, stay orthogonal to the normals.
+    for before, after in zip(given.points, corrupted, strict=True):
+        affine = torch.linalg.lstsq(
+            torch.cat([before[:, :3], torch.ones(N, 1)], 1), after[:, :3]
+        ).solution
+        tangents = torch.linalg.cross(before[:, :3], torch.tensor([0.3, 0.5, 0.8]).expand(N, 3))
+        mapped = tangents @ affine[:3]
+        assert (mapped * after[:, 4:]).sum(1).abs().max() < 1e-4
+        torch.testing.assert_close(after[:, 4:].norm(dim=1), torch.ones(N))

@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import UserError
@@ -171,3 +172,59 @@ def test_loader_test_split_scores_each_cloud_once(processes):
         assert min(sizes) > 0
         labels = torch.cat([batch.labels for share in shares for batch in share])
         assert torch.equal(labels.sort().values, torch.arange(number))
+
+
+INTENSITY_AND_NORMALS = PointChannels(
+    [Channel("intensity"), Channel("normal_x"), Channel("normal_y"), Channel("normal_z")]
+)
+
+
+def sphere(rng):
+    """Points of unit spheres with an intensity and their normals, which are the points."""
+    places = torch.nn.functional.normalize(torch.randn(2, 50, 3, generator=rng), dim=2)
+    return torch.cat([places, torch.rand(2, 50, 1, generator=rng), places], 2)
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_augmentation_turns_normals_with_the_cloud(up, rng):
+    points = sphere(rng)
+
+    turned = Augmentation(rotate_up=up)(points, generator(1), INTENSITY_AND_NORMALS)
+
+    torch.testing.assert_close(turned[..., 4:], turned[..., :3])
+    assert torch.equal(turned[..., 3], points[..., 3])
+    assert not torch.allclose(turned[..., :3], points[..., :3])
+
+
+def test_augmentation_keeps_normals_normal_to_a_stretched_surface(rng):
+    points = sphere(rng)
+
+    stretched = Augmentation(stretch=3.0)(points, generator(1), INTENSITY_AND_NORMALS)
+
+    # The normal of an ellipsoid with the half axes a is x / a².
+    axes = stretched[..., :3].abs().div(points[..., :3].abs()).median(1, keepdim=True).values
+    expected = torch.nn.functional.normalize(stretched[..., :3] / axes.square(), dim=2)
+    torch.testing.assert_close(stretched[..., 4:], expected, atol=1e-5, rtol=1e-4)
+    assert torch.equal(stretched[..., 3], points[..., 3])
+
+
+def test_augmentation_moves_coordinates_as_without_channels(rng):
+    points = sphere(rng)
+    augment = Augmentation("z", 0.1, 2.0, 0.3)
+
+    with_channels = augment(points, generator(1), INTENSITY_AND_NORMALS)
+    without = augment(points[..., :3].contiguous(), generator(1))
+
+    torch.testing.assert_close(with_channels[..., :3], without)
+
+
+def test_loader_gives_channels_to_the_augmentation(rng):
+    points = sphere(rng)
+    split = Clouds(points, torch.arange(2))
+    loader = CloudLoader(
+        split, 2, augment=Augmentation(rotate_up="z"), channels=INTENSITY_AND_NORMALS
+    )
+
+    (batch,) = list(loader)
+
+    torch.testing.assert_close(batch.points[..., 4:], batch.points[..., :3])

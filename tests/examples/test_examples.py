@@ -31,6 +31,18 @@ SHORT = {
         "epochs.sampler=1",
     ],
     "06_registration.py": [*TINY, *SMALL_PCRNET, "sampler.m_max=16", "sizes=[8,16]"],
+    "07_channels.py": [
+        "trainer=cpu",
+        "logger=none",
+        "pictures=0",
+        "dataset.n_points=64",
+        "sampler.m_max=8",
+        "sizes=[4]",
+        "m=8",
+        "recipe.train_points=32",
+        "epochs.task=1",
+        "epochs.sampler=1",
+    ],
 }
 """Arguments that make an example short, by its name."""
 
@@ -41,6 +53,7 @@ LAST_LINE = {
     "04_own_sampler.py": r"fps: [\d.]+% of the shapes from 16 points",
     "05_own_scans.py": r"1024 points of rooms/room_\d.ply to 8, by the sampler in outputs/",
     "06_registration.py": r"Curves and clouds: tensorboard --logdir outputs/",
+    "07_channels.py": r"600 points to 8, \d+% of them on the line",
 }
 """What an example prints at its end, by its name."""
 

@@ -58,9 +58,9 @@ def test_compare_file_samples_once_before_it_measures_time(tmp_path, monkeypatch
     WRITERS[".ply"](tmp_path / "one.ply", Table(points))
     sizes, sample = [], compare.sample_cloud
 
-    def noted(points, *rest):
+    def noted(points, *rest, **named):
         sizes.append(len(points))
-        return sample(points, *rest)
+        return sample(points, *rest, **named)
 
     monkeypatch.setattr(compare, "sample_cloud", noted)
     methods = options_by_method(60, ["random", "fps"], None, None, 0)

@@ -54,12 +54,11 @@ def test_points_of_a_map_are_chosen_alike_in_python_and_by_the_command_line(meth
     _, rows = downsample(points, 30, method, seed=0 if method == "serial" else 8)
 
     options = Options(30, method=method, seed=8)
-    by_file, kept = sample_cloud(
+    by_file, _ = sample_cloud(
         points.numpy(), sampler_of(method, 30, 8), 30, options, Path("map.las")
     )
     assert by_file is not None
     assert by_file.tolist() == rows.tolist()
-    assert (kept == points.numpy()[by_file]).all()
 
 
 @pytest.mark.parametrize("start", [None, 17, "farthest"])

@@ -141,7 +141,7 @@ def test_other_size_needs_flexible_sampler(make, clouds):
     ("points", "named"),
     [
         (torch.zeros(N, 3), "shape"),
-        (torch.zeros(B, N, 4), "shape"),
+        (torch.zeros(B, N, 2), "shape"),
         (torch.zeros(B, 1, N, 3), "shape"),
         (torch.zeros(0, N, 3), "at least one"),
         (torch.zeros(B, 0, 3), "at least one"),

@@ -156,3 +156,37 @@ def test_to_y_up_is_a_rotation_that_raises_the_vertical_axis(up):
 
     assert turned["xyz".index(up)].tolist() == [0, 1, 0]
     assert torch.linalg.det(turned) == 1
+
+
+def test_colours_by_channel_have_one_scale_for_all_sets():
+    points = torch.zeros(1, 101, 4)
+    points[0, :, 3] = torch.arange(101)
+    sample = points[:, [0, 50, 100]]
+
+    colours = figures.colours_by_channel(3, {"input": points, "sampled": sample})
+
+    assert colours["input"].shape == (1, 101, 3)
+    np.testing.assert_array_equal(colours["sampled"], colours["input"][:, [0, 50, 100]])
+    dark, middle, bright = colours["sampled"][0].sum(1)
+    assert dark < middle < bright
+
+
+def test_colours_by_a_constant_channel_are_equal():
+    colours = figures.colours_by_channel(3, {"input": torch.ones(2, 9, 4)})
+
+    assert len(np.unique(colours["input"].reshape(-1, 3), axis=0)) == 1
+
+
+def test_cloud_grid_draws_points_in_the_colours_of_a_channel(tmp_path, rng):
+    points = torch.rand(1, 300, 4, generator=rng)
+    points[..., 3] = (points[..., 1] > 0.5).float()  # bright above, dark below
+
+    figure = figures.cloud_grid(points, {"sampled": points[:, :40]}, ["a cloud"], channel=3)
+
+    image = pixels(figure, tmp_path)
+    bright = np.abs(image - np.array([253, 231, 37]) / 255).max(2) < 0.1
+    dark = np.abs(image - np.array([68, 1, 84]) / 255).max(2) < 0.1
+    for half in (slice(0, image.shape[1] // 2), slice(image.shape[1] // 2, None)):
+        assert bright[:, half].sum() > 50
+        assert dark[:, half].sum() > 50
+        assert bright[:, half].nonzero()[0].mean() < dark[:, half].nonzero()[0].mean()

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from mops_lightning import FMOPSNet, FPSSampler, MOPSNet, SampleNet, SNet, load
+from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.errors import UserError
 from mops_lightning.zoo.export import export
 
@@ -80,3 +81,31 @@ def test_sampler_that_is_not_learned_is_not_exported(tmp_path):
     with pytest.raises(UserError, match="FPSSampler cannot be exported"):
         export(FPSSampler(8).eval(), tmp_path / "net.onnx")
     assert not list(tmp_path.iterdir())
+
+
+CHANNELS = PointChannels(
+    [Channel("intensity"), Channel("normal_x"), Channel("normal_y"), Channel("normal_z")]
+)
+
+
+@pytest.mark.parametrize(
+    ("sampler", "width"),
+    [
+        (MOPSNet(8, point_channels=CHANNELS, **SMALL), 7),
+        (FMOPSNet(8, point_channels=CHANNELS, **SMALL), 7),
+        (SNet(8, feature_channels=(8, 8), head_channels=(8,), point_channels=CHANNELS), 3),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_exported_program_takes_channels(sampler, width, tmp_path):
+    points = torch.cat([clouds(2, 50), clouds(2, 51)[:, :50], clouds(2, 52)[:, :50, :1]], 2)
+    points = CHANNELS.renormalised(points)
+    sampler.eval()
+
+    export(sampler, tmp_path / "net.pt2")
+
+    program = torch.export.load(tmp_path / "net.pt2").module()
+    with torch.no_grad():
+        generated = program(points)
+        assert generated.shape == (2, 8, width)
+        assert torch.allclose(generated, sampler(points).points[..., :width], atol=1e-5)

@@ -120,6 +120,7 @@ def _card(path: Path) -> list[str]:
         "task": f"{chosen['task']} by {chosen['net']}",
         "sizes": _sizes(card),
         "input": "clouds in the unit sphere (centroid at the origin, largest distance from it 1)",
+        "channels": ", ".join(name for name, _, _ in card.get("channels", [])),
         "test figures": _figures(card),
         "data": _data(config),
         "recipe": " ".join(record["overrides"]) or "the defaults",

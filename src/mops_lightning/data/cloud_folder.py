@@ -2,21 +2,25 @@
 
 import hashlib
 import sys
-import zlib
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 from torch import Tensor
 
+from mops_lightning.data.cloud_files import (
+    Content,
+    Reading,
+    append_features,
+    read_clouds,
+    with_progress,
+)
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, make_dataset
-from mops_lightning.data.crops import CROPS, CROPS_PER_FILE, Crop, random_crops
+from mops_lightning.data.crops import Crop
 from mops_lightning.data.file_splits import (
     SPLITS,
     SourceFile,
@@ -26,35 +30,15 @@ from mops_lightning.data.file_splits import (
     split_by_share,
     split_by_time,
 )
-from mops_lightning.data.formats.bin_columns import check_columns
 from mops_lightning.data.formats.mesh import SUFFIXES as MESHES
-from mops_lightning.data.formats.registry import READABLE, read
+from mops_lightning.data.formats.registry import READABLE
 from mops_lightning.data.surfaces import VERSION, sample_surface
-from mops_lightning.errors import UserError, check_at_least, did_you_mean
+from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.filesystem import remove_temporary
-from mops_lightning.ops.points import normalize_unit_sphere
-from mops_lightning.seeding import derive_seed
 from mops_lightning.types import UNKNOWN
 
 CONSEQUENCE = {"train": "never learned", "test": "never scored"}
 """What happens to a class without files in a split."""
-
-
-@dataclass(frozen=True)
-class Content:
-    """What was read from one file.
-
-    Attributes:
-        file: the file.
-        clouds: ``(crops, n_points, 3)`` float32, in the unit sphere.
-        numbers: ``(crops, n_points)`` int64, the part number of every point; None without parts.
-        digest: sha256 of a mesh file; empty for other files.
-    """
-
-    file: SourceFile
-    clouds: Tensor
-    numbers: NDArray[np.int64] | None = None
-    digest: str = ""
 
 
 def cloud_folder(
@@ -72,6 +56,7 @@ def cloud_folder(
     crops: int | None,
     label: str | None = None,
     columns: Sequence[str] | None = None,
+    features: Sequence[str] | None = None,
 ) -> CloudDataset:
     """Read the clouds or meshes in a folder and its subfolders, one per file.
 
@@ -99,30 +84,26 @@ def cloud_folder(
             0 if that is unknown; None: the points have no parts. Not with ``surface``.
         columns: names of the columns of .bin files, which have no header; None: those that their
             names imply. Not with ``surface``.
+        features: names of columns that nets see as channels beside x, y and z, in this order.
+            ``normals`` and ``curvature`` are estimated where a file has no such columns. Not with
+            ``surface``.
 
     Returns:
-        Float32 clouds ``(S, n_points, 3)`` in the unit sphere, with the centroid at the origin, and
-        classes in alphabetical order. ``notes`` has the number of files per split. The fingerprint
-        depends on the content of the files and the arguments, not on ``root``.
+        Float32 clouds ``(S, n_points, 3 + C)`` in the unit sphere, with the centroid at the origin.
+        Channels have mean 0 and standard deviation 1 over the training clouds; normals have length
+        1; ``channels`` has the statistics. Classes are in alphabetical order. ``notes`` has the
+        number of files per split. The fingerprint depends on the content of the files and the
+        arguments, not on ``root``.
 
     Raises:
         UserError: an argument or a file is invalid, or a split is empty.
     """
-    check_at_least(2, n_points=n_points)
-    check_at_least(0, seed=seed, gap=gap)
-    if test_frames not in (None, "last"):
-        raise UserError(f"test_frames must be last or null, got {test_frames!r}.")
     if not 0 < test_share < 1:
         raise UserError(f"test_share must be between 0 and 1, got {test_share}.")
-    if crop not in CROPS:
-        raise UserError(f"crop: unknown {crop!r}.{did_you_mean(crop, CROPS)}")
-    if crops is None:
-        crops = CROPS_PER_FILE[crop]
-    check_at_least(1, crops=crops)
-    if crop == "surface":
-        _check_surface(crops, label, columns)
-    if columns is not None:
-        columns = check_columns("columns", columns)
+    if test_frames not in (None, "last"):
+        raise UserError(f"test_frames must be last or null, got {test_frames!r}.")
+    check_at_least(0, gap=gap)
+    reading = Reading.of(n_points, crop, crops, seed, label, columns, features)
 
     folder = Path(root).expanduser()
     suffixes = MESHES if crop == "surface" else READABLE
@@ -136,25 +117,16 @@ def cloud_folder(
     notes = _notes(folder, files, class_names)
     if crop == "surface":
         contents = _read_meshes(folder, files, n_points, seed, cache)
-        splits = _clouds_of_splits(contents, class_names, crops)
+        splits = _clouds_of_splits(contents, class_names, reading.crops)
         fingerprint = _fingerprint_of_meshes(contents, n_points, seed, class_names)
         return CloudDataset(class_names, splits["train"], splits["test"], fingerprint, notes)
-    contents = _read_clouds(folder, files, n_points, crop, crops, seed, label, columns)
+    contents = read_clouds(folder, files, reading)
+    contents, channels = append_features(contents, reading.features)
     numbers = _known_numbers(contents)
-    splits = _clouds_of_splits(contents, class_names, crops, numbers)
-    dataset = make_dataset("clouds", splits, class_names, None, folder)
+    splits = _clouds_of_splits(contents, class_names, reading.crops, numbers)
+    dataset = make_dataset("clouds", splits, class_names, None, folder, channels=channels)
     part_names = tuple(str(number) for number in numbers.tolist())
     return replace(dataset, notes=notes, part_names=part_names)
-
-
-def _check_surface(crops: int, label: str | None, columns: Sequence[str] | None) -> None:
-    """Refuse what points on the surface of a mesh do not have."""
-    if crops != 1:
-        raise UserError(f"crops must be 1 with crop=surface, got {crops}.")
-    if label is not None:
-        raise UserError(f"label must be null with crop=surface, got {label!r}.")
-    if columns is not None:
-        raise UserError(f"columns must be null with crop=surface, got {list(columns)}.")
 
 
 def _read_meshes(
@@ -166,41 +138,10 @@ def _read_meshes(
         kept = Path(cache).expanduser()
         remove_temporary(kept, below=False)
     contents = []
-    for file in _with_progress(files):
+    for file in with_progress(files):
         digest, cloud = sample_surface(folder / file.name, n_points, seed, kept)
         contents.append(Content(file, cloud[None], digest=digest))
     return contents
-
-
-def _read_clouds(
-    folder: Path,
-    files: Sequence[SourceFile],
-    n_points: int,
-    crop: Crop,
-    crops: int,
-    seed: int,
-    label: str | None,
-    columns: Sequence[str] | None,
-) -> list[Content]:
-    """Draw crops of every cloud."""
-    contents = []
-    for file in _with_progress(files):
-        path = folder / file.name
-        rng = np.random.default_rng(derive_seed(seed, zlib.crc32(str(file.name).encode())))
-        table = read(path, max(10_000, 8 * n_points), seed, columns=columns).finite()
-        drawn = random_crops(table.points, n_points, crops, crop, rng, path)
-        numbers = None
-        if label is not None:
-            numbers = table.whole_numbers(label, path)[drawn.rows]
-        clouds = normalize_unit_sphere(torch.from_numpy(drawn.points))
-        contents.append(Content(file, clouds, numbers))
-    return contents
-
-
-def _with_progress(files: Sequence[SourceFile]) -> Iterable[SourceFile]:
-    """Show on a terminal how many files have been read."""
-    console = Console(stderr=True)
-    return track(files, "Reading files", console=console, disable=not console.is_terminal)
 
 
 def _known_numbers(contents: Sequence[Content]) -> NDArray[np.int64]:

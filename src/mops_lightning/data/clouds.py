@@ -3,13 +3,14 @@
 import hashlib
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from mops_lightning.channels import NO_CHANNELS, PointChannels, coordinates, with_coordinates
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.seeding import generator
 from mops_lightning.types import UNKNOWN
@@ -24,7 +25,7 @@ class Clouds(NamedTuple):
     """One split.
 
     Attributes:
-        points: ``(S, N, 3)`` float32.
+        points: ``(S, N, 3 + C)`` float32.
         labels: ``(S,)`` int64, positions in ``CloudDataset.class_names``.
         sources: ``(S,)`` int64, the same number for clouds that must be in the same split, such as
             the crops of a file; None: no two must.
@@ -58,6 +59,7 @@ class CloudDataset:
             nets.
         notes: facts for the run record, such as the number of files.
         part_names: the parts of shapes, in the order of ``Clouds.parts``; empty without parts.
+        channels: of the points, beside x, y and z.
     """
 
     class_names: tuple[str, ...]
@@ -66,6 +68,36 @@ class CloudDataset:
     fingerprint: str
     notes: dict[str, Any] = field(default_factory=dict)
     part_names: tuple[str, ...] = ()
+    channels: PointChannels = NO_CHANNELS
+
+    def scaled_as(self, channels: PointChannels, source: str) -> "CloudDataset":
+        """Return the data with channels scaled as those that a net was trained with.
+
+        Args:
+            channels: of the net.
+            source: of the net, for the error.
+
+        Raises:
+            UserError: they have other names, or another order.
+        """
+        if channels == self.channels:
+            return self
+        if channels.names != self.channels.names:
+            wanted = ", ".join(channels.features)
+            found = ", ".join(self.channels.features) or "none"
+            advice = f"Set dataset.features=[{wanted}]." if channels else "Leave features out."
+            raise UserError(
+                f"{source} was trained with the features {wanted or 'none'}, but dataset.features "
+                f"gives {found}. {advice}"
+            )
+        train = self._rescaled(self.train, channels)
+        test = self._rescaled(self.test, channels)
+        return replace(self, train=train, test=test, channels=channels)
+
+    def _rescaled(self, clouds: Clouds, channels: PointChannels) -> Clouds:
+        values = self.channels.restored(clouds.points[..., 3:].double())
+        scaled = channels.scaled(values).to(clouds.points.dtype)
+        return clouds._replace(points=torch.cat([clouds.points[..., :3], scaled], -1))
 
 
 def choose_classes(classes: Sequence[str] | None, known: Sequence[str]) -> tuple[str, ...]:
@@ -95,6 +127,7 @@ def make_dataset(
     classes: Sequence[str] | None,
     folder: Path,
     files: Mapping[str, Sequence[str]] | None = None,
+    channels: PointChannels = NO_CHANNELS,
 ) -> CloudDataset:
     """Keep the chosen classes of both splits and compute the fingerprint of the result.
 
@@ -105,6 +138,7 @@ def make_dataset(
         classes: names to keep; None or empty means all.
         folder: source of the files, for errors.
         files: names of the files of every split, part of the fingerprint; None leaves them out.
+        channels: of the points.
 
     Raises:
         UserError: a class is unknown, or a split has no shapes.
@@ -112,6 +146,8 @@ def make_dataset(
     chosen = choose_classes(classes, known)
     n_points = splits["train"].points.shape[1]
     digest = hashlib.sha256(repr((kind, n_points, chosen)).encode())
+    if channels:
+        digest.update(repr(channels.to_plain()).encode())
     # The new label of every class; -1 for those that are left out.
     table = torch.tensor([chosen.index(name) if name in chosen else -1 for name in known])
     kept = []
@@ -128,7 +164,7 @@ def make_dataset(
         if clouds.parts is not None:
             digest.update(clouds.parts.numpy().data)
         kept.append(clouds)
-    return CloudDataset(chosen, kept[0], kept[1], digest.hexdigest())
+    return CloudDataset(chosen, kept[0], kept[1], digest.hexdigest(), channels=channels)
 
 
 def check_parts(dataset: CloudDataset) -> None:
@@ -160,18 +196,19 @@ def noisy(clouds: Clouds, noise: float) -> Clouds:
         clouds: a split.
         noise: standard deviation in units of the coordinates; 0.1 is 10 % in the paper.
     """
-    points = clouds.points
     if not noise:
         return clouds
+    points = coordinates(clouds.points)
     drawn = [
         torch.randn(points.shape[1:], generator=generator(NOISE, s)) for s in range(len(points))
     ]
-    return clouds._replace(points=points + noise * torch.stack(drawn))
+    moved = points + noise * torch.stack(drawn)
+    return clouds._replace(points=with_coordinates(clouds.points, moved))
 
 
 def scale_warning(dataset: CloudDataset) -> str | None:
     """Return one line about training clouds far from the unit sphere, else None."""
-    radius = dataset.train.points.norm(dim=2).amax(1).median().item()
+    radius = coordinates(dataset.train.points).norm(dim=2).amax(1).median().item()
     if 0.5 <= radius <= 2:
         return None
     return (

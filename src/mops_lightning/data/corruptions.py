@@ -6,11 +6,13 @@ et al., 2022). Clouds are drawn and corrupted here, so that figures on their fil
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
+from mops_lightning.channels import NO_CHANNELS, PointChannels, coordinates, with_coordinates
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.ops.points import normalize_unit_sphere
@@ -20,26 +22,75 @@ from mops_lightning.seeding import generator
 STREAM = 17
 """Random stream of the corruptions of test clouds."""
 
-Corruption = Callable[[Tensor, float, torch.Generator], Tensor]
-"""Corrupts a cloud ``(N, 3)`` at a level; the number of points returned depends on both only."""
+
+class Cloud(NamedTuple):
+    """One cloud and what its channels are.
+
+    Attributes:
+        points: ``(N, 3 + C)``.
+        channels: of the points.
+    """
+
+    points: Tensor
+    channels: PointChannels
+
+    @property
+    def places(self) -> Tensor:
+        """The coordinates ``(N, 3)``."""
+        return coordinates(self.points)
+
+    def at(self, places: Tensor) -> "Cloud":
+        """Return the points at other coordinates."""
+        return self._replace(points=with_coordinates(self.points, places))
+
+    def mapped(self, matrix: Tensor) -> "Cloud":
+        """Return the points times an invertible matrix; normals stay normal."""
+        return self._replace(points=self.channels.mapped(self.points, matrix))
+
+    def normalised(self) -> "Cloud":
+        """Return the points in the unit sphere."""
+        return self.at(normalize_unit_sphere(self.places[None])[0])
+
+    def without(self, rows: Tensor) -> "Cloud":
+        """Return the points that are not in ``rows``."""
+        kept = torch.ones(len(self.points), dtype=torch.bool)
+        kept[rows] = False
+        return self._replace(points=self.points[kept])
+
+    def followed_by(self, places: Tensor, rng: torch.Generator) -> "Cloud":
+        """Return the points and further ones, which have the channels of random points."""
+        added = places
+        if self.channels:
+            rows = torch.randint(len(self.points), (len(places),), generator=rng)
+            added = torch.cat([places, self.points[rows, 3:]], 1)
+        return self._replace(points=torch.cat([self.points, added]))
 
 
-def corrupt(clouds: Clouds, spec: str) -> Clouds:
+Corruption = Callable[[Cloud, float, torch.Generator], Cloud]
+"""Corrupts a cloud at a level; the number of points returned depends on both only."""
+
+
+def corrupt(clouds: Clouds, spec: str, channels: PointChannels = NO_CHANNELS) -> Clouds:
     """Corrupt every cloud of a split.
 
     The draw depends on the position of a cloud in the split only, so that every method is tested on
     the same clouds. Points that a corruption adds come last. Parts are kept where no point is
-    added or removed.
+    added or removed. Normals turn with the surface, except under ``distortion``; other channels
+    stay with their points.
 
     Args:
         clouds: a split, in the unit sphere.
         spec: kind and severity, such as ``shear-3``, of ``KINDS`` and 1 to 5.
+        channels: of the points.
 
     Raises:
         UserError: there is no such kind or severity.
     """
     apply, level = parse(spec)
-    points = [apply(cloud, level, generator(STREAM, s)) for s, cloud in enumerate(clouds.points)]
+    points = [
+        apply(Cloud(cloud, channels), level, generator(STREAM, s)).points
+        for s, cloud in enumerate(clouds.points)
+    ]
     stacked = torch.stack(points)
     same = stacked.shape == clouds.points.shape  # the same points in the same order, moved
     return clouds._replace(points=stacked, parts=clouds.parts if same else None)
@@ -58,99 +109,105 @@ def parse(spec: str) -> tuple[Corruption, float]:
     return apply, levels[int(severity) - 1]
 
 
-def jitter(points: Tensor, std: float, rng: torch.Generator) -> Tensor:
+def jitter(cloud: Cloud, std: float, rng: torch.Generator) -> Cloud:
     """Add Gaussian noise to every coordinate."""
-    return points + std * torch.randn(points.shape, generator=rng)
+    places = cloud.places
+    return cloud.at(places + std * torch.randn(places.shape, generator=rng))
 
 
-def rotation(points: Tensor, degrees: float, rng: torch.Generator) -> Tensor:
+def rotation(cloud: Cloud, degrees: float, rng: torch.Generator) -> Cloud:
     """Rotate by an angle of up to ``degrees`` about a random axis."""
     axis = normalize(torch.randn(3, generator=rng), dim=0)
     half = math.radians(degrees) * _uniform((1,), rng) / 2
-    return points @ quaternion_to_matrix(torch.cat([half.cos(), half.sin() * axis]))
+    return cloud.mapped(quaternion_to_matrix(torch.cat([half.cos(), half.sin() * axis])))
 
 
-def scaling(points: Tensor, factor: float, rng: torch.Generator) -> Tensor:
+def scaling(cloud: Cloud, factor: float, rng: torch.Generator) -> Cloud:
     """Scale each axis by a factor between ``1 / factor`` and ``factor``."""
-    return _normalised(points * factor ** _uniform((3,), rng))
+    factors = factor ** _uniform((3,), rng)
+    stretched = cloud.channels.stretched(cloud.points, factors)
+    return cloud._replace(points=stretched).normalised()
 
 
-def shear(points: Tensor, amount: float, rng: torch.Generator) -> Tensor:
+def shear(cloud: Cloud, amount: float, rng: torch.Generator) -> Cloud:
     """Add multiples of the other coordinates, up to ``amount``, to every coordinate."""
     mixed = amount * _uniform((3, 3), rng)
-    return _normalised(points @ (torch.eye(3) + mixed.fill_diagonal_(0)))
+    return cloud.mapped(torch.eye(3) + mixed.fill_diagonal_(0)).normalised()
 
 
-def distortion(points: Tensor, amount: float, rng: torch.Generator) -> Tensor:
+def distortion(cloud: Cloud, amount: float, rng: torch.Generator) -> Cloud:
     """Move the nodes of a lattice of 5 x 5 x 5 by up to ``amount``, and the points with them."""
     lattice = amount * _uniform((1, 3, 5, 5, 5), rng)
-    moved = grid_sample(lattice, points[None, None, None], align_corners=True)
-    return _normalised(points + moved[0, :, 0, 0].T)
+    places = cloud.places
+    moved = grid_sample(lattice, places[None, None, None], align_corners=True)
+    return cloud.at(places + moved[0, :, 0, 0].T).normalised()
 
 
-def density_down(points: Tensor, places: float, rng: torch.Generator) -> Tensor:
+def density_down(cloud: Cloud, places: float, rng: torch.Generator) -> Cloud:
     """Thin the cloud to a quarter in ``places`` neighbourhoods of a tenth of the points."""
-    size = len(points) // 10
+    size = len(cloud.points) // 10
     for _ in range(int(places)):
-        near = _nearest(points, size, rng)
+        near = _nearest(cloud, size, rng)
         gone = near[torch.randperm(size, generator=rng)[: round(0.75 * size)]]
-        points = _without(points, gone)
-    return points
+        cloud = cloud.without(gone)
+    return cloud
 
 
-def density_up(points: Tensor, places: float, rng: torch.Generator) -> Tensor:
+def density_up(cloud: Cloud, places: float, rng: torch.Generator) -> Cloud:
     """Thin the cloud outside of ``places`` neighbourhoods, by as many points as there go inside."""
-    size = len(points) // 10
-    outside = torch.ones(len(points), dtype=torch.bool)
+    size = len(cloud.points) // 10
+    outside = torch.ones(len(cloud.points), dtype=torch.bool)
     for _ in range(int(places)):
-        outside[_nearest(points, size, rng)] = False
+        outside[_nearest(cloud, size, rng)] = False
     rows = outside.nonzero()[:, 0]
     gone = rows[torch.randperm(len(rows), generator=rng)[: int(places) * round(0.75 * size)]]
-    return _without(points, gone)
+    return cloud.without(gone)
 
 
-def cutout(points: Tensor, holes: float, rng: torch.Generator) -> Tensor:
+def cutout(cloud: Cloud, holes: float, rng: torch.Generator) -> Cloud:
     """Cut ``holes`` holes of three percent of the points each."""
-    size = round(0.03 * len(points))
+    size = round(0.03 * len(cloud.points))
     for _ in range(int(holes)):
-        points = _without(points, _nearest(points, size, rng))
-    return points
+        cloud = cloud.without(_nearest(cloud, size, rng))
+    return cloud
 
 
-def drop_global(points: Tensor, share: float, rng: torch.Generator) -> Tensor:
+def drop_global(cloud: Cloud, share: float, rng: torch.Generator) -> Cloud:
     """Drop a share of the points at random."""
-    order = torch.randperm(len(points), generator=rng)
-    return _without(points, order[: round(share * len(points))])
+    number = len(cloud.points)
+    order = torch.randperm(number, generator=rng)
+    return cloud.without(order[: round(share * number)])
 
 
-def drop_local(points: Tensor, share: float, rng: torch.Generator) -> Tensor:
+def drop_local(cloud: Cloud, share: float, rng: torch.Generator) -> Cloud:
     """Drop a share of the points around one to eight places."""
-    for size in _split(round(share * len(points)), rng):
-        points = _without(points, _nearest(points, size, rng))
-    return points
+    for size in _split(round(share * len(cloud.points)), rng):
+        cloud = cloud.without(_nearest(cloud, size, rng))
+    return cloud
 
 
-def add_global(points: Tensor, share: float, rng: torch.Generator) -> Tensor:
+def add_global(cloud: Cloud, share: float, rng: torch.Generator) -> Cloud:
     """Add points that are uniform in the unit ball; ``share`` is relative to the cloud."""
-    count = round(share * len(points))
+    count = round(share * len(cloud.points))
     direction = normalize(torch.randn(count, 3, generator=rng), dim=1)
     radius = torch.rand(count, 1, generator=rng) ** (1 / 3)
-    return torch.cat([points, radius * direction])
+    return cloud.followed_by(radius * direction, rng)
 
 
-def add_local(points: Tensor, share: float, rng: torch.Generator) -> Tensor:
+def add_local(cloud: Cloud, share: float, rng: torch.Generator) -> Cloud:
     """Add points around one to eight points, at distances of about 0.1."""
+    places = cloud.places
     added = []
-    for size in _split(round(share * len(points)), rng):
-        centre = points[torch.randint(len(points), (), generator=rng)]
+    for size in _split(round(share * len(places)), rng):
+        centre = places[torch.randint(len(places), (), generator=rng)]
         std = 0.1 + 0.025 * _uniform((), rng)
         added.append(centre + std * torch.randn(size, 3, generator=rng))
-    return torch.cat([points, *added])
+    return cloud.followed_by(torch.cat(added), rng)
 
 
-def background(points: Tensor, share: float, rng: torch.Generator) -> Tensor:
+def background(cloud: Cloud, share: float, rng: torch.Generator) -> Cloud:
     """Add points that are uniform in the cube from -1 to 1."""
-    return torch.cat([points, _uniform((round(share * len(points)), 3), rng)])
+    return cloud.followed_by(_uniform((round(share * len(cloud.points)), 3), rng), rng)
 
 
 KINDS: dict[str, tuple[Corruption, tuple[float, float, float, float, float]]] = {
@@ -176,20 +233,11 @@ def _uniform(shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
     return 2 * torch.rand(shape, generator=rng) - 1
 
 
-def _normalised(points: Tensor) -> Tensor:
-    return normalize_unit_sphere(points[None])[0]
-
-
-def _nearest(points: Tensor, size: int, rng: torch.Generator) -> Tensor:
+def _nearest(cloud: Cloud, size: int, rng: torch.Generator) -> Tensor:
     """Return the rows of the points nearest to a random point."""
-    centre = points[torch.randint(len(points), (), generator=rng)]
-    return (points - centre).norm(dim=1).topk(size, largest=False).indices
-
-
-def _without(points: Tensor, rows: Tensor) -> Tensor:
-    kept = torch.ones(len(points), dtype=torch.bool)
-    kept[rows] = False
-    return points[kept]
+    places = cloud.places
+    centre = places[torch.randint(len(places), (), generator=rng)]
+    return (places - centre).norm(dim=1).topk(size, largest=False).indices
 
 
 def _split(total: int, rng: torch.Generator) -> list[int]:

@@ -7,6 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Generator, Tensor
 
+from mops_lightning.channels import NO_CHANNELS, PointChannels, coordinates, with_coordinates
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.seeding import generator
@@ -48,8 +49,13 @@ class Augmentation:
                 f"{self.rotate_up!r}."
             )
 
-    def __call__(self, points: Tensor, rng: Generator) -> Tensor:
-        """Return the augmented ``(B, N, 3)`` points."""
+    def __call__(
+        self, points: Tensor, rng: Generator, channels: PointChannels = NO_CHANNELS
+    ) -> Tensor:
+        """Return the augmented ``(B, N, 3 + C)`` points; their normals turn with them.
+
+        Other channels stay as they are. The random numbers do not depend on the channels.
+        """
         if self.rotate_up:
             angle = torch.rand(len(points), generator=rng) * (2 * torch.pi)
             cos = angle.cos()
@@ -59,16 +65,19 @@ class Augmentation:
             # These matrices are for y; moved along the diagonal, they are for another axis.
             up = self.rotate_up if isinstance(self.rotate_up, str) else "y"
             shift = AXES.index(up) - AXES.index("y")
-            points = points @ torch.stack(rows, 1).view(-1, 3, 3).roll((shift, shift), (1, 2))
+            matrix = torch.stack(rows, 1).view(-1, 3, 3).roll((shift, shift), (1, 2))
+            points = channels.rotated(points, matrix)
         if self.jitter:
             most = JITTER_CLIP * self.jitter
-            noise = torch.randn(points.shape, generator=rng).mul_(self.jitter)
-            points = points + noise.clamp_(-most, most)
+            places = coordinates(points)
+            noise = torch.randn(places.shape, generator=rng).mul_(self.jitter)
+            points = with_coordinates(points, places + noise.clamp_(-most, most))
         if self.stretch > 1 or self.shift:
             scale, offset = torch.rand(2, len(points), 1, 3, generator=rng)
             least = 1 / self.stretch
-            points = points * (least + (self.stretch - least) * scale)
-            points = points + self.shift * (2 * offset - 1)
+            points = channels.stretched(points, least + (self.stretch - least) * scale)
+            moved = coordinates(points) + self.shift * (2 * offset - 1)
+            points = with_coordinates(points, moved)
         return points
 
 
@@ -97,6 +106,7 @@ class CloudLoader:
         drop_last: whether to drop an incomplete last batch, because BatchNorm cannot train on a
             single cloud; the only batch is never dropped.
         seed: seed of the order, the augmentation and ``make_batch``.
+        channels: of the points.
         part: rank of this process and number of processes, which share every batch. With
             ``shuffle``, all shares have the same size; otherwise none is empty.
     """
@@ -108,6 +118,7 @@ class CloudLoader:
     make_batch: MakeBatch | None = None
     drop_last: bool = False
     seed: int = 0
+    channels: PointChannels = NO_CHANNELS
     part: tuple[int, int] = (0, 1)
 
     def __post_init__(self) -> None:
@@ -153,7 +164,8 @@ class CloudLoader:
         for batch, (chosen, mine) in enumerate(self._cut(order)[start:], start):
             points = self.clouds.points[chosen]
             if self.augment is not None:  # the full batch, which shares one generator
-                points = self.augment(points, generator(self.seed, epoch, batch))
+                rng = generator(self.seed, epoch, batch)
+                points = self.augment(points, rng, self.channels)
             last = batch + 1 == self.batches
             self.epoch, self.position = (epoch + 1, 0) if last else (epoch, batch + 1)
             yield self._made(points[mine], chosen[mine], epoch)

@@ -16,11 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mops_lightning.channels import PointChannels, coordinates
 from mops_lightning.data.formats.cloud_file import PART, CloudFile
 from mops_lightning.data.formats.guard import check_coordinates, check_size
 from mops_lightning.data.formats.registry import open_cloud_file
-from mops_lightning.data.formats.table import Table, join_tables
+from mops_lightning.data.formats.table import Column, Table, join_tables
 from mops_lightning.files.engine import Engine
+from mops_lightning.files.features import channels_for, generated_columns, with_channels
 from mops_lightning.files.options import Options
 from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.nearest import nearest
@@ -92,14 +94,20 @@ def sample_by_chunks(
     check_size(source, number, m, options.area)
     centre = summed / number
     sphere = UnitSphere(centre, max(over("radius", _radius, centre)) or 1.0)
-    global_ = reduce(torch.maximum, over("global feature", _of_normalised, sphere, net.global_part))
+    seen = Seen(sphere, sampler.point_channels)
+    global_ = reduce(torch.maximum, over("global feature", _of_seen, seen, net.global_part))
     sum_part = partial(net.sum_part, global_=global_, m=m)
-    sums: Partial = reduce(Partial.merge, over("sampling", _of_normalised, sphere, sum_part))
-    generated = sums.result()
+    sums: Partial = reduce(Partial.merge, over("sampling", _of_seen, seen, sum_part))
+    generated = sampler.point_channels.renormalised(sums.result())
+    places = coordinates(generated)
     outcome = Outcome(m, number, 0 if options.area else file.number - number)
     if options.readout == "generated":
-        return Table(sphere.restore(generated), header=file.header), outcome
-    matched: Nearest = reduce(Nearest.merge, over("matching", _nearest, sphere, generated))
+        columns: Mapping[str, Column] = {}
+        if sampler.point_channels and not options.coordinates_only:
+            some = cloud.read(row_ranges[0])
+            columns = generated_columns(some, sampler.point_channels, generated[:, 3:])
+        return Table(sphere.restore(places), columns, file.header), outcome
+    matched: Nearest = reduce(Nearest.merge, over("matching", _nearest, sphere, places))
     kept = replace(matched.table, header=file.header)
     return kept.without_attributes() if options.coordinates_only else kept, outcome
 
@@ -209,11 +217,26 @@ def _radius(cloud: CloudFile, centre: NDArray[np.float64], rows: range) -> float
     return largest_distance(cloud.read(rows).points, centre)
 
 
-def _of_normalised(
-    cloud: CloudFile, sphere: UnitSphere, function: Callable[[Tensor], Any], rows: range
-) -> Any:
-    points = sphere.normalise(cloud.read(rows).points)
-    return function(points) if len(points) else None
+class Seen(NamedTuple):
+    """How a sampler sees the points of a file.
+
+    Attributes:
+        sphere: around all points.
+        channels: of the sampler; features are columns of the file, because they are not estimated
+            from a part of it.
+    """
+
+    sphere: UnitSphere
+    channels: PointChannels
+
+
+def _of_seen(cloud: CloudFile, seen: Seen, function: Callable[[Tensor], Any], rows: range) -> Any:
+    table = cloud.read(rows)
+    if not len(table.points):
+        return None
+    places = seen.sphere.normalise(table.points)
+    channels = channels_for(table, seen.channels, cloud.path, estimates=False)
+    return function(with_channels(places, channels))
 
 
 def _nearest(

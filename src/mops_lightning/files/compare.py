@@ -12,16 +12,20 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError, cKDTree
+from torch import Tensor
 
 from mops_lightning.data.formats.guard import check_size
 from mops_lightning.data.formats.registry import read
 from mops_lightning.errors import UserError
 from mops_lightning.files.arguments import COMPARED
-from mops_lightning.files.downsample import SURFACE, load_sampler, sample_cloud
+from mops_lightning.files.downsample import SURFACE, load_sampler
+from mops_lightning.files.features import channels_for
 from mops_lightning.files.options import Options
+from mops_lightning.files.sample_cloud import sample_cloud
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.report.page import render
 from mops_lightning.report.text import Grid, markdown
@@ -140,9 +144,10 @@ def compare_file(
     check_size(path, len(points), m)
     results = []
     for name, options in methods.items():
-        _warm_up(path, points, m, options)
+        channels = channels_for(table, load_sampler(options).point_channels, path)
+        _warm_up(path, points, m, options, channels)
         start = time.perf_counter()
-        rows = _sample(path, points, m, options)
+        rows = _sample(path, points, m, options, channels)
         seconds = time.perf_counter() - start
         error = ground_error(points[ground], points[rows[ground[rows]]]) if ground.any() else None
         results.append(Result(name, rows, *coverage(points, points[rows]), error, seconds))
@@ -187,16 +192,18 @@ def ground_error(ground: Points, kept: Points) -> float:
     return float(np.sqrt(np.square(height - ground[:, 2]).mean()))
 
 
-def _warm_up(path: Path, points: Points, m: int, options: Options) -> None:
+def _warm_up(path: Path, points: Points, m: int, options: Options, channels: Tensor | None) -> None:
     """Sample a few points, so that imports and compilation are in no method's time."""
     few = np.random.default_rng(0).permutation(len(points))[: 2 * m]
     # A part may be unusable where the whole is not, such as one of equal points.
     with suppress(UserError):
-        _sample(path, points[few], m, options)
+        of_few = None if channels is None else channels[torch.from_numpy(few)]
+        _sample(path, points[few], m, options, of_few)
 
 
-def _sample(path: Path, points: Points, m: int, options: Options) -> Rows:
-    rows, _ = sample_cloud(points, load_sampler(options), m, options, path)
+def _sample(path: Path, points: Points, m: int, options: Options, channels: Tensor | None) -> Rows:
+    sampler = load_sampler(options)
+    rows, _ = sample_cloud(points, sampler, m, options, path, channels=channels)
     assert rows is not None  # completed sets are rows
     return rows
 

@@ -9,19 +9,22 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mops_lightning.data.formats.cloud_file import PART
 from mops_lightning.data.formats.guard import WholeOnlyError, check_coordinates, check_size
 from mops_lightning.data.formats.registry import open_cloud_file, read, write
-from mops_lightning.data.formats.table import Table
+from mops_lightning.data.formats.table import Column, Table
 from mops_lightning.errors import UserError
 from mops_lightning.files.by_distance import keep_by_distance
 from mops_lightning.files.chunks import Outcome, count_by_class, draw, sample_by_chunks
 from mops_lightning.files.column_weights import weights_of
 from mops_lightning.files.engine import Engine
+from mops_lightning.files.features import channels_for, generated_columns
 from mops_lightning.files.normal_columns import normals_of
 from mops_lightning.files.options import Options
 from mops_lightning.files.propagate import write_map
+from mops_lightning.files.sample_cloud import Generated, Sampled, sample_cloud
 from mops_lightning.files.space import in_space
 from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.weights import check_positive
@@ -30,7 +33,6 @@ from mops_lightning.samplers.by_normals import ByNormals
 from mops_lightning.samplers.fps import farthest_rows
 from mops_lightning.samplers.poisson import poisson_rows
 from mops_lightning.samplers.strata import count_classes
-from mops_lightning.samplers.tiles import sample_by_tiles
 from mops_lightning.zoo.find_sampler import untrained
 from mops_lightning.zoo.load import load
 
@@ -224,20 +226,33 @@ def _sample_table(
         counts: number of points of every class in the file; None: classes do not matter.
     """
     check_size(source, len(finite.points), m, options.area)
+    channels = None
+    if options.weights is not None:
+        channels = channels_for(finite, load_sampler(options).point_channels, source)
     if options.strata is None or counts is None:
-        rows, points = _rows(source, finite, m, options)
+        rows, generated = _rows(source, finite, m, options, channels)
         if rows is None:
-            return Table(points, {}, finite.header)
+            assert generated is not None
+            return _generated_table(finite, generated, options)
         return _kept(finite, rows, options)
     classes = options.strata.classes(finite, source)
     by_class = []
     for name, number in options.strata.numbers(counts, m).items():
         if number:
             members = np.flatnonzero(classes == name)
-            chosen, _ = _rows(source, finite.take(members), number, options)
+            of_members = None if channels is None else channels[torch.from_numpy(members)]
+            chosen, _ = _rows(source, finite.take(members), number, options, of_members)
             assert chosen is not None  # classes keep input points
             by_class.append(members[chosen])
     return _kept(finite, np.sort(np.concatenate(by_class)), options)
+
+
+def _generated_table(table: Table, generated: Generated, options: Options) -> Table:
+    columns: Mapping[str, Column] = {}
+    if generated.channels is not None and not options.coordinates_only:
+        channels = load_sampler(options).point_channels
+        columns = generated_columns(table, channels, generated.channels)
+    return Table(generated.points, columns, table.header)
 
 
 def _kept(table: Table, rows: NDArray[np.int64], options: Options) -> Table:
@@ -246,29 +261,35 @@ def _kept(table: Table, rows: NDArray[np.int64], options: Options) -> Table:
 
 
 def _rows(
-    source: Path, finite: Table, m: int, options: Options
-) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
-    """Return the rows of the points that are kept, None for generated points; and the points."""
+    source: Path, finite: Table, m: int, options: Options, channels: Tensor | None
+) -> Sampled:
+    """Return the rows of the points that are kept, or generated points."""
     if options.weight is None:
-        return _rows_of_weighted(source, finite, m, options, None)
+        return _rows_of_weighted(source, finite, m, options, channels, None)
     weight = weights_of(finite, options.weight, source)
     heavy = np.flatnonzero(weight)
     check_positive(len(heavy), m, f"--weight {options.weight} of {source}")
-    rows, points = _rows_of_weighted(source, finite.take(heavy), m, options, weight[heavy])
-    return None if rows is None else heavy[rows], points
+    of_heavy = None if channels is None else channels[torch.from_numpy(heavy)]
+    rows, generated = _rows_of_weighted(
+        source, finite.take(heavy), m, options, of_heavy, weight[heavy]
+    )
+    return None if rows is None else heavy[rows], generated
 
 
 def _rows_of_weighted(
-    source: Path, table: Table, m: int, options: Options, weight: NDArray[np.float64] | None
-) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
+    source: Path,
+    table: Table,
+    m: int,
+    options: Options,
+    channels: Tensor | None,
+    weight: NDArray[np.float64] | None,
+) -> Sampled:
     if options.space is not None:
-        rows = _rows_in_space(table, m, options, source, weight)
-        return rows, table.points[rows]
+        return _rows_in_space(table, m, options, source, weight), None
     sampler = load_sampler(options, m)
     if isinstance(sampler, ByNormals) and options.tile is None:
-        rows = _rows_by_normals(table, sampler, m, source)
-        return rows, table.points[rows]
-    return sample_cloud(table.points, sampler, m, options, source, weight)
+        return _rows_by_normals(table, sampler, m, source), None
+    return sample_cloud(table.points, sampler, m, options, source, weight, channels)
 
 
 def _rows_by_normals(table: Table, sampler: ByNormals, m: int, source: Path) -> NDArray[np.int64]:
@@ -291,42 +312,3 @@ def _rows_in_space(
     choose = poisson_rows if options.method == "poisson" else farthest_rows
     points = torch.from_numpy(used)[None]
     return choose(points, m, options.seed, weight=weights, in_sphere=True)[0].numpy()
-
-
-def sample_cloud(
-    points: NDArray[np.float64],
-    sampler: Sampler,
-    m: int,
-    options: Options,
-    source: Path,
-    weight: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
-    """Sample a cloud in the file's own unit.
-
-    Args:
-        points: ``(N, 3)`` finite, N ≥ m.
-        sampler: from ``load_sampler``.
-        m: number of points to keep.
-        options: how.
-        source: the file, for errors.
-        weight: ``(N,)`` above 0; None: all points are equal.
-
-    Returns:
-        The rows ``(m,)`` of the kept points, or None for generated points; the points ``(m, 3)``.
-
-    Raises:
-        UserError: the coordinates are too large, or tiles keep more points than the sampler can.
-    """
-    check_coordinates(source, points)
-    if options.tile is not None:
-        rows = sample_by_tiles(points, options.tile, m, sampler)
-        return rows, points[rows]
-    weights = None if weight is None else torch.from_numpy(weight)[None]
-    sphere = None if sampler.any_unit else UnitSphere.around(points)
-    given = torch.from_numpy(points) if sphere is None else sphere.normalise(points)
-    new, found = sampler.select(options.readout, given[None], m, weights)
-    if found is None:
-        assert sphere is not None  # generated points are in it
-        return None, sphere.restore(new[0])
-    rows = found[0].numpy()
-    return rows, points[rows]

@@ -175,8 +175,8 @@ class Options:
     @property
     def needs_columns(self) -> bool:
         """Whether attributes are kept, or decide which points are."""
-        decides = self.weight is not None or self.space is not None or self.strata is not None
-        return decides or not self.coordinates_only
+        decides = (self.weight, self.space, self.strata, self.weights)
+        return any(one is not None for one in decides) or not self.coordinates_only
 
     def number(self, trained: int, points: int) -> int:
         """Return how many of so many points to keep.

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from mops_lightning.channels import coordinates
 from mops_lightning.ops.local_matrix import LocalMatrix
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
@@ -21,14 +22,14 @@ def subset_losses(points: Tensor, samples: Tensor, sizes: Sequence[int]) -> dict
     averaged over the clouds.
 
     Args:
-        points: ``(B, N, 3)`` clouds P.
-        samples: ``(B, M, 3)`` generated points Q.
+        points: ``(B, N, 3 + C)`` clouds P; distances are between coordinates.
+        samples: ``(B, M, 3 + C)`` generated points Q.
         sizes: sizes m, each from 1 to M.
 
     Returns:
         Scalars by size, in squared units of the coordinates; 0 if every sample is an input point.
     """
-    distances = nearest(samples, points)[0]
+    distances = nearest(coordinates(samples), coordinates(points))[0]
     return {m: distances[:, :m].mean() for m in sizes}
 
 
@@ -46,8 +47,8 @@ def simplification_losses(
     CVPR 2019, section "Loss"; Lang et al., CVPR 2020).
 
     Args:
-        points: ``(B, N, 3)`` clouds P.
-        samples: ``(B, M, 3)`` generated points Q.
+        points: ``(B, N, 3 + C)`` clouds P; distances are between coordinates.
+        samples: ``(B, M, 3 + C)`` generated points Q.
         sizes: sizes m, each from 1 to M.
         coverage: γ.
         coverage_per_point: δ.
@@ -55,6 +56,8 @@ def simplification_losses(
     Returns:
         Scalars by size, in squared units of the coordinates.
     """
+    points = coordinates(points)
+    samples = coordinates(samples)
     to_cloud = nearest(samples, points)[0]
     losses, begin, from_cloud = {}, 0, None
     for m in sorted(set(sizes)):

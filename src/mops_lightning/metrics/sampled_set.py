@@ -10,6 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from mops_lightning.channels import coordinates
 from mops_lightning.metrics.base import MeanOverClouds
 from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.readout import match, unique_count
@@ -51,7 +52,7 @@ class SubsetDistance(SetMetric):
     @staticmethod
     def measure(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize:
         """Return the mean squared distance to the nearest input points."""
-        distances = nearest(output.points, points)[0]
+        distances = nearest(coordinates(output.points), coordinates(points))[0]
         return {m: distances[:, :m].mean(1) for m in sizes}
 
 

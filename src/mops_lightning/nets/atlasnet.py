@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from mops_lightning.channels import PointChannels
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.nets.autoencoder import PointEncoder, Reconstructor
 from mops_lightning.nets.foldingnet import REACH, square_grid
@@ -46,6 +47,7 @@ class AtlasNet(Reconstructor):
         pieces: M, the number of patches.
         codeword: size d of the codeword.
         patch_channels: sizes of the layers of every patch.
+        point_channels: channels of the points that the encoder sees, or their number.
 
     Raises:
         UserError: an argument is out of range.
@@ -57,6 +59,7 @@ class AtlasNet(Reconstructor):
         pieces: int = 4,
         codeword: int = 128,
         patch_channels: Sequence[int] = (1024, 512, 512),
+        point_channels: PointChannels | int = 0,
     ) -> None:
         super().__init__()
         check_at_least(1, pieces=pieces)
@@ -64,7 +67,7 @@ class AtlasNet(Reconstructor):
             raise UserError(f"n_points must be at least pieces={pieces}, got {n_points}.")
         check_channels("patch_channels", patch_channels)
         self.n_points = n_points
-        self.encoder = PointEncoder(codeword)
+        self.encoder = PointEncoder(codeword, point_channels=point_channels)
         self.patches = nn.ModuleList(Patch(codeword, patch_channels) for _ in range(pieces))
 
     def from_pooled(self, pooled: Tensor, n_points: int | None = None) -> Tensor:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
+from mops_lightning.channels import PointChannels
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
 from mops_lightning.nets.max_pool import PointMaxPool
@@ -22,6 +23,7 @@ class PointEncoder(nn.Module):
     Args:
         codeword: size d of the codeword, the last layer.
         channels: sizes of the layers before it.
+        point_channels: channels of the points, or their number.
 
     Raises:
         UserError: a layer has no channels.
@@ -31,16 +33,18 @@ class PointEncoder(nn.Module):
         self,
         codeword: int = 128,
         channels: Sequence[int] = (64, 128, 128, 256),
+        point_channels: PointChannels | int = 0,
     ) -> None:
         super().__init__()
+        self.point_channels = PointChannels.of(point_channels)
         check_at_least(1, codeword=codeword)
         check_channels("channels", channels)
         self.codeword = codeword
-        self.features = PointMLP([3, *channels])
+        self.features = PointMLP([3 + len(self.point_channels), *channels])
         self.pool = PointMaxPool(channels[-1], codeword)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Map ``(B, N, 3)`` points to ``(B, d)`` codewords, any N."""
+        """Map ``(B, N, 3 + C)`` points to ``(B, d)`` codewords, any N."""
         return self.pool(self.features(points))
 
     def point_features(self, points: Tensor) -> Tensor:
@@ -59,8 +63,13 @@ class Reconstructor(nn.Module):
     encoder: PointEncoder
     n_points: int
 
+    @property
+    def point_channels(self) -> PointChannels:
+        """The channels that the encoder sees; they are not reconstructed."""
+        return self.encoder.point_channels
+
     def forward(self, points: Tensor, n_points: int | None = None) -> Tensor:
-        """Map ``(B, N, 3)`` points, any N, to ``(B, n, 3)``.
+        """Map ``(B, N, 3 + C)`` points, any N, to ``(B, n, 3)``.
 
         Args:
             points: the sampled or the full cloud.
@@ -84,6 +93,7 @@ class AutoEncoder(Reconstructor):
         n_points: n, the fixed number of output points.
         codeword: size d of the codeword.
         encoder_channels: sizes of the encoder's layers before the codeword.
+        point_channels: channels of the points that the encoder sees, or their number.
 
     Raises:
         UserError: an argument is out of range.
@@ -94,12 +104,13 @@ class AutoEncoder(Reconstructor):
         n_points: int = 1024,
         codeword: int = 128,
         encoder_channels: Sequence[int] = (64, 128, 128, 256),
+        point_channels: PointChannels | int = 0,
     ) -> None:
         super().__init__()
         check_at_least(1, n_points=n_points)
         check_channels("encoder_channels", encoder_channels)
         self.n_points = n_points
-        self.encoder = PointEncoder(codeword, encoder_channels)
+        self.encoder = PointEncoder(codeword, encoder_channels, point_channels)
         self.decoder = nn.Sequential(
             *linear_norm_relu([codeword, *DECODER_CHANNELS], norm=False),
             nn.Linear(DECODER_CHANNELS[-1], 3 * n_points),

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mops_lightning.channels import PointChannels, coordinates
 from mops_lightning.errors import check_at_least
 from mops_lightning.nets.layers import check_channels
 from mops_lightning.nets.max_pool import PointMaxPool
@@ -36,11 +37,16 @@ class EdgeConv(nn.Module):
         self.edge = nn.Linear(channels_in, channels_out, bias=False)
         self.norm = nn.BatchNorm1d(channels_out)
 
-    def forward(self, features: Tensor) -> Tensor:
-        """Map ``(B, N, channels_in)`` to ``(B, N, channels_out)``."""
+    def forward(self, features: Tensor, places: Tensor) -> Tensor:
+        """Map ``(B, N, channels_in)`` to ``(B, N, channels_out)``.
+
+        Args:
+            features: x.
+            places: ``(B, N, D)``, by whose distances neighbours are found; x in the publication.
+        """
         n = features.shape[1]
         with torch.no_grad():
-            rows = torch.cdist(features, features).topk(min(self.k, n), largest=False).indices
+            rows = torch.cdist(places, places).topk(min(self.k, n), largest=False).indices
         edges = self.edge(features)
         mixed = self.own(features) - edges + max_of_rows(edges, rows)
         return F.relu(self.norm(mixed.flatten(0, 1))).unflatten(0, (-1, n))
@@ -57,6 +63,7 @@ class DGCNN(nn.Module):
         k: number of neighbours.
         edge_channels: sizes of the edge convolutions.
         dropout: dropout probability.
+        point_channels: channels of the points, or their number.
 
     Raises:
         UserError: an argument is out of range.
@@ -68,20 +75,25 @@ class DGCNN(nn.Module):
         k: int = 16,
         edge_channels: Sequence[int] = (64, 64, 128),
         dropout: float = 0.3,
+        point_channels: PointChannels | int = 0,
     ) -> None:
         super().__init__()
+        self.point_channels = PointChannels.of(point_channels)
         check_at_least(1, k=k)
         check_channels("edge_channels", edge_channels)
-        sizes = zip([3, *edge_channels[:-1]], edge_channels, strict=True)
+        first = 3 + len(self.point_channels)
+        sizes = zip([first, *edge_channels[:-1]], edge_channels, strict=True)
         self.edges = nn.ModuleList(EdgeConv(before, after, k) for before, after in sizes)
         self.pool = PointMaxPool(sum(edge_channels), 1024)
         self.head = classifier_head(num_classes, dropout)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Map ``(B, N, 3)`` points to ``(B, num_classes)`` logits."""
+        """Map ``(B, N, 3 + C)`` points to ``(B, num_classes)`` logits."""
         features = points
+        places = coordinates(points)
         outputs = []
         for layer in self.edges:
-            features = layer(features)
+            features = layer(features, places)
+            places = features
             outputs.append(features)
         return self.head(self.pool(torch.cat(outputs, 2)))

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from mops_lightning.channels import PointChannels
 from mops_lightning.errors import UserError
 from mops_lightning.nets.autoencoder import PointEncoder, Reconstructor
 from mops_lightning.nets.layers import check_channels
@@ -203,6 +204,7 @@ class MFoldingNet(Reconstructor):
         pieces: M.
         codeword: size d of the codeword, a multiple of M.
         fold_channels: sizes of the hidden layers of each of the two foldings.
+        point_channels: channels of the points that the encoder sees, or their number.
 
     Raises:
         UserError: an argument is out of range.
@@ -214,12 +216,13 @@ class MFoldingNet(Reconstructor):
         pieces: int = 4,
         codeword: int = 128,
         fold_channels: Sequence[int] = (2048, 144),
+        point_channels: PointChannels | int = 0,
     ) -> None:
         super().__init__()
         if n_points < pieces:
             raise UserError(f"n_points must be at least pieces={pieces}, got {n_points}.")
         self.n_points = n_points
-        self.encoder = PointEncoder(codeword)
+        self.encoder = PointEncoder(codeword, point_channels=point_channels)
         self.decoder = FoldingDecoder(codeword, pieces, fold_channels)
 
     def from_pooled(self, pooled: Tensor, n_points: int | None = None) -> Tensor:

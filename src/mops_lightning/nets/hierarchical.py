@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mops_lightning.channels import PointChannels, coordinates
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
 from mops_lightning.ops.maxima import max_of_rows
@@ -121,6 +122,8 @@ class Hierarchy(nn.Module):
         points: number of points after every stage.
         channels: channels of the features before the first stage and after every stage.
         k: number of neighbours.
+        point_channels: channels of the points, or their number; the first features are computed
+            from them and the coordinates.
 
     Raises:
         UserError: an argument is out of range.
@@ -132,8 +135,10 @@ class Hierarchy(nn.Module):
         points: Sequence[int],
         channels: Sequence[int],
         k: int,
+        point_channels: PointChannels | int = 0,
     ) -> None:
         super().__init__()
+        self.point_channels = PointChannels.of(point_channels)
         check_at_least(1, k=k)
         check_channels("points", points)
         check_channels("channels", channels)
@@ -151,15 +156,15 @@ class Hierarchy(nn.Module):
             host = {"channels": before} if "channels" in accepted else {}
             return sampler(**{size: m}, **host)
 
-        self.stem = PointMLP([3, channels[0], channels[0]])
+        self.stem = PointMLP([3 + len(self.point_channels), channels[0], channels[0]])
         self.stages = nn.ModuleList(
             Stage(make(m, before), m, before, after, k)
             for m, (before, after) in zip(points, pairwise(channels), strict=True)
         )
 
     def levels(self, points: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return points ``(B, M, 3)`` and their features ``(B, M, C)``: the input, every stage."""
-        levels = [(points, self.stem(points).to(points))]
+        """Return places ``(B, M, 3)`` and their features ``(B, M, C)``: the input, every stage."""
+        levels = [(coordinates(points), self.stem(points).to(points))]
         for stage in self.stages:
             levels.append(stage(*levels[-1]))
         return levels
@@ -185,6 +190,7 @@ class HierarchicalNet(Hierarchy):
         k: number of neighbours.
         hidden: channels between the pooled features and the logits.
         dropout: dropout probability.
+        point_channels: channels of the points, or their number.
 
     Raises:
         UserError: an argument is out of range.
@@ -199,8 +205,9 @@ class HierarchicalNet(Hierarchy):
         k: int = 16,
         hidden: int = 96,
         dropout: float = 0.3,
+        point_channels: PointChannels | int = 0,
     ) -> None:
-        super().__init__(sampler, points, channels, k)
+        super().__init__(sampler, points, channels, k, point_channels)
         check_at_least(1, hidden=hidden)
         pooled = sum(channels[1:]) + channels[-1]
         self.head = nn.Sequential(
@@ -210,7 +217,7 @@ class HierarchicalNet(Hierarchy):
         )
 
     def forward(self, points: Tensor) -> Tensor:
-        """Map ``(B, N, 3)`` points to ``(B, num_classes)`` logits."""
+        """Map ``(B, N, 3 + C)`` points to ``(B, num_classes)`` logits."""
         stages = [features for _, features in self.levels(points)[1:]]
         peaks = [features.amax(1) for features in stages]
         return self.head(torch.cat([*peaks, stages[-1].mean(1)], 1))
@@ -238,15 +245,16 @@ class HierarchicalSegmentation(Hierarchy):
         channels: Sequence[int] = (32, 64, 128),
         k: int = 16,
         dropout: float = 0.3,
+        point_channels: PointChannels | int = 0,
     ) -> None:
-        super().__init__(sampler, points, channels, k)
+        super().__init__(sampler, points, channels, k, point_channels)
         # The deepest level also knows the whole cloud, by the maximum of its features.
         sizes = [2 * channels[-1], *reversed(channels[:-1])]
         self.back = nn.ModuleList(PointMLP([deep + skip, skip]) for deep, skip in pairwise(sizes))
         self.head = nn.Sequential(nn.Dropout(dropout), nn.Linear(channels[0], num_parts))
 
     def forward(self, points: Tensor) -> Tensor:
-        """Map ``(B, N, 3)`` points to ``(B, N, num_parts)`` logits."""
+        """Map ``(B, N, 3 + C)`` points to ``(B, N, num_parts)`` logits."""
         *before, (centres, features) = self.levels(points)
         peaks = features.amax(1, keepdim=True).expand_as(features)
         features = torch.cat([features, peaks], 2)

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from mops_lightning.channels import PointChannels, coordinates
 from mops_lightning.errors import check_at_least
 from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
 from mops_lightning.nets.max_pool import PointMaxPool
-from mops_lightning.ops.rigid import Motion, identity_motion
+from mops_lightning.ops.rigid import Motion, identity_motion, move
 
 HEAD_CHANNELS = (1024, 1024, 512, 512, 256)
 """Sizes of the hidden layers of the head."""
@@ -34,6 +35,7 @@ class PCRNet(nn.Module):
         iterations: number of passes. Each pass registers the source as moved by the passes before
             it, and the motions are composed. The paper uses 1, PCRNet's authors 8.
         feature_channels: sizes of the pointwise layers.
+        point_channels: channels of the points, or their number; normals turn with the source.
 
     Raises:
         UserError: an argument is out of range.
@@ -43,12 +45,15 @@ class PCRNet(nn.Module):
         self,
         iterations: int = 1,
         feature_channels: Sequence[int] = (64, 64, 64, 128, 1024),
+        point_channels: PointChannels | int = 0,
     ) -> None:
         super().__init__()
+        self.point_channels = PointChannels.of(point_channels)
         check_at_least(1, iterations=iterations)
         check_channels("feature_channels", feature_channels, 2)
         self.iterations = iterations
-        self.features = PointMLP([3, *feature_channels[:-1]], norm=False)
+        first = 3 + len(self.point_channels)
+        self.features = PointMLP([first, *feature_channels[:-1]], norm=False)
         self.pool = PointMaxPool(feature_channels[-2], feature_channels[-1], norm=False)
         self.head = linear_norm_relu([2 * feature_channels[-1], *HEAD_CHANNELS], norm=False)
         self.motion = nn.Linear(HEAD_CHANNELS[-1], 7)
@@ -63,13 +68,15 @@ class PCRNet(nn.Module):
         """Return the motion from the source to the target.
 
         Args:
-            source: ``(B, M, 3)``, with the centroid near the origin.
-            target: ``(B, M', 3)``, with the centroid near the origin.
+            source: ``(B, M, 3 + C)``, with the centroid near the origin.
+            target: ``(B, M', 3 + C)``, with the centroid near the origin.
         """
-        total = identity_motion(source)
+        total = identity_motion(coordinates(source))
         of_target = None
         for _ in range(self.iterations):
-            moved = total.apply(source) if of_target is not None else source
+            moved = source
+            if of_target is not None:
+                moved = move(source, total, self.point_channels)
             if of_target is None and source.shape == target.shape:
                 of_source, of_target = self._global(torch.cat([moved, target])).chunk(2)
             else:

@@ -7,6 +7,7 @@ Qi et al., "PointNet: Deep Learning on Point Sets for 3D Classification and Segm
 import torch
 from torch import Tensor, nn
 
+from mops_lightning.channels import PointChannels, coordinates, with_coordinates
 from mops_lightning.nets.layers import PointMLP, linear_norm_relu
 from mops_lightning.nets.max_pool import PointMaxPool
 
@@ -32,16 +33,20 @@ class PointNetVanilla(nn.Module):
     Args:
         num_classes: number of logits.
         dropout: dropout probability.
+        point_channels: channels of the points, or their number.
     """
 
-    def __init__(self, num_classes: int, dropout: float = 0.3) -> None:
+    def __init__(
+        self, num_classes: int, dropout: float = 0.3, point_channels: PointChannels | int = 0
+    ) -> None:
         super().__init__()
-        self.features = PointMLP([3, 64, 64, 64, 128])
+        self.point_channels = PointChannels.of(point_channels)
+        self.features = PointMLP([3 + len(self.point_channels), 64, 64, 64, 128])
         self.pool = PointMaxPool(128, 1024)
         self.head = classifier_head(num_classes, dropout)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Map ``(B, N, 3)`` points to ``(B, num_classes)`` logits."""
+        """Map ``(B, N, 3 + C)`` points to ``(B, num_classes)`` logits."""
         return self.head(self.pool(self.features(points)))
 
     def point_features(self, points: Tensor) -> Tensor:
@@ -83,11 +88,15 @@ class PointNetTransform(nn.Module):
     Args:
         num_classes: number of logits.
         dropout: dropout probability.
+        point_channels: channels of the points, or their number.
     """
 
-    def __init__(self, num_classes: int, dropout: float = 0.3) -> None:
+    def __init__(
+        self, num_classes: int, dropout: float = 0.3, point_channels: PointChannels | int = 0
+    ) -> None:
         super().__init__()
-        self.first = PointMLP([3, 64, 64])
+        self.point_channels = PointChannels.of(point_channels)
+        self.first = PointMLP([3 + len(self.point_channels), 64, 64])
         self.point_transform = TransformNet(3)
         self.feature_transform = TransformNet(64)
         self.features = PointMLP([64, 64, 128])
@@ -95,8 +104,10 @@ class PointNetTransform(nn.Module):
         self.head = classifier_head(num_classes, dropout)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Map ``(B, N, 3)`` points to ``(B, num_classes)`` logits."""
-        features = self.first(points @ self.point_transform(points))
+        """Map ``(B, N, 3 + C)`` points to ``(B, num_classes)`` logits."""
+        places = coordinates(points)
+        turned = places @ self.point_transform(places)
+        features = self.first(with_coordinates(points, turned))
         transform = self.feature_transform(features)
         features = features.to(transform.dtype) @ transform
         return self.head(self.pool(self.features(features)))

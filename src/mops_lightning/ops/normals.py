@@ -36,3 +36,16 @@ def estimate_normals(
         nearest = np.asarray(tree.query(part, k=min(neighbours, len(points)))[1], np.int64)
         normals[start : start + PART] = plane_normals(centred, nearest.reshape(len(part), -1))
     return normals
+
+
+def upward_normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the normals ``(N, 3)`` of points ``(N, 3)`` with the sign that points upwards.
+
+    Points alone cannot tell inside from outside: of both directions, the one with a positive z is
+    taken; where z is 0, with a positive y, then x.
+    """
+    normals = estimate_normals(points)
+    x, y, z = normals.T
+    is_down = (z < 0) | ((z == 0) & ((y < 0) | ((y == 0) & (x < 0))))
+    upward: NDArray[np.float64] = np.where(is_down[:, None], -normals, normals)
+    return upward

@@ -6,6 +6,7 @@ Paper section "Efficient Regression of the Sampled Set", last paragraph.
 import torch
 from torch import Tensor
 
+from mops_lightning.channels import coordinates
 from mops_lightning.errors import UserError
 from mops_lightning.ops.fps import farthest_point_fill
 from mops_lightning.ops.nearest import nearest
@@ -20,13 +21,13 @@ def select(
     """Return the points that a user takes as the sampled set.
 
     Args:
-        points: ``(B, N, 3)`` the clouds.
-        generated: ``(B, M, 3)`` the points that a sampler generated for them.
+        points: ``(B, N, 3 + C)`` the clouds.
+        generated: ``(B, M, 3 + C)`` the points that a sampler generated for them.
         readout: one of ``READOUTS``.
         weight: see ``complete``.
 
     Returns:
-        ``(B, M, 3)``, and their rows ``(B, M)`` in the clouds, or None for generated points.
+        ``(B, M, 3 + C)``, and their rows ``(B, M)`` in the clouds, or None for generated points.
     """
     if readout == "generated":
         return generated, None
@@ -40,8 +41,8 @@ def match(generated: Tensor, points: Tensor) -> Tensor:
     """Match every generated point to its nearest input point.
 
     Args:
-        generated: ``(B, M, 3)``.
-        points: ``(B, N, 3)``.
+        generated: ``(B, M, 3)``, or with channels, which distances leave out.
+        points: ``(B, N, 3)``, or with channels.
 
     Returns:
         ``(B, M)`` int64 rows of ``points``, possibly with repetitions; the lowest row in case of
@@ -57,7 +58,7 @@ def match(generated: Tensor, points: Tensor) -> Tensor:
         >>> match(torch.tensor([[[0.9, 0, 0], [1.2, 0, 0]]]), points)
         tensor([[1, 1]])
     """
-    return nearest(generated.detach(), points.detach())[1]
+    return nearest(coordinates(generated.detach()), coordinates(points.detach()))[1]
 
 
 def unique_count(indices: Tensor) -> Tensor:
@@ -77,7 +78,7 @@ def complete(indices: Tensor, points: Tensor, weight: Tensor | None = None) -> T
 
     Args:
         indices: ``(B, M)`` int64 rows of ``points``, from ``match``.
-        points: ``(B, N, 3)``, N ≥ M.
+        points: ``(B, N, 3)``, N ≥ M, or with channels, which distances leave out.
         weight: ``(B, N)`` of the points in the filling up, see ``farthest_point_sample``.
 
     Returns:
@@ -103,7 +104,7 @@ def complete(indices: Tensor, points: Tensor, weight: Tensor | None = None) -> T
     first = _is_first(indices)
     # A stable sort moves first occurrences to the front and keeps their order.
     order = first.logical_not().byte().argsort(dim=1, stable=True)
-    return farthest_point_fill(points, indices.gather(1, order), first.sum(1), weight)
+    return farthest_point_fill(coordinates(points), indices.gather(1, order), first.sum(1), weight)
 
 
 def _is_first(indices: Tensor) -> Tensor:

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Generator, Tensor
 
+from mops_lightning.channels import PointChannels, coordinates, with_coordinates
+
 
 class Motion(NamedTuple):
     """One rigid motion per cloud.
@@ -31,6 +33,15 @@ class Motion(NamedTuple):
         """Return the composition: ``first``, then this motion."""
         moved = self.apply(first.translation[:, None])[:, 0]
         return Motion(quaternion_multiply(self.quaternion, first.quaternion), moved)
+
+
+def move(points: Tensor, motion: Motion, channels: PointChannels) -> Tensor:
+    """Apply a motion to ``(B, N, 3 + C)`` points, whose normals turn with them."""
+    moved = motion.apply(coordinates(points))
+    if channels.normals is None:
+        return with_coordinates(points, moved)
+    rotation = quaternion_to_matrix(motion.quaternion).to(points.dtype)
+    return with_coordinates(channels.rotated(points, rotation.mT), moved)
 
 
 def identity_motion(points: Tensor) -> Motion:

@@ -8,18 +8,20 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from mops_lightning.channels import PointChannels, coordinates
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.ops.attention import Partial
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.precision import restrict_autocast_to_pointwise
 from mops_lightning.ops.readout import READOUTS, select
+from mops_lightning.samplers.carried import with_carried
 from mops_lightning.samplers.checks import check_dtype, check_points
 from mops_lightning.samplers.fused import PART, FusedMOPSNet
-from mops_lightning.samplers.ragged import Select, select_in_unit_sphere, select_points
+from mops_lightning.samplers.ragged import Method, Select, select_in_unit_sphere, select_points
 from mops_lightning.types import SampleOutput
 
 Chunks = Callable[[], Iterable[Tensor]]
-"""Function that iterates over the chunks ``(n, 3)`` of a cloud, in the same order at every call."""
+"""Function that iterates over the chunks ``(n, 3 + C)`` of a cloud, always in the same order."""
 
 WEIGHTED = "Use fps, random, poisson, or the completed readout of a trained sampler."
 """Advice where weights are not possible."""
@@ -32,8 +34,14 @@ class Sampler(nn.Module):
     ``sample(points, m)``. A learned sampler also implements ``losses``, a flexible one
     ``training_sizes``, and a sampler with a training schedule ``anneal``.
 
+    Points may have C channels beside their coordinates: ``(B, N, 3 + C)``. ``sample`` sees those
+    channels that the sampler was made for. A sampler without learned weights takes points with any
+    channels. Sampled points have all channels of their input: where ``sample`` returns coordinates
+    only, each point has the channels of its input point or, if it is generated, of the nearest one.
+
     Args:
         m: number of points to return; for a flexible sampler, the largest number.
+        point_channels: the channels that ``sample`` sees, or their number.
 
     Raises:
         UserError: ``m`` is not a whole number of at least 1.
@@ -75,21 +83,23 @@ class Sampler(nn.Module):
     size_reduction: Literal["mean", "sum"] = "mean"
     """Reduction of the losses at several ``training_sizes`` to one."""
 
-    def __init__(self, m: int) -> None:
+    def __init__(self, m: int, point_channels: PointChannels | int = 0) -> None:
         super().__init__()
         if isinstance(m, bool) or not isinstance(m, int) or m < 1:
             raise UserError(f"m must be a whole number of at least 1, got {m!r}.")
         self.m = m
+        self.point_channels = PointChannels.of(point_channels)
 
     def forward(self, points: Tensor, m: int | None = None) -> SampleOutput:
         """Sample every cloud of a batch.
 
         Args:
-            points: ``(B, N, 3)`` floating point, finite, N ≥ m.
+            points: ``(B, N, 3 + C)`` floating point, finite, N ≥ m; channels as in training.
             m: number of points to return; None means ``self.m``.
 
         Returns:
-            ``SampleOutput`` with ``(B, m, 3)`` points on the device and in the dtype of the input.
+            ``SampleOutput`` with ``(B, m, 3 + C)`` points, on the device and in the dtype of the
+            input.
 
         Raises:
             UserError: ``points`` or ``m`` is invalid.
@@ -112,6 +122,7 @@ class Sampler(nn.Module):
 
         Args:
             points: ``(N, 3)``, ``(B, N, 3)``, or ``(P, 3)`` with ``batch``; a tensor or an array.
+                Channels follow x, y and z, in the units of files.
             m: number of points to return of each cloud; None means ``self.m``.
             readout: of generated points: ``generated``, ``matched`` (the nearest input points,
                 perhaps repeated) or ``completed`` (m different input points).
@@ -123,10 +134,10 @@ class Sampler(nn.Module):
                 filled up by weight.
 
         Returns:
-            The points, and their indices in the input, or None for generated points; tensors or
-            arrays like the input. For ``(N, 3)`` points ``(m, 3)`` and ``(m,)``, for ``(B, N, 3)``
-            ``(B, m, 3)`` and ``(B, m)``, with ``batch`` both of all clouds one after the other; a
-            cloud with fewer than m points is then returned whole.
+            The points with their channels, and their indices in the input, or None for generated
+            points; tensors or arrays like the input. For ``(N, 3)`` points ``(m, 3)`` and
+            ``(m,)``, for ``(B, N, 3)`` ``(B, m, 3)`` and ``(B, m)``, with ``batch`` both of all
+            clouds one after the other; a cloud with fewer than m points is then returned whole.
 
         Raises:
             UserError: an argument is invalid, or the sampler is in training mode.
@@ -149,8 +160,9 @@ class Sampler(nn.Module):
 
         select: Select = partial(self.select, readout)
         if not self.any_unit:
-            select = partial(select_in_unit_sphere, select)
-        return select_points(select, points, m, batch, weight)
+            select = partial(select_in_unit_sphere, select, self.point_channels)
+        method = Method(select, self.point_channels, self.channels_of_input is None)
+        return select_points(method, points, m, batch, weight)
 
     @torch.no_grad()
     def select(
@@ -163,12 +175,12 @@ class Sampler(nn.Module):
         """
         if self.any_unit:
             self.check_m(m)
-            check_points(clouds, at_least=m)
-            rows = self.choose_rows(clouds, m, weight)
+            check_points(clouds, at_least=m, channels=self.channels_of_input)
+            rows = self.choose_rows(coordinates(clouds), m, weight)
             return gather_points(clouds, rows), rows
         if weight is not None and not self.generates:
-            check_points(clouds, at_least=m)
-            rows = self.sample_weighted(clouds, m, weight)
+            check_points(clouds, at_least=m, channels=self.channels_of_input)
+            rows = self.sample_weighted(coordinates(clouds), m, weight)
             return gather_points(clouds, rows), rows
         given = clouds.to(next(self.parameters(), clouds))  # dtype and device
         if self.streams and given.shape[1] > PART:  # features of all points take more memory
@@ -183,12 +195,13 @@ class Sampler(nn.Module):
         """Check the points and sample them, without losses."""
         # A graph cannot branch on values, and on a GPU the check waits for the device.
         finite = not (torch.compiler.is_compiling() or (self.training and points.is_cuda))
-        check_points(points, at_least=m, finite=finite)
+        check_points(points, at_least=m, finite=finite, channels=self.channels_of_input)
         dtype = next((p.dtype for p in self.parameters()), points.dtype)
         if not torch.is_autocast_enabled(points.device.type):
             check_dtype(points, dtype)
+        seen = points if self.point_channels else coordinates(points)
         with restrict_autocast_to_pointwise(points.device.type):
-            output = self.sample(points.to(dtype), m)
+            output = with_carried(self.sample(seen.to(dtype), m), points)
         return output._replace(points=output.points.to(points.dtype))
 
     def sample_sizes(self, points: Tensor, sizes: Sequence[int]) -> dict[int, SampleOutput]:
@@ -282,6 +295,13 @@ class Sampler(nn.Module):
         )
 
     @property
+    def channels_of_input(self) -> int | None:
+        """How many channels points must have; None: any number."""
+        if self.learned or self.point_channels:
+            return len(self.point_channels)
+        return None
+
+    @property
     def learned(self) -> bool:
         """Whether the sampler has parameters to train."""
         return any(True for _ in self.parameters())
@@ -317,7 +337,7 @@ def stream_sample(sampler: Sampler, chunks: Chunks, m: int | None = None) -> Ten
         m: number of points; None means ``sampler.m``.
 
     Returns:
-        ``(m, 3)``, equal to ``sampler(points, m).points`` up to the rounding of sums.
+        ``(m, 3 + C)``, equal to ``sampler(points, m).points`` up to the rounding of sums.
 
     Raises:
         UserError: the sampler needs whole clouds, ``m`` is out of range, or a chunk is invalid.
@@ -327,13 +347,14 @@ def stream_sample(sampler: Sampler, chunks: Chunks, m: int | None = None) -> Ten
     sampler.check_m(m)
     peaks = (net.global_part(chunk) for chunk in _checked_chunks(chunks, m, sampler))
     global_ = reduce(torch.maximum, peaks)
-    return reduce(Partial.merge, (net.sum_part(chunk, global_, m) for chunk in chunks())).result()
+    sums = (net.sum_part(chunk, global_, m) for chunk in chunks())
+    return sampler.point_channels.renormalised(reduce(Partial.merge, sums).result())
 
 
 def _checked_chunks(chunks: Chunks, m: int, sampler: Sampler) -> Iterable[Tensor]:
     number = 0
     for chunk in chunks():
-        check_points(chunk[None])
+        check_points(chunk[None], channels=sampler.channels_of_input)
         check_dtype(chunk, next(sampler.parameters()).dtype)
         number += len(chunk)
         yield chunk

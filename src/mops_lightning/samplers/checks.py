@@ -7,14 +7,17 @@ from mops_lightning.errors import UserError
 from mops_lightning.ops.keys import are_finite
 
 
-def check_points(points: Tensor, at_least: int = 1, finite: bool = True) -> None:
+def check_points(
+    points: Tensor, at_least: int = 1, finite: bool = True, channels: int | None = 0
+) -> None:
     """Check that an argument is a batch of clouds with enough points.
 
     Args:
-        points: must be ``(B, N, 3)``, floating point and finite.
+        points: must be ``(B, N, 3 + channels)``, floating point and finite.
         at_least: smallest N allowed.
         finite: whether to check for NaN and infinity. Training on a GPU relies on the check in
             data loading.
+        channels: number of channels beside x, y and z; None: any number.
 
     Raises:
         UserError: the argument is invalid.
@@ -22,8 +25,13 @@ def check_points(points: Tensor, at_least: int = 1, finite: bool = True) -> None
     if not isinstance(points, Tensor):
         raise UserError(f"points must be a torch.Tensor, got {type(points).__name__}.")
     shape = tuple(points.shape)
-    if points.ndim != 3 or points.shape[-1] != 3:
-        raise UserError(f"points must have shape (B, N, 3), got {shape}.")
+    width = 3 + (channels or 0)
+    is_wide_enough = points.ndim == 3 and points.shape[-1] >= width
+    if not is_wide_enough or (channels is not None and points.shape[-1] > width):
+        wanted = f"(B, N, {width})"
+        if channels:
+            wanted += f", {channels} of them channels beside x, y and z"
+        raise UserError(f"points must have shape {wanted}, got {shape}.")
     if not points.is_floating_point():
         raise UserError(f"points must be floating point, got {points.dtype}.")
     if points.shape[0] == 0 or points.shape[1] == 0:

@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from mops_lightning.channels import coordinates
 from mops_lightning.errors import UserError
 from mops_lightning.ops.fps import farthest_point_fill
 from mops_lightning.ops.points import gather_points
@@ -54,7 +55,7 @@ class CriticalSampler(Sampler):
     nested = True
 
     def __init__(self, m: int, net: nn.Module | None = None, seed: int = 0) -> None:
-        super().__init__(m)
+        super().__init__(m, getattr(net, "point_channels", 0))
         if not isinstance(net, PointFeatureNet | None):
             raise UserError(
                 "net must have features of single points under a maximum (point_features), as "
@@ -66,7 +67,7 @@ class CriticalSampler(Sampler):
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice."""
-        order = seeded_order(points, self.seed)
+        order = seeded_order(coordinates(points), self.seed)
         return _filled(points, order, *self._chosen(gather_points(points.detach(), order), m))
 
     def by_features(self, points: Tensor, features: Tensor, m: int) -> SampleOutput:
@@ -97,7 +98,8 @@ class CriticalSampler(Sampler):
 
 def _filled(points: Tensor, order: Tensor, rows: Tensor, counts: Tensor) -> SampleOutput:
     """Return the points in the first ``counts`` rows, then farthest points."""
-    filled = farthest_point_fill(gather_points(points.detach(), order), rows, counts)
+    places = coordinates(points.detach())
+    filled = farthest_point_fill(gather_points(places, order), rows, counts)
     indices = order.gather(1, filled)
     return SampleOutput(gather_points(points, indices), indices, {})
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from mops_lightning.channels import PointChannels
 from mops_lightning.errors import UserError
 from mops_lightning.nets.layers import PointFeatures, PointMLP, check_channels
 from mops_lightning.ops.points import gather_points
@@ -33,6 +34,7 @@ class GumbelSampler(Sampler):
         m: number of points to choose.
         tau_min: temperature at the end of training; training starts at 1.
         feature_channels: sizes of the pointwise layers.
+        point_channels: channels of the points, or their number.
 
     Raises:
         UserError: an argument is out of range.
@@ -51,14 +53,15 @@ class GumbelSampler(Sampler):
         m: int,
         tau_min: float = 0.1,
         feature_channels: Sequence[int] = (64, 64, 64, 128, 128),
+        point_channels: PointChannels | int = 0,
     ) -> None:
-        super().__init__(m)
+        super().__init__(m, point_channels)
         if not 0 < tau_min <= 1:
             raise UserError(f"tau_min must be above 0 and at most 1, got {tau_min}.")
         check_channels("feature_channels", feature_channels)
         self.tau_min = tau_min
         self.training_tau = 1.0
-        self.features = PointFeatures(PointMLP([3, *feature_channels]))
+        self.features = PointFeatures(PointMLP([3 + len(self.point_channels), *feature_channels]))
         self.keys = PointMLP([2 * feature_channels[-1], *KEY_CHANNELS])
         self.queries = nn.Linear(KEY_CHANNELS[-1], m, bias=False)
 
@@ -84,4 +87,4 @@ class GumbelSampler(Sampler):
             return SampleOutput(gather_points(points, scores.argmax(2)), None, {})
         noise = -torch.empty_like(scores).exponential_().log()  # of the Gumbel distribution
         weights = ((scores + noise) / self.tau).softmax(2)
-        return SampleOutput(weights @ points, None, {})
+        return SampleOutput(self.point_channels.renormalised(weights @ points), None, {})

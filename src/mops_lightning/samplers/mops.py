@@ -6,10 +6,12 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from mops_lightning.channels import PointChannels, coordinates
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.losses.subset import overlap_losses, subset_losses
 from mops_lightning.nets.layers import PointFeatures, PointMLP, check_channels, linear_norm_relu
 from mops_lightning.ops.local_matrix import LocalMatrix
+from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.precision import pointwise_autocast, pointwise_autocast_dtype
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.anchors import FPSAnchors
@@ -51,6 +53,8 @@ class MOPSNet(Sampler):
             for all. Only with anchors.
         overlap: weight of the penalty on columns of S that choose the same points
             (``losses.subset``); 0, as in the paper, for none.
+        point_channels: channels of the points, or their number. Generated points have SᵀF, with
+            normals of length 1.
 
     Raises:
         UserError: an argument is out of range.
@@ -81,8 +85,9 @@ class MOPSNet(Sampler):
         overlap: float = 0.0,
         candidates: int | None = None,
         neighbours: int | None = None,
+        point_channels: PointChannels | int = 0,
     ) -> None:
-        super().__init__(m)
+        super().__init__(m, point_channels)
         if not 0 < tau_min <= 1:
             raise UserError(f"tau_min must be above 0 and at most 1, got {tau_min}.")
         check_at_least(0, alpha=alpha, overlap=overlap)
@@ -109,7 +114,7 @@ class MOPSNet(Sampler):
         self.training_tau = 1.0
         self.streams = anchors is None  # farthest points need all points at once
         local = feature_channels[-1]
-        self.features = PointFeatures(PointMLP([3, *feature_channels]))
+        self.features = PointFeatures(PointMLP([3 + len(self.point_channels), *feature_channels]))
         # The first layer of ρ acts on [local, global]. The product with the global feature is the
         # same for all points of a cloud, so it is computed once per cloud.
         self.rho_local = nn.Linear(local, rho_channels[0], bias=False)
@@ -135,17 +140,21 @@ class MOPSNet(Sampler):
         self.training_tau = self.tau_min ** min(max(progress, 0.0), 1.0)
 
     def sampling_matrix(self, points: Tensor, m: int | None = None) -> SamplingMatrix | LocalMatrix:
-        """Return the sampling matrices S of ``(B, N, 3)`` points, with the first m columns."""
+        """Return the sampling matrices S of ``(B, N, 3 + C)`` points, with the first m columns."""
         m = self.m if m is None else m
+        places = coordinates(points)
         if isinstance(self.queries, LocalAnchors):
-            return self.queries.local_matrix(points, self._keys_of_candidates, m, self.tau)
+
+            def keys_of(candidates: Tensor, rows: Tensor) -> Tensor:
+                if not self.point_channels:
+                    return self._keys(candidates)
+                return self._keys(gather_points(points, rows))
+
+            return self.queries.local_matrix(places, keys_of, m, self.tau)
         keys = self._keys(points)
         if isinstance(self.queries, FPSAnchors):
-            return self.queries(points, keys, m, self.tau)
+            return self.queries(places, keys, m, self.tau)
         return SamplingMatrix(self.queries.weight, keys, self.tau).leftmost(m)
-
-    def _keys_of_candidates(self, candidates: Tensor, rows: Tensor) -> Tensor:
-        return self._keys(candidates)
 
     def _keys(self, points: Tensor) -> Tensor:
         """Return the inputs of the last layer of ρ ``(B, N, C)``."""
@@ -200,7 +209,8 @@ class MOPSNet(Sampler):
             sampled = torch.bmm(matrix.sparse(self.threshold).mT, values)
         else:
             sampled = matrix.sample(values)
-        return SampleOutput(sampled.to(points.dtype), None, {}, matrix)
+        sampled = self.point_channels.renormalised(sampled.to(points.dtype))
+        return SampleOutput(sampled, None, {}, matrix)
 
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]

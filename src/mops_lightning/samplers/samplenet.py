@@ -6,6 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from mops_lightning.channels import coordinates
 from mops_lightning.errors import UserError, check_at_least, did_you_mean
 from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.ops.points import gather_points
@@ -20,18 +21,18 @@ def soft_projection(queries: Tensor, points: Tensor, k: int, sigma: Tensor | flo
     section "Soft projection"). For σ → 0 it is the nearest point.
 
     Args:
-        queries: ``(B, M, 3)``.
-        points: ``(B, N, 3)``, N ≥ k.
+        queries: ``(B, M, 3)``, or with channels, which do not count.
+        points: ``(B, N, 3 + C)``, N ≥ k; distances are between coordinates.
         k: number of neighbours.
         sigma: σ > 0, in squared units of the coordinates.
 
     Returns:
-        ``(B, M, 3)``; gradients flow to queries, points and σ.
+        ``(B, M, 3 + C)``; gradients flow to queries, points and σ.
 
     Raises:
         UserError: k is out of range.
     """
-    distances, indices = k_nearest(queries, points, k)
+    distances, indices = k_nearest(coordinates(queries), coordinates(points), k)
     # Softmax is shift-invariant; the shift keeps the nearest logit finite for tiny σ.
     weights = ((distances[..., :1] - distances) / sigma).softmax(2)
     return (weights[..., None] * gather_points(points, indices)).sum(2)
@@ -108,7 +109,8 @@ class SampleNet(SNet):
         Raises:
             UserError: there are fewer than k points.
         """
-        return soft_projection(generated, points, self.k, self.sigma)
+        projected = soft_projection(generated, points, self.k, self.sigma)
+        return self.point_channels.renormalised(projected)
 
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]

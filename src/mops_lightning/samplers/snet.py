@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
+from mops_lightning.channels import PointChannels
 from mops_lightning.errors import check_at_least
 from mops_lightning.losses.subset import simplification_losses
 from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
@@ -26,6 +27,8 @@ class SNet(Sampler):
         head_channels: sizes of the head's hidden layers, each with ReLU.
         head_norm: whether the hidden layers have BatchNorm.
         output_norm: whether the output layer has BatchNorm.
+        point_channels: channels of the points, or their number. Generated points have the channels
+            of the nearest input points.
 
     Raises:
         UserError: an argument is out of range.
@@ -49,15 +52,16 @@ class SNet(Sampler):
         head_channels: Sequence[int] = (256, 256, 256),
         head_norm: bool = True,
         output_norm: bool = True,
+        point_channels: PointChannels | int = 0,
     ) -> None:
-        super().__init__(m)
+        super().__init__(m, point_channels)
         check_at_least(0, alpha=alpha, coverage=coverage, coverage_per_point=coverage_per_point)
         check_channels("feature_channels", feature_channels, 2)
         check_channels("head_channels", head_channels)
         self.alpha = alpha
         self.coverage = coverage
         self.coverage_per_point = coverage_per_point
-        self.features = PointMLP([3, *feature_channels[:-1]])
+        self.features = PointMLP([3 + len(self.point_channels), *feature_channels[:-1]])
         self.pool = PointMaxPool(feature_channels[-2], feature_channels[-1])
         layers: list[nn.Module] = list(
             linear_norm_relu([feature_channels[-1], *head_channels], head_norm)

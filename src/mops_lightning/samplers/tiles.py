@@ -26,7 +26,9 @@ NEIGHBOURS = 8
 """Nearest sampled points that the thinning compares a point with."""
 
 
-def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler) -> Rows:
+def sample_by_tiles(
+    points: Points, size: int, m: int, sampler: Sampler, channels: Tensor | None = None
+) -> Rows:
     """Sample every tile of a cloud, then thin the points where tiles meet.
 
     Points of neighbouring tiles may be nearly equal. Therefore a quarter more points are sampled,
@@ -38,6 +40,7 @@ def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler) -> Rows
         size: most points of a tile.
         m: number of points to keep of all tiles together.
         sampler: a flexible sampler.
+        channels: ``(N, C)`` of the points, scaled as for training; None: there are none.
 
     Returns:
         ``(m,)`` different rows, ascending.
@@ -66,6 +69,9 @@ def sample_by_tiles(points: Points, size: int, m: int, sampler: Sampler) -> Rows
             batch = places[first : first + step]
             clouds = [points[tiles[place]] for place in batch]
             stacked = torch.stack([_as_input(sampler, one) for one in clouds])
+            if channels is not None:
+                of_tiles = torch.stack([channels[torch.from_numpy(tiles[p])] for p in batch])
+                stacked = torch.cat([stacked, of_tiles], 2)
             rows = sample_tiles(sampler, stacked, number)
             for place, chosen in zip(batch, rows, strict=True):
                 selected[place] = tiles[place][chosen]

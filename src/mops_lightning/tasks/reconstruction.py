@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torchmetrics import MetricCollection
 
+from mops_lightning.channels import coordinates
 from mops_lightning.metrics import reconstruction
 from mops_lightning.metrics.base import TableMetric, collection
 from mops_lightning.ops.emd import earth_movers_distance
@@ -69,18 +70,19 @@ class Reconstruction(Task):
             The loss terms, and the distances of the reconstructions without a reference.
         """
         built = self.predict(batch, points)
-        found = self._distances(built, batch.points, TRAINED_BLOCK, TRAINED_ROUNDS)
+        clouds = coordinates(batch.points)
+        found = self._distances(built, clouds, TRAINED_BLOCK, TRAINED_ROUNDS)
         return TaskOutput(_means(found), found, None, built)
 
     def scores(self, batch: Batch, samples: Mapping[K, Tensor]) -> dict[K, TaskOutput]:
         """Return the distances of reconstructions from samples and, as targets, from all points."""
-        clouds = batch.points
+        clouds = coordinates(batch.points)
         block = None if clouds.shape[1] <= (self.exact_up_to or 0) else SCORED_BLOCK
 
         def scored(points: Tensor) -> reconstruction.Distances:
             return self._distances(self.predict(batch, points), clouds, block, SCORED_ROUNDS)
 
-        full = scored(clouds)
+        full = scored(batch.points)
         found = {name: scored(points) for name, points in samples.items()}
         return {name: TaskOutput(_means(one), one, full) for name, one in found.items()}
 
@@ -120,14 +122,14 @@ def _(
     """Draw input, sampled points and reconstructions side by side."""
     from mops_lightning.viz.task_results import ReconstructionResult, reconstruction_grid
 
-    clouds = batch.points
-    full = task.predict(batch, clouds)
+    clouds = coordinates(batch.points)
+    full = task.predict(batch, batch.points)
     reference = chamfer_distance(full, clouds)
     columns = {}
     for name, chosen in samples.items():
-        if chosen.shape == clouds.shape:
+        if chosen.shape == batch.points.shape:
             continue  # all points have a column of their own
         built = task.predict(batch, chosen)
         ratios = (chamfer_distance(built, clouds) / reference).tolist()
-        columns[name] = ReconstructionResult(chosen, built, ratios)
+        columns[name] = ReconstructionResult(coordinates(chosen), built, ratios)
     return {"reconstructions": reconstruction_grid(clouds, full, columns, titles)}

@@ -7,12 +7,19 @@ import torch
 from torch import Generator, Tensor, nn
 from torchmetrics import MetricCollection
 
+from mops_lightning.channels import PointChannels, coordinates, with_coordinates
 from mops_lightning.errors import UserError
 from mops_lightning.metrics import registration
 from mops_lightning.metrics.base import collection
 from mops_lightning.metrics.registration import RotationError
 from mops_lightning.ops.points import gather_points
-from mops_lightning.ops.rigid import Motion, identity_motion, quaternion_to_matrix, random_motion
+from mops_lightning.ops.rigid import (
+    Motion,
+    identity_motion,
+    move,
+    quaternion_to_matrix,
+    random_motion,
+)
 from mops_lightning.tasks.base import Task, figures_of
 from mops_lightning.types import PairBatch, TaskOutput
 
@@ -30,13 +37,15 @@ def pair_batch(source: Tensor, target: Tensor, motion: Motion) -> PairBatch:
     """Combine sources and targets into a batch, with every centroid at the origin.
 
     Args:
-        source: ``(B, N, 3)`` the clouds to register.
-        target: ``(B, N, 3)`` the clouds to register them to.
+        source: ``(B, N, 3 + C)`` the clouds to register.
+        target: ``(B, N, 3 + C)`` the clouds to register them to.
         motion: the true motions from source to target.
     """
     both = torch.cat([source, target])
-    centroids = both.mean(1)
-    return PairBatch(both - centroids[:, None], centroids, motion.quaternion, motion.translation)
+    places = coordinates(both)
+    centroids = places.mean(1)
+    centred = with_coordinates(both, places - centroids[:, None])
+    return PairBatch(centred, centroids, motion.quaternion, motion.translation)
 
 
 class Registration(Task):
@@ -51,6 +60,7 @@ class Registration(Task):
         net: maps sources ``(B, M, 3)`` and targets ``(B, M, 3)`` to a ``Motion``.
         resample: number of points of source and target, drawn independently from the shape, so that
             both have different points of one surface; None uses all points in both.
+        point_channels: channels of the points, or their number; normals turn with the target.
 
     Raises:
         UserError: ``resample`` is below 1.
@@ -60,8 +70,14 @@ class Registration(Task):
     net_takes = ("source", "target")
     clouds_per_prediction = 2
 
-    def __init__(self, net: nn.Module, resample: int | None = None) -> None:
+    def __init__(
+        self,
+        net: nn.Module,
+        resample: int | None = None,
+        point_channels: PointChannels | int = 0,
+    ) -> None:
         super().__init__(net)
+        self.point_channels = PointChannels.of(point_channels)
         if resample is not None and resample < 1:
             raise UserError(f"resample must be None or at least 1, got {resample}.")
         self.resample = resample
@@ -86,7 +102,7 @@ class Registration(Task):
         source = target = points
         if self.resample is not None:
             source, target = (self._drawn(points, generators) for _ in range(2))
-        return pair_batch(source, motion.apply(target), motion)
+        return pair_batch(source, move(target, motion, self.point_channels), motion)
 
     def _drawn(self, points: Tensor, generators: Sequence[Generator]) -> Tensor:
         rows = [torch.randperm(points.shape[1], generator=g)[: self.resample] for g in generators]
@@ -183,12 +199,12 @@ def _(
     """Draw the pairs before and after alignment, one column for each readout."""
     from mops_lightning.viz.task_results import RegistrationResult, pair_grid
 
-    source, target = batch.points.chunk(2)
+    source, target = coordinates(batch.points).chunk(2)
     columns = {}
     for name, points in samples.items():
         result = task.step(batch, points)
         motion: Motion = result.output
-        of_source, of_target = points.chunk(2)
+        of_source, of_target = coordinates(points).chunk(2)
         errors = RotationError.of(result.predictions, result.targets)
         columns[name] = RegistrationResult(
             motion.apply(source), motion.apply(of_source), of_target, errors.tolist()

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchmetrics import MetricCollection
 
+from mops_lightning.channels import coordinates
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.metrics.base import collection
 from mops_lightning.metrics.classification import MeanIoU, PointAccuracy
@@ -49,7 +50,7 @@ class Segmentation(Task):
         logits = self.net(points)
         if points is batch.points:  # every point is its own nearest one
             return logits
-        return interpolate(logits, points, batch.points, self.k)
+        return interpolate(logits, coordinates(points), coordinates(batch.points), self.k)
 
     def disagreement(self, found: Tensor, reference: Tensor) -> Tensor:
         """Return KL(reference ‖ found), the mean over the points of a cloud."""
@@ -93,4 +94,5 @@ def _(
 
     assert batch.parts is not None
     predicted = {name: task.step(batch, points).predictions for name, points in samples.items()}
-    return {"parts": part_grid(batch.points, {"true parts": batch.parts, **predicted}, titles)}
+    parts = {"true parts": batch.parts, **predicted}
+    return {"parts": part_grid(coordinates(batch.points), parts, titles)}

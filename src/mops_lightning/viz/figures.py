@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
@@ -19,6 +20,7 @@ from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 from torch.nn.functional import adaptive_max_pool1d
 
+from mops_lightning.channels import coordinates
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write, load_npz
 
@@ -106,26 +108,54 @@ def save_figure(figure: Figure, path: Path, dpi: float = 110, software: str = ""
     return path
 
 
-def cloud_grid(points: Tensor, readouts: Mapping[str, Tensor], titles: Sequence[str]) -> Figure:
+def cloud_grid(
+    points: Tensor,
+    readouts: Mapping[str, Tensor],
+    titles: Sequence[str],
+    channel: int | None = None,
+) -> Figure:
     """Draw clouds as rows and readouts as columns, each over its faint input.
 
     Args:
-        points: ``(K, N, 3)`` input, y up.
-        readouts: ``(K, M, 3)`` by name; names that are not in ``COLOURS`` are drawn green.
+        points: ``(K, N, 3 + C)`` input, y up.
+        readouts: ``(K, M, 3 + C)`` by name; names that are not in ``COLOURS`` are drawn green.
         titles: one per cloud.
+        channel: the column that gives the colours, dark for low and bright for high values; None:
+            the readout does.
 
     Returns:
         A figure; the first column is the input alone.
     """
-    columns = {"input": None, **readouts}
+    columns = {INPUT: None, **readouts}
+    colours: dict[str, np.ndarray] = {}
+    if channel is not None:
+        colours = colours_by_channel(channel, {INPUT: points, **readouts})
     figure = new_figure(2.6 * len(columns), 2.6 * len(points), "tight")
-    for row, cloud in enumerate(upright(points)):
+    for row, cloud in enumerate(upright(coordinates(points))):
         for column, (name, samples) in enumerate(columns.items()):
             title = name if row == 0 else ""
             label = titles[row] if column == 0 else ""
             axes = cloud_axes(figure, len(points), len(columns), row, column, title, label)
-            draw_cloud(axes, cloud, None if samples is None else upright(samples)[row], name)
+            drawn = None if samples is None else upright(coordinates(samples))[row]
+            of_row = colours[name][row] if name in colours else None
+            draw_cloud(axes, cloud, drawn, name, colours=of_row)
     return figure
+
+
+def colours_by_channel(channel: int, sets: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
+    """Return colours ``(K, M, 3)`` of points ``(K, M, 3 + C)`` by the values of one channel.
+
+    All sets have one scale. It leaves out the most extreme hundredth of the input at both ends, of
+    which one would make all others look alike.
+    """
+    values = {name: points[..., channel].detach().cpu().numpy() for name, points in sets.items()}
+    low, high = np.percentile(values[INPUT], (1, 99))
+    spread = high - low if high > low else 1.0
+    scale = colormaps["viridis"]
+    return {
+        name: scale(np.clip((numbers - low) / spread, 0, 1))[..., :3]
+        for name, numbers in values.items()
+    }
 
 
 def comparison(
@@ -147,7 +177,12 @@ def comparison(
 
 
 def draw_cloud(
-    axes: Axes3D, cloud: np.ndarray, samples: np.ndarray | None, readout: str, size: float = 22
+    axes: Axes3D,
+    cloud: np.ndarray,
+    samples: np.ndarray | None,
+    readout: str,
+    size: float = 22,
+    colours: np.ndarray | None = None,
 ) -> None:
     """Draw a cloud, faintly if samples are drawn over it.
 
@@ -158,19 +193,25 @@ def draw_cloud(
             would hide the samples behind it.
         readout: gives the samples' colour.
         size: marker area of up to ``LARGE_MARKER_SAMPLES`` samples; more get smaller markers.
+        colours: ``(M, 3)`` of the samples or, without samples, of the cloud; None: one colour.
     """
     axes.computed_zorder = False
     faint = samples is not None
+    of_cloud: Any = np.array(INPUT_COLOUR) / 255 if faint else "0.35"
+    if colours is not None and not faint:
+        of_cloud = colours
     axes.scatter(
         *cloud.T,
         s=1 if faint else 3,
-        color=np.array(INPUT_COLOUR) / 255 if faint else "0.35",
+        color=of_cloud,
         alpha=0.35 if faint else 1.0,
         depthshade=False,
         rasterized=True,  # thousands of points would make an SVG of megabytes
     )
     if samples is not None:
-        colour = np.array(COLOURS.get(readout, COLOURS["sampled"])) / 255
+        colour = colours
+        if colour is None:
+            colour = np.array(COLOURS.get(readout, COLOURS["sampled"])) / 255
         size = max(size * min(1, LARGE_MARKER_SAMPLES / max(len(samples), 1)), 1.5)
         axes.scatter(*samples.T, s=size, color=colour, depthshade=False, zorder=2)
     frame_cloud(axes, cloud)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import as_tensor
 from mops_lightning.ops.weights import check_positive
+from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.budget import as_size, number_of
 from mops_lightning.samplers.fps import FPSSampler, farthest_rows
 from mops_lightning.samplers.poisson import poisson_rows
@@ -61,14 +62,28 @@ class Choice:
             return self._sample_in_space(cloud, number)
         sampler = find_sampler(self.method, number, cloud.points, self.start, self.seed)
         if self.tile is not None:
-            columns = cloud.columns()[:, :3]
-            return cloud.rows(sample_by_tiles(columns, self.tile, number, sampler))
-        new, rows = sampler.downsample(cloud.coordinates, number, self.readout, None, cloud.weight)
+            return self._sample_tiles(cloud, number, sampler, self.tile)
+        channels = sampler.point_channels
+        seen = cloud.coordinates
+        if channels:
+            seen = torch.cat([seen.double(), cloud.channels(channels)], 1)
+        new, rows = sampler.downsample(seen, number, self.readout, None, cloud.weight)
         if rows is not None:
             return cloud.points[rows], rows
+        if channels:
+            is_floating = cloud.points.is_floating_point()
+            return new.to(cloud.points.dtype) if is_floating else new, None
         if cloud.points.shape[1] > 3:
             raise UserError("generated points have coordinates only: give points[..., :3].")
         return new, None
+
+    def _sample_tiles(self, cloud: Cloud, number: int, sampler: Sampler, tile: int) -> Sample:
+        channels = sampler.point_channels
+        scaled = None
+        if channels:
+            scaled = channels.scaled(cloud.channels(channels)).float()
+        places = cloud.columns()[:, :3]
+        return cloud.rows(sample_by_tiles(places, tile, number, sampler, scaled))
 
     def _sample_in_space(self, cloud: Cloud, number: int) -> Sample:
         """Choose farthest points, or those of sample elimination, by the columns that count."""

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mops_lightning.channels import PointChannels
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import as_tensor, cloud_sizes
 from mops_lightning.ops.weights import CURVATURE, check_weight, curvature
@@ -35,6 +36,22 @@ class Cloud:
         """The first three columns, floating point."""
         coordinates = self.points[:, :3]
         return coordinates if coordinates.is_floating_point() else coordinates.double()
+
+    def channels(self, channels: PointChannels) -> Tensor:
+        """Return the channels ``(N, C)`` of a model in float64: all further columns.
+
+        Raises:
+            UserError: there are more or fewer columns, or values are missing.
+        """
+        width = 3 + len(channels)
+        if self.points.shape[1] != width:
+            raise UserError(
+                f"points must have {width} columns for this model: x, y, z, "
+                f"{', '.join(channels.names)}; got {self.points.shape[1]}."
+            )
+        values = self.points[:, 3:].double()
+        channels.check_known(values, "points")
+        return values
 
     def columns(self) -> NDArray[np.float64]:
         """Return all columns in float64."""

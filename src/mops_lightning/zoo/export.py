@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from mops_lightning.channels import PointChannels
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
@@ -26,6 +27,8 @@ MANY = 2**23
 """Number of points times m at which a file is compared as well: more than S has in one piece."""
 MOST_POINTS = 2**16
 """Largest number of points in this comparison."""
+UPWARDS = 3.0
+"""Added to the z of random normals: means of normals in all directions would have none."""
 AXES = ("batch", "points")
 """Names of the axes of the input that have any size."""
 
@@ -33,7 +36,8 @@ AXES = ("batch", "points")
 class GeneratedPoints(nn.Module):
     """A learned sampler as a net from points to generated points.
 
-    Maps ``(B, N, 3)`` points in the unit sphere to ``(B, m, 3)``.
+    Maps ``(B, N, 3 + C)`` points, in the unit sphere and with scaled channels, to
+    ``(B, m, 3 + C)``; S-Net and SampleNet, which generate coordinates only, to ``(B, m, 3)``.
 
     Args:
         sampler: trained, in eval mode.
@@ -65,16 +69,19 @@ class GeneratedPoints(nn.Module):
             matrix = self.sampler.sampling_matrix(points, self.m)
             if isinstance(matrix, SamplingMatrix):
                 # Blocks of S for many points would limit the number of points of the program.
-                return matrix.sample_dense(points)
-            return matrix.sample(points)
+                sampled = matrix.sample_dense(points)
+            else:
+                sampled = matrix.sample(points)
+            return self.sampler.point_channels.renormalised(sampled)
         return self.sampler.sample(points, self.m).points
 
 
 def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
     """Write a sampler as a program that runs without this package, and compare both.
 
-    Input ``points`` are ``(batch, points, 3)`` float32 in the unit sphere, with any number of
-    clouds and points; output ``generated`` is ``(batch, m, 3)``.
+    Input ``points`` are ``(batch, points, 3 + C)`` float32, in the unit sphere and with channels
+    scaled as in training, with any number of clouds and points; output ``generated`` is
+    ``(batch, m, 3 + C)``, of S-Net and SampleNet ``(batch, m, 3)``.
 
     Args:
         sampler: trained, in eval mode.
@@ -92,7 +99,9 @@ def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
         raise UserError(f"OUT must end in {' or '.join(SUFFIXES)}, got {path}.")
     net = GeneratedPoints(sampler, m)
     m = net.m
-    example = torch.rand(2, 2 * m + 3, 3, generator=torch.Generator().manual_seed(0))
+    channels = sampler.point_channels
+    width = 3 + len(channels)
+    example = torch.rand(2, 2 * m + 3, width, generator=torch.Generator().manual_seed(0))
     dynamic = ({axis: torch.export.Dim(name) for axis, name in enumerate(AXES)},)
     with torch.no_grad(), atomic_write(path) as temporary:
         program = torch.export.export(net, (example,), dynamic_shapes=dynamic)
@@ -104,8 +113,7 @@ def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
         else:
             exported = _to_onnx(program, temporary)
         difference = max(
-            float((exported(points) - sampler(points, m).points).abs().max())
-            for points in _clouds(m)
+            _difference(exported, sampler, m, points) for points in _clouds(m, channels)
         )
         if difference > TOLERANCE:
             raise UserError(
@@ -115,12 +123,28 @@ def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
     return difference
 
 
-def _clouds(m: int) -> Iterable[Tensor]:
+def _difference(
+    exported: Callable[[Tensor], Tensor], sampler: Sampler, m: int, points: Tensor
+) -> float:
+    """Return the largest difference of a program's points from the sampler's."""
+    generated = exported(points)
+    expected = sampler(points, m).points[..., : generated.shape[-1]]
+    return float((generated - expected).abs().max())
+
+
+def _clouds(m: int, channels: PointChannels) -> Iterable[Tensor]:
+    """Yield random clouds in the unit sphere; their normals point upwards, as on a surface."""
     rng = torch.Generator().manual_seed(1)
     many = min(MANY // m + 1, MOST_POINTS)
     for clouds, number in [*((clouds, times * m + 5) for clouds, times in CHECKED), (1, many)]:
         points = torch.randn(clouds, number, 3, generator=rng)
-        yield points / points.norm(dim=2).amax(1)[:, None, None]
+        points = points / points.norm(dim=2).amax(1)[:, None, None]
+        if channels:
+            values = torch.randn(clouds, number, len(channels), generator=rng)
+            points = torch.cat([points, values], 2)
+        if channels.normals is not None:
+            points[..., channels.normals + 2] += UPWARDS
+        yield channels.renormalised(points)
 
 
 def _to_onnx(program: Any, path: Path) -> Callable[[Tensor], Tensor]:

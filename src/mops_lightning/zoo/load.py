@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 import mops_lightning
+from mops_lightning.channels import PointChannels
 from mops_lightning.errors import UserError
 from mops_lightning.nets import atlasnet, autoencoder, dgcnn, foldingnet, pcrnet, pointnet
 from mops_lightning.samplers.base import Sampler
@@ -78,6 +79,7 @@ def load(path: str | Path, cls: type[Sampler] | None = None) -> Sampler:
             f"{_target(node)!r:.99}. For a sampler of your own, give load() its class: "
             "load(path, cls=MySampler)."
         )
+    node = _with_channels(node, content["channels"])
     return _build(found, node, content["state"], path, "sampler", HINT)
 
 
@@ -111,12 +113,20 @@ def read_net(path: str | Path) -> tuple[nn.Module, list[str]]:
         raise UserError(f"{path}: task.net must be one of {known}, got {_target(node)!r:.99}.")
     if "num_classes" in signature(found).parameters:
         node = {**node, "num_classes": len(content["classes"])}
+    node = _with_channels(node, content["channels"])
     state = {name.removeprefix("net."): value for name, value in content["state"].items()}
     return _build(found, node, state, path, "task.net", NET_HINT), content["classes"]
 
 
 def _target(node: Any) -> Any:
     return node.get("_target_") if isinstance(node, dict) else None
+
+
+def _with_channels(node: Any, channels: PointChannels) -> Any:
+    """Return a node's settings with the channels that its file names."""
+    if channels and isinstance(node, dict):
+        return {**node, "point_channels": channels}
+    return node
 
 
 def _known_class(node: Any, known: Iterable[type[M]]) -> type[M] | None:

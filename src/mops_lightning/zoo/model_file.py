@@ -55,12 +55,14 @@ class RunHeader(msgspec.Struct, forbid_unknown_fields=True, tag_field="schema", 
         sha256: of the tensors.
         config: the configuration of the run.
         metrics: its test metrics.
+        channels: name, mean and scale of each channel of the points beside x, y and z.
     """
 
     classes: list[str]
     sha256: SHA256
     config: dict[str, Any]
     metrics: dict[str, Any]
+    channels: list[tuple[str, float, float]] = []
 
 
 class Card(msgspec.Struct, forbid_unknown_fields=True, tag_field="schema", tag=MODEL):
@@ -76,6 +78,7 @@ class Card(msgspec.Struct, forbid_unknown_fields=True, tag_field="schema", tag=M
         notes: further facts for users.
         figures: its test figures.
         record: of the run that trained the model; ``files.task_weights`` names its task net.
+        channels: name, mean and scale of each channel of the points beside x, y and z.
     """
 
     classes: list[str]
@@ -87,6 +90,7 @@ class Card(msgspec.Struct, forbid_unknown_fields=True, tag_field="schema", tag=M
     notes: str
     figures: Figures
     record: dict[str, Any]
+    channels: list[tuple[str, float, float]] = []
 
 
 class Damaged(UserError):
@@ -140,6 +144,10 @@ def read_header(path: Path) -> dict[str, Any]:
         with safe_open(path, framework="numpy") as opened:
             header = json.loads((opened.metadata() or {}).get(KEY, "null"))
         msgspec.convert(header, RunHeader | Card)
+        if header.get("channels"):
+            from mops_lightning.channels import PointChannels  # imports torch
+
+            PointChannels.from_plain(header["channels"])
         if "record" in header:
             run_record.from_plain(header["record"])
     except PermissionError:

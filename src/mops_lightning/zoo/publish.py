@@ -75,7 +75,7 @@ def add(
     if record.config["learn"] == "sampler":
         used = _task_net(task_net, record, folder)
         files |= {"task_weights": used} if used else {}
-    card = {
+    card: dict[str, Any] = {
         "schema": model_file.MODEL,
         "name": name,
         "transform": "unit_sphere",
@@ -86,6 +86,8 @@ def add(
         "figures": card_figures(record),
         "record": {**record.plain(), "files": files},
     }
+    if content["channels"]:
+        card["channels"] = content["channels"].to_plain()
     model_file.write(path, card, state)
     return path
 

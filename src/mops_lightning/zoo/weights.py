@@ -10,6 +10,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from mops_lightning.channels import NO_CHANNELS, PointChannels
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.zoo import model_file, names
@@ -27,6 +28,7 @@ def save(
     config: dict[str, Any],
     metrics: dict[str, float],
     classes: Sequence[str] = (),
+    channels: PointChannels = NO_CHANNELS,
 ) -> None:
     """Write a module's tensors with the configuration and the metrics of their training.
 
@@ -36,13 +38,16 @@ def save(
         config: the run's configuration as plain data.
         metrics: test metrics by name.
         classes: names of classes or parts in the order of the outputs of a task net.
+        channels: of the points that it was trained on.
     """
-    header = {
+    header: dict[str, Any] = {
         "schema": model_file.WEIGHTS,
         "config": config,
         "metrics": metrics,
         "classes": list(classes),
     }
+    if channels:
+        header["channels"] = channels.to_plain()
     state = {
         name: value.detach().cpu().clone(memory_format=torch.contiguous_format)
         for name, value in module.state_dict().items()
@@ -57,7 +62,8 @@ def read(path: str | Path) -> dict[str, Any]:
         path: a weights file, or what ``names.resolve`` takes.
 
     Returns:
-        ``config``, ``metrics``, ``classes``, ``sha256``, and ``state``, the tensors by name.
+        ``config``, ``metrics``, ``classes``, ``channels``, ``sha256``, and ``state``, the tensors
+        by name.
 
     Raises:
         UserError: the file is missing, or may not be read.
@@ -81,9 +87,15 @@ def read(path: str | Path) -> dict[str, Any]:
         "config": trained["config"],
         "metrics": trained["metrics"],
         "classes": header["classes"],
+        "channels": channels_in(header),
         "sha256": header["sha256"],
         "state": state,
     }
+
+
+def channels_in(header: Mapping[str, Any]) -> PointChannels:
+    """Return the channels that the header of a weights file or a model names."""
+    return PointChannels.from_plain(header.get("channels", []))
 
 
 def of_run(run: Path, kind: str = "weights") -> Path:

@@ -83,7 +83,14 @@ class ByWeights(Method):
     def sample(self, points: Points, m: int, seed: int, path: Path) -> Sample:
         """Choose m of points ``(N, 3)``; the seed has no effect."""
         options = self.options(m)
-        return _timed(points, m, load_sampler(options), options, path)
+        sampler = load_sampler(options)
+        if sampler.point_channels:
+            raise UserError(
+                f"--weights: {self.weights} was trained with the features "
+                f"{', '.join(sampler.point_channels.features)}, but scans are registered by x, y "
+                "and z only. Give a sampler that was trained without features."
+            )
+        return _timed(points, m, sampler, options, path)
 
 
 class VoxelFilter(Method):
@@ -134,7 +141,7 @@ def methods_of(
 
 def _timed(points: Points, m: int, sampler: Sampler, options: Options, path: Path) -> Sample:
     began = time.process_time()
-    rows, chosen = sample_cloud(points, sampler, m, options, path)
+    rows, _ = sample_cloud(points, sampler, m, options, path)
     seconds = time.process_time() - began
     assert rows is not None  # completed sets are rows
-    return Sample(chosen, seconds)
+    return Sample(points[rows], seconds)

@@ -7,11 +7,13 @@ Besides the settings of its node, a constructor is offered these values, by argu
 | ``num_classes`` | task, task net | number of classes of the data |
 | ``num_parts`` | task, task net | number of parts that the points of the data belong to |
 | ``net`` | task, samplers, baselines | the task net |
+| ``point_channels`` | task, task net, sampler | channels of the points, see ``channels`` |
 | ``seed`` | baselines | the run's seed, unless the node sets one |
 | ``m`` | baselines, untrained samplers | the largest tested size |
 | ``folder``, ``checkpoint`` | callbacks | the run's folder, its checkpoint |
 | ``score`` | callbacks | name of the task's score |
 | ``batch``, ``titles`` | callbacks | the pictured test clouds and their classes |
+| ``channels`` | callbacks | channels of the pictured clouds |
 | ``name``, ``save_dir`` | loggers | empty, the run's folder |
 """
 
@@ -40,6 +42,7 @@ from mops_lightning.training import checkpoint
 from mops_lightning.training.evaluation import OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
+from mops_lightning.training.run.channels import check_sampler, check_without_channels
 from mops_lightning.training.run.optimizers import OptimizerMakers, check_optimizers
 from mops_lightning.training.run.other_nets import other_tasks
 from mops_lightning.training.run.trainer import make_trainer
@@ -117,6 +120,7 @@ class Parts:
             make_batch=self.experiment.task.make_batch,
             drop_last=True,
             seed=self.cfg.seed,
+            channels=self.dataset.channels,
             part=self.part,
         )
 
@@ -215,9 +219,11 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     # Another seed: the sampler's initial weights must not depend on the task net's size.
     L.seed_everything(derive_seed(cfg.seed, 1) % 2**32, verbose=False)
     of_task = {"net": task.net}  # for samplers that select points by the task net's features
+    of_sampler = {**of_task, "point_channels": dataset.channels}
     sampler: Sampler | None = None
     if cfg.learn != "task":
-        sampler = build_as(Sampler, cfg.sampler, "sampler", of_task)
+        sampler = build_as(Sampler, cfg.sampler, "sampler", of_sampler)
+        check_sampler(sampler, dataset)
     # Pairs may have fewer points than the clouds they are drawn from.
     loader = CloudLoader(dataset.test, 1, make_batch=task.make_batch)
     cloud = loader.batch_of(torch.tensor([0])).points[:1]
@@ -230,7 +236,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
         _try_baselines(baselines, cloud)
         others = other_tasks(cfg, dataset)
     elif sampler is not None and sampler.flexible:
-        sampler = build_as(Sampler, cfg.sampler, "sampler", of_task, m=max(sizes))
+        sampler = build_as(Sampler, cfg.sampler, "sampler", of_sampler, m=max(sizes))
     check_optimizers(cfg)
     makers = OptimizerMakers.of(cfg.optimizer, "optimizer")
     recipe = build_as(Recipe, cfg.recipe, "recipe")
@@ -263,8 +269,11 @@ def _make_task(cfg: DictConfig, dataset: CloudDataset) -> Task:
         "num_parts": len(dataset.part_names),
     }
     _check_fits(cfg, dataset, offered)
-    net = build_as(nn.Module, cfg.task.net, "task.net", offered)
-    task: Task = build_as(Task, cfg.task, "task", offered, net=net)
+    if not takes(cfg.task.net, "point_channels"):
+        check_without_channels(f"task/net={cfg.names.net}", dataset)
+    of_data: dict[str, Any] = {**offered, "point_channels": dataset.channels}
+    net = build_as(nn.Module, cfg.task.net, "task.net", of_data)
+    task: Task = build_as(Task, cfg.task, "task", of_data, net=net)
     return task
 
 

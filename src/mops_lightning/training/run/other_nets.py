@@ -37,7 +37,10 @@ def _task_with_net(name: str, cfg: DictConfig, dataset: CloudDataset) -> Task:
     if takes(cfg.task, "num_parts"):
         raise UserError("no file can name a net of segmentation. Leave other_nets out.")
     net, classes = read_net(name)
-    offered = {"num_classes": len(dataset.class_names)}
+    offered = {
+        "num_classes": len(dataset.class_names),
+        "point_channels": dataset.channels,
+    }
     task: Task = build_as(Task, cfg.task, "task", offered, net=net)
     check_names(classes, task, dataset, name)
     return task

@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor
 
+from mops_lightning.channels import NO_CHANNELS, PointChannels, coordinates
 from mops_lightning.data.clouds import CloudDataset
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.readout_names import FULL
 from mops_lightning.tasks.base import Task, figures_of
@@ -39,18 +40,30 @@ class CloudVisualization(Callback):
         folder: the run's folder; PNGs go to ``pictures`` below it.
         up: the vertical axis of the clouds, ``x``, ``y`` or ``z``, as in
             ``Augmentation.rotate_up``; true and false mean y.
+        colour: name of the channel that gives the colours of the clouds; None: each readout has
+            its colour.
+        channels: of the points.
 
     Raises:
-        UserError: there is no such axis.
+        UserError: there is no such axis or channel.
     """
 
     def __init__(
-        self, batch: Any, titles: Sequence[str], folder: Path, up: bool | str = "y"
+        self,
+        batch: Any,
+        titles: Sequence[str],
+        folder: Path,
+        up: bool | str = "y",
+        colour: str | None = None,
+        channels: PointChannels = NO_CHANNELS,
     ) -> None:
         axis = "y" if isinstance(up, bool) else up
         if axis not in drawing.VIEWS:
             raise UserError(f"up must be x, y or z (the vertical axis), got {up!r:.99}.")
+        if colour is not None and colour not in channels.names:
+            raise UserError(f"colour: no channel {colour!r}.{did_you_mean(colour, channels.names)}")
         self.up = axis
+        self.channel = None if colour is None else 3 + channels.names.index(colour)
         self.batch = batch
         self.titles = list(titles)
         self.folder = folder / "pictures"
@@ -113,7 +126,7 @@ class CloudVisualization(Callback):
         if module.sampler is None:
             methods[FULL] = batch.points
             figures = figures_of(module.task, batch, methods, self.titles)
-            drawn = _Drawn(figures, batch.points, {}, titles)
+            drawn = _Drawn(figures, coordinates(batch.points), {}, titles)
         else:
             drawn = self._with_sampler(module, batch, methods, scores)
         module.train(training)
@@ -133,10 +146,13 @@ class CloudVisualization(Callback):
         samples = readouts(points, {m: output}, module.sampler)[m]
         titles = cloud_titles(module.task, self.titles)
         figures = figures_of(module.task, batch, {**methods, **samples}, self.titles)
+        figures["clouds"] = drawing.cloud_grid(points, samples, titles, self.channel)
+        points = coordinates(points)
+        samples = {name: coordinates(chosen) for name, chosen in samples.items()}
         if scores is not None:
-            main = {**methods, module.main_readout: samples[module.main_readout]}
+            main = {name: coordinates(chosen) for name, chosen in methods.items()}
+            main[module.main_readout] = samples[module.main_readout]
             figures["comparison"] = self._comparison(module, points, main, scores)
-        figures["clouds"] = drawing.cloud_grid(points, samples, titles)
         matrix = output.matrix
         if matrix is not None and points.shape[1] * matrix.m <= DENSE_PIXELS:
             first = matrix.first_cloud()

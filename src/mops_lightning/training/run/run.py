@@ -18,6 +18,7 @@ from mops_lightning.training.as_trained import as_trained
 from mops_lightning.training.evaluation import TrainedRun
 from mops_lightning.training.run import pretrain
 from mops_lightning.training.run.build import build_parts
+from mops_lightning.training.run.channels import scaled_as_trained
 from mops_lightning.training.run.ending import sigterm_as_ctrl_c
 from mops_lightning.training.run.whole import recorded, train_and_test
 
@@ -51,7 +52,7 @@ def run(
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     with sigterm_as_ctrl_c(), recorded(settings, folder, overrides or [], writes=leads) as record:
         with record.timed("data"):
-            dataset = _load_data(cfg)
+            dataset = _load_data(cfg, trained)
         parts = build_parts(cfg, folder, dataset, record, trained)
         task_weights = None
         if parts.has_task_weights:
@@ -95,9 +96,10 @@ def claim(folder: Path) -> None:
         raise UserError(f"out: cannot write to {folder}: {error.strerror}.") from None
 
 
-def _load_data(cfg: DictConfig) -> CloudDataset:
-    """Load both splits and corrupt the test clouds."""
+def _load_data(cfg: DictConfig, trained: TrainedRun | None = None) -> CloudDataset:
+    """Load both splits, scale channels as given nets were trained, and corrupt the test clouds."""
     dataset: CloudDataset = build_as(CloudDataset, cfg.dataset, "dataset")
+    dataset = scaled_as_trained(dataset, cfg, trained)
     warning = scale_warning(dataset)
     if warning:
         print(warning, file=sys.stderr)
@@ -105,5 +107,5 @@ def _load_data(cfg: DictConfig) -> CloudDataset:
     if cfg.test_corruption:
         from mops_lightning.data.corruptions import corrupt
 
-        test = corrupt(test, cfg.test_corruption)
+        test = corrupt(test, cfg.test_corruption, dataset.channels)
     return replace(dataset, test=noisy(test, cfg.test_noise_std))

@@ -309,5 +309,7 @@ def _save_weights(parts: Parts, record: RunRecord) -> None:
         classes: tuple[str, ...] = ()
         if module is task and task.output_names:
             classes = getattr(parts.dataset, task.output_names)
-        weights.save(parts.folder / name, module, record.config, record.metrics, classes)
+        path = parts.folder / name
+        channels = parts.dataset.channels
+        weights.save(path, module, record.config, record.metrics, classes, channels)
         record.files[Path(name).stem] = name

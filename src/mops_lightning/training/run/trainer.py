@@ -179,6 +179,7 @@ def _chosen_callbacks(
         loader = CloudLoader(dataset.test, cfg.batch_size, make_batch=make_batch)
         offered["batch"] = loader.batch_of(rows)
         offered["titles"] = titles
+        offered["channels"] = dataset.channels
     chosen: list[Callback] = []
     for callback in build_callbacks(cfg.callbacks, offered, logged=logged):
         if isinstance(callback, ProgressBar) and not _has(cfg.trainer, "enable_progress_bar"):

@@ -1,0 +1,207 @@
+"""Files sampled by models with channels, which are columns found by their names."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning import downsample, load
+from mops_lightning.channels import Channel, PointChannels
+from mops_lightning.data.formats.registry import WRITERS, read
+from mops_lightning.data.formats.table import Table
+from mops_lightning.errors import UserError
+from mops_lightning.files.compare import compare_file, options_by_method
+from mops_lightning.files.icp.methods import ByWeights
+from mops_lightning.ops.normals import upward_normals
+from mops_lightning.samplers.fmops import FMOPSNet
+from mops_lightning.zoo import weights
+from tests.support.downsample import done, refused
+
+N = 300
+PATH = Path("scan.ply")
+INTENSITY = Channel("intensity", 100.0, 40.0)
+NORMALS = [Channel("normal_x"), Channel("normal_y"), Channel("normal_z")]
+
+
+def save(path, *channels):
+    """Write an FMOPS-Net with channels whose samples depend on them; return the file."""
+    torch.manual_seed(0)
+    settings: dict[str, Any] = {"m_max": 16, "feature_channels": [16, 8], "rho_channels": [12, 10]}
+    net = FMOPSNet(point_channels=PointChannels(channels), **settings)
+    net.queries.weight.data *= 100  # columns of S choose a few points, by their channels, too
+    target = "mops_lightning.samplers.fmops.FMOPSNet"
+    config = {"learn": "sampler", "m": 16, "sampler": {"_target_": target, **settings}}
+    weights.save(path, net, config, {}, channels=PointChannels(channels))
+    return path
+
+
+@pytest.fixture
+def model(tmp_path):
+    return save(tmp_path / "model.safetensors", INTENSITY, Channel("ring", 8.0, 4.0))
+
+
+@pytest.fixture
+def table():
+    rng = np.random.default_rng(0)
+    columns: dict[str, Any] = {
+        "ring": rng.integers(0, 16, N).astype(np.uint8),
+        "time": rng.random(N),
+        "Intensity": rng.integers(0, 255, N).astype(np.uint16),
+    }
+    return Table(rng.normal(size=(N, 3)) * [9, 5, 1] + 1000, columns)
+
+
+def matrix(table, *names):
+    return np.column_stack([table.points, *(table.columns[name] for name in names)])
+
+
+def test_columns_are_found_by_name_in_any_order(model, table, tmp_path):
+    WRITERS[".npz"](tmp_path / "in.npz", table)
+
+    done(tmp_path / "in.npz", tmp_path / "out.npz", "--weights", model, "--m", 9)
+
+    kept = read(tmp_path / "out.npz", 9, 0)
+    expected, rows = load(model).downsample(matrix(table, "Intensity", "ring"), 9)
+    np.testing.assert_array_equal(kept.points, expected[:, :3])
+    for name, column in table.columns.items():
+        np.testing.assert_array_equal(kept.columns[name], column[rows])
+
+
+def test_generated_points_have_channels_in_the_types_of_the_file(model, table, tmp_path):
+    WRITERS[".npz"](tmp_path / "in.npz", table)
+
+    settings = ["--weights", model, "--m", 9, "--readout", "generated"]
+    done(tmp_path / "in.npz", tmp_path / "out.npz", *settings)
+
+    generated = read(tmp_path / "out.npz", 9, 0)
+    given = matrix(table, "Intensity", "ring")
+    expected, _ = load(model).downsample(given, 9, readout="generated")
+    np.testing.assert_allclose(generated.points, expected[:, :3], rtol=1e-6)
+    assert generated.columns["Intensity"].dtype == np.uint16
+    np.testing.assert_allclose(generated.columns["Intensity"], expected[:, 3], atol=0.51)
+    np.testing.assert_allclose(generated.columns["ring"], expected[:, 4], atol=0.51)
+    assert list(generated.columns) == ["Intensity", "ring"]
+
+
+def test_generated_points_without_attributes_have_coordinates_only(model, table, tmp_path):
+    WRITERS[".npz"](tmp_path / "in.npz", table)
+
+    settings = ["--weights", model, "--m", 9, "--readout", "generated", "--coordinates-only"]
+    done(tmp_path / "in.npz", tmp_path / "out.npz", *settings)
+
+    assert not read(tmp_path / "out.npz", 9, 0).columns
+
+
+def test_upward_normals_are_written_with_length_one(table, tmp_path):
+    model = save(tmp_path / "model.safetensors", *NORMALS)
+    WRITERS[".ply"](tmp_path / "in.ply", table)
+
+    settings = ["--weights", model, "--m", 9, "--readout", "generated"]
+    done(tmp_path / "in.ply", tmp_path / "out.ply", *settings)
+
+    columns = read(tmp_path / "out.ply", 9, 0).columns
+    normals = np.stack([columns[name] for name in ("nx", "ny", "nz")], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), np.ones(9), atol=1e-6)
+    given = np.column_stack([table.points, upward_normals(table.points)])
+    expected, _ = load(model).downsample(given, 9, readout="generated")
+    np.testing.assert_allclose(normals, expected[:, 3:], atol=1e-4)
+
+
+@pytest.mark.parametrize("readout", ["generated", "matched"])
+def test_chunks_equal_the_whole_file(readout, model, table, tmp_path):
+    WRITERS[".ply"](tmp_path / "in.ply", table)
+    settings = ["--weights", model, "--m", 9, "--readout", readout]
+
+    done(tmp_path / "in.ply", tmp_path / "whole.npz", *settings)
+    done(tmp_path / "in.ply", tmp_path / "parts.npz", *settings, "--chunk", 70)
+
+    whole, parts = (read(tmp_path / f"{name}.npz", 9, 0) for name in ("whole", "parts"))
+    np.testing.assert_allclose(parts.points, whole.points, atol=1e-3)
+    assert list(parts.columns) == list(whole.columns)
+    for name, column in whole.columns.items():
+        np.testing.assert_allclose(parts.columns[name], column, atol=1)
+
+
+def test_chunks_do_not_estimate_features(table, tmp_path):
+    model = save(tmp_path / "model.safetensors", *NORMALS)
+    WRITERS[".ply"](tmp_path / "in.ply", table)
+
+    settings = ["--weights", model, "--m", 9, "--readout", "generated", "--chunk", 70]
+    line = refused(tmp_path / "in.ply", tmp_path / "out.ply", *settings)
+
+    assert "in.ply has no columns of normals, which are estimated from all points of a file" in line
+
+
+def test_tiles_have_the_channels_of_their_points(model, table, tmp_path):
+    WRITERS[".npz"](tmp_path / "in.npz", table)
+    changed = table.with_columns({"Intensity": table.columns["Intensity"][::-1].copy()})
+    WRITERS[".npz"](tmp_path / "changed.npz", changed)
+    settings = ["--weights", model, "--m", 20, "--tile", 100]
+
+    done(tmp_path / "in.npz", tmp_path / "out.npz", *settings)
+    done(tmp_path / "changed.npz", tmp_path / "other.npz", *settings)
+
+    kept = read(tmp_path / "out.npz", 9, 0).points
+    given = matrix(table, "Intensity", "ring")
+    in_python, _ = downsample(given, 20, model, tile=100)
+    np.testing.assert_array_equal(kept, in_python[:, :3])
+    assert not np.array_equal(kept, read(tmp_path / "other.npz", 9, 0).points)
+
+
+def test_file_without_a_column_is_refused_with_what_it_has(model, table, tmp_path):
+    table.columns.pop("ring")
+    WRITERS[".npz"](tmp_path / "in.npz", table)
+
+    line = refused(tmp_path / "in.npz", tmp_path / "out.npz", "--weights", model, "--m", 9)
+
+    assert "--weights: " in line
+    assert "in.npz has no column 'ring' of intensity, ring." in line
+    assert "Allowed: Intensity, curvature, normals, time." in line
+
+
+def test_missing_values_are_refused_with_their_number(model, table, tmp_path):
+    intensity = table.columns["Intensity"].astype(np.float32)
+    intensity[:7] = np.nan
+    WRITERS[".npz"](tmp_path / "in.npz", table.with_columns({"Intensity": intensity}))
+
+    line = refused(tmp_path / "in.npz", tmp_path / "out.npz", "--weights", model, "--m", 9)
+
+    assert "7 of 300 points of " in line
+    assert "have no finite intensity." in line
+
+
+def test_python_takes_channels_after_the_coordinates(model, table):
+    given = torch.from_numpy(matrix(table, "Intensity", "ring"))
+
+    points, rows = downsample(given, 9, model)
+    generated, none = downsample(given, 9, model, readout="generated")
+    (listed,), _ = downsample([given], 9, model)
+
+    assert torch.equal(points, given[rows])
+    assert torch.equal(listed, points)
+    assert (generated.shape, none) == ((9, 5), None)
+
+
+@pytest.mark.parametrize("columns", [3, 4, 6])
+def test_python_names_the_columns_that_a_model_takes(columns, model):
+    with pytest.raises(UserError, match="x, y, z, intensity, ring"):
+        downsample(torch.rand(30, columns), 9, model)
+
+
+def test_compare_samples_with_channels(model, table, tmp_path):
+    WRITERS[".npz"](tmp_path / "in.npz", table)
+    methods = options_by_method(9, ["fps"], str(model), None, 0)
+
+    result = compare_file(tmp_path / "in.npz", 9, methods, 0)
+
+    _, expected = load(model).downsample(matrix(table, "Intensity", "ring"), 9)
+    np.testing.assert_array_equal(result.results[-1].rows, expected)
+
+
+def test_registration_of_scans_refuses_channels(model, table):
+    method = ByWeights(str(model), None)
+
+    with pytest.raises(UserError, match="trained with the features intensity, ring, but scans"):
+        method.sample(table.points, 9, 0, PATH)

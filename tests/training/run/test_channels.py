@@ -1,0 +1,190 @@
+"""Runs on points with channels: trained, tested again, and loaded with their statistics."""
+
+import shutil
+from dataclasses import replace
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning import FPSSampler, MOPSNet, load
+from mops_lightning.channels import Channel, PointChannels
+from mops_lightning.data.formats.registry import WRITERS, read
+from mops_lightning.data.formats.table import Table
+from mops_lightning.errors import UserError
+from mops_lightning.records import run_record
+from mops_lightning.training.run.channels import check_sampler
+from mops_lightning.zoo.publish import add
+from tests.support import downsample
+from tests.support.command_line import TINY_ANY_DATA, done, refused, runs
+from tests.support.training import small_dataset
+
+SETTINGS = [
+    *TINY_ANY_DATA,
+    "dataset=clouds",
+    "dataset.root=scans",
+    "dataset.crops=4",
+    "dataset.features=[intensity,normals]",
+    "val_fraction=0",
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Clouds of two classes with an intensity and a part, in a folder that tests share."""
+    folder = tmp_path_factory.mktemp("channels")
+    for number in range(8):
+        points = np.random.default_rng(number).normal(size=(120, 3)) * [3, 2, 1]
+        columns = {
+            "intensity": 100 + 10 * points[:, 0].astype(np.float32),
+            "part": (points[:, 1] > 0).astype(np.int32),
+        }
+        path = folder / "scans" / ("car" if number % 2 else "tree") / f"{number}.ply"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        WRITERS[".ply"](path, Table(points, columns))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(folder):
+    """A run that trained a sampler, and its task net before."""
+    done([*SETTINGS, "task=classification", "sampler=fmops", "sampler.m_max=8"], folder)
+    (run,) = runs(folder)
+    return run
+
+
+def test_weights_know_the_statistics_of_the_training_split(trained):
+    sampler: Any = load(trained)
+
+    channels = sampler.point_channels
+    assert channels.features == ("intensity", "normals")
+    assert channels.columns[0].mean == pytest.approx(100, abs=5)
+    assert channels.columns[0].scale == pytest.approx(30, abs=6)
+    assert channels.columns[1][1:] == (0.0, 1.0)
+    assert sampler.features.mlp.layers[0].weight.shape[1] == 7
+
+
+def test_evaluation_of_the_same_data_repeats_the_scores(folder, trained):
+    done([f"evaluate={trained}", "out=evaluated"], folder)
+
+    (again,) = (folder / "evaluated").rglob("result.json")
+    assert run_record.read(again.parent).metrics == run_record.read(trained).metrics
+
+
+def test_evaluation_with_features_in_another_order_is_refused(folder, trained):
+    line = refused([f"evaluate={trained}", "dataset.features=[normals,intensity]"], folder)
+
+    assert "was trained with the features intensity, normals, but dataset.features gives" in line
+    assert "Set dataset.features=[intensity, normals]." in line
+
+
+def test_evaluation_without_the_features_is_refused(folder, trained):
+    line = refused([f"evaluate={trained}", "dataset.features=null"], folder)
+
+    assert "dataset.features gives none. Set dataset.features=[intensity, normals]." in line
+
+
+def test_feature_that_a_file_lacks_is_refused_with_what_it_has(folder):
+    line = refused([*SETTINGS, "dataset.features=[reflectance]"], folder)
+
+    assert "dataset.features: scans/car/1.ply has no column 'reflectance'." in line
+    assert "Allowed: curvature, intensity, normals, part." in line
+
+
+def test_model_has_the_channels_of_its_run(trained, tmp_path):
+    path = add(trained, "fmops.trees", tmp_path)
+
+    model = load(path)
+
+    assert model.point_channels == load(trained).point_channels
+    cloud = torch.rand(50, 7)
+    cloud[:, 4:] = torch.nn.functional.normalize(cloud[:, 4:], dim=1)
+    assert model.downsample(cloud, 5)[0].shape == (5, 7)
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        ["task=registration", "task.net.feature_channels=[16,32]", "sampler=mops"],
+        ["task=reconstruction", "sampler=samplenet", "task.exact_up_to=null", "sampler.k=3"],
+        ["task=segmentation", "dataset.label=part", "learn=joint", "sampler=gumbel"],
+        ["task=classification", "learn=joint", "sampler=fps", "weights=null"],
+    ],
+)
+def test_every_task_trains_with_channels(folder, chosen, tmp_path):
+    augmented = ["++augment.sampler.rotate_up=z", "++augment.task.rotate_up=z", "pictures=2"]
+
+    done([*SETTINGS, *augmented, f"dataset.root={folder / 'scans'}", *chosen], tmp_path)
+
+    (run,) = runs(tmp_path)
+    record = run_record.read(run)
+    assert record.status == "completed"
+    assert record.score is not None
+    assert np.isfinite(record.score)
+
+
+def test_pictures_take_the_colours_of_a_channel(folder, tmp_path):
+    settings = [*SETTINGS, f"dataset.root={folder / 'scans'}", "pictures=1", "weights=null"]
+    settings += ["task=classification", "learn=joint", "+callbacks.pictures.colour=intensity"]
+
+    done(settings, tmp_path)
+
+    (run,) = runs(tmp_path)
+    image = plt.imread(run / "pictures" / "clouds.png")[..., :3]
+    saturated = (image.max(2) - image.min(2)) > 0.3
+    left = saturated[:, : image.shape[1] // 4]
+    assert left.sum() > 50  # the input, which is grey otherwise
+
+
+def test_colour_of_an_unknown_channel_is_refused(folder):
+    line = refused([*SETTINGS, "pictures=1", "+callbacks.pictures.colour=ring"], folder)
+
+    assert "callbacks.pictures.colour: no channel 'ring'. Allowed: intensity, normal_x," in line
+
+
+def test_net_without_channels_is_refused(folder):
+    line = refused([*SETTINGS, "task=reconstruction", "weights=autoencoder.airplane"], folder)
+
+    assert "weights: " in line
+    assert "was trained with the features none, but dataset.features gives intensity" in line
+
+
+def test_learned_sampler_without_channels_is_refused():
+    dataset = replace(small_dataset(), channels=PointChannels([Channel("intensity")]))
+
+    check_sampler(MOPSNet(8, point_channels=1), dataset)
+    check_sampler(FPSSampler(8), dataset)
+    with pytest.raises(UserError, match=r"^sampler: MOPSNet takes x, y and z only, but .* intensi"):
+        check_sampler(MOPSNet(8), dataset)
+
+
+def test_net_without_an_argument_for_channels_is_refused(folder):
+    line = refused([*SETTINGS, "task.net._target_=tests.support.plain_net.PlainNet"], folder)
+
+    assert "task/net=own takes x, y and z only, but dataset.features gives intensity" in line
+
+
+def test_real_airborne_scans_train_and_are_downsampled_with_intensity(real_data, tmp_path):
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    for name in ("autzen-thin.las", "4_6_crop.las"):
+        shutil.copy(real_data(f"airborne/{name}"), scans)
+    settings = ["task=segmentation", "dataset.label=classification", "learn=joint", "sampler=mops"]
+    features = "dataset.features=[intensity,return_number,normals]"
+    done([*SETTINGS, *settings, features, f"dataset.root={scans}"], tmp_path)
+    (run,) = runs(tmp_path)
+    small = tmp_path / "small.las"
+
+    downsample.done(
+        scans / "autzen-thin.las", small, "--weights", run, "--m", 8, "--readout", "generated"
+    )
+
+    before = read(scans / "autzen-thin.las", 9, 0).columns
+    after = read(small, 9, 0).columns
+    assert after["intensity"].dtype == before["intensity"].dtype
+    assert before["intensity"].min() <= after["intensity"].min()
+    assert after["intensity"].max() <= before["intensity"].max()
+    normals = np.stack([after[name] for name in ("nx", "ny", "nz")], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), np.ones(8), atol=1e-5)
