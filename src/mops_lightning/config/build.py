@@ -138,7 +138,10 @@ def build_as(
     Raises:
         UserError: also if it is of another class.
     """
-    taken = {name: value for name, value in (offered or {}).items() if takes(node, name)}
+    taken = {}
+    if offered:
+        parameters = signature(str(node["_target_"]), where)
+        taken = {name: value for name, value in offered.items() if name in parameters}
     made = build(node, where, **taken, **extra)
     if not isinstance(made, kind):
         raise UserError(
