@@ -77,6 +77,61 @@ def test_onnx_file_equals_the_model_at_any_size(tmp_path):
             assert np.allclose(generated, sampler(points).points.numpy(), atol=1e-5)
 
 
+def anchored(**columns):
+    """Return an FMOPS-Net for up to 12 points whose weights are all moved away from their start."""
+    torch.manual_seed(0)
+    sampler = FMOPSNet(12, anchors="fps", **columns, **SMALL)
+    for weights in sampler.queries.parameters():
+        torch.nn.init.normal_(weights, std=0.3)
+    sampler(clouds(4, 150)).points.sum()  # running statistics
+    return sampler.eval()
+
+
+@pytest.mark.parametrize(
+    ("columns", "least"),
+    [
+        ({}, 64),
+        ({"candidates": 8, "neighbours": 6}, 96),
+        ({"candidates": 5}, 64),
+        ({"neighbours": 70}, 70),
+    ],
+    ids=str,
+)
+def test_exported_anchored_program_equals_the_sampler_from_the_least_number(
+    columns, least, tmp_path
+):
+    sampler = anchored(**columns)
+
+    export(sampler, tmp_path / "net.pt2", 5)
+
+    program = torch.export.load(tmp_path / "net.pt2").module()
+    with torch.no_grad():
+        for shape in ((1, least), (3, 200)):
+            points = clouds(*shape)
+            assert torch.allclose(program(points), sampler(points, 5).points, atol=1e-5)
+    with pytest.raises(AssertionError, match=f"points.*>= {least}"):
+        program(clouds(1, least - 1))
+
+
+def test_onnx_file_of_local_columns_equals_the_sampler_and_refuses_too_few_points(tmp_path):
+    pytest.importorskip("onnxscript", reason="extra onnx")
+    onnxruntime = pytest.importorskip("onnxruntime", reason="extra onnx")
+    sampler = anchored(candidates=8, neighbours=6)
+
+    export(sampler, tmp_path / "net.onnx", 5)
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4  # the refusal is also logged
+    session = onnxruntime.InferenceSession(tmp_path / "net.onnx", options)
+    for shape in ((1, 96), (3, 200)):
+        points = clouds(*shape)
+        (generated,) = session.run(["generated"], {"points": points.numpy()})
+        with torch.no_grad():
+            assert np.allclose(generated, sampler(points, 5).points.numpy(), atol=1e-5)
+    with pytest.raises(Exception, match="Out of range value in index tensor"):
+        session.run(["generated"], {"points": clouds(1, 95).numpy()})
+
+
 def test_sampler_that_is_not_learned_is_not_exported(tmp_path):
     with pytest.raises(UserError, match="FPSSampler cannot be exported"):
         export(FPSSampler(8).eval(), tmp_path / "net.onnx")

@@ -66,6 +66,8 @@ def nearest_rows(queries: Tensor, points: Tensor, k: int) -> Tensor:
         k: number of points, at most N.
     """
     queries, points = queries.detach(), points.detach()
+    if torch.compiler.is_exporting():
+        return _nearest_in_graph(queries, points, k)
     work = queries.shape[1] * points.shape[1]
     on_cpu = points.device.type == "cpu" and not torch.compiler.is_compiling()
     if not on_cpu or work < TREE_MIN_WORK:
@@ -75,3 +77,12 @@ def nearest_rows(queries: Tensor, points: Tensor, k: int) -> Tensor:
         _, rows = cKDTree(cloud, balanced_tree=False).query(query, k)
         found.append(torch.from_numpy(rows).view(len(query), k))
     return torch.stack(found)
+
+
+def _nearest_in_graph(queries: Tensor, points: Tensor, k: int) -> Tensor:
+    """Find the k nearest rows ``(B, M, k)`` by operations that do not depend on the sizes."""
+    squares = torch.zeros_like(queries[..., :1])
+    for axis in range(queries.shape[2]):
+        apart = queries[:, :, None, axis] - points[:, None, :, axis]
+        squares = squares + apart.square()
+    return squares.topk(k, largest=False)[1]

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from mops_lightning.ops.points import distance_dtype, gather_points
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
+from mops_lightning.ops.traced_farthest import farthest_from_mean
 from mops_lightning.samplers.fps import FARTHEST, farthest_rows
 
 SPACING_POINTS = 64
@@ -53,6 +54,10 @@ class FPSAnchors(nn.Module):
         """The vectors w ``(m, C)``."""
         return self.slots
 
+    def least_points(self, m: int) -> int:
+        """Return how many points a cloud must have in an exported program for m columns."""
+        return max(m, SPACING_POINTS)
+
     def forward(self, points: Tensor, keys: Tensor, m: int, tau: float) -> SamplingMatrix:
         """Return the first m columns of the sampling matrices.
 
@@ -69,9 +74,8 @@ class FPSAnchors(nn.Module):
         places, keys = points.to(dtype), keys.to(dtype)
         # Distances are more precise around the mean.
         centred = places - places.mean(1, keepdim=True)
-        count = min(SPACING_POINTS, places.shape[1])
-        rows = farthest_rows(places, max(m, count), start=FARTHEST)
-        unit = squared_spacing(gather_points(centred, rows[:, :count]))
+        rows = rows_from_mean(places, m)
+        unit = squared_spacing(gather_points(centred, rows[:, :SPACING_POINTS]))
         rows = rows[:, :m]
         anchors = gather_points(centred, rows)
         width = unit[:, None] * self.log_width[:m].to(dtype).mul(2).exp()
@@ -81,6 +85,23 @@ class FPSAnchors(nn.Module):
         queries = torch.cat([content, 2 * sharpness * anchors, -sharpness], 2)
         squares = centred.square().sum(2, keepdim=True)
         return SamplingMatrix(queries, torch.cat([keys, centred, squares], 2), tau)
+
+
+def rows_from_mean(places: Tensor, number: int) -> Tensor:
+    """Return the rows of the farthest points that determine anchors and the unit of widths.
+
+    Args:
+        places: ``(B, N, 3)``.
+        number: number of farthest points that are needed, beside those for the unit.
+
+    Returns:
+        ``(B, K)`` int64 in the order of choice, with K = max(``number``, ``SPACING_POINTS``), but
+        at most N. Exported programs need N ≥ K.
+    """
+    wanted = max(number, SPACING_POINTS)
+    if torch.compiler.is_exporting():
+        return farthest_from_mean(places, wanted)
+    return farthest_rows(places, min(wanted, places.shape[1]), start=FARTHEST)
 
 
 def squared_spacing(farthest: Tensor) -> Tensor:

@@ -26,9 +26,9 @@ from mops_lightning.samplers.anchors import (
     SMALLEST,
     SPACING_POINTS,
     FPSAnchors,
+    rows_from_mean,
     squared_spacing,
 )
-from mops_lightning.samplers.fps import FARTHEST, farthest_rows
 
 Keys = Callable[[Tensor, Tensor], Tensor]
 """From candidates ``(B, K, 3)`` and their rows ``(B, K)`` in the cloud to keys ``(B, K, C)``."""
@@ -66,6 +66,12 @@ class LocalAnchors(FPSAnchors):
         self.candidates = candidates
         self.neighbours = neighbours
 
+    def least_points(self, m: int) -> int:
+        """Return how many points a cloud must have in an exported program for m columns."""
+        if self.candidates is None:
+            return max(super().least_points(m), self.neighbours or 1)
+        return super().least_points(self.candidates * len(self.slots))
+
     def local_matrix(self, points: Tensor, keys_of: Keys, m: int, tau: float) -> LocalMatrix:
         """Return the first m columns of the sampling matrices.
 
@@ -99,16 +105,23 @@ class LocalAnchors(FPSAnchors):
     def thin(self, places: Tensor, m: int) -> Thinned:
         """Choose the candidates of clouds ``(B, N, 3)``, and m anchors among them."""
         clouds, n = places.shape[:2]
-        wanted = n if self.candidates is None else self.candidates * len(self.slots)
-        spacing = min(SPACING_POINTS, n)
-        thins = wanted < n
-        farthest = farthest_rows(places, max(wanted if thins else m, spacing), start=FARTHEST)
-        unit = squared_spacing(gather_points(places, farthest[:, :spacing]))
-        if thins:
+        wanted = self._wanted(n)
+        farthest = rows_from_mean(places, m if wanted is None else wanted)
+        unit = squared_spacing(gather_points(places, farthest[:, :SPACING_POINTS]))
+        if wanted is not None:
             anchors = torch.arange(m, device=places.device).expand(clouds, m)
             return Thinned(farthest[:, :wanted], anchors, unit)
         everything = torch.arange(n, device=places.device).expand(clouds, n)
         return Thinned(everything, farthest[:, :m], unit)
+
+    def _wanted(self, n: int) -> int | None:
+        """Return how many of n points are candidates; None: all, in the order of the cloud."""
+        if self.candidates is None:
+            return None
+        wanted = self.candidates * len(self.slots)
+        if torch.compiler.is_exporting():  # for any n from least_points
+            return wanted
+        return wanted if wanted < n else None
 
     def _neighbours(self, anchors: Tensor, candidates: Tensor) -> Tensor:
         """Return the places ``(B, m, k)`` of the candidates that columns choose among."""

@@ -14,6 +14,7 @@ from mops_lightning.channels import PointChannels
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
+from mops_lightning.samplers.anchors import FPSAnchors
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.snet import SNet
@@ -22,7 +23,7 @@ SUFFIXES = (".onnx", ".pt2")
 TOLERANCE = 1e-5
 """Largest difference between points of the file and of the sampler, in the unit sphere."""
 CHECKED = ((1, 1), (3, 2), (2, 7))
-"""Numbers of clouds, and of points as multiples of m, at which a file is compared."""
+"""Numbers of clouds, and of points as multiples of the least number, for comparisons."""
 MANY = 2**23
 """Number of points times m at which a file is compared as well: more than S has in one piece."""
 MOST_POINTS = 2**16
@@ -51,17 +52,19 @@ class GeneratedPoints(nn.Module):
         super().__init__()
         self.m = sampler.m if m is None else m
         sampler.check_m(self.m)
-        if isinstance(sampler, MOPSNet) and not sampler.streams:
-            raise UserError(
-                f"{type(sampler).__name__} with anchors=fps cannot be exported, as its farthest "
-                "points are found one by one. Export one without anchors."
-            )
         if not isinstance(sampler, MOPSNet | SNet):
             raise UserError(
                 f"{type(sampler).__name__} cannot be exported. MOPS-Net, FMOPS-Net, S-Net and "
                 "SampleNet can."
             )
         self.sampler = sampler
+
+    @property
+    def least_points(self) -> int:
+        """How many points a cloud must have."""
+        if isinstance(self.sampler, MOPSNet) and isinstance(self.sampler.queries, FPSAnchors):
+            return self.sampler.queries.least_points(self.m)
+        return 1
 
     def forward(self, points: Tensor) -> Tensor:
         """Return the generated points."""
@@ -81,7 +84,9 @@ def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
 
     Input ``points`` are ``(batch, points, 3 + C)`` float32, in the unit sphere and with channels
     scaled as in training, with any number of clouds and points; output ``generated`` is
-    ``(batch, m, 3 + C)``, of S-Net and SampleNet ``(batch, m, 3)``.
+    ``(batch, m, 3 + C)``, of S-Net and SampleNet ``(batch, m, 3)``. With ``anchors=fps`` clouds
+    must have at least ``GeneratedPoints.least_points`` points; the lowest row wins ties of
+    farthest points.
 
     Args:
         sampler: trained, in eval mode.
@@ -101,8 +106,11 @@ def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
     m = net.m
     channels = sampler.point_channels
     width = 3 + len(channels)
-    example = torch.rand(2, 2 * m + 3, width, generator=torch.Generator().manual_seed(0))
-    dynamic = ({axis: torch.export.Dim(name) for axis, name in enumerate(AXES)},)
+    number = 2 * max(m, net.least_points) + 3
+    example = torch.rand(2, number, width, generator=torch.Generator().manual_seed(0))
+    batch, points_axis = AXES
+    points_size = torch.export.Dim(points_axis, min=max(net.least_points, 2))
+    dynamic = ({0: torch.export.Dim(batch), 1: points_size},)
     with torch.no_grad(), atomic_write(path) as temporary:
         program = torch.export.export(net, (example,), dynamic_shapes=dynamic)
         if path.suffix == ".pt2":
@@ -113,7 +121,8 @@ def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
         else:
             exported = _to_onnx(program, temporary)
         difference = max(
-            _difference(exported, sampler, m, points) for points in _clouds(m, channels)
+            _difference(exported, sampler, m, points)
+            for points in _clouds(m, max(m, net.least_points), channels)
         )
         if difference > TOLERANCE:
             raise UserError(
@@ -132,11 +141,18 @@ def _difference(
     return float((generated - expected).abs().max())
 
 
-def _clouds(m: int, channels: PointChannels) -> Iterable[Tensor]:
-    """Yield random clouds in the unit sphere; their normals point upwards, as on a surface."""
+def _clouds(m: int, least: int, channels: PointChannels) -> Iterable[Tensor]:
+    """Yield random clouds in the unit sphere; their normals point upwards, as on a surface.
+
+    Args:
+        m: number of points that are generated.
+        least: smallest number of points of a cloud.
+        channels: of the points.
+    """
     rng = torch.Generator().manual_seed(1)
-    many = min(MANY // m + 1, MOST_POINTS)
-    for clouds, number in [*((clouds, times * m + 5) for clouds, times in CHECKED), (1, many)]:
+    many = max(min(MANY // m + 1, MOST_POINTS), least)
+    shapes = [(clouds, times * least + 5) for clouds, times in CHECKED]
+    for clouds, number in [*shapes, (1, many)]:
         points = torch.randn(clouds, number, 3, generator=rng)
         points = points / points.norm(dim=2).amax(1)[:, None, None]
         if channels:
