@@ -96,6 +96,27 @@ def test_coreset_takes_tensors_normals_and_leaves_out_far_points():
     assert weights.sum() == pytest.approx(200)
 
 
+@pytest.mark.parametrize("m", [np.int64(40), np.uint8(40), torch.tensor(40)])
+def test_coreset_takes_whole_numbers_of_numpy_and_torch(m):
+    source, target = surface(100, 0), surface(100, 1)
+
+    rows, weights = coreset(source, target, np.eye(4), m)
+
+    expected = coreset(source, target, np.eye(4), 40)
+    assert rows.tolist() == expected.rows.tolist()
+    assert weights.tolist() == expected.weights.tolist()
+
+
+def test_coreset_takes_lists_half_precision_and_a_distance_in_a_tensor():
+    source = torch.from_numpy(surface(50, 0)).bfloat16()
+    target = surface(50, 1).tolist()
+
+    rows, _ = coreset(source, target, np.eye(4).tolist(), 50, max_distance=torch.tensor(2.0))
+
+    plain = coreset(source.double().numpy(), np.array(target), np.eye(4), 50, max_distance=2.0)
+    assert rows.tolist() == plain.rows.tolist()
+
+
 def test_coreset_returns_all_points_where_there_are_few():
     points = surface(25, 0)
 
@@ -120,12 +141,22 @@ def test_same_sum_of_numbers_on_a_line_is_two_of_them():
     [
         ({"m": 28}, "m must be a whole number of at least 29, got 28"),
         ({"m": 29.0}, "m must be a whole number of at least 29, got 29.0"),
+        ({"m": np.float64(29)}, "m must be a whole number of at least 29"),
+        ({"m": True}, "m must be a whole number of at least 29, got True"),
         ({"source": np.zeros((5, 2))}, r"source must have shape \(N, 3\).* got \(5, 2\)"),
         ({"target": np.full((5, 3), np.nan)}, "target must be finite"),
-        ({"pose": np.eye(3)}, r"pose must be a \(4, 4\) rigid motion"),
+        ({"target": np.ones((5, 3), complex)}, r"target must be numbers \(N, 3\)"),
+        ({"pose": np.eye(3)}, r"pose must be a \(4, 4\) rigid motion, got shape \(3, 3\)"),
+        ({"pose": "poses.txt"}, r"pose must be numbers \(4, 4\), got str"),
+        ({"pose": [[1, 2], [3]]}, r"pose must be numbers \(4, 4\), got list"),
+        ({"pose": {}}, r"pose must be numbers \(4, 4\), got dict"),
+        ({"pose": pose_of([0, 0, 0], [0, np.nan, 0])}, "pose must be finite, got NaN"),
         ({"pose": 2 * np.eye(4)}, r"pose must be a \(4, 4\) rigid motion"),
         ({"normals": np.ones((4, 3))}, r"normals must be one per target point, \(50, 3\)"),
-        ({"max_distance": 0.0}, "max_distance must be above 0, got 0.0"),
+        ({"max_distance": 0.0}, "max_distance must be a number above 0, got 0.0"),
+        ({"max_distance": None}, "max_distance must be a number above 0, got None"),
+        ({"max_distance": "far"}, "max_distance must be a number above 0, got 'far'"),
+        ({"max_distance": np.nan}, "max_distance must be a number above 0, got nan"),
         ({"pose": pose_of([0, 0, 0], [99, 0, 0]), "max_distance": 1.0}, "no source point is"),
     ],
 )

@@ -31,6 +31,13 @@ def test_stratify_min_keeps_rare_points():
     assert kept_classes(rows) == {-1: 3, 3: 12, 7: 5}
 
 
+@pytest.mark.parametrize("least", [np.int64(5), torch.tensor(5)])
+def test_stratify_min_takes_whole_numbers_of_numpy_and_torch(least):
+    _, rows = downsample(CLOUD, 20, stratify=CLASSES, stratify_min=least)
+
+    assert kept_classes(rows) == {-1: 3, 3: 12, 7: 5}
+
+
 def test_stratify_samples_every_class_on_its_own():
     _, rows = downsample(CLOUD, 20, stratify=CLASSES)
 

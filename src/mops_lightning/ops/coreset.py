@@ -3,12 +3,14 @@
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops.caratheodory import same_sum
 from mops_lightning.ops.normals import estimate_normals
+from mops_lightning.ops.scalars import is_real_number, is_whole_number, python_number
 
 LEAST = 29
 """Least number of points: 21 entries of H, 6 of b, the error and the number of residuals."""
@@ -50,7 +52,7 @@ def coreset(
     m: int,
     *,
     normals: Any = None,
-    max_distance: float = np.inf,
+    max_distance: float | torch.Tensor = np.inf,
 ) -> Coreset:
     """Choose points and weights of a source with which a Gauss–Newton step is that of all points.
 
@@ -64,7 +66,7 @@ def coreset(
         source: ``(N, 3)`` points, an array or a tensor; one cloud, no batch ``(B, N, 3)``.
         target: ``(K, 3)`` points.
         pose: ``(4, 4)`` rigid motion from source to target, at which residuals are taken.
-        m: largest number of points, at least 29.
+        m: largest number of points, at least 29; a whole number of Python, NumPy or torch.
         normals: ``(K, 3)`` unit normals of the target; None: they are estimated.
         max_distance: source points without a target point within it have no residual; in the
             clouds' unit.
@@ -84,8 +86,10 @@ def coreset(
         >>> len(rows) <= 29, round(float(weights.sum()))
         (True, 500)
     """
-    if isinstance(m, bool) or not isinstance(m, int) or m < LEAST:
-        raise UserError(f"m must be a whole number of at least {LEAST}, got {m!r}.")
+    size = python_number(m)
+    if not is_whole_number(size) or size < LEAST:
+        raise UserError(f"m must be a whole number of at least {LEAST}, got {m!r:.99}.")
+    m = int(size)
     found = point_to_plane(source, target, pose, normals, max_distance)
     number = len(found.rows)
     if number <= m:
@@ -106,14 +110,19 @@ def coreset(
 
 
 def point_to_plane(
-    source: Any, target: Any, pose: Any, normals: Any = None, max_distance: float = np.inf
+    source: Any,
+    target: Any,
+    pose: Any,
+    normals: Any = None,
+    max_distance: float | torch.Tensor = np.inf,
 ) -> Residuals:
     """Return the residuals of all source points at a pose; see ``coreset`` for the arguments."""
     points = _cloud("source", source)
     plane_points = _cloud("target", target)
     motion = _motion(pose)
-    if not max_distance > 0:
-        raise UserError(f"max_distance must be above 0, got {max_distance}.")
+    reach = python_number(max_distance)
+    if not is_real_number(reach) or not reach > 0:
+        raise UserError(f"max_distance must be a number above 0, got {max_distance!r:.99}.")
     directions = estimate_normals(plane_points)
     if normals is not None:
         directions = _cloud("normals", normals)
@@ -127,7 +136,7 @@ def point_to_plane(
     moved = points @ motion[:3, :3].T + (motion[:3, 3] - centre)
     neighbours: Any = cKDTree(plane_points).query(moved)
     distance, nearest = neighbours
-    rows = np.flatnonzero(distance <= max_distance)
+    rows = np.flatnonzero(distance <= reach)
     if not len(rows):
         raise UserError("no source point is within max_distance of the target at this pose.")
     across = directions[nearest[rows]]
@@ -146,12 +155,7 @@ def _summands(found: Residuals) -> Array:
 
 def _cloud(name: str, value: Any) -> Array:
     """Return finite points ``(N, 3)`` in float64."""
-    if hasattr(value, "detach"):
-        value = value.detach().cpu().numpy()
-    try:
-        points = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        raise UserError(f"{name} must be numbers (N, 3), got {type(value).__name__}.") from None
+    points = _numbers(name, value, "(N, 3)")
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise UserError(f"{name} must have shape (N, 3), N at least 1, got {points.shape}.")
     if not np.isfinite(points).all():
@@ -161,15 +165,30 @@ def _cloud(name: str, value: Any) -> Array:
 
 def _motion(pose: Any) -> Array:
     """Return a rigid motion ``(4, 4)`` in float64."""
-    if hasattr(pose, "detach"):
-        pose = pose.detach().cpu().numpy()
-    motion: Array = np.asarray(pose, np.float64)
-    is_rigid = motion.shape == (4, 4) and np.allclose(
-        motion[:3, :3] @ motion[:3, :3].T, np.eye(3), atol=1e-3
-    )
-    if not is_rigid or not np.allclose(motion[3], [0, 0, 0, 1]):
+    motion = _numbers("pose", pose, "(4, 4)")
+    if motion.shape != (4, 4):
+        raise UserError(f"pose must be a (4, 4) rigid motion, got shape {motion.shape}.")
+    if not np.isfinite(motion).all():
+        raise UserError("pose must be finite, got NaN or infinity.")
+    rotation = motion[:3, :3]
+    is_orthogonal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    if not is_orthogonal or not np.allclose(motion[3], [0, 0, 0, 1]):
         raise UserError(
-            "pose must be a (4, 4) rigid motion: a rotation, a shift, and (0, 0, 0, 1) below; got "
-            f"shape {motion.shape}."
+            "pose must be a (4, 4) rigid motion: a rotation and a shift, with (0, 0, 0, 1) below; "
+            f"got {motion.tolist()}."
         )
     return motion
+
+
+def _numbers(name: str, value: Any, shape: str) -> Array:
+    """Return an array, a tensor or lists of real numbers in float64."""
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu()
+        value = value.double() if value.is_floating_point() else value
+    try:
+        array = np.asarray(value)
+        if np.iscomplexobj(array):
+            raise TypeError("complex numbers")
+        return array.astype(np.float64)
+    except (TypeError, ValueError):
+        raise UserError(f"{name} must be numbers {shape}, got {type(value).__name__}.") from None

@@ -1,12 +1,12 @@
 """How much of a cloud to keep: a number of points, a share, a spacing, or the size of voxels."""
 
 from math import floor, inf
-from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 
 from mops_lightning.errors import UserError
+from mops_lightning.ops.scalars import is_real_number, is_whole_number, python_number
 
 Size = int | float
 """Points to keep: their number, or a share above 0 and below 1."""
@@ -21,9 +21,9 @@ def as_size(m: Any) -> Size:
     Raises:
         UserError: it is neither.
     """
-    number: Any = m.item() if getattr(m, "shape", None) == () else m
-    is_number = isinstance(number, Real) and not isinstance(number, bool)
-    is_whole = is_number and isinstance(number, Integral)
+    number = python_number(m)
+    is_number = is_real_number(number)
+    is_whole = is_whole_number(number)
     if is_whole and number >= 1:
         return int(number)
     if is_number and not is_whole and 0 < number < 1:

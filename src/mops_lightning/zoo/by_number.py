@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import as_tensor
+from mops_lightning.ops.scalars import is_whole_number, python_number
 from mops_lightning.ops.weights import check_positive
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.budget import as_size, number_of
@@ -123,8 +124,8 @@ class Classes:
         Raises:
             UserError: they are no classes of the points, or no number.
         """
-        is_number = isinstance(least, int | np.integer) and not isinstance(least, bool)
-        if least is not None and not (is_number and least >= 1):
+        number = python_number(least)
+        if least is not None and not (is_whole_number(number) and number >= 1):
             raise UserError(
                 f"stratify_min must be a whole number of at least 1, got {least!r:.99}."
             )
@@ -139,7 +140,7 @@ class Classes:
                 "stratify must hold the class of every point: (N,), (B, N) or (P,) whole numbers, "
                 "or a list of (N,) for a list of clouds."
             )
-        return cls(labels, None if least is None else int(least))
+        return cls(labels, number)
 
     def sample(self, place: int, cloud: Cloud, number: int, choice: Choice) -> Sample:
         """Downsample each class of one cloud on its own."""
