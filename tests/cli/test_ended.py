@@ -130,7 +130,7 @@ def test_sigterm_in_last_test_batch_of_pretraining_starts_no_training(tmp_path, 
 
 def test_sigterm_while_data_are_loaded_is_written_to_the_record(tmp_path, monkeypatch):
     place = "mops_lightning.training.run.run._load_data"
-    monkeypatch.setattr(place, lambda _: os.kill(os.getpid(), signal.SIGTERM))
+    monkeypatch.setattr(place, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
 
     status, _, err = call([*TINY, "hydra.run.dir=run"], tmp_path)
 

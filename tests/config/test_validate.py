@@ -33,6 +33,7 @@ FROM_CODE = {
     *("net", "num_classes", "num_parts"),  # of tasks, nets and samplers
     *("m", "seed"),  # of baselines
     "channels",  # of the stages' samplers
+    "point_channels",  # of samplers, nets and tasks, from the data
     *("save_dir", "checkpoint", "score", "batch", "titles", "folder"),  # of loggers and callbacks
 }
 """Arguments that code gives, not YAML: see training.run.build and training.run.trainer."""

@@ -38,7 +38,7 @@ def test_compare_writes_table_and_page(folder, tmp_path):
     assert "two.pcd: 90 of 700 points" in out
     with (tmp_path / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * 2 * 6
+    assert len(rows) == 2 * 2 * (len(UNTRAINED) + 1)
     assert {row["method"] for row in rows} == {*UNTRAINED, "trained"}
     largest = {row["method"]: float(row["hausdorff"]) for row in rows}
     assert largest["fps"] < largest["random"]

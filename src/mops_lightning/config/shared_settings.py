@@ -67,6 +67,10 @@ def table_settings(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
     return {path: value for path, value in flat.items() if settings.of(path).compared}
 
 
+FROM_DATA = ("point_channels",)
+"""Arguments with a default that a run fills in from its data; ``dataset.features`` decides them."""
+
+
 def with_defaults(node: Any) -> Any:
     """Return settings with the defaults of their classes for arguments that they do not set.
 
@@ -95,7 +99,7 @@ def _defaults(target: str) -> dict[str, Any]:
     defaults = {}
     for name, parameter in parameters.items():
         value = parameter.default
-        if value is parameter.empty:
+        if value is parameter.empty or name in FROM_DATA:
             continue
         defaults[name] = list(value) if isinstance(value, tuple) else value
     return defaults

@@ -81,7 +81,9 @@ def test_evaluation_with_features_in_another_order_is_refused(folder, trained):
 
 
 def test_evaluation_without_the_features_is_refused(folder, trained):
-    line = refused([f"evaluate={trained}", "dataset.features=null"], folder)
+    line = refused(
+        [f"evaluate={trained}", "dataset.features=null", "hydra.run.dir=without"], folder
+    )
 
     assert "dataset.features gives none. Set dataset.features=[intensity, normals]." in line
 
@@ -127,7 +129,7 @@ def test_every_task_trains_with_channels(folder, chosen, tmp_path):
 
 def test_pictures_take_the_colours_of_a_channel(folder, tmp_path):
     settings = [*SETTINGS, f"dataset.root={folder / 'scans'}", "pictures=1", "weights=null"]
-    settings += ["task=classification", "learn=joint", "+callbacks.pictures.colour=intensity"]
+    settings += ["task=classification", "learn=joint", "callbacks.pictures.colour=intensity"]
 
     done(settings, tmp_path)
 
@@ -139,7 +141,7 @@ def test_pictures_take_the_colours_of_a_channel(folder, tmp_path):
 
 
 def test_colour_of_an_unknown_channel_is_refused(folder):
-    line = refused([*SETTINGS, "pictures=1", "+callbacks.pictures.colour=ring"], folder)
+    line = refused([*SETTINGS, "pictures=1", "callbacks.pictures.colour=ring"], folder)
 
     assert "callbacks.pictures.colour: no channel 'ring'. Allowed: intensity, normal_x," in line
 
