@@ -1,5 +1,7 @@
 """Clouds and trained weights, as a user has them in a folder."""
 
+from typing import Any
+
 import distributed
 import numpy as np
 import pytest
@@ -38,6 +40,20 @@ def anchored(tmp_path_factory):
     node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 40, "anchors": "fps"}
     config = {"learn": "sampler", "sampler": node}
     weights.save(folder / "weights.safetensors", FMOPSNet(40, anchors="fps"), config, {})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory):
+    """The folder of a sampler with local columns, whose weights are moved away from their start."""
+    folder = tmp_path_factory.mktemp("local")
+    settings: dict[str, Any] = {"anchors": "fps", "candidates": 3, "neighbours": 6}
+    node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 40, **settings}
+    torch.manual_seed(0)
+    sampler = FMOPSNet(40, **settings)
+    for weight in sampler.queries.parameters():
+        torch.nn.init.normal_(weight, std=0.3)
+    weights.save(folder / "weights.safetensors", sampler, {"learn": "sampler", "sampler": node}, {})
     return folder
 
 

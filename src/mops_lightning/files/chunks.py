@@ -21,6 +21,7 @@ from mops_lightning.data.formats.cloud_file import PART, CloudFile
 from mops_lightning.data.formats.guard import check_coordinates, check_size
 from mops_lightning.data.formats.registry import open_cloud_file
 from mops_lightning.data.formats.table import Column, Table, join_tables
+from mops_lightning.errors import UserError
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.features import channels_for, generated_columns, with_channels
 from mops_lightning.files.options import Options
@@ -77,6 +78,7 @@ def sample_by_chunks(
         UserError: the file is broken or too small, or the sampler cannot work in chunks.
     """
     assert options.chunk is not None
+    _check_streams(sampler, options)
     net = sampler.fused()
     file = open_cloud_file(source, options.area, options.columns)
     cloud, row_ranges = replace(file, header=None), file.row_ranges(options.chunk)
@@ -110,6 +112,16 @@ def sample_by_chunks(
     matched: Nearest = reduce(Nearest.merge, over("matching", _nearest, sphere, places))
     kept = replace(matched.table, header=file.header)
     return kept.without_attributes() if options.coordinates_only else kept, outcome
+
+
+def _check_streams(sampler: Sampler, options: Options) -> None:
+    if sampler.streams:
+        return
+    raise UserError(
+        f"--chunk: the {options.readout} points of {options.weights} need all points of a cloud at "
+        "once. Leave --chunk out, or use --readout completed, which samples --chunk random points. "
+        "MOPS-Net and FMOPS-Net without anchors=fps take chunks."
+    )
 
 
 def count_by_class(source: Path, options: Options, engine: Engine) -> dict[int, int]:

@@ -1,0 +1,58 @@
+"""Files that a sampler with local columns downsamples: whole, by tiles and in chunks."""
+
+import numpy as np
+import pytest
+
+from mops_lightning import load
+from mops_lightning.data.formats.registry import read
+from tests.support.downsample import done, refused
+
+
+@pytest.fixture
+def scan(tmp_path):
+    """A cloud of 3,000 points in map coordinates."""
+    points = np.random.default_rng(1).normal(size=(3000, 3)) * [50, 20, 3] + [4e5, 5e6, 80]
+    path = tmp_path / "scan.npy"
+    np.save(path, points)
+    return path
+
+
+@pytest.mark.parametrize("readout", ["generated", "matched", "completed"])
+def test_local_columns_of_a_file_equal_those_of_the_cloud(readout, local, scan, tmp_path):
+    want, _ = load(str(local)).downsample(np.load(scan), 30, readout)
+
+    done(scan, tmp_path / "out.npy", "--weights", local, "--readout", readout, "--m", 30)
+
+    np.testing.assert_allclose(np.load(tmp_path / "out.npy"), want, rtol=0, atol=1e-4)
+
+
+def test_local_columns_of_a_chunk_with_all_points_equal_those_of_the_file(local, scan, tmp_path):
+    settings = ["--weights", local, "--m", 30]
+    done(scan, tmp_path / "whole.npy", *settings)
+
+    done(scan, tmp_path / "chunk.npy", *settings, "--chunk", 3000)
+
+    np.testing.assert_array_equal(np.load(tmp_path / "chunk.npy"), np.load(tmp_path / "whole.npy"))
+
+
+def test_local_columns_of_tiles_keep_different_points_of_every_tile(local, scan, tmp_path):
+    done(scan, tmp_path / "out.npy", "--weights", local, "--m", 600, "--tile", 150)
+
+    kept = np.load(tmp_path / "out.npy")
+    points = {tuple(point) for point in np.load(scan)}
+    assert len({tuple(point) for point in kept} & points) == 600
+    # Each of 20 tiles keeps 30 points on average.
+    halves = kept[:, 0] < np.median(np.load(scan)[:, 0])
+    assert halves.sum() == pytest.approx(300, abs=40)
+
+
+@pytest.mark.parametrize("readout", ["generated", "matched"])
+def test_local_columns_in_chunks_are_refused_with_what_works(readout, local, scan, tmp_path):
+    settings = ["--weights", local, "--m", 30, "--chunk", 1000]
+
+    err = refused(scan, tmp_path / "out.npy", *settings, "--readout", readout)
+
+    assert f"--chunk: the {readout} points of {local} need all points of a cloud at once" in err
+    assert "use --readout completed, which samples --chunk random points" in err
+    assert "random (--chunk)" in done(scan, tmp_path / "out.npy", *settings)
+    assert len(read(tmp_path / "out.npy", 9, 0).points) == 30
