@@ -4,6 +4,8 @@ Points with C channels are ``(B, N, 3 + C)``. Distances use the first three colu
 """
 
 from collections.abc import Iterable
+from math import isfinite
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import torch
@@ -44,6 +46,9 @@ class PointChannels:
     Args:
         columns: one for each channel.
 
+    Raises:
+        UserError: a column is no ``Channel``, or its mean or scale cannot be used.
+
     Examples:
         >>> from mops_lightning.channels import Channel, PointChannels
         >>> channels = PointChannels((Channel("intensity", 100.0, 50.0),))
@@ -53,6 +58,14 @@ class PointChannels:
 
     def __init__(self, columns: Iterable[Channel] = ()) -> None:
         self.columns = tuple(columns)
+        for column in self.columns:
+            if not isinstance(column, Channel):
+                raise UserError(f"PointChannels takes a list of Channel, got {column!r:.99} in it.")
+            if not (isfinite(column.mean) and isfinite(column.scale) and column.scale > 0):
+                raise UserError(
+                    f"{column.name}: a channel's mean and scale must be finite, its scale above 0, "
+                    f"got mean {column.mean} and scale {column.scale}."
+                )
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, PointChannels) and self.columns == other.columns
@@ -72,12 +85,16 @@ class PointChannels:
         """
         if isinstance(value, PointChannels):
             return value
-        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MOST:
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, Integral)
+            or not 0 <= int(value) <= MOST
+        ):
             raise UserError(
                 f"point_channels must be a whole number from 0 to {MOST}, or PointChannels, got "
                 f"{value!r:.99}."
             )
-        return cls(Channel(f"channel_{place}") for place in range(1, value + 1))
+        return cls(Channel(f"channel_{place}") for place in range(1, int(value) + 1))
 
     @classmethod
     def from_plain(cls, rows: Any) -> "PointChannels":
@@ -92,10 +109,7 @@ class PointChannels:
         for row in rows:
             if not isinstance(row, list) or len(row) != 3 or not isinstance(row[0], str):
                 raise ValueError("a channel must have a name, a mean and a scale")
-            column = Channel(row[0], float(row[1]), float(row[2]))
-            if not (abs(column.mean) < float("inf") and 0 < column.scale < float("inf")):
-                raise ValueError("a channel's mean and scale must be finite, its scale above 0")
-            columns.append(column)
+            columns.append(Channel(row[0], float(row[1]), float(row[2])))
         return cls(columns)
 
     def to_plain(self) -> list[list[Any]]:

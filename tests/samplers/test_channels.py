@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch.nn import functional as F
@@ -237,3 +238,22 @@ def test_downsample_by_an_index_sampler_keeps_all_columns(clouds):
 
     assert torch.equal(points, clouds[0][indices])
     assert torch.equal(indices, FPSSampler(M).downsample(clouds[0, :, :3])[1])
+
+
+def test_point_channels_takes_a_number_of_numpy():
+    assert PointChannels.of(np.int64(2)) == PointChannels.of(2)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ("intensity", "takes a list of Channel, got 'i' in it"),
+        (["intensity"], "takes a list of Channel, got 'intensity' in it"),
+        ([Channel("intensity", 0.5, 0.0)], "intensity: .* above 0, got mean 0.5 and scale 0.0"),
+        ([Channel("intensity", 0.5, -1.0)], "intensity: .* above 0, got mean 0.5 and scale -1.0"),
+        ([Channel("intensity", float("nan"))], "intensity: .* finite, .* got mean nan"),
+    ],
+)
+def test_point_channels_name_a_wrong_column(columns, message):
+    with pytest.raises(UserError, match=message):
+        PointChannels(columns)
