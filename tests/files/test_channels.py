@@ -200,8 +200,6 @@ def test_compare_samples_with_channels(model, table, tmp_path):
     np.testing.assert_array_equal(result.results[-1].rows, expected)
 
 
-def test_registration_of_scans_refuses_channels(model, table):
-    method = ByWeights(str(model), None)
-
+def test_registration_of_scans_refuses_channels(model):
     with pytest.raises(UserError, match="trained with the features intensity, ring, but scans"):
-        method.sample(table.points, 9, 0, PATH)
+        ByWeights(str(model), None, [9])

@@ -95,8 +95,9 @@ def downsample(
     _check_strata(m, stratify, stratify_min)
     if m is not None and not isinstance(m, list | tuple):
         m = as_size(m)
-    is_whole = batch is None and space is None and tile is None and stratify is None
-    if method == "fps" and readout == "completed" and is_whole and weight is None:
+    is_simple = space is None and tile is None and stratify is None
+    is_unweighted_fps = method == "fps" and readout == "completed" and weight is None
+    if is_simple and is_unweighted_fps and batch is None:
         sample = farthest.downsample(points, m, seed or 0, start)
         if sample is not None:
             return sample
@@ -106,7 +107,6 @@ def downsample(
 
     if m is None:
         return to_distance(points, method, readout, batch, seed or 0, weight, spacing, voxel, space)
-    is_simple = space is None and tile is None and stratify is None
     if is_simple and _is_plain(points, m, batch):
         number = number_of(m, points.shape[-2])
         sampler = find_sampler(method, number, points, start, seed)

@@ -72,25 +72,20 @@ class ByWeights(Method):
 
     name = TRAINED
 
-    def __init__(self, weights: str, tile: int | None) -> None:
-        self.weights = weights
-        self.tile = tile
-
-    def options(self, m: int) -> Options:
-        """Return the options of sampling m points."""
-        return Options(m, self.weights, tile=self.tile)
+    def __init__(self, weights: str, tile: int | None, sizes: Sequence[int]) -> None:
+        self.options = {m: Options(m, weights, tile=tile) for m in sizes}
+        self.samplers = {m: load_sampler(options) for m, options in self.options.items()}
+        for sampler in self.samplers.values():
+            if sampler.point_channels:
+                raise UserError(
+                    f"--weights: {weights} was trained with the features "
+                    f"{', '.join(sampler.point_channels.features)}, but scans are registered by x, "
+                    "y and z only. Give a sampler that was trained without features."
+                )
 
     def sample(self, points: Points, m: int, seed: int, path: Path) -> Sample:
         """Choose m of points ``(N, 3)``; the seed has no effect."""
-        options = self.options(m)
-        sampler = load_sampler(options)
-        if sampler.point_channels:
-            raise UserError(
-                f"--weights: {self.weights} was trained with the features "
-                f"{', '.join(sampler.point_channels.features)}, but scans are registered by x, y "
-                "and z only. Give a sampler that was trained without features."
-            )
-        return _timed(points, m, sampler, options, path)
+        return _timed(points, m, self.samplers[m], self.options[m], path)
 
 
 class VoxelFilter(Method):
@@ -124,7 +119,8 @@ def methods_of(
     """Return the methods of a comparison.
 
     Raises:
-        UserError: a name is unknown, or the trained sampler does not choose one of the sizes.
+        UserError: a name is unknown, or the trained sampler has channels, or does not choose one
+            of the sizes.
     """
     methods: list[Method] = []
     for name in names:
@@ -132,10 +128,7 @@ def methods_of(
             raise UserError(f"--methods: unknown {name!r}.{did_you_mean(name, NAMES)}")
         methods.append(VoxelFilter() if name == FILTER else ByName(name))
     if weights is not None:
-        trained = ByWeights(weights, tile)
-        for m in sizes:
-            load_sampler(trained.options(m))
-        methods.append(trained)
+        methods.append(ByWeights(weights, tile, sizes))
     return methods
 
 
