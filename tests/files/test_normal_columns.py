@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from mops_lightning.data.features import STORED_NORMALS
 from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
+from mops_lightning.files.column_means import renormalise
 from mops_lightning.files.downsample import downsample_file
 from mops_lightning.files.options import Options
 
@@ -40,3 +42,14 @@ def test_normals_are_estimated_where_a_point_of_the_file_has_none(tmp_path, wron
     kept = sampled(tmp_path, {"nx": across * (up > 0), "nz": up * (across == 0)})
 
     assert np.count_nonzero(kept.columns["nx"] == 2) < 3
+
+
+@pytest.mark.parametrize("names", STORED_NORMALS)
+def test_means_of_normals_have_length_1_under_every_name(names):
+    means = np.array([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]], np.float32)
+    columns = dict(zip(names, means.T, strict=True))
+
+    renormalise(columns)
+
+    expected = np.array([[0.0, 0.6, 0.8], [0.0, 0.0, 0.0]], np.float32)
+    np.testing.assert_array_equal(np.stack(list(columns.values()), 1), expected)

@@ -79,7 +79,7 @@ def feature_values(
     """
     columns: list[Values] = []
     for name in features:
-        values = _stored(table, name)
+        values = stored_values(table, name)
         if values is None and estimates:
             values = _estimated(table, name)
         if values is None:
@@ -108,7 +108,7 @@ def stored_names(table: Table, feature: str) -> tuple[str, ...]:
     return ()
 
 
-def _stored(table: Table, feature: str) -> Values | None:
+def stored_values(table: Table, feature: str) -> Values | None:
     """Return a feature's columns ``(N, 1)``, of normals ``(N, 3)``, or None without them.
 
     Normals of length 0 stay 0.

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from mops_lightning.data.features import STORED_NORMALS
 from mops_lightning.data.formats.table import Column, Table
 
 AVERAGED = {
@@ -13,8 +14,6 @@ AVERAGED = {
 
 PACKED = {"rgb", "rgba"}
 """Columns whose bits are colours (PCD)."""
-
-NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 
 
 def averaged(table: Table) -> list[str]:
@@ -44,7 +43,7 @@ def as_stored(means: NDArray[np.float64], column: Column) -> Column:
 
 def renormalise(columns: dict[str, Column]) -> None:
     """Scale normals to length 1; those that cancel out stay 0."""
-    for names in NORMALS:
+    for names in STORED_NORMALS:
         if all(name in columns for name in names):
             normals = np.stack([columns[name].astype(np.float64) for name in names], axis=1)
             lengths = np.linalg.norm(normals, axis=1, keepdims=True)

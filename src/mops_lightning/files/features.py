@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from mops_lightning.channels import NORMALS, PointChannels
-from mops_lightning.data.features import Values, feature_values, stored_names
+from mops_lightning.data.features import STORED_NORMALS, Values, feature_values, stored_names
 from mops_lightning.data.formats.table import Column, Table
-from mops_lightning.files.column_means import NORMALS as WRITTEN_NORMALS
 from mops_lightning.files.column_means import as_stored
 
 SETTING = "--weights"
@@ -61,7 +60,7 @@ def generated_columns(
         width = 3 if feature == NORMALS else 1
         of_feature = values[:, first : first + width].T
         if not names:
-            names = WRITTEN_NORMALS[0] if feature == NORMALS else (feature,)
+            names = STORED_NORMALS[0] if feature == NORMALS else (feature,)
             columns |= {n: v.astype(np.float32) for n, v in zip(names, of_feature, strict=True)}
         else:
             for name, column in zip(names, of_feature, strict=True):

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mops_lightning.channels import NORMALS
-from mops_lightning.data.features import stored_names
+from mops_lightning.data.features import stored_values
 from mops_lightning.data.formats.table import Table
 
 
@@ -14,10 +14,8 @@ def normals_of(table: Table) -> NDArray[np.float64] | None:
     Returns:
         None where the file has none, or where a point has none: one that is zero or not finite.
     """
-    names = stored_names(table, NORMALS)
-    if not names:
+    normals = stored_values(table, NORMALS)
+    if normals is None:
         return None
-    normals = np.stack([np.asarray(table.columns[name], np.float64) for name in names], 1)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    is_usable = np.isfinite(lengths).all() and (lengths > 0).all()
-    return normals / lengths if is_usable else None
+    is_usable = np.isfinite(normals).all() and normals.any(axis=1).all()
+    return normals if is_usable else None
