@@ -10,7 +10,7 @@ from mops_lightning.cli.start import INPUTS, OUTPUTS, check_paths, line_about_ru
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.training.run.run import claim
-from tests.support.command_line import TINY, TINY_ANY_DATA, call, refused
+from tests.support.command_line import TINY, TINY_ANY_DATA, call, done, refused
 
 
 def listing(folder):
@@ -50,6 +50,19 @@ def test_second_run_in_folder_writes_nothing(tmp_path):
     err = refused([*TINY, "sampler=fps", "hydra.run.dir=run"], tmp_path)
     assert "already contains a run" in err
     assert listing(tmp_path) == before
+
+
+def test_runs_that_start_in_one_second_get_folders_of_their_own(tmp_path):
+    settings = [*TINY, "sampler=fps", "hydra.run.dir=runs/${now:noon}"]
+
+    first = done(settings, tmp_path)
+    second = done(settings, tmp_path)
+
+    assert "files in runs/noon/" in first
+    assert "files in runs/noon_2/" in second
+    for name in ("noon", "noon_2"):
+        assert (tmp_path / "runs" / name / ".hydra" / "config.yaml").is_file()
+        assert (tmp_path / "runs" / name / "result.json").is_file()
 
 
 @pytest.mark.parametrize(

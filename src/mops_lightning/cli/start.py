@@ -1,5 +1,6 @@
 """Checks before Hydra writes anything into the folder of a single run."""
 
+import itertools
 import sys
 import traceback
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from mops_lightning.cli.effect import check_effect
@@ -50,7 +51,6 @@ class RunStart(Callback):
         own = [str(key) for key in config if key != "hydra"]
         cfg = OmegaConf.masked_copy(config, own)
         try:
-            folder = Path(config.hydra.run.dir)
             given = overrides.as_typed(config.hydra.overrides.task)
             complete = checked(cfg, given)
             if cfg.evaluate:  # the job gets the settings of the trained run
@@ -62,11 +62,31 @@ class RunStart(Callback):
             check_paths(cfg)
             distributed.check_start(cfg, overrides.as_typed(config.hydra.overrides.hydra))
             if not distributed.is_worker_rank(cfg):
-                claim(folder)
+                _use_folder_of_its_own(config)
+                claim(Path(config.hydra.run.dir))
         except OmegaConfBaseException as error:
             end("mops_lightning", explain(error, sys.argv[1:]), USER_ERROR)
         except Exception as error:
             end_in_one_line("mops_lightning", error)
+
+
+def _use_folder_of_its_own(config: DictConfig) -> None:
+    """Make the folder of a run, with a number if one that started in the same second has it."""
+    patterns: Any = OmegaConf.to_container(config.hydra.run, resolve=False)
+    if "${now:" not in patterns["dir"]:
+        return
+    first = config.hydra.run.dir
+    numbered = (f"{first}_{number}" for number in itertools.count(2))
+    with read_write(config.hydra):
+        for folder in itertools.chain([first], numbered):
+            config.hydra.run.dir = folder
+            try:
+                Path(folder).mkdir(parents=True)
+            except FileExistsError:
+                continue
+            except OSError:
+                pass  # claim says what is wrong
+            return
 
 
 def line_about_run(error: Exception, given: list[str]) -> str | None:

@@ -85,7 +85,6 @@ def claim(folder: Path) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # Two runs that start in the same second get the same folder; the second one stops here.
         (folder / STARTED).touch(exist_ok=False)
     except OSError as error:
         if (folder / STARTED).is_file():
