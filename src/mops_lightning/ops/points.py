@@ -1,5 +1,6 @@
 """Input, gathering, normalisation and memory layout of batched point clouds."""
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,6 +10,9 @@ from torch import Tensor
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops import batches
+
+BLOCK = 16384
+"""Points that are measured at once."""
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
@@ -83,7 +87,10 @@ class UnitSphere(NamedTuple):
 
     def normalise(self, points: NDArray[np.float64]) -> Tensor:
         """Return points ``(n, 3)`` of the cloud in the unit sphere, float32, as for training."""
-        return torch.from_numpy(((points - self.centre) / self.radius).astype(np.float32))
+        unit = np.empty(points.shape, np.float32)
+        for block in _blocks(len(points)):
+            unit[block] = (points[block] - self.centre) / self.radius
+        return torch.from_numpy(unit)
 
     def restore(self, points: Tensor) -> NDArray[np.float64]:
         """Return points ``(n, 3)`` of the unit sphere in the file's own unit."""
@@ -93,7 +100,17 @@ class UnitSphere(NamedTuple):
 
 def largest_distance(points: NDArray[np.float64], centre: NDArray[np.float64]) -> float:
     """Return the largest distance of points ``(n, 3)`` from ``centre`` ``(3,)``."""
-    return float(np.linalg.norm(points - centre, axis=1).max(initial=0.0))
+    largest = 0.0
+    for block in _blocks(len(points)):
+        distances = np.linalg.norm(points[block] - centre, axis=1)
+        largest = np.maximum(largest, distances.max())
+    return float(largest)
+
+
+def _blocks(number: int) -> Iterator[slice]:
+    """Return slices of rows whose differences fit into a cache, and add little to the memory."""
+    for first in range(0, number, BLOCK):
+        yield slice(first, first + BLOCK)
 
 
 def distance_dtype(points: Tensor) -> torch.dtype:
