@@ -5,7 +5,7 @@ import pytest
 
 from mops_lightning import load
 from mops_lightning.data.formats.registry import read
-from tests.support.downsample import done, refused
+from tests.support.downsample import done
 
 
 @pytest.fixture
@@ -47,12 +47,24 @@ def test_local_columns_of_tiles_keep_different_points_of_every_tile(local, scan,
 
 
 @pytest.mark.parametrize("readout", ["generated", "matched"])
-def test_local_columns_in_chunks_are_refused_with_what_works(readout, local, scan, tmp_path):
+def test_local_columns_in_chunks_equal_those_of_the_whole_file(readout, local, scan, tmp_path):
+    settings = ["--weights", local, "--m", 30, "--readout", readout]
+    done(scan, tmp_path / "whole.npy", *settings)
+
+    line = done(scan, tmp_path / "chunks.npy", *settings, "--chunk", 700)
+
+    assert "30 of 3,000 points" in line
+    assert "random" not in line
+    chunks, whole = np.load(tmp_path / "chunks.npy"), np.load(tmp_path / "whole.npy")
+    # Generated points are rounded to float32 in the unit sphere.
+    np.testing.assert_allclose(chunks, whole, rtol=0, atol=1e-4 if readout == "generated" else 0)
+
+
+def test_completed_points_of_local_columns_come_from_a_chunk_of_random_points(
+    local, scan, tmp_path
+):
     settings = ["--weights", local, "--m", 30, "--chunk", 1000]
 
-    err = refused(scan, tmp_path / "out.npy", *settings, "--readout", readout)
-
-    assert f"--chunk: the {readout} points of {local} need all points of a cloud at once" in err
-    assert "use --readout completed, which samples --chunk random points" in err
     assert "random (--chunk)" in done(scan, tmp_path / "out.npy", *settings)
+
     assert len(read(tmp_path / "out.npy", 9, 0).points) == 30

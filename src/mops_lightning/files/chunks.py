@@ -79,7 +79,6 @@ def sample_by_chunks(
     """
     assert options.chunk is not None
     _check_streams(sampler, options)
-    net = sampler.fused()
     file = open_cloud_file(source, options.area, options.columns)
     cloud, row_ranges = replace(file, header=None), file.row_ranges(options.chunk)
 
@@ -97,10 +96,14 @@ def sample_by_chunks(
     centre = summed / number
     sphere = UnitSphere(centre, max(over("radius", _radius, centre)) or 1.0)
     seen = Seen(sphere, sampler.point_channels)
-    global_ = reduce(torch.maximum, over("global feature", _of_seen, seen, net.global_part))
-    sum_part = partial(net.sum_part, global_=global_, m=m)
-    sums: Partial = reduce(Partial.merge, over("sampling", _of_seen, seen, sum_part))
-    generated = sampler.point_channels.renormalised(sums.result())
+
+    def over_seen(title: str, function: Callable[[Tensor], Any]) -> Iterable[Any]:
+        return over(title, _of_seen, seen, function)
+
+    if sampler.streams:
+        generated = _generate_by_parts(sampler, m, over_seen)
+    else:
+        generated = _generate_at_once(sampler, m, number, over_seen)
     places = coordinates(generated)
     outcome = Outcome(m, number, 0 if options.area else file.number - number)
     if options.readout == "generated":
@@ -114,13 +117,42 @@ def sample_by_chunks(
     return kept.without_attributes() if options.coordinates_only else kept, outcome
 
 
+OverSeen = Callable[[str, Callable[[Tensor], Any]], Iterable[Any]]
+"""Applies a function to the points of every chunk, as the sampler sees them, under a title."""
+
+
+def _generate_by_parts(sampler: Sampler, m: int, over_seen: OverSeen) -> Tensor:
+    """Return the generated points ``(m, 3 + C)``, of which every chunk gives its part."""
+    net = sampler.fused()
+    global_ = reduce(torch.maximum, over_seen("global feature", net.global_part))
+    sum_part = partial(net.sum_part, global_=global_, m=m)
+    sums: Partial = reduce(Partial.merge, over_seen("sampling", sum_part))
+    return sampler.point_channels.renormalised(sums.result())
+
+
+@torch.no_grad()
+def _generate_at_once(sampler: Sampler, m: int, number: int, over_seen: OverSeen) -> Tensor:
+    """Return the generated points ``(m, 3 + C)``; what the sampler sees of all points is kept."""
+    width = 3 + len(sampler.point_channels)
+    points = next(sampler.parameters()).new_empty(number, width)
+    first = 0
+    for part in over_seen("reading", _as_seen):
+        points[first : first + len(part)] = part
+        first += len(part)
+    return sampler(points[None], m).points[0]
+
+
+def _as_seen(points: Tensor) -> Tensor:
+    return points
+
+
 def _check_streams(sampler: Sampler, options: Options) -> None:
-    if sampler.streams:
+    if sampler.streams or sampler.is_thinned:
         return
     raise UserError(
         f"--chunk: the {options.readout} points of {options.weights} need all points of a cloud at "
         "once. Leave --chunk out, or use --readout completed, which samples --chunk random points. "
-        "MOPS-Net and FMOPS-Net without anchors=fps take chunks."
+        "MOPS-Net and FMOPS-Net take chunks, with anchors=fps if they have candidates."
     )
 
 

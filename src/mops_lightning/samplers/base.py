@@ -77,6 +77,10 @@ class Sampler(nn.Module):
     streams: bool = False
     """Whether clouds can be sampled in chunks (``stream_sample``), by ``fused``."""
 
+    is_thinned: bool = False
+    """Whether generated points come from few candidates of a cloud, so that beside the points
+    themselves little memory is needed."""
+
     spreads: bool = True
     """Whether the method spreads the points evenly; random and serial sampling do not."""
 

@@ -113,6 +113,7 @@ class MOPSNet(Sampler):
         self.tau_min = tau_min
         self.training_tau = 1.0
         self.streams = anchors is None  # farthest points need all points at once
+        self.is_thinned = candidates is not None
         local = feature_channels[-1]
         self.features = PointFeatures(PointMLP([3 + len(self.point_channels), *feature_channels]))
         # The first layer of ρ acts on [local, global]. The product with the global feature is the
