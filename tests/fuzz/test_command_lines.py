@@ -44,7 +44,7 @@ GROUPS = {
     "trainer": ("auto", "cpu"),
     "learn": ("task", "sampler", "joint", "nothing"),
     "weights": ("auto", "null"),
-    "dataset": ("shapes", "modelnet40", "meshes", "hdf5"),
+    "dataset": ("shapes", "scans_of_shapes", "modelnet40", "meshes", "hdf5"),
 }
 
 # No number makes a run longer or larger than a test can wait for.

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mops_lightning.channels import NORMAL_COLUMNS, NORMALS, Channel, PointChannels
+from mops_lightning.channels import NO_CHANNELS, NORMAL_COLUMNS, NORMALS, Channel, PointChannels
 from mops_lightning.data.formats.columns import RESERVED
 from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.table import Table
@@ -163,6 +163,8 @@ def channels_of(features: Sequence[str], training: Iterable[Values]) -> PointCha
         Every channel but normals is scaled to mean 0 and standard deviation 1; a constant one is
         moved only.
     """
+    if not features:
+        return NO_CHANNELS
     rows = np.concatenate([values.reshape(-1, values.shape[-1]) for values in training])
     columns: list[Channel] = []
     for name in features:

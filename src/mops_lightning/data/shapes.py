@@ -93,12 +93,12 @@ def shapes(
     Raises:
         UserError: an argument is invalid, or ``cache`` cannot be written.
     """
-    _check_number(1, n_points=n_points)
-    _check_number(1, train_per_class=train_per_class)
-    _check_number(1, test_per_class=test_per_class)
-    _check_number(0, seed=seed)
-    chosen = _chosen_classes(classes)
-    part_names = _part_names(chosen)
+    check_number(1, n_points=n_points)
+    check_number(1, train_per_class=train_per_class)
+    check_number(1, test_per_class=test_per_class)
+    check_number(0, seed=seed)
+    chosen = chosen_classes(classes)
+    part_names = part_names_of(chosen)
     counts = (train_per_class, test_per_class)
     settings = {
         "dataset": "shapes",
@@ -132,7 +132,7 @@ def shapes(
     return CloudDataset(chosen, train, test, fingerprint, part_names=part_names)
 
 
-def _check_number(minimum: int, **argument: Any) -> None:
+def check_number(minimum: int, **argument: Any) -> None:
     """Refuse a value that is not a whole number of at least ``minimum``."""
     ((name, value),) = argument.items()
     is_number = isinstance(value, int) and not isinstance(value, bool)
@@ -140,9 +140,10 @@ def _check_number(minimum: int, **argument: Any) -> None:
         raise UserError(f"{name} must be a whole number of at least {minimum}, got {value!r}.")
 
 
-def _chosen_classes(
+def chosen_classes(
     classes: Sequence[str] | Literal["asymmetric", "parts"] | None,
 ) -> tuple[str, ...]:
+    """Return the classes that the argument ``classes`` names, in the order of their labels."""
     if classes == "asymmetric":
         return choose_classes(ASYMMETRIC, CLASSES)
     if classes == "parts":
@@ -150,7 +151,7 @@ def _chosen_classes(
     return choose_classes(classes, CLASSES)
 
 
-def _part_names(chosen: Sequence[str]) -> tuple[str, ...]:
+def part_names_of(chosen: Sequence[str]) -> tuple[str, ...]:
     """Return the parts of the classes, each once; none if a class does not know its parts."""
     if not set(chosen) <= set(PARTS):
         return ()

@@ -63,20 +63,45 @@ def sampled_shape(
         The points ``(n_points, 3)`` in the unit sphere, and the names of their parts, which are
         empty where the shape does not know its parts.
     """
+    form, spread = random_streams(class_name, seed, split, number)
+    mesh, angle = built(class_name, form)
+    surface_seed = int(spread.generate_state(1, np.uint64)[0])
+    surface, faces = trimesh.sample.sample_surface(mesh, n_points, seed=surface_seed)
+    cloud = np.asarray(surface) @ rotation_about_y(angle)
+    return UnitSphere.around(cloud).normalise(cloud).numpy(), parts_of_faces(mesh)[faces]
+
+
+def random_streams(
+    class_name: str, seed: int, split: int, number: int, streams: int = 2
+) -> list[SeedSequence]:
+    """Return independent random streams of one shape; the first is the stream of its form.
+
+    Args:
+        class_name: of the shape.
+        seed: of the data set.
+        split: 0 for training, 1 for test.
+        number: of the shape among those of its class in the split.
+        streams: their number.
+    """
     key = (split, zlib.crc32(class_name.encode()), number)
-    form, spread = SeedSequence(seed, spawn_key=key).spawn(2)
+    return SeedSequence(seed, spawn_key=key).spawn(streams)
+
+
+def built(class_name: str, form: SeedSequence) -> tuple[Trimesh, float]:
+    """Build a shape; also return the angle in radians by which it is to be turned about y."""
     rng = np.random.default_rng(form)
     mesh = BUILDERS[class_name](rng)
     mesh.vertices *= np.exp(rng.uniform(-1, 1, 3) * STRETCH)
-    angle = rng.uniform(-YAW, YAW)
-    surface_seed = int(spread.generate_state(1, np.uint64)[0])
-    surface, faces = trimesh.sample.sample_surface(mesh, n_points, seed=surface_seed)
-    cloud = np.asarray(surface) @ _rotation_about_y(angle)
-    names_of_faces = mesh.metadata.get("parts", np.full(len(mesh.faces), ""))
-    return UnitSphere.around(cloud).normalise(cloud).numpy(), names_of_faces[faces]
+    return mesh, rng.uniform(-YAW, YAW)
 
 
-def _rotation_about_y(angle: float) -> NDArray[np.float64]:
+def parts_of_faces(mesh: Trimesh) -> NDArray[np.str_]:
+    """Return the name of every face's part; empty where the shape does not know its parts."""
+    names: NDArray[np.str_] = mesh.metadata.get("parts", np.full(len(mesh.faces), ""))
+    return names
+
+
+def rotation_about_y(angle: float) -> NDArray[np.float64]:
     """Return the matrix that rotates row vectors about the up axis, by an angle in radians."""
     cos = np.cos(angle)
     sin = np.sin(angle)

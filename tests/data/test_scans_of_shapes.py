@@ -1,0 +1,247 @@
+"""Procedural scans: what is on the floor, what a scanner sees, channels, seeds and errors."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning.data.procedural.scenes import scan_of_shape
+from mops_lightning.data.scans_of_shapes import scans_of_shapes
+from mops_lightning.errors import UserError
+from mops_lightning.records.run_record import read
+from mops_lightning.samplers.fps import FPSSampler
+from tests.support.command_line import TINY_ANY_DATA, done, runs
+
+SMALL: dict[str, Any] = {
+    "n_points": 128,
+    "train_per_class": 2,
+    "test_per_class": 1,
+    "classes": ["cup", "stool"],
+}
+
+
+def scan(class_name="chair", n_points=2000, outliers=0.06, noise=0.0, number=0):
+    return scan_of_shape(class_name, n_points, outliers, noise, seed=0, split=0, number=number)
+
+
+# Content
+
+
+def test_scans_have_classes_and_parts_in_the_unit_sphere():
+    data = scans_of_shapes(**SMALL)
+
+    assert data.class_names == ("cup", "stool")
+    assert data.part_names == (
+        "vessel",
+        "handle",
+        "saucer",
+        "seat",
+        "leg",
+        "floor",
+        "clutter",
+        "outlier",
+    )
+    assert data.train.points.shape == (4, 128, 3)
+    assert data.train.labels.tolist() == [0, 0, 1, 1]
+    assert data.test.parts is not None
+    assert data.test.parts.shape == (2, 128)
+    assert data.train.points.norm(dim=2).amax(1).allclose(torch.ones(4))
+    assert data.train.points.mean(1).abs().max() < 1e-6
+
+
+def test_scans_of_classes_without_parts_have_one_part_for_the_shape():
+    data = scans_of_shapes(**{**SMALL, "classes": ["bowl", "stool"]})
+
+    assert data.part_names == ("object", "floor", "clutter", "outlier")
+    parts = data.train.parts
+    assert parts is not None
+    assert (parts == 0).any(1).all()
+    assert (parts == 1).any(1).all()
+
+
+def test_scan_without_noise_has_its_points_on_surfaces():
+    found = scan(outliers=0.0)
+
+    floor = found.parts == "floor"
+    chair = np.isin(found.parts, ("seat", "back", "leg", "arm"))
+    assert abs(found.points[floor, 1]).max() < 1e-9
+    assert found.points[~floor, 1].min() > -1e-9
+    assert np.ptp(found.points[chair], axis=0).max() <= 1 + 1e-9
+    assert floor.sum() + chair.sum() + (found.parts == "clutter").sum() == 2000
+
+
+def test_scan_sees_no_floor_under_a_bottle():
+    found = scan("bottle", 4000, outliers=0.0)
+
+    bottle = found.points[found.parts == "object"]
+    middle = (bottle.min(0) + bottle.max(0)) / 2
+    radius = np.ptp(bottle[:, 0]) / 2
+    above = np.linalg.norm((found.points - middle)[:, [0, 2]], axis=1) < radius / 2
+    assert above.sum() > 20
+    assert set(found.parts[above]) == {"object"}
+
+
+def test_scan_outliers_are_at_most_the_share_and_off_the_floor():
+    shares = []
+    for number in range(12):
+        found = scan("cup", 1000, outliers=0.1, number=number)
+        outliers = found.parts == "outlier"
+        shares.append(outliers.mean())
+        assert len(found.points) == 1000
+
+    assert max(shares) <= 0.1
+    assert 0.02 < np.mean(shares) < 0.08
+
+
+def test_scan_noise_moves_points_along_the_rays():
+    still = scan(outliers=0.0)
+    moved = scan(outliers=0.0, noise=0.01)
+
+    height = moved.points[moved.parts == "floor", 1]
+    assert 0.002 < height.std() < 0.01
+    assert still.points.shape == moved.points.shape
+
+
+def test_scan_intensity_falls_with_the_angle_of_incidence():
+    found = scan("shelf", 4000, outliers=0.0)
+
+    floor = found.parts == "floor"
+    assert found.intensities.min() >= 0
+    assert found.intensities.max() <= 1
+    # Scanners are low: the floor far from all of them is seen at the flattest angle.
+    assert found.intensities[floor].std() > 0.03
+
+
+def test_scans_farthest_points_take_outliers_first():
+    data = scans_of_shapes(256, 8, 1, ["chair"])
+    parts = data.train.parts
+    assert parts is not None
+    outlier = data.part_names.index("outlier")
+
+    rows = FPSSampler(32)(data.train.points).indices
+
+    assert rows is not None
+    among_all = (parts == outlier).double().mean()
+    among_farthest = (parts.gather(1, rows) == outlier).double().mean()
+    assert among_farthest > 2 * among_all
+
+
+# Channels
+
+
+def test_scans_have_intensity_and_normals_as_channels():
+    plain = scans_of_shapes(**SMALL)
+    data = scans_of_shapes(**SMALL, features=["intensity", "normals"])
+
+    assert data.channels.features == ("intensity", "normals")
+    assert data.train.points.shape == (4, 128, 7)
+    assert torch.equal(data.train.points[..., :3], plain.train.points)
+    intensity = data.train.points[..., 3]
+    assert abs(intensity.mean()) < 1e-4
+    assert intensity.std() == pytest.approx(1, abs=1e-2)
+    assert data.train.points[..., 4:].norm(dim=2).allclose(torch.ones(4, 128), atol=1e-5)
+    assert data.fingerprint != plain.fingerprint
+
+
+def test_scans_normals_of_the_floor_point_up():
+    data = scans_of_shapes(1024, 1, 1, ["sofa"], outliers=0.0, features=["normals"])
+    parts = data.train.parts
+    assert parts is not None
+
+    floor = data.train.points[0, parts[0] == data.part_names.index("floor")]
+
+    assert floor[:, 4].median() > 0.97
+
+
+# Reproducibility
+
+
+def test_scans_depend_on_seed_and_not_on_counts():
+    first = scans_of_shapes(**SMALL)
+    more = scans_of_shapes(**{**SMALL, "train_per_class": 3, "classes": ["bowl", "cup", "stool"]})
+    other = scans_of_shapes(**SMALL, seed=1)
+
+    assert torch.equal(first.train.points[:2], more.train.points[3:5])
+    assert torch.equal(first.train.points, scans_of_shapes(**SMALL).train.points)
+    assert not torch.equal(first.train.points, other.train.points)
+    assert not torch.equal(first.train.points[0], first.test.points[0])
+
+
+def test_scans_fingerprint_depends_on_arguments():
+    variants: list[dict[str, Any]] = [
+        {},
+        {"n_points": 65},
+        {"outliers": 0.0},
+        {"noise": 0.02},
+        {"features": ["intensity"]},
+        {"seed": 1},
+    ]
+
+    prints = [scans_of_shapes(**{**SMALL, **variant}).fingerprint for variant in variants]
+
+    assert len(set(prints)) == len(variants)
+
+
+def test_scans_from_cache_equal_made_ones(tmp_path):
+    made = scans_of_shapes(**SMALL, features=["normals"], cache=tmp_path)
+    (file,) = tmp_path.iterdir()
+    again = scans_of_shapes(**SMALL, features=["normals"], cache=tmp_path)
+    assert torch.equal(made.train.points, again.train.points)
+    file.write_bytes(file.read_bytes()[:1000])
+
+    repaired = scans_of_shapes(**SMALL, features=["normals"], cache=tmp_path)
+
+    assert torch.equal(made.train.points, repaired.train.points)
+    assert made.channels == again.channels == repaired.channels
+
+
+def test_scans_keep_global_random_state():
+    def states():
+        return str(np.random.get_state(legacy=False)), torch.get_rng_state().tolist()  # noqa: NPY002
+
+    before = states()
+    scans_of_shapes(**SMALL)
+
+    assert states() == before
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"outliers": 1.0}, "outliers must be a share from 0 to below 1"),
+        ({"outliers": True}, "outliers must be a share"),
+        ({"noise": -0.1}, "noise must be a number of at least 0"),
+        ({"noise": float("nan")}, "noise must be a number of at least 0"),
+        ({"features": ["colour"]}, "scans of shapes have intensity, normals, curvature"),
+        ({"n_points": 0}, "n_points must be a whole number of at least 1"),
+        ({"classes": ["sofas"]}, "unknown class 'sofas'. Did you mean 'sofa'"),
+    ],
+)
+def test_scans_bad_argument_is_refused(arguments, message):
+    with pytest.raises(UserError, match=message):
+        scans_of_shapes(**{**SMALL, **arguments})
+
+
+# A run
+
+
+@pytest.mark.parametrize(
+    ("task", "classes", "score"),
+    [
+        ("classification", ["dataset.classes=[chair,vase,lamp]"], "accuracy"),
+        ("segmentation", [], "mean_iou"),
+    ],
+)
+def test_scans_run_with_channels_by_plain_defaults(task, classes, score, tmp_path):
+    chosen = [f"task={task}", "dataset=scans_of_shapes", "dataset.features=[intensity]", *classes]
+    tiny = ["dataset.train_per_class=1", "dataset.test_per_class=1", "val_fraction=0"]
+
+    done([*chosen, *TINY_ANY_DATA, *tiny], tmp_path)
+
+    (run,) = runs(tmp_path)
+    record = read(run)
+    assert 0 <= record.metrics[f"test/generated/{score}"] <= 1
