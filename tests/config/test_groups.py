@@ -14,6 +14,7 @@ from mops_lightning.config.settings import declared
 from mops_lightning.records.run_record import read
 from mops_lightning.tree import dotted
 from tests.support.command_line import TINY, TINY_ANY_DATA, call, done, runs
+from tests.support.small_data import write_airborne
 
 composed = cache(lambda chosen: compose(chosen.split()))
 """What several tests read and none changes."""
@@ -211,6 +212,24 @@ def test_labels_name_own_samplers_by_their_class():
     cfg = compose([own, "m=8", *labels])
 
     assert (cfg.logger.one, cfg.logger.two) == ("FPSSampler-m8", "FPSSampler")
+
+
+def test_las_segmentation_learns_ground_and_scores_all_points(tmp_path):
+    for number in range(3):
+        write_airborne(tmp_path / "scans" / "train" / f"{number}.las", number)
+    write_airborne(tmp_path / "scans" / "test" / "3.las", 3)
+    small = ["dataset.n_points=256", "m=32", "task.net.points=[32,8]", "batch_size=4"]
+    chosen = ["experiment=las_segmentation", "dataset.root=scans", *small]
+
+    done([*chosen, "trainer=cpu", "logger=none", "pictures=0", "epochs.joint=12"], tmp_path)
+
+    (run,) = runs(tmp_path)
+    record = read(run)
+    assert record.part_names == ["1", "2"]
+    assert record.test_clouds == 4
+    assert record.score_name == "test/sampled/mean_iou"
+    assert record.score is not None
+    assert record.score > 0.7
 
 
 @pytest.mark.parametrize("files", [2, 4])

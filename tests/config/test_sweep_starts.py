@@ -40,6 +40,7 @@ FORMS = {
     "segmentation": "shapes",
     "noise": "shapes",
     "corruptions": "shapes",
+    "las_segmentation": "airborne",
 }
 """The data that a sweep reads; the others read ModelNet40."""
 
@@ -69,6 +70,7 @@ SMALLER = {
         "dataset.train_per_class=2",
         "dataset.test_per_class=1",
     ],
+    "las_segmentation": ["dataset.n_points=256", "m=16", "task.net.points=[16,8]"],
     "reconstruction_sizes": ["dataset.n_points=256"],
     "reconstruction_fmops": ["dataset.n_points=256"],
     "registration": ["task.net.feature_channels=[16,32]"],

@@ -196,3 +196,32 @@ def test_cloud_folder_without_cloud_raises(tmp_path):
         cloud_folder(tmp_path)
     with pytest.raises(UserError, match=r"^root: no file in or below .*none ends in"):
         cloud_folder(tmp_path / "none")
+
+
+def test_cloud_folder_tiles_score_every_labelled_point_of_a_file_once(tmp_path):
+    for seed, number in enumerate((300, 500, 700)):
+        points = np.random.default_rng(seed).uniform(0, [40, 30, 2], (number, 3))
+        classes = np.where(points[:, 2] < 1, 2, 5)
+        WRITERS[".ply"](tmp_path / f"{seed}.ply", Table(points, {"classification": classes}))
+
+    data = module.cloud_folder(
+        tmp_path, 128, test_frames=None, crop="tiles", crops=None, label="classification"
+    )
+
+    counts = []
+    for clouds in (data.train, data.test):
+        assert clouds.parts is not None
+        assert clouds.sources is not None
+        for source in clouds.sources.unique():
+            known = clouds.parts[clouds.sources == source] >= 0
+            counts.append(int(known.sum()))
+            assert len(known) == -(-counts[-1] // 128)
+    assert sorted(counts) == [300, 500, 700]
+    assert data.part_names == ("2", "5")
+
+
+def test_cloud_folder_number_of_tiles_is_refused(tmp_path):
+    write(tmp_path / "scan.ply")
+
+    with pytest.raises(UserError, match="crops must be null with crop=tiles"):
+        module.cloud_folder(tmp_path, 64, test_frames=None, crop="tiles", crops=3)

@@ -16,6 +16,10 @@ def cloud(number=2000, side=10.0):
     return np.random.default_rng(0).uniform(0, side, (number, 3)) + FAR
 
 
+def cut(points, n_points):
+    return random_crops(points, n_points, None, "tiles", np.random.default_rng(0), PATH)
+
+
 def draw(points, crop="nearest", n_points=50, number=6, seed=1):
     rng = np.random.default_rng(seed)
     return random_crops(points, n_points, number, crop, rng, PATH).points
@@ -47,3 +51,37 @@ def test_random_crops_whole():
 def test_random_crops_of_coincident_points_raises():
     with pytest.raises(BadCloudError, match="the 50 points of a crop coincide"):
         draw(np.ones((60, 3)), "whole")
+
+
+def test_tiles_have_every_point_as_their_own_once():
+    points = np.random.default_rng(0).random((1000, 3)) * [100, 60, 5] + 5e5
+
+    tiles = cut(points, 96)
+
+    assert tiles.own is not None
+    assert tiles.points.shape == (11, 96, 3)
+    assert np.sort(tiles.rows[tiles.own]).tolist() == list(range(1000))
+    assert abs(tiles.points.mean(1)).max() < 1e-4
+
+
+def test_tiles_are_filled_up_by_near_points_of_other_tiles():
+    points = np.random.default_rng(0).random((1000, 3)) * [100, 60, 5]
+
+    tiles = cut(points, 96)
+
+    assert tiles.own is not None
+    for rows, own in zip(tiles.rows, tiles.own, strict=True):
+        assert len(set(rows.tolist())) == 96
+        middle = points[rows[own]].mean(0)
+        reach = np.linalg.norm(points[rows[own]] - middle, axis=1).max()
+        assert np.linalg.norm(points[rows[~own]] - middle, axis=1).max() < 1.5 * reach
+
+
+def test_tiles_of_as_many_points_as_a_tile_are_the_whole_cloud():
+    points = np.random.default_rng(0).random((50, 3))
+
+    tiles = cut(points, 50)
+
+    assert tiles.own is not None
+    assert tiles.own.all()
+    assert tiles.rows.tolist() == [list(range(50))]

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mops_lightning.data.formats.registry import WRITERS
+from mops_lightning.data.formats.table import Table
 from tests.support.hdf5 import write_file
 from tests.support.meshes import BALL, BOX, scaled, write_mesh
 
@@ -11,7 +13,10 @@ POINTS = 1024
 
 
 def write_all(top: Path) -> None:
-    """Write a folder for each form of data: modelnet40, hdf5, meshes, mesh_sequence, clouds."""
+    """Write a folder for each form of data.
+
+    They are modelnet40, hdf5, meshes, mesh_sequence, clouds and airborne.
+    """
     _write_modelnet40(top / "modelnet40")
     _write_one_class(top / "hdf5")
     for split in ("train", "test"):
@@ -26,6 +31,25 @@ def write_all(top: Path) -> None:
     for number in range(6):
         cloud = np.random.default_rng(number).random((3000, 3)).astype("float32")
         np.save(top / "clouds" / f"scan{number}.npy", cloud)
+    for split, seed in (("train", 0), ("test", 1)):
+        write_airborne(top / "airborne" / split / "tile.las", seed)
+
+
+def write_airborne(path: Path, seed: int, number: int = 1000) -> None:
+    """Write an airborne scan: ground (class 2), and bright points of one return above it (1)."""
+    random = np.random.default_rng(seed)
+    points = random.uniform(0, [40, 30, 0.2], (number, 3))
+    points += (500_000, 4_000_000, 100)
+    is_ground = random.random(number) < 0.6
+    points[~is_ground, 2] += random.uniform(2, 6, (~is_ground).sum())
+    columns = {
+        "classification": np.where(is_ground, 2, 1).astype("uint8"),
+        "intensity": np.where(is_ground, 40, 200).astype("uint16"),
+        "return_number": np.where(is_ground, 2, 1).astype("uint8"),
+        "number_of_returns": np.full(number, 2, "uint8"),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    WRITERS[".las"](path, Table(points, columns))
 
 
 def _write_modelnet40(folder: Path) -> None:

@@ -28,6 +28,7 @@ from mops_lightning.data.formats.registry import read
 from mops_lightning.errors import UserError, check_at_least, did_you_mean
 from mops_lightning.ops.points import normalize_unit_sphere
 from mops_lightning.seeding import derive_seed
+from mops_lightning.types import UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Reading:
 
     n_points: int
     crop: Crop
-    crops: int
+    crops: int | None
     seed: int
     label: str | None
     columns: tuple[str, ...] | None
@@ -81,16 +82,22 @@ class Reading:
         check_at_least(0, seed=seed)
         if crop not in CROPS:
             raise UserError(f"crop: unknown {crop!r}.{did_you_mean(crop, CROPS)}")
+        if crop == "tiles" and crops is not None:
+            raise UserError(
+                f"crops must be null with crop=tiles, whose number follows from a file's points, "
+                f"got {crops}."
+            )
         if crops is None:
             crops = CROPS_PER_FILE[crop]
-        check_at_least(1, crops=crops)
+        if crops is not None:
+            check_at_least(1, crops=crops)
         if crop == "surface":
             _check_surface(crops, label=label, columns=columns, features=features)
         named = None if columns is None else tuple(check_columns("columns", columns))
         return cls(n_points, crop, crops, seed, label, named, check_features(features))
 
 
-def _check_surface(crops: int, **of_files: Any) -> None:
+def _check_surface(crops: int | None, **of_files: Any) -> None:
     """Refuse what surfaces of meshes do not have."""
     if crops != 1:
         raise UserError(f"crops must be 1 with crop=surface, got {crops}.")
@@ -112,6 +119,8 @@ def read_clouds(folder: Path, files: Sequence[SourceFile], reading: Reading) -> 
         numbers = None
         if reading.label is not None:
             numbers = table.whole_numbers(reading.label, path)[drawn.rows]
+            if drawn.own is not None:
+                numbers = np.where(drawn.own, numbers, UNKNOWN)
         values = None
         if reading.features:
             values = feature_values(table, reading.features, path, "features")[drawn.rows]

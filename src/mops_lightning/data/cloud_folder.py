@@ -77,9 +77,11 @@ def cloud_folder(
             last frames of every class are the test split.
         crop: ``nearest`` takes the points nearest to a drawn point, as the tiles of ``downsample
             --tile``; ``whole`` random points of the cloud; ``surface`` random points on the
-            surface of a mesh, uniform by area.
+            surface of a mesh, uniform by area; ``tiles`` cuts the cloud, so that every point of
+            a file is in one tile, whose label counts. Tiles that would have fewer points are
+            filled up by points of their neighbours, whose parts are unknown there.
         crops: number of clouds per file; 1 for ``surface``. None: 32 crops, or one whole cloud,
-            which then counts once per epoch.
+            which then counts once per epoch, or as many tiles as the points fill.
         label: column of the files that says to which part a point belongs, by a whole number, below
             0 if that is unknown; None: the points have no parts. Not with ``surface``.
         columns: names of the columns of .bin files, which have no header; None: those that their
@@ -117,13 +119,13 @@ def cloud_folder(
     notes = _notes(folder, files, class_names)
     if crop == "surface":
         contents = _read_meshes(folder, files, n_points, seed, cache)
-        splits = _clouds_of_splits(contents, class_names, reading.crops)
+        splits = _clouds_of_splits(contents, class_names)
         fingerprint = _fingerprint_of_meshes(contents, n_points, seed, class_names)
         return CloudDataset(class_names, splits["train"], splits["test"], fingerprint, notes)
     contents = read_clouds(folder, files, reading)
     contents, channels = append_features(contents, reading.features)
     numbers = _known_numbers(contents)
-    splits = _clouds_of_splits(contents, class_names, reading.crops, numbers)
+    splits = _clouds_of_splits(contents, class_names, numbers)
     dataset = make_dataset("clouds", splits, class_names, None, folder, channels=channels)
     part_names = tuple(str(number) for number in numbers.tolist())
     return replace(dataset, notes=notes, part_names=part_names)
@@ -156,7 +158,6 @@ def _known_numbers(contents: Sequence[Content]) -> NDArray[np.int64]:
 def _clouds_of_splits(
     contents: Sequence[Content],
     class_names: Sequence[str],
-    crops: int,
     numbers: NDArray[np.int64] | None = None,
 ) -> dict[str, Clouds]:
     """Put the clouds of the files together, split by split.
@@ -164,7 +165,6 @@ def _clouds_of_splits(
     Args:
         contents: what was read.
         class_names: in the order of the labels.
-        crops: number of clouds per file.
         numbers: of the parts, in the order of their positions; None: there are no parts.
     """
     splits = {}
@@ -172,14 +172,15 @@ def _clouds_of_splits(
         members = [
             (row, content) for row, content in enumerate(contents) if content.file.split == split
         ]
+        counts = torch.tensor([len(one.clouds) for _, one in members])
         labels = torch.tensor([class_names.index(one.file.class_name) for _, one in members])
         sources = None
-        if crops > 1:
-            sources = torch.tensor([row for row, _ in members]).repeat_interleave(crops)
+        if counts.gt(1).any():
+            sources = torch.tensor([row for row, _ in members]).repeat_interleave(counts)
         parts = [_parts(one.numbers, numbers) for _, one in members if one.numbers is not None]
         splits[split] = Clouds(
             torch.cat([one.clouds for _, one in members]),
-            labels.repeat_interleave(crops),
+            labels.repeat_interleave(counts),
             sources,
             torch.cat(parts) if parts else None,
         )

@@ -5,18 +5,21 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.samplers.tiles import balanced_tiles
 
-Crop = Literal["nearest", "whole", "surface"]
-CROPS = ("nearest", "whole", "surface")
+Crop = Literal["nearest", "whole", "surface", "tiles"]
+CROPS = ("nearest", "whole", "surface", "tiles")
 
 CROPS_PER_FILE = {
     "nearest": 32,
     "whole": 1,
     "surface": 1,
+    "tiles": None,
 }
-"""Number of clouds that are drawn from a file, unless ``crops`` sets it."""
+"""Number of clouds that are drawn from a file, unless ``crops`` sets it; tiles follow the file."""
 
 DRAWS = 50
 """Crops that are drawn before a file is rejected because all points of a crop coincide."""
@@ -28,27 +31,30 @@ class Crops(NamedTuple):
     Attributes:
         points: ``(crops, n_points, 3)`` float32, each crop with its centroid at the origin.
         rows: ``(crops, n_points)`` int64, the rows of these points in the cloud.
+        own: ``(crops, n_points)``, which points belong to the crop; others are in the tile of
+            another crop, too, and have no part in this one. None: all.
     """
 
     points: NDArray[np.float32]
     rows: NDArray[np.int64]
+    own: NDArray[np.bool_] | None = None
 
 
 def random_crops(
     points: NDArray[np.float64],
     n_points: int,
-    number: int,
+    number: int | None,
     crop: Crop,
     rng: np.random.Generator,
     path: Path,
 ) -> Crops:
-    """Draw crops of a cloud.
+    """Draw crops of a cloud, or cut it into tiles.
 
     Args:
         points: ``(N, 3)``.
         n_points: number of points per crop.
-        number: of crops.
-        crop: ``nearest`` or ``whole``, as in ``cloud_folder.cloud_folder``.
+        number: of crops; None for tiles.
+        crop: ``nearest``, ``whole`` or ``tiles``, as in ``cloud_folder.cloud_folder``.
         rng: random generator.
         path: of the file, for errors.
 
@@ -60,14 +66,46 @@ def random_crops(
             f"{path} has {len(points)} points, fewer than dataset.n_points={n_points}. Lower "
             "dataset.n_points, or remove the file."
         )
-    centred = np.empty((number, n_points, 3), np.float32)
+    if number is None:
+        return _tiles(points, n_points)
     rows = np.empty((number, n_points), np.int64)
     for place in range(number):
         rows[place] = _rows_of_a_crop(points, n_points, crop, rng, path)
-        drawn = points[rows[place]]
+    return Crops(_centred(points, rows), rows)
+
+
+def _centred(points: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return the points of crops, each with its centroid at the origin."""
+    centred = np.empty((*rows.shape, 3), np.float32)
+    for place, chosen in enumerate(rows):
+        drawn = points[chosen]
         # Before float32, which has too few digits for coordinates of a map.
         centred[place] = drawn - drawn.mean(0)
-    return Crops(centred, rows)
+    return centred
+
+
+def _tiles(points: NDArray[np.float64], n_points: int) -> Crops:
+    """Cut a cloud into tiles of at most ``n_points`` points, each filled up by its neighbours.
+
+    Every point is a tile's own once. A tile with fewer points also has the nearest points of other
+    tiles, which are not its own.
+    """
+    tree = cKDTree(points)
+    tiles = balanced_tiles(points, n_points)
+    rows = np.empty((len(tiles), n_points), np.int64)
+    own = np.zeros((len(tiles), n_points), np.bool_)
+    for place, tile in enumerate(tiles):
+        number = len(tile)
+        rows[place, :number] = tile
+        own[place, :number] = True
+        missing = n_points - number
+        if missing:
+            # Of the nearest n_points + missing points, at least ``missing`` are in other tiles.
+            most = min(n_points + missing, len(points))
+            near = np.asarray(tree.query(points[tile].mean(0), most)[1])
+            others = near[~np.isin(near, tile)]
+            rows[place, number:] = others[:missing]
+    return Crops(_centred(points, rows), rows, own)
 
 
 def _rows_of_a_crop(
