@@ -1,12 +1,15 @@
 """Decorators that let numba compile loops."""
 
 import hashlib
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from pickle import UnpicklingError
 from types import ModuleType
 from typing import Any, cast
 
 from numba import extending, njit, types
+from numba.core.caching import FunctionCache
 
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 """Distances never with ``fastmath``, which could change them."""
@@ -49,21 +52,36 @@ def bits_float(typing: Any, bits: Any, like: Any) -> Any:
     return like(bits, like), generate
 
 
-def jit_cached(function: Any) -> Any:
+class KeptForms(FunctionCache):
+    """The compiled forms of a function in files, without which a call takes longer but succeeds."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return a compiled form, or None where its file is missing or broken."""
+        with suppress(OSError, EOFError, UnpicklingError):
+            return super().load_overload(sig, target_context)
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Write a compiled form, unless that fails.
+
+        Besides a full disk, numba raises "no compiled object yet" (RuntimeError) once in a while,
+        when several processes compile the same functions for the first time.
+        """
+        with suppress(OSError, RuntimeError):
+            super().save_overload(sig, data)
+
+
+def jit_cached(function: Any, **options: Any) -> Any:
     """Compile, and keep the compiled form in a file next to the source or in the user's cache."""
-    try:
-        return njit(function, **OPTIONS, cache=True)
-    except RuntimeError:  # neither folder can be written to
-        return njit(function, **OPTIONS)
+    dispatcher = njit(function, **OPTIONS, **options)
+    with suppress(RuntimeError):  # neither folder can be written to
+        dispatcher._cache = KeptForms(function)  # as Dispatcher.enable_caching does
+    return dispatcher
 
 
 def jit_sums(function: Any) -> Any:
     """Compile as ``jit_cached``; sums may be added in any order, which vectorises products."""
-    order: Any = {"reassoc", "contract"}
-    try:
-        return njit(function, **OPTIONS, cache=True, fastmath=order)
-    except RuntimeError:  # neither folder can be written to
-        return njit(function, **OPTIONS, fastmath=order)
+    return jit_cached(function, fastmath={"reassoc", "contract"})
 
 
 def jit_cached_with(*modules: ModuleType) -> Any:
