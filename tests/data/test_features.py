@@ -68,6 +68,21 @@ def test_upward_normals_of_planes_are_exact_and_point_upwards():
     np.testing.assert_allclose(upward_normals(tilted + 1000), np.tile(-normal, (100, 1)), atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("along", "expected"),
+    [
+        ([3.0, 4.0, 0.0], [-0.8, 0.6, 0.0]),
+        ([-3.0, 4.0, 0.0], [0.8, 0.6, 0.0]),
+        ([0.0, 1.0, 0.0], [1.0, 0.0, 0.0]),
+    ],
+)
+def test_upward_normals_of_a_wall_have_a_positive_y_or_else_x(along, expected):
+    steps, heights = np.indices((6, 6)).reshape(2, 36, 1)
+    wall = steps * np.array(along) + heights * np.array([0.0, 0.0, 1.0])
+
+    np.testing.assert_allclose(upward_normals(wall), np.tile(expected, (36, 1)), atol=1e-9)
+
+
 @pytest.mark.parametrize("points", [np.zeros((5, 3)), np.ones((1, 3))])
 def test_upward_normals_of_equal_points_point_upwards(points):
     expected = np.tile([0.0, 0.0, 1.0], (len(points), 1))

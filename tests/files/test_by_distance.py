@@ -113,6 +113,20 @@ def test_voxel_means_average_quantities_and_renormalise_normals(scan, tmp_path):
     assert (voxel[np.searchsorted(whole.columns["row"], rows)] == np.arange(len(places))).all()
 
 
+@pytest.mark.parametrize("chunk", [[], ["--chunk", 2]])
+def test_voxel_mean_of_a_missing_value_is_missing(chunk, tmp_path):
+    points = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.3, 0.3, 0.3], [1.5, 0.5, 0.5]])
+    heat = np.array([1.0, np.nan, 3.0, 7.0])
+    WRITERS[".ply"](tmp_path / "in.ply", Table(points, {"heat": heat}))
+
+    arguments = ["--voxel", 1, "--readout", "generated", *chunk]
+    done(tmp_path / "in.ply", tmp_path / "out.npz", *arguments)
+
+    means = read(tmp_path / "out.npz", 9, 0)
+    np.testing.assert_allclose(means.points, [[0.2, 0.2, 0.2], [1.5, 0.5, 0.5]], atol=1e-9)
+    np.testing.assert_array_equal(means.columns["heat"], [np.nan, 7.0])
+
+
 def test_voxel_means_renormalise_normals_by_the_names_of_pcl(tmp_path):
     points = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.3, 0.3, 0.3]])
     normals = {"normal_x": [1.0, 0.0, 0.0], "normal_y": [0.0, 1.0, 0.0], "normal_z": [0.0] * 3}
