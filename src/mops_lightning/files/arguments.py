@@ -1,10 +1,11 @@
 """Arguments that several subcommands of files share."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from mops_lightning.data.formats.bin_columns import parse_columns
-from mops_lightning.errors import Parser
+from mops_lightning.errors import Parser, UserError
 
 WEIGHTS = "a trained sampler: a model, a weights file, a run, or URL#sha256=HASH of a weights file"
 
@@ -32,3 +33,39 @@ def parsed(
 def columns_of(chosen: argparse.Namespace) -> tuple[str, ...] | None:
     """Return the names that ``--columns`` gives, or None."""
     return None if chosen.columns is None else parse_columns(chosen.columns)
+
+
+def numbers(text: str) -> list[int]:
+    """Return the whole numbers in a word of the command line, such as ``8`` or ``8,16,32``."""
+    return [int(part) for part in text.split(",") if part.strip()]
+
+
+def one_of(weights: Sequence[str] | None) -> str | None:
+    """Return the only trained sampler, or None.
+
+    Raises:
+        UserError: there are several.
+    """
+    if weights and len(weights) > 1:
+        raise UserError(f"several --weights are for --task-net, got {', '.join(weights)}.")
+    return weights[0] if weights else None
+
+
+def check_out(folder: Path, overwrite: bool, written: Sequence[str] = COMPARED) -> None:
+    """Check that a comparison may be written to a folder.
+
+    Args:
+        folder: the folder; it need not exist.
+        overwrite: whether an earlier comparison may be replaced.
+        written: names of the files that are written.
+
+    Raises:
+        UserError: it is a file, or has other files, or an earlier comparison.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"--out must be a folder, got the file {folder}.")
+    found = {path.name for path in folder.glob("[!.]*")}
+    if other := sorted(found.difference(written)):
+        raise UserError(f"--out: {folder} has other files, such as {other[0]}. Give a new one.")
+    if found and not overwrite:
+        raise UserError(f"--out: {folder / max(found)} exists. Give another, or --overwrite.")

@@ -2,13 +2,26 @@
 
 import argparse
 import time
+from collections.abc import Sequence
 from os.path import realpath
 from pathlib import Path
 
 from mops_lightning.errors import UserError, did_you_mean, one_line_endings, printable
-from mops_lightning.files.arguments import COLUMNS, COMPARED, WEIGHTS, Add, columns_of, parsed
+from mops_lightning.files.arguments import (
+    COLUMNS,
+    COMPARED,
+    WEIGHTS,
+    Add,
+    check_out,
+    columns_of,
+    numbers,
+    one_of,
+    parsed,
+)
+from mops_lightning.files.icp.cli import ONLY_ICP, compare_icp
 from mops_lightning.files.icp.cli import add_arguments as add_icp_arguments
-from mops_lightning.files.icp.cli import compare_icp, refuse_icp_options
+from mops_lightning.files.task_net.cli import ONLY_TASK_NET, compare_by_net
+from mops_lightning.files.task_net.cli import add_arguments as add_task_net_arguments
 from mops_lightning.filesystem import remove_temporary
 from mops_lightning.zoo.names import UNTRAINED
 
@@ -24,9 +37,16 @@ Each file is sampled to m points by every untrained method and, with --weights, 
 sampler. A table and a page with the clouds in 3-D show the chamfer and
 Hausdorff distances to the full cloud, how evenly it is represented, and the time.
 
+With --task-net RUN, FILES may be folders. The table shows the score and the loss of a trained task
+net from m points of every method, over five draws of crops. The last line says which method to use
+for how many points; --save keeps it as a sampler for `downsample --weights`.
+
 With --task icp, FILE is one folder of scans. Halves of random crops, or with --poses consecutive
 frames, are aligned by small_gicp from m points of every method. The table shows the error of the
 rotation over ten draws, and the times."""
+
+DRAWN = ("draws", "crops", "points")
+"""Options of comparisons that draw crops."""
 
 
 def propagate(arguments: list[str], prog: str = "mops-lightning propagate") -> None:
@@ -108,40 +128,82 @@ def _compare_arguments(add: Add) -> None:
         default="coverage",
         help="what is measured: distances to the whole cloud (default), or registration",
     )
-    add("--m", type=int, nargs="+", required=True, help="numbers of points to keep")
-    add("--weights", help=WEIGHTS)
+    add(
+        "--m",
+        type=numbers,
+        nargs="+",
+        required=True,
+        metavar="NUMBER",
+        help="numbers of points to keep, such as 8,16,32",
+    )
+    add("--weights", action="append", help=f"{WEIGHTS}; --task-net: may be given several times")
     add("--methods", nargs="+", help="untrained methods; default: all")
     add("--columns", metavar="X,Y,Z,...", help=COLUMNS)
     add("--tile", type=int, metavar="POINTS", help="the trained sampler by tiles, as in downsample")
     add("--out", type=Path, default=Path("compare"), help="folder to write; default: compare")
     add("--seed", type=int, default=0, help="seed of random choices")
     add("--overwrite", action="store_true", help="replace an earlier comparison in --out")
+    add(
+        "--draws",
+        type=int,
+        metavar="N",
+        help="icp, --task-net: draws of crops and random choices; default: 10, --task-net 5",
+    )
+    add(
+        "--crops",
+        type=int,
+        metavar="N",
+        help="icp, --task-net: crops of every file and draw; default: 32, --task-net 8, or 1 for a "
+        "net of whole clouds",
+    )
+    add(
+        "--points",
+        type=int,
+        metavar="N",
+        help="icp, --task-net: points of a crop; default: 1024, --task-net as in training",
+    )
+    add_task_net_arguments(add)
     add_icp_arguments(add)
 
 
 def _compare(chosen: argparse.Namespace) -> None:
+    chosen.m = [m for word in chosen.m for m in word]
+    if not chosen.m:
+        raise UserError("--m must be numbers of points, such as 8,16,32.")
+    if not 0 <= chosen.seed < 2**63:
+        raise UserError(f"--seed must be from 0 to 2**63 - 1, got {chosen.seed}.")
     if chosen.weights is None and chosen.tile is not None:
         raise UserError("--tile is for the trained sampler: give --weights.")
-    _check_out(chosen)
-    table = compare_icp(chosen) if chosen.task == "icp" else _compare_coverage(chosen)
+    is_icp = chosen.task == "icp"
+    if chosen.task_net is not None:
+        if is_icp:
+            raise UserError("--task-net scores its own task: leave --task out.")
+        _refuse(chosen, ONLY_ICP, "--task icp")
+        compare_by_net(chosen)
+        return
+    _refuse(chosen, ONLY_TASK_NET, "--task-net")
+    if not is_icp:
+        _refuse(chosen, (*ONLY_ICP, *DRAWN), "--task icp")
+    check_out(chosen.out, chosen.overwrite)
+    table = compare_icp(chosen) if is_icp else _compare_coverage(chosen)
     print(table)
     print(f"files in {chosen.out}/: {', '.join(COMPARED)}")
 
 
-def _check_out(chosen: argparse.Namespace) -> None:
-    """Reject a folder with other files, or with an earlier comparison without ``--overwrite``."""
-    if chosen.out.exists() and not chosen.out.is_dir():
-        raise UserError(f"--out must be a folder, got the file {chosen.out}.")
-    found = {path.name for path in chosen.out.glob("[!.]*")}
-    if other := sorted(found.difference(COMPARED)):
-        raise UserError(f"--out: {chosen.out} has other files, such as {other[0]}. Give a new one.")
-    if found and not chosen.overwrite:
-        raise UserError(f"--out: {chosen.out / max(found)} exists. Give another, or --overwrite.")
+def _refuse(chosen: argparse.Namespace, options: Sequence[str], of: str) -> None:
+    """Reject options that have no effect.
+
+    Raises:
+        UserError: one of them is given.
+    """
+    for name in options:
+        if getattr(chosen, name) is not None:
+            raise UserError(f"--{name.replace('_', '-')} is for {of}.")
 
 
 def _compare_coverage(chosen: argparse.Namespace) -> str:
     """Measure distances to the whole clouds, and return the table as text."""
-    refuse_icp_options(chosen)
+    weights = one_of(chosen.weights)
     names = chosen.methods or list(UNTRAINED)
     for name in names:
         if name not in UNTRAINED:
@@ -153,7 +215,7 @@ def _compare_coverage(chosen: argparse.Namespace) -> str:
     from mops_lightning.files.downsample import load_sampler
 
     by_size = {
-        m: comparison.options_by_method(m, names, chosen.weights, chosen.tile, chosen.seed)
+        m: comparison.options_by_method(m, names, weights, chosen.tile, chosen.seed)
         for m in chosen.m
     }
     for methods in by_size.values():

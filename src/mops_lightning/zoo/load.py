@@ -14,11 +14,15 @@ from mops_lightning.channels import PointChannels
 from mops_lightning.errors import UserError
 from mops_lightning.nets import atlasnet, autoencoder, dgcnn, foldingnet, pcrnet, pointnet
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.by_budget import ByBudget
 from mops_lightning.zoo import names, weights
 from mops_lightning.zoo.construction import Construction
 from mops_lightning.zoo.weights import fit_state
 
 M = TypeVar("M", bound=nn.Module)
+
+SEES_CHANNELS = "sees_channels"
+"""Whether a method of a ``ByBudget`` was trained on the channels that its file names."""
 
 HINT = "Give a sampler, or the weights of a run with learn=sampler or learn=joint."
 NET_HINT = "Give the weights of a task net, such as those of a run with learn=task."
@@ -72,7 +76,7 @@ def load(path: str | Path, cls: type[Sampler] | None = None) -> Sampler:
     if config.get("learn") == "task":
         raise UserError(f"{path} holds a task net, not a sampler. {HINT}")
     node = config.get("sampler")
-    found = cls or _known_class(node, package_samplers())
+    found = cls or _known_class(node, [*package_samplers(), ByBudget])
     if found is None:
         raise UserError(
             f"{path}: sampler._target_ must be a sampler of mops_lightning, got "
@@ -153,11 +157,13 @@ def _build(
     """
     if not isinstance(node, dict):
         raise UserError(f"{path}: {part} must be a group of settings, got {node!r:.99}.")
-    arguments = {name: value for name, value in node.items() if name != "_target_"}
+    arguments = _arguments(node)
 
     def make() -> M:
         try:
             with Construction(len(state)):
+                if issubclass(cls, ByBudget):
+                    return cls(**{**arguments, "samplers": _members(node, path)})
                 return cls(**arguments)
         except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: sizes over 64 bits
             reason = str(error).partition("\n")[0]
@@ -171,3 +177,29 @@ def _build(
     module = make()
     fit_state(module, state, path, hint)
     return module.eval()
+
+
+def _arguments(node: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in node.items() if name != "_target_"}
+
+
+def _members(node: dict[str, Any], path: Path) -> list[Sampler]:
+    """Build the samplers of a ``ByBudget``, which have no weights yet.
+
+    Raises:
+        UserError: one of them is not a sampler of this package.
+    """
+    members = node.get("samplers")
+    samplers = []
+    for member in members if isinstance(members, list) else []:
+        cls = _known_class(member, package_samplers())
+        if cls is None:
+            raise UserError(
+                f"{path}: a method must be a sampler of mops_lightning, got "
+                f"{_target(member)!r:.99}. {HINT}"
+            )
+        arguments = _arguments(member)
+        if arguments.pop(SEES_CHANNELS, False):
+            arguments["point_channels"] = node.get("point_channels", 0)
+        samplers.append(cls(**arguments))
+    return samplers

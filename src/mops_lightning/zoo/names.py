@@ -82,7 +82,8 @@ def resolve(reference: str | Path) -> Path:
     """Return the path that a user means: an existing file or folder, a model, or a download.
 
     Args:
-        reference: a path, the name of a model, or an address with a hash; see ``addresses``.
+        reference: a path, with or without ``.safetensors``, the name of a model, or an address with
+            a hash; see ``addresses``.
 
     Returns:
         A path. It may not exist if it contains a folder or ends like a file.
@@ -100,6 +101,9 @@ def resolve(reference: str | Path) -> Path:
     model = find_model(text)
     if model is not None:
         return model
+    saved = path.with_name(f"{path.name}{model_file.SUFFIX}")
+    if not text.endswith(FILES) and saved.is_file():
+        return saved
     if path.name != text or text.endswith(FILES):
         return path
     raise UserError(f"no file or model {text!r}.{did_you_mean(text, available())}")

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from mops_lightning.errors import UserError, check_at_least
-from mops_lightning.files.arguments import Add, columns_of
+from mops_lightning.files.arguments import Add, columns_of, one_of
 
 REGISTRATIONS = ("plane", "gicp")
 
@@ -19,9 +19,6 @@ FRAMES = {"angle": 2.0, "shift": 0.5, "max_distance": 1.0}
 ONLY_ICP = (
     "poses",
     "sample_target",
-    "draws",
-    "crops",
-    "points",
     "motions",
     "angle",
     "shift",
@@ -33,7 +30,6 @@ ONLY_ICP = (
 
 def add_arguments(add: Add) -> None:
     """Declare the options that ``--task icp`` alone has."""
-    add("--draws", type=int, metavar="N", help="icp: draws of crops and starts; default: 10")
     add(
         "--poses",
         type=Path,
@@ -48,8 +44,6 @@ def add_arguments(add: Add) -> None:
         help="icp: sample the target like the source; small_gicp then estimates its normals from "
         "the sample. Default: all points of the target",
     )
-    add("--crops", type=int, metavar="N", help="icp: crops of every scan and draw; default: 32")
-    add("--points", type=int, metavar="N", help="icp: points of a crop; default: 1024")
     add("--motions", type=int, metavar="N", help="icp: starts of every pair; default: 1")
     add(
         "--angle",
@@ -77,17 +71,6 @@ def add_arguments(add: Add) -> None:
     )
 
 
-def refuse_icp_options(chosen: argparse.Namespace) -> None:
-    """Reject options that have no effect without ``--task icp``.
-
-    Raises:
-        UserError: there is one.
-    """
-    for name in ONLY_ICP:
-        if getattr(chosen, name) is not None:
-            raise UserError(f"--{name.replace('_', '-')} is for --task icp.")
-
-
 def compare_icp(chosen: argparse.Namespace) -> str:
     """Compare methods by registration, write the files and return the table as text.
 
@@ -104,7 +87,7 @@ def compare_icp(chosen: argparse.Namespace) -> str:
     small_gicp()  # reports that it is missing before any file is read
     setup = Setup(
         sizes=chosen.m,
-        methods=methods_of(chosen.methods or NAMES, chosen.weights, chosen.tile, chosen.m),
+        methods=methods_of(chosen.methods or NAMES, one_of(chosen.weights), chosen.tile, chosen.m),
         registrations=chosen.registration,
         draws=chosen.draws,
         motions=chosen.motions,

@@ -9,13 +9,18 @@ import pandas as pd
 
 from mops_lightning.files.arguments import COMPARED
 from mops_lightning.files.icp.measure import ALIGNED, Score
-from mops_lightning.files.icp.methods import FPS_FARTHEST
+from mops_lightning.files.icp.methods import FPS_FARTHEST, TRAINED
 from mops_lightning.filesystem import atomic_write
+from mops_lightning.metrics.info import MetricInfo
+from mops_lightning.records.verdict import verdict
 from mops_lightning.report.page import render
 from mops_lightning.report.text import Grid, markdown
 
 RIVAL = FPS_FARTHEST
 """The method to which the others are compared draw by draw."""
+
+ROTATION = MetricInfo("degrees", label="rotation error", unit="°", higher_is_better=False)
+"""By which methods are judged."""
 
 HEAD = [
     "method",
@@ -44,12 +49,28 @@ MEANINGS = [
 def write_scores(scores: Sequence[Score], folder: Path) -> str:
     """Write the table of every draw and the page, and return the means over draws as text."""
     frame = pd.DataFrame([asdict(score) for score in scores])
-    page = render("compare", grids_of(frame), [], MEANINGS, "How to read this")
+    sentences = sentences_of(frame)
+    remarks = [*MEANINGS, *sentences]
+    page = render("compare", grids_of(frame), [], remarks, "How to read this")
     csv = frame.to_csv(index=False, lineterminator="\n")
     for name, content in zip(COMPARED, (csv, page), strict=True):
         with atomic_write(folder / name) as temporary:
             temporary.write_text(content, encoding="utf-8")
-    return as_text(frame)
+    return "\n".join([as_text(frame), *sentences])
+
+
+def sentences_of(frame: pd.DataFrame) -> list[str]:
+    """Return for every registration which method to use for how many points; see ``as_text``."""
+    sentences = []
+    for registration in frame.registration.unique():
+        chosen = frame[(frame.registration == registration) & (frame.m > 0)]
+        scores: dict[int, dict[str, list[float]]] = {}
+        for (m, method), group in chosen.groupby(["m", "method"], sort=False):
+            scores.setdefault(int(m), {})[str(method)] = group.degrees.tolist()
+        sentence = verdict(scores, ROTATION, [TRAINED])
+        if sentence:
+            sentences.append(f"{registration}: {sentence}")
+    return sentences
 
 
 def as_text(frame: pd.DataFrame) -> str:

@@ -27,6 +27,7 @@ import torch
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
+from mops_lightning.channels import PointChannels
 from mops_lightning.config import distributed, settings
 from mops_lightning.config.build import build_as, takes
 from mops_lightning.config.declaration import Training
@@ -271,7 +272,21 @@ def _make_task(cfg: DictConfig, dataset: CloudDataset) -> Task:
     _check_fits(cfg, dataset, offered)
     if not takes(cfg.task.net, "point_channels"):
         check_without_channels(f"task/net={cfg.names.net}", dataset)
-    of_data: dict[str, Any] = {**offered, "point_channels": dataset.channels}
+    return build_task(cfg, offered, dataset.channels)
+
+
+def build_task(cfg: DictConfig, outputs: Mapping[str, int], channels: PointChannels) -> Task:
+    """Build a task and its net, without weights.
+
+    Args:
+        cfg: a composed configuration.
+        outputs: ``num_classes`` and ``num_parts``.
+        channels: of the points.
+
+    Raises:
+        UserError: a setting that the task or its net does not allow.
+    """
+    of_data: dict[str, Any] = {**outputs, "point_channels": channels}
     net = build_as(nn.Module, cfg.task.net, "task.net", of_data)
     task: Task = build_as(Task, cfg.task, "task", of_data, net=net)
     return task

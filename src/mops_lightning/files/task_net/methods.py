@@ -1,0 +1,194 @@
+"""The methods that are compared: those without weights, critical points, and trained samplers."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mops_lightning.channels import PointChannels, coordinates
+from mops_lightning.errors import UserError, did_you_mean
+from mops_lightning.files.task_net.subject import Subject
+from mops_lightning.ops.farthest import FARTHEST
+from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.by_budget import MOST
+from mops_lightning.samplers.critical_points import CriticalSampler
+from mops_lightning.types import PointFeatureNet
+from mops_lightning.zoo import names, weights
+from mops_lightning.zoo.find_sampler import untrained
+from mops_lightning.zoo.load import SEES_CHANNELS, load
+
+FPS_FARTHEST, CRITICAL, TRAINED = "fps_farthest", "critical", "trained"
+
+NAMES = (*names.UNTRAINED, FPS_FARTHEST, CRITICAL)
+"""Methods without training of their own."""
+
+
+class Method(ABC):
+    """One way to choose points.
+
+    Attributes:
+        name: in the table.
+    """
+
+    name: str
+
+    @abstractmethod
+    def rows(self, clouds: Tensor, m: int, seed: int) -> Tensor:
+        """Return the rows ``(B, m)`` of chosen points of clouds ``(B, N, 3 + C)``."""
+
+    def takes(self, m: int) -> bool:
+        """Return whether it chooses m points."""
+        return True
+
+
+def _selected(sampler: Sampler, clouds: Tensor, m: int) -> Tensor:
+    rows = sampler.select("completed", clouds, m)[1]
+    assert rows is not None  # completed sets are rows
+    return rows
+
+
+class Untrained(Method):
+    """A sampler without weights, by its name."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def rows(self, clouds: Tensor, m: int, seed: int) -> Tensor:
+        """Return the rows of chosen points."""
+        return _selected(self.sampler(m, seed), coordinates(clouds), m)
+
+    def sampler(self, m: int, seed: int) -> Sampler:
+        """Return the sampler of up to m points."""
+        if self.name == FPS_FARTHEST:
+            return untrained("fps", m, seed, start=FARTHEST)
+        return untrained(self.name, m, seed)
+
+    def node(self, seed: int) -> dict[str, Any]:
+        """Return the sampler as plain data, as ``ByBudget`` files hold it."""
+        cls = type(self.sampler(1, seed))
+        node: dict[str, Any] = {"_target_": f"{cls.__module__}.{cls.__qualname__}", "m": MOST}
+        if self.name not in ("voxel", "serial"):
+            node["seed"] = seed
+        if self.name == FPS_FARTHEST:
+            node["start"] = FARTHEST
+        return node
+
+
+class Critical(Method):
+    """The points that win the maxima of the task net's features."""
+
+    name = CRITICAL
+
+    def __init__(self, net: Any) -> None:
+        self.net = net
+
+    def rows(self, clouds: Tensor, m: int, seed: int) -> Tensor:
+        """Return the rows of chosen points."""
+        return _selected(CriticalSampler(m, net=self.net, seed=seed), clouds, m)
+
+
+class Trained(Method):
+    """A trained sampler, whose completed sets are taken."""
+
+    def __init__(self, reference: str, name: str, seen: PointChannels) -> None:
+        """Load the sampler.
+
+        Raises:
+            UserError: there is no such sampler, or it sees other channels than the net.
+        """
+        self.name = name
+        self.seen = seen
+        try:
+            self.path = weights.of_run(names.resolve(reference))
+            self.sampler = load(self.path)
+        except UserError as error:
+            raise UserError(f"--weights: {error}") from None
+        channels = self.sampler.point_channels
+        if channels and channels.names != seen.names:
+            raise UserError(
+                f"--weights: {reference} sees the channels {', '.join(channels.names)}, but the "
+                f"task net sees {', '.join(seen.names) or 'none'}."
+            )
+
+    def takes(self, m: int) -> bool:
+        """Return whether it was trained for m points."""
+        return m <= self.sampler.m if self.sampler.flexible else m == self.sampler.m
+
+    def rows(self, clouds: Tensor, m: int, seed: int) -> Tensor:
+        """Return the rows of chosen points; without any, the channels are its own or none."""
+        channels = self.sampler.point_channels
+        if not channels:
+            return _selected(self.sampler, coordinates(clouds), m)
+        values = channels.scaled(self.seen.restored(clouds[..., 3:].double()))
+        own = torch.cat([coordinates(clouds), values.to(clouds.dtype)], -1)
+        return _selected(self.sampler, own, m)
+
+    def node(self) -> dict[str, Any]:
+        """Return the sampler as plain data, as ``ByBudget`` files hold it."""
+        node = dict(weights.read(self.path)["config"]["sampler"])
+        if self.sampler.point_channels:
+            node[SEES_CHANNELS] = True
+        return node
+
+
+def methods_of(
+    chosen: Sequence[str] | None, references: Sequence[str], subject: Subject, sizes: Sequence[int]
+) -> list[Method]:
+    """Return the methods of a comparison.
+
+    Farthest points are always among them, because the others are compared with these.
+
+    Args:
+        chosen: names among ``NAMES``; None: all that the net allows.
+        references: of trained samplers.
+        subject: the task; the sampler that its run trained is added where there is no reference.
+        sizes: numbers of points.
+
+    Raises:
+        UserError: a name is unknown, a sampler does not fit, or it chooses none of the sizes.
+    """
+    has_features = isinstance(subject.task.net, PointFeatureNet)
+    known = [name for name in NAMES if name != CRITICAL or has_features]
+    for name in chosen or ():
+        if name == CRITICAL and not has_features:
+            raise UserError(
+                f"--methods: critical needs a net with features of single points under a maximum, "
+                f"which {subject.name} has not."
+            )
+        if name not in known:
+            raise UserError(f"--methods: unknown {name!r}.{did_you_mean(name, known)}")
+    if chosen is not None:
+        known = [name for name in known if name in chosen or name in ("fps", FPS_FARTHEST)]
+    methods: list[Method] = []
+    for name in known:
+        methods.append(Critical(subject.task.net) if name == CRITICAL else Untrained(name))
+    return methods + list(_trained(references, subject, sizes))
+
+
+def _trained(references: Sequence[str], subject: Subject, sizes: Sequence[int]) -> list[Trained]:
+    given = list(references)
+    if not given and subject.sampler is not None:
+        given = [str(subject.sampler)]
+    samplers = []
+    for reference in given:
+        name = TRAINED if len(given) == 1 else _short_name(reference, given)
+        sampler = Trained(reference, name, subject.channels)
+        if not any(sampler.takes(m) for m in sizes):
+            most = sampler.sampler.m
+            allowed = f"up to {most}" if sampler.sampler.flexible else str(most)
+            raise UserError(
+                f"--m: {reference} was trained for {allowed} points, got "
+                f"{', '.join(map(str, sizes))}."
+            )
+        samplers.append(sampler)
+    return samplers
+
+
+def _short_name(reference: str, others: Sequence[str]) -> str:
+    """Return the last part of a path, unless others have the same."""
+    short = Path(reference).name
+    is_unique = [Path(other).name for other in others].count(short) == 1
+    return short if is_unique and short not in NAMES else reference

@@ -1,0 +1,179 @@
+"""What a comparison by a task net shows: tables, a curve and a page."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean, stdev
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from mops_lightning.files.task_net.keep import Choice, by_part, by_size
+from mops_lightning.files.task_net.measure import ALL, EVERYTHING, LOSS
+from mops_lightning.filesystem import atomic_write
+from mops_lightning.metrics.info import MetricInfo
+from mops_lightning.records.verdict import verdict
+from mops_lightning.report.page import render
+from mops_lightning.report.plots import COLOURS
+from mops_lightning.report.tables import Cell, Part
+from mops_lightning.report.text import BEST, Grid, markdown
+from mops_lightning.viz.figures import new_figure, save_figure
+
+TABLE, TEXT, CURVE, PAGE = "table.csv", "table.md", "curve.svg", "compare.html"
+FILES = (TABLE, TEXT, CURVE, PAGE)
+"""The files of a comparison."""
+
+MEANINGS = [
+    "Every figure is the mean over the draws, ± the standard deviation between draws; every draw "
+    "has other crops and other random choices. All methods of a draw see the same clouds. Bold: "
+    "the best mean. A method counts as better than farthest points if the difference exceeds twice "
+    "its standard error, which is taken over the draws of both halves of the files.",
+    "- Points are input points: of trained samplers, completed sets are scored.",
+    "- fps: farthest points from a drawn point; fps_farthest: from the point farthest from the "
+    "mean. critical: points that win the maxima of the net's features. trained: the trained "
+    "sampler.",
+]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The scores of all methods.
+
+    Attributes:
+        frame: one row for every draw, group of files, number of points and method; see
+            ``measure.Score``.
+        metric: of the column ``score``.
+        net: name of the task net.
+        files: their number.
+        own: names of the trained samplers.
+        choices: what was kept for every number of points; empty: nothing.
+        saved: the file with these methods, or None.
+    """
+
+    frame: pd.DataFrame
+    metric: MetricInfo
+    net: str
+    files: int
+    own: list[str]
+    choices: list[Choice]
+    saved: Path | None
+
+    @property
+    def sentence(self) -> str:
+        """Which method to use for how many points."""
+        return verdict(by_size(self.frame, ALL), self.metric, self.own, by_part(self.frame))
+
+    @property
+    def text(self) -> str:
+        """Return the tables, how to read them, what was kept, and the sentence."""
+        return markdown(self._grids(), [*MEANINGS, "", *self._ending()])
+
+    def write(self, folder: Path) -> None:
+        """Write ``FILES`` to a folder."""
+        contents = {
+            TABLE: self.frame.to_csv(index=False, lineterminator="\n"),
+            TEXT: self.text,
+        }
+        for name, content in contents.items():
+            with atomic_write(folder / name) as temporary:
+                temporary.write_text(content, encoding="utf-8")
+        curve = save_figure(self._curve(), folder / CURVE)
+        remarks = [*self._ending(), *MEANINGS]
+        page = render("compare", self._grids(), [], remarks, "What to use", [curve])
+        with atomic_write(folder / PAGE) as temporary:
+            temporary.write_text(page, encoding="utf-8")
+
+    def _ending(self) -> list[str]:
+        """Return what was kept, and the sentence."""
+        if self.saved is None:
+            return [self.sentence]
+        kept = [f"Kept in {self.saved}, chosen on one half of the files, checked on the other:"]
+        return [*kept, *(f"- {choice.line}" for choice in self.choices), "", self.sentence]
+
+    def _grids(self) -> list[Grid]:
+        """Return a table of scores, and one of losses where the score is another value."""
+        grids = [self._grid("score", self.metric)]
+        if self.metric != LOSS:
+            grids.append(self._grid("loss", LOSS))
+        return grids
+
+    def _grid(self, column: str, metric: MetricInfo) -> Grid:
+        frame = self.frame[self.frame.files == ALL]
+        sizes = [m for m in frame.m.unique() if m]
+        draws = frame.draw.nunique()
+        clouds = frame.clouds.iloc[0]
+        title = (
+            f"{metric.title} of {self.net}: {_counted(draws, 'draw')} of {clouds:,} clouds from "
+            f"{_counted(self.files, 'file')}"
+        )
+        best = {m: _best(frame[frame.m == m], column, metric) for m in sizes}
+        rows: list[list[str | Cell]] = []
+        for method in frame.method.unique():
+            of_method = frame[frame.method == method]
+            row: list[str | Cell] = [method]
+            for m in sizes:
+                values = of_method[of_method.m == (0 if method == EVERYTHING else m)][column]
+                rank = BEST if method == best[m] else 0
+                row.append(_cell(values.tolist(), metric, rank))
+            rows.append(row)
+        rows.sort(key=lambda row: row[0] == EVERYTHING)
+        return Grid(title, ["method", *(f"m={m:,}" for m in sizes)], rows)
+
+    def _curve(self) -> Figure:
+        """Draw the score against the number of points."""
+        scores = by_size(self.frame, ALL)
+        sizes = list(scores)
+        figure = new_figure(7.5, 4.2)
+        axis = figure.subplots()
+        names = list(dict.fromkeys(name for values in scores.values() for name in values))
+        scale = self.metric.scale
+        for number, name in enumerate(names):
+            known = [m for m in sizes if name in scores[m]]
+            axis.errorbar(
+                [sizes.index(m) for m in known],
+                [scale * fmean(scores[m][name]) for m in known],
+                yerr=[scale * _spread(scores[m][name]) for m in known],
+                label=name,
+                color=COLOURS[number % len(COLOURS)],
+                linestyle="-" if name in self.own else "--",
+                marker="o",
+                markersize=3,
+                capsize=2,
+            )
+        whole = self.frame[(self.frame.files == ALL) & (self.frame.method == EVERYTHING)]
+        axis.axhline(scale * whole.score.mean(), color="grey", linewidth=0.8, label=EVERYTHING)
+        axis.set_xticks(range(len(sizes)), [f"{m:,}" for m in sizes])
+        axis.set(xlabel="points", ylabel=self.metric.title)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        return figure
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+
+
+def _best(frame: pd.DataFrame, column: str, metric: MetricInfo) -> str:
+    """Return the method with the best mean."""
+    means = frame.groupby("method", sort=False)[column].mean()
+    return str(means.idxmax() if metric.higher_is_better else means.idxmin())
+
+
+def _spread(values: Sequence[float]) -> float:
+    return stdev(values) if len(values) > 1 else 0.0
+
+
+def _cell(values: Sequence[float], metric: MetricInfo, rank: int) -> str | Cell:
+    """Return the mean of the draws, and their standard deviation where there are several."""
+    if not values:
+        return "-"
+    mean = metric.format(fmean(values))
+    if len(values) == 1:
+        return Cell((Part(mean, rank),))
+    spread = f"{metric.scale * stdev(values):.{_decimals(mean)}f}"
+    return Cell((Part(mean, rank),), f" ± {spread}")
+
+
+def _decimals(number: str) -> int:
+    """Return how many decimals a number has."""
+    return len(number.partition("e")[0].partition(".")[2])
