@@ -43,6 +43,7 @@ SHORT = {
         "epochs.task=1",
         "epochs.sampler=1",
     ],
+    "08_is_it_worth_it.py": ["1"],
 }
 """Arguments that make an example short, by its name."""
 
@@ -54,6 +55,7 @@ LAST_LINE = {
     "05_own_scans.py": r"1024 points of rooms/room_\d.ply to 8, by the sampler in outputs/",
     "06_registration.py": r"Curves and clouds: tensorboard --logdir outputs/",
     "07_channels.py": r"600 points to 8, \d+% of them on the line",
+    "08_is_it_worth_it.py": r"At 8 points, best.safetensors has \w+Sampler",
 }
 """What an example prints at its end, by its name."""
 

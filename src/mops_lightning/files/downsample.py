@@ -29,6 +29,7 @@ from mops_lightning.files.space import in_space
 from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.weights import check_positive
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.by_budget import ByBudget
 from mops_lightning.samplers.by_normals import ByNormals
 from mops_lightning.samplers.fps import farthest_rows
 from mops_lightning.samplers.poisson import poisson_rows
@@ -94,6 +95,10 @@ def _check_flexible(sampler: Sampler, options: Options) -> None:
 
 
 def _check_size(sampler: Sampler, options: Options, m: int | None) -> None:
+    if options.m is None and isinstance(sampler, ByBudget):
+        raise UserError(
+            f"--m: {options.weights} holds the best method of every number of points. Give --m."
+        )
     if m is None or m == sampler.m or (m < sampler.m and sampler.flexible):
         return
     allowed, advice = f"{sampler.m}", f"Give --m {sampler.m}"

@@ -85,6 +85,21 @@ class ByBudget(Sampler):
         """Return m of the points ``(B, N, 3)`` with their indices."""
         sampler = self.sampler_for(m)
         seen = points if sampler.point_channels else coordinates(points)
-        _, rows = sampler.select("completed", seen, m)
-        assert rows is not None  # completed sets are rows
+        rows = rows_in_unit_sphere(sampler, seen, m)
         return SampleOutput(gather_points(points, rows), rows, {})
+
+
+def rows_in_unit_sphere(sampler: Sampler, clouds: Tensor, m: int) -> Tensor:
+    """Return the rows ``(B, m)`` of different points, of generated ones those of completed sets.
+
+    Args:
+        sampler: in evaluation mode.
+        clouds: ``(B, N, 3 + C)`` in the unit sphere, with the channels that the sampler takes.
+        m: number of points.
+    """
+    if sampler.generates:
+        rows = sampler.select("completed", clouds, m)[1]
+    else:
+        rows = sampler(clouds, m).indices
+    assert rows is not None  # completed sets are rows
+    return rows

@@ -48,13 +48,10 @@ class Choice:
         text = f"{self.m:,} points: {self.method}"
         if self.checked is None:
             return text
+        difference = f"{self.checked} {'better' if self.checked.mean > 0 else 'worse'}"
         if self.rejected:
-            how = f"{self.checked} {'better' if self.checked.mean > 0 else 'worse'}"
-            return (
-                f"{text}; {self.rejected}, chosen on the first half of the files, was {how} on the "
-                "other half"
-            )
-        return f"{text}, {self.checked} better than FPS on files that it was not chosen on"
+            return f"{text}; {self.rejected} was {difference} on the other half"
+        return f"{text}, {difference} than FPS on the other half"
 
 
 def by_size(frame: pd.DataFrame, files: str) -> dict[int, dict[str, list[float]]]:

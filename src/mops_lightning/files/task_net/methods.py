@@ -13,7 +13,7 @@ from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.files.task_net.subject import Subject
 from mops_lightning.ops.farthest import FARTHEST
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.by_budget import MOST
+from mops_lightning.samplers.by_budget import MOST, rows_in_unit_sphere
 from mops_lightning.samplers.critical_points import CriticalSampler
 from mops_lightning.types import PointFeatureNet
 from mops_lightning.zoo import names, weights
@@ -44,12 +44,6 @@ class Method(ABC):
         return True
 
 
-def _selected(sampler: Sampler, clouds: Tensor, m: int) -> Tensor:
-    rows = sampler.select("completed", clouds, m)[1]
-    assert rows is not None  # completed sets are rows
-    return rows
-
-
 class Untrained(Method):
     """A sampler without weights, by its name."""
 
@@ -58,7 +52,7 @@ class Untrained(Method):
 
     def rows(self, clouds: Tensor, m: int, seed: int) -> Tensor:
         """Return the rows of chosen points."""
-        return _selected(self.sampler(m, seed), coordinates(clouds), m)
+        return rows_in_unit_sphere(self.sampler(m, seed), coordinates(clouds), m)
 
     def sampler(self, m: int, seed: int) -> Sampler:
         """Return the sampler of up to m points."""
@@ -87,7 +81,7 @@ class Critical(Method):
 
     def rows(self, clouds: Tensor, m: int, seed: int) -> Tensor:
         """Return the rows of chosen points."""
-        return _selected(CriticalSampler(m, net=self.net, seed=seed), clouds, m)
+        return rows_in_unit_sphere(CriticalSampler(m, net=self.net, seed=seed), clouds, m)
 
 
 class Trained(Method):
@@ -121,10 +115,10 @@ class Trained(Method):
         """Return the rows of chosen points; without any, the channels are its own or none."""
         channels = self.sampler.point_channels
         if not channels:
-            return _selected(self.sampler, coordinates(clouds), m)
+            return rows_in_unit_sphere(self.sampler, coordinates(clouds), m)
         values = channels.scaled(self.seen.restored(clouds[..., 3:].double()))
         own = torch.cat([coordinates(clouds), values.to(clouds.dtype)], -1)
-        return _selected(self.sampler, own, m)
+        return rows_in_unit_sphere(self.sampler, own, m)
 
     def node(self) -> dict[str, Any]:
         """Return the sampler as plain data, as ``ByBudget`` files hold it."""

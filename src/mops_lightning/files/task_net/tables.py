@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import floor, log10
 from pathlib import Path
 from statistics import fmean, stdev
 
@@ -65,8 +66,8 @@ class Comparison:
 
     @property
     def text(self) -> str:
-        """Return the tables, how to read them, what was kept, and the sentence."""
-        return markdown(self._grids(), [*MEANINGS, "", *self._ending()])
+        """The tables, how to read them, what was kept, and the sentence."""
+        return markdown(self._grids(), [*MEANINGS, *self._ending()])
 
     def write(self, folder: Path) -> None:
         """Write ``FILES`` to a folder."""
@@ -85,10 +86,13 @@ class Comparison:
 
     def _ending(self) -> list[str]:
         """Return what was kept, and the sentence."""
-        if self.saved is None:
-            return [self.sentence]
-        kept = [f"Kept in {self.saved}, chosen on one half of the files, checked on the other:"]
-        return [*kept, *(f"- {choice.line}" for choice in self.choices), "", self.sentence]
+        lines = []
+        if self.saved is not None:
+            lines += ["", f"Kept in {self.saved}, chosen on one half of the files:"]
+            lines += [f"- {choice.line}" for choice in self.choices]
+        if self.sentence:
+            lines += ["", self.sentence]
+        return lines
 
     def _grids(self) -> list[Grid]:
         """Return a table of scores, and one of losses where the score is another value."""
@@ -167,13 +171,16 @@ def _cell(values: Sequence[float], metric: MetricInfo, rank: int) -> str | Cell:
     """Return the mean of the draws, and their standard deviation where there are several."""
     if not values:
         return "-"
-    mean = metric.format(fmean(values))
+    form = _form(metric, fmean(values))
+    mean = format(metric.scale * fmean(values), form)
     if len(values) == 1:
         return Cell((Part(mean, rank),))
-    spread = f"{metric.scale * stdev(values):.{_decimals(mean)}f}"
-    return Cell((Part(mean, rank),), f" ± {spread}")
+    return Cell((Part(mean, rank),), f" ± {format(metric.scale * stdev(values), form)}")
 
 
-def _decimals(number: str) -> int:
-    """Return how many decimals a number has."""
-    return len(number.partition("e")[0].partition(".")[2])
+def _form(metric: MetricInfo, mean: float) -> str:
+    """Return the format of a mean and its spread: two decimals, or four digits of the mean."""
+    if metric.unit or not mean:
+        return ".2f"
+    decimals = 3 - floor(log10(abs(mean)))
+    return f".{max(decimals, 0)}f" if decimals < 7 else ".2e"

@@ -1,0 +1,90 @@
+"""The best sampler for each number of points."""
+
+import pytest
+import torch
+
+from mops_lightning import FMOPSNet, FPSSampler, MOPSNet, PoissonSampler, RandomSampler
+from mops_lightning.errors import UserError
+from mops_lightning.samplers.by_budget import MOST, ByBudget
+
+FPS, RANDOM, POISSON = FPSSampler(MOST), RandomSampler(MOST), PoissonSampler(MOST)
+
+
+@pytest.mark.parametrize(
+    ("m", "expected"),
+    [
+        (3, RANDOM),  # below the first compared number: its method
+        (8, RANDOM),
+        (12, RANDOM),  # between two with the same method
+        (16, RANDOM),
+        (20, FPS),  # between two with different methods
+        (32, POISSON),
+        (40, FPS),  # between two with different methods
+        (64, FPS),
+        (65, FPS),  # above the last one
+        (5000, FPS),
+    ],
+)
+def test_by_budget_takes_the_method_of_the_number(m, expected):
+    sampler = ByBudget([8, 16, 32, 64], [1, 1, 2, 0], [FPS, RANDOM, POISSON])
+
+    assert sampler.sampler_for(m) is expected
+
+
+def test_by_budget_takes_farthest_points_for_numbers_that_a_sampler_does_not_return():
+    fixed, flexible = MOPSNet(m=8).eval(), FMOPSNet(m_max=8).eval()
+
+    of_fixed = ByBudget([8], [1], [FPS, fixed])
+    of_flexible = ByBudget([8, 12], [1, 1], [FPS, flexible])
+
+    assert of_fixed.sampler_for(8) is fixed
+    assert of_fixed.sampler_for(7) is FPS
+    assert of_flexible.sampler_for(7) is flexible
+    assert of_flexible.sampler_for(10) is FPS
+
+
+def test_by_budget_returns_the_completed_set_of_a_trained_sampler(rng):
+    points = torch.rand(2, 64, 3, generator=rng)
+    trained = FMOPSNet(m_max=16).eval()
+    sampler = ByBudget([8, 32], [1, 0], [FPS, trained]).eval()
+
+    output = sampler(points, 8)
+    larger = sampler.downsample(points, 32)
+
+    expected, rows = trained.select("completed", points, 8)
+    assert rows is not None
+    assert output.indices.tolist() == rows.tolist()
+    assert torch.equal(output.points, expected)
+    assert torch.equal(larger[1], FPSSampler(32).downsample(points, 32)[1])
+    assert torch.equal(larger[0], points.gather(1, larger[1][..., None].expand(-1, -1, 3)))
+
+
+def test_by_budget_shows_channels_to_the_samplers_that_take_them(rng):
+    points = torch.rand(2, 64, 5, generator=rng)
+    trained = FMOPSNet(m_max=16, point_channels=2).eval()
+    sampler = ByBudget([8, 16], [1, 0], [FPS, trained], point_channels=2).eval()
+
+    rows = sampler(points, 8).indices
+    farthest = sampler(points, 16)
+
+    expected = trained.select("completed", points, 8)[0]
+    assert torch.equal(points.gather(1, rows[..., None].expand(-1, -1, 5)), expected)
+    assert torch.equal(farthest.points, FPSSampler(16)(points).points)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (([8], [0], [RANDOM]), "begin with farthest"),
+        (([8], [0], []), "begin with farthest"),
+        (([], [], [FPS]), "ascending"),
+        (([16, 8], [0, 0], [FPS]), "ascending"),
+        (([8, 8], [0, 0], [FPS]), "ascending"),
+        (([8], [0, 0], [FPS]), "ascending"),
+        (([8], [1], [FPS]), "positions"),
+        (([8], [-1], [FPS]), "positions"),
+    ],
+)
+def test_by_budget_refuses_arguments_that_do_not_fit(arguments, said):
+    with pytest.raises(UserError, match=said):
+        ByBudget(*arguments)
