@@ -10,14 +10,14 @@ from torch import Tensor, nn
 from torchmetrics import MetricCollection
 
 from mops_lightning.channels import NO_CHANNELS, PointChannels
-from mops_lightning.data.crops import CROPS_PER_FILE, Crop
+from mops_lightning.data.crops import Crop
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.tasks.base import Task
 from mops_lightning.types import Batch, TaskOutput
 
 CROPS = {
     "nearest": 8,
-    "whole": CROPS_PER_FILE["whole"],
+    "whole": 1,
 }
 """Crops of every file and draw, unless ``--crops`` sets them."""
 
@@ -122,7 +122,8 @@ def subject_of_run(
     except UserError as error:
         raise UserError(f"--task-net: {error}") from None
     data = trained.config["dataset"]
-    crop: Crop = "nearest" if data.get("crop") == "nearest" else "whole"
+    # Tiles are neighbourhoods, too, but always the same ones.
+    crop: Crop = "nearest" if data.get("crop") in ("nearest", "tiles") else "whole"
     subject = Subject(
         name=reference,
         task=trained.task,
