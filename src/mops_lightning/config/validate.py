@@ -51,6 +51,7 @@ def check(cfg: DictConfig) -> None:
     _check_evaluation(plain)
     _check_epochs(plain["epochs"])
     _check_augmentation(plain["augment"])
+    _check_number_of_points(plain)
     for name, setting in settings.declared().items():
         if setting.counts(plain["learn"]):
             _check_node(plain.get(name), name)
@@ -101,6 +102,16 @@ def _check_augmentation(augment: dict[str, Any]) -> None:
         described = {**(node or {}), "_target_": AUGMENTATION}
         _check_node(described, where)
         build(OmegaConf.create(described), where)  # the class checks its values
+
+
+def _check_number_of_points(config: dict[str, Any]) -> None:
+    """Refuse clouds of different sizes for a task net that makes clouds of one size."""
+    is_open = config["dataset"].get("n_points", 0) is None
+    if is_open and "n_points" in config["task"]["net"]:
+        net = config["names"]["net"]
+        raise UserError(
+            f"dataset.n_points must be a number with task/net={net}: it makes clouds of one size."
+        )
 
 
 def _check_length(trainer: dict[str, Any]) -> None:

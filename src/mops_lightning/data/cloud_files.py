@@ -54,7 +54,7 @@ class Content:
 class Reading:
     """What is read from every file; the attributes are arguments of ``cloud_folder``."""
 
-    n_points: int
+    n_points: int | None
     crop: Crop
     crops: int | None
     seed: int
@@ -65,7 +65,7 @@ class Reading:
     @classmethod
     def of(
         cls,
-        n_points: int,
+        n_points: int | None,
         crop: Crop,
         crops: int | None,
         seed: int,
@@ -78,7 +78,13 @@ class Reading:
         Raises:
             UserError: one of them is invalid, or does not fit the crop.
         """
-        check_at_least(2, n_points=n_points)
+        if n_points is not None:
+            check_at_least(2, n_points=n_points)
+        elif crop != "whole":
+            raise UserError(
+                f"n_points must be a number with crop={crop}; null keeps all points of a cloud, "
+                "with crop=whole."
+            )
         check_at_least(0, seed=seed)
         if crop not in CROPS:
             raise UserError(f"crop: unknown {crop!r}.{did_you_mean(crop, CROPS)}")
@@ -110,7 +116,7 @@ def _check_surface(crops: int | None, **of_files: Any) -> None:
 def read_clouds(folder: Path, files: Sequence[SourceFile], reading: Reading) -> list[Content]:
     """Draw crops of every cloud."""
     contents = []
-    surface = max(10_000, 8 * reading.n_points)
+    surface = max(10_000, 8 * (reading.n_points or 0))
     for file in with_progress(files):
         path = folder / file.name
         rng = np.random.default_rng(derive_seed(reading.seed, zlib.crc32(str(file.name).encode())))

@@ -43,7 +43,7 @@ CONSEQUENCE = {"train": "never learned", "test": "never scored"}
 
 def cloud_folder(
     root: str | Path,
-    n_points: int = 1024,
+    n_points: int | None = 1024,
     classes: Sequence[str] | None = None,
     test_share: float = 0.2,
     gap: int = 0,
@@ -65,7 +65,8 @@ def cloud_folder(
 
     Args:
         root: the folder. The first folder of a path is the class, if there is one.
-        n_points: number of points per cloud.
+        n_points: number of points per cloud. None keeps all points of every file, with ``whole``:
+            clouds then have different sizes, see ``loader.CloudLoader``.
         classes: names to keep; None or empty means all.
         test_share: share of test files in a class, between 0 and 1.
         gap: number of frames between training and test frames that are not used, because
@@ -91,7 +92,7 @@ def cloud_folder(
             ``surface``.
 
     Returns:
-        Float32 clouds ``(S, n_points, 3 + C)`` in the unit sphere, with the centroid at the origin.
+        Float32 clouds ``(S, N, 3 + C)`` in the unit sphere, with the centroid at the origin.
         Channels have mean 0 and standard deviation 1 over the training clouds; normals have length
         1; ``channels`` has the statistics. Classes are in alphabetical order. ``notes`` has the
         number of files per split. The fingerprint depends on the content of the files and the
@@ -118,6 +119,7 @@ def cloud_folder(
         files = split_by_folder(names) or split_by_share(names, test_share, seed)
     notes = _notes(folder, files, class_names)
     if crop == "surface":
+        assert n_points is not None  # Reading.of refuses it
         contents = _read_meshes(folder, files, n_points, seed, cache)
         splits = _clouds_of_splits(contents, class_names)
         fingerprint = _fingerprint_of_meshes(contents, n_points, seed, class_names)
@@ -178,13 +180,23 @@ def _clouds_of_splits(
         if counts.gt(1).any():
             sources = torch.tensor([row for row, _ in members]).repeat_interleave(counts)
         parts = [_parts(one.numbers, numbers) for _, one in members if one.numbers is not None]
+        sizes = torch.tensor([one.clouds.shape[1] for _, one in members])
+        differ = bool((sizes != sizes[0]).any())
+        most = int(sizes.max())
         splits[split] = Clouds(
-            torch.cat([one.clouds for _, one in members]),
+            torch.cat([_repeated(one.clouds, most) for _, one in members]),
             labels.repeat_interleave(counts),
             sources,
-            torch.cat(parts) if parts else None,
+            torch.cat([_repeated(numbers, most) for numbers in parts]) if parts else None,
+            sizes.repeat_interleave(counts) if differ else None,
         )
     return splits
+
+
+def _repeated(values: Tensor, number: int) -> Tensor:
+    """Return ``(crops, n, ...)`` values with rows repeated until there are ``number``."""
+    own = values.shape[1]
+    return values if own == number else values[:, torch.arange(number) % own]
 
 
 def _parts(found: NDArray[np.int64], numbers: NDArray[np.int64] | None) -> Tensor:

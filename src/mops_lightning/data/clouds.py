@@ -30,12 +30,23 @@ class Clouds(NamedTuple):
         sources: ``(S,)`` int64, the same number for clouds that must be in the same split, such as
             the crops of a file; None: no two must.
         parts: ``(S, N)`` int64, positions in ``CloudDataset.part_names`` or ``UNKNOWN``, or None.
+        sizes: ``(S,)`` int64, the number of points of every cloud; the rows behind them repeat the
+            cloud. None: every cloud has N points.
     """
 
     points: Tensor
     labels: Tensor
     sources: Tensor | None = None
     parts: Tensor | None = None
+    sizes: Tensor | None = None
+
+    @property
+    def smallest(self) -> tuple[int, int]:
+        """The row of the cloud with the fewest points, and their number."""
+        if self.sizes is None:
+            return 0, self.points.shape[1]
+        row = int(self.sizes.argmin())
+        return row, int(self.sizes[row])
 
     def take(self, rows: Tensor) -> "Clouds":
         """Return the clouds of the given rows, or of a mask, with all that belongs to them."""
@@ -44,6 +55,7 @@ class Clouds(NamedTuple):
             self.labels[rows],
             None if self.sources is None else self.sources[rows],
             None if self.parts is None else self.parts[rows],
+            None if self.sizes is None else self.sizes[rows],
         )
 
 
@@ -163,6 +175,8 @@ def make_dataset(
         digest.update(clouds.labels.numpy().data)
         if clouds.parts is not None:
             digest.update(clouds.parts.numpy().data)
+        if clouds.sizes is not None:
+            digest.update(clouds.sizes.numpy().data)
         kept.append(clouds)
     return CloudDataset(chosen, kept[0], kept[1], digest.hexdigest(), channels=channels)
 

@@ -87,6 +87,10 @@ def corrupt(clouds: Clouds, spec: str, channels: PointChannels = NO_CHANNELS) ->
         UserError: there is no such kind or severity.
     """
     apply, level = parse(spec)
+    if clouds.sizes is not None:
+        raise UserError(
+            f"test_corruption={spec} needs clouds of one size. Set dataset.n_points to a number."
+        )
     points = [
         apply(Cloud(cloud, channels), level, generator(STREAM, s)).points
         for s, cloud in enumerate(clouds.points)

@@ -42,7 +42,7 @@ class Crops(NamedTuple):
 
 def random_crops(
     points: NDArray[np.float64],
-    n_points: int,
+    n_points: int | None,
     number: int | None,
     crop: Crop,
     rng: np.random.Generator,
@@ -52,7 +52,7 @@ def random_crops(
 
     Args:
         points: ``(N, 3)``.
-        n_points: number of points per crop.
+        n_points: number of points per crop; None: all, in random order.
         number: of crops; None for tiles.
         crop: ``nearest``, ``whole`` or ``tiles``, as in ``cloud_folder.cloud_folder``.
         rng: random generator.
@@ -61,6 +61,8 @@ def random_crops(
     Raises:
         BadCloudError: the cloud has fewer than ``n_points`` points, or they coincide.
     """
+    if n_points is None:
+        n_points = len(points)
     if len(points) < n_points:
         raise BadCloudError(
             f"{path} has {len(points)} points, fewer than dataset.n_points={n_points}. Lower "

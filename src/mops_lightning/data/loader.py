@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 from mops_lightning.channels import NO_CHANNELS, PointChannels, coordinates, with_coordinates
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.errors import UserError, check_at_least
+from mops_lightning.ops.points import gather_points
 from mops_lightning.seeding import generator
 from mops_lightning.types import Batch
 
@@ -84,6 +85,10 @@ class Augmentation:
 FIXED = 11
 DRAWN = 12
 """Random streams of tasks: the same in every epoch, or new in every epoch."""
+DENSITY = 14
+"""Random stream of the points that are drawn from clouds of different sizes."""
+WINDOW = 8
+"""Batches whose clouds are sorted by size together."""
 
 MakeBatch = Callable[[Tensor, list[Generator]], Any]
 """Function that converts clouds for a task, given one random generator per cloud."""
@@ -96,9 +101,13 @@ class CloudLoader:
     The content of batch i depends on the seed, the epoch and i only, so that a resumed run gets the
     same batches as an uninterrupted one.
 
+    Clouds of different sizes, with ``Clouds.sizes``: with ``shuffle``, a batch has clouds of
+    similar sizes, and each of them has as many of its points, drawn anew in every epoch, as the
+    smallest of the batch. Without ``shuffle``, each cloud is a batch of its own, with all points.
+
     Args:
         clouds: the split, in memory.
-        batch_size: clouds per batch.
+        batch_size: clouds per batch; 1 for clouds of different sizes without ``shuffle``.
         shuffle: whether every epoch has a new order; otherwise the order of the split.
         augment: augmentation, or None.
         make_batch: the task's conversion of clouds, see ``tasks.base.Task.make_batch``. Without
@@ -123,6 +132,8 @@ class CloudLoader:
 
     def __post_init__(self) -> None:
         """Start before the first batch."""
+        if self.clouds.sizes is not None and not self.shuffle:
+            self.batch_size = 1
         full, rest = divmod(len(self.clouds.points), self.batch_size)
         self.batches = full if self.drop_last and full else full + bool(rest)
         self.epoch = self.position = self.resume_at = 0
@@ -133,7 +144,8 @@ class CloudLoader:
     @property
     def keeps_clouds(self) -> bool:
         """Whether the clouds are the same in every epoch, neither augmented nor converted."""
-        return self.make_batch is None and self.augment in (None, Augmentation())
+        is_fixed = self.clouds.sizes is None or not self.shuffle
+        return is_fixed and self.make_batch is None and self.augment in (None, Augmentation())
 
     def set_epoch(self, epoch: int) -> None:
         """Start ``epoch`` from its first batch, unless it is the current epoch."""
@@ -159,16 +171,33 @@ class CloudLoader:
         self.resume_at = 0
         if self.shuffle:
             order = torch.randperm(number, generator=generator(self.seed, epoch))
+            if self.clouds.sizes is not None:
+                order = _similar_together(order, self.clouds.sizes, self.batch_size)
         else:
             order = torch.arange(number)
         for batch, (chosen, mine) in enumerate(self._cut(order)[start:], start):
-            points = self.clouds.points[chosen]
+            points, parts = self._points(chosen, generator(DENSITY, self.seed, epoch, batch))
             if self.augment is not None:  # the full batch, which shares one generator
                 rng = generator(self.seed, epoch, batch)
                 points = self.augment(points, rng, self.channels)
             last = batch + 1 == self.batches
             self.epoch, self.position = (epoch + 1, 0) if last else (epoch, batch + 1)
-            yield self._made(points[mine], chosen[mine], epoch)
+            parts = None if parts is None else parts[mine]
+            yield self._made(points[mine], parts, chosen[mine], epoch)
+
+    def _points(self, rows: Tensor, rng: Generator) -> tuple[Tensor, Tensor | None]:
+        """Return the points of clouds, as many as the smallest of them has, and their parts."""
+        clouds = self.clouds.take(rows)
+        points, parts = clouds.points, clouds.parts
+        if clouds.sizes is None:
+            return points, parts
+        number = clouds.smallest[1]
+        # The smallest of random numbers, which are infinite for rows that repeat a cloud.
+        drawn = torch.rand(points.shape[:2], generator=rng)
+        drawn[torch.arange(points.shape[1]) >= clouds.sizes[:, None]] = torch.inf
+        kept = drawn.topk(number, largest=False).indices.sort(1).values
+        points = gather_points(points, kept)
+        return points, None if parts is None else parts.gather(1, kept)
 
     def _cut(self, order: Tensor) -> list[tuple[Tensor, slice]]:
         """Return the rows of every batch, and the slice of them that belongs to this process."""
@@ -187,12 +216,20 @@ class CloudLoader:
 
     def batch_of(self, rows: Tensor) -> Any:
         """Return the clouds with the rows ``(B,)`` as a batch; for loaders without shuffle."""
-        return self._made(self.clouds.points[rows], rows, 0)
+        points, parts = self._points(rows, generator(DENSITY, self.seed))
+        return self._made(points, parts, rows, 0)
 
-    def _made(self, points: Tensor, rows: Tensor, epoch: int) -> Any:
+    def _made(self, points: Tensor, parts: Tensor | None, rows: Tensor, epoch: int) -> Any:
         if self.make_batch is None:
-            parts = self.clouds.parts
-            labels = self.clouds.labels[rows]
-            return Batch(points, labels, rows, None if parts is None else parts[rows])
+            return Batch(points, self.clouds.labels[rows], rows, parts)
         stream = (DRAWN, self.seed, epoch) if self.shuffle else (FIXED, self.seed)
         return self.make_batch(points, [generator(*stream, row) for row in rows.tolist()])
+
+
+def _similar_together(order: Tensor, sizes: Tensor, batch_size: int) -> Tensor:
+    """Return a random order in which the clouds of a batch have similar sizes.
+
+    Clouds of ``WINDOW`` batches at a time are sorted by size.
+    """
+    windows = [rows[sizes[rows].argsort(stable=True)] for rows in order.split(WINDOW * batch_size)]
+    return torch.cat(windows)

@@ -46,6 +46,7 @@ from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.run.channels import check_sampler, check_without_channels
 from mops_lightning.training.run.optimizers import OptimizerMakers, check_optimizers
 from mops_lightning.training.run.other_nets import other_tasks
+from mops_lightning.training.run.sizes import check_processes, smallest_cloud
 from mops_lightning.training.run.trainer import make_trainer
 
 STANDARD = (8, 16, 32, 64, 128, 256, 512)
@@ -156,6 +157,7 @@ def build_parts(
     parts = Parts(cfg, folder, dataset, train, held_out, experiment, trainer, resumed, trained)
     validated = len(held_out.labels) if parts.trains else 0
     tested = len(dataset.test.labels)
+    check_processes(dataset, trainer.world_size)
     distributed.check_shares(cfg.batch_size, tested, validated, trainer.world_size)
     _check_weights(parts)
     record.device = _device_name(trainer)
@@ -225,9 +227,7 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     if cfg.learn != "task":
         sampler = build_as(Sampler, cfg.sampler, "sampler", of_sampler)
         check_sampler(sampler, dataset)
-    # Pairs may have fewer points than the clouds they are drawn from.
-    loader = CloudLoader(dataset.test, 1, make_batch=task.make_batch)
-    cloud = loader.batch_of(torch.tensor([0])).points[:1]
+    cloud = smallest_cloud((dataset.test, dataset.train), task.make_batch)
     trains = cfg.learn != "nothing"
     sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, cloud.shape[1], training=trains)
     baselines: dict[str, Sampler] = {}

@@ -1,0 +1,29 @@
+"""Clouds of different sizes: the smallest of them, and what cannot take them."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from mops_lightning.data.clouds import CloudDataset, Clouds
+from mops_lightning.data.loader import CloudLoader, MakeBatch
+from mops_lightning.errors import UserError
+
+
+def check_processes(dataset: CloudDataset, processes: int) -> None:
+    """Refuse clouds of different sizes for several processes, which share every batch."""
+    differ = dataset.train.sizes is not None or dataset.test.sizes is not None
+    if differ and processes > 1:
+        raise UserError(
+            f"trainer.devices must be 1 with clouds of different sizes, got {processes}. Or set "
+            "dataset.n_points to a number."
+        )
+
+
+def smallest_cloud(splits: Sequence[Clouds], make_batch: MakeBatch | None) -> Tensor:
+    """Return the cloud ``(1, N, 3 + C)`` with the fewest points, as a sampler gets it."""
+    smallest = min(splits, key=lambda clouds: clouds.smallest[1])
+    # Pairs may have fewer points than the clouds they are drawn from.
+    loader = CloudLoader(smallest, 1, make_batch=make_batch)
+    cloud: Tensor = loader.batch_of(torch.tensor([smallest.smallest[0]])).points[:1]
+    return cloud

@@ -1,0 +1,194 @@
+"""Clouds of different sizes: from a folder to batches, and scores as of each cloud alone."""
+
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning.data.cloud_folder import cloud_folder
+from mops_lightning.data.clouds import Clouds
+from mops_lightning.data.corruptions import corrupt
+from mops_lightning.data.formats.registry import read
+from mops_lightning.data.loader import CloudLoader
+from mops_lightning.errors import UserError
+from mops_lightning.ops.points import UnitSphere
+from mops_lightning.records.run_record import read as read_record
+from tests.support.command_line import call, done, refused, runs
+
+SIZES = (40, 90, 60, 120, 40, 75)
+
+
+def write_clouds(folder, sizes=SIZES):
+    """Boxes and balls, half of them for the test, with the part of every point."""
+    for number, size in enumerate(sizes):
+        random = np.random.default_rng(number)
+        points = random.uniform(-1, 1, (size, 3))
+        kind = "ball" if number % 2 else "box"
+        if kind == "ball":
+            points /= np.linalg.norm(points, axis=1, keepdims=True)
+        split = "train" if number < len(sizes) // 2 else "test"
+        path = folder / kind / split / f"{number}.npz"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = (points[:, 2] > 0).astype("int64")
+        np.savez(path, xyz=points + 50, half=part)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_clouds(tmp_path / "clouds", (*SIZES, *SIZES))
+    return tmp_path / "clouds"
+
+
+def dataset_of(folder, **arguments):
+    return cloud_folder(
+        folder, None, test_frames=None, crop="whole", crops=None, label="half", **arguments
+    )
+
+
+def test_clouds_of_a_folder_keep_all_their_points(folder):
+    data = dataset_of(folder)
+
+    assert data.train.sizes is not None
+    assert sorted(data.train.sizes.tolist()) == sorted(SIZES)
+    for path in sorted((folder / "box" / "train").iterdir())[:1]:
+        points = read(path, 0, 0).points
+        expected = UnitSphere.around(points).normalise(points)
+        size = int(data.train.sizes[data.train.labels == 1][0])
+        found = data.train.points[data.train.labels == 1][0, :size]
+        assert len(points) == size
+        order = [tuple(row) for row in expected.round(decimals=4).tolist()]
+        assert sorted(order) == sorted(tuple(row) for row in found.round(decimals=4).tolist())
+
+
+def test_loader_without_shuffle_gives_each_cloud_with_all_its_points(folder):
+    clouds = dataset_of(folder).test
+    assert clouds.sizes is not None
+    assert clouds.parts is not None
+
+    batches = list(CloudLoader(clouds, 4))
+
+    assert [batch.points.shape[1] for batch in batches] == clouds.sizes.tolist()
+    for row, batch in enumerate(batches):
+        size = int(clouds.sizes[row])
+        assert torch.equal(batch.points[0], clouds.points[row, :size])
+        assert torch.equal(batch.parts[0], clouds.parts[row, :size])
+
+
+def test_loader_with_shuffle_gives_different_points_of_every_cloud_once(folder):
+    clouds = dataset_of(folder).train
+    assert clouds.sizes is not None
+    seen = []
+
+    for batch in CloudLoader(clouds, 3, shuffle=True):
+        sizes = clouds.sizes[batch.rows]
+        assert batch.points.shape[1] == sizes.min()
+        for points, parts, row in zip(batch.points, batch.parts, batch.rows, strict=True):
+            cloud = clouds.points[row, : clouds.sizes[row]]
+            same = (points[:, None] == cloud).all(2)
+            assert same.sum(1).tolist() == [1] * len(points)
+            assert same.sum(0).max() == 1
+            assert torch.equal(parts, clouds.parts[row][same.int().argmax(1)])
+        seen += batch.rows.tolist()
+
+    assert sorted(seen) == list(range(6))
+
+
+def test_loader_with_shuffle_puts_clouds_of_similar_sizes_together():
+    sizes = torch.arange(20, 60)
+    clouds = Clouds(torch.rand(40, 59, 3), torch.zeros(40, dtype=torch.long), sizes=sizes)
+
+    batches = list(CloudLoader(clouds, 5, shuffle=True))
+
+    spread = [int(sizes[batch.rows].max() - sizes[batch.rows].min()) for batch in batches]
+    assert spread == [4] * 8
+
+
+def test_loader_points_depend_on_epoch_and_continue_after_a_stop(folder):
+    clouds = dataset_of(folder).train
+    loader = CloudLoader(clouds, 2, shuffle=True)
+    first = [batch.points for batch in loader]
+    second = [batch.points for batch in loader]
+    resumed = CloudLoader(clouds, 2, shuffle=True)
+    resumed.load_state_dict({"epoch": 1, "position": 2})
+
+    rest = [batch.points for batch in resumed]
+
+    assert torch.equal(rest[0], second[2])
+    assert not all(map(torch.equal, first, second))
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        ["sampler=mops"],
+        ["sampler=fps"],
+        ["sampler=samplenet", "task=segmentation", "dataset.label=half", "learn=joint"],
+        ["sampler=fmops", "sampler.m_max=16", "task=registration", "learn=joint", "weights=null"],
+    ],
+)
+def test_run_on_clouds_of_different_sizes_trains_and_scores_all(chosen, folder, tmp_path):
+    done([*RUN, *chosen, "trainer.max_epochs=1", "epochs.task=1"], tmp_path)
+
+    (run,) = runs(tmp_path)
+    record = read_record(run)
+    assert record.test_clouds == 6
+    assert record.score is not None
+    assert np.isfinite(record.score)
+
+
+RUN = [
+    *("task=classification", "dataset=clouds", "dataset.root=clouds", "dataset.crop=whole"),
+    *("dataset.n_points=null", "trainer=cpu", "batch_size=3", "m=8", "val_fraction=0"),
+    *("pictures=2", "logger=none"),
+]
+
+
+def test_run_scores_clouds_of_different_sizes_as_each_alone(folder, tmp_path):
+    """The twin: test every cloud in a run of its own data set."""
+    done([*RUN, "sampler=mops", "epochs.task=1", "trainer.max_epochs=1"], tmp_path)
+    (run,) = runs(tmp_path)
+    together = read_record(run).metrics
+    alone = []
+    clouds = sorted(folder.glob("*/test/*.npz"))
+
+    for number, path in enumerate(clouds):
+        single = tmp_path / f"single{number}"
+        kind = path.parent.parent.name
+        for name in ("ball", "box"):
+            (single / name / "train").mkdir(parents=True)
+            (single / name / "train" / "0.npz").write_bytes(path.read_bytes())
+        (single / kind / "test").mkdir()
+        (single / kind / "test" / path.name).write_bytes(path.read_bytes())
+        status, _, err = call(
+            [f"evaluate={run}", f"dataset.root={single}", f"out=alone{number}", "pictures=0"],
+            tmp_path,
+        )
+        assert status == 0, err
+        (result,) = (tmp_path / f"alone{number}").rglob("result.json")
+        alone.append(read_record(result.parent).metrics)
+
+    for name in ("test/generated/accuracy", "test/completed/accuracy"):
+        assert together[name] == pytest.approx(np.mean([one[name] for one in alone]))
+    loss = "test/loss/cross_entropy"
+    assert together[loss] == pytest.approx(np.mean([one[loss] for one in alone]), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        (["dataset.crop=nearest"], "n_points must be a number with crop=nearest"),
+        (["task=reconstruction"], "dataset.n_points must be a number with task/net=autoencoder:"),
+        (["test_corruption=jitter-1"], "test_corruption=jitter-1 needs clouds of one size"),
+        (["m=41"], "m must be at most the 40 points of a cloud"),
+    ],
+)
+def test_run_on_clouds_of_different_sizes_refuses_what_needs_one_size(
+    chosen, message, folder, tmp_path
+):
+    err = refused([*RUN, "sampler=fps", *chosen], tmp_path)
+
+    assert message in err
+
+
+def test_corrupt_clouds_of_different_sizes_is_refused(folder):
+    with pytest.raises(UserError, match="needs clouds of one size"):
+        corrupt(dataset_of(folder).test, "shear-3")
