@@ -41,6 +41,7 @@ FORMS = {
     "noise": "shapes",
     "corruptions": "shapes",
     "las_segmentation": "airborne",
+    "scans_of_shapes": "shapes",
 }
 """The data that a sweep reads; the others read ModelNet40."""
 
@@ -71,6 +72,7 @@ SMALLER = {
         "dataset.test_per_class=1",
     ],
     "las_segmentation": ["dataset.n_points=256", "m=16", "task.net.points=[16,8]"],
+    "scans_of_shapes": ["dataset.train_per_class=2", "dataset.test_per_class=1"],
     "reconstruction_sizes": ["dataset.n_points=256"],
     "reconstruction_fmops": ["dataset.n_points=256"],
     "registration": ["task.net.feature_channels=[16,32]"],

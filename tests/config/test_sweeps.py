@@ -29,6 +29,8 @@ ON_SHAPES = ("ablation", "segmentation")
 """Sweeps that use the procedural shapes without the overlay."""
 TESTS_ONLY = ("noise", "corruptions")
 """Sweeps that test a trained run."""
+ON_FILES = ("las_segmentation",)
+"""Sweeps whose settings of the data mean nothing for shapes."""
 PLACES = ("sampler", "task.net.sampler", "dataset")
 CELLS = (
     "modelnet40=49 modelnet40_trials=41 ablation=18 segmentation=23 registration=23 hierarchical=24"
@@ -76,7 +78,7 @@ def test_sweep_cells_are_valid_and_named_by_swept_settings(name):
     checked(cfg)
 
 
-@pytest.mark.parametrize("name", sorted({*SWEEPS} - {*ON_SHAPES, *TESTS_ONLY}))
+@pytest.mark.parametrize("name", sorted({*SWEEPS} - {*ON_SHAPES, *TESTS_ONLY, *ON_FILES}))
 def test_quick_overlay_runs_any_sweep_on_shapes(name):
     full = composed(name)
     quick = composed(name, ["+quick=shapes", "dataset=shapes"])
