@@ -1,10 +1,8 @@
 """Poisson-disk sampling by sample elimination, with exactly m points.
 
-The compiled loops visit the points of neighbouring cells only. They run on the CPU, for clouds on
+The compiled loops visit neighbouring blocks of points only. They run on the CPU, for clouds on
 other devices, too.
 """
-
-import itertools
 
 import numpy as np
 import torch
@@ -16,10 +14,11 @@ from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import seeded_order
+from mops_lightning.samplers.serial import morton_codes
 from mops_lightning.types import SampleOutput
 
-FINEST = 2**20
-"""Maximum number of cells along an axis: three positions fit into an integer of 64 bits."""
+SMALLEST = 2.3e-308
+"""Above the least normal number."""
 
 
 class PoissonSampler(Sampler):
@@ -109,19 +108,15 @@ def eliminate(points: Tensor, m: int, weight: Tensor | None = None) -> Tensor:
         ``(B, m)`` int64 rows of ``points``, ascending.
     """
     number = points.shape[1]
-    points = points.double()
-    reach = spacing_bound(points, m).clamp_min(torch.finfo(points.dtype).tiny)
+    reach = spacing_bound(points, m).clamp_min(torch.finfo(torch.float64).tiny)
     # Sums of integers do not depend on the order of the points.
     scale = 2.0 ** min(50, 62 - number.bit_length())
     shares = np.empty((len(points), 0))
     if weight is not None:
         shares = (weight.double().amin(1, keepdim=True) / weight.double()).cpu().numpy()
-    clouds = zip(points.cpu().numpy(), reach.flatten().tolist(), shares, strict=True)
-    remaining = [
-        _eliminate_by_cells(cloud, m, bound, share, scale) for cloud, bound, share in clouds
-    ]
-    rows = [torch.from_numpy(np.flatnonzero(remains)) for remains in remaining]
-    return torch.stack(rows).to(points.device)
+    clouds = zip(points.double().cpu().numpy(), reach.flatten().tolist(), shares, strict=True)
+    remaining = [_least_crowded(cloud, m, bound, share, scale) for cloud, bound, share in clouds]
+    return torch.from_numpy(np.stack(remaining)).to(points.device)
 
 
 def spacing_bound(points: Tensor, m: int) -> Tensor:
@@ -135,44 +130,32 @@ def spacing_bound(points: Tensor, m: int) -> Tensor:
         m: number of points.
 
     Returns:
-        ``(B, 1)``.
+        ``(B, 1)`` float64.
     """
     if m == 1:
-        spans = points.amax(1) - points.amin(1)
+        spans = points.double().amax(1) - points.double().amin(1)
         return torch.linalg.vector_norm(spans, dim=1, keepdim=True)
-    chosen = gather_points(points, farthest_point_sample(points, m))
+    chosen = gather_points(points, farthest_point_sample(points, m)).double()
     last = torch.linalg.vector_norm(chosen[:, :-1] - chosen[:, -1:], dim=2)
     return 2 * last.amin(1, keepdim=True)
 
 
-def _eliminate_by_cells(
+def _least_crowded(
     points: NDArray[np.float64], m: int, reach: float, shares: NDArray[np.float64], scale: float
-) -> NDArray[np.bool_]:
-    """Return whether each of ``(N, C)`` points remains, by the compiled loops."""
-    points = np.pad(points, ((0, 0), (0, max(3 - points.shape[1], 0))))
-    coordinates = points[:, :3]  # points that are near are near in these, too
-    low = coordinates.min(0)
-    extent = float((coordinates.max(0) - low).max())
-    side = max(reach, extent / FINEST) * (1 + 1e-9)
-    position = ((coordinates - low) / side).astype(np.int64) + 1  # no neighbour is below 0
-    key = (position[:, 0] * 2 * FINEST + position[:, 1]) * 2 * FINEST + position[:, 2]
-    order = key.argsort(kind="stable")
-    ordered = key[order]
-    starts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
-    cells = ordered[starts]
-    around = np.empty((len(cells), 27), np.int32)
-    for column, (x, y, z) in enumerate(itertools.product((-1, 0, 1), repeat=3)):
-        wanted = cells + ((x * 2 * FINEST + y) * 2 * FINEST + z)
-        place = np.minimum(np.searchsorted(cells, wanted), len(cells) - 1)
-        around[:, column] = np.where(cells[place] == wanted, place, -1)
-    remains: NDArray[np.bool_] = kernel_elimination.eliminate(
-        np.ascontiguousarray(points[order].T).ravel(),
+) -> NDArray[np.int64]:
+    """Return the m rows of ``(N, C)`` points that remain, ascending."""
+    padded = np.pad(points, ((0, 0), (0, max(3 - points.shape[1], 0))))
+    order = np.argsort(morton_codes(torch.from_numpy(padded[None, :, :3]))[0].numpy())
+    farthest = reach * (1 - scale**-0.125)  # from here on, weights are less than 1
+    limit = farthest * farthest * (1 + 1e-9) + SMALLEST
+    rows = kernel_elimination.eliminate(
+        np.ascontiguousarray(padded[order].T).ravel(),
+        padded.shape[1],
         order,
-        np.append(starts, len(points)),
-        around.ravel(),
         shares[order] if len(shares) else shares,
         m,
-        reach,
+        limit,
+        1 / reach,
         scale,
     )
-    return remains
+    return np.sort(rows)
