@@ -21,12 +21,14 @@ from .samplers.information import InformationSampler as InformationSampler
 from .samplers.mops import MOPSNet as MOPSNet
 from .samplers.normal_space import NormalSpaceSampler as NormalSpaceSampler
 from .samplers.poisson import PoissonSampler as PoissonSampler
+from .samplers.pose import PoseSampler as PoseSampler
 from .samplers.random import RandomSampler as RandomSampler
 from .samplers.samplenet import ProgressiveSampleNet as ProgressiveSampleNet
 from .samplers.samplenet import SampleNet as SampleNet
 from .samplers.serial import SerialSampler as SerialSampler
 from .samplers.snet import SNet as SNet
 from .samplers.stage import StageMOPSNet as StageMOPSNet
+from .samplers.steady import SteadySampler as SteadySampler
 from .samplers.voxel import VoxelSampler as VoxelSampler
 from .types import SampleOutput as SampleOutput
 from .zoo.downsample import downsample as downsample

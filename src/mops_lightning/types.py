@@ -70,6 +70,8 @@ class SampleOutput(NamedTuple):
         matrix: the sampling matrix S that generated the points, or None.
         soft_projected: ``(B, M, 3 + C)`` points on which the task net is trained in place of
             ``points``, or None; only in training. See ``Sampler.project`` for the readout.
+        log_residuals: ``(B, N)`` logarithms of the residuals that the sampler expects at the input
+            points in registration, or None.
 
     Examples:
         >>> import torch
@@ -84,6 +86,7 @@ class SampleOutput(NamedTuple):
     losses: dict[str, Tensor]
     matrix: "SamplingMatrix | LocalMatrix | None" = None
     soft_projected: Tensor | None = None
+    log_residuals: Tensor | None = None
 
     def first(self, m: int) -> "SampleOutput":
         """Return the first ``m`` points, without the losses, which cover all points."""
@@ -95,6 +98,7 @@ class SampleOutput(NamedTuple):
             {},
             None if self.matrix is None else self.matrix.leftmost(m),
             None if self.soft_projected is None else self.soft_projected[:, :m],
+            self.log_residuals,
         )
 
 

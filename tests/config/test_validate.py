@@ -26,7 +26,15 @@ def choices():
             yield f"{group}={path.stem}"
 
 
-WITH_ROOT = ("meshes", "hdf5", "clouds", "own_scans", "las_segmentation", "mesh_sequence")
+WITH_ROOT = (
+    "meshes",
+    "hdf5",
+    "clouds",
+    "own_scans",
+    "own_scans_icp",
+    "las_segmentation",
+    "mesh_sequence",
+)
 """Choices whose files the user must name."""
 FROM_CODE = {
     *("params", "optimizer", "total_steps"),  # of optimizers and schedules

@@ -18,6 +18,7 @@ from tests.support.downsample import call, done, refused
         ["normal_space"],
         ["covariance"],
         ["information"],
+        ["steady"],
         ["fps", "--tile", 64],
         ["information", "--tile", 64],
     ],

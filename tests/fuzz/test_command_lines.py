@@ -36,6 +36,7 @@ GROUPS = {
         "normal_space",
         "covariance",
         "information",
+        "steady",
     ),
     "task": ("classification", "registration", "reconstruction"),
     "task/net": ("pointnet", "pcrnet", "autoencoder", "foldingnet", "atlasnet"),

@@ -6,10 +6,12 @@ import pytest
 from mops_lightning.ops.normals import estimate_normals
 from mops_lightning.ops.stability import (
     PRIOR,
+    RIDGE,
     informative_places,
     places_by_direction,
     plane_rows,
     stable_places,
+    steady_places,
 )
 
 
@@ -46,6 +48,26 @@ def plain_stable(rows, m):
     return chosen
 
 
+def plain_steady(rows, spread, m):
+    """Compute the covariances of all poses anew for every choice."""
+    variances = (spread / np.median(spread)) ** 2
+    information = RIDGE * np.eye(6)
+    noise = RIDGE * np.eye(6)
+    chosen: list[int] = []
+    for _ in range(m):
+        traces = np.full(len(rows), np.inf)
+        for place in set(range(len(rows))) - set(chosen):
+            square = np.outer(rows[place], rows[place])
+            inverse = np.linalg.inv(information + square)
+            covariance = inverse @ (noise + variances[place] * square) @ inverse
+            traces[place] = np.trace(covariance[:3, :3])  # of the rotation
+        chosen.append(int(np.argmin(traces)))
+        square = np.outer(rows[chosen[-1]], rows[chosen[-1]])
+        information += square
+        noise += variances[chosen[-1]] * square
+    return chosen
+
+
 def test_rows_are_the_changes_of_plane_distances_under_small_motions():
     rng = np.random.default_rng(0)
     points = rng.normal(size=(20, 3))
@@ -73,6 +95,22 @@ def test_stable_places_equal_a_search_of_all_points():
     assert stable_places(rows, 40).tolist() == plain_stable(rows, 40)
 
 
+def test_steady_places_equal_a_search_of_all_covariances():
+    points = box(150)
+    rows = plane_rows(points, estimate_normals(points))
+    spread = np.random.default_rng(1).uniform(0.2, 3, 150)
+
+    assert steady_places(rows, spread, 40).tolist() == plain_steady(rows, spread, 40)
+
+
+def test_steady_places_leave_out_points_with_large_residuals():
+    points = box(300)
+    rows = plane_rows(points, estimate_normals(points))
+    spread = np.where(np.arange(300) < 200, 1.0, 50.0)
+
+    assert np.count_nonzero(steady_places(rows, spread, 40) >= 200) <= 1
+
+
 def test_all_rules_return_every_place_once_when_all_points_are_kept():
     points = np.repeat(box(20), 3, axis=0)  # copies
     rows = plane_rows(points, estimate_normals(points))
@@ -81,6 +119,7 @@ def test_all_rules_return_every_place_once_when_all_points_are_kept():
         informative_places(rows, 60),
         stable_places(rows, 60),
         places_by_direction(rows[:, 3:], 60),
+        steady_places(rows, np.ones(60), 60),
     ):
         assert sorted(places) == list(range(60))
 

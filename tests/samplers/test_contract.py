@@ -235,7 +235,7 @@ def test_gradients_are_correct(make, rng):
         (gradient,) = torch.autograd.grad(output.points.sum(), points)
         chosen = torch.zeros(1, 9, 1).index_fill(1, output.indices[0], 1.0)
         assert torch.equal(gradient, chosen.expand_as(gradient).to(gradient))
-    if sampler.learned and not isinstance(sampler, GumbelSampler):  # it chooses in evaluation
+    if sampler.generates and not isinstance(sampler, GumbelSampler):  # it chooses in evaluation
         assert torch.autograd.gradcheck(lambda p: sampler(p).points, (points,))
         total = output.points.square().sum()
         # SampleNet's temperature has an effect in training only.

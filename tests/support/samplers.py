@@ -16,10 +16,12 @@ from mops_lightning.samplers.information import InformationSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.samplers.normal_space import NormalSpaceSampler
 from mops_lightning.samplers.poisson import PoissonSampler
+from mops_lightning.samplers.pose import PoseSampler
 from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet
 from mops_lightning.samplers.serial import SerialSampler
 from mops_lightning.samplers.snet import SNet
+from mops_lightning.samplers.steady import SteadySampler
 from mops_lightning.samplers.voxel import VoxelSampler
 
 SMALL: dict[str, Any] = {"feature_channels": (8, 6), "head_channels": (12, 10)}
@@ -43,6 +45,8 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "normal_space": lambda m, **kw: NormalSpaceSampler(m, **kw),
     "covariance": lambda m: CovarianceSampler(m),
     "information": lambda m: InformationSampler(m),
+    "steady": lambda m: SteadySampler(m),
+    "pose": lambda m: PoseSampler(m, feature_channels=(8, 6), head_channels=(5,)),
     "critical": lambda m, **kw: CriticalSampler(m, PointNetVanilla(3), **kw),
     "gumbel": lambda m: GumbelSampler(m, feature_channels=(8, 6)),
     "mops": lambda m: MOPSNet(m, **MOPS_LAYERS),

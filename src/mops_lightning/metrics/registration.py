@@ -54,6 +54,15 @@ class RotationError(TableMetric):
         return value.float()
 
 
+class MedianRotationError(RotationError):
+    """Median of the rotation errors, in degrees, for registrations of which some fail."""
+
+    name = "median_rotation_error_deg"
+    label = "median rotation error"
+    summary_order = 0
+    quantile = 0.5
+
+
 class RotationErrorP90(RotationError):
     """90th percentile of the rotation errors, in degrees."""
 
@@ -91,6 +100,14 @@ class RotationRecall(MeanOverClouds):
     def update(self, predicted: Motion, true: Motion) -> None:
         """Add a batch of motions."""
         self.add(RotationError.of(predicted, true) <= self.degrees)
+
+
+class RotationRecall2(RotationRecall):
+    """Recall at 2 degrees."""
+
+    name = "rotation_recall_2deg"
+    summary_order = 3
+    degrees = 2.0
 
 
 class RotationRecall5(RotationRecall):

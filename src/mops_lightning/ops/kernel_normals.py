@@ -58,6 +58,26 @@ def _smallest_axis(matrix, vectors):
     return smallest
 
 
+@jit
+def _scatter(points, rows, mean, matrix):
+    """Write the mean of points, and the sum of the products of their distances from it."""
+    mean[:] = 0.0
+    for j in range(len(rows)):
+        for axis in range(3):
+            mean[axis] += points[rows[j], axis]
+    mean /= len(rows)
+    matrix[:] = 0.0
+    for j in range(len(rows)):
+        row = rows[j]
+        for a in range(3):
+            for b in range(a, 3):
+                product = (points[row, a] - mean[a]) * (points[row, b] - mean[b])
+                matrix[a, b] += product
+    for a in range(3):
+        for b in range(a):
+            matrix[a, b] = matrix[b, a]
+
+
 @jit_cached
 def plane_normals(points, neighbours):
     """Return the unit normal of the plane through the neighbours of every point.
@@ -73,24 +93,46 @@ def plane_normals(points, neighbours):
     matrix = np.empty((3, 3))
     vectors = np.empty((3, 3))
     mean = np.empty(3)
-    k = neighbours.shape[1]
     for i in range(len(neighbours)):
-        mean[:] = 0.0
-        for j in range(k):
-            for axis in range(3):
-                mean[axis] += points[neighbours[i, j], axis]
-        mean /= k
-        matrix[:] = 0.0
-        for j in range(k):
-            row = neighbours[i, j]
-            for a in range(3):
-                for b in range(a, 3):
-                    product = (points[row, a] - mean[a]) * (points[row, b] - mean[b])
-                    matrix[a, b] += product
-        for a in range(3):
-            for b in range(a):
-                matrix[a, b] = matrix[b, a]
+        _scatter(points, neighbours[i], mean, matrix)
         smallest = _smallest_axis(matrix, vectors)
         for axis in range(3):
             normals[i, axis] = vectors[axis, smallest]
     return normals
+
+
+@jit_cached
+def ellipsoids(points, neighbours):
+    """Return the spread of the neighbours of every point, and where the point is in it.
+
+    Args:
+        points: ``(N, 3)`` float64.
+        neighbours: ``(N, k)`` rows of points.
+
+    Returns:
+        ``(N, 5)``: the standard deviations along the three axes, ascending, and the point's
+        distances from the neighbours' mean, across the shortest axis' plane and within it; and
+        ``(N, 3)`` the directions of the shortest axes.
+    """
+    numbers = np.empty((len(neighbours), 5))
+    normals = np.empty((len(neighbours), 3))
+    matrix = np.empty((3, 3))
+    vectors = np.empty((3, 3))
+    mean = np.empty(3)
+    lengths = np.empty(3)
+    for i in range(len(neighbours)):
+        _scatter(points, neighbours[i], mean, matrix)
+        smallest = _smallest_axis(matrix, vectors)
+        above = 0.0
+        squared = 0.0
+        for axis in range(3):
+            lengths[axis] = np.sqrt(max(matrix[axis, axis], 0.0) / neighbours.shape[1])
+            normals[i, axis] = vectors[axis, smallest]
+            offset = points[i, axis] - mean[axis]
+            above += offset * vectors[axis, smallest]
+            squared += offset * offset
+        lengths.sort()
+        numbers[i, :3] = lengths
+        numbers[i, 3] = abs(above)
+        numbers[i, 4] = np.sqrt(max(squared - above * above, 0.0))
+    return numbers, normals

@@ -93,6 +93,19 @@ def quaternion_from_euler(angles: Tensor) -> Tensor:
     return result
 
 
+def motion_of_vectors(turn: Tensor, shift: Tensor) -> Motion:
+    """Return the motion that turns points about the origin and then shifts them.
+
+    Args:
+        turn: ``(B, 3)`` rotation vectors: the axis times the angle.
+        shift: ``(B, 3)``.
+    """
+    angle = torch.linalg.vector_norm(turn, dim=1, keepdim=True)
+    # sin(θ/2)/θ, by torch's sinc, which is sin(πx)/(πx) and 1 at 0
+    vector = turn * torch.sinc(angle / (2 * torch.pi)) / 2
+    return Motion(torch.cat([(angle / 2).cos(), vector], 1), shift)
+
+
 def rotation_angle(first: Tensor, second: Tensor) -> Tensor:
     """Return the geodesic angle between two rotations.
 

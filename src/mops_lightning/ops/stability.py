@@ -9,9 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mops_lightning.ops.kernel_stability import cover_least_held, grow_information
+from mops_lightning.ops.kernel_steady import grow_steady
 
 PRIOR = 1e-3
 """Information about every direction before the first point, in units of that of one point."""
+
+RIDGE = 1e-2
+"""The same for ``steady_places``, where it is the knowledge of the pose before registration."""
+
+ROTATION = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+"""The directions of ``plane_rows`` that turn the points."""
 
 CELLS = 5
 """Cells along each axis of a face of the cube of normals; odd, so that an axis is inside a cell."""
@@ -68,6 +75,30 @@ def informative_places(rows: NDArray[np.float64], m: int) -> NDArray[np.int64]:
         ``(m,)`` places, in the order of choice; of equal gains the lowest place.
     """
     places: NDArray[np.int64] = grow_information(np.ascontiguousarray(rows), PRIOR, m)
+    return places
+
+
+def steady_places(
+    rows: NDArray[np.float64], spread: NDArray[np.float64], m: int
+) -> NDArray[np.int64]:
+    """Choose m points from which the error of the rotation is expected to be smallest.
+
+    Least squares over residuals with standard deviations s has the covariance H⁻¹·W·H⁻¹, with
+    H = Σ v vᵀ and W = Σ s² v vᵀ (White, Econometrica 1980). Each point is the one after which the
+    part of its trace that belongs to the rotation is smallest.
+
+    Args:
+        rows: ``(N, 6)`` from ``plane_rows``.
+        spread: ``(N,)`` the standard deviations s, above 0, in any unit.
+        m: number of points, at most N.
+
+    Returns:
+        ``(m,)`` places, in the order of choice; of equal traces the lowest place.
+    """
+    variances = np.square(spread / np.median(spread))
+    places: NDArray[np.int64] = grow_steady(
+        np.ascontiguousarray(rows), variances, ROTATION, RIDGE, m
+    )
     return places
 
 

@@ -29,6 +29,8 @@ ORDER = (
     "normal_space",
     "covariance",
     "information",
+    "steady",
+    "pose",
     "critical",
     "submodular",
     "gumbel",

@@ -9,7 +9,7 @@ from torch import Generator, Tensor, nn
 from torchmetrics import MetricCollection
 
 from mops_lightning.errors import UserError
-from mops_lightning.types import TaskOutput
+from mops_lightning.types import SampleOutput, TaskOutput
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -91,6 +91,15 @@ class Task(nn.Module):
             Loss terms, predictions and targets.
         """
         raise NotImplementedError
+
+    def sample_losses(self, batch: Any, output: SampleOutput) -> dict[str, Tensor]:
+        """Return losses of what a sampler tells beside its points; none by default.
+
+        Args:
+            batch: as for ``predict``.
+            output: the sampler's, for the points that it has seen of ``batch.points``.
+        """
+        return {}
 
     def scores(self, batch: Any, samples: Mapping[K, Tensor]) -> dict[K, TaskOutput]:
         """Run the net on several samples of one batch, for scores; by default ``step`` on each.

@@ -43,8 +43,8 @@ def downsample(
         m: number of points to return of each cloud, or a share of its points, a float below 1; a
             list holds one for each cloud.
         method: ``random``, ``serial``, ``voxel``, ``fps``, ``poisson``, ``normal_space``,
-            ``covariance`` or ``information``, or what ``load`` takes, such as the name of a model.
-            A model suits the task net and the shapes that it was trained for.
+            ``covariance``, ``information`` or ``steady``, or what ``load`` takes, such as the name
+            of a model. A model suits the task net and the shapes that it was trained for.
         readout: of a model: ``generated``, ``matched`` or ``completed``; see
             ``Sampler.downsample``. With ``voxel=``, ``generated`` returns the means of the voxels.
         batch: ``(P,)`` the cloud of every point, ascending from 0, as in PyTorch Geometric.

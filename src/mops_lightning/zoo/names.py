@@ -16,6 +16,7 @@ UNTRAINED = {
     "normal_space": "NormalSpaceSampler",
     "covariance": "CovarianceSampler",
     "information": "InformationSampler",
+    "steady": "SteadySampler",
 }
 """Samplers without weights, public names of the package, by the name of the method."""
 SHIPPED = Path(__file__).parent / "models"

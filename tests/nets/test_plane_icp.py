@@ -1,0 +1,105 @@
+"""Point-to-plane ICP, beside NumPy's least squares and small_gicp."""
+
+import numpy as np
+import pytest
+import torch
+
+from mops_lightning.errors import UserError
+from mops_lightning.nets.plane_icp import PlaneICP, nearest_rows, surface_normals, weighted_step
+from mops_lightning.ops.rigid import motion_of_vectors, rotation_angle
+from tests.ops.test_stability import box
+
+
+@pytest.fixture
+def pair():
+    """Two samples of one box, and the motion between them."""
+    source = torch.from_numpy(box(600, seed=1))[None] / 4
+    target = torch.from_numpy(box(600, seed=2))[None] / 4
+    true = motion_of_vectors(torch.tensor([[0.05, -0.1, 0.08]]), torch.tensor([[0.03, 0.0, -0.02]]))
+    return source.float(), true.apply(target.float()), true
+
+
+def test_weighted_step_equals_least_squares_of_numpy():
+    rng = np.random.default_rng(0)
+    levers, residuals, weights = rng.normal(size=(30, 6)), rng.normal(size=30), rng.random(30)
+    roots = np.sqrt(weights)
+
+    expected = np.linalg.lstsq(levers * roots[:, None], -residuals * roots)[0]
+    found = weighted_step(*(torch.from_numpy(x)[None] for x in (levers, residuals, weights)))
+
+    assert found[0].numpy() == pytest.approx(expected, abs=1e-6)
+
+
+def test_step_has_the_gradients_of_its_formula():
+    rng = np.random.default_rng(0)
+    levers, residuals, weights = rng.normal(size=(9, 6)), rng.normal(size=9), rng.random(9)
+    arguments = [torch.tensor(x[None], requires_grad=True) for x in (levers, residuals, weights)]
+
+    assert torch.autograd.gradcheck(weighted_step, arguments)
+
+
+def test_icp_finds_the_motion_between_two_samples_of_a_box(pair):
+    source, target, true = pair
+
+    found = PlaneICP()(source, target)
+
+    assert torch.rad2deg(rotation_angle(found.quaternion, true.quaternion)) < 0.5
+    torch.testing.assert_close(found.translation, true.translation, atol=0.005, rtol=0)
+
+
+def test_icp_ends_where_small_gicp_ends(pair):
+    small_gicp = pytest.importorskip("small_gicp")
+    source, target, _ = pair
+    known = small_gicp.align(
+        target[0].double().numpy(),
+        source[0].double().numpy(),
+        registration_type="PLANE_ICP",
+        downsampling_resolution=1e-6,
+        max_correspondence_distance=0.3,
+        max_iterations=60,
+    ).T_target_source
+
+    found = PlaneICP(40)(source, target)
+
+    moved = source[0].double().numpy() @ known[:3, :3].T + known[:3, 3]
+    assert found.apply(source)[0].numpy() == pytest.approx(moved, abs=0.005)
+
+
+def test_points_beyond_the_distance_have_no_effect(pair):
+    source, target, _ = pair
+    far = torch.cat([source, source[:, :50] + 40], 1)
+
+    expected = PlaneICP()(source, target)
+
+    torch.testing.assert_close(PlaneICP()(far, target).quaternion, expected.quaternion)
+
+
+def test_gradients_of_the_last_step_reach_the_source(pair):
+    source, target, _ = pair
+    source.requires_grad_()
+
+    PlaneICP(3)(source, target).quaternion[:, 1:].sum().backward()
+
+    assert torch.isfinite(source.grad).all()
+    assert source.grad.abs().sum() > 0
+
+
+def test_normals_of_a_plane_are_its_direction():
+    plane = torch.rand(1, 50, 3) * torch.tensor([1.0, 1.0, 0.0])
+
+    assert surface_normals(plane)[0, :, 2].abs().numpy() == pytest.approx(1)
+
+
+def test_nearest_rows_of_moved_points_are_the_points_themselves(rng):
+    points = torch.rand(2, 40, 3, generator=rng)
+
+    rows, distance = nearest_rows(points + 1e-4, points)
+
+    assert rows.tolist() == [list(range(40))] * 2
+    assert distance.max() < 1e-3
+
+
+@pytest.mark.parametrize("distance", [0.0, -1.0, float("inf"), float("nan")])
+def test_distance_out_of_range_raises(distance):
+    with pytest.raises(UserError, match="max_distance must be a number above 0"):
+        PlaneICP(max_distance=distance)

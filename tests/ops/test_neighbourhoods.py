@@ -1,0 +1,62 @@
+"""Descriptions of neighbourhoods, beside a plain form and under motions."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mops_lightning.ops.kernel_normals import ellipsoids
+from mops_lightning.ops.neighbourhoods import FEATURES, describe_neighbourhoods
+from tests.ops.test_stability import box
+
+
+def plain_ellipsoid(points, rows, place):
+    """Compute the spread of one neighbourhood by NumPy's eigenvectors."""
+    mean = points[rows].mean(0)
+    variances, axes = np.linalg.eigh(np.cov(points[rows].T, bias=True))
+    offset = points[place] - mean
+    above = abs(offset @ axes[:, 0])
+    beside = np.linalg.norm(offset - offset @ axes[:, 0] * axes[:, 0])
+    return [*np.sqrt(variances), above, beside], axes[:, 0]
+
+
+def test_ellipsoids_equal_eigenvectors_of_numpy():
+    points = box(100)
+    rows = np.asarray(cKDTree(points).query(points, k=12)[1])
+
+    numbers, normals = ellipsoids(points, rows)
+
+    for place in range(100):
+        expected, normal = plain_ellipsoid(points, rows[place], place)
+        assert numbers[place] == pytest.approx(expected, abs=1e-9)
+        assert abs(normals[place] @ normal) == pytest.approx(1)
+
+
+def test_features_of_turned_scaled_and_moved_cloud_are_the_same():
+    points = box(200)
+    turn = Rotation.from_rotvec([0.3, -1.2, 2.0]).as_matrix()
+
+    features = describe_neighbourhoods(points).features
+    moved = describe_neighbourhoods(40 * points @ turn.T + [500, -3, 20]).features
+
+    assert features.shape == (200, FEATURES)
+    assert moved == pytest.approx(features, abs=1e-6)
+
+
+@pytest.mark.parametrize("number", [1, 2, 5, 30])
+def test_features_of_coincident_points_are_finite(number):
+    found = describe_neighbourhoods(np.full((number, 3), 7.0))
+
+    assert np.isfinite(found.features).all()
+    assert np.linalg.norm(found.normals, axis=1) == pytest.approx(1)
+
+
+def test_features_tell_a_border_from_the_middle_of_a_plane():
+    x, y = np.meshgrid(np.arange(15.0), np.arange(15.0))
+    plane = np.stack([x.ravel(), y.ravel(), np.zeros(225)], axis=1)
+    middle, corner = 7 * 15 + 7, 0
+
+    features = describe_neighbourhoods(plane).features
+    beside = features[:, 4]  # distance from the mean of the six nearest points
+
+    assert beside[corner] > beside[middle] + 1

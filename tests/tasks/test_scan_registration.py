@@ -1,0 +1,124 @@
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mops_lightning.errors import UserError
+from mops_lightning.metrics.registration import RotationError
+from mops_lightning.nets.plane_icp import PlaneICP, surface_normals
+from mops_lightning.ops.rigid import Motion, identity_motion, motion_of_vectors
+from mops_lightning.seeding import generator
+from mops_lightning.tasks.scan_registration import ScanRegistration
+from mops_lightning.types import SampleOutput
+from tests.ops.test_stability import box
+
+
+@pytest.fixture
+def clouds():
+    return torch.from_numpy(np.stack([box(400, seed) for seed in range(3)])).float() / 4
+
+
+def task(**settings):
+    return ScanRegistration(PlaneICP(), **settings)
+
+
+def batch_of(clouds, **settings):
+    return task(**settings).make_batch(clouds, [generator(7, row) for row in range(len(clouds))])
+
+
+def test_halves_share_no_point_and_target_is_moved(clouds):
+    batch = batch_of(clouds)
+
+    source, target = batch.points.chunk(2)
+    motion = Motion(batch.quaternion, batch.translation)
+    back = torch.linalg.inv(motion.apply(torch.eye(3).expand(3, 3, 3)) - batch.translation[:, None])
+    original = (target - batch.translation[:, None]) @ back
+    together = torch.cat([source, original], 1)
+    for found, cloud in zip(together, clouds, strict=True):
+        distance, rows = cKDTree(cloud).query(found)
+        assert np.max(distance) < 1e-5
+        assert np.sort(rows).tolist() == list(range(400))
+
+
+def test_starts_are_within_their_limits(clouds):
+    batch = batch_of(clouds.repeat(50, 1, 1), angle=15, shift=0.1)
+
+    still = identity_motion(clouds.repeat(50, 1, 1))
+    angles = RotationError.of(Motion(batch.quaternion, batch.translation), still)
+    shifts = torch.linalg.vector_norm(batch.translation, dim=1)
+    assert 14 < angles.max() <= 15
+    assert 0.09 < shifts.max() <= 0.1
+
+
+def test_step_with_all_points_finds_the_motion():
+    batch = batch_of(torch.from_numpy(box(3000)[None]).float() / 4)
+
+    result = task().step(batch, batch.points)
+
+    assert RotationError.of(result.predictions, result.targets).max() < 1
+
+
+def test_sample_of_the_target_is_not_used(clouds):
+    batch = batch_of(clouds)
+    source, target = batch.points.chunk(2)
+
+    found = task().predict(batch, torch.cat([source[:, :50], target[:, :50]]))
+
+    expected = PlaneICP()(source[:, :50], target)
+    assert torch.equal(found.quaternion, expected.quaternion)
+
+
+def test_residuals_without_motion_equal_a_plain_form(clouds):
+    batch = batch_of(clouds)
+    found = task().residuals(batch)
+
+    source, target = batch.points.chunk(2)
+    aligned = Motion(batch.quaternion, batch.translation).apply(source)
+    normals = surface_normals(target)
+    for number in range(3):
+        distance, rows = cKDTree(target[number]).query(aligned[number])
+        apart = (aligned[number] - target[number][rows]).double()
+        plain = (apart * normals[number][rows].double()).sum(1).abs()
+        plain[torch.from_numpy(distance) > 0.3] = 0.3
+        torch.testing.assert_close(found[number, 0].double(), plain, atol=1e-5, rtol=0)
+
+
+def test_loss_is_smallest_at_the_mean_residual(clouds):
+    torch.manual_seed(3)
+    batch = batch_of(clouds)
+    state = torch.get_rng_state()
+    best = task().residuals(batch).mean(1).log()
+
+    losses = {}
+    for offset in (-0.1, 0.0, 0.1):
+        torch.set_rng_state(state)
+        output = SampleOutput(batch.points, None, {}, log_residuals=best + offset)
+        losses[offset] = float(task().sample_losses(batch, output)["residual"])
+
+    assert losses[0.0] == pytest.approx(float(best.mean()) + 1, abs=1e-4)
+    assert min(losses, key=losses.__getitem__) == 0.0
+
+
+def test_samplers_without_residuals_have_no_such_loss(clouds):
+    batch = batch_of(clouds)
+
+    assert task().sample_losses(batch, SampleOutput(batch.points, None, {})) == {}
+
+
+def test_clouds_of_one_point_and_wrong_limits_raise(clouds):
+    with pytest.raises(UserError, match="two points or more, got 1"):
+        batch_of(clouds[:, :1])
+    with pytest.raises(UserError, match="angle must be at least 0"):
+        task(angle=-1)
+    with pytest.raises(UserError, match="max_distance must be a number above 0"):
+        task(max_distance=0.0)
+
+
+def test_rotation_vectors_turn_as_scipys():
+    turn = torch.tensor([[0.0, 0.0, 0.0], [1e-8, 0.0, 0.0], [0.3, -2.0, 1.0]], dtype=torch.float64)
+
+    found = motion_of_vectors(turn, torch.zeros(3, 3, dtype=torch.float64)).quaternion
+
+    expected = Rotation.from_rotvec(turn.numpy()).as_quat(scalar_first=True)
+    assert found.numpy() == pytest.approx(expected, abs=1e-12)
