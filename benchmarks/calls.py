@@ -1,8 +1,9 @@
 """``python benchmarks/calls.py``: the calls that users make, beside the loop and other libraries.
 
 Processor time of one thread; the calls of a row take turns. *Loop* is the compiled loop alone, from
-a given first point. Clouds are unit spheres in float32. Libraries that are not installed are left
-out: fpsample, torch-quickfps, torch-fps, point-cloud-utils. Set OMP_NUM_THREADS=1.
+a given first point. Clouds are unit spheres, in float32 for farthest points. Libraries that are not
+installed are left out: fpsample, torch-quickfps, point-cloud-utils, small_gicp, open3d-cpu. The
+table goes into benchmarks/README.md, too. Set OMP_NUM_THREADS=1.
 """
 
 import argparse
@@ -17,6 +18,7 @@ from typing import Any
 import measure
 import numpy as np
 import torch
+from budgets import sphere, voxel_cases
 from cases import cloud
 from libraries import Calls, installed
 from torch import Tensor
@@ -44,13 +46,28 @@ OTHERS = (
 )
 """Methods, numbers of points, and of points to keep."""
 
+VOXELS = ((10_000, 0.1, 1000), (100_000, 0.1, 1000))
+"""Numbers of points, sizes of voxels, and numbers of points of the form with exactly m."""
+
 HEIGHTS = (3, 5, 7)
 """Heights of the trees of the libraries; the fastest one counts."""
 
-LIBRARIES = ("fpsample", "torch-quickfps", "torch-fps", "point-cloud-utils", "numba")
+LIBRARIES = (
+    "fpsample",
+    "torch-quickfps",
+    "point-cloud-utils",
+    "small_gicp",
+    "open3d-cpu",
+    "numba",
+)
 
-SIMPLE = 2**26
-"""Most distances for a library that computes all of them."""
+LEFT_OUT = {"torch-fps": "its first call compiles for more than five minutes"}
+"""Libraries that are never timed, and why."""
+
+README = Path(__file__).with_name("README.md")
+
+BEGIN, END = "<!-- calls: begin -->", "<!-- calls: end -->"
+"""Lines of the README around the table."""
 
 
 def farthest_calls(points: Tensor, m: int) -> Calls:
@@ -73,9 +90,6 @@ def farthest_calls(points: Tensor, m: int) -> Calls:
     if quick := installed("torch_quickfps"):
         for height in HEIGHTS:
             calls[f"torch-quickfps, height {height}"] = partial(quick.sample, points, m, height)
-    if clouds * number * m <= SIMPLE and (simple := installed("torch_fps")):
-        valid = torch.ones(points.shape[:2], dtype=torch.bool)
-        calls["torch-fps"] = partial(simple.farthest_point_sampling, points, valid, m)
     return calls
 
 
@@ -90,9 +104,7 @@ def other_calls(method: str, number: int, m: int) -> Calls:
     if method == "poisson" and (utils := installed("point_cloud_utils")):
         reduce = utils.downsample_point_cloud_poisson_disk
         array = points.numpy().astype(np.float64)
-        calls["point-cloud-utils, about m"] = partial(
-            reduce, array, -1, target_num_samples=m, random_seed=1
-        )
+        calls["point-cloud-utils"] = partial(reduce, array, -1, target_num_samples=m, random_seed=1)
     return calls
 
 
@@ -108,28 +120,45 @@ def timed(names: dict[str, Any], calls: Calls, rounds: int) -> list[dict[str, An
     return list(rows.values())
 
 
+def table(record: dict[str, Any]) -> str:
+    """Return the medians in milliseconds, one line for what is sampled, one column for a call."""
+    seconds: dict[tuple[str, str], dict[str, float]] = {}
+    for row in record["cases"]:
+        several = f"{row['clouds']} x " if row["clouds"] > 1 else ""
+        case = (row["method"], f"{several}{row['N']:,} → {row['m']:,}")
+        seconds.setdefault(case, {})[row["call"]] = row["seconds"]
+    calls = list(dict.fromkeys(row["call"] for row in record["cases"]))
+    lines = [
+        f"| method | points | {' | '.join(calls)} |",
+        f"|---|---|{'--:|' * len(calls)}",
+    ]
+    for (method, points), found in seconds.items():
+        cells = [f"{1e3 * found[call]:.3g}" if call in found else "" for call in calls]
+        lines.append(f"| {method} | {points} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
 def page(record: dict[str, Any]) -> str:
-    """Return the results as a table."""
+    """Return the table, and how it was measured."""
     git = record["machine"]["git"]
     changes = " with changes" if git["dirty"] else ""
     versions = ", ".join(f"{name} {number}" for name, number in record["others"].items())
-    lines = [
-        "# Calls",
-        "",
-        f"{record['machine']['cpu']}, one thread, processor time on a busy machine, medians of "
-        f"{record['rounds']} rounds; spread: distance between the quartiles. Commit "
-        f"{git['commit'][:10]}{changes}; {versions}. `python benchmarks/calls.py`",
-        "",
-        "| method | points | call | ms | spread |",
-        "|---|---|---|--:|--:|",
-    ]
-    for row in record["cases"]:
-        times = f"{row['clouds']} x " if row["clouds"] > 1 else ""
-        lines.append(
-            f"| {row['method']} | {times}{row['N']:,} → {row['m']:,} | {row['call']} | "
-            f"{1e3 * row['seconds']:.3g} | {1e3 * row['spread']:.2g} |"
-        )
-    return "\n".join(lines) + "\n"
+    left_out = "; ".join(f"{name} is left out: {why}" for name, why in record["left_out"].items())
+    spread = max(row["spread"] / row["seconds"] for row in record["cases"])
+    return (
+        "# Calls\n\n"
+        f"Milliseconds. {record['machine']['cpu']}, one thread, processor time on a busy machine, "
+        f"medians of {record['rounds']} rounds; the distance between the quartiles is at most "
+        f"{spread:.0%} of the median. Commit {git['commit'][:10]}{changes}; {versions}. "
+        f"{left_out}. `python benchmarks/calls.py`\n\n" + table(record)
+    )
+
+
+def readme_with(text: str, record: dict[str, Any]) -> str:
+    """Return the text of the README with the table of a record."""
+    before, _, rest = text.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    return f"{before}{BEGIN}\n\n{table(record)}\n{END}{after}"
 
 
 def _versions() -> dict[str, str]:
@@ -154,6 +183,7 @@ def main() -> None:
     record: dict[str, Any] = {
         "machine": measure.machine(),
         "others": _versions(),
+        "left_out": LEFT_OUT,
         "rounds": chosen.rounds,
         "cases": [],
     }
@@ -161,6 +191,7 @@ def main() -> None:
         record["cases"] += timed(names, calls, chosen.rounds)
         chosen.out.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n")
         chosen.out.with_suffix(".md").write_text(page(record))
+    README.write_text(readme_with(README.read_text(), record))
     print(page(record))
 
 
@@ -172,6 +203,9 @@ def _rows() -> Iterator[tuple[dict[str, Any], Calls]]:
     for method, number, m in OTHERS:
         names = {"method": method, "clouds": 1, "N": number, "m": m}
         yield names, other_calls(method, number, m)
+    for number, size, m in VOXELS:
+        names = {"method": "voxel", "clouds": 1, "N": number, "m": m, "size": size}
+        yield names, voxel_cases(sphere(number), size, m)
 
 
 if __name__ == "__main__":
