@@ -139,3 +139,34 @@ def test_sampler_with_half_of_its_points_distinct_has_not_collapsed():
     metrics = {"test/full/accuracy": 1.0, "test/generated/accuracy": 0.5}
     text = printed({**metrics, "test/matched/unique_points": 16.0}, "test/generated/accuracy")
     assert "distinct" not in text
+
+
+def test_run_on_own_files_ends_in_the_methods_to_use():
+    errors = {
+        8: {"fps": 2.0, "fps_farthest": 2.1, "completed": 1.8, "generated": 1.7, "random": 5.0},
+        32: {"fps": 1.2, "fps_farthest": 1.0, "completed": 1.005, "generated": 0.9, "random": 2.0},
+    }
+    metrics = {"test/full/nre_cd": 1.0}
+    for m, by_readout in errors.items():
+        for readout, error in by_readout.items():
+            metrics[f"test/m{m}/{readout}/nre_cd"] = error
+    of_files = {**NAMES, "task": "reconstruction", "dataset": "clouds"}
+
+    text = printed(metrics, "test/m32/generated/nre_cd", names=of_files)
+    other = printed(metrics, "test/m32/generated/nre_cd", names={**of_files, "dataset": "shapes"})
+
+    said = (
+        "Use FPS from the farthest point from 32 points on; your sampler is 10 % better at 8 "
+        "(one draw).\n"
+    )
+    assert said in text
+    assert "Use FPS" not in other
+
+
+def test_run_of_registration_without_a_trained_sampler_ends_without_advice():
+    of_pairs = {**NAMES, "task": "registration"}
+    metrics = {"test/sampled/rotation_error_deg": 9.0, "test/full/rotation_error_deg": 3.0}
+
+    text = printed(metrics, "test/sampled/rotation_error_deg", names=of_pairs)
+
+    assert "Use" not in text

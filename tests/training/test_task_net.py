@@ -81,7 +81,7 @@ def test_run_that_failed_or_names_own_classes_is_refused(run_folder):
         read_task(str(run_folder))
 
 
-def test_sampler_without_its_task_net_and_damaged_files_are_refused(tmp_path):
+def test_file_of_a_samplers_run_is_taken_if_it_holds_the_task_net(tmp_path):
     from mops_lightning import FMOPSNet
     from mops_lightning.zoo import weights
 
@@ -97,6 +97,12 @@ def test_sampler_without_its_task_net_and_damaged_files_are_refused(tmp_path):
     weights.save(path, FMOPSNet(16), card["record"]["config"], {})
     with pytest.raises(UserError, match="a sampler without its task net"):
         read_task(str(path))
+
+    net = read_task("pointnet.modelnet40")
+    weights.save(path, net.task, card["record"]["config"], {}, net.outputs)
+    beside = read_task(str(path))  # as a sampler's run writes its task net
+    assert beside.sampler is None
+    assert beside.outputs == net.outputs
 
     path.write_bytes(b"no weights")
     with pytest.raises(UserError, match="damaged"):

@@ -10,8 +10,16 @@ from rich.table import Table
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.records.collapse import collapse_line, collapsed, distinct_points
 from mops_lightning.records.metric_info import in_summary_order, metric_info
-from mops_lightning.records.readout_names import FULL, GENERATED, MATCHED, ROWS, parse_metric_name
+from mops_lightning.records.readout_names import (
+    COMPLETED,
+    FULL,
+    GENERATED,
+    MATCHED,
+    ROWS,
+    parse_metric_name,
+)
 from mops_lightning.records.run_record import FILE, Names, RunRecord
+from mops_lightning.records.verdict import verdict
 
 OWN = "own"
 """Name of a group whose class the user names on the command line."""
@@ -36,13 +44,38 @@ def closing_lines(folder: Path, record: RunRecord, console: Console | None = Non
         title, table = results_table(record)
         console.print(title, soft_wrap=True, highlight=False, style="italic")
         console.print(table)
-        if line := collapse_line(record):
+        for line in filter(None, (collapse_line(record), advice(record))):
             console.print(line, soft_wrap=True, highlight=False)
     status = f"{record.status} in {record.seconds['total']:.0f} s"
     if record.partial:
         status += f", but {' and '.join(record.partial)}"
     files = ", ".join([FILE, *sorted(record.files.values())])
     console.print(f"{status}; files in {folder}/: {files}", soft_wrap=True, highlight=False)
+
+
+def advice(record: RunRecord) -> str:
+    """Return which method to use for how many points, of runs on own files and of registration.
+
+    The sampler's completed sets are compared with the baselines by the task's score; empty for
+    other runs.
+    """
+    names = record.config["names"]
+    score = parse_metric_name(record.score_name)
+    is_asked = names["dataset"] == "clouds" or names["task"] == "registration"
+    if not is_asked or score is None:
+        return ""
+    scores: dict[int, dict[str, list[float]]] = {}
+    for key, value in record.metrics.items():
+        name = parse_metric_name(key)
+        if name is None or name.metric != score.metric or value is None:
+            continue
+        is_baseline = name.readout not in ROWS
+        if is_baseline or name.readout == COMPLETED:
+            m = name.m or record.config["m"]
+            scores.setdefault(m, {})[name.readout] = [value]
+    if not all(COMPLETED in values for values in scores.values()):
+        return ""
+    return verdict(scores, metric_info(score.metric, [record]), [COMPLETED])
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,8 @@ def read_task(reference: str) -> TrainedTask:
             user's own.
     """
     trained = _trained_run(reference)
-    path = _task_weights(trained)
+    is_task_net = trained.trained_task_net or _is_task_net(trained.place)
+    path = weights.of_run(trained.place) if is_task_net else _task_weights(trained)
     content = weights.read(path)
     record = trained.record
     outputs = {
@@ -59,7 +60,7 @@ def read_task(reference: str) -> TrainedTask:
     cfg = as_trained(compose(trained.choices()), trained, trained.choices())
     task = build_task(cfg, outputs, content["channels"])
     weights.fit_state(task, content["state"], path)
-    sampler = None if trained.trained_task_net else weights.of_run(trained.place)
+    sampler = None if is_task_net else weights.of_run(trained.place)
     return TrainedTask(
         task.eval().requires_grad_(False),
         tuple(content["classes"]),
@@ -105,16 +106,21 @@ def _record_of(config: dict[str, Any], place: Path) -> RunRecord:
 
 
 def _task_weights(trained: TrainedRun) -> Path:
-    """Return the file with the weights of the task net.
+    """Return the file with the weights of the task net that a sampler was trained for.
 
     Raises:
         UserError: the run kept none.
     """
-    if trained.trained_task_net:
-        return weights.of_run(trained.place)
     if "task_weights" not in trained.record.files:
         raise UserError(
             f"{trained.name} holds a sampler without its task net. Give the folder of its run, or "
             "a task net."
         )
     return weights.of_run(trained.place, "task_weights")
+
+
+def _is_task_net(place: Path) -> bool:
+    """Return whether a weights file of a sampler's run holds the task net beside the sampler."""
+    if not place.is_file() or model_file.read_header(place)["schema"] != model_file.WEIGHTS:
+        return False
+    return all(name.startswith("net.") for name in weights.read(place)["state"])

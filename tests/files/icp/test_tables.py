@@ -2,7 +2,8 @@
 
 import pandas as pd
 
-from mops_lightning.files.icp.tables import grids_of
+from mops_lightning.files.icp.measure import Score
+from mops_lightning.files.icp.tables import grids_of, sentences_of, write_scores
 
 
 def score(draw, method, degrees):
@@ -45,3 +46,26 @@ def test_grid_of_one_draw_without_farthest_points_has_no_spread():
     (grid,) = grids_of(pd.DataFrame([score(0, "random", 2.0)]))
 
     assert grid.rows[0][:4] == ["random", "16", "2.000", "-"]
+
+
+def test_comparison_ends_in_the_method_to_use_for_every_registration(tmp_path):
+    rows = []
+    for draw, level in enumerate((1.0, 1.2, 0.9)):
+        for registration in ("plane", "gicp"):
+            factor = 0.8 if registration == "plane" else 1.1
+            for method, error in (("fps_farthest", level), ("information", factor * level)):
+                values = score(draw, method, error) | {"registration": registration}
+                rows.append(Score(**values))
+
+    text = write_scores(rows, tmp_path)
+
+    assert text.splitlines()[-2:] == [
+        "plane: Use information for 16 points; information is 20 % better than FPS at 16 (three "
+        "draws).",
+        "gicp: Use FPS from the farthest point for 16 points (three draws).",
+    ]
+    assert "plane: Use information" in (tmp_path / "compare.html").read_text()
+
+
+def test_comparison_without_farthest_points_has_no_sentence():
+    assert sentences_of(pd.DataFrame([score(0, "random", 2.0)])) == []
