@@ -76,3 +76,12 @@ def test_real_scans_keep_attributes(real_data, tmp_path):
     assert "normal_x" in fragment.columns
     assert "nx" in read(tmp_path / "stanford-bunny.ply", 9, 0).columns  # .obj has no room
     assert len(read(tmp_path / "kitti_000000.bin", 9, 0).columns["intensity"]) == 100
+
+
+def test_downsample_of_one_point_says_point(tmp_path):
+    source = tmp_path / "one.xyz"
+    source.write_text("1 2 3\n")
+
+    out = done(source, tmp_path / "small.npy", "--method", "fps", "--m", 1)
+
+    assert "small.npy: 1 of 1 point, " in out

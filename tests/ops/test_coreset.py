@@ -165,3 +165,13 @@ def test_coreset_names_a_wrong_argument(changed, message):
 
     with pytest.raises(UserError, match=message):
         coreset(**(arguments | changed))
+
+
+@pytest.mark.parametrize("size", [1e100, 1e200])
+def test_coreset_of_sums_too_large_for_float64_is_refused(size):
+    source, target = surface(100, 0), surface(100, 1)
+    normals = np.zeros((100, 3))
+    normals[:, 2] = size
+
+    with pytest.raises(UserError, match="too large for float64"):
+        coreset(source, target, np.eye(4), 29, normals=normals)

@@ -40,6 +40,11 @@ def numbers(text: str) -> list[int]:
     return [int(part) for part in text.split(",") if part.strip()]
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun, such as ``1 point`` or ``1,200 points``."""
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+
+
 def one_of(weights: Sequence[str] | None) -> str | None:
     """Return the only trained sampler, or None.
 

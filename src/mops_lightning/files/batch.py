@@ -20,6 +20,7 @@ from rich.progress import track
 
 from mops_lightning.data.formats.registry import READABLE, WRITERS
 from mops_lightning.errors import UserError, as_line, one_line, printable
+from mops_lightning.files.arguments import counted
 from mops_lightning.files.engine import Engine
 from mops_lightning.files.options import Options
 from mops_lightning.files.total import Job, share_total
@@ -165,7 +166,7 @@ def process_file(source: Path, target: Path, options: Options, engine: Engine | 
 
 def _told(result: "Outcome", options: Options) -> str:
     """Return the numbers of points of a file, and how they were chosen, in words."""
-    words = f"{result.kept:,} of {result.number:,} points"
+    words = f"{result.kept:,} of {counted(result.number, 'point')}"
     if result.dropped:
         words += f" ({result.dropped:,} more without finite coordinates left out)"
     if result.drawn is not None and result.drawn < result.number:
@@ -228,8 +229,8 @@ def process_folder(
     if inputs.unreadable:
         words += f": {' '.join(_kinds(inputs.unreadable))}"
     if dropped:
-        words += f"; {dropped:,} points without finite coordinates left out"
-    print(printable(f"{number} files: {words}; in {target}"))
+        words += f"; {counted(dropped, 'point')} without finite coordinates left out"
+    print(printable(f"{counted(number, 'file')}: {words}; in {target}"))
     return len(failures)
 
 

@@ -14,6 +14,7 @@ from mops_lightning.files.arguments import (
     Add,
     check_out,
     columns_of,
+    counted,
     numbers,
     one_of,
     parsed,
@@ -106,7 +107,7 @@ def _propagate(chosen: argparse.Namespace) -> None:
     columns = columns_of(chosen)
     number = propagate_file(chosen.small, big, target, chosen.field, chosen.k, chosen.mean, columns)
     names, seconds = ", ".join(chosen.field), time.perf_counter() - start
-    print(printable(f"{target}: {names} of {number:,} points, {seconds:.1f} s"))
+    print(printable(f"{target}: {names} of {counted(number, 'point')}, {seconds:.1f} s"))
 
 
 def compare(arguments: list[str], prog: str = "mops-lightning compare") -> None:

@@ -15,6 +15,9 @@ from mops_lightning.ops.scalars import is_real_number, is_whole_number, python_n
 LEAST = 29
 """Least number of points: 21 entries of H, 6 of b, the error and the number of residuals."""
 
+LARGEST = 1e140
+"""Largest summand: squares of sums of these are finite."""
+
 Array = NDArray[np.float64]
 
 
@@ -94,7 +97,13 @@ def coreset(
     number = len(found.rows)
     if number <= m:
         return Coreset(found.rows, np.ones(number))
-    vectors = _summands(found)
+    with np.errstate(over="ignore", invalid="ignore"):
+        vectors = _summands(found)
+    if not np.abs(vectors).max() < LARGEST:
+        raise UserError(
+            "the sums of residuals are too large for float64. Give normals of length 1, and "
+            "smaller coordinates."
+        )
     parts = m // LEAST
     chosen = []
     weights = []

@@ -163,6 +163,12 @@ def test_one_folder_is_needed(scans, tmp_path, capsys):
     assert "--task icp takes one folder of scans, got" in file
 
 
+def test_wrong_folder_is_reported_before_a_sampler_is_loaded(scans, tmp_path, capsys):
+    wrong = ["--task", "icp", tmp_path / "none", "--m", 20, "--weights", "no.such.model"]
+
+    assert "takes one folder of scans, got" in refused(capsys, *wrong)
+
+
 def test_missing_library_is_named(scans, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "small_gicp", None)
 

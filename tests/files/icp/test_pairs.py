@@ -79,5 +79,3 @@ def test_scans_are_in_the_order_of_their_numbers(tmp_path):
         (tmp_path / name).touch()
 
     assert [path.name for path in scans_of(tmp_path)] == ["f_9.ply", "f_10.ply"]
-    with pytest.raises(UserError, match="takes one folder of scans"):
-        scans_of(tmp_path / "f_9.ply")

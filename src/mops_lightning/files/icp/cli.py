@@ -77,14 +77,18 @@ def compare_icp(chosen: argparse.Namespace) -> str:
     Raises:
         UserError: an argument or a file is invalid.
     """
+    folder = _folder(chosen)
     _fill_defaults(chosen)
     from mops_lightning.files.icp.align import small_gicp
     from mops_lightning.files.icp.measure import Setup, compare_by_icp
     from mops_lightning.files.icp.methods import NAMES, methods_of
     from mops_lightning.files.icp.pairs import read_points, scans_of
+    from mops_lightning.files.icp.poses import read_poses
     from mops_lightning.files.icp.tables import write_scores
 
     small_gicp()  # reports that it is missing before any file is read
+    if chosen.poses is not None:
+        read_poses(chosen.poses)  # reports its mistakes before any scan is read
     setup = Setup(
         sizes=chosen.m,
         methods=methods_of(chosen.methods or NAMES, one_of(chosen.weights), chosen.tile, chosen.m),
@@ -99,19 +103,19 @@ def compare_icp(chosen: argparse.Namespace) -> str:
     )
     columns = columns_of(chosen)
     surface = max(10_000, 8 * (chosen.points or max(chosen.m)))
-    scans = [
-        (path, read_points(path, chosen.seed, columns, surface))
-        for path in scans_of(_folder(chosen))
-    ]
+    scans = [(path, read_points(path, chosen.seed, columns, surface)) for path in scans_of(folder)]
     pairs_of_draw = _pairs(chosen, scans)
     scores = list(compare_by_icp(pairs_of_draw, setup))
     return write_scores(scores, chosen.out)
 
 
 def _folder(chosen: argparse.Namespace) -> Path:
+    """Check the paths before libraries and samplers are loaded."""
     if len(chosen.files) != 1:
         raise UserError(f"--task icp takes one folder of scans, got {len(chosen.files)} paths.")
     folder: Path = chosen.files[0]
+    if not folder.is_dir():
+        raise UserError(f"--task icp takes one folder of scans, got {folder}.")
     return folder
 
 

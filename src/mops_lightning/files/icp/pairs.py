@@ -40,10 +40,8 @@ def scans_of(folder: Path) -> list[Path]:
     """Return the files of a folder in the order of their numbers.
 
     Raises:
-        UserError: it is no folder, or has no file that can be read.
+        UserError: it has no file that can be read.
     """
-    if not folder.is_dir():
-        raise UserError(f"--task icp takes one folder of scans, got {folder}.")
     names = list_files(folder, READABLE)
     return [
         folder / name for name in sorted(names, key=lambda name: (name.parent, by_number(name)))

@@ -9,6 +9,7 @@ from statistics import fmean, stdev
 import pandas as pd
 from matplotlib.figure import Figure
 
+from mops_lightning.files.arguments import counted
 from mops_lightning.files.task_net.keep import Choice, by_part, by_size
 from mops_lightning.files.task_net.measure import ALL, EVERYTHING, LOSS
 from mops_lightning.filesystem import atomic_write
@@ -107,8 +108,8 @@ class Comparison:
         draws = frame.draw.nunique()
         clouds = frame.clouds.iloc[0]
         title = (
-            f"{metric.title} of {self.net}: {_counted(draws, 'draw')} of {clouds:,} clouds from "
-            f"{_counted(self.files, 'file')}"
+            f"{metric.title} of {self.net}: {counted(draws, 'draw')} of {clouds:,} clouds from "
+            f"{counted(self.files, 'file')}"
         )
         best = {m: _best(frame[frame.m == m], column, metric) for m in sizes}
         rows: list[list[str | Cell]] = []
@@ -151,10 +152,6 @@ class Comparison:
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
         return figure
-
-
-def _counted(number: int, noun: str) -> str:
-    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 
 
 def _best(frame: pd.DataFrame, column: str, metric: MetricInfo) -> str:
