@@ -182,6 +182,20 @@ def test_local_products_in_loops_equal_gathered_keys(rng):
     )
 
 
+def test_weighted_sums_equal_those_of_gathered_rows_and_so_do_their_gradients(rng):
+    weights = torch.rand(2, 5, 4, dtype=torch.float64, generator=rng, requires_grad=True)
+    values = torch.randn(2, 9, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+    rows = torch.randint(9, (2, 5, 4), generator=rng)  # some repeat
+
+    sums = local_attention.weighted_sums(weights, rows, values)
+
+    gathered = gather_points(values, rows)
+    torch.testing.assert_close(sums, (weights[..., None] * gathered).sum(2))
+    assert torch.autograd.gradcheck(
+        lambda left, right: local_attention.weighted_sums(left, rows, right), (weights, values)
+    )
+
+
 def test_local_matched_points_are_chosen_from_all_points(rng):
     net = local(m=4, candidates=1, neighbours=1).float().eval()
     points = torch.randn(50, 3, generator=rng)

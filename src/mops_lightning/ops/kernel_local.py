@@ -1,4 +1,4 @@
-"""Products of queries with chosen keys, compiled by numba for ``ops.local_attention``."""
+"""Products with chosen rows and sums of them, compiled by numba for ``ops.local_attention``."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -30,3 +30,33 @@ def products_backward(gradients, queries, keys, places, query_gradients, key_gra
             for c in range(channels):
                 query_gradient[c] += gradient * key[c]
                 key_gradient[c] += gradient * query[c]
+
+
+@jit_cached
+def sums(weights, rows, values, out):
+    """Write the sum of ``weights[i, t] · values[rows[i, t]]`` over t to ``out[i]``."""
+    channels = values.shape[1]
+    for i in range(len(weights)):
+        total = out[i]
+        total[:] = 0
+        for t in range(weights.shape[1]):
+            weight = weights[i, t]
+            line = values[rows[i, t]]
+            for c in range(channels):
+                total[c] += weight * line[c]
+
+
+@jit_sums
+def sums_backward(gradients, weights, rows, values, weight_gradients, value_gradients):
+    """Add the gradients of ``sums`` to those of weights and values."""
+    channels = values.shape[1]
+    for i in range(len(weights)):
+        gradient = gradients[i]
+        for t in range(weights.shape[1]):
+            weight = weights[i, t]
+            line, line_gradient = values[rows[i, t]], value_gradients[rows[i, t]]
+            product = weights.dtype.type(0)
+            for c in range(channels):
+                product += gradient[c] * line[c]
+                line_gradient[c] += weight * gradient[c]
+            weight_gradients[i, t] += product

@@ -1,4 +1,4 @@
-"""Logits of columns that choose among a few points each."""
+"""Logits and means of columns that choose among a few points each."""
 
 from typing import Any
 
@@ -27,10 +27,55 @@ def chosen_products(queries: Tensor, keys: Tensor, places: Tensor) -> Tensor:
         ``(B, M, k)``; gradients flow to queries and keys. On a CPU no ``(B, M, k, C)`` copy of the
         keys is made.
     """
-    compiles = torch.compiler.is_compiling()
-    if compiles or queries.device.type != "cpu" or queries.dtype.itemsize < 4:
+    if not _has_loops(queries):
         return (gather_points(keys, places) @ queries[..., None])[..., 0]
     return _ChosenProducts.apply(queries.contiguous(), keys.contiguous(), places.contiguous())
+
+
+def weighted_sums(weights: Tensor, rows: Tensor, values: Tensor) -> Tensor:
+    """Return sums of chosen rows, each with its weight.
+
+    Args:
+        weights: ``(B, M, k)``.
+        rows: ``(B, M, k)`` int64, rows of the values.
+        values: ``(B, N, V)``.
+
+    Returns:
+        ``(B, M, V)``; gradients flow to weights and values. On a CPU no ``(B, M, k, V)`` copy of
+        the values is made.
+    """
+    if not _has_loops(weights):
+        return (weights[:, :, None] @ gather_points(values, rows))[:, :, 0]
+    return _WeightedSums.apply(weights.contiguous(), rows.contiguous(), values.contiguous())
+
+
+def _has_loops(values: Tensor) -> bool:
+    """Return whether compiled loops take the values: on a CPU, of 32 bits at least."""
+    on_cpu = values.device.type == "cpu" and not torch.compiler.is_compiling()
+    return on_cpu and values.dtype.itemsize >= 4
+
+
+class _WeightedSums(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, weights: Tensor, rows: Tensor, values: Tensor) -> Tensor:
+        ctx.save_for_backward(weights, rows, values)
+        out = values.new_empty(*weights.shape[:2], values.shape[2])
+        arrays = (part.detach().numpy() for part in (weights, rows, values, out))
+        for cloud in zip(*arrays, strict=True):
+            kernel_local.sums(*cloud)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, Tensor]:
+        weights, rows, values = ctx.saved_tensors
+        weight_gradients = torch.zeros_like(weights)
+        value_gradients = torch.zeros_like(values)
+        given = gradients[0].contiguous()
+        parts = (given, weights, rows, values, weight_gradients, value_gradients)
+        for cloud in zip(*(part.detach().numpy() for part in parts), strict=True):
+            kernel_local.sums_backward(*cloud)
+        return weight_gradients, None, value_gradients
 
 
 class _ChosenProducts(torch.autograd.Function):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.local_attention import weighted_sums
 
 
 class LocalMatrix(NamedTuple):
@@ -52,7 +52,7 @@ class LocalMatrix(NamedTuple):
 
     def sample(self, points: Tensor) -> Tensor:
         """Return Q = SᵀP ``(B, M, V)`` of values ``(B, N, V)``, as ``SamplingMatrix.sample``."""
-        return (self.weights[:, :, None] @ gather_points(points, self.rows))[:, :, 0]
+        return weighted_sums(self.weights, self.rows, points)
 
     def sparse(self, threshold: float = 0.01) -> Tensor:
         """Return S in coordinate (COO) format, as ``SamplingMatrix.sparse``."""
