@@ -23,8 +23,8 @@ from mops_lightning.report.text import markdown
 from mops_lightning.training.evaluation import command_line
 from mops_lightning.training.run import run as running
 from mops_lightning.training.run.build import build_parts
-from tests.config.test_sweep_starts import without_hydra
-from tests.config.test_sweeps import ON_SHAPES, composed
+from tests.config.test_sweep_starts import FORMS, SMALLER, without_hydra
+from tests.config.test_sweeps import composed
 from tests.support.small_data import POINTS, write_all
 
 ROOT = Path(__file__).parents[1]
@@ -115,7 +115,9 @@ def small(arguments: list[str], roots: Path, sweep: str = "") -> list[str]:
     text = " ".join(chosen)
     if "experiment=own_scans" in text:
         data = [f"dataset.root={roots}/clouds", f"dataset.cache={roots}/cache"]
-    elif "modelnet40" in text or "evaluate=" in text or (sweep and sweep not in ON_SHAPES):
+    elif FORMS.get(sweep) == "airborne":
+        data = [f"dataset.root={roots}/airborne", *SMALLER[sweep]]
+    elif "modelnet40" in text or "evaluate=" in text or (sweep and FORMS.get(sweep) != "shapes"):
         data = [f"dataset.root={roots}/modelnet40"]
     else:
         data = ["dataset.train_per_class=1", "dataset.test_per_class=1"]
