@@ -99,6 +99,31 @@ def test_callback_that_asks_before_min_epochs_ends_at_min_epochs_after_a_stop(
     assert ended(tmp_path / "resumed") == ended(tmp_path / "unbroken")
 
 
+def test_training_stopped_twice_after_its_last_validation_keeps_it(tmp_path, monkeypatch):
+    settings = [*LONG, "trainer.max_epochs=5", "+trainer.check_val_every_n_epoch=3"]
+    done([*settings, "hydra.run.dir=unbroken"], tmp_path)
+
+    def stop_after(steps):
+        def stop(self, _):
+            if self.global_step == steps:
+                interrupt("SIGTERM")
+
+        return stop
+
+    given = []
+    for steps, run in ((6, "first"), (8, "second")):  # an epoch has two steps
+        with monkeypatch.context() as patched:
+            patched.setattr(Experiment, "on_before_zero_grad", stop_after(steps))
+            status, _, err = call([*settings, f"hydra.run.dir={run}", *given], tmp_path)
+        assert status == 130, err
+        given = [f"ckpt_path={run}"]
+
+    done([*settings, "hydra.run.dir=resumed", *given], tmp_path)
+
+    assert ended(tmp_path / "resumed") == ended(tmp_path / "unbroken")
+    assert run_record.read(tmp_path / "resumed").validation
+
+
 def stop_in_last_test_batch(self, outputs, batch, number):
     if number + 1 == self.trainer.num_test_batches[0]:
         os.kill(os.getpid(), signal.SIGTERM)

@@ -6,7 +6,8 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.training.run.callbacks import STANDARD, EpochLines, build_callbacks
-from tests.support.command_line import TINY, done, runs
+from mops_lightning.zoo import weights
+from tests.support.command_line import TINY, done, job, runs
 
 STOPPING = [
     "+callbacks.early._target_=lightning.pytorch.callbacks.EarlyStopping",
@@ -57,3 +58,14 @@ def test_epoch_lines_show_validation_of_their_own_epoch_only(tmp_path):
 
     lines = [line for line in out.splitlines() if line.startswith("epoch ")]
     assert ["val/generated/accuracy" in line for line in lines] == [False, True, False, True]
+
+
+def test_pictures_and_a_logger_change_no_weight(tmp_path):
+    settings = ["weights=null", "trainer.max_epochs=2"]
+    job(tmp_path / "plain", *settings)
+
+    job(tmp_path / "drawn", *settings, "pictures=1", "logger=tensorboard")
+
+    plain, drawn = (weights.read(tmp_path / run / weights.FILE) for run in ("plain", "drawn"))
+    assert drawn["sha256"] == plain["sha256"]
+    assert (tmp_path / "drawn" / "pictures").is_dir()

@@ -1,3 +1,5 @@
+import shutil
+
 import pytest
 
 from mops_lightning.config.compose import compose
@@ -6,6 +8,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.report.collect import sampler_row
 from mops_lightning.training.evaluation import command_line
 from mops_lightning.training.run.run import run
+from mops_lightning.zoo import weights
 from tests.support.command_line import job
 
 
@@ -21,6 +24,16 @@ def test_sampler_trained_under_several_nets(tmp_path):
     # Another second net is another training.
     with pytest.raises(UserError, match=r"other settings .*other_nets\.2"):
         job(tmp_path / "new", f"other_nets=[{nets[0]}]", f"ckpt_path={tmp_path / 'both'}")
+    # And so is one under other weights in the same file.
+    kept = (nets[1] / weights.FILE).read_bytes()
+    shutil.copyfile(nets[0] / weights.FILE, nets[1] / weights.FILE)
+    both = f"other_nets=[{nets[0]},{nets[1]}]"
+    with pytest.raises(UserError, match=r"other settings \(other_nets\.2\)"):
+        job(tmp_path / "newer", both, f"ckpt_path={tmp_path / 'both'}")
+    (nets[1] / weights.FILE).write_bytes(kept)
+    assert (
+        job(tmp_path / "resumed", both, f"ckpt_path={tmp_path / 'both'}").metrics == record.metrics
+    )
     for folder in nets:  # an evaluation needs none of them
         (folder / "weights.safetensors").unlink()
     given = [f"evaluate={tmp_path / 'both'}", "pictures=0", "logger=none"]

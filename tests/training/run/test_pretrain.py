@@ -52,6 +52,17 @@ def test_task_net_is_pretrained_by_its_own_optimizer(tmp_path):
     assert by_run.task_weights_sha256 == alone["sha256"]
 
 
+def test_cached_task_net_is_that_of_the_same_data(tmp_path):
+    settings = [*SMALL_PCRNET, "sampler=fps"]
+    first = train(tmp_path, *settings, "dataset.seed=0").task_weights_sha256
+
+    second = train(tmp_path, *settings, "dataset.seed=1").task_weights_sha256
+
+    assert second != first
+    assert train(tmp_path, *settings, "dataset.seed=0").task_weights_sha256 == first
+    assert len(files(tmp_path, "cache/weights/*/weights.safetensors")) == 2
+
+
 def test_pretraining_starts_from_given_weights(tmp_path):
     train(tmp_path, "learn=task", *SMALL_PCRNET)
     own = [*SMALL_PCRNET, f"pretrain_from={tmp_path}/run0", "sampler=fps", "pretrain.lr=1e-30"]

@@ -221,6 +221,16 @@ def test_shortened_sampler_is_no_warm_start_and_no_figure_of_a_report(tmp_path):
     assert "trained for 1 of 2 steps" in found.undone[str(tmp_path / "short")]
 
 
+def test_evaluation_of_a_run_that_was_tested_in_part_is_whole(tmp_path):
+    job(tmp_path / "run", "weights=null", "+trainer.limit_test_batches=1")
+    assert run_record.read(tmp_path / "run").partial == ["tested on 1 of 3 batches"]
+
+    done(["evaluate=run", "pictures=0", "logger=none", "hydra.run.dir=again"], tmp_path)
+
+    assert run_record.read(tmp_path / "again").partial == []
+    assert [record.folder for record in collect(tmp_path).done] == [str(tmp_path / "again")]
+
+
 def test_number_of_steps_in_place_of_epochs_is_a_whole_training(tmp_path, capsys):
     endless = ["trainer.max_epochs=-1", "+trainer.max_steps=5"]
 
