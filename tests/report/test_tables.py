@@ -134,6 +134,20 @@ def test_values_within_two_deviations_of_the_best_are_level(tmp_path):
     assert "level" not in text
 
 
+def test_percentages_within_two_deviations_of_the_best_are_level(tmp_path):
+    """The best has a deviation of 2 %: 3 % less is level, 5 % less is not."""
+    for seed, value in enumerate((0.78, 0.80, 0.82)):
+        put(tmp_path / f"{seed}", "mops", 32, {"test/generated/accuracy": value}, seed=seed)
+    put(tmp_path, "fmops", 32, {"test/generated/accuracy": 0.77})
+    put(tmp_path, "snet", 32, {"test/generated/accuracy": 0.75})
+
+    text = table(tmp_path)
+
+    assert "| mops | **80.00 ± 2.00** (n=3)" in text
+    assert "| fmops | **77.00** |" in text
+    assert "| snet | <u>75.00</u> |" in text
+
+
 def test_equal_cells_are_named(tmp_path):
     for alpha in (1, 10, 100):
         values = {"generated": 1.037, "matched": 1.035}

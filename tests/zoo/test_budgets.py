@@ -92,6 +92,16 @@ def test_voxel_with_weights_keeps_the_heaviest_point_of_each():
     assert nearest.tolist() == [1, 3]
 
 
+def test_spacing_of_equal_weights_follows_the_seed_as_without_weights():
+    weight = torch.ones(200)
+
+    kept = [downsample(CLOUD, spacing=2.0, seed=seed, weight=weight)[1].tolist() for seed in (0, 7)]
+
+    assert kept[0] != kept[1]
+    for seed, rows in zip((0, 7), kept, strict=True):
+        assert rows == downsample(CLOUD, spacing=2.0, seed=seed)[1].tolist()
+
+
 def test_voxel_generated_returns_means_of_all_columns():
     points = np.array([[0.1, 0.1, 0.1, 4.0], [0.3, 0.5, 0.9, 6.0], [1.5, 0.5, 0.5, 1.0]])
 

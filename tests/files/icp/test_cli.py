@@ -100,6 +100,8 @@ def test_frames_with_poses_are_aligned_to_the_true_motion(tmp_path, capsys):
     assert [row["method"] for row in rows] == ["all points", "covariance"] * 2
     assert max(float(row["degrees"]) for row in rows) < 0.5
     assert max(float(row["shift"]) for row in rows) < 0.05
+    starts = {row["degrees"] for row in rows if row["method"] == "all points"}
+    assert len(starts) == 2  # of every draw its own: frames are the same
     assert "plane, 300 points: 2 draws of 2 alignments" in capsys.readouterr().out
 
 

@@ -15,6 +15,7 @@ from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
+from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.run.channels import check_sampler
 from mops_lightning.zoo.publish import add
 from tests.support import downsample
@@ -71,6 +72,29 @@ def test_evaluation_of_the_same_data_repeats_the_scores(folder, trained):
 
     (again,) = (folder / "evaluated").rglob("result.json")
     assert run_record.read(again.parent).metrics == run_record.read(trained).metrics
+
+
+def test_normals_of_corrupted_test_clouds_turn_with_them(folder, trained, monkeypatch):
+    seen = {}
+
+    def clouds_of(*settings):
+        with monkeypatch.context() as patched:
+            patched.setattr(Experiment, "on_test_batch_end", note, raising=False)
+            done([f"evaluate={trained}", "hydra.run.dir=tested", *settings], folder)
+        shutil.rmtree(folder / "tested")
+        return torch.cat([seen.pop(number) for number in sorted(seen)])
+
+    def note(self, outputs, batch, number):
+        seen[number] = batch.points
+
+    plain = clouds_of()
+    turned = clouds_of("test_corruption=rotation-5")
+
+    for before, after in zip(plain, turned, strict=True):
+        rotation = torch.linalg.lstsq(before[:, :3], after[:, :3]).solution
+        assert (rotation - torch.eye(3)).abs().max() > 0.01
+        torch.testing.assert_close(after[:, 4:], before[:, 4:] @ rotation, rtol=0, atol=1e-4)
+        assert torch.equal(after[:, 3], before[:, 3])  # the intensity
 
 
 def test_evaluation_with_features_in_another_order_is_refused(folder, trained):

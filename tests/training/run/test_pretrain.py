@@ -85,6 +85,14 @@ def test_resume_other_weights_raises(tmp_path):
             train(tmp_path, *task, weights_, f"ckpt_path={checkpoint}")
 
 
+def test_resume_with_other_clouds_held_out_raises(tmp_path):
+    task = ["learn=task", *SMALL_PCRNET]
+    train(tmp_path, *task, "val_fraction=0.25")
+
+    with pytest.raises(UserError, match=r"other settings \(val_fraction\); val_fraction is 0\.5 "):
+        train(tmp_path, *task, "val_fraction=0.5", f"ckpt_path={tmp_path / 'run0'}")
+
+
 def test_resume_on_changed_clouds_raises(tmp_path):
     def trained(seed, *more):
         for split in ("train", "test"):
