@@ -110,7 +110,7 @@ def test_training_stopped_twice_after_its_last_validation_keeps_it(tmp_path, mon
 
         return stop
 
-    given = []
+    given: list[str] = []
     for steps, run in ((6, "first"), (8, "second")):  # an epoch has two steps
         with monkeypatch.context() as patched:
             patched.setattr(Experiment, "on_before_zero_grad", stop_after(steps))

@@ -133,6 +133,14 @@ def test_stratify_with_chunk_draws_a_class_from_all_of_the_file(clouds, tmp_path
     assert rows.max() > 540
 
 
+def test_stratify_with_chunk_chooses_among_as_many_points_as_the_chunk_has(clouds, tmp_path):
+    options = ["--method", "fps", "--m", 60, "--stratify", "class:min=20", "--chunk", 300]
+
+    out = done(clouds / "a.ply", tmp_path / "out.ply", *options)
+
+    assert "60 of 600 points, chosen among 300 that were drawn at random (--chunk)" in out
+
+
 def test_stratify_more_than_m_is_refused(clouds, tmp_path):
     options = ["--method", "fps", "--m", 30, "--stratify", "class:min=20"]
 

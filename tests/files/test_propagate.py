@@ -172,6 +172,21 @@ def test_later_parts_may_have_larger_and_broken_numbers(target, tmp_path):
     np.testing.assert_array_equal(made[name], rows["intensity"])
 
 
+def test_fraction_between_the_smallest_and_the_largest_number_is_kept(tmp_path):
+    """LAS has whole intensities, which hold the smallest and the largest number here."""
+    points = np.random.default_rng(1).random((180, 3))
+    rows = np.zeros(180, [*((axis, "f8") for axis in "xyz"), ("intensity", "f8")])
+    rows["x"], rows["y"], rows["z"] = points.T
+    rows["intensity"][[70, 100]] = 0.5, 3
+    np.save(tmp_path / "big.npy", rows)
+    WRITERS[".npz"](tmp_path / "small.npz", Table(points[:5], {"label": np.arange(5)}))
+
+    done(main, [*(tmp_path / name for name in ("small.npz", "big.npy", "out.las")), *FIELD])
+
+    made = contents(tmp_path / "out.las").columns
+    np.testing.assert_array_equal(made["intensity_"], rows["intensity"])
+
+
 def test_first_part_far_from_the_last_one_keeps_its_place(tmp_path):
     """The whole-number steps of LAS must reach from one to the other."""
     points = np.random.default_rng(1).random((120, 3))

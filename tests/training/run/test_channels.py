@@ -75,7 +75,7 @@ def test_evaluation_of_the_same_data_repeats_the_scores(folder, trained):
 
 
 def test_normals_of_corrupted_test_clouds_turn_with_them(folder, trained, monkeypatch):
-    seen = {}
+    seen: dict[int, torch.Tensor] = {}
 
     def clouds_of(*settings):
         with monkeypatch.context() as patched:
