@@ -15,6 +15,8 @@ class ShippedSweeps(SearchPathPlugin):
         Args:
             search_path: where Hydra looks for configurations; changed in place.
         """
-        places = [entry.path for entry in search_path.get_path()]
-        if f"file://{conf_dir()}" in places or str(conf_dir()) in places:
+        conf = conf_dir()
+        known = {entry.path for entry in search_path.get_path()}
+        is_this_program = f"file://{conf}" in known or str(conf) in known
+        if is_this_program:
             search_path.append("mops_lightning", f"file://{sweeps_dir()}")

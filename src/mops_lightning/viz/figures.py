@@ -4,6 +4,7 @@ Without pyplot's global state.
 """
 
 import io
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -90,22 +91,31 @@ def save_figure(figure: Figure, path: Path, dpi: float = 110, software: str = ""
         dpi: resolution of a PNG, and of the images in an SVG.
         software: what wrote it, for the metadata; empty: none in a PNG, matplotlib's in an SVG.
     """
+    creator: dict[str, str] = {}
+    if software:
+        creator["Creator"] = software
     buffer = io.BytesIO()
     if path.suffix == ".svg":
-        creator = {"Creator": software} if software else {}
         figure.savefig(buffer, format="svg", dpi=dpi, metadata={"Date": None, **creator})
+        content = buffer.getvalue()
     else:
         figure.savefig(buffer, format="png", dpi=dpi)
-        image = Image.open(buffer).convert("RGB")
-        buffer = io.BytesIO()
-        palette = image.quantize(256, dither=Image.Dither.NONE)
-        metadata = PngInfo()
-        if software:
-            metadata.add_text("Software", software)
-        palette.save(buffer, "PNG", optimize=True, pnginfo=metadata)
+        content = _with_palette(buffer, software)
     with atomic_write(path) as temporary:
-        temporary.write_bytes(buffer.getvalue())
+        temporary.write_bytes(content)
     return path
+
+
+def _with_palette(png: io.BytesIO, software: str) -> bytes:
+    """Return a PNG with 256 colours, and with the name of what wrote it."""
+    metadata = PngInfo()
+    if software:
+        metadata.add_text("Software", software)
+    image = Image.open(png).convert("RGB")
+    palette = image.quantize(256, dither=Image.Dither.NONE)
+    packed = io.BytesIO()
+    palette.save(packed, "PNG", optimize=True, pnginfo=metadata)
+    return packed.getvalue()
 
 
 def cloud_grid(
@@ -130,14 +140,19 @@ def cloud_grid(
     colours: dict[str, np.ndarray] = {}
     if channel is not None:
         colours = colours_by_channel(channel, {INPUT: points, **readouts})
-    figure = new_figure(2.6 * len(columns), 2.6 * len(points), "tight")
+    number = len(points)
+    figure = new_figure(2.6 * len(columns), 2.6 * number, "tight")
     for row, cloud in enumerate(upright(coordinates(points))):
         for column, (name, samples) in enumerate(columns.items()):
             title = name if row == 0 else ""
             label = titles[row] if column == 0 else ""
-            axes = cloud_axes(figure, len(points), len(columns), row, column, title, label)
-            drawn = None if samples is None else upright(coordinates(samples))[row]
-            of_row = colours[name][row] if name in colours else None
+            axes = cloud_axes(figure, number, len(columns), row, column, title, label)
+            drawn = None
+            if samples is not None:
+                drawn = upright(coordinates(samples))[row]
+            of_row = None
+            if name in colours:
+                of_row = colours[name][row]
             draw_cloud(axes, cloud, drawn, name, colours=of_row)
     return figure
 
@@ -148,14 +163,19 @@ def colours_by_channel(channel: int, sets: Mapping[str, Tensor]) -> dict[str, np
     All sets have one scale. It leaves out the most extreme hundredth of the input at both ends, of
     which one would make all others look alike.
     """
-    values = {name: points[..., channel].detach().cpu().numpy() for name, points in sets.items()}
+    values = {}
+    for name, points in sets.items():
+        values[name] = points[..., channel].detach().cpu().numpy()
     low, high = np.percentile(values[INPUT], (1, 99))
-    spread = high - low if high > low else 1.0
+    spread = 1.0
+    if high > low:
+        spread = high - low
     scale = colormaps["viridis"]
-    return {
-        name: scale(np.clip((numbers - low) / spread, 0, 1))[..., :3]
-        for name, numbers in values.items()
-    }
+    colours = {}
+    for name, numbers in values.items():
+        shares = np.clip((numbers - low) / spread, 0, 1)
+        colours[name] = scale(shares)[..., :3]
+    return colours
 
 
 def comparison(
@@ -168,11 +188,15 @@ def comparison(
         samples: ``(M, 3)`` by the name of a readout or baseline, which gives the colour.
         captions: by the same names, then one for the whole cloud.
     """
-    figure = new_figure(2.4 * len(captions), 2.9)
+    columns = len(captions)
+    figure = new_figure(2.4 * columns, 2.9)
     cloud = upright(points)
     for column, (name, caption) in enumerate(captions.items()):
-        axes = cloud_axes(figure, 1, len(captions), 0, column, caption)
-        draw_cloud(axes, cloud, upright(samples[name]) if name in samples else None, name)
+        axes = cloud_axes(figure, 1, columns, 0, column, caption)
+        drawn = None
+        if name in samples:
+            drawn = upright(samples[name])
+        draw_cloud(axes, cloud, drawn, name)
     return figure
 
 
@@ -196,25 +220,37 @@ def draw_cloud(
         colours: ``(M, 3)`` of the samples or, without samples, of the cloud; None: one colour.
     """
     axes.computed_zorder = False
-    faint = samples is not None
-    of_cloud: Any = np.array(INPUT_COLOUR) / 255 if faint else "0.35"
-    if colours is not None and not faint:
-        of_cloud = colours
-    axes.scatter(
-        *cloud.T,
-        s=1 if faint else 3,
-        color=of_cloud,
-        alpha=0.35 if faint else 1.0,
-        depthshade=False,
-        rasterized=True,  # thousands of points would make an SVG of megabytes
-    )
-    if samples is not None:
-        colour = colours
-        if colour is None:
-            colour = np.array(COLOURS.get(readout, COLOURS["sampled"])) / 255
-        size = max(size * min(1, LARGE_MARKER_SAMPLES / max(len(samples), 1)), 1.5)
-        axes.scatter(*samples.T, s=size, color=colour, depthshade=False, zorder=2)
+    if samples is None:
+        _draw_whole(axes, cloud, colours)
+    else:
+        _draw_faint(axes, cloud)
+        _draw_samples(axes, samples, readout, size, colours)
     frame_cloud(axes, cloud)
+
+
+# Points are rasterized, because thousands of them would make an SVG of megabytes.
+def _draw_whole(axes: Axes3D, cloud: np.ndarray, colours: np.ndarray | None) -> None:
+    colour: Any = colours
+    if colour is None:
+        colour = "0.35"
+    axes.scatter(*cloud.T, s=3, color=colour, alpha=1.0, depthshade=False, rasterized=True)
+
+
+def _draw_faint(axes: Axes3D, cloud: np.ndarray) -> None:
+    colour = np.array(INPUT_COLOUR) / 255
+    axes.scatter(*cloud.T, s=1, color=colour, alpha=0.35, depthshade=False, rasterized=True)
+
+
+def _draw_samples(
+    axes: Axes3D, samples: np.ndarray, readout: str, size: float, colours: np.ndarray | None
+) -> None:
+    colour = colours
+    if colour is None:
+        colour = np.array(COLOURS.get(readout, COLOURS["sampled"])) / 255
+    number = max(len(samples), 1)
+    shrink = min(1, LARGE_MARKER_SAMPLES / number)
+    marker = max(size * shrink, 1.5)
+    axes.scatter(*samples.T, s=marker, color=colour, depthshade=False, zorder=2)
 
 
 def matrix_figure(dense: Tensor, gram: Tensor, title: str) -> Figure:
@@ -228,35 +264,42 @@ def matrix_figure(dense: Tensor, gram: Tensor, title: str) -> Figure:
         title: the cloud and sampler of the matrix.
     """
     values = dense.detach().cpu()
-    order = values.argmax(1).mul(2.0).sub(values.amax(1)).argsort()
+    columns = values.shape[1]
+    strongest = values.argmax(1)
+    # An entry is at most 1, so the column decides, and the entry where columns are equal.
+    order = strongest.mul(2.0).sub(values.amax(1)).argsort()
     rows = adaptive_max_pool1d(values[order].T, min(MATRIX_ROWS, len(values))).T
-    extent = (-0.5, values.shape[1] - 0.5, len(values) - 0.5, -0.5)
+    extent = (-0.5, columns - 0.5, len(values) - 0.5, -0.5)
     scale: dict[str, Any] = {"vmin": 0, "vmax": 1, "cmap": "viridis"}
+
     figure = new_figure(9, 4.4)
     left, right = figure.subplots(1, 2, gridspec_kw={"wspace": 0.08})
-    images = [
-        left.imshow(rows.numpy(), aspect="auto", interpolation="nearest", extent=extent, **scale),
-        right.imshow(gram.detach().cpu().numpy(), **scale),
-    ]
+    left.imshow(rows.numpy(), aspect="auto", interpolation="nearest", extent=extent, **scale)
     left.set(title="S (points sorted by strongest column)", xlabel="column", ylabel="point")
+    image = right.imshow(gram.detach().cpu().numpy(), **scale)
     right.set(title="SᵀS", xlabel="column", ylabel="column")
-    figure.colorbar(images[1], ax=[left, right], shrink=0.8)
+    figure.colorbar(image, ax=[left, right], shrink=0.8)
     figure.suptitle(title, fontsize=10)
     return figure
 
 
 def upright(points: Tensor | np.ndarray) -> np.ndarray:
     """Turn y-up clouds into matplotlib's z-up ones."""
-    array = points if isinstance(points, np.ndarray) else points.detach().cpu().float().numpy()
-    return np.stack([array[..., 0], -array[..., 2], array[..., 1]], -1)
+    if isinstance(points, Tensor):
+        points = points.detach().cpu().float().numpy()
+    x = points[..., 0]
+    y = points[..., 1]
+    z = points[..., 2]
+    return np.stack([x, -z, y], -1)
 
 
 def frame_cloud(axes: Axes3D, cloud: np.ndarray) -> None:
     """Fit the axes to a cloud with equal scales, and hide them."""
-    centre = (cloud.max(0) + cloud.min(0)) / 2
+    x, y, z = (cloud.max(0) + cloud.min(0)) / 2
     reach = np.ptp(cloud, axis=0).max() / 2 or 1.0
-    for name, middle in zip("xyz", centre, strict=True):
-        getattr(axes, f"set_{name}lim")(middle - reach, middle + reach)
+    axes.set_xlim(x - reach, x + reach)
+    axes.set_ylim(y - reach, y + reach)
+    axes.set_zlim(z - reach, z + reach)
     axes.set_box_aspect((1, 1, 1), zoom=1.3)
     axes.set_axis_off()
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
@@ -279,13 +322,19 @@ def view_upright(figure: Figure, up: str) -> None:
 def to_y_up(points: Tensor, up: str) -> Tensor:
     """Rotate points ``(..., 3)`` so that their vertical axis ``x``, ``y`` or ``z`` becomes y."""
     x, y, z = points.unbind(-1)
-    turned = {"x": (-y, x, z), "y": (x, y, z), "z": (x, z, -y)}
+    turned = {
+        "x": (-y, x, z),
+        "y": (x, y, z),
+        "z": (x, z, -y),
+    }
     return torch.stack(turned[up], -1)
 
 
 def thinned(points: Any) -> Any:
     """Return every k-th point of clouds ``(..., N, 3)`` above ``MAX_INPUT_POINTS``."""
-    return points[..., :: -(-points.shape[-2] // MAX_INPUT_POINTS), :]
+    number = points.shape[-2]
+    step = math.ceil(number / MAX_INPUT_POINTS)
+    return points[..., :: max(step, 1), :]
 
 
 def save_clouds(
@@ -299,10 +348,12 @@ def save_clouds(
         sampled: ``(K, M, 3)`` by readout.
         titles: one per cloud.
     """
+    arrays: dict[str, Any] = {TITLES: np.array(titles)}
     clouds = {INPUT: thinned(points), **sampled}
-    arrays = {name: cloud.detach().cpu().float().numpy() for name, cloud in clouds.items()}
+    for name, cloud in clouds.items():
+        arrays[name] = cloud.detach().cpu().float().numpy()
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **{TITLES: np.array(titles)}, **arrays)
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def load_clouds(path: Path) -> tuple[list[str], dict[str, NDArray[np.float32]]]:
@@ -318,11 +369,17 @@ def load_clouds(path: Path) -> tuple[list[str], dict[str, NDArray[np.float32]]]:
         arrays = load_npz(path)
         titles = [str(title) for title in arrays.pop(TITLES)]
         clouds = {INPUT: arrays.pop(INPUT), **arrays}
-        shapes = {cloud.shape[::2] for cloud in clouds.values()}
-        finite = all(np.isfinite(cloud).all() for cloud in clouds.values())
-        if len(clouds) < 2 or not titles or shapes != {(len(titles), 3)} or not finite:
+        if not titles or not _are_clouds(clouds, len(titles)):
             raise ValueError("expected finite clouds and samples for each title")
     # Numpy raises TypeError for other kinds of numbers, SystemError for odd characters.
     except (KeyError, SystemError, TypeError, ValueError) as error:
         raise UserError(f"{path}: cannot read saved clouds: {error}.") from None
     return titles, clouds
+
+
+def _are_clouds(clouds: Mapping[str, NDArray[Any]], number: int) -> bool:
+    """Return whether the input and at least one sample are finite ``(number, points, 3)``."""
+    for cloud in clouds.values():
+        if cloud.shape[::2] != (number, 3) or not np.isfinite(cloud).all():
+            return False
+    return len(clouds) >= 2

@@ -10,11 +10,37 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
-from mops_lightning.viz import figures
+from mops_lightning.viz.figures import (
+    cloud_axes,
+    draw_cloud,
+    frame_cloud,
+    new_figure,
+    thinned,
+    upright,
+)
 
 SOURCE_COLOUR = (0.12, 0.47, 0.86)
 TARGET_COLOUR = (0.84, 0.3, 0.05)
 SAMPLE_SIZE = 14
+
+
+class _Grid(NamedTuple):
+    """A figure with one row of clouds below the other."""
+
+    figure: Figure
+    rows: int
+    columns: int
+
+    @classmethod
+    def of(cls, rows: int, columns: int, inches: float) -> "_Grid":
+        """Return an empty grid of square cells with sides of so many inches."""
+        return cls(new_figure(inches * columns, inches * rows, "tight"), rows, columns)
+
+    def axes(self, row: int, column: int, title: str, label: str) -> Axes3D:
+        """Add the axes of one cell."""
+        return cloud_axes(
+            self.figure, self.rows, self.columns, row, column, title=title, label=label
+        )
 
 
 class RegistrationResult(NamedTuple):
@@ -49,28 +75,33 @@ def pair_grid(
         aligned: by readout.
         titles: one per pair.
     """
-    columns = {"before (centred)": None, **{f"by {name}": aligned[name] for name in aligned}}
-    figure = figures.new_figure(2.8 * len(columns), 2.8 * len(source), "tight")
-    for row in range(len(source)):
-        for column, (head, result) in enumerate(columns.items()):
-            label = f"{titles[row]}, {before[row]:.1f}° apart"
-            if result is not None:
-                label = f"rotation error {result.errors[row]:.1f}°"
-            title = head if row == 0 else ""
-            axes = figures.cloud_axes(figure, len(source), len(columns), row, column, title, label)
-            moved = (source if result is None else result.source)[row]
-            _draw_pair(axes, moved, target[row], s=1.5, alpha=0.35)
-            if result is not None and result.source_points.shape[1] < source.shape[1]:
-                samples = result.source_points[row], result.target_points[row]
-                _draw_pair(axes, *samples, s=SAMPLE_SIZE, edgecolors="black", linewidths=0.4)
-            figures.frame_cloud(axes, figures.upright(torch.cat([moved, target[row]])))
-    figure.supxlabel("source blue, target orange, sampled points ringed", fontsize=9)
-    return figure
+    grid = _Grid.of(len(source), 1 + len(aligned), 2.8)
+    for row, title in enumerate(titles):
+        head = "before (centred)" if row == 0 else ""
+        axes = grid.axes(row, 0, head, f"{title}, {before[row]:.1f}° apart")
+        _draw_whole_pair(axes, source[row], target[row])
+        for column, (name, result) in enumerate(aligned.items(), start=1):
+            head = f"by {name}" if row == 0 else ""
+            axes = grid.axes(row, column, head, f"rotation error {result.errors[row]:.1f}°")
+            _draw_whole_pair(axes, result.source[row], target[row])
+            if result.source_points.shape[1] < source.shape[1]:
+                _draw_rings(axes, result.source_points[row], result.target_points[row])
+    grid.figure.supxlabel("source blue, target orange, sampled points ringed", fontsize=9)
+    return grid.figure
+
+
+def _draw_whole_pair(axes: Axes3D, source: Tensor, target: Tensor) -> None:
+    _draw_pair(axes, source, target, s=1.5, alpha=0.35)
+    frame_cloud(axes, upright(torch.cat([source, target])))
+
+
+def _draw_rings(axes: Axes3D, source: Tensor, target: Tensor) -> None:
+    _draw_pair(axes, source, target, s=SAMPLE_SIZE, edgecolors="black", linewidths=0.4)
 
 
 def _draw_pair(axes: Axes3D, source: Tensor, target: Tensor, **style: Any) -> None:
-    for points, colour in ((source, SOURCE_COLOUR), (target, TARGET_COLOUR)):
-        axes.scatter(*figures.upright(points).T, color=colour, depthshade=False, **style)
+    axes.scatter(*upright(source).T, color=SOURCE_COLOUR, depthshade=False, **style)
+    axes.scatter(*upright(target).T, color=TARGET_COLOUR, depthshade=False, **style)
 
 
 class ReconstructionResult(NamedTuple):
@@ -100,28 +131,24 @@ def reconstruction_grid(
         results: by readout or sampler, one column each.
         titles: one per cloud.
     """
-    columns = 1 + len(results)
-    rows = 2 * len(points)
-    figure = figures.new_figure(2.4 * columns, 2.4 * rows, "tight")
-
-    def cell(row: int, column: int, title: str, label: str) -> Axes3D:
-        # Titles of later clouds would repeat the titles of the first row.
-        shown = title if row % 2 == 1 or row == 0 else ""
-        return figures.cloud_axes(figure, rows, columns, row, column, shown, label)
-
-    for number, cloud in enumerate(map(figures.thinned, figures.upright(points))):
+    grid = _Grid.of(2 * len(points), 1 + len(results), 2.4)
+    from_all = upright(full)
+    for number, cloud in enumerate(map(thinned, upright(points))):
         above = 2 * number
-        under = 2 * number + 1
-        _draw_depth(cell(above, 0, "input", titles[number]), cloud, cloud)
-        from_full = figures.thinned(figures.upright(full)[number])
-        _draw_depth(cell(under, 0, "from all points", ""), from_full, cloud)
+        under = above + 1
+        is_first = number == 0
+        axes = grid.axes(above, 0, "input" if is_first else "", titles[number])
+        _draw_depth(axes, cloud, cloud)
+        axes = grid.axes(under, 0, "from all points", "")
+        _draw_depth(axes, thinned(from_all[number]), cloud)
         for column, (name, result) in enumerate(results.items(), start=1):
-            samples = figures.upright(result.samples)[number]
-            axes = cell(above, column, name, f"{len(samples)} points")
-            figures.draw_cloud(axes, cloud, samples, name, size=16)
-            axes = cell(under, column, f"from {name}", f"NRE {result.ratios[number]:.2f}")
-            _draw_depth(axes, figures.thinned(figures.upright(result.points)[number]), cloud)
-    return figure
+            samples = upright(result.samples)[number]
+            axes = grid.axes(above, column, name if is_first else "", f"{len(samples)} points")
+            draw_cloud(axes, cloud, samples, name, size=16)
+            reconstruction = thinned(upright(result.points)[number])
+            axes = grid.axes(under, column, f"from {name}", f"NRE {result.ratios[number]:.2f}")
+            _draw_depth(axes, reconstruction, cloud)
+    return grid.figure
 
 
 def part_grid(points: Tensor, parts: Mapping[str, Tensor], titles: Sequence[str]) -> Figure:
@@ -132,22 +159,26 @@ def part_grid(points: Tensor, parts: Mapping[str, Tensor], titles: Sequence[str]
         parts: ``(K, N)`` part numbers, below 0 if unknown, by the name of a column.
         titles: one per cloud.
     """
-    figure = figures.new_figure(2.4 * len(parts), 2.4 * len(points), "tight")
+    grid = _Grid.of(len(points), len(parts), 2.4)
     most = max(int(numbers.max()) for numbers in parts.values())
-    colour = colormaps["tab20"].with_extremes(under="lightgrey")  # for points of unknown part
-    for row, cloud in enumerate(map(figures.thinned, figures.upright(points))):
+    scale: dict[str, Any] = {
+        "cmap": colormaps["tab20"].with_extremes(under="lightgrey"),  # points of unknown part
+        "vmin": 0,
+        "vmax": most,
+    }
+    for row, cloud in enumerate(map(thinned, upright(points))):
         for column, (name, numbers) in enumerate(parts.items()):
             title = name if row == 0 else ""
             label = titles[row] if column == 0 else ""
-            axes = figures.cloud_axes(figure, len(points), len(parts), row, column, title, label)
-            drawn = figures.thinned(numbers[row, :, None].cpu())[:, 0]
-            colours: Any = {"c": drawn, "cmap": colour, "vmin": 0, "vmax": most}
-            axes.scatter(*cloud.T, s=2, depthshade=False, **colours)
-            figures.frame_cloud(axes, cloud)
-    return figure
+            axes = grid.axes(row, column, title, label)
+            of_points = numbers[row].cpu()[:, None]
+            drawn = thinned(of_points)[:, 0]
+            axes.scatter(*cloud.T, s=2, depthshade=False, c=drawn, **scale)
+            frame_cloud(axes, cloud)
+    return grid.figure
 
 
 def _draw_depth(axes: Axes3D, drawn: np.ndarray, cloud: np.ndarray) -> None:
     """Draw points coloured by depth, framed as ``cloud``."""
     axes.scatter(*drawn.T, s=2, c=drawn[:, 1], cmap="viridis", depthshade=False)
-    figures.frame_cloud(axes, cloud)
+    frame_cloud(axes, cloud)

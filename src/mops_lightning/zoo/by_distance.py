@@ -29,21 +29,21 @@ def to_distance(
         raise UserError(f"method needs m: spacing and voxel take none, got {str(method)!r}.")
     if readout not in ("completed", "matched", "generated"):
         raise UserError(f"readout must be completed or generated, got {readout!r:.99}.")
+    is_generated = readout == "generated"
     clouds = Clouds.of(points, batch, weight)
     if spacing is not None:
         distance = check_distance("spacing", spacing)
-        if readout == "generated":
+        if is_generated:
             raise UserError("readout: spacing keeps input points, and generates none.")
         samples = [_spaced(cloud, distance, seed, space) for cloud in clouds.clouds]
         return clouds.join(samples, same_size=False)
     size = check_distance("voxel", voxel)
     if space is not None:
         raise UserError("space is for fps, poisson and spacing; voxels are cubes of coordinates.")
-    if readout == "generated":
-        if weight is not None:
-            raise UserError("weight: the means of voxels take no weights.")
-        return clouds.join([_voxel_means(cloud, size) for cloud in clouds.clouds], same_size=False)
-    samples = [_voxels(cloud, size) for cloud in clouds.clouds]
+    if is_generated and weight is not None:
+        raise UserError("weight: the means of voxels take no weights.")
+    sample_voxels = _voxel_means if is_generated else _voxels
+    samples = [sample_voxels(cloud, size) for cloud in clouds.clouds]
     return clouds.join(samples, same_size=False)
 
 
@@ -53,7 +53,8 @@ def _spaced(cloud: Cloud, spacing: float, seed: int, space: Any) -> Sample:
     if weight is None:
         return cloud.rows(keep_spaced(used, spacing, seed))
     heavy = np.flatnonzero(weight)
-    return cloud.rows(heavy[keep_spaced(used[heavy], spacing, seed, weight[heavy])])
+    kept = keep_spaced(used[heavy], spacing, seed, weight[heavy])
+    return cloud.rows(heavy[kept])
 
 
 def _voxels(cloud: Cloud, size: float) -> Sample:
@@ -67,6 +68,5 @@ def _voxels(cloud: Cloud, size: float) -> Sample:
 
 
 def _voxel_means(cloud: Cloud, size: float) -> Sample:
-    means = torch.from_numpy(voxel_means(cloud.columns(), size)).to(cloud.points.device)
-    is_floating = cloud.points.is_floating_point()
-    return means.to(cloud.points.dtype) if is_floating else means, None
+    means = torch.from_numpy(voxel_means(cloud.columns(), size))
+    return cloud.in_its_type(means.to(cloud.points.device)), None

@@ -41,17 +41,23 @@ class Choice:
         Raises:
             UserError: they do not fit.
         """
-        if self.space is not None and self.method not in ("fps", "poisson"):
+        if self.space is not None:
+            self._check_space()
+        if self.tile is not None:
+            self._check_tile(self.tile, weight)
+
+    def _check_space(self) -> None:
+        if self.method not in ("fps", "poisson"):
             raise UserError(
                 "space is for method='fps', method='poisson' and spacing, got "
                 f"{str(self.method)!r}."
             )
-        if self.space is not None and self.tile is not None:
+        if self.tile is not None:
             raise UserError("give space or tile, not both.")
-        if self.tile is None:
-            return
-        if isinstance(self.tile, bool) or not isinstance(self.tile, int) or self.tile < 2:
-            raise UserError(f"tile must be a whole number of at least 2, got {self.tile!r:.99}.")
+
+    def _check_tile(self, tile: Any, weight: Any) -> None:
+        if isinstance(tile, bool) or not isinstance(tile, int) or tile < 2:
+            raise UserError(f"tile must be a whole number of at least 2, got {tile!r:.99}.")
         if weight is not None:
             raise UserError("weight needs the whole cloud at once: leave tile out.")
         if self.readout != "completed":
@@ -68,15 +74,14 @@ class Choice:
         seen = cloud.coordinates
         if channels:
             seen = torch.cat([seen.double(), cloud.channels(channels)], 1)
-        new, rows = sampler.downsample(seen, number, self.readout, None, cloud.weight)
+        generated, rows = sampler.downsample(seen, number, self.readout, None, cloud.weight)
         if rows is not None:
             return cloud.points[rows], rows
         if channels:
-            is_floating = cloud.points.is_floating_point()
-            return new.to(cloud.points.dtype) if is_floating else new, None
+            return cloud.in_its_type(generated), None
         if cloud.points.shape[1] > 3:
             raise UserError("generated points have coordinates only: give points[..., :3].")
-        return new, None
+        return generated, None
 
     def _sample_tiles(self, cloud: Cloud, number: int, sampler: Sampler, tile: int) -> Sample:
         channels = sampler.point_channels
@@ -93,16 +98,17 @@ class Choice:
         choose: Any = partial(farthest_rows, start=self.start)
         if self.method == "poisson":
             choose = poisson_rows
-        used = cloud.in_space(self.space)
-        points = torch.from_numpy(np.ascontiguousarray(used))[None]
+        used = np.ascontiguousarray(cloud.in_space(self.space))
+        points = torch.from_numpy(used)[None]
         weight = cloud.numbers()
         if weight is None:
-            return cloud.rows(choose(points, number, seed, in_sphere=True)[0].numpy())
+            chosen = choose(points, number, seed, in_sphere=True)[0]
+            return cloud.rows(chosen.numpy())
         heavy = np.flatnonzero(weight)
         check_positive(len(heavy), number)
         weights = torch.from_numpy(weight[heavy])[None]
-        rows = choose(points[:, heavy], number, seed, weight=weights, in_sphere=True)[0]
-        return cloud.rows(heavy[rows.numpy()])
+        chosen = choose(points[:, heavy], number, seed, weight=weights, in_sphere=True)[0]
+        return cloud.rows(heavy[chosen.numpy()])
 
 
 @dataclass(frozen=True)
@@ -125,35 +131,44 @@ class Classes:
             UserError: they are no classes of the points, or no number.
         """
         number = python_number(least)
-        if least is not None and not (is_whole_number(number) and number >= 1):
+        is_least = is_whole_number(number) and number >= 1
+        if least is not None and not is_least:
             raise UserError(
                 f"stratify_min must be a whole number of at least 1, got {least!r:.99}."
             )
         sizes = [len(cloud.points) for cloud in clouds.clouds]
-        if clouds.form == "list":
-            parts = list(stratify) if isinstance(stratify, list | tuple) else []
-            labels = [_whole_numbers(part) for part in parts]
-        else:
-            labels = list(np.split(_whole_numbers(stratify).reshape(-1), np.cumsum(sizes)[:-1]))
-        if [part.shape for part in labels] != [(size,) for size in sizes]:
+        labels = _split_labels(stratify, sizes, clouds.form == "list")
+        if [of_cloud.shape for of_cloud in labels] != [(size,) for size in sizes]:
             raise UserError(
                 "stratify must hold the class of every point: (N,), (B, N) or (P,) whole numbers, "
                 "or a list of (N,) for a list of clouds."
             )
         return cls(labels, number)
 
-    def sample(self, place: int, cloud: Cloud, number: int, choice: Choice) -> Sample:
+    def sample(self, number_of_cloud: int, cloud: Cloud, m: int, choice: Choice) -> Sample:
         """Downsample each class of one cloud on its own."""
-        classes = self.of_clouds[place]
-        numbers = share_among_classes(count_classes(classes), number, self.least)
+        classes = self.of_clouds[number_of_cloud]
+        shares = share_among_classes(count_classes(classes), m, self.least)
         kept = []
-        for name, number_of_class in numbers.items():
-            if number_of_class:
-                members = np.flatnonzero(classes == name)
-                rows = choice.sample(cloud.take(members), number_of_class)[1]
-                assert rows is not None  # check_stratified
-                kept.append(members[rows.cpu().numpy()])
+        for label, share in shares.items():
+            if share == 0:
+                continue
+            members = np.flatnonzero(classes == label)
+            _, rows = choice.sample(cloud.take(members), share)
+            assert rows is not None  # check_stratified
+            kept.append(members[rows.cpu().numpy()])
         return cloud.rows(np.sort(np.concatenate(kept)))
+
+
+def _split_labels(stratify: Any, sizes: list[int], is_list: bool) -> list[NDArray[np.int64]]:
+    """Return the labels of each cloud, of which the numbers may be wrong."""
+    if not is_list:
+        ends = np.cumsum(sizes)
+        together = _whole_numbers(stratify).reshape(-1)
+        return list(np.split(together, ends[:-1]))
+    if not isinstance(stratify, list | tuple):
+        return []
+    return [_whole_numbers(labels) for labels in stratify]
 
 
 def _whole_numbers(values: Any) -> NDArray[np.int64]:
@@ -188,24 +203,24 @@ def to_number(
     """Downsample clouds to numbers of points; see ``downsample``."""
     clouds = Clouds.of(points, batch, weight)
     is_per_cloud = isinstance(m, list | tuple)
-    numbers = _numbers(m, clouds)
+    sizes = _numbers(m, clouds)
     choice.check(weight)
     classes = None
     if stratify is not None:
         check_stratified(choice)
         classes = Classes.of(stratify, stratify_min, clouds)
+    may_be_small = clouds.form in ("list", "flat")
     samples = []
-    for place, (cloud, number) in enumerate(zip(clouds.clouds, numbers, strict=True)):
-        if len(cloud.points) <= number and clouds.form in ("list", "flat"):
-            samples.append(cloud.rows(np.arange(len(cloud.points))))
-        elif len(cloud.points) < number:
-            raise UserError(
-                f"m must be at most the number of points N={len(cloud.points)}, got m={number}."
-            )
+    for number, (cloud, size) in enumerate(zip(clouds.clouds, sizes, strict=True)):
+        available = len(cloud.points)
+        if available <= size and may_be_small:
+            samples.append(cloud.rows(np.arange(available)))
+        elif available < size:
+            raise UserError(f"m must be at most the number of points N={available}, got m={size}.")
         elif classes is None:
-            samples.append(choice.sample(cloud, number))
+            samples.append(choice.sample(cloud, size))
         else:
-            samples.append(classes.sample(place, cloud, number, choice))
+            samples.append(classes.sample(number, cloud, size, choice))
     return clouds.join(samples, same_size=not is_per_cloud)
 
 
@@ -216,6 +231,7 @@ def _numbers(m: Any, clouds: Clouds) -> Sequence[int]:
         sizes = [as_size(size) for size in m]
     if len(sizes) != len(clouds.clouds):
         raise UserError(f"m: {len(sizes)} numbers for {len(clouds.clouds)} clouds.")
-    return [
-        number_of(size, len(cloud.points)) for size, cloud in zip(sizes, clouds.clouds, strict=True)
-    ]
+    numbers = []
+    for size, cloud in zip(sizes, clouds.clouds, strict=True):
+        numbers.append(number_of(size, len(cloud.points)))
+    return numbers

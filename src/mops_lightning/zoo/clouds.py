@@ -35,7 +35,9 @@ class Cloud:
     def coordinates(self) -> Tensor:
         """The first three columns, floating point."""
         coordinates = self.points[:, :3]
-        return coordinates if coordinates.is_floating_point() else coordinates.double()
+        if coordinates.is_floating_point():
+            return coordinates
+        return coordinates.double()
 
     def channels(self, channels: PointChannels) -> Tensor:
         """Return the channels ``(N, C)`` of a model in float64: all further columns.
@@ -43,11 +45,12 @@ class Cloud:
         Raises:
             UserError: there are more or fewer columns, or values are missing.
         """
-        width = 3 + len(channels)
-        if self.points.shape[1] != width:
+        columns = self.points.shape[1]
+        wanted = 3 + len(channels)
+        if columns != wanted:
             raise UserError(
-                f"points must have {width} columns for this model: x, y, z, "
-                f"{', '.join(channels.names)}; got {self.points.shape[1]}."
+                f"points must have {wanted} columns for this model: x, y, z, "
+                f"{', '.join(channels.names)}; got {columns}."
             )
         values = self.points[:, 3:].double()
         channels.check_known(values, "points")
@@ -65,6 +68,12 @@ class Cloud:
         tensor = torch.from_numpy(rows).to(self.points.device)
         return self.points[tensor], tensor
 
+    def in_its_type(self, generated: Tensor) -> Tensor:
+        """Return generated points in the type of the cloud, where that is floating point."""
+        if self.points.is_floating_point():
+            return generated.to(self.points.dtype)
+        return generated
+
     def take(self, rows: NDArray[np.int64]) -> "Cloud":
         """Return the cloud of some points."""
         tensor = torch.from_numpy(rows).to(self.points.device)
@@ -79,7 +88,8 @@ class Cloud:
         if space is None:
             return columns[:, :3]
         scales = np.array(check_scales(space, columns.shape[1]))
-        used = columns[:, scales > 0] * scales[scales > 0]
+        counts = scales > 0
+        used = columns[:, counts] * scales[counts]
         if not np.isfinite(used).all():
             raise UserError("space: a column is not finite.")
         return used
@@ -116,28 +126,26 @@ class Clouds:
         if isinstance(points, list | tuple):
             return cls._of_list(points, batch, weight)
         tensor = as_tensor("points", points)
-        is_one = tensor.ndim == 2
-        if tensor.ndim not in (2, 3) or tensor.shape[-1] < 3 or (batch is not None and not is_one):
-            wanted = "(N, 3) or (B, N, 3)" if batch is None else "(P, 3) with batch"
-            raise UserError(
-                f"points must have shape {wanted}, or more columns, got {tuple(tensor.shape)}."
-            )
+        _check_shape(tensor, batch)
         if weight is not None and not isinstance(weight, str):
             weight = check_weight(weight, tuple(tensor.shape[:-1]))
         is_array = isinstance(points, np.ndarray)
         if batch is not None:
-            sizes = cloud_sizes(len(tensor), as_tensor("batch", batch)).tolist()
-            if 0 in sizes:
-                raise UserError(f"batch: cloud {sizes.index(0)} has no points. Number from 0.")
-            parts = list(tensor.split(sizes))
-            weights = weight.split(sizes) if isinstance(weight, Tensor) else [weight] * len(sizes)
-            clouds = [Cloud(*pair) for pair in zip(parts, weights, strict=True)]
-            return cls(clouds, "flat", [is_array] * len(clouds))
-        if is_one:
+            return cls._of_flat(tensor, batch, weight, is_array)
+        if tensor.ndim == 2:
             return cls([Cloud(tensor, weight)], "one", [is_array])
-        weights = list(weight) if isinstance(weight, Tensor) else [weight] * len(tensor)
-        clouds = [Cloud(*pair) for pair in zip(tensor, weights, strict=True)]
+        clouds = _pair(list(tensor), weight)
         return cls(clouds, "batch", [is_array] * len(clouds))
+
+    @classmethod
+    def _of_flat(cls, points: Tensor, batch: Any, weight: Any, is_array: bool) -> "Clouds":
+        sizes = cloud_sizes(len(points), as_tensor("batch", batch)).tolist()
+        if 0 in sizes:
+            raise UserError(f"batch: cloud {sizes.index(0)} has no points. Number from 0.")
+        if isinstance(weight, Tensor):
+            weight = weight.split(sizes)
+        clouds = _pair(list(points.split(sizes)), weight)
+        return cls(clouds, "flat", [is_array] * len(clouds))
 
     @classmethod
     def _of_list(cls, points: Sequence[Any], batch: Any, weight: Any) -> "Clouds":
@@ -147,10 +155,15 @@ class Clouds:
             weight = [weight] * len(points)
         if not isinstance(weight, list | tuple) or len(weight) != len(points):
             raise UserError(f"weight must be a list for the {len(points)} clouds.")
-        parts = [cls.of(*pair) for pair in zip(points, [None] * len(points), weight, strict=True)]
-        if any(part.form != "one" for part in parts):
-            raise UserError("points must be a list of clouds (N, 3), got one of another shape.")
-        return cls([part.clouds[0] for part in parts], "list", [part.arrays[0] for part in parts])
+        clouds = []
+        arrays = []
+        for points_of_cloud, weight_of_cloud in zip(points, weight, strict=True):
+            given = cls.of(points_of_cloud, None, weight_of_cloud)
+            if given.form != "one":
+                raise UserError("points must be a list of clouds (N, 3), got one of another shape.")
+            clouds += given.clouds
+            arrays += given.arrays
+        return cls(clouds, "list", arrays)
 
     def join(self, samples: list[Sample], same_size: bool) -> tuple[Any, Any]:
         """Return the samples in the form of the clouds; a batch as one if all have one size."""
@@ -159,26 +172,58 @@ class Clouds:
         if self.form == "one":
             return _as_given(samples[0], self.arrays[0])
         if self.form == "flat":
-            sizes = [len(cloud.points) for cloud in self.clouds]
-            starts = np.cumsum([0, *sizes[:-1]]).tolist()
-            rows = [
-                rows + start
-                for (_, rows), start in zip(samples, starts, strict=True)
-                if rows is not None
-            ]
-            together = torch.cat([points for points, _ in samples])
-            is_selected = len(rows) == len(samples)
-            return _as_given((together, torch.cat(rows) if is_selected else None), self.arrays[0])
+            return _as_given(self._concatenated(samples), self.arrays[0])
         if self.form == "batch" and same_size:
-            rows = [rows for _, rows in samples if rows is not None]
-            stacked = torch.stack([points for points, _ in samples])
-            return _as_given((stacked, torch.stack(rows) if rows else None), self.arrays[0])
-        given = [_as_given(*pair) for pair in zip(samples, self.arrays, strict=True)]
-        return [points for points, _ in given], [rows for _, rows in given]
+            return _as_given(_stacked(samples), self.arrays[0])
+        all_points = []
+        all_rows = []
+        for sample, is_array in zip(samples, self.arrays, strict=True):
+            points, rows = _as_given(sample, is_array)
+            all_points.append(points)
+            all_rows.append(rows)
+        return all_points, all_rows
+
+    def _concatenated(self, samples: list[Sample]) -> Sample:
+        """Join samples in one tensor; rows count in the points of all clouds together."""
+        points = torch.cat([sample[0] for sample in samples])
+        all_rows = []
+        start = 0
+        for cloud, (_, rows) in zip(self.clouds, samples, strict=True):
+            if rows is None:
+                return points, None
+            all_rows.append(rows + start)
+            start += len(cloud.points)
+        return points, torch.cat(all_rows)
+
+
+def _check_shape(points: Tensor, batch: Any) -> None:
+    dimensions = (2, 3) if batch is None else (2,)
+    wanted = "(N, 3) or (B, N, 3)" if batch is None else "(P, 3) with batch"
+    if points.ndim not in dimensions or points.shape[-1] < 3:
+        raise UserError(
+            f"points must have shape {wanted}, or more columns, got {tuple(points.shape)}."
+        )
+
+
+def _pair(points: Sequence[Tensor], weight: Any) -> list[Cloud]:
+    """Return clouds from their points, and one weight for all or a sequence of weights."""
+    if weight is None or isinstance(weight, str):
+        return [Cloud(of_cloud, weight) for of_cloud in points]
+    return [Cloud(of_cloud, own) for of_cloud, own in zip(points, weight, strict=True)]
+
+
+def _stacked(samples: list[Sample]) -> Sample:
+    points = torch.stack([sample[0] for sample in samples])
+    rows = [rows for _, rows in samples if rows is not None]
+    if not rows:
+        return points, None
+    return points, torch.stack(rows)
 
 
 def _as_given(sample: Sample, as_array: bool) -> tuple[Any, Any]:
     points, rows = sample
     if not as_array:
         return points, rows
-    return points.numpy(), None if rows is None else rows.numpy()
+    if rows is None:
+        return points.numpy(), None
+    return points.numpy(), rows.numpy()

@@ -137,7 +137,8 @@ def _is_plain(points: Any, m: Any, batch: Any) -> bool:
     is_share = isinstance(m, float)
     if isinstance(m, list | tuple) or (is_share and batch is not None):
         return False
-    is_floating = (
-        points.dtype.kind == "f" if isinstance(points, np.ndarray) else points.is_floating_point()
-    )
+    if isinstance(points, np.ndarray):
+        is_floating = points.dtype.kind == "f"
+    else:
+        is_floating = points.is_floating_point()
     return is_floating and len(points.shape) in (2, 3) and points.shape[-1] == 3

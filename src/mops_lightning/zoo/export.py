@@ -62,9 +62,11 @@ class GeneratedPoints(nn.Module):
     @property
     def least_points(self) -> int:
         """How many points a cloud must have."""
-        if isinstance(self.sampler, MOPSNet) and isinstance(self.sampler.queries, FPSAnchors):
-            return self.sampler.queries.least_points(self.m)
-        return 1
+        if not isinstance(self.sampler, MOPSNet):
+            return 1
+        if not isinstance(self.sampler.queries, FPSAnchors):
+            return 1
+        return self.sampler.queries.least_points(self.m)
 
     def forward(self, points: Tensor) -> Tensor:
         """Return the generated points."""
@@ -103,33 +105,45 @@ def export(sampler: Sampler, path: Path, m: int | None = None) -> float:
     if path.suffix not in SUFFIXES:
         raise UserError(f"OUT must end in {' or '.join(SUFFIXES)}, got {path}.")
     net = GeneratedPoints(sampler, m)
-    m = net.m
-    channels = sampler.point_channels
-    width = 3 + len(channels)
-    number = 2 * max(m, net.least_points) + 3
-    example = torch.rand(2, number, width, generator=torch.Generator().manual_seed(0))
-    batch, points_axis = AXES
-    points_size = torch.export.Dim(points_axis, min=max(net.least_points, 2))
-    dynamic = ({0: torch.export.Dim(batch), 1: points_size},)
     with torch.no_grad(), atomic_write(path) as temporary:
-        program = torch.export.export(net, (example,), dynamic_shapes=dynamic)
+        program = _traced(net)
         if path.suffix == ".pt2":
-            packed = io.BytesIO()  # on a full disk, torch would abort the process
-            torch.export.save(program, packed)
-            temporary.write_bytes(packed.getvalue())
-            exported: Callable[[Tensor], Tensor] = torch.export.load(temporary).module()
+            exported = _to_pt2(program, temporary)
         else:
             exported = _to_onnx(program, temporary)
-        difference = max(
-            _difference(exported, sampler, m, points)
-            for points in _clouds(m, max(m, net.least_points), channels)
-        )
+        differences = []
+        for points in _clouds(net.m, max(net.m, net.least_points), sampler.point_channels):
+            differences.append(_difference(exported, sampler, net.m, points))
+        difference = max(differences)
         if difference > TOLERANCE:
             raise UserError(
                 f"{path}: its points differ from the sampler's by up to {difference:.1e}, more "
                 f"than {TOLERANCE:.0e}; nothing was written. Export in the other format."
             )
     return difference
+
+
+def _traced(net: GeneratedPoints) -> Any:
+    """Return the program of a sampler for any number of clouds and points."""
+    width = 3 + len(net.sampler.point_channels)
+    number = 2 * max(net.m, net.least_points) + 3
+    rng = torch.Generator().manual_seed(0)
+    example = torch.rand(2, number, width, generator=rng)
+    batch, points = AXES
+    axes = {
+        0: torch.export.Dim(batch),
+        1: torch.export.Dim(points, min=max(net.least_points, 2)),
+    }
+    return torch.export.export(net, (example,), dynamic_shapes=(axes,))
+
+
+def _to_pt2(program: Any, path: Path) -> Callable[[Tensor], Tensor]:
+    """Write a program in torch's format and return the function of the file."""
+    packed = io.BytesIO()  # on a full disk, torch would abort the process
+    torch.export.save(program, packed)
+    path.write_bytes(packed.getvalue())
+    exported: Callable[[Tensor], Tensor] = torch.export.load(path).module()
+    return exported
 
 
 def _difference(
@@ -189,4 +203,9 @@ def _to_onnx(program: Any, path: Path) -> Callable[[Tensor], Tensor]:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    return lambda points: torch.from_numpy(session.run(None, {"points": points.numpy()})[0])
+
+    def exported(points: Tensor) -> Tensor:
+        (generated,) = session.run(None, {"points": points.numpy()})
+        return torch.from_numpy(generated)
+
+    return exported

@@ -35,34 +35,44 @@ def downsample(
     array = _as_array(points)
     if array is None or not isinstance(size, int | float):
         return None
-    m = number_of(size, array.shape[-2])
-    if not 1 <= m <= array.shape[-2] or len(array) == 0 or not _is_start(start, array.shape[-2]):
+    number = array.shape[-2]
+    m = number_of(size, number)
+    if not 1 <= m <= number or len(array) == 0 or not _is_start(start, number):
         return None
-    clouds = array if array.ndim == 3 else array[None]
-    rows = rows_from_start(clouds, m, SeededOrder(seed, True), start, threads=number_of_threads())
-    if rows is None:
+    is_one = array.ndim == 2
+    clouds = array[None] if is_one else array
+    order = SeededOrder(seed, True)
+    chosen = rows_from_start(clouds, m, order, start, threads=number_of_threads())
+    if chosen is None:
         return None
-    given = rows if array.ndim == 3 else rows[0]
+    rows = chosen[0] if is_one else chosen
     if isinstance(points, np.ndarray):
-        return _gathered(array, given), given
-    return _tensors(points, given)
+        return _gathered(array, rows), rows
+    return _tensors(points, rows)
 
 
 def _as_array(points: Any) -> NDArray[Any] | None:
     """Return the coordinates as an array that shares the memory, or None for other input."""
     if isinstance(points, np.ndarray):
         array = np.asarray(points)  # without subclasses, such as np.memmap
-    else:
-        torch = sys.modules.get("torch")
-        if torch is None or not isinstance(points, torch.Tensor) or not points.is_cpu:
-            return None
-        if points.dtype not in (torch.float32, torch.float64) or points.is_sparse:
-            return None
+    elif _is_plain_tensor(points):
         array = points.detach().numpy()
+    else:
+        return None
     is_float = array.dtype in (np.float32, np.float64) and array.dtype.isnative
-    if not is_float or array.ndim not in (2, 3) or array.shape[-1] != 3:
+    is_clouds = array.ndim in (2, 3) and array.shape[-1] == 3
+    if not is_float or not is_clouds:
         return None
     return array
+
+
+def _is_plain_tensor(points: Any) -> bool:
+    """Return whether this is a dense tensor of floats on the CPU, without importing torch."""
+    torch = sys.modules.get("torch")
+    if torch is None or not isinstance(points, torch.Tensor):
+        return False
+    is_float = points.dtype in (torch.float32, torch.float64)
+    return bool(points.is_cpu and is_float and not points.is_sparse)
 
 
 def _is_start(start: Any, number: int) -> bool:

@@ -17,10 +17,13 @@ def find_sampler(
     method: str | Path, m: int, points: Any, start: int | str | None, seed: int | None
 ) -> Sampler:
     """Return the sampler of a method, or of a model on the device of the points."""
-    if method in names.UNTRAINED:
-        arguments = {} if start is None else {"start": start}
-        return untrained(str(method), m, seed or 0, **arguments)
-    return _model(str(method), str(getattr(points, "device", "cpu")))
+    name = str(method)
+    if method not in names.UNTRAINED:
+        device = getattr(points, "device", "cpu")
+        return _model(name, str(device))
+    if start is None:
+        return untrained(name, m, seed or 0)
+    return untrained(name, m, seed or 0, start=start)
 
 
 def untrained(method: str, m: int, seed: int = 0, **arguments: Any) -> Sampler:
@@ -38,13 +41,14 @@ def _model(name: str, device: str) -> Sampler:
         UserError: there is no such method or model.
     """
     known = {*names.UNTRAINED, *names.available()}
-    exists = addresses.is_address(name) or Path(name).expanduser().exists()
-    if not name or not (name in known or exists):
+    is_known = name in known or addresses.is_address(name) or Path(name).expanduser().exists()
+    if not name or not is_known:
         raise UserError(f"method: unknown {name!r}.{did_you_mean(name, known)}")
     path = weights.of_run(names.resolve(name))
     if not path.is_file():
         raise UserError(f"method: {name!r} holds no weights: there is no {path}.")
-    return _loaded(path, path.stat().st_mtime_ns, device)
+    changed = path.stat().st_mtime_ns
+    return _loaded(path, changed, device)
 
 
 @lru_cache(maxsize=4)

@@ -27,8 +27,13 @@ SEES_CHANNELS = "sees_channels"
 HINT = "Give a sampler, or the weights of a run with learn=sampler or learn=joint."
 NET_HINT = "Give the weights of a task net, such as those of a run with learn=task."
 NETS: tuple[type[nn.Module], ...] = (
-    *(pointnet.PointNetVanilla, pointnet.PointNetTransform, dgcnn.DGCNN, pcrnet.PCRNet),
-    *(autoencoder.AutoEncoder, atlasnet.AtlasNet, foldingnet.MFoldingNet),
+    pointnet.PointNetVanilla,
+    pointnet.PointNetTransform,
+    dgcnn.DGCNN,
+    pcrnet.PCRNet,
+    autoencoder.AutoEncoder,
+    atlasnet.AtlasNet,
+    foldingnet.MFoldingNet,
 )
 """The task nets that files may name."""
 
@@ -36,9 +41,13 @@ NETS: tuple[type[nn.Module], ...] = (
 @cache
 def package_samplers() -> list[type[Sampler]]:
     """Return the samplers that files may name: all of the public API."""
-    public = [getattr(mops_lightning, name) for name in mops_lightning.__all__]
-    classes = [value for value in public if isinstance(value, type) and issubclass(value, Sampler)]
-    return [cls for cls in classes if cls is not Sampler]
+    samplers: list[type[Sampler]] = []
+    for name in mops_lightning.__all__:
+        public = getattr(mops_lightning, name)
+        is_sampler = isinstance(public, type) and issubclass(public, Sampler)
+        if is_sampler and public is not Sampler:
+            samplers.append(public)
+    return samplers
 
 
 def load(path: str | Path, cls: type[Sampler] | None = None) -> Sampler:
@@ -107,23 +116,28 @@ def read_net(path: str | Path) -> tuple[nn.Module, list[str]]:
     """Load a trained task net, and the names of its classes; see ``load_net``."""
     path = weights.of_task_net(path)
     content = weights.read(path)
-    if content["config"].get("learn") not in ("task", "joint"):
+    config = content["config"]
+    if config.get("learn") not in ("task", "joint"):
         raise UserError(f"{path} holds a sampler, not a task net. {NET_HINT}")
-    task = content["config"].get("task")
-    node = task.get("net") if isinstance(task, dict) else None
-    found: type[nn.Module] | None = _known_class(node, NETS)
-    if node is None or found is None:
+    node = None
+    if isinstance(config.get("task"), dict):
+        node = config["task"].get("net")
+    net_class: type[nn.Module] | None = _known_class(node, NETS)
+    if node is None or net_class is None:
         known = ", ".join(cls.__name__ for cls in NETS)
         raise UserError(f"{path}: task.net must be one of {known}, got {_target(node)!r:.99}.")
-    if "num_classes" in signature(found).parameters:
+    if "num_classes" in signature(net_class).parameters:
         node = {**node, "num_classes": len(content["classes"])}
     node = _with_channels(node, content["channels"])
     state = {name.removeprefix("net."): value for name, value in content["state"].items()}
-    return _build(found, node, state, path, "task.net", NET_HINT), content["classes"]
+    net = _build(net_class, node, state, path, "task.net", NET_HINT)
+    return net, content["classes"]
 
 
 def _target(node: Any) -> Any:
-    return node.get("_target_") if isinstance(node, dict) else None
+    if not isinstance(node, dict):
+        return None
+    return node.get("_target_")
 
 
 def _with_channels(node: Any, channels: PointChannels) -> Any:
@@ -136,7 +150,10 @@ def _with_channels(node: Any, channels: PointChannels) -> Any:
 def _known_class(node: Any, known: Iterable[type[M]]) -> type[M] | None:
     """Return the class that a file names, if it is one of the known ones."""
     target = _target(node)
-    return next((cls for cls in known if target == f"{cls.__module__}.{cls.__qualname__}"), None)
+    for cls in known:
+        if target == f"{cls.__module__}.{cls.__qualname__}":
+            return cls
+    return None
 
 
 def _build(

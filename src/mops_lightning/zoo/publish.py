@@ -5,6 +5,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.records.metric_info import metric_info
@@ -49,38 +51,26 @@ def add(
     Raises:
         UserError: the name is not allowed or taken, or the run has no weights.
     """
-    if not names.is_name(name):
-        raise UserError(
-            f"NAME must be words of a-z, 0-9, _ and - with dots between, such as "
-            f"fmops.chairs-m64, got {name!r}."
-        )
-    path = folder / f"{name}{model_file.SUFFIX}"
-    if path.exists() and not overwrite:
-        raise UserError(f"{path} exists. Give another NAME, or --overwrite.")
-    record = run_record.read(run)
-    if record.status != "completed" or "weights" not in record.files:
-        raise UserError(f"{run}: not a completed run that kept its weights. Give another RUN.")
-    if record.partial:
-        raise UserError(
-            f"{run}: {' and '.join(record.partial)}. A model is made from a whole run. Repeat "
-            "it without what shortened it."
-        )
+    path = _free_path(folder, name, overwrite)
+    record = _whole_record(run)
     content = weights.read(weights.of_run(run))
     state = content["state"]
-    wide = {name for name, value in state.items() if value.ndim == 2 and value.numel() >= WIDE}
-    if half and wide:
-        state |= {name: state[name].half() for name in wide}
+    wide = _wide_names(state) if half else []
+    for wide_name in wide:
+        state[wide_name] = state[wide_name].half()
+    if wide:
         notes = f"{notes} {ROUNDED}".lstrip()
     files = {"weights": name}
     if record.config["learn"] == "sampler":
         used = _task_net(task_net, record, folder)
-        files |= {"task_weights": used} if used else {}
+        if used is not None:
+            files["task_weights"] = used
     card: dict[str, Any] = {
         "schema": model_file.MODEL,
         "name": name,
         "transform": "unit_sphere",
         "licence": licence,
-        "precision": "float16" if half and wide else "float32",
+        "precision": "float16" if wide else "float32",
         "notes": notes,
         "classes": content["classes"],
         "figures": card_figures(record),
@@ -90,6 +80,53 @@ def add(
         card["channels"] = content["channels"].to_plain()
     model_file.write(path, card, state)
     return path
+
+
+def _free_path(folder: Path, name: str, overwrite: bool) -> Path:
+    """Return the file of a new model.
+
+    Raises:
+        UserError: the name is not allowed or taken.
+    """
+    if not names.is_name(name):
+        raise UserError(
+            f"NAME must be words of a-z, 0-9, _ and - with dots between, such as "
+            f"fmops.chairs-m64, got {name!r}."
+        )
+    path = folder / f"{name}{model_file.SUFFIX}"
+    if path.exists() and not overwrite:
+        raise UserError(f"{path} exists. Give another NAME, or --overwrite.")
+    return path
+
+
+def _whole_record(run: Path) -> RunRecord:
+    """Return the record of a completed run with weights that nothing shortened.
+
+    Raises:
+        UserError: the run is another one.
+    """
+    record = run_record.read(run)
+    if not _has_weights(record):
+        raise UserError(f"{run}: not a completed run that kept its weights. Give another RUN.")
+    if record.partial:
+        raise UserError(
+            f"{run}: {' and '.join(record.partial)}. A model is made from a whole run. Repeat "
+            "it without what shortened it."
+        )
+    return record
+
+
+def _has_weights(record: RunRecord) -> bool:
+    return record.status == "completed" and "weights" in record.files
+
+
+def _wide_names(state: dict[str, Tensor]) -> list[str]:
+    """Return the names of the weight matrices that may be stored in 16 bits."""
+    wide = []
+    for name, value in state.items():
+        if value.ndim == 2 and value.numel() >= WIDE:
+            wide.append(name)
+    return wide
 
 
 def add_all(runs: Iterable[Path], sweep: Path, folder: Path) -> list[Path]:
@@ -106,34 +143,43 @@ def add_all(runs: Iterable[Path], sweep: Path, folder: Path) -> list[Path]:
     Returns:
         The files, in the order in which they were written.
     """
-    trained = []
+    task_nets: list[tuple[str, Path]] = []
+    samplers: list[tuple[str, Path]] = []
     for run in runs:
         record = run_record.read(run)
-        if record.status == "completed" and "weights" in record.files:
-            parts = (sweep.name, str(run.relative_to(sweep)))
-            name = ".".join(re.sub(r"[^a-z0-9_-]+", "-", part.lower()) for part in parts)
-            trained.append((record.config["learn"] != "task", name, run))
-    return [add(run, name, folder, overwrite=True) for _, name, run in sorted(trained)]
+        if not _has_weights(record):
+            continue
+        parts = (sweep.name, str(run.relative_to(sweep)))
+        name = ".".join(re.sub(r"[^a-z0-9_-]+", "-", part.lower()) for part in parts)
+        trained = task_nets if record.config["learn"] == "task" else samplers
+        trained.append((name, run))
+    in_order = [*sorted(task_nets), *sorted(samplers)]
+    return [add(run, name, folder, overwrite=True) for name, run in in_order]
 
 
 def card_figures(record: RunRecord) -> dict[str, Any]:
     """Return a record's score by readout, at the run's own size, for a card."""
-    scores = {key: value for key, value in record.metrics.items() if value is not None}
-    named = record.score_name
-    parts = {key: part for key in scores if (part := parse_metric_name(key))}
-    if named not in parts:
+    scores: dict[MetricName, float] = {}
+    for key, value in record.metrics.items():
+        parsed = parse_metric_name(key)
+        if value is not None and parsed is not None:
+            scores[parsed] = value
+    score = parse_metric_name(record.score_name)
+    if score is None or score not in scores:
         raise UserError("the record of the run has no test score. Give a run that was tested.")
-    main = parts[named]
-    info = metric_info(main.metric, [record])
-    full = main.readout == FULL
-    shown = {MetricName(main.m, one, main.metric) for one in ROWS if (one == FULL) == full}
+    info = metric_info(score.metric, [record])
+    is_full = score.readout == FULL
+    values = {}
+    for name, value in scores.items():
+        is_of_score = (name.m, name.metric) == (score.m, score.metric)
+        is_shown = is_of_score and name.readout in ROWS and (name.readout == FULL) == is_full
+        if is_shown:
+            values[name.readout] = info.format(value)
     return {
         "metric": info.title,
-        "m": None if full else main.m or record.config["m"],
+        "m": None if is_full else score.m or record.config["m"],
         "points": record.config["dataset"].get("n_points"),
-        "values": {
-            part.readout: info.format(scores[key]) for key, part in parts.items() if part in shown
-        },
+        "values": values,
     }
 
 

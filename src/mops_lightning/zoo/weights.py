@@ -188,11 +188,16 @@ def fit_state(
 def first_nonfinite(state: Any, name: str = "") -> str | None:
     """Return the dotted name of the first tensor with NaN or infinity in nested data, if any."""
     if isinstance(state, Tensor):
-        return None if bool(torch.isfinite(state).all()) else name
+        is_finite = bool(torch.isfinite(state).all())
+        return None if is_finite else name
     parts: Iterable[tuple[Any, Any]] = ()
     if isinstance(state, Mapping):
         parts = state.items()
     elif isinstance(state, list | tuple):
         parts = enumerate(state)
-    named = ((f"{name}.{key}" if name else str(key), value) for key, value in parts)
-    return next(filter(None, (first_nonfinite(value, path) for path, value in named)), None)
+    for key, value in parts:
+        path = f"{name}.{key}" if name else str(key)
+        nonfinite = first_nonfinite(value, path)
+        if nonfinite:
+            return nonfinite
+    return None
