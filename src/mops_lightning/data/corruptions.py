@@ -91,23 +91,26 @@ def corrupt(clouds: Clouds, spec: str, channels: PointChannels = NO_CHANNELS) ->
         raise UserError(
             f"test_corruption={spec} needs clouds of one size. Set dataset.n_points to a number."
         )
-    points = [
-        apply(Cloud(cloud, channels), level, generator(STREAM, s)).points
-        for s, cloud in enumerate(clouds.points)
-    ]
-    stacked = torch.stack(points)
-    same = stacked.shape == clouds.points.shape  # the same points in the same order, moved
-    return clouds._replace(points=stacked, parts=clouds.parts if same else None)
+    corrupted = []
+    for number, points in enumerate(clouds.points):
+        cloud = apply(Cloud(points, channels), level, generator(STREAM, number))
+        corrupted.append(cloud.points)
+    stacked = torch.stack(corrupted)
+    parts = None
+    if stacked.shape == clouds.points.shape:  # the same points in the same order, moved
+        parts = clouds.parts
+    return clouds._replace(points=stacked, parts=parts)
 
 
 def parse(spec: str) -> tuple[Corruption, float]:
     """Return the function and the level of ``KIND-SEVERITY``."""
     kind, _, severity = spec.rpartition("-")
     if kind not in KINDS or severity not in ("1", "2", "3", "4", "5"):
-        known = kind in KINDS or spec in KINDS
+        is_known = kind in KINDS or spec in KINDS
+        hint = "" if is_known else did_you_mean(kind or spec, KINDS)
         raise UserError(
             "test_corruption must be a kind with a severity of 1 to 5, such as shear-3, got "
-            f"{spec!r}.{'' if known else did_you_mean(kind or spec, KINDS)}"
+            f"{spec!r}.{hint}"
         )
     apply, levels = KINDS[kind]
     return apply, levels[int(severity) - 1]
@@ -123,7 +126,8 @@ def rotation(cloud: Cloud, degrees: float, rng: torch.Generator) -> Cloud:
     """Rotate by an angle of up to ``degrees`` about a random axis."""
     axis = normalize(torch.randn(3, generator=rng), dim=0)
     half = math.radians(degrees) * _uniform((1,), rng) / 2
-    return cloud.mapped(quaternion_to_matrix(torch.cat([half.cos(), half.sin() * axis])))
+    quaternion = torch.cat([half.cos(), half.sin() * axis])
+    return cloud.mapped(quaternion_to_matrix(quaternion))
 
 
 def scaling(cloud: Cloud, factor: float, rng: torch.Generator) -> Cloud:
@@ -150,22 +154,25 @@ def distortion(cloud: Cloud, amount: float, rng: torch.Generator) -> Cloud:
 def density_down(cloud: Cloud, places: float, rng: torch.Generator) -> Cloud:
     """Thin the cloud to a quarter in ``places`` neighbourhoods of a tenth of the points."""
     size = len(cloud.points) // 10
+    number_gone = round(0.75 * size)
     for _ in range(int(places)):
         near = _nearest(cloud, size, rng)
-        gone = near[torch.randperm(size, generator=rng)[: round(0.75 * size)]]
-        cloud = cloud.without(gone)
+        order = torch.randperm(size, generator=rng)
+        cloud = cloud.without(near[order[:number_gone]])
     return cloud
 
 
 def density_up(cloud: Cloud, places: float, rng: torch.Generator) -> Cloud:
     """Thin the cloud outside of ``places`` neighbourhoods, by as many points as there go inside."""
     size = len(cloud.points) // 10
-    outside = torch.ones(len(cloud.points), dtype=torch.bool)
+    number_gone = int(places) * round(0.75 * size)
+    is_outside = torch.ones(len(cloud.points), dtype=torch.bool)
     for _ in range(int(places)):
-        outside[_nearest(cloud, size, rng)] = False
-    rows = outside.nonzero()[:, 0]
-    gone = rows[torch.randperm(len(rows), generator=rng)[: int(places) * round(0.75 * size)]]
-    return cloud.without(gone)
+        near = _nearest(cloud, size, rng)
+        is_outside[near] = False
+    rows = is_outside.nonzero()[:, 0]
+    order = torch.randperm(len(rows), generator=rng)
+    return cloud.without(rows[order[:number_gone]])
 
 
 def cutout(cloud: Cloud, holes: float, rng: torch.Generator) -> Cloud:
@@ -201,17 +208,20 @@ def add_global(cloud: Cloud, share: float, rng: torch.Generator) -> Cloud:
 def add_local(cloud: Cloud, share: float, rng: torch.Generator) -> Cloud:
     """Add points around one to eight points, at distances of about 0.1."""
     places = cloud.places
+    total = round(share * len(places))
     added = []
-    for size in _split(round(share * len(places)), rng):
-        centre = places[torch.randint(len(places), (), generator=rng)]
+    for size in _split(total, rng):
+        row = torch.randint(len(places), (), generator=rng)
         std = 0.1 + 0.025 * _uniform((), rng)
-        added.append(centre + std * torch.randn(size, 3, generator=rng))
+        offsets = std * torch.randn(size, 3, generator=rng)
+        added.append(places[row] + offsets)
     return cloud.followed_by(torch.cat(added), rng)
 
 
 def background(cloud: Cloud, share: float, rng: torch.Generator) -> Cloud:
     """Add points that are uniform in the cube from -1 to 1."""
-    return cloud.followed_by(_uniform((round(share * len(cloud.points)), 3), rng), rng)
+    count = round(share * len(cloud.points))
+    return cloud.followed_by(_uniform((count, 3), rng), rng)
 
 
 KINDS: dict[str, tuple[Corruption, tuple[float, float, float, float, float]]] = {
@@ -240,8 +250,9 @@ def _uniform(shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
 def _nearest(cloud: Cloud, size: int, rng: torch.Generator) -> Tensor:
     """Return the rows of the points nearest to a random point."""
     places = cloud.places
-    centre = places[torch.randint(len(places), (), generator=rng)]
-    return (places - centre).norm(dim=1).topk(size, largest=False).indices
+    row = torch.randint(len(places), (), generator=rng)
+    distances = (places - places[row]).norm(dim=1)
+    return distances.topk(size, largest=False).indices
 
 
 def _split(total: int, rng: torch.Generator) -> list[int]:

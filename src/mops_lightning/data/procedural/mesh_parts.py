@@ -38,9 +38,10 @@ def cushion(x: Span, y: Span, z: Span, radius: float) -> Trimesh:
     """
     ball, faces = _ball()
     low, high = np.array((x, y, z)).T
+    centre = (low + high) / 2
     half = (high - low) / 2
     round_off = np.minimum(radius, half)
-    vertices = (low + high) / 2 + np.sign(ball) * (half - round_off) + ball * round_off
+    vertices = centre + np.sign(ball) * (half - round_off) + ball * round_off
     return Trimesh(vertices, faces, process=False)
 
 
@@ -51,9 +52,8 @@ def _ball() -> tuple[Array, NDArray[np.int64]]:
     Its octants can therefore be moved apart; vertices on a plane stay in the middle of a side.
     """
     angles = np.linspace(-np.pi / 2, np.pi / 2, 9)
-    ball = trimesh.creation.revolve(
-        np.column_stack((np.cos(angles), np.sin(angles))), sections=16, process=False
-    )
+    profile = np.column_stack((np.cos(angles), np.sin(angles)))
+    ball = trimesh.creation.revolve(profile, sections=16, process=False)
     return np.asarray(ball.vertices).round(12), np.asarray(ball.faces)
 
 
@@ -64,12 +64,15 @@ def loft(rings: ArrayLike) -> Trimesh:
         rings: ``(R, K, 3)``, R cross-sections of K points each.
     """
     stack = np.asarray(rings, dtype=np.float64)
-    ends = stack[[0, -1]].mean(1, keepdims=True).repeat(stack.shape[1], axis=1)
-    stack = np.concatenate((ends[:1], stack, ends[1:]))
+    middles = stack[[0, -1]].mean(1, keepdims=True)
+    first, last = middles.repeat(stack.shape[1], axis=1)
+    stack = np.concatenate((first[None], stack, last[None]))
     rows, sides = stack.shape[:2]
     here = np.arange((rows - 1) * sides)
     after = here // sides * sides + (here + 1) % sides
-    faces = np.stack((here, after, here + sides, after, after + sides, here + sides), axis=1)
+    next_here = here + sides
+    next_after = after + sides
+    faces = np.stack((here, after, next_here, after, next_after, next_here), axis=1)
     return Trimesh(stack.reshape(-1, 3), faces.reshape(-1, 3), process=False)
 
 
@@ -93,21 +96,30 @@ def tube(
     along = np.gradient(centres, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     if across is None:
-        across = np.cross(along[0], np.eye(3)[np.abs(along[0]).argmin()])
+        start = along[0]
+        across = np.cross(start, np.eye(3)[np.abs(start).argmin()])
     normal = np.asarray(across, dtype=np.float64)
     normal = np.broadcast_to(normal / np.linalg.norm(normal), centres.shape)
-    turn = 2 * np.pi * (np.arange(sections) + 0.5) / sections
-    # Radius of the inscribed circle, so that bars with few corners are not thinner.
-    reach = (np.broadcast_to(radii, len(centres)) / np.cos(np.pi / sections))[:, None, None]
     first = normal[:, None] * flatten
     second = np.cross(along, normal)[:, None]
-    rings = np.cos(turn)[None, :, None] * first + np.sin(turn)[None, :, None] * second
-    return loft(centres[:, None] + reach * rings)
+
+    turn = 2 * np.pi * (np.arange(sections) + 0.5) / sections
+    cosines = np.cos(turn)[None, :, None]
+    sines = np.sin(turn)[None, :, None]
+    ring = cosines * first + sines * second
+    # Radius of the inscribed circle, so that bars with few corners are not thinner.
+    reach = np.broadcast_to(radii, len(centres)) / np.cos(np.pi / sections)
+    return loft(centres[:, None] + reach[:, None, None] * ring)
 
 
 def rod(start: ArrayLike, end: ArrayLike, radius: ArrayLike, sections: int = 12) -> Trimesh:
     """Return a straight bar; ``radius`` is one number, or one per end."""
     return tube(np.stack((np.asarray(start), np.asarray(end))), radius, sections)
+
+
+def post(x: float, z: float, height: float, radius: float, sections: int) -> Trimesh:
+    """Return an upright bar that stands on the ground."""
+    return rod((x, 0, z), (x, height, z), radius, sections)
 
 
 def turned(profile: ArrayLike, sections: int = 32) -> Trimesh:
@@ -136,7 +148,9 @@ def smooth(points: ArrayLike, steps: int = 24) -> Array:
         steps: number of points of the result, ``(steps, D)``.
     """
     knots = np.asarray(points, dtype=np.float64)
-    return PchipInterpolator(np.arange(len(knots)), knots)(np.linspace(0, len(knots) - 1, steps))
+    places = np.arange(len(knots))
+    curve = PchipInterpolator(places, knots)
+    return curve(np.linspace(0, len(knots) - 1, steps))
 
 
 def named(part: str, *meshes: Trimesh) -> list[Trimesh]:
@@ -149,12 +163,19 @@ def named(part: str, *meshes: Trimesh) -> list[Trimesh]:
 def join(parts: Sequence[Trimesh]) -> Trimesh:
     """Return one mesh of all parts; ``metadata["parts"]`` names the part of every face."""
     # trimesh's concatenate also merges normals and visuals, at a third of the time of the dataset.
-    starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-    vertices = np.concatenate([part.vertices for part in parts])
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
-    names = [part.metadata.get("part", "") for part in parts]
-    of_faces = np.repeat(names, [len(part.faces) for part in parts])
-    return Trimesh(vertices, faces, process=False, metadata={"parts": of_faces})
+    faces = []
+    names = []
+    start = 0
+    for part in parts:
+        faces.append(part.faces + start)
+        names += [part.metadata.get("part", "")] * len(part.faces)
+        start += len(part.vertices)
+    return Trimesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate(faces),
+        process=False,
+        metadata={"parts": np.array(names)},
+    )
 
 
 def four_legs(
@@ -179,8 +200,11 @@ def four_legs(
     corners = np.array([(-1, 1), (1, 1), (1, -1), (-1, -1)])
     tops = corners * (width / 2 - radius, depth / 2 - radius)
     feet = tops + corners * splay * height
-    ends = np.stack((np.insert(tops, 1, height, axis=1), np.insert(feet, 1, 0.0, axis=1)), axis=1)
-    return [rod(top, foot, (radius, radius * taper), sections) for top, foot in ends], ends
+    tops = np.insert(tops, 1, height, axis=1)
+    feet = np.insert(feet, 1, 0.0, axis=1)
+    ends = np.stack((tops, feet), axis=1)
+    legs = [rod(top, foot, (radius, radius * taper), sections) for top, foot in ends]
+    return legs, ends
 
 
 def rungs(ends: Array, level: float, radius: float) -> list[Trimesh]:
@@ -188,5 +212,8 @@ def rungs(ends: Array, level: float, radius: float) -> list[Trimesh]:
 
     ``ends`` is from ``four_legs``, ``level`` relative to the height of the legs.
     """
-    at = ends[:, 1] + level * (ends[:, 0] - ends[:, 1])
-    return [rod(at[i], at[(i + 1) % len(at)], radius, 8) for i in range(len(at))]
+    tops = ends[:, 0]
+    feet = ends[:, 1]
+    places = feet + level * (tops - feet)
+    next_places = np.roll(places, -1, axis=0)
+    return [rod(here, there, radius, 8) for here, there in zip(places, next_places, strict=True)]

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from trimesh import Trimesh
 
 from mops_lightning.data.procedural.airplane import airplane
-from mops_lightning.data.procedural.furniture import bed, desk, lamp, shelf, table
+from mops_lightning.data.procedural.beds import bed
+from mops_lightning.data.procedural.desks import desk
+from mops_lightning.data.procedural.furniture import lamp, shelf, table
 from mops_lightning.data.procedural.seats import chair, sofa, stool
 from mops_lightning.data.procedural.vessels import bottle, bowl, bucket, cup, goblet, teapot, vase
 from mops_lightning.ops.points import UnitSphere

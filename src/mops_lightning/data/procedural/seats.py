@@ -5,6 +5,7 @@ from numpy.random import Generator
 from trimesh import Trimesh
 
 from mops_lightning.data.procedural.mesh_parts import (
+    Array,
     Span,
     around,
     box,
@@ -18,6 +19,9 @@ from mops_lightning.data.procedural.mesh_parts import (
     tube,
 )
 
+POST = 0.045
+"""Radius of the posts of a chair's back."""
+
 
 def chair(rng: Generator) -> Trimesh:
     """Return a chair with one of four backs, legs or a swivel foot, and possibly arms."""
@@ -26,25 +30,40 @@ def chair(rng: Generator) -> Trimesh:
     seat = rng.uniform(0.65, 1.15)
     rise = rng.uniform(0.3, 1.25)
     thick = rng.uniform(0.06, 0.16)
-    parts = named("seat", _pad(rng, width, depth, (seat - thick, seat)))
+    under = seat - thick
+    parts = named("seat", _pad(rng, width, depth, (under, seat)))
     if rng.random() < 0.25:
-        parts += named("leg", *_swivel(rng, seat - thick, min(width, depth) * 0.5))
+        legs = _swivel(rng, under, min(width, depth) * 0.5)
     else:
-        legs, ends = four_legs(
-            rng, width, depth, seat - thick, rng.uniform(0.035, 0.06), rng.uniform(0, 0.12)
-        )
-        parts += named("leg", *legs)
-        if rng.random() < 0.4:
-            parts += named("leg", *rungs(ends, rng.uniform(0.25, 0.5), 0.025))
+        legs = _chair_legs(rng, width, depth, under)
+    parts += named("leg", *legs)
     parts += named("back", _chair_back(rng, width, -depth / 2, (seat, seat + rise)))
     if rng.random() < 0.3:
         y = seat + rise * rng.uniform(0.3, 0.6)
         reach = depth * rng.uniform(0.25, 0.45)
+        z = (-depth / 2, reach)
         for side in (-1, 1):
             x = side * (width / 2 - 0.03)
-            post = rod((x, seat - thick / 2, reach - 0.06), (x, y, reach - 0.06), 0.03, 8)
-            parts += named("arm", box(around(0.09, x), around(0.05, y), (-depth / 2, reach)), post)
+            parts += named("arm", *_chair_arm(x, (seat - thick / 2, y), z))
     return join(parts)
+
+
+def _chair_legs(rng: Generator, width: float, depth: float, height: float) -> list[Trimesh]:
+    radius = rng.uniform(0.035, 0.06)
+    splay = rng.uniform(0, 0.12)
+    parts, ends = four_legs(rng, width, depth, height, radius, splay)
+    if rng.random() < 0.4:
+        level = rng.uniform(0.25, 0.5)
+        parts += rungs(ends, level, 0.025)
+    return parts
+
+
+def _chair_arm(x: float, y: Span, z: Span) -> list[Trimesh]:
+    low, high = y
+    front = z[1] - 0.06
+    rest = box(around(0.09, x), around(0.05, high), z)
+    support = rod((x, low, front), (x, high, front), 0.03, 8)
+    return [rest, support]
 
 
 def _pad(rng: Generator, width: float, depth: float, y: Span) -> Trimesh:
@@ -56,7 +75,8 @@ def _pad(rng: Generator, width: float, depth: float, y: Span) -> Trimesh:
 def _swivel(rng: Generator, height: float, reach: float) -> list[Trimesh]:
     star = rng.integers(4, 6)
     parts = [rod((0, 0.12, 0), (0, height, 0), 0.05)]
-    for turn in 2 * np.pi * np.arange(star) / star + np.pi / 2:
+    turns = 2 * np.pi * np.arange(star) / star + np.pi / 2
+    for turn in turns:
         foot = (reach * np.cos(turn), 0.04, reach * np.sin(turn))
         parts.append(rod((0, 0.15, 0), foot, (0.05, 0.03), 6))
     return parts
@@ -65,28 +85,55 @@ def _swivel(rng: Generator, height: float, reach: float) -> list[Trimesh]:
 def _chair_back(rng: Generator, width: float, z: float, y: Span) -> Trimesh:
     """Return a back of posts and rails, slats, rungs or a panel, at ``z`` and tilted back."""
     low, high = y
-    post = 0.045
     half = width / 2 - 0.045
+    x = (-half, half)
     kind = rng.integers(4)
     if kind == 0:
-        gap = rng.uniform(0.0, 0.25)
-        parts = [cushion(around(width * 0.95), (low + gap, high), around(0.11), 0.05)]
-        parts += [rod((x, low - 0.05, 0), (x, low + gap + 0.1, 0), post) for x in (-half, half)]
+        parts = _cushioned_back(rng, width, x, y)
     else:
-        parts = [rod((x, low - 0.05, 0), (x, high, 0), post, 8) for x in (-half, half)]
-        parts.append(box((-half, half), (high - 0.16, high), around(0.06)))
+        parts = _back_frame(x, y)
     if kind == 1:
-        for x in np.linspace(-half, half, rng.integers(5, 8))[1:-1]:
-            parts.append(box(around(0.06, x), (low, high - 0.16), around(0.04)))
+        parts += _slats(rng, x, y)
     elif kind == 2:
-        for level in np.linspace(low, high - 0.08, rng.integers(4, 6))[1:-1]:
-            parts.append(box((-half, half), around(0.1, level), around(0.04)))
+        parts += _rails(rng, x, y)
     elif kind == 3:
-        parts.append(box((-half, half), (low + (high - low) * 0.2, high - 0.1), around(0.04)))
+        panel = (low + (high - low) * 0.2, high - 0.1)
+        parts.append(box(x, panel, around(0.04)))
     back = join(parts)
     lean = rng.uniform(0.0, 0.28)
-    back.vertices[:, 2] += z + 0.05 - lean * np.clip(back.vertices[:, 1] - low, 0, None)
+    above_seat = np.clip(back.vertices[:, 1] - low, 0, None)
+    back.vertices[:, 2] += z + 0.05 - lean * above_seat
     return back
+
+
+def _cushioned_back(rng: Generator, width: float, x: Span, y: Span) -> list[Trimesh]:
+    low, high = y
+    gap = rng.uniform(0.0, 0.25)
+    parts = [cushion(around(width * 0.95), (low + gap, high), around(0.11), 0.05)]
+    for side in x:
+        parts.append(rod((side, low - 0.05, 0), (side, low + gap + 0.1, 0), POST))
+    return parts
+
+
+def _back_frame(x: Span, y: Span) -> list[Trimesh]:
+    """Return two posts and the rail between their upper ends."""
+    low, high = y
+    posts = [rod((side, low - 0.05, 0), (side, high, 0), POST, 8) for side in x]
+    rail = box(x, (high - 0.16, high), around(0.06))
+    return [*posts, rail]
+
+
+def _slats(rng: Generator, x: Span, y: Span) -> list[Trimesh]:
+    low, high = y
+    left, right = x
+    places = np.linspace(left, right, rng.integers(5, 8))[1:-1]
+    return [box(around(0.06, place), (low, high - 0.16), around(0.04)) for place in places]
+
+
+def _rails(rng: Generator, x: Span, y: Span) -> list[Trimesh]:
+    low, high = y
+    levels = np.linspace(low, high - 0.08, rng.integers(4, 6))[1:-1]
+    return [box(x, around(0.1, level), around(0.04)) for level in levels]
 
 
 def stool(rng: Generator) -> Trimesh:
@@ -95,37 +142,56 @@ def stool(rng: Generator) -> Trimesh:
     height = rng.uniform(0.5, 1.4)
     depth = width * rng.uniform(0.8, 1.0)
     thick = rng.uniform(0.04, 0.2)
-    y = (height - thick, height)
+    under = height - thick
     is_round = rng.random() < 0.55
-    parts = named("seat", disc(width / 2, y) if is_round else _pad(rng, width, depth, y))
+    if is_round:
+        seat = disc(width / 2, (under, height))
+    else:
+        seat = _pad(rng, width, depth, (under, height))
     kind = rng.random()
     if kind < 0.25:
-        base = width * rng.uniform(0.4, 0.55)
-        pillar = rod((0, 0, 0), (0, height - thick, 0), 0.05)
-        parts += named("leg", disc(base, (0, 0.05)), pillar)
-        if height > 0.9:
-            ring = width * 0.33
-            y_ring = height * rng.uniform(0.3, 0.45)
-            turn = np.linspace(0, 2 * np.pi, 25)
-            path = np.column_stack((np.cos(turn) * ring, np.full(25, y_ring), np.sin(turn) * ring))
-            bar = rod((-ring, y_ring, 0), (ring, y_ring, 0), 0.02, 8)
-            parts += named("leg", tube(path, 0.025, 8, across=(0, 1, 0)), bar)
-        return join(parts)
-    splay = rng.uniform(0.03, 0.2)
-    radius = rng.uniform(0.03, 0.055)
-    inset = 0.75 if is_round else 1.0
-    if is_round and kind < 0.6:
-        turn = 2 * np.pi * np.arange(3) / 3 + np.pi / 2
-        out = np.column_stack((np.cos(turn), np.zeros(3), np.sin(turn)))
-        tops = out * width * 0.36 + (0, y[0], 0)
-        ends = np.stack((tops, out * (width * 0.36 + splay * y[0])), axis=1)
-        legs = [rod(top, foot, (radius, radius * 0.8)) for top, foot in ends]
+        legs = _stool_foot(rng, width, height, under)
     else:
-        legs, ends = four_legs(rng, width * inset, depth * inset, y[0], radius, splay)
-    parts += named("leg", *legs)
-    if rng.random() < 0.7:
-        parts += named("leg", *rungs(ends, rng.uniform(0.2, 0.45), 0.025))
-    return join(parts)
+        splay = rng.uniform(0.03, 0.2)
+        radius = rng.uniform(0.03, 0.055)
+        if is_round and kind < 0.6:
+            legs, ends = _three_legs(width, under, radius, splay)
+        else:
+            inset = 0.75 if is_round else 1.0
+            legs, ends = four_legs(rng, width * inset, depth * inset, under, radius, splay)
+        if rng.random() < 0.7:
+            level = rng.uniform(0.2, 0.45)
+            legs += rungs(ends, level, 0.025)
+    return join(named("seat", seat) + named("leg", *legs))
+
+
+def _stool_foot(rng: Generator, width: float, height: float, under: float) -> list[Trimesh]:
+    """Return a pillar on a disc; of a bar stool, with a ring for the feet."""
+    base = width * rng.uniform(0.4, 0.55)
+    pillar = rod((0, 0, 0), (0, under, 0), 0.05)
+    parts = [disc(base, (0, 0.05)), pillar]
+    is_tall = height > 0.9
+    if is_tall:
+        ring = width * 0.33
+        y = height * rng.uniform(0.3, 0.45)
+        turn = np.linspace(0, 2 * np.pi, 25)
+        path = np.column_stack((np.cos(turn) * ring, np.full(25, y), np.sin(turn) * ring))
+        bar = rod((-ring, y, 0), (ring, y, 0), 0.02, 8)
+        parts += [tube(path, 0.025, 8, across=(0, 1, 0)), bar]
+    return parts
+
+
+def _three_legs(
+    width: float, height: float, radius: float, splay: float
+) -> tuple[list[Trimesh], Array]:
+    """Return three legs under a round seat, and their ends; see ``four_legs``."""
+    turn = 2 * np.pi * np.arange(3) / 3 + np.pi / 2
+    out = np.column_stack((np.cos(turn), np.zeros(3), np.sin(turn)))
+    tops = out * width * 0.36 + (0, height, 0)
+    feet = out * (width * 0.36 + splay * height)
+    ends = np.stack((tops, feet), axis=1)
+    legs = [rod(top, foot, (radius, radius * 0.8)) for top, foot in ends]
+    return legs, ends
 
 
 def sofa(rng: Generator) -> Trimesh:
@@ -142,25 +208,37 @@ def sofa(rng: Generator) -> Trimesh:
     whole = width + 2 * arm
     base = seat - rng.uniform(0.14, 0.2)
     edge = rng.uniform(0.03, 0.09)
+    rear = -depth / 2
+    front = depth / 2
     parts = [
-        box(around(width), (foot, base), (depth / 2 - 0.1, depth / 2 - 0.03)),
-        cushion(around(whole), (foot, back), (-depth / 2, -depth / 2 + thick * 0.5), edge),
+        box(around(width), (foot, base), (front - 0.1, front - 0.03)),
+        cushion(around(whole), (foot, back), (rear, rear + thick * 0.5), edge),
     ]
     for side in (-1, 1):
         x = around(arm, side * (width + arm) / 2)
-        parts.append(cushion(x, (foot, rest), (-depth / 2 + thick * 0.3, depth / 2), edge))
-        for z in (-depth / 2 + 0.1, depth / 2 - 0.1):
-            x_foot = side * (whole / 2 - 0.08)
+        parts.append(cushion(x, (foot, rest), (rear + thick * 0.3, front), edge))
+        x_foot = side * (whole / 2 - 0.08)
+        for z in (rear + 0.1, front - 0.1):
             parts.append(rod((x_foot, 0, z), (x_foot, foot + 0.01, z), 0.035, 8))
-    long_side = rng.choice((-1, 1)) if seats > 1 and rng.random() < 0.3 else 0
+    long_seat = _long_seat(rng, seats)
     each = width / seats
-    for i in range(seats):
-        x = around(each * 0.97, (i - (seats - 1) / 2) * each)
-        stretch = 0.6 if long_side * (i - (seats - 1) / 2) == (seats - 1) / 2 > 0 else 0.0
-        front = depth / 2 + stretch
-        parts.append(cushion(x, (base, seat), (-depth / 2 + thick * 0.5, front), 0.06))
-        behind = (-depth / 2 + thick * 0.45, -depth / 2 + thick)
+    for number in range(seats):
+        from_middle = number - (seats - 1) / 2
+        x = around(each * 0.97, from_middle * each)
+        end = front
+        if number == long_seat:
+            end = front + 0.6
+        parts.append(cushion(x, (base, seat), (rear + thick * 0.5, end), 0.06))
+        behind = (rear + thick * 0.45, rear + thick)
         parts.append(cushion(x, (seat, back + 0.03), behind, 0.06))
-        if stretch:
-            parts.append(box(x, (foot, base), (depth / 2, front)))
+        if number == long_seat:
+            parts.append(box(x, (foot, base), (front, end)))
     return join(parts)
+
+
+def _long_seat(rng: Generator, seats: int) -> int | None:
+    """Return the number of the seat that is long, the first or the last; None if no seat is."""
+    if seats == 1 or rng.random() >= 0.3:
+        return None
+    side = rng.choice((-1, 1))
+    return 0 if side == -1 else seats - 1

@@ -27,19 +27,21 @@ def bottle(rng: Generator) -> Trimesh:
     shoulder = rng.uniform(0.48, 0.68)
     start = shoulder + rng.uniform(0.1, 0.2)
     kind = rng.choice(3, p=(0.5, 0.25, 0.25))
-    waist = (1.0, rng.uniform(0.72, 0.88), rng.uniform(1.1, 1.25))[kind]
+    waists = (1.0, rng.uniform(0.72, 0.88), rng.uniform(1.1, 1.25))
     body = [
         (radius * 0.9, 0.0),
         (radius, 0.04),
-        (radius * waist, shoulder * rng.uniform(0.4, 0.6)),
+        (radius * waists[kind], shoulder * rng.uniform(0.4, 0.6)),
         (radius, shoulder),
         (neck, start),
         (neck, height),
     ]
-    if kind == 0:  # a straight wall, which a smooth curve would round off
+    is_straight = kind == 0
+    if is_straight:  # a smooth curve would round off the wall
         del body[2]
     parts = [turned([(0.0, 0.0), *smooth(body, 28)])]
-    if rng.random() < 0.7:
+    has_cap = rng.random() < 0.7
+    if has_cap:
         parts.append(disc(neck * rng.uniform(1.15, 1.5), (height - 0.09, height + 0.03)))
     else:
         parts.append(turned([(neck * 1.25, height - 0.05), (neck * 1.25, height)]))
@@ -55,16 +57,27 @@ def vase(rng: Generator) -> Trimesh:
     lip = min(neck * rng.uniform(1.05, 1.9), belly * 1.15)
     low = rng.uniform(0.3, 0.55)
     high = rng.uniform(0.72, 0.85)
-    if rng.random() < 0.25:  # a beaker: no belly, wider at the top
-        wall = smooth([(foot, 0), (foot * rng.uniform(0.9, 1.3), low), (belly, height)], 24)
+    is_beaker = rng.random() < 0.25
+    if is_beaker:  # no belly, wider at the top
+        middle = foot * rng.uniform(0.9, 1.3)
+        wall = smooth([(foot, 0), (middle, low), (belly, height)], 24)
         return turned([(0.0, 0.0), *wall])
-    wall = smooth([(foot, 0), (foot * 0.85, 0.06), (belly, low), (neck, high), (lip, height)], 32)
+    profile = [
+        (foot, 0),
+        (foot * 0.85, 0.06),
+        (belly, low),
+        (neck, high),
+        (lip, height),
+    ]
+    wall = smooth(profile, 32)
     parts = [turned([(0.0, 0.0), *wall])]
     if rng.random() < 0.3:
         reach = rng.uniform(0.12, 0.22)
         thick = rng.uniform(0.022, 0.035)
-        ends = (high + height) / 2, (low + high) / 2
-        parts += [_handle(wall, *ends, side * reach, thick) for side in (-1, 1)]
+        upper = (high + height) / 2
+        lower = (low + high) / 2
+        for side in (-1, 1):
+            parts.append(_handle(wall, upper, lower, side * reach, thick))
     return join(parts)
 
 
@@ -78,10 +91,13 @@ def bowl(rng: Generator) -> Trimesh:
     up = np.linspace(0, 1, 16)
     wall = foot + (radius - foot) * (1 - (1 - up) ** bulge) ** (1 / 1.3)
     profile = np.column_stack((wall, ring + depth * up))
-    parts = [turned([(0.0, ring), *profile]), turned([(foot * 0.95, 0), (foot * 0.95, ring)])]
+    body = turned([(0.0, ring), *profile])
+    stand = turned([(foot * 0.95, 0), (foot * 0.95, ring)])
+    parts = [body, stand]
     if rng.random() < 0.4:
         lip = rng.uniform(0.03, 0.1)
-        parts.append(turned([(radius, ring + depth), (radius + lip, ring + depth + lip * 0.3)]))
+        edge = ring + depth
+        parts.append(turned([(radius, edge), (radius + lip, edge + lip * 0.3)]))
     return join(parts)
 
 
@@ -96,11 +112,13 @@ def cup(rng: Generator) -> Trimesh:
     parts = named("vessel", turned([(0.0, 0.0), *wall]))
     top = height * rng.uniform(0.78, 0.92)
     low = height * rng.uniform(0.15, 0.4)
-    handle = _handle(wall, top, low, rng.uniform(0.15, 0.36), rng.uniform(0.025, 0.05))
-    parts += named("handle", handle)
+    reach = rng.uniform(0.15, 0.36)
+    thick = rng.uniform(0.025, 0.05)
+    parts += named("handle", _handle(wall, top, low, reach, thick))
     if rng.random() < 0.25:
         plate = radius * rng.uniform(1.5, 1.9)
-        parts += named("saucer", turned([(0, -0.03), (plate * 0.6, -0.03), (plate, 0.05)]))
+        profile = [(0, -0.03), (plate * 0.6, -0.03), (plate, 0.05)]
+        parts += named("saucer", turned(profile))
     return join(parts)
 
 
@@ -111,24 +129,43 @@ def bucket(rng: Generator) -> Trimesh:
     foot = radius * rng.uniform(0.6, 0.85)
     parts = [turned([(0, 0), (foot, 0), (radius, height)])]
     rim = rng.uniform(0.025, 0.06)
-    parts.append(turned([(radius, height - rim), (radius + rim, height - rim), (radius, height)]))
+    edge = [
+        (radius, height - rim),
+        (radius + rim, height - rim),
+        (radius, height),
+    ]
+    parts.append(turned(edge))
     for level in rng.uniform(0.3, 0.8, rng.integers(0, 3)):
         at = foot + (radius - foot) * level
         y = height * level
-        parts.append(turned([(at, y - 0.02), (at + 0.03, y), (at, y + 0.02)]))
+        ridge = [(at, y - 0.02), (at + 0.03, y), (at, y + 0.02)]
+        parts.append(turned(ridge))
     swing = np.pi * rng.choice((0.5, rng.uniform(0.15, 0.85), -0.12))
-    turn = np.linspace(0, np.pi, 16)
     ear = radius + rim
+    parts.append(_bail(rng, ear, height - rim / 2, swing))
+    for side in (-1, 1):
+        inner = (side * radius * 0.97, height - rim, 0)
+        outer = (side * ear, height, 0)
+        parts.append(rod(inner, outer, 0.05))
+    return join(parts)
+
+
+def _bail(rng: Generator, ear: float, y: float, swing: float) -> Trimesh:
+    """Return the handle of a bucket, half an oval between both ears.
+
+    Args:
+        rng: chooses its measures.
+        ear: distance of an ear from the axis.
+        y: height of the ears.
+        swing: angle of the handle above the horizontal, in radians.
+    """
+    turn = np.linspace(0, np.pi, 16)
     lift = ear * rng.uniform(0.85, 1.1)
     out = np.sin(turn) * lift
-    rise = height - rim / 2 + np.sin(swing) * out
-    path = np.column_stack((np.cos(turn) * ear, rise, np.cos(swing) * out))
+    path = np.column_stack((np.cos(turn) * ear, y + np.sin(swing) * out, np.cos(swing) * out))
     # A lowered handle is outside the wall, at the distance of the rim.
     across = (0, -np.cos(swing), np.sin(swing))
-    parts.append(tube(path, rng.uniform(0.018, 0.03), 8, across))
-    for side in (-1, 1):
-        parts.append(rod((side * radius * 0.97, height - rim, 0), (side * ear, height, 0), 0.05))
-    return join(parts)
+    return tube(path, rng.uniform(0.018, 0.03), 8, across)
 
 
 def goblet(rng: Generator) -> Trimesh:
@@ -138,9 +175,16 @@ def goblet(rng: Generator) -> Trimesh:
     rise = rng.uniform(0.15, 0.55)
     deep = 1.0 - rise
     wide = rng.uniform(0.18, 0.42)
-    start = [(foot, 0.0), (foot * 0.5, 0.03), (stem, 0.08), (stem, rise * 0.95)]
-    if rng.random() < 0.25:  # conical
-        return turned([(0, 0), *smooth(start, 12), (stem, rise), (wide, 1.0)])
+    foot_profile = [
+        (foot, 0.0),
+        (foot * 0.5, 0.03),
+        (stem, 0.08),
+        (stem, rise * 0.95),
+    ]
+    lower = smooth(foot_profile, 12)
+    is_conical = rng.random() < 0.25
+    if is_conical:
+        return turned([(0, 0), *lower, (stem, rise), (wide, 1.0)])
     mouth = rng.uniform(0.7, 1.1)
     glass = [
         (stem, rise),
@@ -148,12 +192,12 @@ def goblet(rng: Generator) -> Trimesh:
         (wide, rise + deep * rng.uniform(0.4, 0.6)),
         (wide * mouth, 1.0),
     ]
-    parts = [turned([(0.0, 0.0), *smooth(start, 12), *smooth(glass, 18)])]
+    parts = [turned([(0.0, 0.0), *lower, *smooth(glass, 18)])]
     if rng.random() < 0.4:
-        knob = stem * rng.uniform(1.6, 2.4)
+        width = stem * rng.uniform(1.6, 2.4)
         y = rise * rng.uniform(0.4, 0.8)
-        half = 0.04
-        parts.append(turned(smooth([(stem, y - half), (knob, y), (stem, y + half)], 9), 16))
+        knob = [(stem, y - 0.04), (width, y), (stem, y + 0.04)]
+        parts.append(turned(smooth(knob, 9), 16))
     return join(parts)
 
 
@@ -165,49 +209,74 @@ def teapot(rng: Generator) -> Trimesh:
     mouth = radius * rng.uniform(0.35, 0.6)
     widest = height * rng.uniform(0.3, 0.55)
     wall = smooth([(foot, 0), (radius, widest), (mouth, height)], 18)
-    dome = rng.uniform(0.06, 0.16)
-    lid = smooth([(mouth, height), (mouth * 0.7, height + dome * 0.7), (0, height + dome)], 8)
-    knob = rng.uniform(0.045, 0.075)
-    ball = height + dome + knob * 0.8 + knob * np.array((-1, -0.7, 0, 0.7, 1))
-    ball_profile = np.column_stack((knob * np.array((0, 0.7, 1, 0.7, 0)), ball))
     parts = named("vessel", turned([(0.0, 0.0), *wall]))
-    parts += named("lid", turned(lid), turned(ball_profile, 12))
+    parts += named("lid", *_lid(rng, mouth, height))
+    parts += named("spout", _spout(rng, radius, height, widest))
+    thick = rng.uniform(0.03, 0.05)
+    is_over_the_top = rng.random() < 0.25
+    if is_over_the_top:
+        handle = _arch(rng, wall, height * 0.8, thick)
+    else:
+        top = height * rng.uniform(0.75, 0.92)
+        low = height * rng.uniform(0.15, 0.35)
+        handle = _handle(wall, top, low, rng.uniform(0.28, 0.45), thick)
+    parts += named("handle", handle)
+    return join(parts)
+
+
+def _lid(rng: Generator, mouth: float, height: float) -> list[Trimesh]:
+    """Return a domed lid with a knob."""
+    dome = rng.uniform(0.06, 0.16)
+    profile = [
+        (mouth, height),
+        (mouth * 0.7, height + dome * 0.7),
+        (0, height + dome),
+    ]
+    lid = turned(smooth(profile, 8))
+    radius = rng.uniform(0.045, 0.075)
+    ball_heights = height + dome + radius * 0.8 + radius * np.array((-1, -0.7, 0, 0.7, 1))
+    ball_radii = radius * np.array((0, 0.7, 1, 0.7, 0))
+    knob = turned(np.column_stack((ball_radii, ball_heights)), 12)
+    return [lid, knob]
+
+
+def _spout(rng: Generator, radius: float, height: float, widest: float) -> Trimesh:
     reach = rng.uniform(0.3, 0.5)
     tip = height * rng.uniform(0.85, 1.1)
     root = widest * rng.uniform(0.6, 1.0)
-    spout = [
+    path = [
         (-radius * 0.85, root, 0),
         (-radius - reach * 0.45, root + (tip - root) * 0.3, 0),
         (-radius - reach * 0.7, root + (tip - root) * 0.75, 0),
         (-radius - reach, tip, 0),
     ]
     wide = rng.uniform(0.09, 0.14)
-    widths = np.linspace(wide, wide * 0.4, 12)
-    parts += named("spout", tube(smooth(spout, 12), widths, 12, across=(0, 0, 1)))
-    thick = rng.uniform(0.03, 0.05)
-    if rng.random() < 0.25:  # over the top
-        turn = np.linspace(0, np.pi, 16)
-        y = height * 0.8
-        start = np.interp(y, wall[:, 1], wall[:, 0])
-        rise = y + np.sin(turn) * rng.uniform(0.5, 0.75)
-        path = np.column_stack((np.cos(turn) * start, rise, np.zeros(16)))
-        parts += named("handle", tube(path, thick, 10, across=(0, 0, 1)))
-    else:
-        top = height * rng.uniform(0.75, 0.92)
-        low = height * rng.uniform(0.15, 0.35)
-        parts += named("handle", _handle(wall, top, low, rng.uniform(0.28, 0.45), thick))
-    return join(parts)
+    radii = np.linspace(wide, wide * 0.4, 12)
+    return tube(smooth(path, 12), radii, 12, across=(0, 0, 1))
+
+
+def _arch(rng: Generator, wall: Array, y: float, thick: float) -> Trimesh:
+    """Return a handle over the top, from a height of the wall."""
+    turn = np.linspace(0, np.pi, 16)
+    start = _radius_at(wall, y)
+    rise = y + np.sin(turn) * rng.uniform(0.5, 0.75)
+    path = np.column_stack((np.cos(turn) * start, rise, np.zeros(16)))
+    return tube(path, thick, 10, across=(0, 0, 1))
 
 
 def _handle(wall: Array, top: float, low: float, reach: float, thick: float) -> Trimesh:
     """Return a curved handle between two heights of a wall; on the left for negative reach."""
-    side = np.sign(reach)
     # The ends are slightly inside the wall, so that there is no gap.
-    start, end = (
-        np.array((side * 0.96 * np.interp(y, wall[:, 1], wall[:, 0]), y, 0)) for y in (top, low)
-    )
+    inside = np.sign(reach) * 0.96
+    start = np.array((inside * _radius_at(wall, top), top, 0))
+    end = np.array((inside * _radius_at(wall, low), low, 0))
     turn = np.linspace(0, np.pi, 14)
     share = ((1 - np.cos(turn)) / 2)[:, None]
     path = start * (1 - share) + end * share  # half an oval
     path[:, 0] += reach * np.sin(turn) ** 0.8
     return tube(path, thick, 10, across=(0, 0, 1))
+
+
+def _radius_at(wall: Array, y: float) -> float:
+    """Return the radius of a wall ``(P, 2)`` at a height."""
+    return np.interp(y, wall[:, 1], wall[:, 0])
