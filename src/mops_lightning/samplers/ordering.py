@@ -17,7 +17,9 @@ from mops_lightning.ops.points import distance_dtype
 SUM_BITS = 51
 """Bits of the integers of which a mean is computed."""
 
-FIRST, SECOND = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB  # the multipliers of SplitMix64
+FIRST = 0xBF58476D1CE4E5B9
+SECOND = 0x94D049BB133111EB
+"""Multipliers of SplitMix64."""
 
 
 def seeded_order(points: Tensor, seed: int, in_sphere: bool = False) -> Tensor:
@@ -47,20 +49,23 @@ def seeded_keys(points: Tensor, seed: int, in_sphere: bool = False) -> Tensor:
     if given.is_cpu:
         numbers = given.to(distance_dtype(given)).numpy()
         return torch.from_numpy(keys.seeded_keys(numbers, SeededOrder(seed, in_sphere)))
-    return _keys_on_device(in_unit_sphere(given) if in_sphere else given, seed)
+    if in_sphere:
+        given = in_unit_sphere(given)
+    return _keys_on_device(given, seed)
 
 
 def _keys_on_device(points: Tensor, seed: int) -> Tensor:
     hashes = point_hashes(points, seed)
     values, order = hashes.sort(dim=1, stable=True)
-    equal = values[:, 1:] == values[:, :-1]
-    if bool(equal.any()):
+    is_copy = values[:, 1:] == values[:, :-1]
+    if bool(is_copy.any()):
         place = torch.arange(points.shape[1], device=points.device).expand_as(order)
-        begin = place.clone()
-        begin[:, 1:].masked_fill_(equal, 0)
-        copy = place - begin.cummax(1).values
+        first = place.clone()
+        first[:, 1:].masked_fill_(is_copy, 0)
+        number_of_copy = place - first.cummax(1).values
         # First copies keep their keys, so that clouds without copies do not depend on the batch.
-        values = torch.where(copy > 0, _scramble(values + copy * _signed(STEP)), values)
+        scrambled = _scramble(values + number_of_copy * _signed(STEP))
+        values = torch.where(number_of_copy > 0, scrambled, values)
         hashes = torch.empty_like(hashes).scatter_(1, order, values)
     return hashes
 
@@ -82,8 +87,10 @@ def exact_mean(points: Tensor) -> Tensor:
     They are means of integers of 51 bits.
     """
     largest = points.abs().amax((1, 2), keepdim=True)
-    units = torch.ldexp(torch.ones_like(largest), SUM_BITS - torch.frexp(largest).exponent)
+    exponent = SUM_BITS - torch.frexp(largest).exponent
+    units = torch.ldexp(torch.ones_like(largest), exponent)
     whole = (points * units.clamp_max(2.0**1000)).round().long()
+    # The sum of all 51 bits would exceed 64 bits.
     high = (whole >> 26).sum(1, keepdim=True).double()
     low = (whole & (2**26 - 1)).sum(1, keepdim=True).double()
     return (high * 2.0**26 + low) / points.shape[1] / units
@@ -95,7 +102,8 @@ def smallest(keys: Tensor, m: int) -> Tensor:
         return keys.argsort(dim=1, stable=True)[:, :m].contiguous()
     values = keys.numpy()
     rows = np.argpartition(values, m - 1, axis=1)[:, :m]
-    order = np.argsort(np.take_along_axis(values, rows, 1), axis=1)
+    keys_of_rows = np.take_along_axis(values, rows, 1)
+    order = np.argsort(keys_of_rows, axis=1)
     return torch.from_numpy(np.take_along_axis(rows, order, 1))
 
 
@@ -124,8 +132,10 @@ def point_hashes(points: Tensor, seed: int) -> Tensor:
     bits = (points.double() + 0.0).view(torch.int64)
     keys = torch.full_like(bits[..., 0], _signed(seed * STEP + 1))
     for axis in range(points.shape[2]):
-        keys = _xor_shift(keys.bitwise_xor_(bits[..., axis]).mul_(_signed(FIRST)), 32)
-    return _scramble(keys.add_(_xor_shift(keys, 29).mul_(_signed(SECOND)).sum(1, keepdim=True)))
+        keys = keys.bitwise_xor_(bits[..., axis]).mul_(_signed(FIRST))
+        keys = _xor_shift(keys, 32)
+    of_cloud = _xor_shift(keys, 29).mul_(_signed(SECOND)).sum(1, keepdim=True)
+    return _scramble(keys.add_(of_cloud))
 
 
 def _scramble(keys: Tensor) -> Tensor:

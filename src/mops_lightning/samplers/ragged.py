@@ -54,35 +54,51 @@ def select_points(
         UserError: an argument has a wrong type, shape or value.
     """
     tensor = as_tensor("points", points)
+    is_array = isinstance(points, np.ndarray)
     if not tensor.is_floating_point():
-        conversion = "astype(float)" if isinstance(points, np.ndarray) else "float()"
+        conversion = "astype(float)" if is_array else "float()"
         raise UserError(
             f"points must be floating point, got {tensor.dtype}. Try points.{conversion}."
         )
     if weight is not None and not isinstance(weight, str):
         weight = check_weight(weight, tuple(tensor.shape[:-1])).to(tensor.device)
-    one = tensor.ndim == 2
     _check_shape(tensor, method, batch is not None)
     if batch is not None:
-        result = _flat(method, tensor, m, as_tensor("batch", batch), weight)
-    elif one:
-        alone = weight[None] if isinstance(weight, Tensor) else weight
-        chosen, rows = _selected(method, tensor[None], m, alone)
-        result = chosen[0], None if rows is None else rows[0]
+        chosen, rows = _flat(method, tensor, m, as_tensor("batch", batch), weight)
+    elif tensor.ndim == 2:
+        chosen, rows = _one(method, tensor, m, weight)
     else:
-        result = _selected(method, tensor, m, weight)
-    if not isinstance(points, np.ndarray):
-        return result
-    return result[0].numpy(), None if result[1] is None else result[1].numpy()
+        chosen, rows = _selected(method, tensor, m, weight)
+    if not is_array:
+        return chosen, rows
+    if rows is None:
+        return chosen.numpy(), None
+    return chosen.numpy(), rows.numpy()
+
+
+def _one(method: Method, points: Tensor, m: int, weight: Weight) -> Sample:
+    """Select from one cloud."""
+    if isinstance(weight, Tensor):
+        weight = weight[None]
+    chosen, rows = _selected(method, points[None], m, weight)
+    return _first(chosen, rows)
+
+
+def _first(chosen: Tensor, rows: Tensor | None, cloud: int = 0) -> Sample:
+    """Return the sample of one cloud of a batch."""
+    if rows is None:
+        return chosen[cloud], None
+    return chosen[cloud], rows[cloud]
 
 
 def _check_shape(points: Tensor, method: Method, is_flat: bool) -> None:
     """Refuse points without the columns of a method, and channels that are not numbers."""
     channels = method.channels
     width = 3 + len(channels)
-    allowed = (2,) if is_flat else (2, 3)
-    fits = points.ndim in allowed and points.shape[-1] >= width
-    if not fits or (points.shape[-1] > width and not method.any_channels):
+    dimensions = (2,) if is_flat else (2, 3)
+    has_all = points.ndim in dimensions and points.shape[-1] >= width
+    has_more = points.shape[-1] > width
+    if not has_all or (has_more and not method.any_channels):
         wanted = f"(P, {width}) with batch" if is_flat else f"(N, {width}) or (B, N, {width})"
         of_channels = ""
         if channels:
@@ -96,13 +112,19 @@ def _flat(method: Method, points: Tensor, m: int, batch: Tensor, weight: Weight)
     counts = cloud_sizes(len(points), batch).tolist()
     if 0 in counts:
         raise UserError(f"batch: cloud {counts.index(0)} has no points. Number clouds from 0.")
-    weights = weight.split(counts) if isinstance(weight, Tensor) else [weight] * len(counts)
+    weights: Sequence[Weight] = [weight] * len(counts)
+    if isinstance(weight, Tensor):
+        weights = weight.split(counts)
     samples = _each(method, list(points.split(counts)), m, weights)
-    starts = np.cumsum([0, *counts[:-1]]).tolist()
-    chosen = torch.cat([sampled for sampled, _ in samples])
-    parts = zip(samples, starts, strict=True)
-    rows = [rows + start for (_, rows), start in parts if rows is not None]
-    return chosen, torch.cat(rows) if len(rows) == len(samples) else None
+    chosen = torch.cat([sample[0] for sample in samples])
+    all_rows = []
+    start = 0
+    for count, (_, rows) in zip(counts, samples, strict=True):
+        if rows is None:
+            return chosen, None
+        all_rows.append(rows + start)
+        start += count
+    return chosen, torch.cat(all_rows)
 
 
 def _each(method: Method, clouds: list[Tensor], m: int, weights: Sequence[Weight]) -> list[Sample]:
@@ -111,17 +133,26 @@ def _each(method: Method, clouds: list[Tensor], m: int, weights: Sequence[Weight
         raise UserError("points must have at least one cloud.")
     samples: dict[int, Sample] = {}
     for size in sorted({len(cloud) for cloud in clouds}):
-        members = [i for i, cloud in enumerate(clouds) if len(cloud) == size]
+        members = [number for number, cloud in enumerate(clouds) if len(cloud) == size]
         if size < m:
             everything = torch.arange(size, device=clouds[0].device)
-            samples |= {i: (clouds[i], everything) for i in members}
+            for number in members:
+                samples[number] = clouds[number], everything
             continue
-        tensors = [part for part in (weights[i] for i in members) if isinstance(part, Tensor)]
-        weight = torch.stack(tensors) if tensors else weights[0]
-        points, rows = _selected(method, torch.stack([clouds[i] for i in members]), m, weight)
-        for place, i in enumerate(members):
-            samples[i] = points[place], None if rows is None else rows[place]
-    return [samples[i] for i in range(len(clouds))]
+        points = torch.stack([clouds[number] for number in members])
+        weight = _together([weights[number] for number in members])
+        chosen, rows = _selected(method, points, m, weight)
+        for place, number in enumerate(members):
+            samples[number] = _first(chosen, rows, place)
+    return [samples[number] for number in range(len(clouds))]
+
+
+def _together(weights: Sequence[Weight]) -> Weight:
+    """Return the weights of clouds as one batch; a word or None is the same for all."""
+    tensors = [weight for weight in weights if isinstance(weight, Tensor)]
+    if tensors:
+        return torch.stack(tensors)
+    return weights[0]
 
 
 def _selected(method: Method, points: Tensor, m: int, weight: Weight) -> Sample:
@@ -135,7 +166,9 @@ def _selected(method: Method, points: Tensor, m: int, weight: Weight) -> Sample:
     if weight is not None and not bool(weight.all()):
         return _without_zeros(method, points, m, weight)
     chosen, rows = method.select(points, m, weight)
-    return chosen if rows is None else gather_points(points, rows), rows
+    if rows is None:
+        return chosen, None
+    return gather_points(points, rows), rows
 
 
 def select_in_unit_sphere(
@@ -172,20 +205,22 @@ def _computed(word: str, points: Tensor) -> Tensor:
     """Return the weights ``(B, N)`` that a word asks for."""
     if word != CURVATURE:
         raise UserError(f"weight must be {CURVATURE!r} or numbers, got {word!r:.99}.")
-    parts = [
-        torch.from_numpy(curvature(coordinates(cloud).cpu().numpy())) for cloud in points.detach()
-    ]
-    return torch.stack(parts).to(points.device)
+    weights = []
+    for cloud in points.detach():
+        places = coordinates(cloud).cpu().numpy()
+        weights.append(torch.from_numpy(curvature(places)))
+    return torch.stack(weights).to(points.device)
 
 
 def _without_zeros(method: Method, points: Tensor, m: int, weight: Tensor) -> Sample:
     """Select from the points of positive weight only."""
-    chosen, rows = [], []
-    for cloud, part in zip(points, weight, strict=True):
-        kept = part.nonzero()[:, 0]
-        check_positive(len(kept), m)
-        sampled, places = _selected(method, cloud[kept][None], m, part[kept][None])
-        assert places is not None  # generated points have no weights
-        chosen.append(sampled[0])
-        rows.append(kept[places[0]])
-    return torch.stack(chosen), torch.stack(rows)
+    all_chosen = []
+    all_rows = []
+    for cloud, weight_of_cloud in zip(points, weight, strict=True):
+        heavy = weight_of_cloud.nonzero()[:, 0]
+        check_positive(len(heavy), m)
+        chosen, rows = _selected(method, cloud[heavy][None], m, weight_of_cloud[heavy][None])
+        assert rows is not None  # generated points have no weights
+        all_chosen.append(chosen[0])
+        all_rows.append(heavy[rows[0]])
+    return torch.stack(all_chosen), torch.stack(all_rows)

@@ -3,16 +3,30 @@
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 KINDS = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
-    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+"""Data types by the names of a header."""
 
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 
@@ -85,7 +99,8 @@ class Lists:
         starts = np.cumsum(self.counts) - self.counts
         for length in np.unique(self.counts):
             rows = np.flatnonzero(self.counts == length)
-            yield rows, self.items[starts[rows][:, None] + np.arange(length)]
+            places = starts[rows][:, None] + np.arange(length)
+            yield rows, self.items[places]
 
 
 Values = NDArray[Any] | Lists
@@ -124,22 +139,30 @@ def read_header(data: bytes) -> Header:
 def _split(data: bytes) -> tuple[list[list[str]], int]:
     """Return the words of a header's lines, without comments, and where it ends in bytes."""
     first = re.match(rb"[^\r\n]*(\r?\n|\r)", data)
-    end = b"\r" if first and first[1] == b"\r" else b"\n"
-    last = re.compile(end + rb"[ \t]*end_header[ \t\r]*?" + end).search(data, 0, LONGEST_HEADER)
+    newline = b"\n"
+    if first and first[1] == b"\r":
+        newline = b"\r"
+    end_header = re.compile(newline + rb"[ \t]*end_header[ \t\r]*?" + newline)
+    last = end_header.search(data, 0, LONGEST_HEADER)
     if not last:
         raise ValueError("its header does not end")
     text = data[: last.start()].decode("latin-1")
-    words = [line.split() for line in text.split(end.decode())]
-    return [line for line in words if line[:1] not in ([], ["comment"], ["obj_info"])], last.end()
+    lines = []
+    for line in text.split(newline.decode()):
+        words = line.split()
+        if words and words[0] not in ("comment", "obj_info"):
+            lines.append(words)
+    return lines, last.end()
 
 
 def _property(words: list[str], order: str) -> Property:
     if len(words) == 2 and words[0] in KINDS:
         return Property(words[1], np.dtype(order + KINDS[words[0]]))
-    is_list = len(words) == 4 and words[0] == "list"
-    if is_list and words[1] in KINDS and words[2] in KINDS and KINDS[words[1]][0] != "f":
-        kind, count = np.dtype(order + KINDS[words[2]]), np.dtype(order + KINDS[words[1]])
-        return Property(words[3], kind, count)
+    if len(words) == 4 and words[0] == "list" and words[2] in KINDS:
+        count = KINDS.get(words[1], "")
+        if count.startswith(("i", "u")):
+            kind = np.dtype(order + KINDS[words[2]])
+            return Property(words[3], kind, np.dtype(order + count))
     raise ValueError(f"its header has the property {' '.join(words)[:80]!r}")
 
 
@@ -183,24 +206,60 @@ def _element_with_lists(
     kind = _row_type_of_lengths(element, lengths)
     if len(data) - offset >= kind.itemsize * element.number:
         rows = np.frombuffer(data, kind, element.number, offset)
-        same = all(
-            bool((rows[f"count {place}"] == length).all()) for place, length in lengths.items()
-        )
-        if same:
+        if _all_have_lengths(rows, lengths):
             return _of_equal_lengths(rows, element), offset + rows.nbytes
     return _walk(data, offset, element)
 
 
+def _all_have_lengths(rows: NDArray[Any], lengths: Mapping[int, int]) -> bool:
+    """Return whether the lists of all rows have the lengths of the first row."""
+    for number, length in lengths.items():
+        is_same = rows[f"count {number}"] == length
+        if not is_same.all():
+            return False
+    return True
+
+
 def _lengths_in_row(data: bytes, offset: int, element: Element) -> dict[int, int]:
-    """Return the number of items of every list in one row, by the place of the property."""
+    """Return the number of items of every list in one row, by the number of the property."""
     lengths = {}
-    for place, part in enumerate(element.properties):
+    for number, part in enumerate(element.properties):
         if part.count is None:
             offset += part.kind.itemsize
             continue
-        lengths[place] = _count(data, offset, part, element)
-        offset += part.count.itemsize + lengths[place] * part.kind.itemsize
+        lengths[number] = _count(data, offset, part, element)
+        offset += part.count.itemsize
+        offset += lengths[number] * part.kind.itemsize
     return lengths
+
+
+class _Collected:
+    """The bytes of one property, from rows of different lengths.
+
+    Args:
+        part: the property.
+    """
+
+    def __init__(self, part: Property) -> None:
+        self.part = part
+        self.size = part.kind.itemsize
+        self.count_size = 0
+        self.byte_order: Literal["big", "little"] = "little"
+        self.is_signed = False
+        if part.count is not None:
+            self.count_size = part.count.itemsize
+            self.is_signed = part.count.kind == "i"
+            if part.count.byteorder == ">":
+                self.byte_order = "big"
+        self.pieces: list[bytes] = []
+        self.counts: list[int] = []
+
+    def values(self) -> Values:
+        """Return the numbers of all rows, or the lists."""
+        items = np.frombuffer(b"".join(self.pieces), self.part.kind)
+        if self.part.count is None:
+            return items
+        return Lists(np.array(self.counts, np.int64), items)
 
 
 def _count(data: bytes, offset: int, part: Property, element: Element) -> int:
@@ -238,85 +297,76 @@ def _of_equal_lengths(rows: NDArray[Any], element: Element) -> dict[str, Values]
 
 def _walk(data: bytes, offset: int, element: Element) -> tuple[dict[str, Values], int]:
     """Read rows of different lengths, one after the other."""
-    parts = element.properties
-    pieces: list[list[bytes]] = [[] for _ in parts]
-    counts: list[list[int]] = [[] for _ in parts]
-    steps = [
-        (place, part.kind.itemsize, part.count.itemsize if part.count is not None else 0)
-        for place, part in enumerate(parts)
-    ]
-    orders = [
-        "big" if part.count is not None and part.count.byteorder == ">" else "little"
-        for part in parts
-    ]
-    signed = [part.count is not None and part.count.kind == "i" for part in parts]
+    columns = [_Collected(part) for part in element.properties]
     for row in range(element.number):
-        for place, size, count_size in steps:
+        for column in columns:
             number = 1
-            if count_size:
-                word = data[offset : offset + count_size]
-                number = int.from_bytes(word, orders[place], signed=signed[place])  # type: ignore[arg-type]
-                counts[place].append(number)
-                offset += count_size
-            end = offset + number * size
+            if column.count_size:
+                word = data[offset : offset + column.count_size]
+                number = int.from_bytes(word, column.byte_order, signed=column.is_signed)
+                column.counts.append(number)
+                offset += column.count_size
+            end = offset + number * column.size
             if number < 0 or end > len(data):
                 raise _ends_early(element, row)
-            pieces[place].append(data[offset:end])
+            column.pieces.append(data[offset:end])
             offset = end
-    values: dict[str, Values] = {}
-    for place, part in enumerate(parts):
-        items = np.frombuffer(b"".join(pieces[place]), part.kind)
-        is_list = part.count is not None
-        values[part.name] = Lists(np.array(counts[place], np.int64), items) if is_list else items
-    return values, offset
+    return {column.part.name: column.values() for column in columns}, offset
 
 
 def _ascii_elements(words: list[bytes], elements: list[Element]) -> dict[str, dict[str, Values]]:
-    found: dict[str, dict[str, Values]] = {}
-    place = 0
+    properties: dict[str, dict[str, Values]] = {}
+    start = 0
     for element in elements:
-        found[element.name] = {}
         if not element.properties or not element.number:
-            continue
-        if element.has_lists:
-            found[element.name], place = _ascii_lists(words, place, element)
-            continue
-        width = len(element.properties)
-        end = place + width * element.number
-        if end > len(words):
-            raise _ends_early(element, (len(words) - place) // width)
-        numbers = np.array(words[place:end], np.float64).reshape(-1, width)
-        for column, part in zip(numbers.T, element.properties, strict=True):
-            found[element.name][part.name] = _of_kind(column, part)
-        place = end
-    return found
+            properties[element.name] = {}
+        elif element.has_lists:
+            properties[element.name], start = _ascii_lists(words, start, element)
+        else:
+            properties[element.name], start = _ascii_numbers(words, start, element)
+    return properties
 
 
-def _ascii_lists(words: list[bytes], place: int, element: Element) -> tuple[dict[str, Values], int]:
+def _ascii_numbers(
+    words: list[bytes], start: int, element: Element
+) -> tuple[dict[str, Values], int]:
+    """Return the numbers of an element without lists, and the first word after it."""
+    width = len(element.properties)
+    end = start + width * element.number
+    if end > len(words):
+        raise _ends_early(element, (len(words) - start) // width)
+    numbers = np.array(words[start:end], np.float64).reshape(-1, width)
+    values: dict[str, Values] = {}
+    for column, part in zip(numbers.T, element.properties, strict=True):
+        values[part.name] = _of_kind(column, part)
+    return values, end
+
+
+def _ascii_lists(words: list[bytes], start: int, element: Element) -> tuple[dict[str, Values], int]:
     items: list[list[bytes]] = [[] for _ in element.properties]
     counts: list[list[int]] = [[] for _ in element.properties]
     for row in range(element.number):
         for column, part in enumerate(element.properties):
             number = 1
             if part.count is not None:
-                if place >= len(words):
+                if start >= len(words):
                     raise _ends_early(element, row)
-                number = int(words[place])
+                number = int(words[start])
                 counts[column].append(number)
-                place += 1
-            end = place + number
+                start += 1
+            end = start + number
             if number < 0 or end > len(words):
                 raise _ends_early(element, row)
-            items[column] += words[place:end]
-            place = end
+            items[column] += words[start:end]
+            start = end
     values: dict[str, Values] = {}
     for column, part in enumerate(element.properties):
         numbers = _of_kind(np.array(items[column], np.float64), part)
-        is_list = part.count is not None
-        values[part.name] = (
-            Lists(np.array(counts[column], np.int64), numbers) if is_list else numbers
-        )
-    return values, place
+        if part.count is None:
+            values[part.name] = numbers
+        else:
+            values[part.name] = Lists(np.array(counts[column], np.int64), numbers)
+    return values, start
 
 
 def _of_kind(numbers: NDArray[np.float64], part: Property) -> NDArray[Any]:
