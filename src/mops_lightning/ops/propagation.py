@@ -6,7 +6,7 @@ caller asks for it, so that a label stays a label.
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -87,36 +87,50 @@ def propagation_map(
                 [0],
                 [1]])
     """
-    points, sampled = as_tensor("points", points), as_tensor("sampled", sampled)
+    points = as_tensor("points", points)
+    sampled = as_tensor("sampled", sampled)
     if (batch is None) != (sampled_batch is None):
         raise UserError("batch and sampled_batch belong together: give both or none.")
-    ndim = 2 if batch is not None or points.ndim == 2 else 3
-    for name, tensor in (("points", points), ("sampled", sampled)):
-        if tensor.ndim != ndim or not tensor.is_floating_point():
-            raise UserError(
-                f"{name} must be floating point of {ndim} dimensions, got {tensor.dtype} of shape "
-                f"{tuple(tensor.shape)}."
-            )
-    if batch is not None:
-        sizes = cloud_sizes(len(points), as_tensor("batch", batch)).tolist()
-        labels = as_tensor("sampled_batch", sampled_batch)
-        numbers = cloud_sizes(len(sampled), labels, "sampled_batch").tolist()
-        clouds, samples = points.split(sizes), sampled.split(numbers)
-    elif ndim == 2:
-        clouds, samples = (points,), (sampled,)
-    else:
-        clouds, samples = points.unbind(), sampled.unbind()
+    is_flat = batch is not None or points.ndim == 2
+    ndim = 2 if is_flat else 3
+    _check_kind("points", points, ndim)
+    _check_kind("sampled", sampled, ndim)
+    clouds = _split_clouds("batch", points, batch)
+    samples = _split_clouds("sampled_batch", sampled, sampled_batch)
     if len(clouds) != len(samples) or not clouds:
         raise UserError(
             f"points and sampled must have as many clouds, got {len(clouds)} and {len(samples)}."
         )
-    found = [_search(cloud, sample, k) for cloud, sample in zip(clouds, samples, strict=True)]
-    rows, weights = zip(*found, strict=True)
-    if ndim == 3:
-        return PropagationMap(torch.stack(rows), torch.stack(weights), sampled.shape[1])
-    begins = np.cumsum([0, *map(len, samples)])[:-1].tolist()
-    shifted = [part + begin for part, begin in zip(rows, begins, strict=True)]
-    return PropagationMap(torch.cat(shifted), torch.cat(weights), len(sampled))
+    all_rows = []
+    all_weights = []
+    start = 0
+    for cloud, sample in zip(clouds, samples, strict=True):
+        rows, weights = _search(cloud, sample, k)
+        all_rows.append(rows + start)
+        all_weights.append(weights)
+        if is_flat:
+            start += len(sample)
+    if is_flat:
+        return PropagationMap(torch.cat(all_rows), torch.cat(all_weights), len(sampled))
+    return PropagationMap(torch.stack(all_rows), torch.stack(all_weights), sampled.shape[1])
+
+
+def _check_kind(name: str, points: Tensor, ndim: int) -> None:
+    if points.ndim != ndim or not points.is_floating_point():
+        raise UserError(
+            f"{name} must be floating point of {ndim} dimensions, got {points.dtype} of shape "
+            f"{tuple(points.shape)}."
+        )
+
+
+def _split_clouds(name: str, points: Tensor, batch: Any) -> tuple[Tensor, ...]:
+    """Return the clouds of ``(P, C)`` with a batch, of ``(N, C)``, or of ``(B, N, C)``."""
+    if batch is not None:
+        sizes = cloud_sizes(len(points), as_tensor(name, batch), name)
+        return points.split(sizes.tolist())
+    if points.ndim == 2:
+        return (points,)
+    return points.unbind()
 
 
 def mapper(sampled: Any, k: int = 1) -> Callable[[Any], PropagationMap]:
@@ -127,7 +141,9 @@ def mapper(sampled: Any, k: int = 1) -> Callable[[Any], PropagationMap]:
         k: number of sampled points.
     """
     sampled = as_tensor("sampled", sampled)
-    tree = cKDTree(sampled.double().numpy()) if k > 1 else None
+    tree = None
+    if k > 1:
+        tree = cKDTree(sampled.double().numpy())
 
     def map_part(points: Any) -> PropagationMap:
         rows, weights = _search(as_tensor("points", points), sampled, k, tree)
@@ -139,6 +155,26 @@ def mapper(sampled: Any, k: int = 1) -> Callable[[Any], PropagationMap]:
 @torch.no_grad()
 def _search(points: Tensor, sampled: Tensor, k: int, tree: Any = None) -> tuple[Tensor, Tensor]:
     """Return the k nearest rows ``(N, k)`` of one cloud, and their weights."""
+    _check_search(points, sampled, k)
+    dtype = torch.promote_types(points.dtype, sampled.dtype)
+    dtype_of_weights = torch.promote_types(dtype, torch.float32)
+    if k == 1:
+        _, nearest_rows = nearest(points.to(dtype)[None], sampled.to(dtype)[None])
+        rows = nearest_rows[0, :, None]
+        return rows, torch.ones_like(rows, dtype=dtype_of_weights)
+    if tree is None:
+        tree = cKDTree(sampled.double().cpu().numpy())
+    near = _nearest_in_tree(tree, points.double().cpu().numpy(), k)
+    squared, rows = (torch.from_numpy(array).to(points.device) for array in near)
+    # Relative to the nearest point, because 1/d² may be infinite.
+    nearest_squared = squared[:, :1]
+    is_at_point = (squared == 0).to(squared)
+    inverse = torch.where(nearest_squared > 0, nearest_squared / squared, is_at_point)
+    weights = inverse / inverse.sum(1, keepdim=True)
+    return rows, weights.to(dtype_of_weights)
+
+
+def _check_search(points: Tensor, sampled: Tensor, k: int) -> None:
     if points.shape[1] != sampled.shape[1]:
         raise UserError(
             f"points and sampled must have the same number of coordinates, got {points.shape[1]} "
@@ -149,19 +185,6 @@ def _search(points: Tensor, sampled: Tensor, k: int, tree: Any = None) -> tuple[
         raise UserError(f"k must be from 1 to the number of sampled points, {most}, got {k}.")
     if not (bool(torch.isfinite(points).all()) and bool(torch.isfinite(sampled).all())):
         raise UserError("points and sampled must be finite, got NaN or infinity.")
-    dtype = torch.promote_types(points.dtype, sampled.dtype)
-    points, sampled = points.to(dtype), sampled.to(dtype)
-    if k == 1:
-        rows = nearest(points[None], sampled[None])[1][0, :, None]
-        return rows, torch.ones_like(rows, dtype=torch.promote_types(dtype, torch.float32))
-    if tree is None:
-        tree = cKDTree(sampled.double().cpu().numpy())
-    found = _nearest_in_tree(tree, points.double().cpu().numpy(), k)
-    squared, rows = (torch.from_numpy(part).to(points.device) for part in found)
-    # Relative to the nearest point, because 1/d² may be infinite.
-    inverse = torch.where(squared[:, :1] > 0, squared[:, :1] / squared, (squared == 0).to(squared))
-    weights = inverse / inverse.sum(1, keepdim=True)
-    return rows, weights.to(torch.promote_types(dtype, torch.float32))
 
 
 def _nearest_in_tree(
@@ -173,16 +196,19 @@ def _nearest_in_tree(
     at the same distance, so more points are asked for, and all where these are not enough.
     """
     asked = min(k + MORE, tree.n)
-    rows = np.asarray(tree.query(points, k=asked)[1], np.int64).reshape(len(points), asked)
+    _, rows_in_tree = tree.query(points, k=asked)
+    rows = np.asarray(rows_in_tree, np.int64).reshape(len(points), asked)
     squared, rows = _by_distance(tree, points, rows)
     if asked < tree.n:
-        tied = np.flatnonzero(squared[:, -1] <= squared[:, k - 1] * (1 + ROUNDING))
-        reach = np.sqrt(squared[tied, k - 1]) * (1 + ROUNDING)
+        farthest = squared[:, k - 1]
+        tied = np.flatnonzero(squared[:, -1] <= farthest * (1 + ROUNDING))
+        reach = np.sqrt(farthest[tied]) * (1 + ROUNDING)
         within = tree.query_ball_point(points[tied], reach)
-        for place, candidates in zip(tied, within, strict=True):
-            row = np.asarray(candidates, np.int64)[None]
-            near, ordered = _by_distance(tree, points[place, None], row)
-            squared[place, :k], rows[place, :k] = near[0, :k], ordered[0, :k]
+        for number, candidates in zip(tied, within, strict=True):
+            of_point = np.asarray(candidates, np.int64)[None]
+            near_squared, near_rows = _by_distance(tree, points[number, None], of_point)
+            squared[number, :k] = near_squared[0, :k]
+            rows[number, :k] = near_rows[0, :k]
     return squared[:, :k], rows[:, :k]
 
 
@@ -230,15 +256,17 @@ def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> An
     if not isinstance(map, PropagationMap):
         raise UserError(f"map must be a PropagationMap or a file, got {type(map).__name__}.")
     numbers = as_tensor("values", values)
-    rows, leading = _rows(map, numbers).to(numbers.device), map.rows.ndim - 1
-    missing = rows[:, 0] < 0
-    if fill is None and bool(missing.any()):
+    rows = _rows(map, numbers).to(numbers.device)
+    is_missing = rows[:, 0] < 0
+    has_missing = bool(is_missing.any())
+    if fill is None and has_missing:
         raise UserError(
-            f"map: {int(missing.sum())} points have no finite coordinates. Give their value, such "
-            "as fill=0."
+            f"map: {int(is_missing.sum())} points have no finite coordinates. Give their value, "
+            "such as fill=0."
         )
     rows = rows.clamp_min(0)
-    table = numbers.reshape(-1, *numbers.shape[leading:])
+    shape_of_value = numbers.shape[map.rows.ndim - 1 :]
+    table = numbers.reshape(-1, *shape_of_value)
     weights = map.weights.to(numbers.device).reshape(rows.shape)
     if rows.shape[1] == 1:
         result = _signed(table)[rows[:, 0]].view(table.dtype)
@@ -246,11 +274,13 @@ def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> An
         result = _mean(table, rows, weights)
     else:
         result = _vote(table, rows, weights)
-    if bool(missing.any()):
+    if has_missing:
         value = _fill_value(fill, table.dtype).to(table.device)
-        _signed(result)[missing] = _signed(value)
-    result = result.reshape(*map.rows.shape[:-1], *numbers.shape[leading:])
-    return result if isinstance(values, Tensor) else result.numpy()
+        _signed(result)[is_missing] = _signed(value)
+    result = result.reshape(*map.rows.shape[:-1], *shape_of_value)
+    if isinstance(values, Tensor):
+        return result
+    return result.numpy()
 
 
 def interpolate(values: Tensor, points: Tensor, queries: Tensor, k: int = 3) -> Tensor:
@@ -268,14 +298,15 @@ def interpolate(values: Tensor, points: Tensor, queries: Tensor, k: int = 3) -> 
     Returns:
         ``(B, N, C)``.
     """
+    clouds, m, channels = values.shape
     squared, rows = k_nearest(queries, points, min(k, points.shape[1]))
     weights = 1 / (squared + CLOSE)
     weights = weights / weights.sum(2, keepdim=True)
-    clouds, m, channels = values.shape
-    places = rows + torch.arange(clouds, device=rows.device)[:, None, None] * m
+    starts = torch.arange(clouds, device=rows.device) * m
+    rows_of_all = rows + starts[:, None, None]
     # One sum per query, without the tensor of all neighbours' values.
     mean = F.embedding_bag(
-        places.flatten(0, 1),
+        rows_of_all.flatten(0, 1),
         values.flatten(0, 1),
         mode="sum",
         per_sample_weights=weights.flatten(0, 1).to(values),
@@ -285,19 +316,22 @@ def interpolate(values: Tensor, points: Tensor, queries: Tensor, k: int = 3) -> 
 
 def _rows(map: PropagationMap, values: Tensor) -> Tensor:
     """Return the rows ``(T, k)`` of values whose clouds are one after the other; check both."""
-    leading, clouds = map.rows.ndim - 1, map.rows.shape[:-2]
-    if tuple(values.shape[:leading]) != (*clouds, map.m):
+    clouds = map.rows.shape[:-2]
+    wanted = (*clouds, map.m)
+    if tuple(values.shape[: len(wanted)]) != wanted:
         raise UserError(
             f"values must have one row for each of {map.m} sampled points, shape "
-            f"{(*clouds, map.m)}, got {tuple(values.shape)}."
+            f"{wanted}, got {tuple(values.shape)}."
         )
     rows = map.rows.long()
-    if rows.numel() and not (int(rows.min()) >= -1 and int(rows.max()) < map.m):
-        raise UserError(
-            f"map: rows must be from -1 to {map.m - 1}, got {int(rows.min())} to {int(rows.max())}."
-        )
+    if rows.numel():
+        least = int(rows.min())
+        most = int(rows.max())
+        if least < -1 or most >= map.m:
+            raise UserError(f"map: rows must be from -1 to {map.m - 1}, got {least} to {most}.")
     if clouds:
-        rows = rows + map.m * torch.arange(clouds[0], device=rows.device)[:, None, None]
+        starts = map.m * torch.arange(clouds[0], device=rows.device)
+        rows = rows + starts[:, None, None]
     return rows.reshape(-1, rows.shape[-1])
 
 
@@ -312,16 +346,18 @@ def _fill_value(fill: Any, dtype: torch.dtype) -> Tensor:
     Raises:
         UserError: the data type of the values cannot hold it.
     """
-    kind = torch.empty(0, dtype=dtype).numpy().dtype if dtype != torch.bfloat16 else None
+    kind = np.dtype(np.float32)  # numpy has no bfloat16
+    if dtype != torch.bfloat16:
+        kind = torch.empty(0, dtype=dtype).numpy().dtype
     try:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             wanted = np.asarray(fill)
-            stored = wanted.astype(kind or np.float32)
+            stored = wanted.astype(kind)
     except (TypeError, ValueError, OverflowError):
         raise UserError(f"fill must be a number, got {fill!r}.") from None
-    exact = stored.dtype.kind == "f" or np.array_equal(stored.astype(object), wanted.astype(object))
-    if not exact:
+    is_whole = stored.dtype.kind != "f"
+    if is_whole and not np.array_equal(stored.astype(object), wanted.astype(object)):
         raise UserError(f"fill must be a number of the type {dtype}, got {fill!r}.")
     return torch.from_numpy(np.array(stored)).to(dtype)
 
@@ -330,13 +366,21 @@ def _mean(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     """Return weighted means, of the table's dtype."""
     if table.dtype in (torch.int64, torch.uint64):
         return _mean_of_64_bits(table, rows, weights)
-    exact = table if table.is_floating_point() else table.double()
-    weights = weights.to(torch.promote_types(exact.dtype, torch.float32))
-    weights = weights.reshape(*weights.shape, *[1] * (table.ndim - 1))
-    total = exact[rows[:, 0]] * weights[:, 0]
-    for i in range(1, rows.shape[1]):
-        total = total + exact[rows[:, i]] * weights[:, i]
-    return (total if table.is_floating_point() else total.round()).to(table.dtype)
+    is_whole = not table.is_floating_point()
+    numbers = table.double() if is_whole else table
+    weights = weights.to(torch.promote_types(numbers.dtype, torch.float32))
+    weights = _for_values(weights, table)
+    total = numbers[rows[:, 0]] * weights[:, 0]
+    for neighbour in range(1, rows.shape[1]):
+        total = total + numbers[rows[:, neighbour]] * weights[:, neighbour]
+    if is_whole:
+        total = total.round()
+    return total.to(table.dtype)
+
+
+def _for_values(weights: Tensor, table: Tensor) -> Tensor:
+    """Return weights ``(T, k)`` with as many dimensions as the values of ``(T, k)`` rows have."""
+    return weights.reshape(*weights.shape, *[1] * (table.ndim - 1))
 
 
 def _mean_of_64_bits(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
@@ -350,30 +394,33 @@ def _mean_of_64_bits(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     if table.dtype == torch.uint64:
         high = torch.where(high < 0, high + HALF, high)
     low = (bits & 0xFFFFFFFF).double()
-    base = rows.gather(1, weights.argmax(1, keepdim=True))[:, 0]
+    heaviest = weights.argmax(1, keepdim=True)
+    base = rows.gather(1, heaviest)[:, 0]
     weights = weights.double() / weights.double().sum(1, keepdim=True)
-    weights = weights.reshape(*weights.shape, *[1] * (table.ndim - 1))
+    weights = _for_values(weights, table)
     difference = torch.zeros_like(high[base])
-    for i in range(rows.shape[1]):
-        row = rows[:, i]
+    for neighbour in range(rows.shape[1]):
+        row = rows[:, neighbour]
         away = (high[row] - high[base]) * HALF + (low[row] - low[base])
-        difference = difference + away * weights[:, i]
+        difference = difference + away * weights[:, neighbour]
     difference = difference.round()
     upper = (difference / HALF).floor()
     lower = difference - upper * HALF
-    return (bits[base] + (upper.long() << 32) + lower.long()).view(table.dtype)
+    mean = bits[base] + (upper.long() << 32) + lower.long()
+    return mean.view(table.dtype)
 
 
 def _vote(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     """Return, column by column, the value with the largest sum of weights; of equals the nearer."""
     bits = _signed(table)
     codes = bits.long().reshape(len(table), -1)[rows]  # (T, k, columns)
-    votes = [
-        ((codes == codes[:, i, None]) * weights[..., None]).sum(1) for i in range(rows.shape[1])
-    ]
+    votes = []
+    for neighbour in range(rows.shape[1]):
+        is_same = codes == codes[:, neighbour, None]
+        votes.append((is_same * weights[..., None]).sum(1))
     winner = torch.stack(votes, 1).argmax(1, keepdim=True)
-    chosen = codes.gather(1, winner).to(bits.dtype).reshape(-1, *table.shape[1:])
-    return chosen.view(table.dtype)
+    chosen = codes.gather(1, winner).to(bits.dtype)
+    return chosen.reshape(-1, *table.shape[1:]).view(table.dtype)
 
 
 def read_map(path: Path) -> PropagationMap:
@@ -385,23 +432,35 @@ def read_map(path: Path) -> PropagationMap:
     if not path.is_file():
         raise UserError(f"map: no file {path}. Write it by downsample --map {path}.")
     arrays = load_npz(path)
-    rows: Any = arrays.get("rows")
-    m: Any = arrays.get("m")
-    kinds = {array.dtype.kind for array in (rows, m) if array is not None}
-    if rows is None or m is None or not kinds <= {"i", "u"} or not _sizes_fit(rows, m):
+    if not _is_map(arrays):
         raise UserError(
             f"{path} is no map: it must hold whole numbers, rows (N, k) and m of at least 1, got "
             f"{', '.join(arrays) or 'no arrays'}. Write it by downsample --map."
         )
+    rows = arrays["rows"]
     weights = arrays.get("weights", np.ones((len(rows), 1), np.float32))  # may lack for k = 1
-    are_numbers = weights.dtype.kind in "fiu" and weights.shape == rows.shape
-    if not are_numbers or not (np.isfinite(weights).all() and (weights >= 0).all()):
+    if not _are_weights(weights, rows.shape):
         raise UserError(f"{path}: weights must be finite, at least 0, and of shape {rows.shape}.")
     if weights.dtype.kind != "f":
         weights = weights.astype(np.float64)
-    whole = as_tensor("rows", rows.astype(np.int64))
-    return PropagationMap(whole, as_tensor("weights", weights), int(m))
+    return PropagationMap(
+        rows=as_tensor("rows", rows.astype(np.int64)),
+        weights=as_tensor("weights", weights),
+        m=int(arrays["m"]),
+    )
 
 
-def _sizes_fit(rows: NDArray[Any], m: NDArray[Any]) -> bool:
+def _is_map(arrays: Mapping[str, NDArray[Any]]) -> bool:
+    if "rows" not in arrays or "m" not in arrays:
+        return False
+    rows = arrays["rows"]
+    m = arrays["m"]
+    if rows.dtype.kind not in "iu" or m.dtype.kind not in "iu":
+        return False
     return rows.ndim == 2 and rows.shape[1] > 0 and m.ndim == 0 and bool(m >= 1)
+
+
+def _are_weights(weights: NDArray[Any], shape: tuple[int, ...]) -> bool:
+    if weights.dtype.kind not in "fiu" or weights.shape != shape:
+        return False
+    return bool(np.isfinite(weights).all() and (weights >= 0).all())

@@ -28,15 +28,12 @@ def from_columns(columns: Mapping[str, Column], path: Path, layout: Any = None) 
     Raises:
         BadCloudError: there are no coordinates, or float64 does not hold them.
     """
-    lower = {name.lower(): name for name in reversed(list(columns))}
-    if not {"x", "y", "z"} <= set(lower):
+    name_of = {name.lower(): name for name in reversed(list(columns))}
+    if not {"x", "y", "z"} <= name_of.keys():
         raise BadCloudError(f"{path} must have columns x, y and z, got {', '.join(columns)}.")
-    axes = [lower[axis] for axis in "xyz"]
+    axes = [name_of["x"], name_of["y"], name_of["z"]]
     for name in axes:
-        if columns[name].dtype.kind not in "fiu":
-            raise BadCloudError(f"{path}: {name} must be numbers, got {columns[name].dtype}.")
-        if not holds_exactly(np.dtype(np.float64), columns[name]):
-            raise BadCloudError(f"{path}: {name} has numbers that float64 does not hold exactly.")
+        _check_coordinates(name, columns[name], path)
     points = np.stack([np.asarray(columns[name], np.float64) for name in axes], 1)
     kind = np.result_type(*(columns[name].dtype for name in axes))
     attributes: dict[str, Column] = {}
@@ -49,6 +46,13 @@ def from_columns(columns: Mapping[str, Column], path: Path, layout: Any = None) 
         else:
             left_out.append(name)
     return Table(points, attributes, form=Form(kind, left_out=tuple(left_out), layout=layout))
+
+
+def _check_coordinates(name: str, column: Column, path: Path) -> None:
+    if column.dtype.kind not in "fiu":
+        raise BadCloudError(f"{path}: {name} must be numbers, got {column.dtype}.")
+    if not holds_exactly(np.dtype(np.float64), column):
+        raise BadCloudError(f"{path}: {name} has numbers that float64 does not hold exactly.")
 
 
 def is_number_column(column: Column) -> bool:
@@ -80,14 +84,20 @@ def column_names(array: NDArray[Any], path: Path) -> list[str]:
         BadCloudError: the array has neither rows of at least three numbers nor one row of fields
             per point.
     """
-    shape, kind = array.shape, array.dtype.kind
+    shape = array.shape
     if array.dtype.names:
         if array.ndim != 1:
             raise BadCloudError(f"{path} must hold one row of fields per point, got {shape}.")
         return list(array.dtype.names)
-    if len(shape) != 2 or shape[1] < 3 or kind not in "fiu":
+    is_rows = len(shape) == 2 and shape[1] >= 3
+    if not is_rows or array.dtype.kind not in "fiu":
         raise BadCloudError(f"{path} must hold rows of x, y, z, got {array.dtype} {shape}.")
-    return ["x", "y", "z", *(f"column_{place}" for place in range(3, shape[1]))]
+    return unnamed(shape[1])
+
+
+def unnamed(number: int) -> list[str]:
+    """Return the names of columns without names: x, y, z, column_3 and so on."""
+    return ["x", "y", "z", *(f"column_{column}" for column in range(3, number))]
 
 
 def split_array(name: str, values: NDArray[Any]) -> dict[str, Column]:
@@ -116,13 +126,18 @@ def holds_exactly(kind: np.dtype[Any], column: Column) -> bool:
         return True
     if column.dtype.kind == "f":
         return np.can_cast(column.dtype, kind) or changed_numbers(column, kind) == 0
-    if kind.kind == "f":  # numpy calls every cast from int64 to float64 safe
-        most = min(LARGEST_WHOLE, 2 ** (np.finfo(kind).nmant + 1))
-        least = -most
-    else:
-        least, most = np.iinfo(kind).min, np.iinfo(kind).max
+    least, most = _whole_numbers_of(kind)
     # Compared as Python's integers, which do not overflow.
     return least <= int(column.min()) and int(column.max()) <= most
+
+
+def _whole_numbers_of(kind: np.dtype[Any]) -> tuple[int, int]:
+    """Return the smallest and largest number between which a data type holds all whole ones."""
+    if kind.kind == "f":  # numpy calls every cast from int64 to float64 safe
+        most = min(LARGEST_WHOLE, 2 ** (np.finfo(kind).nmant + 1))
+        return -most, most
+    limits = np.iinfo(kind)
+    return limits.min, limits.max
 
 
 def changed_numbers(column: Column, kind: np.dtype[Any]) -> int:
@@ -155,14 +170,16 @@ def fitting_type(name: str, column: Column, allowed: Iterable[str], suffix: str)
     Raises:
         CannotHoldError: no data type of the format holds the numbers.
     """
-    own = np.dtype("u1") if column.dtype.kind == "b" else in_native_order(column).dtype
+    if column.dtype.kind == "b":
+        own = np.dtype("u1")
+    else:
+        own = in_native_order(column).dtype
     kinds = [np.dtype(kind) for kind in allowed]
     if own in kinds:
         return own
-    wider = [np.dtype(kind) for kind in WIDER[own.kind]]
-    for kind in wider:
-        if kind in kinds and holds_exactly(kind, column):
-            return kind
+    for wider in map(np.dtype, WIDER[own.kind]):
+        if wider in kinds and holds_exactly(wider, column):
+            return wider
     if own.kind == "f":  # longdouble, with more digits than any format has
         return np.dtype(np.float64)
     others = [other for other in (".npz", ".las") if other != suffix]
@@ -175,13 +192,16 @@ def fitting_type(name: str, column: Column, allowed: Iterable[str], suffix: str)
 
 def floating(kind: np.dtype[Any]) -> np.dtype[Any]:
     """Return float32 or float64, whichever holds all numbers of a data type up to 2**53."""
-    return np.dtype(np.float32 if np.can_cast(kind, np.float32) else np.float64)
+    if np.can_cast(kind, np.float32):
+        return np.dtype(np.float32)
+    return np.dtype(np.float64)
 
 
 def to_rows(columns: Mapping[str, Column]) -> NDArray[Any]:
     """Return columns ``(N,)`` as a structured array of N rows, in little-endian order."""
     fields = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
-    rows = np.empty(len(next(iter(columns.values()))), fields)
+    first = next(iter(columns.values()))
+    rows = np.empty(len(first), fields)
     for name, column in columns.items():
         rows[name] = column
     return rows

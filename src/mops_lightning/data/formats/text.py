@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mops_lightning.data.formats.columns import from_columns, unique_names
+from mops_lightning.data.formats.columns import from_columns, unique_names, unnamed
 from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.table import Column, Table
 
@@ -45,19 +45,18 @@ def read(path: Path) -> Table:
         BadCloudError: the file has no points, or fewer than its first line announces.
     """
     text = path.read_text(encoding="utf-8-sig", errors="replace")
-    lines = [COMMENT.split(line)[0].strip() for line in text.splitlines()]
-    lines = [line for line in lines if line]
+    lines = _lines_of_numbers(text)
     if not lines:
         raise BadCloudError(f"{path} is empty.")
-    separator = next((mark for mark in ",;" if mark in lines[-1]), None)
+    separator = _separator(lines[-1])
     announced = None
     if len(lines) > 1 and len(lines[0].split(separator)) == 1 and lines[0].isdecimal():
         announced = int(lines.pop(0))
     words = _words(lines[0], separator)
-    if not any(map(_is_number, words)):
-        lines.pop(0)
-    else:
+    if any(map(_is_number, words)):
         words = []
+    else:
+        lines.pop(0)
     if not lines:
         raise BadCloudError(f"{path} holds no points.")
     columns = numbers_of_lines(lines, separator)
@@ -67,11 +66,34 @@ def read(path: Path) -> Table:
     if len(columns) < 3:
         raise BadCloudError(f"{path} must hold rows of x, y, z, got {len(columns)} columns.")
     header, names = _header(text, separator, words, len(columns))
-    mark = separator or ("\t" if "\t" in lines[-1] else " ")
     table = from_columns(dict(zip(names, columns, strict=True)), path)
-    in_table = [_name_in_table(name, table) for name in names]
-    layout = TextForm(mark, header, tuple(in_table), announced is not None)
+    blank = "\t" if "\t" in lines[-1] else " "
+    layout = TextForm(
+        separator=separator or blank,
+        header=header,
+        names=tuple(_name_in_table(name, table) for name in names),
+        counted=announced is not None,
+    )
     return replace(table, form=replace(table.form, layout=layout))
+
+
+def _lines_of_numbers(text: str) -> list[str]:
+    """Return the lines of a text without comments and empty lines."""
+    lines = []
+    for line in text.splitlines():
+        content = COMMENT.split(line)[0].strip()
+        if content:
+            lines.append(content)
+    return lines
+
+
+def _separator(line: str) -> str | None:
+    """Return the mark between the numbers of a line; None for blanks."""
+    if "," in line:
+        return ","
+    if ";" in line:
+        return ";"
+    return None
 
 
 def _name_in_table(name: str, table: Table) -> str:
@@ -100,11 +122,13 @@ def _header(
     for line in text.lstrip("\ufeff").splitlines()[:HEADER_LINES]:
         # A header may be a comment: as many words as there are columns, x, y and z among them.
         names = _words(line.strip().lstrip("#/ "), separator)
-        if len(names) == number and {"x", "y", "z"} <= {name.lower() for name in names}:
+        if len(names) != number:
+            continue
+        if {"x", "y", "z"} <= {name.lower() for name in names}:
             return line, _different(names)
-        if words and names == words and len(words) == number:
+        if words and names == words:
             return line, _different(["x", "y", "z", *words[3:]])
-    return "", ["x", "y", "z", *(f"column_{place}" for place in range(3, number))]
+    return "", unnamed(number)
 
 
 def _different(names: list[str]) -> list[str]:
@@ -122,9 +146,10 @@ def numbers_of_lines(lines: list[str], separator: str | None) -> list[Column]:
     """Return the columns of lines; whole numbers of 64 bits keep all digits."""
     array: NDArray[Any] = np.loadtxt(lines, delimiter=separator, ndmin=2)
     columns: list[Column] = []
-    for place, values in enumerate(array.T):
-        whole = np.isfinite(values).all() and bool((values == np.rint(values)).all())
-        integers = _integers(lines, separator, place) if whole else None
+    for number, values in enumerate(array.T):
+        integers = None
+        if np.isfinite(values).all() and (values == np.rint(values)).all():
+            integers = _integers(lines, separator, number)
         columns.append(values if integers is None else integers)
     return columns
 
@@ -155,17 +180,17 @@ def write(path: Path, table: Table) -> None:
     Every number has as few digits as give the same number of its data type. Separator and names are
     those of a text file that was read.
     """
-    layout = table.form.layout
-    form = layout if isinstance(layout, TextForm) else TextForm()
+    form = table.form.layout
+    if not isinstance(form, TextForm):
+        form = TextForm()
     names = ["x", "y", "z", *table.columns]
-    known = [names.index(name) for name in form.names if name in names]
-    order = [*known, *(place for place in range(len(names)) if place not in known)]
+    order = _order(names, form)
     header = form.header
-    if tuple(names[place] for place in order) != form.names:
+    if tuple(names[column] for column in order) != form.names:
         plain = ["x", "y", "z", *unique_names(table)]
-        header = _new_header(form, [plain[place] for place in order])
+        header = _new_header(form, [plain[column] for column in order])
     columns = [*table.stored_coordinates().T, *table.columns.values()]
-    words = [_shortest(columns[place]) for place in order]
+    words = [_shortest(columns[column]) for column in order]
     lines = map(form.separator.join, zip(*words, strict=True))
     with path.open("w", encoding="utf-8", newline="\n") as file:
         if form.counted:
@@ -175,14 +200,24 @@ def write(path: Path, table: Table) -> None:
         file.writelines(f"{line}\n" for line in lines)
 
 
+def _order(names: list[str], form: TextForm) -> list[int]:
+    """Return the numbers of columns in the order of the file that was read, new columns last."""
+    order = [names.index(name) for name in form.names if name in names]
+    for column in range(len(names)):
+        if column not in order:
+            order.append(column)
+    return order
+
+
 def _new_header(form: TextForm, names: list[str]) -> str:
     """Return a line of names; none if all names are those of unnamed columns."""
-    unnamed = all(name in ("x", "y", "z") or name.startswith("column_") for name in names)
-    if unnamed and not form.header:
+    are_unnamed = all(name in ("x", "y", "z") or name.startswith("column_") for name in names)
+    if are_unnamed and not form.header:
         return ""
-    is_comment = not form.header or COMMENT.match(form.header) is not None
     line = form.separator.join(names)
-    return f"# {line}" if is_comment else line
+    if not form.header or COMMENT.match(form.header):
+        return f"# {line}"
+    return line
 
 
 def _shortest(column: Column) -> list[str]:

@@ -21,7 +21,8 @@ EXTRA = struct.Struct("<2xBB32s4x72x3d3d32s")
 TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 """Types 1 to 10 of extra dimensions; 11 to 20 are pairs of them, 21 to 30 triples."""
 
-SCALED, SHIFTED = 8, 16
+SCALED = 8
+SHIFTED = 16
 """Bits of an extra dimension's options."""
 
 PIECE = 7
@@ -70,12 +71,13 @@ class Extra:
 
     def to_bytes(self) -> bytes:
         """Return the entry of a dimension without scales, or of undocumented bytes."""
-        type_, options = 0, self.count
+        type_ = 0
+        options = self.count
         if self.documented:
             type_ = 1 + TYPES.index(self.kind.lstrip("<|")) + len(TYPES) * (self.count - 1)
             options = 0
-        numbers = (0.0,) * 6
-        return EXTRA.pack(type_, options, self.name.encode(), *numbers, b"")
+        scales_and_offsets = (0.0,) * 6
+        return EXTRA.pack(type_, options, self.name.encode(), *scales_and_offsets, b"")
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,17 @@ class Dimension:
 
     def _numbers(self, rows: Rows) -> NDArray[Any]:
         numbers = rows[self.field]
-        return numbers if self.element is None else numbers[:, self.element]
+        if self.element is None:
+            return numbers
+        return numbers[:, self.element]
+
+    @property
+    def _step(self) -> float:
+        return 1.0 if self.scale is None else self.scale
+
+    @property
+    def _start(self) -> float:
+        return 0.0 if self.offset is None else self.offset
 
     def get(self, rows: Rows) -> NDArray[Any]:
         """Return the values ``(N,)``."""
@@ -116,21 +128,19 @@ class Dimension:
             return (numbers & self.mask) >> self._shift
         if not self.is_scaled:
             return numbers.copy()
-        scale = 1.0 if self.scale is None else self.scale
-        offset = 0.0 if self.offset is None else self.offset
-        return numbers * scale + offset
+        return numbers * self._step + self._start
 
     def set(self, rows: Rows, values: NDArray[Any]) -> None:
         """Write values ``(N,)``, which the dimension can hold."""
         numbers = self._numbers(rows)
         if self.mask:
             bits = (values.astype(numbers.dtype) << self._shift) & self.mask
-            numbers[:] = (numbers & ~np.uint8(self.mask)) | bits
+            others = numbers & ~np.uint8(self.mask)
+            numbers[:] = others | bits
         elif self.is_scaled:
-            scale = 1.0 if self.scale is None else self.scale
-            offset = 0.0 if self.offset is None else self.offset
-            steps = (values - offset) / scale
-            numbers[:] = np.rint(steps) if numbers.dtype.kind in "iu" else steps
+            steps = (values - self._start) / self._step
+            is_whole = numbers.dtype.kind in "iu"
+            numbers[:] = np.rint(steps) if is_whole else steps
         else:
             numbers[:] = values
 
@@ -159,48 +169,58 @@ class Layout:
     def dtype(self) -> np.dtype[Any]:
         """The data type of a point."""
         kinds: list[Any] = [(name, self.standard[name]) for name in self.standard.names or ()]
-        for place, extra in enumerate(self.extra):
+        for number, extra in enumerate(self.extra):
             shape = () if extra.count == 1 else (extra.count,)
-            kinds.append((f"extra {place}", extra.kind, shape))
+            kinds.append((f"extra {number}", extra.kind, shape))
         return np.dtype(kinds)
 
     @cached_property
     def dimensions(self) -> dict[str, Dimension]:
         """Where every column is; an array of k numbers is k columns, ``NAME_0`` to ``NAME_k-1``."""
+        dimensions = self._standard_dimensions()
+        for number, extra in enumerate(self.extra):
+            field = f"extra {number}"
+            if extra.count == 1:
+                name = free_name(extra.name, dimensions)
+                dimensions[name] = _extra_dimension(field, extra, None)
+                continue
+            for element in range(extra.count):
+                name = free_name(f"{extra.name}_{element}", dimensions)
+                dimensions[name] = _extra_dimension(field, extra, element)
+        return dimensions
+
+    def _standard_dimensions(self) -> dict[str, Dimension]:
         import laspy
 
         bits = laspy.point.dims.get_sub_fields_dict(self.format)
-        found: dict[str, Dimension] = {}
+        dimensions: dict[str, Dimension] = {}
         for name in laspy.PointFormat(self.format).dimension_names:
             if name in bits:
                 field, sub_field = bits[name]
-                found[name] = Dimension(field, sub_field.mask)
+                dimensions[name] = Dimension(field, sub_field.mask)
             elif name not in "XYZ":
-                found[name] = Dimension(name)
-        for place, extra in enumerate(self.extra):
-            for element in range(extra.count):
-                name = extra.name if extra.count == 1 else f"{extra.name}_{element}"
-                found[free_name(name, found)] = _extra_dimension(place, extra, element)
-        return found
+                dimensions[name] = Dimension(name)
+        return dimensions
 
     @property
     def arrays(self) -> dict[str, tuple[str, ...]]:
         """The names of the arrays, and the columns of each."""
-        found: dict[str, list[str]] = {}
+        columns_of: dict[str, list[str]] = {}
         for name, dimension in self.dimensions.items():
             if dimension.element is not None:
-                extra = self.extra[int(dimension.field.removeprefix("extra "))]
-                found.setdefault(extra.name, []).append(name)
-        return {name: tuple(columns) for name, columns in found.items()}
+                number = int(dimension.field.removeprefix("extra "))
+                array = self.extra[number].name
+                columns_of.setdefault(array, []).append(name)
+        return {name: tuple(columns) for name, columns in columns_of.items()}
 
     def holds(self, name: str, values: NDArray[Any]) -> bool:
         """Return whether a dimension holds values ``(any,)`` exactly."""
         dimension = self.dimensions[name]
         rows = np.zeros(len(values), self.dtype)
-        floats = values.dtype.kind == "f"
+        is_float = values.dtype.kind == "f"
         with suppress(OverflowError, TypeError, ValueError), np.errstate(all="ignore"):
             dimension.set(rows, values)
-            return np.array_equal(dimension.get(rows), values, equal_nan=floats)
+            return np.array_equal(dimension.get(rows), values, equal_nan=is_float)
         return False
 
     def with_columns(
@@ -218,28 +238,29 @@ class Layout:
         Returns:
             The layout, and the dimension of every column.
         """
-        names = {
-            name: name
-            for name, values in columns.items()
-            if name in self.dimensions and self.holds(name, values)
-        }
-        array_of = self._new_arrays(columns, arrays or {})
-        parts_of: dict[str, tuple[str, ...]] = {}
-        taken = dict.fromkeys(self.dimensions)
-        added: list[Extra] = []
+        names: dict[str, str] = {}
         for name, values in columns.items():
-            if name in names or any(name in parts for parts in parts_of.values()):
+            if name in self.dimensions and self.holds(name, values):
+                names[name] = name
+        array_of = self._new_arrays(columns, arrays or {})
+        columns_of: dict[str, tuple[str, ...]] = {}
+        taken = dict.fromkeys(self.dimensions)
+        extra = list(self.extra)
+        placed = set(names)
+        for name, values in columns.items():
+            if name in placed:
                 continue
-            wanted, parts = array_of.get(name, (name, (name,)))
-            own = free_name(wanted, taken)
-            taken[own] = None
-            parts_of[f"extra {len(self.extra) + len(added)}"] = parts
-            added.append(Extra(own, _kind(values), len(parts)))
-        layout = Layout(self.format, (*self.extra, *added))
+            wanted, together = array_of.get(name, (name, (name,)))
+            free = free_name(wanted, taken)
+            taken[free] = None
+            columns_of[f"extra {len(extra)}"] = together
+            extra.append(Extra(free, _kind(values), len(together)))
+            placed.update(together)
+        layout = Layout(self.format, tuple(extra))
         for dimension_name, dimension in layout.dimensions.items():
-            if dimension.field in parts_of:
-                part = parts_of[dimension.field][dimension.element or 0]
-                names[part] = dimension_name
+            if dimension.field in columns_of:
+                column = columns_of[dimension.field][dimension.element or 0]
+                names[column] = dimension_name
         return layout, names
 
     def _new_arrays(
@@ -247,19 +268,24 @@ class Layout:
     ) -> dict[str, tuple[str, tuple[str, ...]]]:
         """Return the array of every column that can be one dimension with its neighbours."""
         array_of: dict[str, tuple[str, tuple[str, ...]]] = {}
-        for name, parts in arrays.items():
-            new = [columns[part] for part in parts if part in columns]
-            is_whole = len(new) == len(parts) and self.dimensions.keys().isdisjoint(parts)
-            if is_whole and len(parts) in (2, 3) and len({values.dtype for values in new}) == 1:
-                array_of |= dict.fromkeys(parts, (name, parts))
+        for name, members in arrays.items():
+            kinds = [columns[member].dtype for member in members if member in columns]
+            is_whole = len(kinds) == len(members) and len(set(kinds)) == 1
+            is_new = self.dimensions.keys().isdisjoint(members)
+            if is_whole and is_new and len(members) in (2, 3):
+                array_of |= dict.fromkeys(members, (name, members))
         return array_of
 
 
-def _extra_dimension(place: int, extra: Extra, element: int) -> Dimension:
-    scale = None if extra.scales is None else extra.scales[element]
-    offset = None if extra.offsets is None else extra.offsets[element]
-    array_element = None if extra.count == 1 else element
-    return Dimension(f"extra {place}", 0, array_element, scale, offset)
+def _extra_dimension(field: str, extra: Extra, element: int | None) -> Dimension:
+    """Return an extra dimension, or one element of an array."""
+    place = element or 0
+    return Dimension(
+        field,
+        element=element,
+        scale=None if extra.scales is None else extra.scales[place],
+        offset=None if extra.offsets is None else extra.offsets[place],
+    )
 
 
 def free_name(name: str, taken: Mapping[str, Any]) -> str:
@@ -293,10 +319,14 @@ def layout_of(header: Header) -> Layout:
     if left < 0:
         raise ValueError(f"a point of format {header.format} does not fit in {header.item} bytes")
     extra = documented_extra(header)
-    left -= sum(dimension.size for dimension in extra)
+    left -= _size(extra)
     if left:
         extra.append(Extra("ExtraBytes", "u1", left, documented=False))
     return Layout(header.format, tuple(extra))
+
+
+def _size(extra: list[Extra]) -> int:
+    return sum(dimension.size for dimension in extra)
 
 
 def is_extra(record: Record) -> bool:
@@ -310,8 +340,11 @@ def documented_extra(header: Header) -> list[Extra]:
     Where it documents more bytes than a point has, the record is invalid by the specification.
     """
     room = header.item - Layout(header.format).standard.itemsize
-    extra = [e for r in header.records if is_extra(r) for e in _documented(r.data)]
-    return extra if sum(dimension.size for dimension in extra) <= room else []
+    extra: list[Extra] = []
+    for record in header.records:
+        if is_extra(record):
+            extra += _documented(record.data)
+    return extra if _size(extra) <= room else []
 
 
 def _documented(data: bytes) -> Iterator[Extra]:
@@ -324,10 +357,19 @@ def _documented(data: bytes) -> Iterator[Extra]:
         if type_ == 0:
             extra = Extra(text, "u1", options, documented=False)
         else:
-            count = 1 + (type_ - 1) // len(TYPES)
-            scales = tuple(numbers[:count]) if options & SCALED else None
-            offsets = tuple(numbers[3 : 3 + count]) if options & SHIFTED else None
-            kind = "<" + TYPES[(type_ - 1) % len(TYPES)]
-            extra = Extra(text, kind, count, scales, offsets)
+            extra = _numbers_entry(text, type_, options, numbers)
         if extra.size:
             yield extra
+
+
+def _numbers_entry(name: str, type_: int, options: int, numbers: list[float]) -> Extra:
+    """Return an extra dimension of numbers; ``numbers`` are three scales and three offsets."""
+    more, kind = divmod(type_ - 1, len(TYPES))
+    count = 1 + more
+    scales = None
+    if options & SCALED:
+        scales = tuple(numbers[:count])
+    offsets = None
+    if options & SHIFTED:
+        offsets = tuple(numbers[3 : 3 + count])
+    return Extra(name, f"<{TYPES[kind]}", count, scales, offsets)
