@@ -15,122 +15,158 @@ LABELS = [np.int64, np.uint32, np.uint16, np.uint8, np.bool_]
 def plain_map(points, sampled, k):
     """Sort all distances; weights are 1/d²."""
     distances = torch.cdist(
-        points.double(), sampled.double(), compute_mode="donot_use_mm_for_euclid_dist"
+        points.double(),
+        sampled.double(),
+        compute_mode="donot_use_mm_for_euclid_dist",
     )
     near, rows = distances.sort(dim=1)
     inverse = near[:, :k] ** -2
-    return rows[:, :k], inverse / inverse.sum(1, keepdim=True)
+    weights = inverse / inverse.sum(1, keepdim=True)
+    return rows[:, :k], weights
 
 
 @pytest.mark.parametrize("k", [1, 3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_map_has_nearest_rows_and_inverse_square_weights(k, dtype, rng):
-    points, sampled = torch.rand(200, 3, generator=rng), torch.rand(30, 3, generator=rng)
-    made = propagation_map(points.to(dtype), sampled.to(dtype), k)
+    points = torch.rand(200, 3, generator=rng)
+    sampled = torch.rand(30, 3, generator=rng)
     rows, weights = plain_map(points, sampled, k)
+
+    made = propagation_map(points.to(dtype), sampled.to(dtype), k)
+
     assert torch.equal(made.rows, rows)
     torch.testing.assert_close(made.weights, weights.to(dtype), rtol=1e-4, atol=1e-6)
     assert made.m == 30
 
 
-def test_sampled_points_keep_their_values(rng):
+@pytest.mark.parametrize("k", [1, 5])
+def test_sampled_points_keep_their_values(k, rng):
     points = torch.rand(80, 3, generator=rng)
     chosen = torch.randperm(80, generator=rng)[:20]
     scores = torch.rand(20, 4, generator=rng)
-    for k in (1, 5):
-        carried = propagate(scores, propagation_map(points, points[chosen], k))
-        assert torch.equal(carried[chosen], scores)
+
+    carried = propagate(scores, propagation_map(points, points[chosen], k))
+
+    assert torch.equal(carried[chosen], scores)
 
 
 def test_ragged_clouds_equal_clouds_one_by_one(rng):
-    sizes, m = [40, 25], [8, 6]
-    clouds = [torch.rand(size, 3, generator=rng) for size in sizes]
-    labels = [torch.randint(9, (number,), generator=rng) for number in m]
-    samples = [cloud[:number] for cloud, number in zip(clouds, m, strict=True)]
-    alone = [
-        propagate(own, propagation_map(cloud, sample, 3))
-        for own, cloud, sample in zip(labels, clouds, samples, strict=True)
-    ]
-    batch, sampled_batch = (torch.arange(2).repeat_interleave(torch.tensor(n)) for n in (sizes, m))
-    flat = propagation_map(torch.cat(clouds), torch.cat(samples), 3, batch, sampled_batch)
-    assert torch.equal(propagate(torch.cat(labels), flat), torch.cat(alone))
+    first = torch.rand(40, 3, generator=rng)
+    second = torch.rand(25, 3, generator=rng)
+    labels = torch.randint(9, (14,), generator=rng)
+    batch = torch.tensor([0] * 40 + [1] * 25)
+    sampled = torch.cat([first[:8], second[:6]])
+    sampled_batch = torch.tensor([0] * 8 + [1] * 6)
+
+    flat = propagation_map(torch.cat([first, second]), sampled, 3, batch, sampled_batch)
+
+    of_first = propagate(labels[:8], propagation_map(first, first[:8], 3))
+    of_second = propagate(labels[8:], propagation_map(second, second[:6], 3))
+    assert torch.equal(propagate(labels, flat), torch.cat([of_first, of_second]))
 
 
-def test_batch_equals_clouds_one_by_one(rng):
-    clouds, samples = torch.rand(2, 20, 3, generator=rng), torch.rand(2, 6, 3, generator=rng)
-    dense = propagation_map(clouds, samples, 2)
+@pytest.mark.parametrize("cloud", [0, 1])
+def test_batch_equals_clouds_one_by_one(cloud, rng):
+    points = torch.rand(2, 20, 3, generator=rng)
+    samples = torch.rand(2, 6, 3, generator=rng)
     values = torch.rand(2, 6, 5, generator=rng)
-    for cloud in range(2):
-        one = propagation_map(clouds[cloud], samples[cloud], 2)
-        assert torch.equal(propagate(values, dense)[cloud], propagate(values[cloud], one))
+
+    carried = propagate(values, propagation_map(points, samples, 2))
+
+    alone = propagation_map(points[cloud], samples[cloud], 2)
+    assert torch.equal(carried[cloud], propagate(values[cloud], alone))
 
 
 @pytest.mark.parametrize("kind", LABELS)
 @pytest.mark.parametrize("k", [1, 4])
 def test_labels_stay_exact(kind, k, rng):
-    points, sampled = (torch.rand(n, 3, generator=rng).numpy() for n in (90, 12))
-    labels = (np.arange(12) % (2 if kind is np.bool_ else 5)).astype(kind)
+    points = torch.rand(90, 3, generator=rng).numpy()
+    sampled = torch.rand(12, 3, generator=rng).numpy()
+    number_of_labels = 2 if kind is np.bool_ else 5
+    labels = (np.arange(12) % number_of_labels).astype(kind)
     made = propagation_map(points, sampled, k)
+
     carried = propagate(labels, made)
+
     assert carried.dtype == labels.dtype
     for row, weights, label in zip(made.rows.tolist(), made.weights.tolist(), carried, strict=True):
         votes = dict.fromkeys(labels[row], 0.0)
-        for own, weight in zip(labels[row], weights, strict=True):
-            votes[own] += weight
+        for neighbour, weight in zip(labels[row], weights, strict=True):
+            votes[neighbour] += weight
         assert votes[label] == pytest.approx(max(votes.values()))
 
 
 def test_columns_vote_one_by_one_and_colours_are_averaged_on_request():
-    made = PropagationMap(torch.tensor([[0, 1, 2]]), torch.tensor([[0.4, 0.35, 0.25]]), 3)
+    rows = torch.tensor([[0, 1, 2]])
+    weights = torch.tensor([[0.4, 0.35, 0.25]])
+    made = PropagationMap(rows, weights, 3)
     colours = np.array([[0, 200], [100, 0], [100, 0]], np.uint8)
-    assert propagate(colours, made).tolist() == [[100, 0]]
+
+    voted = propagate(colours, made)
     mean = propagate(colours, made, mean=True)
-    assert (mean.tolist(), mean.dtype) == ([[60, 80]], np.uint8)
+
+    assert voted.tolist() == [[100, 0]]
+    assert mean.tolist() == [[60, 80]]
+    assert mean.dtype == np.uint8
 
 
 def test_gradients_flow_to_features(rng):
+    points = torch.rand(9, 3, generator=rng, dtype=torch.float64)
+    sampled = torch.rand(6, 3, generator=rng, dtype=torch.float64)
     values = torch.rand(6, 2, generator=rng, dtype=torch.float64, requires_grad=True)
-    made = propagation_map(torch.rand(9, 3, generator=rng).double(), torch.rand(6, 3).double(), 3)
+    made = propagation_map(points, sampled, 3)
+
     assert torch.autograd.gradcheck(lambda features: propagate(features, made), values)
 
 
 ROWS = np.zeros((5, 2), np.int32)
+COLUMN = ROWS[:, :1]
+NO_SUCH_MAP = "is no map"
+OUT_OF_RANGE = "rows must be from -1 to 2, got"
 
 
 @pytest.mark.parametrize(
     ("arrays", "said"),
     [
         ({"m": np.array(3)}, r"is no map: .*rows \(N, k\) and m of at least 1, got m"),
-        ({"rows": ROWS}, "is no map"),
+        ({"rows": ROWS}, NO_SUCH_MAP),
         ({"rows": ROWS / 2, "m": np.array(3)}, "must hold whole numbers"),
-        ({"rows": ROWS[0], "m": np.array(3)}, "is no map"),
-        ({"rows": ROWS[:, :0], "m": np.array(3)}, "is no map"),
-        ({"rows": ROWS, "m": np.array([3, 3])}, "is no map"),
+        ({"rows": ROWS[0], "m": np.array(3)}, NO_SUCH_MAP),
+        ({"rows": ROWS[:, :0], "m": np.array(3)}, NO_SUCH_MAP),
+        ({"rows": ROWS, "m": np.array([3, 3])}, NO_SUCH_MAP),
         ({"rows": ROWS, "m": np.array(-3)}, "m of at least 1"),
-        ({"rows": ROWS[:, :1] + 3, "m": np.array(3)}, "rows must be from -1 to 2, got 3 to 3"),
-        ({"rows": ROWS[:, :1] - 2, "m": np.array(3)}, "rows must be from -1 to 2, got -2"),
-        (
-            {"rows": ROWS[:, :1] - 1, "m": np.array(3)},
-            "5 points have no finite coordinates.* fill=0",
-        ),
-        ({"rows": ROWS[:, :1], "m": np.array(4)}, r"each of 4 sampled points, shape \(4,\), got"),
+        ({"rows": COLUMN + 3, "m": np.array(3)}, f"{OUT_OF_RANGE} 3 to 3"),
+        ({"rows": COLUMN - 2, "m": np.array(3)}, f"{OUT_OF_RANGE} -2"),
+        ({"rows": COLUMN - 1, "m": np.array(3)}, "5 points have no finite coordinates.* fill=0"),
+        ({"rows": COLUMN, "m": np.array(4)}, r"each of 4 sampled points, shape \(4,\), got"),
         ({"rows": ROWS, "m": np.array(3)}, "weights must be finite"),
         ({"rows": ROWS, "m": np.array(3), "weights": ROWS * np.nan}, "weights must be finite"),
     ],
 )
 def test_bad_map_gets_one_line(arrays, said, tmp_path):
-    np.savez(tmp_path / "map.npz", **arrays)
+    path = tmp_path / "map.npz"
+    np.savez(path, **arrays)
+
     with pytest.raises(UserError, match=said) as error:
-        propagate(np.arange(3), tmp_path / "map.npz")
+        propagate(np.arange(3), path)
+
     assert "\n" not in str(error.value)
 
 
-def test_missing_or_broken_map_gets_one_line(tmp_path):
+def test_missing_map_gets_one_line(tmp_path):
     with pytest.raises(UserError, match=r"no file .*map.npz\. Write it by downsample --map"):
         propagate(np.arange(3), tmp_path / "map.npz")
-    (tmp_path / "map.npz").write_bytes(b"PK" * 40)
+
+
+def test_broken_map_gets_one_line(tmp_path):
+    path = tmp_path / "map.npz"
+    path.write_bytes(b"PK" * 40)
+
     with pytest.raises(UserError, match=r"map.npz is broken"):
-        propagate(np.arange(3), tmp_path / "map.npz")
+        propagate(np.arange(3), path)
+
+
+def test_dictionary_as_a_map_gets_one_line():
     with pytest.raises(UserError, match="map must be a PropagationMap or a file, got dict"):
         propagate(np.arange(3), {"rows": 3})
 
@@ -166,18 +202,25 @@ def test_wrong_argument_gets_one_line(arguments, said):
 def test_map_breaks_ties_by_the_lowest_row(k):
     axis = np.arange(6.0)
     grid = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
-    sampled = np.concatenate([grid[::3], grid[::3]])[::-1].copy()  # each twice
+    third = grid[::3]
+    sampled = np.concatenate([third, third])[::-1].copy()
+    middles = grid + 0.5
 
-    rows = propagation_map(grid + 0.5, sampled, k).rows.numpy()
+    rows = propagation_map(middles, sampled, k).rows.numpy()
 
-    squared = np.square((grid + 0.5)[:, None] - sampled).sum(2)
-    np.testing.assert_array_equal(rows, squared.argsort(1, kind="stable")[:, :k])
+    squared = np.square(middles[:, None] - sampled).sum(2)
+    nearest = squared.argsort(1, kind="stable")[:, :k]
+    np.testing.assert_array_equal(rows, nearest)
 
 
 def exact_mean(values, weights):
     """Round a weighted mean of whole numbers, computed in fractions."""
-    total = sum(Fraction(w) for w in weights)
-    return round(sum(int(v) * Fraction(w) for v, w in zip(values, weights, strict=True)) / total)
+    total = Fraction(0)
+    total_weight = Fraction(0)
+    for value, weight in zip(values, weights, strict=True):
+        total += int(value) * Fraction(weight)
+        total_weight += Fraction(weight)
+    return round(total / total_weight)
 
 
 @pytest.mark.parametrize("kind", [np.int64, np.uint64])
@@ -199,16 +242,18 @@ def test_mean_of_64_bits_does_not_wrap(kind):
 @pytest.mark.parametrize("kind", [np.uint16, np.uint32, np.uint64, np.int64, np.float32])
 @pytest.mark.parametrize("k", [1, 2])
 def test_fill_is_the_value_of_points_without_coordinates(kind, k):
+    largest = 9 if kind is np.float32 else np.iinfo(kind).max
+    values = np.array([5, 6, largest], kind)
     rows = torch.tensor([[0, 1], [-1, -1], [2, 1]])[:, :k]
-    made = PropagationMap(rows, torch.full((3, k), 1 / k), 3)
-    values = np.array([5, 6, np.iinfo(kind).max if kind != np.float32 else 9], kind)
+    weights = torch.full((3, k), 1 / k)
 
-    carried = propagate(values, made, fill=7)
+    carried = propagate(values, PropagationMap(rows, weights, 3), fill=7)
 
     assert carried.dtype == kind
     assert carried[1] == 7
     if k == 1:
-        np.testing.assert_array_equal(carried[[0, 2]], values[[0, 2]])
+        assert carried[0] == 5
+        assert carried[2] == largest
 
 
 def test_fill_that_the_type_cannot_hold_is_refused():
@@ -228,9 +273,14 @@ def test_map_file_with_big_endian_arrays_is_read(tmp_path):
 @pytest.mark.parametrize("name", ["rows", "weights", "m"])
 @pytest.mark.parametrize("kind", ["c16", "M8[s]", "U3"])
 def test_map_file_with_arrays_that_are_no_numbers_is_refused(kind, name, tmp_path):
-    arrays = {"rows": np.zeros((2, 2), int), "weights": np.ones((2, 2)), "m": np.array(2)}
-    arrays[name] = arrays[name].astype(int).astype(kind)
-    np.savez(tmp_path / "map.npz", allow_pickle=True, **arrays)
+    path = tmp_path / "map.npz"
+    arrays = {
+        "rows": np.zeros((2, 2), int),
+        "weights": np.ones((2, 2), int),
+        "m": np.array(2),
+    }
+    arrays[name] = arrays[name].astype(kind)
+    np.savez(path, allow_pickle=True, **arrays)
 
     with pytest.raises(UserError, match=r"is no map|weights must be finite"):
-        propagate(np.array([7, 8]), tmp_path / "map.npz")
+        propagate(np.array([7, 8]), path)
