@@ -1,3 +1,5 @@
+"""Quaternions and rigid motions against SciPy."""
+
 import numpy as np
 import pytest
 import torch
@@ -7,79 +9,154 @@ from mops_lightning.ops import rigid
 from mops_lightning.seeding import generator
 from tests.support.rigid import motion
 
+ANGLES = (0.0, 1e-12, 1e-7, 1e-3, np.pi / 2, np.pi - 1e-7, np.pi)
+
 
 def rotations(number=200, seed=0):
     """Return random and special rotations: none, tiny, and half turns, exact and almost."""
-    axes = np.concatenate([np.eye(3), np.random.default_rng(seed).normal(size=(7, 3))])
+    rng = np.random.default_rng(seed)
+    axes = np.concatenate([np.eye(3), rng.normal(size=(7, 3))])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    angles = (0.0, 1e-12, 1e-7, 1e-3, np.pi / 2, np.pi - 1e-7, np.pi)
-    special = Rotation.from_rotvec(np.concatenate([axes * angle for angle in angles]))
-    return Rotation.concatenate([Rotation.random(number, random_state=seed), special])
+    special = np.concatenate([axes * angle for angle in ANGLES])
+    at_random = Rotation.random(number, random_state=seed)
+    return Rotation.concatenate([at_random, Rotation.from_rotvec(special)])
 
 
 def quaternions(rotation):
-    return torch.from_numpy(np.roll(rotation.as_quat(), 1, axis=-1).copy())  # scipy: scalar last
+    scalar_last = rotation.as_quat()
+    return torch.from_numpy(np.roll(scalar_last, 1, axis=-1).copy())
 
 
 def same_rotation(got, want, tolerance=1e-12):
-    sign = torch.where((got * want).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    product = (got * want).sum(-1, keepdim=True)
+    sign = torch.where(product < 0, -1.0, 1.0)
     torch.testing.assert_close(got * sign, want, atol=tolerance, rtol=0)
 
 
 def test_quaternion_to_matrix_equals_scipy():
     given = rotations()
-    got = rigid.quaternion_to_matrix(quaternions(given))
-    torch.testing.assert_close(got, torch.from_numpy(given.as_matrix()), atol=1e-12, rtol=0)
+
+    matrices = rigid.quaternion_to_matrix(quaternions(given))
+
+    expected = torch.from_numpy(given.as_matrix())
+    torch.testing.assert_close(matrices, expected, atol=1e-12, rtol=0)
 
 
-def test_multiply_and_conjugate_equal_scipy():
-    first, second = rotations(seed=1), rotations(seed=2)
+def test_multiply_equals_scipy():
+    first = rotations(seed=1)
+    second = rotations(seed=2)
+
     product = rigid.quaternion_multiply(quaternions(first), quaternions(second))
+
     same_rotation(product, quaternions(first * second))
-    same_rotation(rigid.quaternion_conjugate(quaternions(first)), quaternions(first.inv()))
+
+
+def test_conjugate_equals_scipy():
+    given = rotations(seed=1)
+
+    inverse = rigid.quaternion_conjugate(quaternions(given))
+
+    same_rotation(inverse, quaternions(given.inv()))
 
 
 def test_quaternion_from_euler_uses_fixed_axes_xyz():
     angles = np.random.default_rng(3).uniform(-np.pi, np.pi, (100, 3))
-    want = Rotation.from_euler("xyz", angles)
-    same_rotation(rigid.quaternion_from_euler(torch.from_numpy(angles)), quaternions(want))
+
+    turned = rigid.quaternion_from_euler(torch.from_numpy(angles))
+
+    same_rotation(turned, quaternions(Rotation.from_euler("xyz", angles)))
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_rotation_angle_equals_scipy(dtype):
-    first, second = rotations(seed=1), rotations(seed=1)[::-1]
-    pairs = [(first, second), (first, first)]
-    for angle in (0.0, 1e-6, 1e-4, 1.0, np.pi - 1e-6, np.pi):
-        pairs.append((first, first * Rotation.from_rotvec([0, 0, angle])))
-    for a, b in pairs:
-        got = rigid.rotation_angle(quaternions(a).to(dtype), quaternions(b).to(dtype))
-        want = torch.from_numpy((a.inv() * b).magnitude()).to(dtype)
-        assert torch.isfinite(got).all()
-        tolerance = 1e-7 if dtype == torch.float64 else 2e-6
-        torch.testing.assert_close(got, want, atol=tolerance, rtol=0)
-    a, b = quaternions(first), quaternions(rotations(seed=2))  # any sign and norm
-    torch.testing.assert_close(rigid.rotation_angle(-3 * a, b), rigid.rotation_angle(a, b))
+TOLERANCES = {torch.float64: 1e-7, torch.float32: 2e-6}
 
 
-def test_motion_composition_and_identity(rng):
+def check_angle(first, second, dtype):
+    """Compare the angles between two series of rotations with SciPy's."""
+    angle = rigid.rotation_angle(quaternions(first).to(dtype), quaternions(second).to(dtype))
+
+    expected = (first.inv() * second).magnitude()
+    assert torch.isfinite(angle).all()
+    torch.testing.assert_close(
+        angle, torch.from_numpy(expected).to(dtype), atol=TOLERANCES[dtype], rtol=0
+    )
+
+
+@pytest.mark.parametrize("dtype", TOLERANCES)
+def test_rotation_angle_of_random_pairs_equals_scipy(dtype):
+    first = rotations(seed=1)
+
+    check_angle(first, first[::-1], dtype)
+    check_angle(first, first, dtype)
+
+
+@pytest.mark.parametrize("dtype", TOLERANCES)
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 1e-4, 1.0, np.pi - 1e-6, np.pi])
+def test_rotation_angle_of_known_turns_equals_scipy(angle, dtype):
+    first = rotations(seed=1)
+    turn = Rotation.from_rotvec([0, 0, angle])
+
+    check_angle(first, first * turn, dtype)
+
+
+def test_rotation_angle_takes_quaternions_of_any_sign_and_norm():
+    first = quaternions(rotations(seed=1))
+    second = quaternions(rotations(seed=2))
+
+    angle = rigid.rotation_angle(-3 * first, second)
+
+    torch.testing.assert_close(angle, rigid.rotation_angle(first, second))
+
+
+def test_motion_after_another_moves_points_twice(rng):
     points = torch.randn(5, 40, 3, generator=rng)
-    first, second = motion(1), motion(2)
-    moved = first.apply(points)
+    first = motion(1)
+    second = motion(2)
+
     twice = second.after(first).apply(points)
-    torch.testing.assert_close(twice, second.apply(moved), atol=1e-5, rtol=0)
-    torch.testing.assert_close(rigid.identity_motion(points).apply(points), points)
-    torch.testing.assert_close(moved.diff(dim=1).norm(dim=2), points.diff(dim=1).norm(dim=2))
+
+    one_by_one = second.apply(first.apply(points))
+    torch.testing.assert_close(twice, one_by_one, atol=1e-5, rtol=0)
 
 
-def test_random_motion_covers_its_range():
+def test_identity_motion_keeps_points(rng):
+    points = torch.randn(5, 40, 3, generator=rng)
+
+    moved = rigid.identity_motion(points).apply(points)
+
+    torch.testing.assert_close(moved, points)
+
+
+def test_motion_keeps_distances(rng):
+    points = torch.randn(5, 40, 3, generator=rng)
+
+    moved = motion(1).apply(points)
+
+    distances = points.diff(dim=1).norm(dim=2)
+    torch.testing.assert_close(moved.diff(dim=1).norm(dim=2), distances)
+
+
+def test_random_motion_covers_its_translations():
     drawn = rigid.random_motion(45.0, 0.5, [generator(i) for i in range(2000)])
+
     assert drawn.translation.abs().max() <= 0.5
     assert (drawn.translation.amin(0) < -0.49).all()
     assert (drawn.translation.amax(0) > 0.49).all()
-    angles = Rotation.from_quat(np.roll(drawn.quaternion.numpy(), -1, 1)).as_euler("xyz", True)
-    assert np.abs(angles).max() <= 45.001
-    assert (np.abs(angles).max(0) > 44).all()
-    # The mean error of always predicting the identity is about 42.8 degrees.
-    still = torch.tensor([1.0, 0.0, 0.0, 0.0])
-    mean = torch.rad2deg(rigid.rotation_angle(drawn.quaternion, still.expand(2000, 4))).mean()
-    assert 41.5 < mean < 44
+
+
+def test_random_motion_covers_its_angles():
+    drawn = rigid.random_motion(45.0, 0.5, [generator(i) for i in range(2000)])
+
+    scalar_last = np.roll(drawn.quaternion.numpy(), -1, 1)
+    angles = np.abs(Rotation.from_quat(scalar_last).as_euler("xyz", degrees=True))
+    assert angles.max() <= 45.001
+    assert (angles.max(0) > 44).all()
+
+
+def test_random_motion_has_the_mean_angle_of_its_range():
+    drawn = rigid.random_motion(45.0, 0.5, [generator(i) for i in range(2000)])
+    still = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(2000, 4)
+
+    angles = rigid.rotation_angle(drawn.quaternion, still)
+
+    # Of always predicting the identity, about 42.8 degrees.
+    assert 41.5 < torch.rad2deg(angles).mean() < 44
