@@ -6,8 +6,10 @@ import torch
 
 def derive_seed(*numbers: int) -> int:
     """Hash non-negative numbers to one seed below 2^63."""
-    low, high = np.random.SeedSequence(numbers).generate_state(2, np.uint32)
-    return (int(high) << 32 | int(low)) >> 1
+    words = np.random.SeedSequence(numbers).generate_state(2, np.uint32)
+    low = int(words[0])
+    high = int(words[1])
+    return (high << 32 | low) >> 1
 
 
 def generator(*numbers: int) -> torch.Generator:

@@ -16,11 +16,15 @@ def cloud_sizes(number: int, batch: NDArray[Any], name: str = "batch") -> NDArra
         batch: ``(P,)`` the cloud of every point, ascending from 0, as in PyTorch Geometric.
         name: of the argument, for errors.
     """
-    if batch.shape != (number,) or batch.dtype.kind not in "iub":
+    is_whole = batch.dtype.kind in "iub"
+    if batch.shape != (number,) or not is_whole:
         raise UserError(
             f"{name} must be whole numbers of shape (P={number},), got {batch.dtype} of shape "
             f"{batch.shape}."
         )
-    if number and (batch[0] < 0 or bool((batch[1:] < batch[:-1]).any())):
-        raise UserError(f"{name} must be ascending and at least 0. Sort the points by cloud.")
+    if number:
+        is_negative = batch[0] < 0
+        descends = bool((batch[1:] < batch[:-1]).any())
+        if is_negative or descends:
+            raise UserError(f"{name} must be ascending and at least 0. Sort the points by cloud.")
     return np.bincount(batch.astype(np.int64))

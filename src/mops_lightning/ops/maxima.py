@@ -17,11 +17,12 @@ def max_of_rows(features: Tensor, rows: Tensor) -> Tensor:
     Returns:
         ``(B, M, C)``; gradients flow to the winning rows.
     """
-    # torch.compile cannot look into the compiled loop.
-    winners = None if torch.compiler.is_compiling() else compiled.winners(features, rows)
-    if winners is not None:
-        return features.gather(1, winners)
+    if not torch.compiler.is_compiling():  # it cannot look into the compiled loop
+        winners = compiled.winners(features, rows)
+        if winners is not None:
+            return features.gather(1, winners)
     clouds, n, channels = features.shape
-    places = rows + torch.arange(clouds, device=rows.device)[:, None, None] * n
-    best = F.embedding_bag(places.flatten(0, 1), features.flatten(0, 1), mode="max")
+    starts = torch.arange(clouds, device=rows.device) * n
+    rows_of_all = rows + starts[:, None, None]
+    best = F.embedding_bag(rows_of_all.flatten(0, 1), features.flatten(0, 1), mode="max")
     return best.view(clouds, -1, channels)

@@ -44,7 +44,8 @@ def nearest(queries: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     _check_shapes(queries, points)
     with torch.no_grad():
         indices = _search(queries, points, 1)[..., 0]
-    return (queries - gather_points(points, indices)).square().sum(2), indices
+    differences = queries - gather_points(points, indices)
+    return differences.square().sum(2), indices
 
 
 def k_nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
@@ -67,7 +68,8 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
         raise UserError(f"k must be from 1 to the number of points N={points.shape[1]}, got {k}.")
     with torch.no_grad():
         indices = _search(queries, points, k)
-    return (queries[:, :, None] - gather_points(points, indices)).square().sum(3), indices
+    differences = queries[:, :, None] - gather_points(points, indices)
+    return differences.square().sum(3), indices
 
 
 def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
@@ -92,7 +94,9 @@ def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
         >>> chamfer_distance(torch.zeros(1, 4, 3), torch.ones(1, 2, 3))
         tensor([6.])
     """
-    return nearest(points, others)[0].mean(1) + nearest(others, points)[0].mean(1)
+    from_points, _ = nearest(points, others)
+    from_others, _ = nearest(others, points)
+    return from_points.mean(1) + from_others.mean(1)
 
 
 def _check_shapes(queries: Tensor, points: Tensor) -> None:
@@ -107,9 +111,11 @@ def _check_shapes(queries: Tensor, points: Tensor) -> None:
 
 def _search(queries: Tensor, points: Tensor, k: int) -> Tensor:
     """Return the ``(B, M, k)`` nearest rows."""
-    traced = torch.compiler.is_compiling()  # a graph cannot contain compiled loops
-    rows = None if traced else compiled.nearest(queries, points, k)
-    return search_in_blocks(queries, points, k) if rows is None else rows
+    if not torch.compiler.is_compiling():  # a graph cannot contain compiled loops
+        rows = compiled.nearest(queries, points, k)
+        if rows is not None:
+            return rows
+    return search_in_blocks(queries, points, k)
 
 
 def search_in_blocks(queries: Tensor, points: Tensor, k: int) -> Tensor:
@@ -117,24 +123,32 @@ def search_in_blocks(queries: Tensor, points: Tensor, k: int) -> Tensor:
     dtype = distance_dtype(points)
     rows = to_planes(queries.to(dtype))[..., None]  # (C, B, M, 1)
     columns = to_planes(points.to(dtype))[:, :, None]  # (C, B, 1, N)
-    clouds, m, width = queries.shape[0], queries.shape[1], points.shape[1]
+    clouds, m = queries.shape[:2]
+    width = points.shape[1]
     limit = BLOCK["cpu" if points.device.type == "cpu" else "other"]
     height = max(1, min(m, limit // width))
     depth = max(1, min(clouds, limit // (height * width)))
     indices = torch.empty(clouds, m, k, dtype=torch.int64, device=points.device)
     buffers = rows.new_empty(2, depth * height * width)  # one allocation saves a third of the time
-    for b in range(0, clouds, depth):
-        for r in range(0, m, height):
-            part = rows[:, b : b + depth, r : r + height]
-            shape = (*part.shape[1:3], width)
+    for cloud in range(0, clouds, depth):
+        some_clouds = slice(cloud, cloud + depth)
+        for row in range(0, m, height):
+            some_rows = slice(row, row + height)
+            block = rows[:, some_clouds, some_rows]
+            shape = (*block.shape[1:3], width)
             total, difference = buffers[:, : math.prod(shape)].view(2, *shape)
-            torch.sub(columns[0, b : b + depth], part[0], out=total)
+            torch.sub(columns[0, some_clouds], block[0], out=total)
             total.mul_(total)
             for axis in range(1, len(rows)):
-                torch.sub(columns[axis, b : b + depth], part[axis], out=difference)
+                torch.sub(columns[axis, some_clouds], block[axis], out=difference)
                 total.addcmul_(difference, difference)
-            flat = total.view(-1, width)
-            # topk would break ties arbitrarily.
-            winners = flat.argmin(1) if k == 1 else flat.topk(k, largest=False)[1]
-            indices[b : b + depth, r : r + height] = winners.view(*shape[:2], k)
+            winners = _smallest(total.view(-1, width), k)
+            indices[some_clouds, some_rows] = winners.view(*shape[:2], k)
     return indices
+
+
+def _smallest(distances: Tensor, k: int) -> Tensor:
+    """Return the columns of the k smallest numbers of every row; for k = 1 the lowest of ties."""
+    if k == 1:
+        return distances.argmin(1)  # topk would break ties arbitrarily
+    return distances.topk(k, largest=False).indices

@@ -35,8 +35,10 @@ def plane_rows(points: NDArray[np.float64], normals: NDArray[np.float64]) -> NDA
         normals: ``(N, 3)``, of either sign.
     """
     centred = points - points.mean(0)
-    scale = float(np.linalg.norm(centred, axis=1).mean()) or 1.0
-    return np.concatenate([np.cross(centred / scale, normals), normals], axis=1)
+    distances = np.linalg.norm(centred, axis=1)
+    scale = float(distances.mean()) or 1.0
+    turns = np.cross(centred / scale, normals)
+    return np.concatenate([turns, normals], axis=1)
 
 
 def stable_places(rows: NDArray[np.float64], m: int) -> NDArray[np.int64]:
@@ -121,16 +123,19 @@ def places_by_direction(normals: NDArray[np.float64], m: int) -> NDArray[np.int6
     by_bucket = np.argsort(bucket, kind="stable")
     counts = np.bincount(bucket)
     starts = np.cumsum(counts) - counts
+    places_in_bucket = np.arange(len(normals)) - starts[bucket[by_bucket]]
     rounds = np.empty(len(normals), np.int64)
-    rounds[by_bucket] = np.arange(len(normals)) - starts[bucket[by_bucket]]
+    rounds[by_bucket] = places_in_bucket
     return np.argsort(rounds, kind="stable")[:m]
 
 
 def _buckets(normals: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the cell ``(N,)`` of every normal on the cube, 0 to 3·CELLS² − 1."""
-    face = np.abs(normals).argmax(1)
-    along = np.take_along_axis(normals, face[:, None], 1)[:, 0]
-    others = np.take_along_axis(normals, (face[:, None] + [1, 2]) % 3, 1)
-    angles = np.arctan(others / along[:, None]) / (np.pi / 4)  # from -1 to 1
-    cells = np.clip(((angles + 1) / 2 * CELLS).astype(np.int64), 0, CELLS - 1)
-    return (face * CELLS + cells[:, 0]) * CELLS + cells[:, 1]
+    face = np.abs(normals).argmax(1)[:, None]
+    other_axes = (face + np.array([1, 2])) % 3
+    along = np.take_along_axis(normals, face, 1)
+    across = np.take_along_axis(normals, other_axes, 1)
+    angles = np.arctan(across / along) / (np.pi / 4)  # from -1 to 1
+    cells = ((angles + 1) / 2 * CELLS).astype(np.int64)
+    rows, columns = np.clip(cells, 0, CELLS - 1).T
+    return (face[:, 0] * CELLS + rows) * CELLS + columns

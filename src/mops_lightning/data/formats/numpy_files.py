@@ -46,18 +46,18 @@ def write_npy(path: Path, table: Table) -> list[str]:
         fields, because no data type holds the numbers of all columns.
     """
     points = table.stored_coordinates()
-    columns = table.columns.values()
-    kind = np.result_type(points, *columns)
+    columns: dict[str, Column] = dict(zip("xyz", points.T, strict=True))
+    columns |= unique_names(table)
+    kind = np.result_type(*columns.values())
+    is_plain = all(holds_exactly(kind, column) for column in columns.values())
     with path.open("wb") as file:
-        if all(holds_exactly(kind, column) for column in (*points.T, *columns)):
-            array = np.empty((len(points), 3 + len(columns)), kind)
-            array[:, :3] = points
-            for place, column in enumerate(columns, 3):
-                array[:, place] = column
+        if is_plain:
+            array = np.empty((len(points), len(columns)), kind)
+            for number, column in enumerate(columns.values()):
+                array[:, number] = column
             np.save(file, array)
             return _lost_names(table)
-        named: dict[str, Column] = dict(zip("xyz", points.T, strict=True)) | unique_names(table)
-        np.save(file, to_rows(named))
+        np.save(file, to_rows(columns))
     return ["rows of named fields, because no data type holds the numbers of all columns"]
 
 
@@ -75,7 +75,8 @@ def locate_npy(path: Path) -> CloudFile:
         BadCloudError: the array does not hold points, or not one after the other.
     """
     array = np.load(path, mmap_mode="r", allow_pickle=False)
-    names, kind = column_names(array, path), array.dtype
+    names = column_names(array, path)
+    kind = array.dtype
     if kind.names is None:
         if not array.flags.c_contiguous:
             raise WholeOnlyError(f"{path}: --chunk needs an array in C order, got Fortran order.")
@@ -90,12 +91,8 @@ def read_npz(path: Path) -> Table:
         UserError: the file is broken, or no array is the points.
     """
     arrays = load_npz(path)
-    chosen = next((name for name in POINTS if name in arrays), None)
-    if chosen is None and len(arrays) == 1:
-        (chosen,) = arrays
-    if chosen is None:
-        raise BadCloudError(f"{path} has no array named points, got {', '.join(arrays) or 'none'}.")
-    table = from_array(arrays.pop(chosen), path)
+    name_of_points = _name_of_points(arrays, path)
+    table = from_array(arrays.pop(name_of_points), path)
     columns: dict[str, Column] = dict(table.columns)
     grouped: dict[str, tuple[str, ...]] = {}
     left_out = list(table.form.left_out)
@@ -103,12 +100,31 @@ def read_npz(path: Path) -> Table:
         if not _is_attribute(array, len(table.points)):
             left_out.append(name)
             continue
-        parts = split_array(name, in_native_order(array))
+        of_array = split_array(name, in_native_order(array))
         if array.ndim == 2:
-            grouped[name] = tuple(parts)
-        columns |= parts
-    form = replace(table.form, arrays=grouped, left_out=tuple(left_out), layout=NpzForm(chosen))
+            grouped[name] = tuple(of_array)
+        columns |= of_array
+    form = replace(
+        table.form,
+        arrays=grouped,
+        left_out=tuple(left_out),
+        layout=NpzForm(name_of_points),
+    )
     return replace(table, columns=columns, form=form)
+
+
+def _name_of_points(arrays: dict[str, NDArray[Any]], path: Path) -> str:
+    """Return the name of the array with the coordinates.
+
+    Raises:
+        BadCloudError: there is none.
+    """
+    for name in POINTS:
+        if name in arrays:
+            return name
+    if len(arrays) == 1:
+        return next(iter(arrays))
+    raise BadCloudError(f"{path} has no array named points, got {', '.join(arrays) or 'none'}.")
 
 
 def _is_attribute(array: NDArray[Any], number: int) -> bool:
@@ -135,15 +151,25 @@ def write_npz(path: Path, table: Table) -> None:
 
 def joined_arrays(table: Table) -> dict[str, NDArray[Any]]:
     """Return columns ``(N,)``, and arrays ``(N, k)`` of the columns that were one in the file."""
-    array_of = {part: name for name, parts in table.form.arrays.items() for part in parts}
+    array_of = {}
+    for array, names in table.form.arrays.items():
+        if _is_whole(table, names):
+            array_of |= dict.fromkeys(names, array)
     joined: dict[str, NDArray[Any]] = {}
     for name, column in table.columns.items():
-        array = array_of.get(name)
-        parts = table.form.arrays.get(array or "", ())
-        kinds = {table.columns[part].dtype for part in parts if part in table.columns}
-        complete = all(part in table.columns for part in parts) and len(kinds) == 1
-        if array is None or not complete:
+        if name not in array_of:
             joined[name] = column
-        elif array not in joined:
-            joined[array] = np.stack([table.columns[part] for part in parts], 1)
+            continue
+        array = array_of[name]
+        if array not in joined:
+            of_array = [table.columns[member] for member in table.form.arrays[array]]
+            joined[array] = np.stack(of_array, 1)
     return joined
+
+
+def _is_whole(table: Table, names: tuple[str, ...]) -> bool:
+    """Return whether a table has all columns of an array, of one data type."""
+    if not all(name in table.columns for name in names):
+        return False
+    kinds = {table.columns[name].dtype for name in names}
+    return len(kinds) == 1

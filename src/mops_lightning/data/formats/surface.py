@@ -37,17 +37,26 @@ def scene_attributes(scene: Any) -> SceneAttributes:
     Args:
         scene: a ``trimesh.Scene`` as a file was read, without further processing.
     """
-    of_vertices, of_faces = [], []
+    of_vertices: list[dict[str, Column]] = []
+    of_faces: list[dict[str, Column]] = []
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         part = scene.geometry[name]
-        if hasattr(part, "faces"):
-            of_vertices.append(_vertex_attributes(part, transform))
-            of_faces.append(_colours(part.visual.face_colors) if _has_colours(part, "face") else {})
-    vertices, faces = _joined(of_vertices), _joined(of_faces)
-    names = dict.fromkeys(name for part in (*of_vertices, *of_faces) for name in part)
-    left_out = tuple(name for name in names if name not in vertices and name not in faces)
-    return SceneAttributes(vertices, faces, left_out)
+        if not hasattr(part, "faces"):
+            continue
+        of_vertices.append(_vertex_attributes(part, transform))
+        colours = {}
+        if _has_colours(part, "face"):
+            colours = _colours(part.visual.face_colors)
+        of_faces.append(colours)
+    vertices = _joined(of_vertices)
+    faces = _joined(of_faces)
+    left_out: dict[str, None] = {}
+    for columns in (*of_vertices, *of_faces):
+        for name in columns:
+            if name not in vertices and name not in faces:
+                left_out[name] = None
+    return SceneAttributes(vertices, faces, tuple(left_out))
 
 
 def _vertex_attributes(part: Mesh, transform: NDArray[np.float64]) -> dict[str, Column]:
@@ -97,8 +106,8 @@ def attributes(
     """
     from trimesh.triangles import points_to_barycentric
 
-    weights = points_to_barycentric(np.asarray(mesh.triangles)[faces], points)
-    weights = np.nan_to_num(weights).clip(0, 1)
+    triangles = np.asarray(mesh.triangles)[faces]
+    weights = np.nan_to_num(points_to_barycentric(triangles, points)).clip(0, 1)
     corners = np.asarray(mesh.faces)[faces]
     columns = {name: column[faces] for name, column in mesh.face_attributes.items()}
     for name, column in mesh.vertex_attributes.items():
@@ -111,16 +120,19 @@ def attributes(
 
 def _at_points(name: str, values: Column, weights: NDArray[np.float64]) -> Column:
     """Return numbers ``(n,)`` between those of three corners ``(n, 3)``."""
-    if values.dtype.kind == "f" or name in COLOURS:
-        mean = (values * weights).sum(1) / weights.sum(1)
-        rounded = mean.round() if values.dtype.kind != "f" else mean
-        return rounded.astype(values.dtype)
-    nearest = weights.argmax(1)
-    return values[np.arange(len(values)), nearest]
+    is_float = values.dtype.kind == "f"
+    if not is_float and name not in COLOURS:
+        nearest = weights.argmax(1)
+        return values[np.arange(len(values)), nearest]
+    mean = (values * weights).sum(1) / weights.sum(1)
+    if not is_float:
+        mean = mean.round()
+    return mean.astype(values.dtype)
 
 
 def _unit_normals(columns: dict[str, Column]) -> dict[str, Column]:
     normals = np.stack([columns[name] for name in NORMALS], 1).astype(np.float64)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    unit = (normals / np.where(lengths > 0, lengths, 1)).astype(np.float32)
+    lengths[lengths == 0] = 1
+    unit = (normals / lengths).astype(np.float32)
     return dict(zip(NORMALS, unit.T, strict=True))

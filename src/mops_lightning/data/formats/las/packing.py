@@ -85,19 +85,15 @@ class Plan:
     def pack(self, table: Table) -> Rows:
         """Return the packed points ``(n,)`` of a part of the table."""
         rows = np.zeros(len(table.points), self.layout.dtype)
-        packed = table.columns if isinstance(table.columns, LasColumns) else None
-        changes = table.columns if packed is None else packed.changes
-        if packed is not None and packed.layout.format == self.layout.format:
-            size = packed.layout.dtype.itemsize
-            rows.view(np.uint8).reshape(len(rows), -1)[:, :size] = (
-                np.ascontiguousarray(packed.rows).view(np.uint8).reshape(len(rows), -1)
-            )
-        elif packed is not None:
-            _modernise(packed, rows, self.layout)
+        columns = table.columns
+        if isinstance(columns, LasColumns):
+            _copy_packed(columns, rows, self.layout)
+            columns = columns.changes
         else:
             self._set_coordinates(rows, table)
-        for name, column in changes.items():
-            self.layout.dimensions[self.names[name]].set(rows, column)
+        for name, column in columns.items():
+            dimension = self.layout.dimensions[self.names[name]]
+            dimension.set(rows, column)
         return rows
 
     def _set_coordinates(self, rows: Rows, table: Table) -> None:
@@ -105,10 +101,23 @@ class Plan:
         axes = zip("XYZ", self.header.scales, self.header.offsets, table.points.T, strict=True)
         for axis, scale, offset, values in axes:
             rows[axis] = np.rint((values - offset) / scale)
-            change = np.abs(rows[axis] * scale + offset - values).max(initial=0.0)
-            self.moved = max(self.moved, float(change))
-        for name in ("return_number", "number_of_returns"):
-            self.layout.dimensions[name].set(rows, np.ones(len(rows), np.uint8))
+            changes = np.abs(rows[axis] * scale + offset - values)
+            self.moved = max(self.moved, float(changes.max(initial=0.0)))
+        ones = np.ones(len(rows), np.uint8)
+        self.layout.dimensions["return_number"].set(rows, ones)
+        self.layout.dimensions["number_of_returns"].set(rows, ones)
+
+
+def _copy_packed(packed: LasColumns, rows: Rows, layout: Layout) -> None:
+    """Copy all dimensions of packed points to points of a layout."""
+    if packed.layout.format != layout.format:
+        _modernise(packed, rows, layout)
+        return
+    # Added dimensions come last, so that the old bytes of a point are the first ones of the new.
+    size = packed.layout.dtype.itemsize
+    old = np.ascontiguousarray(packed.rows).view(np.uint8)
+    new = rows.view(np.uint8)
+    new.reshape(len(rows), -1)[:, :size] = old.reshape(len(rows), -1)
 
 
 def _modernise(packed: LasColumns, rows: Rows, layout: Layout) -> None:
@@ -118,8 +127,9 @@ def _modernise(packed: LasColumns, rows: Rows, layout: Layout) -> None:
     for name, dimension in packed.layout.dimensions.items():
         values = dimension.get(packed.rows)
         if name == "scan_angle_rank":
-            name, values = "scan_angle", np.rint(values / DEGREES)
-        layout.dimensions[name].set(rows, values)
+            layout.dimensions["scan_angle"].set(rows, np.rint(values / DEGREES))
+        else:
+            layout.dimensions[name].set(rows, values)
 
 
 def plan(path: Path, table: TableParts, copc: bool) -> tuple[Plan, Iterator[Table]]:
@@ -177,20 +187,25 @@ def _needs_modern(columns: Mapping[str, Column]) -> bool:
     """Return whether LAS 1.4 has a dimension for a number that 1.2 has not, such as class 64."""
     old = Layout(OLD_FORMAT)
     new = Layout(MODERN[OLD_FORMAT])
-    return any(
-        name in old.dimensions
-        and name in new.dimensions
-        and new.holds(name, values)
-        and not old.holds(name, values)
-        for name, values in columns.items()
-    )
+    for name, values in columns.items():
+        if name not in old.dimensions or name not in new.dimensions:
+            continue
+        if new.holds(name, values) and not old.holds(name, values):
+            return True
+    return False
 
 
 def _new_header(table: TableParts, modern: bool) -> Header:
     """Make the header of a file that does not come from one of LAS: 1.2, or 1.4."""
-    minor = 4 if modern else 2
+    if modern:
+        minor = 4
+        form = MODERN[OLD_FORMAT]
+        encoding = WKT
+    else:
+        minor = 2
+        form = OLD_FORMAT
+        encoding = 0
     size = HEADER_BYTES[minor]
-    form, encoding = (MODERN[OLD_FORMAT], WKT) if modern else (OLD_FORMAT, 0)
     today = date.today()
     item = Layout(form).standard.itemsize
     extent = float(np.ptp(table.corners, axis=0).max())
@@ -202,7 +217,7 @@ def _new_header(table: TableParts, modern: bool) -> Header:
     head[26:31] = b"OTHER"
     struct.pack_into("<3H", head, 90, today.timetuple().tm_yday, today.year, size)
     struct.pack_into("<BH", head, 104, form, item)
-    struct.pack_into("<3d", head, 131, *[scale] * 3)
+    struct.pack_into("<3d", head, 131, scale, scale, scale)
     struct.pack_into("<3d", head, 155, *table.corners[0])
     return Header(bytes(head))
 
@@ -224,7 +239,10 @@ def _modern_header(header: Header, layout: Layout) -> tuple[Header, Layout]:
 def _with_records(header: Header, layout: Layout) -> Header:
     """Return a header for a layout, without the records of a compression and an octree."""
     left_out = {("laszip encoded", LASZIP), (COPC, 1)}
-    records = [r for r in header.records if (r.user, r.number) not in left_out]
+    records = []
+    for record in header.records:
+        if (record.user, record.number) not in left_out:
+            records.append(record)
     if layout.extra != layout_of(header).extra:
         records = _with_extra(records, documented_extra(header), layout)
     head = bytearray(header.head)
@@ -241,9 +259,14 @@ def _with_extra(records: list[Record], documented: list[Extra], layout: Layout) 
     They are added to the last record: some readers, such as laspy, read one record only.
     """
     others = [record for record in records if not is_extra(record)]
-    known = [record for record in records if is_extra(record)] if documented else []
-    last = known.pop() if known else Record.new(SPEC, EXTRA_BYTES, b"", "Extra Bytes Record")
-    data = last.data[: len(last.data) // EXTRA.size * EXTRA.size]
+    known = []
+    if documented:
+        known = [record for record in records if is_extra(record)]
+    last = Record.new(SPEC, EXTRA_BYTES, b"", "Extra Bytes Record")
+    if known:
+        last = known.pop()
+    whole_entries = len(last.data) // EXTRA.size
+    data = last.data[: whole_entries * EXTRA.size]
     for extra in layout.extra[len(documented) :]:
         data += b"".join(piece.to_bytes() for piece in extra.pieces())
     return [*others, *known, replace(last, data=data)]
