@@ -86,6 +86,23 @@ def _rows_of(table: Table, path: Path, rows: range) -> Table:
     return replace(table.take(np.arange(rows.start, rows.stop)), header=None)
 
 
+Weight = NDArray[np.float64] | None
+
+
+def _weight_of(weight: Weight, rows: NDArray[np.int64]) -> Weight:
+    """Return the weights of some points."""
+    if weight is None:
+        return None
+    return weight[rows]
+
+
+def _joined(first: Weight, second: Weight) -> Weight:
+    """Return the weights of two ranges, both of which have some or none."""
+    if first is None or second is None:
+        return None
+    return np.concatenate([first, second])
+
+
 class Part(NamedTuple):
     """Points of a range of rows that may be kept.
 
@@ -98,7 +115,7 @@ class Part(NamedTuple):
 
     table: Table
     rows: NDArray[np.int64]
-    weight: NDArray[np.float64] | None
+    weight: Weight
     number: int
 
 
@@ -130,15 +147,20 @@ class Candidates(NamedTuple):
     table: Table
     rows: NDArray[np.int64]
     used: NDArray[np.float64]
-    weight: NDArray[np.float64] | None
+    weight: Weight
     number: int
     is_cut: bool = False
 
     def take(self, rows: NDArray[np.int64], is_cut: bool) -> "Candidates":
         """Return the candidates in some rows."""
-        weight = None if self.weight is None else self.weight[rows]
-        table, used = self.table.take(rows), self.used[rows]
-        return Candidates(table, self.rows[rows], used, weight, self.number, is_cut)
+        return Candidates(
+            table=self.table.take(rows),
+            rows=self.rows[rows],
+            used=self.used[rows],
+            weight=_weight_of(self.weight, rows),
+            number=self.number,
+            is_cut=is_cut,
+        )
 
     def first(self, most: int | None, seed: int) -> "Candidates":
         """Return the candidates that come first, each place once, in the order of the file."""
@@ -153,21 +175,19 @@ class Candidates(NamedTuple):
 
     def merge(self, other: "Candidates") -> "Candidates":
         """Join the candidates of two ranges, of which the other one comes later."""
+        number = self.number + other.number
+        is_cut = self.is_cut or other.is_cut
         if not len(self.rows):
-            is_cut = self.is_cut or other.is_cut
-            return other._replace(number=self.number + other.number, is_cut=is_cut)
+            return other._replace(number=number, is_cut=is_cut)
         if not len(other.rows):
-            return self._replace(number=self.number + other.number)
-        weight = None
-        if self.weight is not None and other.weight is not None:
-            weight = np.concatenate([self.weight, other.weight])
+            return self._replace(number=number)
         return Candidates(
-            join_tables([self.table, other.table]),
-            np.concatenate([self.rows, other.rows]),
-            np.concatenate([self.used, other.used]),
-            weight,
-            self.number + other.number,
-            self.is_cut or other.is_cut,
+            table=join_tables([self.table, other.table]),
+            rows=np.concatenate([self.rows, other.rows]),
+            used=np.concatenate([self.used, other.used]),
+            weight=_joined(self.weight, other.weight),
+            number=number,
+            is_cut=is_cut,
         )
 
 
@@ -198,13 +218,17 @@ class Found(NamedTuple):
     rows: NDArray[np.int64]
     voxel: NDArray[np.int64]
     distance: NDArray[np.float64]
-    weight: NDArray[np.float64] | None
+    weight: Weight
 
     def take(self, rows: NDArray[np.int64]) -> "Found":
         """Return some of the points."""
-        weight = None if self.weight is None else self.weight[rows]
-        table, places = self.table.take(rows), self.rows[rows]
-        return Found(table, places, self.voxel[rows], self.distance[rows], weight)
+        return Found(
+            table=self.table.take(rows),
+            rows=self.rows[rows],
+            voxel=self.voxel[rows],
+            distance=self.distance[rows],
+            weight=_weight_of(self.weight, rows),
+        )
 
     def merge(self, other: "Found") -> "Found":
         """Keep the better point of every voxel; see ``representatives``."""
@@ -212,22 +236,27 @@ class Found(NamedTuple):
             return other
         if not len(other.rows):
             return self
-        weight = None
-        if self.weight is not None and other.weight is not None:
-            weight = np.concatenate([self.weight, other.weight])
         both = Found(
-            join_tables([self.table, other.table]),
-            np.concatenate([self.rows, other.rows]),
-            np.concatenate([self.voxel, other.voxel]),
-            np.concatenate([self.distance, other.distance]),
-            weight,
+            table=join_tables([self.table, other.table]),
+            rows=np.concatenate([self.rows, other.rows]),
+            voxel=np.concatenate([self.voxel, other.voxel]),
+            distance=np.concatenate([self.distance, other.distance]),
+            weight=_joined(self.weight, other.weight),
         )
-        x, y, z = both.table.points.T
-        lightness = np.zeros(len(both.rows)) if weight is None else -weight
-        order = np.lexsort((both.rows, z, y, x, both.distance, lightness, both.voxel))
+        return both._first_of_voxels()
+
+    def _first_of_voxels(self) -> "Found":
+        """Return the heaviest point of every voxel, of equals the nearest to its mean."""
+        x, y, z = self.table.points.T
+        lightness = np.zeros(len(self.rows))
+        if self.weight is not None:
+            lightness = -self.weight
+        # The last key of a lexsort comes first.
+        order = np.lexsort((self.rows, z, y, x, self.distance, lightness, self.voxel))
+        ordered = self.voxel[order]
         is_first = np.ones(len(order), bool)
-        is_first[1:] = both.voxel[order[1:]] != both.voxel[order[:-1]]
-        return both.take(order[is_first])
+        is_first[1:] = ordered[1:] != ordered[:-1]
+        return self.take(order[is_first])
 
 
 def _occupied(cloud: CloudFile, options: Options, rows: range) -> tuple[Voxels, int]:
@@ -242,16 +271,23 @@ def _found(cloud: CloudFile, options: Options, voxels: Voxels, rows: range) -> F
     best = representatives(part.table.points, options.voxel, voxels, part.weight)
     voxel = np.flatnonzero(best.rows >= 0)
     kept = best.rows[voxel]
-    weight = None if part.weight is None else part.weight[kept]
-    return Found(part.table.take(kept), part.rows[kept], voxel, best.distances[voxel], weight)
+    return Found(
+        table=part.table.take(kept),
+        rows=part.rows[kept],
+        voxel=voxel,
+        distance=best.distances[voxel],
+        weight=_weight_of(part.weight, kept),
+    )
 
 
 def _largest(
     cloud: CloudFile, options: Options, names: list[str], rows: range
 ) -> NDArray[np.float64]:
-    values = values_of(_read(cloud, options, rows).table, names)
-    finite: NDArray[np.float64] = np.abs(np.where(np.isfinite(values), values, 0.0))
-    return finite.max(axis=0, initial=0.0)
+    table = _read(cloud, options, rows).table
+    values = values_of(table, names)
+    values[~np.isfinite(values)] = 0.0
+    largest: NDArray[np.float64] = np.abs(values).max(axis=0, initial=0.0)
+    return largest
 
 
 def _column_sums(
@@ -318,9 +354,12 @@ class Passes(NamedTuple):
         """Return one point of every voxel, and how many finite points the file has."""
         number = 0
         voxels: Voxels | None = None
-        for part, read in self.over("voxels", _occupied):
-            number += read
-            voxels = part if voxels is None else voxels.merge(part)
+        for occupied_in_part, number_in_part in self.over("voxels", _occupied):
+            number += number_in_part
+            if voxels is None:
+                voxels = occupied_in_part
+            else:
+                voxels = voxels.merge(occupied_in_part)
         if voxels is None or not len(voxels.counts):
             return Table(np.empty((0, 3))), number
         found: Found = reduce(Found.merge, self.over("nearest", _found, voxels))
