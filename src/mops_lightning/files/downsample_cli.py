@@ -93,34 +93,8 @@ def _downsample_arguments(add: Add) -> None:
     add("--surface", type=int, help="points to sample from a mesh first; default: 10000 or 8m")
     add("--vertices", action="store_true", help="of a mesh: its vertices, not its surface")
     add("--columns", metavar="X,Y,Z,...", help=COLUMNS)
-    add("--workers", type=int, default=1, help="processes that share a folder's files")
-    add(
-        "--tile",
-        type=int,
-        metavar="POINTS",
-        help="cut large scenes into tiles of up to so many points (a balanced kd-tree), sample "
-        "each as in training, and keep --m points in total",
-    )
-    add(
-        "--chunk",
-        type=int,
-        metavar="POINTS",
-        help="for clouds larger than memory: MOPS-Net's generated and matched points are computed "
-        "from all points, so many at a time; everything else samples so many random points",
-    )
-    add(
-        "--cluster",
-        metavar="ADDRESS",
-        help="distribute the chunks of every file over the workers of this Dask scheduler",
-    )
-    add(
-        "--map",
-        type=Path,
-        metavar="FILE.npz",
-        help="write for every point of IN the row of its nearest point of OUT, to carry labels "
-        "back by mops_lightning.propagate",
-    )
-    add("--map-k", type=int, default=1, help="rows per point in --map, with weights 1/d^2")
+    _piece_arguments(add)
+    _map_arguments(add)
     add(
         "--weight",
         metavar="FIELD",
@@ -142,6 +116,41 @@ def _downsample_arguments(add: Add) -> None:
     )
     add("--seed", type=int, default=0, help="seed of random choices")
     add("--overwrite", action="store_true", help="replace existing files")
+
+
+def _piece_arguments(add: Add) -> None:
+    """Add what divides files, and clouds that are large, into pieces of work."""
+    add("--workers", type=int, default=1, help="processes that share a folder's files")
+    add(
+        "--tile",
+        type=int,
+        metavar="POINTS",
+        help="cut large scenes into tiles of up to so many points (a balanced kd-tree), sample "
+        "each as in training, and keep --m points in total",
+    )
+    add(
+        "--chunk",
+        type=int,
+        metavar="POINTS",
+        help="for clouds larger than memory: MOPS-Net's generated and matched points are computed "
+        "from all points, so many at a time; everything else samples so many random points",
+    )
+    add(
+        "--cluster",
+        metavar="ADDRESS",
+        help="distribute the chunks of every file over the workers of this Dask scheduler",
+    )
+
+
+def _map_arguments(add: Add) -> None:
+    add(
+        "--map",
+        type=Path,
+        metavar="FILE.npz",
+        help="write for every point of IN the row of its nearest point of OUT, to carry labels "
+        "back by mops_lightning.propagate",
+    )
+    add("--map-k", type=int, default=1, help="rows per point in --map, with weights 1/d^2")
 
 
 def _downsample(chosen: argparse.Namespace) -> int:

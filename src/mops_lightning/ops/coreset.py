@@ -92,30 +92,37 @@ def coreset(
     size = python_number(m)
     if not is_whole_number(size) or size < LEAST:
         raise UserError(f"m must be a whole number of at least {LEAST}, got {m!r:.99}.")
-    m = int(size)
-    found = point_to_plane(source, target, pose, normals, max_distance)
-    number = len(found.rows)
-    if number <= m:
-        return Coreset(found.rows, np.ones(number))
+    residuals = point_to_plane(source, target, pose, normals, max_distance)
+    number = len(residuals.rows)
+    if number <= size:
+        return Coreset(residuals.rows, np.ones(number))
     with np.errstate(over="ignore", invalid="ignore"):
-        vectors = _summands(found)
+        vectors = _summands(residuals)
     if not np.abs(vectors).max() < LARGEST:
         raise UserError(
             "the sums of residuals are too large for float64. Give normals of length 1, and "
             "smaller coordinates."
         )
-    parts = m // LEAST
-    chosen = []
-    weights = []
-    for part in range(parts):
-        places = np.arange(part, number, parts)
-        keep = len(range(part, m, parts))
-        rows, values = same_sum(vectors[places], keep)
-        chosen.append(places[rows])
-        weights.append(values)
-    places = np.concatenate(chosen)
+    places, weights = _with_equal_sums(vectors, int(size))
     order = np.argsort(places)
-    return Coreset(found.rows[places[order]], np.concatenate(weights)[order])
+    return Coreset(residuals.rows[places[order]], weights[order])
+
+
+def _with_equal_sums(vectors: Array, m: int) -> tuple[NDArray[np.int64], Array]:
+    """Return m rows of vectors and their weights, whose weighted sum is that of all vectors.
+
+    The vectors are dealt to as many groups as m allows, and each group keeps its own sum.
+    """
+    groups = m // LEAST
+    places = []
+    weights = []
+    for group in range(groups):
+        members = np.arange(group, len(vectors), groups)
+        keep = len(range(group, m, groups))
+        rows, weights_of_rows = same_sum(vectors[members], keep)
+        places.append(members[rows])
+        weights.append(weights_of_rows)
+    return np.concatenate(places), np.concatenate(weights)
 
 
 def point_to_plane(
@@ -148,18 +155,21 @@ def point_to_plane(
     rows = np.flatnonzero(distance <= reach)
     if not len(rows):
         raise UserError("no source point is within max_distance of the target at this pose.")
-    across = directions[nearest[rows]]
-    values = np.einsum("ni,ni->n", across, moved[rows] - plane_points[nearest[rows]])
-    jacobians = np.concatenate([np.cross(moved[rows], across), across], axis=1)
+    moved = moved[rows]
+    nearest = nearest[rows]
+    across = directions[nearest]
+    values = np.einsum("ni,ni->n", across, moved - plane_points[nearest])
+    jacobians = np.concatenate([np.cross(moved, across), across], axis=1)
     return Residuals(rows, values, jacobians)
 
 
-def _summands(found: Residuals) -> Array:
+def _summands(residuals: Residuals) -> Array:
     """Return what each residual adds to H (its upper triangle), b and the error, ``(n, 28)``."""
-    upper = np.triu_indices(6)
-    products = found.jacobians[:, upper[0]] * found.jacobians[:, upper[1]]
-    slopes = found.jacobians * found.values[:, None]
-    return np.column_stack([products, slopes, np.square(found.values)])
+    rows, columns = np.triu_indices(6)
+    jacobians = residuals.jacobians
+    products = jacobians[:, rows] * jacobians[:, columns]
+    slopes = jacobians * residuals.values[:, None]
+    return np.column_stack([products, slopes, np.square(residuals.values)])
 
 
 def _cloud(name: str, value: Any) -> Array:
@@ -193,7 +203,8 @@ def _numbers(name: str, value: Any, shape: str) -> Array:
     """Return an array, a tensor or lists of real numbers in float64."""
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu()
-        value = value.double() if value.is_floating_point() else value
+        if value.is_floating_point():  # NumPy has no bfloat16
+            value = value.double()
     try:
         array = np.asarray(value)
         if np.iscomplexobj(array):

@@ -82,24 +82,35 @@ def fps(
         array([0, 3])
     """
     is_array = isinstance(x, np.ndarray)
-    if not (is_array or hasattr(x, "detach")) or x.ndim == 0 or len(x) == 0:
-        shape = tuple(getattr(x, "shape", ()))
-        raise UserError(
-            f"x must be a tensor or an array (P, C) with P ≥ 1, got {type(x).__name__} {shape}."
-        )
-    counts = np.array([len(x)]) if batch is None else cloud_sizes(len(x), _on_cpu(batch))
+    _check_points(x)
+    if batch is None:
+        counts = np.array([len(x)])
+    else:
+        counts = cloud_sizes(len(x), _on_cpu(batch))
     if batch_size is not None and batch_size < len(counts):
         raise UserError(f"batch_size must be at least {len(counts)}, got {batch_size}.")
     sizes = _sizes(counts, ratio)
-    starts = _random_starts(counts, is_array) if random_start else np.zeros_like(counts)
+    starts = np.zeros_like(counts)
+    if random_start:
+        starts = _random_starts(counts, is_array)
     if not is_array and x.device.type != "cpu":
         return _on_device(x, counts, sizes, starts)
-    rows = _chosen(float_points(_on_cpu(x)).reshape(len(x), -1), counts, sizes, starts)
+    points = float_points(_on_cpu(x)).reshape(len(x), -1)
+    rows = _chosen(points, counts, sizes, starts)
     if is_array:
         return rows
     import torch
 
     return torch.from_numpy(rows)
+
+
+def _check_points(x: Any) -> None:
+    is_numbers = isinstance(x, np.ndarray) or hasattr(x, "detach")
+    if not is_numbers or x.ndim == 0 or len(x) == 0:
+        shape = tuple(getattr(x, "shape", ()))
+        raise UserError(
+            f"x must be a tensor or an array (P, C) with P ≥ 1, got {type(x).__name__} {shape}."
+        )
 
 
 def _on_cpu(values: Any) -> Array:
@@ -115,12 +126,18 @@ def _on_cpu(values: Any) -> Array:
 
 def _sizes(counts: Rows, ratio: Any) -> Rows:
     """Return ⌈ratio · n⌉ of every cloud, rounded as in pyg-lib, in float32."""
-    share = np.asarray(_on_cpu(ratio) if hasattr(ratio, "detach") else ratio, np.float32).reshape(
-        -1
-    )
-    if not ((share > 0) & (share <= 1)).all() or len(share) not in (1, len(counts)):
+    if hasattr(ratio, "detach"):
+        ratio = _on_cpu(ratio)
+    shares = np.asarray(ratio, np.float32).reshape(-1)
+    are_shares = ((shares > 0) & (shares <= 1)).all()
+    if not are_shares or len(shares) not in (1, len(counts)):
         raise UserError(f"ratio must be above 0 and at most 1, one or one per cloud, got {ratio}.")
-    return np.ceil(counts.astype(np.float32) * share).astype(np.int64)
+    return np.ceil(counts.astype(np.float32) * shares).astype(np.int64)
+
+
+def _are_alike(counts: Rows, sizes: Rows) -> bool:
+    """Return whether all clouds have one number of points, of which one number is chosen."""
+    return bool((counts == counts[0]).all() and (sizes == sizes[0]).all())
 
 
 def _random_starts(counts: Rows, is_array: bool) -> Rows:
@@ -137,15 +154,18 @@ def _random_starts(counts: Rows, is_array: bool) -> Rows:
 def _chosen(points: Array, counts: Rows, sizes: Rows, starts: Rows) -> Rows:
     """Return the rows of all clouds, cloud by cloud."""
     begins = counts.cumsum() - counts
-    if (counts == counts[0]).all() and (sizes == sizes[0]).all():
+    if _are_alike(counts, sizes):
         clouds = points.reshape(len(counts), counts[0], -1)
-        return (_of_clouds(clouds, int(sizes[0]), starts) + begins[:, None]).reshape(-1)
-    parts = [
-        _of_clouds(points[begin : begin + count][None], m, start[None])[0] + begin
-        for begin, count, m, start in zip(begins, counts, sizes, starts, strict=True)
-        if count
-    ]
-    return np.concatenate(parts)
+        rows = _of_clouds(clouds, int(sizes[0]), starts)
+        return (rows + begins[:, None]).reshape(-1)
+    rows_of_clouds = []
+    for begin, count, m, start in zip(begins, counts, sizes, starts, strict=True):
+        if count == 0:
+            continue
+        cloud = points[begin : begin + count]
+        rows = _of_clouds(cloud[None], m, start[None])[0]
+        rows_of_clouds.append(rows + begin)
+    return np.concatenate(rows_of_clouds)
 
 
 def _of_clouds(clouds: Array, m: int, starts: Rows) -> Rows:
@@ -167,16 +187,16 @@ def _on_device(x: "Tensor", counts: Rows, sizes: Rows, starts: Rows) -> "Tensor"
     floating = x.detach() if x.is_floating_point() else x.double()
     points = floating.reshape(len(x), -1)
     begins = counts.cumsum() - counts
-    if (counts == counts[0]).all() and (sizes == sizes[0]).all():
+    if _are_alike(counts, sizes):
         clouds = points.reshape(len(counts), int(counts[0]), -1)
-        rows = farthest_point_sample(clouds, int(sizes[0]), torch.from_numpy(starts).to(x.device))
+        first = torch.from_numpy(starts).to(x.device)
+        rows = farthest_point_sample(clouds, int(sizes[0]), first)
         return (rows + torch.from_numpy(begins)[:, None].to(x.device)).flatten()
+    clouds_of_points = points.split(counts.tolist())
     numbers = zip(sizes.tolist(), starts.tolist(), begins.tolist(), strict=True)
-    parts = zip(points.split(counts.tolist()), numbers, strict=True)
-    return torch.cat(
-        [
-            farthest_point_sample(cloud[None], m, start)[0] + begin
-            for cloud, (m, start, begin) in parts
-            if m
-        ]
-    )
+    rows_of_clouds = []
+    for cloud, (m, start, begin) in zip(clouds_of_points, numbers, strict=True):
+        if m > 0:
+            rows = farthest_point_sample(cloud[None], m, start)[0]
+            rows_of_clouds.append(rows + begin)
+    return torch.cat(rows_of_clouds)
