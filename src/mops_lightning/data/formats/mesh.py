@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mops_lightning.data.formats import ply
 from mops_lightning.data.formats.gltf import plain_glb
@@ -96,15 +97,15 @@ def parse_mesh(data: bytes, path: Path) -> "Trimesh":
         raise BadCloudError(f"{path} must end in {', '.join(SUFFIXES)}.")
     if not data.strip():
         raise BadCloudError(f"{path} is empty.")
+    area = 0.0
+    extent = 0.0
     with naming_file(path), np.errstate(all="ignore"):
         mesh = _load(data, kind, path)
-        if mesh.vertices.shape[1] != 3:
-            raise ValueError(f"vertices must have 3 coordinates, got {mesh.vertices.shape[1]}")
-        faces = np.asarray(mesh.faces).reshape(-1, 3)
-        if len(faces) and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):
-            raise ValueError("a face refers to a vertex that does not exist")
-        area = float(mesh.area) if len(faces) else 0.0
-        extent = float(np.ptp(mesh.triangles, axis=(0, 1)).max()) if area else 0.0
+        faces = _checked_faces(mesh)
+        if len(faces):
+            area = float(mesh.area)
+        if area:
+            extent = float(np.ptp(mesh.triangles, axis=(0, 1)).max())
     if not len(faces):
         raise BadCloudError(f"{path} has no faces, so there is no surface to sample.")
     announced = _announced_faces(data, kind)
@@ -117,41 +118,80 @@ def parse_mesh(data: bytes, path: Path) -> "Trimesh":
     return mesh
 
 
+def _checked_faces(mesh: "Trimesh") -> NDArray[np.int64]:
+    """Return the faces of a mesh ``(F, 3)``.
+
+    Raises:
+        ValueError: vertices have not three coordinates, or a face has no such vertex.
+    """
+    if mesh.vertices.shape[1] != 3:
+        raise ValueError(f"vertices must have 3 coordinates, got {mesh.vertices.shape[1]}")
+    faces = np.asarray(mesh.faces).reshape(-1, 3)
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):
+        raise ValueError("a face refers to a vertex that does not exist")
+    return faces
+
+
 def _load(data: bytes, kind: str, path: Path) -> "Trimesh":
     """Parse a file and join the parts of a scene."""
     import trimesh
 
     if kind == ".ply":
-        parsed = ply.parse_mesh(data, path)
-        mesh = trimesh.Trimesh(parsed.table.points, parsed.faces, process=False)
-        mesh.vertex_attributes.update(parsed.table.columns)
-        mesh.face_attributes.update(parsed.face_columns)
-        mesh.metadata[LEFT_OUT] = parsed.left_out
-        return mesh
-    if kind == ".stl":
-        count = int.from_bytes(data[80:84], "little")
-        is_ascii = len(data) != 84 + 50 * count
-        if is_ascii and not data.lstrip().startswith(b"solid"):
-            raise ValueError(f"{count} triangles take {84 + 50 * count} bytes, not {len(data)}")
-    if kind in (".off", ".obj") or (kind == ".stl" and is_ascii):
-        data = _plain_text(data)
-    if kind == ".obj" and data.count(b"usemtl") > MAX_MATERIALS:
-        data = re.sub(rb"(?m)^[ ]*usemtl.*$", b"", data)
-    if kind == ".glb":
-        data = plain_glb(data, path)
+        return _load_ply(data, path)
+    data = _prepared(data, kind, path)
     # Materials do not affect the surface, and their files may be missing.
-    extra: dict[str, Any] = {"skip_materials": True} if kind != ".off" else {}
+    extra: dict[str, Any] = {}
+    if kind != ".off":
+        extra["skip_materials"] = True
     scene: Any = trimesh.load(
         BytesIO(data), file_type=kind[1:], force="scene", process=False, **extra
     )
-    found = scene_attributes(scene)
+    of_scene = scene_attributes(scene)
     joined: Trimesh = scene.to_mesh()
     joined.vertex_attributes.clear()
-    joined.vertex_attributes.update(found.of_vertices)
+    joined.vertex_attributes.update(of_scene.of_vertices)
     joined.face_attributes.clear()
-    joined.face_attributes.update(found.of_faces)
-    joined.metadata[LEFT_OUT] = (*_left_out(data, kind), *found.left_out)
+    joined.face_attributes.update(of_scene.of_faces)
+    joined.metadata[LEFT_OUT] = (*_left_out(data, kind), *of_scene.left_out)
     return joined
+
+
+def _load_ply(data: bytes, path: Path) -> "Trimesh":
+    import trimesh
+
+    parsed = ply.parse_mesh(data, path)
+    mesh = trimesh.Trimesh(parsed.table.points, parsed.faces, process=False)
+    mesh.vertex_attributes.update(parsed.table.columns)
+    mesh.face_attributes.update(parsed.face_columns)
+    mesh.metadata[LEFT_OUT] = parsed.left_out
+    return mesh
+
+
+def _prepared(data: bytes, kind: str, path: Path) -> bytes:
+    """Return the content of a file in a form that trimesh reads well."""
+    if kind == ".glb":
+        return plain_glb(data, path)
+    if kind == ".stl" and not _is_ascii_stl(data):
+        return data
+    data = _plain_text(data)
+    if kind == ".obj" and data.count(b"usemtl") > MAX_MATERIALS:
+        data = re.sub(rb"(?m)^[ ]*usemtl.*$", b"", data)
+    return data
+
+
+def _is_ascii_stl(data: bytes) -> bool:
+    """Return whether an STL file is text.
+
+    Raises:
+        ValueError: it is neither text nor as long as its number of triangles says.
+    """
+    count = int.from_bytes(data[80:84], "little")
+    size = 84 + 50 * count
+    if len(data) == size:
+        return False
+    if not data.lstrip().startswith(b"solid"):
+        raise ValueError(f"{count} triangles take {size} bytes, not {len(data)}")
+    return True
 
 
 def _plain_text(data: bytes) -> bytes:
@@ -182,5 +222,8 @@ def _announced_faces(data: bytes, kind: str) -> int:
     """Return the face count in the header of an OFF file; truncated files have fewer."""
     if kind != ".off":
         return 0
-    counts = re.search(rb"OFF\s*\d+\s+(\d+)", re.sub(rb"#[^\n]*", b"", data[:4096]))
-    return int(counts[1]) if counts else 0
+    without_comments = re.sub(rb"#[^\n]*", b"", data[:4096])
+    counts = re.search(rb"OFF\s*\d+\s+(\d+)", without_comments)
+    if counts is None:
+        return 0
+    return int(counts[1])

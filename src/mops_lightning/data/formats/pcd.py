@@ -36,30 +36,36 @@ def read(path: Path) -> Table:
     """Read a PCD file; a field with a COUNT of k becomes k columns."""
     data = path.read_bytes()
     header, start = _header(data)
-    names = header["FIELDS"]
-    counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
-    number = int(header.get("POINTS", [header["WIDTH"][0]])[0])
+    number = int(header.get("POINTS", header["WIDTH"])[0])
     if number < 1:
         raise BadCloudError(f"{path} holds no points.")
-    fields = []
-    kinds = zip(names, header["TYPE"], header["SIZE"], counts, strict=True)
-    for place, (name, kind, size, count) in enumerate(kinds):
-        field = f"_{place}" if name == "_" else name
-        fields.append((field, f"<{KINDS[kind]}{int(size)}", (count,)))
-    array = _body(path, data[start:], header["DATA"][0], np.dtype(fields), number)
+    layout = _layout(header)
+    array = _body(path, data[start:], header["DATA"][0], layout, number)
     columns: dict[str, Column] = {}
     grouped: dict[str, tuple[str, ...]] = {}
-    for name, _, (count,) in fields:
+    for name in layout.names or ():
         if name.startswith("_"):
             continue  # bytes without a meaning
-        values = array[name][:, 0] if count == 1 else array[name]
-        parts = split_array(name, values)
-        if count > 1:
-            grouped[name] = tuple(parts)
-        columns |= parts
+        values = array[name]
+        of_field = split_array(name, values)
+        if values.shape[1] > 1:
+            grouped[name] = tuple(of_field)
+        columns |= of_field
     viewpoint = " ".join(header.get("VIEWPOINT", [NO_VIEWPOINT]))
     table = from_columns(columns, path, PcdForm(viewpoint))
     return replace(table, form=replace(table.form, arrays=grouped))
+
+
+def _layout(header: dict[str, list[str]]) -> np.dtype[Any]:
+    """Return the data type of a point; fields without a name get one that begins with ``_``."""
+    names = header["FIELDS"]
+    counts = header.get("COUNT", ["1"] * len(names))
+    fields = []
+    entries = zip(names, header["TYPE"], header["SIZE"], counts, strict=True)
+    for number, (name, kind, size, count) in enumerate(entries):
+        field = f"_{number}" if name == "_" else name
+        fields.append((field, f"<{KINDS[kind]}{int(size)}", (int(count),)))
+    return np.dtype(fields)
 
 
 def write(path: Path, table: Table) -> None:
@@ -74,27 +80,27 @@ def write(path: Path, table: Table) -> None:
     for name, column in unique_names(table).items():
         columns[name] = column.astype(fitting_type(name, column, TYPES, ".pcd"))
     fields = _fields(columns, table)
+    kinds = [columns[names[0]].dtype for names in fields.values()]
     letters = {kind: letter for letter, kind in KINDS.items()}
-    kinds = {name: columns[parts[0]].dtype for name, parts in fields.items()}
-    layout = table.form.layout
-    form = layout if isinstance(layout, PcdForm) else PcdForm()
+    form = table.form.layout
+    if not isinstance(form, PcdForm):
+        form = PcdForm()
     rows = to_rows(columns)
-    header = {
-        "VERSION": "0.7",
-        "FIELDS": " ".join(fields),
-        "SIZE": " ".join(str(kind.itemsize) for kind in kinds.values()),
-        "TYPE": " ".join(letters[kind.kind] for kind in kinds.values()),
-        "COUNT": " ".join(str(len(parts)) for parts in fields.values()),
-        "WIDTH": str(len(rows)),
-        "HEIGHT": "1",
-        "VIEWPOINT": form.viewpoint,
-        "POINTS": str(len(rows)),
-        "DATA": "binary\n",
-    }
-    lines = [f"{name} {values}" for name, values in header.items()]
-    text = "\n".join(["# .PCD v0.7 - Point Cloud Data file format", *lines])
+    lines = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        f"FIELDS {' '.join(fields)}",
+        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}",
+        f"TYPE {' '.join(letters[kind.kind] for kind in kinds)}",
+        f"COUNT {' '.join(str(len(names)) for names in fields.values())}",
+        f"WIDTH {len(rows)}",
+        "HEIGHT 1",
+        f"VIEWPOINT {form.viewpoint}",
+        f"POINTS {len(rows)}",
+        "DATA binary\n",
+    ]
     with path.open("wb") as file:
-        file.write(text.encode())
+        file.write("\n".join(lines).encode())
         rows.tofile(file)
 
 
@@ -102,17 +108,23 @@ def _fields(columns: dict[str, Column], table: Table) -> dict[str, list[str]]:
     """Return the fields of a file with the columns of each: several, where they were one field."""
     names = list(columns)
     fields: dict[str, list[str]] = {}
-    place = 0
-    while place < len(names):
-        name, length = names[place], 1
-        for array, parts in table.form.arrays.items():
-            together = tuple(names[place : place + len(parts)]) == parts
-            kinds = {columns[part].dtype for part in parts if part in columns}
-            if together and len(kinds) == 1 and array not in columns:
-                name, length = array, len(parts)
-        fields[name] = names[place : place + length]
-        place += length
+    start = 0
+    while start < len(names):
+        field = names[start]
+        length = 1
+        for array, members in table.form.arrays.items():
+            are_next = tuple(names[start : start + len(members)]) == members
+            if are_next and array not in columns and _have_one_type(columns, members):
+                field = array
+                length = len(members)
+        fields[field] = names[start : start + length]
+        start += length
     return fields
+
+
+def _have_one_type(columns: dict[str, Column], names: tuple[str, ...]) -> bool:
+    kinds = {columns[name].dtype for name in names}
+    return len(kinds) == 1
 
 
 def _header(data: bytes) -> tuple[dict[str, list[str]], int]:

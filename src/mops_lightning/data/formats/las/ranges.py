@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from mops_lightning.data.formats.las.header import Header, Record
 from mops_lightning.data.formats.las.layout import EXTRA, Layout, Rows, is_extra
 
-NO_DATA, SMALLEST, LARGEST = 1, 2, 4
+NO_DATA = 1
+SMALLEST = 2
+LARGEST = 4
 """Bits of an extra dimension's options."""
 
 PLACES = {NO_DATA: 40, SMALLEST: 64, LARGEST: 88}
@@ -46,16 +48,28 @@ class Entry:
     def add(self, rows: Rows) -> None:
         """Look at the numbers of more points."""
         numbers = rows[self.field].reshape(len(rows), self.count)
-        ranges = [self._range(numbers[:, place], place) for place in range(self.count)]
-        if any(found is None for found in ranges):
-            return  # one of an array's numbers has no value
-        low = [found[0] for found in ranges if found is not None]
-        high = [found[1] for found in ranges if found is not None]
+        smallest = []
+        largest = []
+        for element in range(self.count):
+            values = self._values(numbers[:, element], element)
+            if not len(values):
+                return  # one of an array's numbers has no value
+            smallest.append(values.min().item())
+            largest.append(values.max().item())
         if self.smallest is None or self.largest is None:
-            self.smallest, self.largest = low, high
+            self.smallest = smallest
+            self.largest = largest
             return
-        self.smallest = [min(pair) for pair in zip(self.smallest, low, strict=True)]
-        self.largest = [max(pair) for pair in zip(self.largest, high, strict=True)]
+        self.smallest = [min(pair) for pair in zip(self.smallest, smallest, strict=True)]
+        self.largest = [max(pair) for pair in zip(self.largest, largest, strict=True)]
+
+    def _values(self, numbers: NDArray[Any], element: int) -> NDArray[Any]:
+        """Return the numbers that are values."""
+        if self.no_data is not None:
+            numbers = numbers[numbers != self.no_data[element]]
+        if self.kind == "f":
+            numbers = numbers[~np.isnan(numbers)]
+        return numbers
 
     def _range(self, numbers: NDArray[Any], place: int) -> tuple[Any, Any] | None:
         """Return the smallest and the largest of the numbers that are values."""
@@ -69,9 +83,13 @@ class Entry:
         """Write the numbers into an entry of the record."""
         if self.smallest is None or self.largest is None:
             return
-        for bit, values in ((SMALLEST, self.smallest), (LARGEST, self.largest)):
-            if self.options & bit:
-                struct.pack_into(f"<{self.count}{WIDE[self.kind]}", entry, PLACES[bit], *values)
+        if self.options & SMALLEST:
+            self._write(entry, PLACES[SMALLEST], self.smallest)
+        if self.options & LARGEST:
+            self._write(entry, PLACES[LARGEST], self.largest)
+
+    def _write(self, entry: bytearray, start: int, values: list[Any]) -> None:
+        struct.pack_into(f"<{self.count}{WIDE[self.kind]}", entry, start, *values)
 
 
 class ExtraRanges:
@@ -81,14 +99,16 @@ class ExtraRanges:
         self.entries: dict[tuple[int, int], Entry] = {}
         fields = iter(range(len(layout.extra)))
         for record, start, data in _entries(header.records):
-            type_, options = data[2], data[3]
+            type_ = data[2]
+            options = data[3]
             if type_ == 0 and options == 0:
                 continue  # takes no bytes, so that the layout lacks it
-            place = next(fields, None)
-            if place is None:
+            field = next(fields, None)
+            if field is None:
                 break
-            if type_ and options & (SMALLEST | LARGEST):
-                self.entries[record, start] = _entry(place, layout, data)
+            has_range = options & (SMALLEST | LARGEST)
+            if type_ and has_range:
+                self.entries[record, start] = _entry(field, layout, data)
 
     def add(self, rows: Rows) -> None:
         """Look at more points."""
@@ -98,27 +118,31 @@ class ExtraRanges:
     def fill(self, records: tuple[Record, ...]) -> tuple[Record, ...]:
         """Return the records of the file with the numbers of its points."""
         filled = list(records)
-        for (place, start), entry in self.entries.items():
-            data = bytearray(filled[place].data)
-            text = data[start : start + EXTRA.size]
+        for (number, start), entry in self.entries.items():
+            data = bytearray(filled[number].data)
+            end = start + EXTRA.size
+            text = data[start:end]
             entry.fill(text)
-            data[start : start + EXTRA.size] = text
-            filled[place] = replace(filled[place], data=bytes(data))
+            data[start:end] = text
+            filled[number] = replace(filled[number], data=bytes(data))
         return tuple(filled)
 
 
 def _entries(records: tuple[Record, ...]) -> Iterator[tuple[int, int, bytes]]:
-    """Yield the place of a record, the start of an entry in it, and the entry."""
-    for place, record in enumerate(records):
-        if is_extra(record):
-            for start in range(0, len(record.data) - EXTRA.size + 1, EXTRA.size):
-                yield place, start, record.data[start : start + EXTRA.size]
+    """Yield the number of a record, the start of an entry in it, and the entry."""
+    for number, record in enumerate(records):
+        if not is_extra(record):
+            continue
+        last = len(record.data) - EXTRA.size
+        for start in range(0, last + 1, EXTRA.size):
+            yield number, start, record.data[start : start + EXTRA.size]
 
 
-def _entry(place: int, layout: Layout, data: bytes) -> Entry:
-    extra = layout.extra[place]
+def _entry(number: int, layout: Layout, data: bytes) -> Entry:
+    extra = layout.extra[number]
     kind = np.dtype(extra.kind).kind
+    options = data[3]
     no_data = None
-    if data[3] & NO_DATA:
+    if options & NO_DATA:
         no_data = struct.unpack_from(f"<{extra.count}{WIDE[kind]}", data, PLACES[NO_DATA])
-    return Entry(f"extra {place}", kind, extra.count, data[3], no_data)
+    return Entry(f"extra {number}", kind, extra.count, options, no_data)
