@@ -85,16 +85,13 @@ class PointChannels:
         """
         if isinstance(value, PointChannels):
             return value
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, Integral)
-            or not 0 <= int(value) <= MOST
-        ):
+        is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+        if not is_whole or not 0 <= int(value) <= MOST:
             raise UserError(
                 f"point_channels must be a whole number from 0 to {MOST}, or PointChannels, got "
                 f"{value!r:.99}."
             )
-        return cls(Channel(f"channel_{place}") for place in range(1, int(value) + 1))
+        return cls(Channel(f"channel_{number}") for number in range(1, int(value) + 1))
 
     @classmethod
     def from_plain(cls, rows: Any) -> "PointChannels":
@@ -127,11 +124,13 @@ class PointChannels:
     @property
     def features(self) -> tuple[str, ...]:
         """The channels as ``dataset.features`` names them: normals are one feature."""
-        return tuple(
-            NORMALS if name == NORMAL_COLUMNS[0] else name
-            for name in self.names
-            if name not in NORMAL_COLUMNS[1:]
-        )
+        features = []
+        for name in self.names:
+            if name == NORMAL_COLUMNS[0]:
+                features.append(NORMALS)
+            elif name not in NORMAL_COLUMNS:
+                features.append(name)
+        return tuple(features)
 
     @property
     def normals(self) -> int | None:
@@ -160,11 +159,12 @@ class PointChannels:
         Raises:
             UserError: a value is NaN or infinite; the error names the channel and their number.
         """
-        for place, name in enumerate(self.names):
-            number = int((~torch.isfinite(values[..., place])).sum())
-            if number:
+        for column, name in enumerate(self.names):
+            of_channel = values[..., column]
+            missing = int((~torch.isfinite(of_channel)).sum())
+            if missing:
                 raise UserError(
-                    f"{where}: {number} of {values[..., place].numel()} values of {name} are not "
+                    f"{where}: {missing} of {of_channel.numel()} values of {name} are not "
                     "finite. Remove these points, or use another feature."
                 )
 
@@ -215,12 +215,16 @@ class PointChannels:
 
 def coordinates(points: Tensor) -> Tensor:
     """Return the first three columns of ``(..., 3 + C)`` points; without channels, the points."""
-    return points if points.shape[-1] == 3 else points[..., :3]
+    if points.shape[-1] == 3:
+        return points
+    return points[..., :3]
 
 
 def with_coordinates(points: Tensor, moved: Tensor) -> Tensor:
     """Return points ``(..., 3 + C)`` at other coordinates ``(..., 3)``, with their channels."""
-    return moved if points.shape[-1] == 3 else torch.cat([moved, points[..., 3:]], -1)
+    if points.shape[-1] == 3:
+        return moved
+    return torch.cat([moved, points[..., 3:]], -1)
 
 
 NO_CHANNELS = PointChannels()

@@ -78,15 +78,20 @@ def did_you_mean(name: str, allowed: Iterable[str]) -> str:
     """
     names = sorted(allowed)
     close = get_close_matches(name, names, n=3, cutoff=0.5)
-    hint = f" Did you mean {' or '.join(repr(c) for c in close)}?" if close else ""
-    listed = f" Allowed: {', '.join(names)}." if len(names) <= 40 else ""
-    return hint + listed
+    hint = ""
+    if close:
+        hint += f" Did you mean {' or '.join(repr(match) for match in close)}?"
+    if len(names) <= 40:
+        hint += f" Allowed: {', '.join(names)}."
+    return hint
 
 
 def one_line(error: BaseException) -> str:
     """Return the type and the message of a parser's error, short and on one line."""
-    said = " ".join(str(error).split())
-    return f"{type(error).__name__}: {said[:MESSAGE]}{'…' if len(said) > MESSAGE else ''}"
+    message = " ".join(str(error).split())
+    if len(message) > MESSAGE:
+        message = f"{message[:MESSAGE]}…"
+    return f"{type(error).__name__}: {message}"
 
 
 def printable(text: str) -> str:
@@ -94,10 +99,13 @@ def printable(text: str) -> str:
 
     Line ends and tabs are kept.
     """
-    return "".join(
-        one if one.isprintable() or one in "\n\t" else one.encode("unicode_escape").decode()
-        for one in text
-    )
+    return "".join(map(_printable_character, text))
+
+
+def _printable_character(character: str) -> str:
+    if character.isprintable() or character in "\n\t":
+        return character
+    return character.encode("unicode_escape").decode()
 
 
 def as_line(text: str) -> str:
@@ -108,10 +116,13 @@ def as_line(text: str) -> str:
 
 def file_error(error: OSError) -> str:
     """Return one line about a file or folder that cannot be read or written."""
-    name = f"{error.filename}: " if error.filename else ""
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    hint = " Free some space, or give another folder, and run the same command again."
-    return f"{name}{error.strerror or error}.{hint if full else ''}"
+    line = f"{error.strerror or error}."
+    if error.filename:
+        line = f"{error.filename}: {line}"
+    is_full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    if is_full:
+        line += " Free some space, or give another folder, and run the same command again."
+    return line
 
 
 def line_about(error: BaseException) -> str | None:

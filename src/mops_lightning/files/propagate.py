@@ -32,13 +32,15 @@ def write_map(path: Path, points: Points, sampled: Points, k: int) -> None:
         sampled: ``(m, 3)``.
         k: number of sampled points per point, at most m.
     """
-    finite = np.isfinite(points).all(1)
-    found = propagation_map(points[finite], sampled, k)
-    arrays: dict[str, Any] = {"rows": np.full((len(points), k), -1, np.int32), "m": len(sampled)}
-    arrays["rows"][finite] = found.rows.numpy()
+    is_finite = np.isfinite(points).all(1)
+    near = propagation_map(points[is_finite], sampled, k)
+    rows = np.full((len(points), k), -1, np.int32)
+    rows[is_finite] = near.rows.numpy()
+    arrays: dict[str, Any] = {"rows": rows, "m": len(sampled)}
     if k > 1:  # the weight of one point is 1
-        arrays["weights"] = np.zeros((len(points), k), np.float32)
-        arrays["weights"][finite] = found.weights.numpy()
+        weights = np.zeros((len(points), k), np.float32)
+        weights[is_finite] = near.weights.numpy()
+        arrays["weights"] = weights
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
 
@@ -73,20 +75,23 @@ def propagate_file(
         UserError: a file is broken, or the sample lacks a column.
     """
     sample = _read(small, columns).finite()
-    missing = next((name for name in fields if name not in sample.columns), None)
-    if missing is not None:
-        hint = did_you_mean(missing, sample.columns)
-        raise UserError(f"--field: {small} has no column {missing!r}.{hint}")
+    carried: dict[str, Column] = {}
+    for name in fields:
+        if name not in sample.columns:
+            hint = did_you_mean(name, sample.columns)
+            raise UserError(f"--field: {small} has no column {name!r}.{hint}")
+        carried[name] = sample.columns[name]
     most = len(sample.points)
     if not 1 <= k <= most:
         raise UserError(f"--k must be from 1 to the {most} points of {small}, got {k}.")
-    carried = {name: sample.columns[name] for name in fields}
     map_part = mapper(sample.points, k)
 
     def carry(table: Table) -> Table:
-        found = map_part(table.points)
-        columns = {name: _carried(name, values, found, mean) for name, values in carried.items()}
-        return table.with_columns(columns)
+        near = map_part(table.points)
+        of_part = {}
+        for name, values in carried.items():
+            of_part[name] = _carried(name, values, near, mean)
+        return table.with_columns(of_part)
 
     tables = _tables(big, columns)
     form = _measure(big, tables("measuring"))
@@ -95,22 +100,23 @@ def propagate_file(
     return form.number
 
 
-def _carried(name: str, values: Column, found: PropagationMap, mean: bool) -> Column:
+def _carried(name: str, values: Column, near: PropagationMap, mean: bool) -> Column:
     """Return the values of all points; packed colours are averaged channel by channel.
 
     Raises:
         UserError: packed colours to average have another data type than 32 bits.
     """
-    averages = found.rows.shape[-1] > 1 and (mean or values.dtype.kind == "f")
-    if name not in PACKED_COLOURS or not averages:
-        return np.asarray(propagate(values, found, mean))
+    has_several = near.rows.shape[-1] > 1
+    is_averaged = has_several and (mean or values.dtype.kind == "f")
+    if name not in PACKED_COLOURS or not is_averaged:
+        return np.asarray(propagate(values, near, mean))
     if values.dtype.itemsize != 4:
         raise UserError(
             f"--field {name}: only packed colours of 32 bits can be averaged, got "
             f"{values.dtype}. Leave --k out."
         )
     channels = np.ascontiguousarray(values).view(np.uint8).reshape(-1, 4)
-    averaged = np.ascontiguousarray(propagate(channels, found, mean=True))
+    averaged = np.ascontiguousarray(propagate(channels, near, mean=True))
     return averaged.view(values.dtype)[:, 0]
 
 
@@ -150,25 +156,35 @@ def _measure(path: Path, tables: Iterable[Table]) -> TableParts:
         BadCloudError: there are no points.
     """
     number = 0
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    low = np.full(3, np.inf)
+    high = np.full(3, -np.inf)
     first: Table | None = None
     columns: dict[str, Column] = {}
     for table in tables:
         if first is None:
-            first, columns = table, dict(table.columns)
+            first = table
+            columns = dict(table.columns)
         for name, column in table.columns.items():
             columns[name] = np.concatenate([columns[name], _extremes(column)])
         guard.check_coordinates(path, table.points)
         number += len(table.points)
-        low, high = np.minimum(low, table.points.min(0)), np.maximum(high, table.points.max(0))
+        low = np.minimum(low, table.points.min(0))
+        high = np.maximum(high, table.points.max(0))
     if first is None:
         raise guard.BadCloudError(f"{path} holds no points.")
-    kind = first.form.coordinates or np.dtype(np.float64)
-    corners = np.stack([low, high])
-    return TableParts([], number, corners, kind, columns, first.header, first.form)
+    return TableParts(
+        parts=[],
+        number=number,
+        corners=np.stack([low, high]),
+        coordinates=first.form.coordinates or np.dtype(np.float64),
+        columns=columns,
+        header=first.header,
+        form=first.form,
+    )
 
 
 def _extremes(column: Column) -> Column:
     """Return the lowest and the highest number, and the one farthest from a whole number."""
     fraction = np.abs(column - np.rint(column))
-    return column[[column.argmin(), column.argmax(), fraction.argmax()]]
+    rows = [column.argmin(), column.argmax(), fraction.argmax()]
+    return column[rows]

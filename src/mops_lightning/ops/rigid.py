@@ -47,20 +47,23 @@ def move(points: Tensor, motion: Motion, channels: PointChannels) -> Tensor:
 def identity_motion(points: Tensor) -> Motion:
     """Return the identity for every cloud of ``(B, N, 3)`` points."""
     zero = torch.zeros_like(points[:, 0])
-    return Motion(torch.cat([torch.ones_like(zero[:, :1]), zero], 1), zero)
+    one = torch.ones_like(zero[:, :1])
+    return Motion(torch.cat([one, zero], 1), zero)
 
 
 def quaternion_conjugate(quaternion: Tensor) -> Tensor:
     """Return the inverse rotations of ``(..., 4)`` unit quaternions."""
-    return torch.cat([quaternion[..., :1], -quaternion[..., 1:]], -1)
+    scalar, vector = quaternion.tensor_split((1,), -1)
+    return torch.cat([scalar, -vector], -1)
 
 
 def quaternion_multiply(left: Tensor, right: Tensor) -> Tensor:
     """Return the Hamilton product ``(..., 4)``: the rotation ``right``, then ``left``."""
-    a, u = left[..., :1], left[..., 1:]
-    b, v = right[..., :1], right[..., 1:]
+    a, u = left.tensor_split((1,), -1)
+    b, v = right.tensor_split((1,), -1)
     scalar = a * b - (u * v).sum(-1, keepdim=True)
-    return torch.cat([scalar, a * v + b * u + torch.linalg.cross(u, v)], -1)
+    vector = a * v + b * u + torch.linalg.cross(u, v)
+    return torch.cat([scalar, vector], -1)
 
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
@@ -82,15 +85,19 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
 
 def quaternion_from_euler(angles: Tensor) -> Tensor:
     """Convert ``(..., 3)`` angles about the fixed axes x, then y, then z to quaternions."""
-    half = angles / 2
-    result = None
-    for axis in range(3):
-        rotation = torch.zeros(*angles.shape[:-1], 4, dtype=angles.dtype, device=angles.device)
-        rotation[..., 0] = half[..., axis].cos()
-        rotation[..., 1 + axis] = half[..., axis].sin()
-        result = rotation if result is None else quaternion_multiply(rotation, result)
-    assert result is not None
-    return result
+    about_x = _about_axis(angles, 0)
+    about_y = _about_axis(angles, 1)
+    about_z = _about_axis(angles, 2)
+    return quaternion_multiply(about_z, quaternion_multiply(about_y, about_x))
+
+
+def _about_axis(angles: Tensor, axis: int) -> Tensor:
+    """Return the quaternions ``(..., 4)`` of one of ``(..., 3)`` angles."""
+    half = angles[..., axis] / 2
+    quaternion = torch.zeros(*half.shape, 4, dtype=angles.dtype, device=angles.device)
+    quaternion[..., 0] = half.cos()
+    quaternion[..., 1 + axis] = half.sin()
+    return quaternion
 
 
 def motion_of_vectors(turn: Tensor, shift: Tensor) -> Motion:
@@ -120,8 +127,9 @@ def rotation_angle(first: Tensor, second: Tensor) -> Tensor:
         ``(...)``, in radians from 0 to π.
     """
     between = quaternion_multiply(quaternion_conjugate(first), second)
-    vector = torch.linalg.vector_norm(between[..., 1:], dim=-1)
-    return 2 * torch.atan2(vector, between[..., 0].abs())
+    scalar = between[..., 0]
+    length = torch.linalg.vector_norm(between[..., 1:], dim=-1)
+    return 2 * torch.atan2(length, scalar.abs())
 
 
 def random_motion(rotation: float, translation: float, generators: Sequence[Generator]) -> Motion:
@@ -135,7 +143,8 @@ def random_motion(rotation: float, translation: float, generators: Sequence[Gene
     Returns:
         B motions in float32.
     """
-    drawn = torch.stack([torch.rand(2, 3, generator=g, dtype=torch.float64) for g in generators])
-    drawn = 2 * drawn - 1
+    numbers = [torch.rand(2, 3, generator=rng, dtype=torch.float64) for rng in generators]
+    drawn = 2 * torch.stack(numbers) - 1
     angles = torch.deg2rad(drawn[:, 0] * rotation)
-    return Motion(quaternion_from_euler(angles).float(), (drawn[:, 1] * translation).float())
+    shifts = drawn[:, 1] * translation
+    return Motion(quaternion_from_euler(angles).float(), shifts.float())

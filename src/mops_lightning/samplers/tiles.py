@@ -1,6 +1,8 @@
 """Downsampling large scenes by tiles: cut, sample every tile as in training, thin the seams."""
 
+import math
 from collections import defaultdict
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -50,8 +52,10 @@ def sample_by_tiles(
     """
     tiles = balanced_tiles(points, size)
     sizes = [len(tile) for tile in tiles]
-    thinned = len(tiles) > 1 and sampler.spreads
-    sampled = min(int(EXTRA * m), len(points)) if thinned else m
+    is_thinned = len(tiles) > 1 and sampler.spreads
+    sampled = m
+    if is_thinned:
+        sampled = min(int(EXTRA * m), len(points))
     numbers = np.minimum(shares(sampled, sizes), sampler.m).tolist()
     if sum(numbers) < m:
         raise UserError(
@@ -59,24 +63,43 @@ def sample_by_tiles(
             f"sampler was trained for up to {sampler.m} points of each. Use smaller tiles, or keep "
             "fewer points."
         )
-    same: dict[tuple[int, int], list[int]] = defaultdict(list)
-    for place, pair in enumerate(zip(sizes, numbers, strict=True)):
-        same[pair].append(place)
     selected: list[Rows] = [np.empty(0, np.int64)] * len(tiles)
-    for (n, number), places in same.items():
-        step = max(BATCH // n, 1)
-        for first in range(0, len(places) if number else 0, step):
-            batch = places[first : first + step]
-            clouds = [points[tiles[place]] for place in batch]
-            stacked = torch.stack([_as_input(sampler, one) for one in clouds])
-            if channels is not None:
-                of_tiles = torch.stack([channels[torch.from_numpy(tiles[p])] for p in batch])
-                stacked = torch.cat([stacked, of_tiles], 2)
-            rows = sample_tiles(sampler, stacked, number)
-            for place, chosen in zip(batch, rows, strict=True):
-                selected[place] = tiles[place][chosen]
+    for batch in _batches(sizes, numbers):
+        batch_of_tiles = [tiles[number] for number in batch]
+        stacked = _stacked(sampler, points, batch_of_tiles, channels)
+        rows = sample_tiles(sampler, stacked, numbers[batch[0]])
+        for number, rows_in_tile in zip(batch, rows, strict=True):
+            selected[number] = tiles[number][rows_in_tile]
     kept = np.concatenate(selected)
     return np.sort(kept[thin(points[kept], m)])
+
+
+def _batches(sizes: list[int], numbers: list[int]) -> Iterator[list[int]]:
+    """Yield tiles that are sampled together: of one size, of which one number is kept.
+
+    Args:
+        sizes: points of every tile.
+        numbers: points to keep of every tile; tiles that keep none are left out.
+    """
+    alike: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for tile, (size, number) in enumerate(zip(sizes, numbers, strict=True)):
+        if number > 0:
+            alike[size, number].append(tile)
+    for (size, _), tiles in alike.items():
+        step = max(BATCH // size, 1)
+        for first in range(0, len(tiles), step):
+            yield tiles[first : first + step]
+
+
+def _stacked(
+    sampler: Sampler, points: Points, tiles: list[Rows], channels: Tensor | None
+) -> Tensor:
+    """Return tiles of one size ``(B, n, 3 + C)`` as the sampler takes them."""
+    places = torch.stack([_as_input(sampler, points[tile]) for tile in tiles])
+    if channels is None:
+        return places
+    of_tiles = [channels[torch.from_numpy(tile)] for tile in tiles]
+    return torch.cat([places, torch.stack(of_tiles)], 2)
 
 
 def _as_input(sampler: Sampler, points: Points) -> Tensor:
@@ -98,18 +121,22 @@ def balanced_tiles(points: Points, size: int) -> list[Rows]:
     """
     tiles: list[Rows] = []
     planes = np.ascontiguousarray(points.T)  # extremes are found ten times as fast along memory
-    parts = [(np.arange(len(points)), -(-len(points) // size))]
+    number_of_tiles = math.ceil(len(points) / size)
+    parts = [(np.arange(len(points)), number_of_tiles)]
     while parts:
         rows, number = parts.pop()
         if number == 1:
             tiles.append(np.sort(rows))
             continue
         inside = planes.take(rows, 1)
-        axis = int((inside.max(1) - inside.min(1)).argmax())
-        first = number // 2
-        at = len(rows) * first // number
+        extents = inside.max(1) - inside.min(1)
+        axis = int(extents.argmax())
+        in_lower = number // 2
+        at = len(rows) * in_lower // number
         order = inside[axis].argpartition(at)
-        parts += [(rows[order[at:]], number - first), (rows[order[:at]], first)]
+        lower = (rows[order[:at]], in_lower)
+        upper = (rows[order[at:]], number - in_lower)
+        parts += [upper, lower]
     return tiles
 
 
@@ -159,4 +186,5 @@ def thin(points: Points, m: int) -> Rows:
             excess -= 1
     kept = np.flatnonzero(remains)
     # Too many remain only where many points are equal.
-    return np.sort(kept[distance[kept, 1].argsort(kind="stable")[excess:]])
+    farthest_last = distance[kept, 1].argsort(kind="stable")
+    return np.sort(kept[farthest_last[excess:]])
