@@ -1,3 +1,5 @@
+"""Nearest points and the chamfer distance against double loops, SciPy and torch."""
+
 import pytest
 import torch
 from scipy.spatial import cKDTree
@@ -10,55 +12,85 @@ from mops_lightning.ops.points import gather_points
 from tests.support.plain import plain_nearest
 
 
-@pytest.mark.parametrize("form", ["compiled", "torch"])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("n", [5, 32, 75])
-def test_nearest_equals_double_loop(n, dtype, form, rng, monkeypatch):
-    if form == "torch":
-        monkeypatch.setattr(compiled, "nearest", lambda *_: None)
+@pytest.fixture
+def without_compiled_loops(monkeypatch):
+    """Leave the search to torch."""
+    monkeypatch.setattr(compiled, "nearest", lambda *_: None)
+
+
+def check_against_double_loop(n, dtype, rng):
     queries = torch.randn(2, 6, 3, dtype=dtype, generator=rng)
     points = torch.randn(2, n, 3, dtype=dtype, generator=rng)
+
     distances, indices = nearest(queries, points)
-    expected, places = plain_nearest(queries, points)
+
+    expected_distances, expected_indices = plain_nearest(queries, points)
     assert distances.dtype == dtype
-    assert torch.equal(indices, places)
-    torch.testing.assert_close(distances, expected)
+    assert torch.equal(indices, expected_indices)
+    torch.testing.assert_close(distances, expected_distances)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("n", [5, 32, 75])
+def test_nearest_equals_double_loop(n, dtype, rng):
+    check_against_double_loop(n, dtype, rng)
+
+
+@pytest.mark.usefixtures("without_compiled_loops")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("n", [5, 32, 75])
+def test_nearest_in_torch_equals_double_loop(n, dtype, rng):
+    check_against_double_loop(n, dtype, rng)
+
+
+def gradients(search_, queries, points, weights):
+    """Return the gradients of a weighted sum of distances."""
+    leaves = [queries.clone().requires_grad_(), points.clone().requires_grad_()]
+    distances, _ = search_(*leaves)
+    (distances * weights).sum().backward()
+    return [leaf.grad for leaf in leaves]
 
 
 def test_nearest_gradients_equal_double_loop(rng):
-    def gradients(function):
-        leaves = [values.clone().requires_grad_() for values in (queries, points)]
-        (function(*leaves)[0] * weights).sum().backward()
-        return [leaf.grad for leaf in leaves]
-
-    queries, points = torch.randn(2, 2, 9, 3, dtype=torch.float64, generator=rng)
+    queries = torch.randn(2, 9, 3, dtype=torch.float64, generator=rng)
+    points = torch.randn(2, 9, 3, dtype=torch.float64, generator=rng)
     weights = torch.randn(2, 9, generator=rng)
-    torch.testing.assert_close(gradients(nearest), gradients(plain_nearest))
+
+    of_nearest = gradients(nearest, queries, points, weights)
+
+    of_plain = gradients(plain_nearest, queries, points, weights)
+    torch.testing.assert_close(of_nearest, of_plain)
 
 
+@pytest.mark.usefixtures("without_compiled_loops")
 @pytest.mark.parametrize("block", [1, 100, 1000, 1500])
 def test_nearest_block_size_changes_nothing(block, rng, monkeypatch):
     queries = torch.randn(3, 11, 3, generator=rng)
     points = torch.randn(3, 40, 3, generator=rng)
-    monkeypatch.setattr(compiled, "nearest", lambda *_: None)
-    whole = nearest(queries, points)
+    whole_distances, whole_indices = nearest(queries, points)
     monkeypatch.setitem(search.BLOCK, "cpu", block)
-    for part, expected in zip(nearest(queries, points), whole, strict=True):
-        assert torch.equal(part, expected)
+
+    distances, indices = nearest(queries, points)
+
+    assert torch.equal(distances, whole_distances)
+    assert torch.equal(indices, whole_indices)
 
 
 @pytest.mark.parametrize("offset", [0.0, 30.0])
-def test_nearest_far_from_origin_has_no_cancellation(offset, rng):
+@pytest.mark.parametrize("cloud", [0, 1])
+def test_nearest_far_from_origin_has_no_cancellation(cloud, offset, rng):
     """Close points far from the origin, where |a|² + |b|² − 2⟨a, b⟩ in float32 goes wrong."""
     points = offset + 0.01 * torch.rand(2, 1500, 3, generator=rng)
     queries = points[:, :400] + 1e-4 * torch.randn(2, 400, 3, generator=rng)
+
     distances, indices = nearest(queries, points)
-    for b in range(2):
-        expected, _ = cKDTree(points[b].double().numpy()).query(queries[b].double().numpy())
-        found = gather_points(points, indices)[b].double()
-        exact = (queries[b].double() - found).norm(dim=1)
-        torch.testing.assert_close(exact, torch.from_numpy(expected), rtol=1e-6, atol=0)
-        torch.testing.assert_close(distances[b].double().sqrt(), exact, rtol=1e-5, atol=0)
+
+    tree = cKDTree(points[cloud].double().numpy())
+    expected, _ = tree.query(queries[cloud].double().numpy())
+    chosen = gather_points(points, indices)[cloud].double()
+    exact = (queries[cloud].double() - chosen).norm(dim=1)
+    torch.testing.assert_close(exact, torch.from_numpy(expected), rtol=1e-6, atol=0)
+    torch.testing.assert_close(distances[cloud].double().sqrt(), exact, rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("value", [float("inf"), -float("inf"), float("nan")])
@@ -66,61 +98,99 @@ def test_nearest_of_query_that_is_not_finite_is_a_row(value, rng):
     points = torch.randn(1, 33, 3, generator=rng)
     queries = points[:, :5] + 0.01
     queries[0, 2] = value
+
     distances, indices = nearest(queries, points)
+    _, near_indices = k_nearest(queries, points, 3)
+
     assert not distances[0, 2].isfinite()
     assert indices[0, [0, 1, 3, 4]].tolist() == [0, 1, 3, 4]
-    assert k_nearest(queries, points, 3)[1].max() < 33
+    assert near_indices.max() < 33
 
 
-def test_nearest_of_ties_is_lowest_index():
-    points = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0]]]).repeat(1, 20, 1)
-    assert nearest(torch.zeros(1, 1, 3), points)[1].item() == 2
-    assert nearest(torch.tensor([[[1.0, 1, 0]]]), points)[1].item() == 0
+@pytest.mark.parametrize(
+    ("query", "row"),
+    [
+        ([0.0, 0.0, 0.0], 2),
+        ([1.0, 1.0, 0.0], 0),
+    ],
+)
+def test_nearest_of_ties_is_lowest_index(query, row):
+    four = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0]]])
+    points = four.repeat(1, 20, 1)
+
+    _, indices = nearest(torch.tensor([[query]]), points)
+
+    assert indices.item() == row
 
 
 def test_nearest_half_precision_compares_in_float32(rng):
     points = torch.randn(1, 50, 3, generator=rng).half()
     queries = torch.randn(1, 20, 3, generator=rng).half()
+
     distances, indices = nearest(queries, points)
+
+    _, expected = nearest(queries.float(), points.float())
     assert distances.dtype == torch.half
-    assert torch.equal(indices, nearest(queries.float(), points.float())[1])
+    assert torch.equal(indices, expected)
 
 
-@pytest.mark.parametrize(
-    ("queries", "points"), [((1, 4, 3), (2, 5, 3)), ((1, 4, 2), (1, 5, 3)), ((1, 4, 3), (1, 0, 3))]
-)
+MISMATCHES = [
+    ((1, 4, 3), (2, 5, 3)),
+    ((1, 4, 2), (1, 5, 3)),
+    ((1, 4, 3), (1, 0, 3)),
+]
+
+
+@pytest.mark.parametrize(("queries", "points"), MISMATCHES)
 def test_nearest_shape_mismatch_raises(queries, points):
-    for search_ in (nearest, lambda q, p: k_nearest(q, p, 1)):
-        with pytest.raises(UserError, match="points"):
-            search_(torch.zeros(queries), torch.zeros(points))
+    with pytest.raises(UserError, match="points"):
+        nearest(torch.zeros(queries), torch.zeros(points))
+
+
+@pytest.mark.parametrize(("queries", "points"), MISMATCHES)
+def test_k_nearest_shape_mismatch_raises(queries, points):
+    with pytest.raises(UserError, match="points"):
+        k_nearest(torch.zeros(queries), torch.zeros(points), 1)
 
 
 @pytest.mark.parametrize("k", [1, 4, 30])
 def test_k_nearest_equals_sorted_distances(k, rng):
     queries = torch.randn(2, 8, 3, dtype=torch.float64, generator=rng)
     points = torch.randn(2, 30, 3, dtype=torch.float64, generator=rng)
+
     distances, indices = k_nearest(queries, points, k)
-    expected, places = torch.cdist(queries, points).square().sort(2)
-    assert torch.equal(indices, places[..., :k])
-    torch.testing.assert_close(distances, expected[..., :k])
+
+    expected_distances, expected_indices = torch.cdist(queries, points).square().sort(2)
+    assert torch.equal(indices, expected_indices[..., :k])
+    torch.testing.assert_close(distances, expected_distances[..., :k])
 
 
 @pytest.mark.parametrize("k", [0, 6])
 def test_k_nearest_out_of_range_raises(k):
+    queries = torch.zeros(1, 2, 3)
+    points = torch.zeros(1, 5, 3)
+
     with pytest.raises(UserError, match=rf"k must be from 1 .*N=5, got {k}"):
-        k_nearest(torch.zeros(1, 2, 3), torch.zeros(1, 5, 3), k)
+        k_nearest(queries, points, k)
 
 
 def plain_chamfer(points, others):
     squares = (points[:, :, None] - others[:, None]).square().sum(-1)
-    return squares.min(2).values.mean(1) + squares.min(1).values.mean(1)
+    from_points = squares.min(2).values.mean(1)
+    from_others = squares.min(1).values.mean(1)
+    return from_points + from_others
 
 
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 7), (40, 25), (300, 900)])
 def test_chamfer_equals_plain_form(n, m, rng):
     points = torch.randn(3, n, 3, dtype=torch.float64, generator=rng, requires_grad=True)
     others = torch.randn(3, m, 3, dtype=torch.float64, generator=rng, requires_grad=True)
-    got, want = chamfer_distance(points, others), plain_chamfer(points, others)
-    torch.testing.assert_close(got, want)
-    gradients = [torch.autograd.grad(value.sum(), [points, others]) for value in (got, want)]
-    torch.testing.assert_close(*gradients)
+
+    distance = chamfer_distance(points, others)
+
+    expected = plain_chamfer(points, others)
+    torch.testing.assert_close(distance, expected)
+    torch.testing.assert_close(
+        torch.autograd.grad(distance.sum(), [points, others]),
+        torch.autograd.grad(expected.sum(), [points, others]),
+    )

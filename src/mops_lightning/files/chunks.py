@@ -40,9 +40,10 @@ class Nearest(NamedTuple):
 
     def merge(self, other: "Nearest") -> "Nearest":
         """Keep the nearer points; in case of ties, the points of the earlier range."""
-        nearer = other.distance < self.distance
-        number = len(nearer)
-        rows = np.arange(number) + number * nearer
+        is_nearer = other.distance < self.distance
+        number = len(is_nearer)
+        rows = np.arange(number)
+        rows[is_nearer] += number  # the other table's rows come after this one's
         table = join_tables([self.table, other.table]).take(rows)
         return Nearest(np.minimum(self.distance, other.distance), table)
 

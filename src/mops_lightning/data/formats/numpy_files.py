@@ -151,7 +151,7 @@ def write_npz(path: Path, table: Table) -> None:
 
 def joined_arrays(table: Table) -> dict[str, NDArray[Any]]:
     """Return columns ``(N,)``, and arrays ``(N, k)`` of the columns that were one in the file."""
-    array_of = {}
+    array_of: dict[str, str] = {}
     for array, names in table.form.arrays.items():
         if _is_whole(table, names):
             array_of |= dict.fromkeys(names, array)

@@ -88,21 +88,28 @@ def parse_mesh(data: bytes, path: Path) -> PlyMesh:
     header = read_header(data[:LONGEST_HEADER])
     elements = read_elements(data, header)
     table = _vertices(path, header, elements)
-    found = elements.get("face", {})
-    lists = [name for name, values in found.items() if isinstance(values, Lists)]
-    chosen = next((name for name in (*INDICES, *lists) if name in lists), None)
-    if chosen is None:
+    lists: dict[str, Lists] = {}
+    numbers: dict[str, Column] = {}
+    for name, values in elements.get("face", {}).items():
+        if isinstance(values, Lists):
+            lists[name] = values
+        else:
+            numbers[name] = values
+    corners = _corners(lists)
+    if corners is None:
         return PlyMesh(table, np.empty((0, 3), np.int64), {}, table.form.left_out)
-    corners = found[chosen]
-    assert isinstance(corners, Lists)
     faces, rows = _triangles(corners)
-    columns = {
-        name: in_native_order(values)[rows]
-        for name, values in found.items()
-        if not isinstance(values, Lists)
-    }
+    columns = {name: in_native_order(values)[rows] for name, values in numbers.items()}
     left_out = tuple(name for name in table.form.left_out if name != "element face")
     return PlyMesh(table, faces, columns, left_out)
+
+
+def _corners(lists: dict[str, Lists]) -> Lists | None:
+    """Return the corners of the faces: the list with a usual name, or else the first one."""
+    for name in (*INDICES, *lists):
+        if name in lists:
+            return lists[name]
+    return None
 
 
 def _is_compressed(header: Header) -> bool:
@@ -117,7 +124,8 @@ def _is_faces(element: Element) -> bool:
 
 def _triangles(polygons: Lists) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Cut polygons into triangles ``(F, 3)`` from their first corners; and the row of each."""
-    triangles, rows = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
+    triangles = [np.empty((0, 3), np.int64)]
+    rows = [np.empty(0, np.int64)]
     for of_length, corners in polygons.by_length():
         whole = corners.astype(np.int64)
         for second in range(1, corners.shape[1] - 1):
@@ -140,11 +148,9 @@ def _vertices(path: Path, header: Header, elements: dict[str, dict[str, Values]]
             left_out.append(name)
         else:
             columns[name] = values
-    left_out += [
-        f"element {element.name}"
-        for element in header.elements
-        if element.name != points.name and element.number > 0
-    ]
+    for element in header.elements:
+        if element.name != points.name and element.number > 0:
+            left_out.append(f"element {element.name}")
     table = from_columns(columns, path)
     form = Form(table.form.coordinates, left_out=tuple(left_out))
     return replace(table, form=form)
@@ -180,12 +186,19 @@ def write_parts(path: Path, table: TableParts) -> None:
     kinds = dict.fromkeys("xyz", floating(table.coordinates))
     for name, column in examples.items():
         kinds[name] = fitting_type(name, column, TYPES, ".ply")
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {table.number}"]
-    lines += [f"property {TYPES[kind.str[1:]]} {name}" for name, kind in kinds.items()]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {table.number}",
+    ]
+    for name, kind in kinds.items():
+        lines.append(f"property {TYPES[kind.str[1:]]} {name}")
+    lines.append("end_header\n")
     with path.open("wb") as file:
-        file.write("\n".join([*lines, "end_header\n"]).encode())
+        file.write("\n".join(lines).encode())
         for part in table.parts:
-            columns = dict(zip("xyz", part.points.T, strict=True)) | unique_names(part)
+            columns: dict[str, Column] = dict(zip("xyz", part.points.T, strict=True))
+            columns |= unique_names(part)
             typed = {name: column.astype(kinds[name]) for name, column in columns.items()}
             file.write(to_rows(typed).tobytes())
 
@@ -206,11 +219,12 @@ def locate(path: Path) -> CloudFile:
         raise WholeOnlyError(f"{path} is a compressed PLY, which --chunk does not read.")
     points = _points(path, header)
     offset = header.end
-    for element in header.elements[: header.elements.index(points) + 1]:
+    for element in header.elements:
         if element.has_lists:
             raise WholeOnlyError(
                 f"{path}: --chunk needs vertices without lists, and no lists before them."
             )
-        if element is not points:
-            offset += element.row_type().itemsize * element.number
+        if element is points:
+            break
+        offset += element.row_type().itemsize * element.number
     return binary_file(path, points.number, points.row_type(), offset)

@@ -1,7 +1,6 @@
 """Writing LAS and LAZ files."""
 
 import struct
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, Protocol
@@ -38,30 +37,41 @@ class Summary:
         self.ranges.add(rows)
         returns = self.layout.dimensions["return_number"].get(rows)
         self.returns += np.bincount(returns, minlength=16)
-        for place, axis in enumerate("XYZ"):
-            self.low[place] = min(self.low[place], rows[axis].min())
-            self.high[place] = max(self.high[place], rows[axis].max())
+        for axis, name in enumerate("XYZ"):
+            self.low[axis] = min(self.low[axis], rows[name].min())
+            self.high[axis] = max(self.high[axis], rows[name].max())
         if "gps_time" in self.layout.dimensions:
             times = rows["gps_time"]
-            low, high = self.times
-            self.times = min(low, float(times.min())), max(high, float(times.max()))
+            first, last = self.times
+            self.times = (
+                min(first, float(times.min())),
+                max(last, float(times.max())),
+            )
 
     def fill(self, head: bytearray) -> None:
         """Write the numbers, bounds and times into a header."""
-        minor, form = head[25], head[104] & 0x7F
-        legacy = minor < 4 or (minor == 4 and form < 6 and self.number < LEGACY_LIMIT)
-        counts = [self.number, *self.returns[1:6]] if legacy else [0] * 6
-        struct.pack_into("<6I", head, 107, *counts)
+        minor = head[25]
+        struct.pack_into("<6I", head, 107, *self._legacy_counts(head))
         if minor >= 4:
             struct.pack_into("<16Q", head, 247, self.number, *self.returns[1:])
-        for place in range(3):
-            (scale,) = struct.unpack_from("<d", head, 131 + 8 * place)
-            (offset,) = struct.unpack_from("<d", head, 155 + 8 * place)
-            high_low = self.high[place] * scale + offset, self.low[place] * scale + offset
-            struct.pack_into("<2d", head, 179 + 16 * place, *high_low)
+        for axis in range(3):
+            (scale,) = struct.unpack_from("<d", head, 131 + 8 * axis)
+            (offset,) = struct.unpack_from("<d", head, 155 + 8 * axis)
+            high = self.high[axis] * scale + offset
+            low = self.low[axis] * scale + offset
+            struct.pack_into("<2d", head, 179 + 16 * axis, high, low)
         if minor >= 5:
-            low, high = self.times
-            struct.pack_into("<2d", head, 375, high, low)
+            first, last = self.times
+            struct.pack_into("<2d", head, 375, last, first)
+
+    def _legacy_counts(self, head: bytearray) -> list[int]:
+        """Return the number of points and of the returns 1 to 5; zeros where 1.4 forbids them."""
+        minor = head[25]
+        form = head[104] & 0x7F
+        is_small = form < 6 and self.number < LEGACY_LIMIT
+        if minor < 4 or (minor == 4 and is_small):
+            return [self.number, *self.returns[1:6]]
+        return [0, 0, 0, 0, 0, 0]
 
 
 class Points(Protocol):
@@ -122,24 +132,25 @@ def compression(layout: Layout, variable: bool = False) -> Record:
 def write_parts(path: Path, table: TableParts) -> list[str]:
     """Write a LAS or LAZ file part by part; return what it does not hold."""
     form, parts = plan(path, table, copc=False)
-    header, summary = form.header, Summary(form.header, form.layout)
-    compressed = path.suffix.lower() == ".laz"
-    if compressed:
+    header = form.header
+    summary = Summary(form.header, form.layout)
+    is_compressed = path.suffix.lower() == ".laz"
+    if is_compressed:
         record = compression(form.layout)
         header = replace(header, records=(*header.records, record))
     with path.open("wb+") as stream:
-        begin(stream, header, compressed)
-        points: Points = CompressedPoints(stream, record) if compressed else PlainPoints(stream)
-        for part in _filled(form.pack(part) for part in parts):
-            summary.add(part)
-            points.write(part)
+        begin(stream, header, is_compressed)
+        points: Points = PlainPoints(stream)
+        if is_compressed:
+            points = CompressedPoints(stream, record)
+        for part in parts:
+            rows = form.pack(part)
+            if len(rows):
+                summary.add(rows)
+                points.write(rows)
         points.close()
-        finish(stream, header, compressed, summary, list(header.extended))
+        finish(stream, header, is_compressed, summary, list(header.extended))
     return form.notes()
-
-
-def _filled(parts: Iterator[Rows]) -> Iterator[Rows]:
-    return (part for part in parts if len(part))
 
 
 def begin(stream: BinaryIO, header: Header, compressed: bool) -> None:
@@ -157,13 +168,14 @@ def finish(
     extended: list[Record],
 ) -> None:
     """Write the records after the points, and the final header and records before them."""
-    place = stream.seek(0, 2)
+    end = stream.seek(0, 2)
     for record in extended:
         stream.write(record.to_bytes(extended=True))
     head = _head(header, compressed)
     summary.fill(head)
     if header.minor >= 4:
-        struct.pack_into("<QI", head, 235, place if extended else 0, len(extended))
+        first_extended = end if extended else 0
+        struct.pack_into("<QI", head, 235, first_extended, len(extended))
     stream.seek(0)
     stream.write(head)
     for record in summary.ranges.fill(header.records):
@@ -176,5 +188,7 @@ def _head(header: Header, compressed: bool) -> bytearray:
     head[58:90] = SOFTWARE.ljust(32, b"\0")
     first = len(head) + sum(len(record.to_bytes()) for record in header.records)
     struct.pack_into("<2I", head, 96, first, len(header.records))
-    head[104] = (head[104] & 0x7F) | (0x80 if compressed else 0)
+    head[104] &= 0x7F
+    if compressed:
+        head[104] |= 0x80
     return head
