@@ -122,7 +122,13 @@ def compare_arguments(arguments: list[str], prog: str) -> argparse.Namespace:
 
 
 def _compare_arguments(add: Add) -> None:
-    add("files", metavar="FILE", type=Path, nargs="+", help="clouds or meshes; icp: one folder")
+    add(
+        "files",
+        metavar="FILE",
+        type=Path,
+        nargs="+",
+        help="clouds or meshes; icp: one folder; --task-net: files and folders",
+    )
     add(
         "--task",
         choices=("coverage", "icp"),

@@ -11,21 +11,9 @@ from mops_lightning import FPSSampler, load
 from mops_lightning.files.cli import compare
 from mops_lightning.files.downsample_cli import downsample
 from mops_lightning.samplers.by_budget import ByBudget
+from mops_lightning.zoo.names import UNTRAINED
 from tests.files.task_net.conftest import write_clouds
 from tests.support.captured import captured, done, refused
-
-METHODS = {
-    "fps",
-    "random",
-    "voxel",
-    "poisson",
-    "serial",
-    "normal_space",
-    "covariance",
-    "information",
-    "fps_farthest",
-}
-
 
 NET = """
 import torch
@@ -56,7 +44,8 @@ def test_run_is_compared_by_every_method_and_its_own_sampler(own_scans, scans, t
         "--out", tmp_path / "out",
     )  # fmt: skip
 
-    assert set(frame.method) == {*METHODS, "critical", "trained", "all points"}
+    further = ("fps_farthest", "critical", "trained", "all points")
+    assert set(frame.method) == {*UNTRAINED, *further}
     trained = frame[frame.method == "trained"]
     assert sorted(trained.m.unique()) == [4, 8]  # up to 16 points
     whole = frame[frame.files == "all"]

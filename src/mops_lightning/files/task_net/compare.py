@@ -23,7 +23,7 @@ from mops_lightning.files.task_net.subject import (
     subject_of_run,
 )
 from mops_lightning.files.task_net.tables import Comparison
-from mops_lightning.zoo.weights import read as read_weights
+from mops_lightning.samplers.base import Sampler
 
 DRAWS = 5
 
@@ -34,7 +34,7 @@ def compare_task_net(
     m: Sequence[int],
     *,
     loss: Loss | None = None,
-    weights: str | Path | Sequence[str | Path] = (),
+    weights: str | Path | Sampler | Sequence[str | Path | Sampler] = (),
     methods: Sequence[str] | None = None,
     draws: int = DRAWS,
     crops: int | None = None,
@@ -60,8 +60,8 @@ def compare_task_net(
         loss: of a module, a function of its output and a ``Batch``: one number, or one per cloud.
             The position of a file's folder among all folders is in ``batch.labels``, and the column
             ``label`` in ``batch.parts``.
-        weights: trained samplers, each a run, a model or a weights file; by default the one that
-            the run of the task net trained.
+        weights: trained samplers, each a run, a model, a weights file or a ``Sampler``; by default
+            the one that the run of the task net trained. ``save`` leaves out a ``Sampler``.
         methods: names of methods without training; None: all that the net allows. Farthest points
             are always among them.
         draws: number of draws.
@@ -88,8 +88,8 @@ def compare_task_net(
     subject = _subject(task_net, loss, points, crops, label)
     sizes = sorted(set(m))
     check_sizes(sizes, subject.n_points, subject)
-    compared = methods_of(methods, _listed(weights), subject, sizes)
-    paths = files_of([Path(path) for path in _listed(files)])
+    compared = methods_of(methods, _samplers(weights), subject, sizes)
+    paths = files_of([Path(path) for path in _paths(files)])
     paths = without_training_files(paths, _configs(subject, compared))
     if kept is not None and len(paths) < 2:
         raise UserError(
@@ -114,11 +114,17 @@ def compare_task_net(
     return comparison
 
 
-def _listed(values: Any) -> list[str]:
-    """Return one path or several as a list of texts."""
-    if isinstance(values, str | Path):
-        return [str(values)]
-    return [str(value) for value in values]
+def _paths(files: str | Path | Sequence[str | Path]) -> list[str | Path]:
+    return [files] if isinstance(files, str | Path) else list(files)
+
+
+def _samplers(
+    weights: str | Path | Sampler | Sequence[str | Path | Sampler],
+) -> list[str | Sampler]:
+    """Return one sampler or several as a list, paths as texts."""
+    if isinstance(weights, str | Path | Sampler):
+        weights = [weights]
+    return [one if isinstance(one, Sampler) else str(one) for one in weights]
 
 
 def _free(path: Path, overwrite: bool) -> Path:
@@ -149,4 +155,4 @@ def _subject(
 def _configs(subject: Subject, methods: Sequence[Method]) -> list[dict[str, Any]]:
     """Return the settings of the runs that trained the net and the samplers."""
     trained = [method for method in methods if isinstance(method, Trained)]
-    return [subject.config, *(read_weights(method.path)["config"] for method in trained)]
+    return [subject.config, *(method.config() for method in trained)]

@@ -86,9 +86,10 @@ def choose(frame: pd.DataFrame, metric: MetricInfo, methods: Sequence[Method]) -
     Args:
         frame: columns of ``Score``.
         metric: of the scores.
-        methods: that were compared. Critical points are not chosen, because they need the net.
+        methods: that were compared. Critical points are not chosen, because they need the net, nor
+            are samplers in memory.
     """
-    names = [method.name for method in methods if isinstance(method, Trained | Untrained)]
+    names = [method.name for method in methods if _is_savable(method)]
     first = by_size(frame, CHOOSING)
     second = by_size(frame, CHECKING)
     choices = []
@@ -96,6 +97,10 @@ def choose(frame: pd.DataFrame, metric: MetricInfo, methods: Sequence[Method]) -
         choosable = {name: values[name] for name in names if name in values}
         choices.append(_choice(m, choosable, second[m], metric))
     return choices
+
+
+def _is_savable(method: Method) -> bool:
+    return isinstance(method, Untrained) or (isinstance(method, Trained) and bool(method.path))
 
 
 def _choice(m: int, first: Values, second: Values, metric: MetricInfo) -> Choice:

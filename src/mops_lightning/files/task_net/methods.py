@@ -85,25 +85,37 @@ class Critical(Method):
 
 
 class Trained(Method):
-    """A trained sampler, whose completed sets are taken."""
+    """A trained sampler, whose completed sets are taken.
 
-    def __init__(self, reference: str, name: str, seen: PointChannels) -> None:
-        """Load the sampler.
+    Args:
+        given: a sampler, a run, a model or a weights file.
+        name: in the table.
+        seen: the channels of the task net.
 
-        Raises:
-            UserError: there is no such sampler, or it sees other channels than the net.
-        """
+    Attributes:
+        sampler: in evaluation mode.
+        path: its weights file; None for a sampler in memory, which cannot be saved.
+
+    Raises:
+        UserError: there is no such sampler, or it sees other channels than the net.
+    """
+
+    def __init__(self, given: str | Sampler, name: str, seen: PointChannels) -> None:
         self.name = name
         self.seen = seen
-        try:
-            self.path = weights.of_run(names.resolve(reference))
-            self.sampler = load(self.path)
-        except UserError as error:
-            raise UserError(f"--weights: {error}") from None
+        self.path: Path | None = None
+        if isinstance(given, Sampler):
+            self.sampler = given.eval()
+        else:
+            try:
+                self.path = weights.of_run(names.resolve(given))
+                self.sampler = load(self.path)
+            except UserError as error:
+                raise UserError(f"--weights: {error}") from None
         channels = self.sampler.point_channels
         if channels and channels.names != seen.names:
             raise UserError(
-                f"--weights: {reference} sees the channels {', '.join(channels.names)}, but the "
+                f"--weights: {name} sees the channels {', '.join(channels.names)}, but the "
                 f"task net sees {', '.join(seen.names) or 'none'}."
             )
 
@@ -120,16 +132,26 @@ class Trained(Method):
         own = torch.cat([coordinates(clouds), values.to(clouds.dtype)], -1)
         return rows_in_unit_sphere(self.sampler, own, m)
 
+    def config(self) -> dict[str, Any]:
+        """Return the settings of the run that trained it; empty for a sampler in memory."""
+        if self.path is None:
+            return {}
+        config: dict[str, Any] = weights.read(self.path)["config"]
+        return config
+
     def node(self) -> dict[str, Any]:
         """Return the sampler as plain data, as ``ByBudget`` files hold it."""
-        node = dict(weights.read(self.path)["config"]["sampler"])
+        node = dict(self.config()["sampler"])
         if self.sampler.point_channels:
             node[SEES_CHANNELS] = True
         return node
 
 
 def methods_of(
-    chosen: Sequence[str] | None, references: Sequence[str], subject: Subject, sizes: Sequence[int]
+    chosen: Sequence[str] | None,
+    given: Sequence[str | Sampler],
+    subject: Subject,
+    sizes: Sequence[int],
 ) -> list[Method]:
     """Return the methods of a comparison.
 
@@ -137,8 +159,8 @@ def methods_of(
 
     Args:
         chosen: names among ``NAMES``; None: all that the net allows.
-        references: of trained samplers.
-        subject: the task; the sampler that its run trained is added where there is no reference.
+        given: trained samplers.
+        subject: the task; the sampler that its run trained is added where none is given.
         sizes: numbers of points.
 
     Raises:
@@ -159,30 +181,34 @@ def methods_of(
     methods: list[Method] = []
     for name in known:
         methods.append(Critical(subject.task.net) if name == CRITICAL else Untrained(name))
-    return methods + list(_trained(references, subject, sizes))
+    return methods + list(_trained(given, subject, sizes))
 
 
-def _trained(references: Sequence[str], subject: Subject, sizes: Sequence[int]) -> list[Trained]:
-    given = list(references)
+def _trained(
+    given: Sequence[str | Sampler], subject: Subject, sizes: Sequence[int]
+) -> list[Trained]:
     if not given and subject.sampler is not None:
         given = [str(subject.sampler)]
     samplers = []
-    for reference in given:
-        name = TRAINED if len(given) == 1 else _short_name(reference, given)
-        sampler = Trained(reference, name, subject.channels)
-        if not any(sampler.takes(m) for m in sizes):
-            most = sampler.sampler.m
-            allowed = f"up to {most}" if sampler.sampler.flexible else str(most)
+    for one, name in zip(given, _names(given), strict=True):
+        method = Trained(one, name, subject.channels)
+        if not any(method.takes(m) for m in sizes):
+            most = method.sampler.m
+            allowed = f"up to {most}" if method.sampler.flexible else str(most)
             raise UserError(
-                f"--m: {reference} was trained for {allowed} points, got "
-                f"{', '.join(map(str, sizes))}."
+                f"--m: {name} was trained for {allowed} points, got {', '.join(map(str, sizes))}."
             )
-        samplers.append(sampler)
+        samplers.append(method)
     return samplers
 
 
-def _short_name(reference: str, others: Sequence[str]) -> str:
-    """Return the last part of a path, unless others have the same."""
-    short = Path(reference).name
-    is_unique = [Path(other).name for other in others].count(short) == 1
-    return short if is_unique and short not in NAMES else reference
+def _names(given: Sequence[str | Sampler]) -> list[str]:
+    """Return a name for every trained sampler: the last part of its path, or its class."""
+    if len(given) == 1:
+        return [TRAINED]
+    short = [type(one).__name__ if isinstance(one, Sampler) else Path(one).name for one in given]
+    numbered = []
+    for place, name in enumerate(short):
+        is_unique = short.count(name) == 1 and name not in NAMES
+        numbered.append(name if is_unique else f"{name}_{place + 1}")
+    return numbered

@@ -1,0 +1,92 @@
+"""``compare_task_net`` as a user calls it in Python."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from torch import nn
+
+from mops_lightning import FMOPSNet, FPSSampler, load
+from mops_lightning.channels import Channel, PointChannels
+from mops_lightning.errors import UserError
+from mops_lightning.files.task_net.compare import compare_task_net
+from mops_lightning.zoo import weights
+
+
+class Extent(nn.Module):
+    """Returns the largest coordinates: a net to which farthest points matter."""
+
+    def forward(self, points):
+        return points.amax(1)
+
+
+def distance(output, batch):
+    return (output - batch.points.amax(1)).norm(dim=1)
+
+
+SMALL: dict[str, Any] = {"points": 64, "crops": 2, "draws": 3, "methods": ["random"]}
+
+
+def test_scores_of_a_module_are_the_mean_losses_of_the_chosen_points(scans):
+    chosen = []
+
+    def remembered(output, batch):
+        loss = distance(output, batch)
+        chosen.append((batch.points, output, loss))
+        return loss
+
+    result = compare_task_net(scans, Extent(), [8], loss=remembered, **SMALL)
+
+    whole = result.frame[result.frame.files == "all"]
+    assert set(whole.method) == {"all points", "fps", "fps_farthest", "random"}
+    farthest = whole[(whole.method == "fps_farthest") & (whole.draw == 0)].score.item()
+    # Two halves of three files in every draw; in each, all points come first.
+    clouds = [points for points, _, loss in chosen if not loss.any()][:2]
+    expected = []
+    for points in clouds:
+        rows = FPSSampler(8, start="farthest")(points).indices
+        few = points.gather(1, rows[..., None].expand(-1, -1, 3))
+        expected += (few.amax(1) - points.amax(1)).norm(dim=1).tolist()
+    assert len(expected) == 12
+    assert farthest == pytest.approx(np.mean(expected), rel=1e-6)
+    assert result.sentence.startswith("Use FPS")
+    assert result.saved is None
+
+
+def test_samplers_in_memory_are_compared_and_not_saved(scans, tmp_path):
+    samplers = [FMOPSNet(16), FMOPSNet(8)]
+
+    result = compare_task_net(
+        scans, Extent(), [8, 16], loss=distance, weights=samplers, save=tmp_path / "best", **SMALL
+    )
+
+    assert result.own == ["FMOPSNet_1", "FMOPSNet_2"]
+    sizes = result.frame[result.frame.method == "FMOPSNet_2"].m.unique().tolist()
+    assert sizes == [8]
+    assert not any(parameter.requires_grad for parameter in load(tmp_path / "best").parameters())
+    assert {choice.method for choice in result.choices} <= {"fps", "fps_farthest", "random"}
+
+
+def test_sampler_that_sees_other_channels_is_refused(scans, tmp_path):
+    channels = PointChannels([Channel("intensity", 100.0, 50.0)])
+    node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 16}
+    path = tmp_path / "a.safetensors"
+    config = {"learn": "sampler", "sampler": node}
+    weights.save(path, FMOPSNet(16, point_channels=channels), config, {}, channels=channels)
+
+    with pytest.raises(UserError, match="sees the channels intensity, but the task net sees none"):
+        compare_task_net(scans, Extent(), [8], loss=distance, weights=path, **SMALL)
+
+
+@pytest.mark.parametrize(
+    ("net", "loss", "said"),
+    [
+        (Extent(), None, "loss must be a function"),
+        (3, distance, "task_net must be a run, a model or a torch.nn.Module, got int"),
+        ("pointnet.modelnet40", distance, "loss is for a module of your own"),
+        (nn.Linear(5, 2), distance, r"Linear fails on clouds of 64 points with 3 columns"),
+    ],
+)
+def test_net_or_loss_of_another_kind_is_refused(net, loss, said, scans):
+    with pytest.raises(UserError, match=said):
+        compare_task_net(scans, net, [8], loss=loss, **SMALL)
