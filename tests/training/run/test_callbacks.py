@@ -1,11 +1,13 @@
 """The callbacks group: standard ones, one left out, one added."""
 
 import pytest
+import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
 from mops_lightning.training.run.callbacks import STANDARD, EpochLines, build_callbacks
+from mops_lightning.training.run.pictures import CloudVisualization, _Drawn
 from mops_lightning.zoo import weights
 from tests.support.command_line import TINY, done, job, runs
 
@@ -69,3 +71,25 @@ def test_pictures_and_a_logger_change_no_weight(tmp_path):
     plain, drawn = (weights.read(tmp_path / run / weights.FILE) for run in ("plain", "drawn"))
     assert drawn["sha256"] == plain["sha256"]
     assert (tmp_path / "drawn" / "pictures").is_dir()
+
+
+@pytest.mark.parametrize(
+    "length",
+    [
+        ["trainer.max_epochs=-1", "+trainer.max_steps=40"],
+        ["trainer.max_epochs=-1", "+trainer.max_steps=20", "+trainer.accumulate_grad_batches=2"],
+    ],
+)
+def test_pictures_are_drawn_ten_times_in_a_training_of_twenty_epochs(length, tmp_path, monkeypatch):
+    drawn = []
+
+    def note(self, trainer, module, scores):
+        if scores is None:
+            drawn.append(trainer.current_epoch)
+        return _Drawn({}, torch.zeros(1, 1, 3), {}, [])
+
+    monkeypatch.setattr(CloudVisualization, "_drawn", note)
+
+    job(tmp_path / "run", "weights=null", "pictures=1", "logger=tensorboard", *length)
+
+    assert drawn == [0, 2, 4, 6, 8, 10, 12, 14, 16, 18]

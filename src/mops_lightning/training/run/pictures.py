@@ -1,5 +1,6 @@
 """The callback that draws the same few test clouds during training and after the test."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,7 +71,7 @@ class CloudVisualization(Callback):
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Draw into TensorBoard every tenth of the run."""
-        every = max((trainer.max_epochs or 1) // 10, 1)
+        every = max(_planned_epochs(trainer) // 10, 1)
         board = _board(trainer)
         if board is None or trainer.current_epoch % every != 0:
             return
@@ -195,6 +196,12 @@ class _Drawn(NamedTuple):
     points: Tensor
     samples: dict[str, Tensor]
     titles: list[str]
+
+
+def _planned_epochs(trainer: L.Trainer) -> int:
+    """Return the epochs of a whole training, also where ``trainer.max_steps`` says its length."""
+    steps_of_epoch = math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
+    return int(trainer.estimated_stepping_batches) // max(steps_of_epoch, 1)
 
 
 def _board(trainer: L.Trainer) -> TensorBoardLogger | None:
