@@ -104,8 +104,8 @@ def remove_temporary(folder: Path, below: bool = True) -> None:
         return
     pattern = f"{TEMPORARY}*"
     with suppress(OSError):  # the folder cannot be read
-        found = list(folder.rglob(pattern) if below else folder.glob(pattern))
-        for path in found:
+        left_behind = folder.rglob(pattern) if below else folder.glob(pattern)
+        for path in list(left_behind):
             with suppress(OSError), path.open("rb+") as file:  # in use, gone, or another user's
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 path.unlink()

@@ -38,7 +38,10 @@ def main(arguments: list[str], prog: str) -> None:
             parser = Parser(prog, DESCRIPTION)
             parser.add_argument("name", nargs="?", metavar="NAME", help="see above")
             chosen = parser.parse_args(arguments)
-            lines = _table() if chosen.name is None else _card(names.resolve(chosen.name))
+            if chosen.name is None:
+                lines = _table()
+            else:
+                lines = _card(names.resolve(chosen.name))
         print(printable("\n".join(lines)))
 
 

@@ -111,8 +111,8 @@ def _from_words(text: str, texts: Sequence[str], arguments: Sequence[str]) -> st
     """
     if refused := NO_OVERRIDE.search(text):
         inside = NOT_IN_STRUCT.search("\n".join(texts))
-        key = inside.group(1) if inside else refused.group(1)
-        return _no_such_setting(key, arguments)
+        named = inside or refused
+        return _no_such_setting(named.group(1), arguments)
     if unknown := UNKNOWN_IN_FILE.search(text):
         file, name = unknown.groups()
         return f"{file}.yaml: {name}: no such setting.{did_you_mean(name, settings.declared())}"

@@ -50,8 +50,9 @@ class RotationError(TableMetric):
     def compute(self) -> Tensor:
         """Return the mean or the quantile over all pairs so far."""
         angles = self.factor * dim_zero_cat(self.angles).double()
-        value = angles.mean() if self.quantile is None else angles.quantile(self.quantile)
-        return value.float()
+        if self.quantile is None:
+            return angles.mean().float()
+        return angles.quantile(self.quantile).float()
 
 
 class MedianRotationError(RotationError):

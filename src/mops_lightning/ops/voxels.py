@@ -173,10 +173,13 @@ def representatives(
         counts, sums = _sums(flat, size, grouped)
         voxel_of_cell = np.arange(len(counts))
     else:
-        counts, sums = voxels.counts, voxels.sums
+        counts = voxels.counts
+        sums = voxels.sums
         voxel_of_cell = voxels.rows_of(grouped.places.reshape(-1, 3))
     means = (sums / counts[:, None])[voxel_of_cell]
-    heaviness = np.empty(0) if weight is None else np.ascontiguousarray(weight, np.float64)
+    heaviness = np.empty(0)
+    if weight is not None:
+        heaviness = np.ascontiguousarray(weight, np.float64)
     found = cell_kernels.nearest(
         flat.ravel(), float(size), grouped.cell_of, means.ravel(), heaviness
     )

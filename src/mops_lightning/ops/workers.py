@@ -16,7 +16,9 @@ def number_of_threads() -> int:
         threads: int = torch.get_num_threads()
         return threads
     limit = os.environ.get("OMP_NUM_THREADS", "")
-    return int(limit) if limit.isdecimal() and int(limit) else os.cpu_count() or 1
+    if limit.isdecimal() and int(limit) > 0:
+        return int(limit)
+    return os.cpu_count() or 1
 
 
 @cache

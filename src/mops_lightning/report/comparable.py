@@ -345,4 +345,6 @@ def _is_number(value: Any) -> bool:
 
 def _text(value: Any) -> str:
     """Return a value as text; numbers that are equal give the same text."""
-    return repr(float(value)) if type(value) is int else repr(value)
+    if type(value) is int:
+        value = float(value)
+    return repr(value)

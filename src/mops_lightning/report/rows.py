@@ -181,5 +181,7 @@ def sort_key(row: str) -> tuple[bool, int, str]:
     """Return a key that sorts rows as the paper's tables do, rows of other nets last."""
     _, other_net, sampler = row.rpartition(" on ")  # such as "dgcnn on mops fast"
     name = sampler.split()[0]  # without its recipe
-    place = ORDER.index(name) if name in ORDER else len(ORDER)
+    place = len(ORDER)
+    if name in ORDER:
+        place = ORDER.index(name)
     return bool(other_net), place, row

@@ -64,9 +64,12 @@ def check_scales(space: Any, columns: int) -> list[float]:
     Raises:
         UserError: these are other numbers, or all of them are 0.
     """
-    scales = np.array(space, np.float64) if _are_numbers(space) else np.empty(0)
-    valid = scales.shape == (columns,) and np.isfinite(scales).all() and (scales >= 0).all()
-    if not valid or not scales.any():
+    scales = np.empty(0)
+    if _are_numbers(space):
+        scales = np.array(space, np.float64)
+    is_one_each = scales.shape == (columns,)
+    are_factors = np.isfinite(scales).all() and (scales >= 0).all()
+    if not is_one_each or not are_factors or not scales.any():
         raise UserError(
             f"space must hold a factor of at least 0 for each of the {columns} columns, such as "
             f"(1, 1, 1, 0.5), got {space!r:.99}."

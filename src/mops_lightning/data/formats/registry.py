@@ -107,7 +107,9 @@ def read(
         data = path.read_bytes()
         if not vertices:
             return sample_mesh(path, data, surface, seed)
-        return ply.read_vertices(path) if suffix == ".ply" else mesh_vertices(path, data)
+        if suffix == ".ply":
+            return ply.read_vertices(path)
+        return mesh_vertices(path, data)
 
 
 def read_points(path: Path, columns: Sequence[str] | None = None) -> Table | None:
@@ -176,7 +178,10 @@ def open_cloud_file(
     if suffix not in CHUNKED:
         raise WholeOnlyError(f"{path}: --chunk works with {', '.join(CHUNKED)}.")
     with reading(path):
-        file = scans.locate(path, columns) if suffix == ".bin" else CHUNKED[suffix](path)
+        if suffix == ".bin":
+            file = scans.locate(path, columns)
+        else:
+            file = CHUNKED[suffix](path)
         if area is None:
             return file
         if suffix in (".las", ".laz"):
