@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.spatial import cKDTree
 
 import mops_lightning
@@ -13,7 +12,8 @@ from mops_lightning.data.formats.table import Table
 from mops_lightning.files import propagate as module
 from mops_lightning.files.cli import propagate as main
 from mops_lightning.ops import propagation
-from tests.support.captured import captured, done, refused
+from tests.support.captured import captured, done
+from tests.support.clouds import line_of
 from tests.support.downsample import call as downsample
 from tests.support.downsample import refused as not_downsampled
 
@@ -47,35 +47,64 @@ def nearest(points, sampled):
     return np.linalg.norm(points[:, None] - sampled, axis=2).argmin(1)
 
 
+def write_scan(path, points, **columns):
+    """Write a structured array with coordinates of float64 and other columns."""
+    fields = [("x", "f8"), ("y", "f8"), ("z", "f8")]
+    for name, values in columns.items():
+        fields.append((name, values.dtype))
+    rows = np.zeros(len(points), fields)
+    rows["x"] = points[:, 0]
+    rows["y"] = points[:, 1]
+    rows["z"] = points[:, 2]
+    for name, values in columns.items():
+        rows[name] = values
+    np.save(path, rows)
+
+
 def test_map_leads_from_sample_to_all_points(scan, tmp_path):
-    map_, small = tmp_path / "map.npz", tmp_path / "small.ply"
-    arguments = ["--m", 30, "--method", "fps", "--map", map_]
-    status, _, err = downsample(scan, small, *arguments)
+    map_ = tmp_path / "map.npz"
+    small = tmp_path / "small.ply"
+
+    status, _, err = downsample(scan, small, "--m", 30, "--method", "fps", "--map", map_)
+
     assert (status, err) == (0, "")
-    points, sample = contents(scan).points, contents(small)
+    points = contents(scan).points
+    sample = contents(small)
     labels = np.arange(30) + 2**60
     carried = mops_lightning.propagate(labels, map_, fill=-1)
+    is_finite = np.isfinite(points).all(1)
+    expected = labels[nearest(points[is_finite], sample.points)]
     assert len(carried) == 500
-    finite = np.isfinite(points).all(1)
-    np.testing.assert_array_equal(carried[~finite], -1)
-    expected = labels[nearest(points[finite], sample.points)]
-    np.testing.assert_array_equal(carried[finite], expected)
-    assert (np.load(map_)["rows"][sample.columns["intensity"], 0] >= 0).all()
+    np.testing.assert_array_equal(carried[~is_finite], -1)
+    np.testing.assert_array_equal(carried[is_finite], expected)
+    rows = np.load(map_)["rows"]
+    assert (rows[sample.columns["intensity"], 0] >= 0).all()
 
 
 def test_map_with_several_rows_averages_scores(scan, tmp_path):
-    map_, small = tmp_path / "new" / "map.npz", tmp_path / "small.npz"
-    arguments = ["--m", 30, "--method", "random", "--map", map_, "--map-k", 4]
-    assert downsample(scan, small, *arguments)[0] == 0
-    points = contents(scan).finite().points
-    sampled = contents(small).points
-    distances = np.linalg.norm(points[:, None] - sampled, axis=2)
-    rows = distances.argsort(1)[:, :4]
-    inverse = np.maximum(np.take_along_axis(distances, rows, 1), 1e-12) ** -2
+    map_ = tmp_path / "new" / "map.npz"
+    small = tmp_path / "small.npz"
     scores = np.random.default_rng(2).random(30)
+
+    status, _, _ = downsample(
+        scan, small, "--m", 30, "--method", "random", "--map", map_, "--map-k", 4
+    )
+
+    assert status == 0
+    points = contents(scan).finite().points
+    distances = np.linalg.norm(points[:, None] - contents(small).points, axis=2)
+    rows = distances.argsort(1)[:, :4]
+    near = np.take_along_axis(distances, rows, 1)
+    inverse = np.maximum(near, 1e-12) ** -2
     expected = (scores[rows] * inverse).sum(1) / inverse.sum(1)
     carried = mops_lightning.propagate(scores, map_, fill=np.nan)
     np.testing.assert_allclose(carried[np.isfinite(carried)], expected, rtol=1e-5)
+
+
+def test_map_of_a_folder_gets_one_line(scan, tmp_path):
+    said = not_downsampled(tmp_path, "out", "--m", 8, "--method", "fps", "--map", "map.npz")
+
+    assert "--map is the map of one file" in said
 
 
 @pytest.mark.parametrize(
@@ -93,10 +122,10 @@ def test_map_with_several_rows_averages_scores(scan, tmp_path):
 def test_wrong_map_of_downsample_gets_one_line(arguments, said, scan, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "old.npz").touch()
-    settings = ["--m", 8, "--method", "fps"]
-    assert said in not_downsampled("big.ply", "small.npz", *settings, *arguments)
-    said = not_downsampled(tmp_path, "out", *settings, "--map", "map.npz")
-    assert "--map is the map of one file" in said
+
+    line = not_downsampled("big.ply", "small.npz", "--m", 8, "--method", "fps", *arguments)
+
+    assert said in line
 
 
 @pytest.mark.parametrize("source", [".ply", ".las", ".laz", ".npy", ".npz", ".xyz"])
@@ -104,32 +133,40 @@ def test_wrong_map_of_downsample_gets_one_line(arguments, said, scan, tmp_path, 
 def test_labels_reach_all_points(source, target, tmp_path):
     random = np.random.default_rng(1)
     points = random.normal(size=(200, 3)).astype(np.float32).astype(float)
-    big, small, out = tmp_path / f"big{source}", tmp_path / "small.npz", tmp_path / f"out{target}"
-    WRITERS[source](big, Table(points, {"intensity": np.arange(200, dtype=np.uint16)}))
+    intensity = np.arange(200, dtype=np.uint16)
     labels = np.arange(20) + 2**30
     classes = np.array([3] * 10 + [200] * 10, np.uint8)  # a LAS class of old files is below 32
-    columns: dict[str, Any] = {"label": labels, "classification": classes}
-    columns["score"] = random.random(20)
+    scores = random.random(20)
+    columns: dict[str, Any] = {"label": labels, "classification": classes, "score": scores}
+    big = tmp_path / f"big{source}"
+    small = tmp_path / "small.npz"
+    out = tmp_path / f"out{target}"
+    WRITERS[source](big, Table(points, {"intensity": intensity}))
     WRITERS[".npz"](small, Table(points[:20], columns))
-    fields = [word for name in columns for word in ("--field", name)]
+    fields = ["--field", "label", "--field", "classification", "--field", "score"]
+
     said = done(main, [small, big, out, *fields])
+
     assert "label, classification, score of 200 points" in said
     made = contents(out)
-    np.testing.assert_allclose(made.points, points, atol=1e-6)
     rows = nearest(contents(big).points, points[:20])
+    np.testing.assert_allclose(made.points, points, atol=1e-6)
     np.testing.assert_array_equal(made.columns["label"], labels[rows])
-    np.testing.assert_array_equal(made.columns["score"], columns["score"][rows])
+    np.testing.assert_array_equal(made.columns["score"], scores[rows])
     # LAS keeps numbers that its own column cannot hold in a column beside it.
     name = "classification_" if "classification_" in made.columns else "classification"
     np.testing.assert_array_equal(made.columns[name], classes[rows])
-    if source not in (".npy",):
-        np.testing.assert_array_equal(made.columns["intensity"], np.arange(200))
+    if source != ".npy":  # a plain array has no names of columns
+        np.testing.assert_array_equal(made.columns["intensity"], intensity)
 
 
 def test_points_without_coordinates_are_left_out_and_columns_kept(scan, tmp_path):
+    small = tmp_path / "small.ply"
     sample = contents(scan).take(np.arange(0, 90, 3))
-    WRITERS[".ply"](tmp_path / "small.ply", Table(sample.points, {"label": np.arange(30)}))
-    done(main, [tmp_path / "small.ply", scan, "--field", "label"])
+    WRITERS[".ply"](small, Table(sample.points, {"label": np.arange(30)}))
+
+    done(main, [small, scan, *FIELD])
+
     made = contents(tmp_path / "big_propagated.ply")
     whole = contents(scan).finite()
     np.testing.assert_array_equal(made.points, whole.points)
@@ -138,7 +175,6 @@ def test_points_without_coordinates_are_left_out_and_columns_kept(scan, tmp_path
 
 
 def test_parts_share_one_tree_of_the_sample(scan, tmp_path, monkeypatch):
-    sample = contents(scan).take(np.arange(0, 90, 3))
     built = []
 
     def counted(rows: Any) -> Any:
@@ -146,118 +182,107 @@ def test_parts_share_one_tree_of_the_sample(scan, tmp_path, monkeypatch):
         return cKDTree(rows)
 
     monkeypatch.setattr(propagation, "cKDTree", counted)
+    small = tmp_path / "small.ply"
+    sample = contents(scan).take(np.arange(0, 90, 3))
     scores = np.random.default_rng(1).random(30)
-    WRITERS[".ply"](tmp_path / "small.ply", Table(sample.points, {"score": scores}))
-    assert call(tmp_path / "small.ply", scan, "--field", "score", "--k", 3)[0] == 0
+    WRITERS[".ply"](small, Table(sample.points, {"score": scores}))
+
+    status, _, _ = call(small, scan, "--field", "score", "--k", 3)
+
+    assert status == 0
     assert len(built) == 1
     whole = propagation.propagation_map(contents(scan).finite().points, sample.points, 3)
     made = contents(tmp_path / "big_propagated.ply").columns["score"]
     np.testing.assert_allclose(made, mops_lightning.propagate(scores, whole), atol=1e-12)
 
 
-@pytest.mark.parametrize("target", [".ply", ".las"])
-def test_later_parts_may_have_larger_and_broken_numbers(target, tmp_path):
+@pytest.mark.parametrize(("target", "name"), [(".ply", "intensity"), (".las", "intensity_")])
+def test_later_parts_may_have_larger_and_broken_numbers(target, name, tmp_path):
     points = np.random.default_rng(1).random((180, 3))
     large = np.arange(180) + 2**31 - 70  # int32 holds those of the first part
-    rows = np.zeros(180, [*((axis, "f8") for axis in "xyz"), ("large", "i8"), ("intensity", "f8")])
-    rows["x"], rows["y"], rows["z"] = points.T
-    rows["large"], rows["intensity"] = large, np.where(np.arange(180) > 100, 0.5, 3)
-    np.save(tmp_path / "big.npy", rows)
-    WRITERS[".npz"](tmp_path / "small.npz", Table(points[:5], {"label": np.arange(5)}))
-    files = [tmp_path / "small.npz", tmp_path / "big.npy", tmp_path / f"out{target}"]
-    assert call(*files, "--field", "label")[0] == 0
-    made = contents(files[2]).columns
+    intensity = np.full(180, 3.0)
+    intensity[101:] = 0.5
+    small = tmp_path / "small.npz"
+    big = tmp_path / "big.npy"
+    out = tmp_path / f"out{target}"
+    write_scan(big, points, large=large, intensity=intensity)
+    WRITERS[".npz"](small, Table(points[:5], {"label": np.arange(5)}))
+
+    done(main, [small, big, out, *FIELD])
+
+    made = contents(out).columns
     np.testing.assert_array_equal(made["large"], large)
-    name = "intensity_" if target == ".las" else "intensity"
-    np.testing.assert_array_equal(made[name], rows["intensity"])
+    np.testing.assert_array_equal(made[name], intensity)
 
 
 def test_fraction_between_the_smallest_and_the_largest_number_is_kept(tmp_path):
     """LAS has whole intensities, which hold the smallest and the largest number here."""
     points = np.random.default_rng(1).random((180, 3))
-    rows = np.zeros(180, [*((axis, "f8") for axis in "xyz"), ("intensity", "f8")])
-    rows["x"], rows["y"], rows["z"] = points.T
-    rows["intensity"][[70, 100]] = 0.5, 3
-    np.save(tmp_path / "big.npy", rows)
-    WRITERS[".npz"](tmp_path / "small.npz", Table(points[:5], {"label": np.arange(5)}))
+    intensity = np.zeros(180)
+    intensity[70] = 0.5
+    intensity[100] = 3
+    small = tmp_path / "small.npz"
+    big = tmp_path / "big.npy"
+    out = tmp_path / "out.las"
+    write_scan(big, points, intensity=intensity)
+    WRITERS[".npz"](small, Table(points[:5], {"label": np.arange(5)}))
 
-    done(main, [*(tmp_path / name for name in ("small.npz", "big.npy", "out.las")), *FIELD])
+    done(main, [small, big, out, *FIELD])
 
-    made = contents(tmp_path / "out.las").columns
-    np.testing.assert_array_equal(made["intensity_"], rows["intensity"])
+    np.testing.assert_array_equal(contents(out).columns["intensity_"], intensity)
 
 
 def test_first_part_far_from_the_last_one_keeps_its_place(tmp_path):
     """The whole-number steps of LAS must reach from one to the other."""
     points = np.random.default_rng(1).random((120, 3))
     points[:60] += [3_000_000, 5_000_000, 0]
-    np.save(tmp_path / "big.npy", points)
-    WRITERS[".npz"](tmp_path / "small.npz", Table(points[:3], {"label": np.arange(3)}))
+    small = tmp_path / "small.npz"
+    big = tmp_path / "big.npy"
+    out = tmp_path / "out.las"
+    np.save(big, points)
+    WRITERS[".npz"](small, Table(points[:3], {"label": np.arange(3)}))
 
-    done(main, [*(tmp_path / name for name in ("small.npz", "big.npy", "out.las")), *FIELD])
+    done(main, [small, big, out, *FIELD])
 
-    np.testing.assert_allclose(contents(tmp_path / "out.las").points, points, atol=0.01)
+    np.testing.assert_allclose(contents(out).points, points, atol=0.01)
 
 
-def test_colours_are_averaged_and_labels_vote(tmp_path):
-    line = np.arange(5.0)[:, None] * [1, 0, 0]
-    WRITERS[".npz"](tmp_path / "big.npz", Table(line, {}))
+@pytest.fixture
+def line_files(tmp_path):
+    """Five points on a line, and a sample of three with a label and a colour."""
+    line = line_of(5)
     columns = {"label": np.array([5, 9, 9]), "red": np.array([0, 100, 100], np.uint8)}
-    WRITERS[".npz"](tmp_path / "small.npz", Table(line[[0, 2, 4]], columns))
-    files = [tmp_path / "small.npz", tmp_path / "big.npz"]
-    assert call(*files, tmp_path / "a.ply", "--field", "label", "--k", 3)[0] == 0
-    assert contents(tmp_path / "a.ply").columns["label"].tolist() == [5, 9, 9, 9, 9]
-    assert call(*files, tmp_path / "b.ply", "--field", "red", "--k", 2, "--mean")[0] == 0
-    assert contents(tmp_path / "b.ply").columns["red"].tolist() == [0, 50, 100, 100, 100]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["small.npz", "big.npz", "--field", "lable"], "no column 'lable'. Did you mean 'label'?"),
-        (["small.npz", "big.npz", "--field", "label", "--k", 4], "--k must be from 1 to the 3"),
-        (
-            ["small.npz", "big.npz", "out.obj", "--field", "label"],
-            "OUT must end in .ply, .las, .laz, .copc.laz, got",
-        ),
-        (["small.npz", "mesh.ply", "mesh.ply", "--field", "label"], "OUT must differ"),
-        (["small.npz", "big.npz", "old.ply", "--field", "label"], "old.ply exists"),
-        (["small.npz", "nowhere.ply", "--field", "label"], "nowhere.ply: no such file"),
-        (["nowhere.ply", "big.npz", "--field", "label"], "nowhere.ply: no such file"),
-        (["small.npz", "empty.npz", "--field", "label"], "must be a cloud of at least one point"),
-        (["small.npz", "mesh.ply", "--field", "label"], "must be a cloud of at least one point"),
-        (["small.npz", "mesh.off", "out.ply", "--field", "label"], "mesh.off must end in .ply"),
-        (["small.npz", ".", "--field", "label"], ".: not a file"),
-        (["small.npz", "", "--field", "label"], ".: not a file"),
-        (["small.npz", "/", "--field", "label"], "/: not a file"),
-    ],
-)
-def test_mistake_ends_in_one_line(arguments, said, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    line = np.arange(5.0)[:, None] * [1, 0, 0]
     WRITERS[".npz"](tmp_path / "big.npz", Table(line, {}))
-    WRITERS[".npz"](tmp_path / "small.npz", Table(line[:3], {"label": np.arange(3)}))
-    (tmp_path / "old.ply").touch()
-    WRITERS[".npz"](tmp_path / "empty.npz", Table(line[:0], {}))
-    trimesh.creation.box().export(tmp_path / "mesh.ply")
-    trimesh.creation.box().export(tmp_path / "mesh.off")
-    before = sorted(tmp_path.iterdir())
-    assert said in refused(main, arguments)
-    assert sorted(tmp_path.iterdir()) == before
+    WRITERS[".npz"](tmp_path / "small.npz", Table(line[[0, 2, 4]], columns))
+    return [tmp_path / "small.npz", tmp_path / "big.npz"]
+
+
+def test_labels_of_several_sampled_points_vote(line_files, tmp_path):
+    done(main, [*line_files, tmp_path / "out.ply", *FIELD, "--k", 3])
+
+    assert contents(tmp_path / "out.ply").columns["label"].tolist() == [5, 9, 9, 9, 9]
+
+
+def test_colours_are_averaged_on_request(line_files, tmp_path):
+    done(main, [*line_files, tmp_path / "out.ply", "--field", "red", "--k", 2, "--mean"])
+
+    assert contents(tmp_path / "out.ply").columns["red"].tolist() == [0, 50, 100, 100, 100]
 
 
 @pytest.mark.parametrize("kind", ["f4", "u4"])
 def test_packed_colours_are_averaged_channel_by_channel(kind, tmp_path):
-    line = np.arange(3.0)[:, None] * [1, 0, 0]
+    line = line_of(3)
     bytes_of_colours = np.array([[0, 0, 200, 0], [100, 2, 0, 0]], np.uint8)  # blue, green, red
     packed = bytes_of_colours.view(f"<{kind}")[:, 0]
-    WRITERS[".npz"](tmp_path / "big.npz", Table(line, {}))
-    WRITERS[".pcd"](tmp_path / "small.pcd", Table(line[[0, 2]], {"rgb": packed}))
-    files = [tmp_path / "small.pcd", tmp_path / "big.npz", tmp_path / "out.ply"]
+    small = tmp_path / "small.pcd"
+    big = tmp_path / "big.npz"
+    out = tmp_path / "out.ply"
+    WRITERS[".npz"](big, Table(line, {}))
+    WRITERS[".pcd"](small, Table(line[[0, 2]], {"rgb": packed}))
 
-    done(main, [*files, "--field", "rgb", "--k", 2, "--mean"])
+    done(main, [small, big, out, "--field", "rgb", "--k", 2, "--mean"])
 
-    carried = np.ascontiguousarray(contents(tmp_path / "out.ply").columns["rgb"])
+    carried = np.ascontiguousarray(contents(out).columns["rgb"])
     assert carried.view(np.uint8).reshape(-1, 4).tolist() == [
         [0, 0, 200, 0],
         [50, 1, 100, 0],
@@ -266,15 +291,17 @@ def test_packed_colours_are_averaged_channel_by_channel(kind, tmp_path):
 
 
 def test_packed_colours_of_whole_numbers_are_carried_unmixed_without_mean(tmp_path):
-    line = np.arange(3.0)[:, None] * [1, 0, 0]
+    line = line_of(3)
     packed = np.array([200, 512], np.uint32)
-    WRITERS[".npz"](tmp_path / "big.npz", Table(line, {}))
-    WRITERS[".pcd"](tmp_path / "small.pcd", Table(line[[0, 2]], {"rgb": packed}))
-    files = [tmp_path / "small.pcd", tmp_path / "big.npz", tmp_path / "out.ply"]
+    small = tmp_path / "small.pcd"
+    big = tmp_path / "big.npz"
+    out = tmp_path / "out.ply"
+    WRITERS[".npz"](big, Table(line, {}))
+    WRITERS[".pcd"](small, Table(line[[0, 2]], {"rgb": packed}))
 
-    done(main, [*files, "--field", "rgb", "--k", 2])
+    done(main, [small, big, out, "--field", "rgb", "--k", 2])
 
-    carried = contents(tmp_path / "out.ply").columns["rgb"].tolist()
+    carried = contents(out).columns["rgb"].tolist()
     assert carried[0] == 200
     assert carried[1] in (200, 512)
     assert carried[2] == 512

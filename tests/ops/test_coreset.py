@@ -1,5 +1,7 @@
 """Exact coresets of point-to-plane residuals."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 import torch
@@ -15,7 +17,17 @@ from mops_lightning.ops.normals import estimate_normals
 def surface(number, seed):
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-3, 3, (2, number))
-    return np.stack([x, y, np.sin(x) + np.cos(2 * y) / 2 + rng.normal(0, 0.02, number)], 1)
+    noise = rng.normal(0, 0.02, number)
+    z = np.sin(x) + np.cos(2 * y) / 2 + noise
+    return np.stack([x, y, z], 1)
+
+
+class Sums(NamedTuple):
+    """What residuals add up to: H, b and the error."""
+
+    hessian: np.ndarray
+    slope: np.ndarray
+    error: float
 
 
 def pose_of(turn, shift):
@@ -27,64 +39,80 @@ def pose_of(turn, shift):
 
 def plain_sums(source, target, pose, rows, weights):
     """Add up H, b and the error, residual by residual, about the origin of the target."""
-    normals, tree = estimate_normals(target), cKDTree(target)
-    hessian, slope, error = np.zeros((6, 6)), np.zeros(6), 0.0
+    normals = estimate_normals(target)
+    tree = cKDTree(target)
+    hessian = np.zeros((6, 6))
+    slope = np.zeros(6)
+    error = 0.0
     for row, weight in zip(rows, weights, strict=True):
         moved = pose[:3, :3] @ source[row] + pose[:3, 3]
-        nearest = tree.query(moved)[1]
-        residual = normals[nearest] @ (moved - target[nearest])
-        jacobian = np.concatenate([np.cross(moved, normals[nearest]), normals[nearest]])
+        _, nearest = tree.query(moved)
+        normal = normals[nearest]
+        residual = normal @ (moved - target[nearest])
+        jacobian = np.concatenate([np.cross(moved, normal), normal])
         hessian += weight * np.outer(jacobian, jacobian)
         slope += weight * jacobian * residual
         error += weight * residual**2
-    return hessian, slope, error
+    return Sums(hessian, slope, error)
+
+
+def assert_equal_sums(kept, whole):
+    """Compare each sum up to rounding, relative to its largest number."""
+    for of_kept, of_whole in zip(kept, whole, strict=True):
+        tolerance = 1e-9 * np.abs(of_whole).max()
+        assert of_kept == pytest.approx(of_whole, rel=1e-9, abs=tolerance)
 
 
 @pytest.mark.parametrize("m", [29, 40, 100, 300])
 def test_coreset_has_the_sums_of_all_residuals(m):
-    source, target = surface(1500, 0), surface(1200, 1)
+    source = surface(1500, 0)
+    target = surface(1200, 1)
     pose = pose_of([0.05, -0.1, 0.2], [0.1, 0.2, -0.1])
 
     rows, weights = coreset(source, target, pose, m)
 
-    every = plain_sums(source, target, pose, range(1500), np.ones(1500))
-    found = plain_sums(source, target, pose, rows, weights)
-    assert len(rows) == len(set(rows.tolist())) <= m
+    whole = plain_sums(source, target, pose, range(1500), np.ones(1500))
+    assert_equal_sums(plain_sums(source, target, pose, rows, weights), whole)
+    assert len(rows) <= m
+    assert len(set(rows.tolist())) == len(rows)
     assert (weights > 0).all()
     assert weights.sum() == pytest.approx(1500, rel=1e-9)
-    for kept, whole in zip(found, every, strict=True):
-        assert kept == pytest.approx(whole, rel=1e-9, abs=1e-9 * np.abs(whole).max())
 
 
 def test_coreset_gives_the_gauss_newton_step_of_all_points_in_map_coordinates():
-    place = np.array([4e5, 5e6, 100.0])
-    source, target = surface(1500, 0), surface(1200, 1) + place
-    pose = pose_of([0.05, -0.1, 0.2], place + np.array([0.1, 0.2, -0.1]))
+    origin = np.array([4e5, 5e6, 100.0])
+    source = surface(1500, 0)
+    target = surface(1200, 1)
+    turn = [0.05, -0.1, 0.2]
+    shift = np.array([0.1, 0.2, -0.1])
 
-    rows, weights = coreset(source, target, pose, 29)
+    rows, weights = coreset(source, target + origin, pose_of(turn, origin + shift), 29)
 
-    near = pose_of([0.05, -0.1, 0.2], [0.1, 0.2, -0.1])
-    every = plain_sums(source, target - place, near, range(1500), np.ones(1500))
-    found = plain_sums(source, target - place, near, rows, weights)
-    whole = np.linalg.solve(every[0], every[1])
-    assert np.linalg.solve(found[0], found[1]) == pytest.approx(whole, rel=1e-7)
+    near = pose_of(turn, shift)
+    near_target = (target + origin) - origin
+    whole = plain_sums(source, near_target, near, range(1500), np.ones(1500))
+    kept = plain_sums(source, near_target, near, rows, weights)
+    step_of_all = np.linalg.solve(whole.hessian, whole.slope)
+    step = np.linalg.solve(kept.hessian, kept.slope)
+    assert step == pytest.approx(step_of_all, rel=1e-7)
 
 
 def test_coreset_of_a_plane_has_its_sums_though_its_hessian_is_singular():
     rng = np.random.default_rng(0)
     flat = np.column_stack([rng.uniform(-1, 1, (800, 2)), np.zeros(800)])
+    source = flat[:400]
+    target = flat[400:]
     pose = pose_of([0.01, 0, 0], [0, 0, 0.1])
 
-    rows, weights = coreset(flat[:400], flat[400:], pose, 29)
+    rows, weights = coreset(source, target, pose, 29)
 
-    every = plain_sums(flat[:400], flat[400:], pose, range(400), np.ones(400))
-    found = plain_sums(flat[:400], flat[400:], pose, rows, weights)
-    for kept, whole in zip(found, every, strict=True):
-        assert kept == pytest.approx(whole, rel=1e-9, abs=1e-9 * np.abs(whole).max())
+    whole = plain_sums(source, target, pose, range(400), np.ones(400))
+    assert_equal_sums(plain_sums(source, target, pose, rows, weights), whole)
 
 
 def test_coreset_takes_tensors_normals_and_leaves_out_far_points():
-    source, target = surface(300, 0), surface(300, 1)
+    source = surface(300, 0)
+    target = surface(300, 1)
     source[:100] += 50.0
     up = np.repeat([[0.0, 0, 1]], 300, axis=0)
 
@@ -98,7 +126,8 @@ def test_coreset_takes_tensors_normals_and_leaves_out_far_points():
 
 @pytest.mark.parametrize("m", [np.int64(40), np.uint8(40), torch.tensor(40)])
 def test_coreset_takes_whole_numbers_of_numpy_and_torch(m):
-    source, target = surface(100, 0), surface(100, 1)
+    source = surface(100, 0)
+    target = surface(100, 1)
 
     rows, weights = coreset(source, target, np.eye(4), m)
 

@@ -18,31 +18,62 @@ def moved(net):
     return net
 
 
+def farthest_order(points, number):
+    """Return farthest points of clouds, from the point farthest from the mean."""
+    centred = points - points.mean(1, keepdim=True)
+    start = centred.norm(dim=2).argmax(1)
+    return farthest_point_sample(points, number, start)
+
+
+def plain_stage(net, points, features, candidates, neighbours):
+    """Return the generated points of one cloud by a softmax over all candidates.
+
+    Args:
+        net: of five points and 16 key channels.
+        points: ``(60, 3)``.
+        features: ``(60, C)``.
+        candidates: rows of the points that may have weights.
+        neighbours: candidates nearest to an anchor, which have weights.
+    """
+    order = farthest_order(points[None], 60)[0]
+    anchors = points[order[:5]]
+    places = points[candidates]
+    near = torch.cdist(anchors, places).argsort(1)[:, :neighbours]
+
+    local = features[candidates]
+    hidden = net.rho_local(local) + net.rho_global(local.amax(0))
+    keys = net.rho_first(hidden)
+    queries = net.queries.slots + keys[:5] @ net.queries.relation.T / 4
+    logits = keys @ queries.T
+
+    ordered = points[order]
+    last_gap = (ordered[:-1] - ordered[-1]).square().sum(1).amin()
+    unit = last_gap * 60 / 64
+    squares = torch.cdist(places, anchors).square()
+    widths = unit * net.queries.log_width.exp().square()
+    logits = logits - squares / widths
+
+    is_outside = torch.ones_like(logits, dtype=torch.bool).scatter(0, near.T, False)
+    weights = logits.masked_fill(is_outside, -torch.inf).softmax(0)
+    return weights.T @ places
+
+
 @pytest.mark.parametrize("candidates", [None, 3])
 def test_stage_sampler_equals_a_dense_softmax_over_the_host_features(candidates, rng):
     net = moved(StageMOPSNet(5, 7, key_channels=16, candidates=candidates, neighbours=6)).double()
     points = torch.randn(1, 60, 3, dtype=torch.float64, generator=rng)
     features = torch.randn(1, 60, 7, dtype=torch.float64, generator=rng, requires_grad=True)
-    start = (points - points.mean(1, keepdim=True)).norm(dim=2).argmax(1)
-    order = farthest_point_sample(points, 60, start)[0]
-    rows = order if candidates is None else order[: 3 * 5]
-    near = torch.cdist(points[0, order[:5]], points[0, rows]).argsort(1)[:, :6]
+    rows = farthest_order(points, 60)[0]
+    if candidates is not None:
+        rows = rows[: candidates * 5]
 
     output = net.by_features(points, features, 5)
 
-    local = features[0, rows]
-    hidden = net.rho_local(local) + net.rho_global(local.amax(0))
-    keys = net.rho_first(hidden)
-    chosen = points[0, order[:60]]
-    unit = (chosen[:-1] - chosen[-1]).square().sum(1).amin() * 60 / 64
-    logits = keys @ (net.queries.slots + keys[:5] @ net.queries.relation.T / 4).T
-    squares = torch.cdist(points[0, rows], points[0, order[:5]]).square()
-    logits = logits - squares / (unit * net.queries.log_width.exp().square())
-    outside = torch.ones_like(logits, dtype=torch.bool).scatter(0, near.T, False)
-    want = logits.masked_fill(outside, -torch.inf).softmax(0).T @ points[0, rows]
-    torch.testing.assert_close(output.points[0], want)
-    (got,) = torch.autograd.grad(output.points.square().sum(), features, retain_graph=True)
-    torch.testing.assert_close(got, torch.autograd.grad(want.square().sum(), features)[0])
+    expected = plain_stage(net, points[0], features[0], rows, neighbours=6)
+    torch.testing.assert_close(output.points[0], expected)
+    (gradient,) = torch.autograd.grad(output.points.square().sum(), features, retain_graph=True)
+    (expected_gradient,) = torch.autograd.grad(expected.square().sum(), features)
+    torch.testing.assert_close(gradient, expected_gradient)
     assert set(output.losses) == {"subset"}
 
 
@@ -52,35 +83,47 @@ def test_hierarchical_net_trains_its_stages_through_the_host_features(rng):
     points = torch.randn(4, 40, 3, generator=rng)
 
     logits = net(points)
-    (logits.square().mean() + sum(net.losses.values())).backward()
+    loss = logits.square().mean() + sum(net.losses.values())
+    loss.backward()
 
     assert logits.shape == (4, 3)
-    names = {f"stage{i}_{name}" for i in (1, 2) for name in ("subset", "overlap")}
-    assert set(net.losses) == names
+    assert set(net.losses) == {
+        "stage1_subset",
+        "stage1_overlap",
+        "stage2_subset",
+        "stage2_overlap",
+    }
     for name, weights in net.named_parameters():
         assert weights.grad is not None, name
         assert weights.grad.isfinite().all(), name
-    assert not any(name.endswith("sampler.features") for name, _ in net.named_modules())
+    modules = [name for name, _ in net.named_modules()]
+    assert not any(name.endswith("sampler.features") for name in modules)
 
 
 def test_stage_sampler_takes_clouds_with_fewer_points(rng):
     sampler = partial(StageMOPSNet, neighbours=4)
     net = HierarchicalNet(3, sampler, points=(12, 6), channels=(8, 10, 12), k=4, hidden=8).eval()
+    points = torch.randn(2, 5, 3, generator=rng)
 
-    assert net(torch.randn(2, 5, 3, generator=rng)).shape == (2, 3)
+    logits = net(points)
+
+    assert logits.shape == (2, 3)
 
 
 def test_stage_sampler_starts_near_farthest_points(rng):
     net = StageMOPSNet(50, 4).eval()
     points = torch.nn.functional.normalize(torch.randn(2, 1000, 3, generator=rng), dim=2)
-    start = (points - points.mean(1, keepdim=True)).norm(dim=2).argmax(1)
-    anchors = gather_points(points, farthest_point_sample(points, 50, start))
+    features = torch.randn(2, 1000, 4, generator=rng)
 
-    generated = net.by_features(points, torch.randn(2, 1000, 4, generator=rng), 50).points
+    generated = net.by_features(points, features, 50).points
 
+    anchors = gather_points(points, farthest_order(points, 50))
     assert (generated - anchors).norm(dim=2).max() < 0.2
 
 
 def test_stage_sampler_outside_a_net_is_refused(rng):
+    net = StageMOPSNet(5, 7).eval()
+    points = torch.randn(1, 60, 3, generator=rng)
+
     with pytest.raises(UserError, match=r"inside a hierarchical net only.*sampler=mops"):
-        StageMOPSNet(5, 7).eval()(torch.randn(1, 60, 3, generator=rng))
+        net(points)

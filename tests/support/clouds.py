@@ -1,6 +1,8 @@
 """Clouds on which fast and plain forms could differ."""
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.nn import functional as F
 
 
@@ -29,3 +31,10 @@ def cloud_of(
     if kind == "outlier":
         points[:, 0] = 1e6
     return points
+
+
+def line_of(number: int) -> NDArray[np.float64]:
+    """Return points ``(N, 3)`` at distances of 1 along x."""
+    line = np.zeros((number, 3))
+    line[:, 0] = np.arange(number)
+    return line
