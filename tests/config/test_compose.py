@@ -2,7 +2,7 @@
 
 import pytest
 
-from mops_lightning.config.given import check_overrides
+from mops_lightning.config.check_overrides import check_overrides
 from tests.support.command_line import TINY, TINY_WITH_PICTURES, refused
 
 LATE, NET = "+trainer.val_check_interval=100", "task/net=hierarchical"

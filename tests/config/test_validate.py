@@ -44,7 +44,7 @@ FROM_CODE = {
     "point_channels",  # of samplers, nets and tasks, from the data
     *("save_dir", "checkpoint", "score", "batch", "titles", "folder"),  # of loggers and callbacks
 }
-"""Arguments that code gives, not YAML: see training.run.build and training.run.trainer."""
+"""Arguments that code gives, not YAML: see training.run.make_experiment."""
 
 
 def nodes(cfg):

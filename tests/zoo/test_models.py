@@ -16,8 +16,8 @@ from mops_lightning.data.loader import CloudLoader
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.training.as_trained import as_trained
 from mops_lightning.training.evaluation import TrainedRun, command_line
-from mops_lightning.training.run.build import make_experiment
-from mops_lightning.training.run.stages import load_trained
+from mops_lightning.training.run.load import load_trained
+from mops_lightning.training.run.make_experiment import make_experiment
 from mops_lightning.zoo import model_file, names
 
 CLOUDS = Path(__file__).parent / "clouds.npz"

@@ -60,7 +60,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
 
 def _run_or_repeat(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
     """Run a cell whose folder is locked, unless it is completed, and return its score."""
-    from mops_lightning.training.run.run import STARTED, checked, claim, run
+    from mops_lightning.training.run.run import STARTED, checked, claim, run_in
 
     (folder / FAILED).unlink(missing_ok=True)
     remove_temporary(folder)
@@ -85,7 +85,7 @@ def _run_or_repeat(cfg: DictConfig, folder: Path, overrides: list[str]) -> float
     # A process that was killed before it wrote a record left this file.
     (folder / STARTED).unlink(missing_ok=True)
     claim(folder)
-    return _number(run(cfg, folder, overrides, claimed=True).score)
+    return _number(run_in(folder, cfg, overrides).score)
 
 
 def _number(score: float | None) -> float:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mops_lightning import errors
+from mops_lightning.config.check_overrides import check_overrides
 from mops_lightning.config.explain import explain
-from mops_lightning.config.given import check_overrides
 from mops_lightning.config.groups import conf_dir
 from mops_lightning.config.overrides import as_typed, key, readable, with_home, with_own_classes
 
@@ -143,7 +143,7 @@ def _job(cfg: "DictConfig") -> float | None:
     from mops_lightning.cli.start import line_about_run
     from mops_lightning.cli.sweep import run_cell
     from mops_lightning.config import distributed
-    from mops_lightning.training.run.run import run
+    from mops_lightning.training.run.run import run_in
 
     hydra_cfg = HydraConfig.get()
     swept = hydra_cfg.mode == RunMode.MULTIRUN
@@ -156,7 +156,7 @@ def _job(cfg: "DictConfig") -> float | None:
                 distributed.check_multirun(cfg)
                 score = run_cell(cfg, folder, overrides)
             else:
-                score = run(cfg, folder, overrides, claimed=True).score
+                score = run_in(folder, cfg, overrides).score
         except BrokenPipeError:
             raise
         except errors.Interrupted as stop:

@@ -5,8 +5,8 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
 from mops_lightning.config.by_hydra import composed
+from mops_lightning.config.check_overrides import check_overrides
 from mops_lightning.config.explain import explain
-from mops_lightning.config.given import check_overrides
 from mops_lightning.config.overrides import with_own_classes
 from mops_lightning.errors import UserError
 

@@ -12,7 +12,7 @@ from mops_lightning.records.run_record import RunRecord
 from mops_lightning.tasks.base import Task
 from mops_lightning.training.as_trained import as_trained
 from mops_lightning.training.evaluation import TrainedRun
-from mops_lightning.training.run.build import build_task
+from mops_lightning.training.run.make_experiment import build_task
 from mops_lightning.zoo import model_file, names, weights
 
 
@@ -49,8 +49,8 @@ def read_task(reference: str) -> TrainedTask:
             user's own.
     """
     trained = _trained_run(reference)
-    is_task_net = trained.trained_task_net or _is_task_net(trained.place)
-    path = weights.of_run(trained.place) if is_task_net else _task_weights(trained)
+    is_task_net = trained.trained_task_net or _is_task_net(trained.path)
+    path = weights.of_run(trained.path) if is_task_net else _task_weights(trained)
     content = weights.read(path)
     record = trained.record
     outputs = {
@@ -60,7 +60,7 @@ def read_task(reference: str) -> TrainedTask:
     cfg = as_trained(compose(trained.choices()), trained, trained.choices())
     task = build_task(cfg, outputs, content["channels"])
     weights.fit_state(task, content["state"], path)
-    sampler = None if is_task_net else weights.of_run(trained.place)
+    sampler = None if is_task_net else weights.of_run(trained.path)
     return TrainedTask(
         task.eval().requires_grad_(False),
         tuple(content["classes"]),
@@ -116,7 +116,7 @@ def _task_weights(trained: TrainedRun) -> Path:
             f"{trained.name} holds a sampler without its task net. Give the folder of its run, or "
             "a task net."
         )
-    return weights.of_run(trained.place, "task_weights")
+    return weights.of_run(trained.path, "task_weights")
 
 
 def _is_task_net(place: Path) -> bool:

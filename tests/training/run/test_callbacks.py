@@ -6,7 +6,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
-from mops_lightning.training.run.callbacks import STANDARD, EpochLines, build_callbacks
+from mops_lightning.training.run.callbacks import DEFAULT_CALLBACKS, EpochLines, build_callbacks
 from mops_lightning.training.run.pictures import CloudVisualization, _Drawn
 from mops_lightning.zoo import weights
 from tests.support.command_line import TINY, done, job, runs
@@ -26,7 +26,7 @@ def build_from(overrides, tmp_path):
 
 
 def test_without_logger_and_pictures_two_are_built_if_none_is_left_out(tmp_path):
-    assert set(compose().callbacks) == set(STANDARD)
+    assert set(compose().callbacks) == set(DEFAULT_CALLBACKS)
     assert [type(one) for one in build_from([], tmp_path)] == [ModelCheckpoint, EpochLines]
     made = build_from(["callbacks.progress=null"], tmp_path)
     assert [type(one) for one in made] == [ModelCheckpoint]

@@ -13,7 +13,7 @@ from mops_lightning.config.build import build_as
 from mops_lightning.config.shortened import UNLIMITED
 from mops_lightning.errors import UserError
 
-STANDARD = ("learning_rate", "checkpoint", "progress", "pictures")
+DEFAULT_CALLBACKS = ("learning_rate", "checkpoint", "progress", "pictures")
 """Names in ``conf/callbacks/default.yaml``. None of them changes the training."""
 
 

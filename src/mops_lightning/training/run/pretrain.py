@@ -17,9 +17,11 @@ from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.checkpoint import CHECKPOINT, checkpoint_identity
 from mops_lightning.training.evaluation import OF_RUN
-from mops_lightning.training.run.build import Parts, build_parts
-from mops_lightning.training.run.callbacks import STANDARD
-from mops_lightning.training.run.whole import recorded, train_and_test
+from mops_lightning.training.run.build import build_parts
+from mops_lightning.training.run.callbacks import DEFAULT_CALLBACKS
+from mops_lightning.training.run.parts import Parts
+from mops_lightning.training.run.recorded import recorded
+from mops_lightning.training.run.stages import train_and_test
 from mops_lightning.zoo import weights
 from mops_lightning.zoo.weights import FILE
 
@@ -45,7 +47,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, run_folder: Path) -> Pa
     if cfg.weights in (None, OF_RUN) or cfg.ckpt_path is not None:
         return None
     if cfg.weights == "auto" and cfg.learn == "task":
-        return _start(cfg.pretrain_from)
+        return _start_weights(cfg.pretrain_from)
     if cfg.weights != "auto":
         return weights.of_task_net(cfg.weights)
     folder = cache_folder(cfg, dataset)
@@ -76,22 +78,24 @@ def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
         f"first, {epochs}. Cache: {folder}",
         flush=True,
     )
-    own = task_config(cfg)
+    task_cfg = task_config(cfg)
     is_resumed = (folder / "checkpoints" / CHECKPOINT).is_file()
     if is_resumed:
-        own.ckpt_path = str(folder)
+        task_cfg.ckpt_path = str(folder)
     try:
-        with recorded(_plain(own), folder, []) as record:
-            start = None if is_resumed else _start(cfg.pretrain_from)
-            parts = build_parts(own, folder, dataset, record)
+        with recorded(_plain(task_cfg), folder, []) as record:
+            start = None if is_resumed else _start_weights(cfg.pretrain_from)
+            parts = build_parts(task_cfg, folder, dataset, record)
             train_and_test(parts, record, start)
     except (KeyboardInterrupt, Interrupted):
         raise Interrupted("The same command resumes the task net's training.") from None
 
 
-def _start(pretrain_from: str | None) -> Path | None:
+def _start_weights(pretrain_from: str | None) -> Path | None:
     """Return the file that the training of a task net starts from; None: as initialised."""
-    return None if pretrain_from is None else weights.of_task_net(pretrain_from)
+    if pretrain_from is None:
+        return None
+    return weights.of_task_net(pretrain_from)
 
 
 def _plain(cfg: DictConfig) -> Any:
@@ -100,31 +104,36 @@ def _plain(cfg: DictConfig) -> Any:
 
 def task_config(cfg: DictConfig) -> DictConfig:
     """Return the configuration of the run that trains the task net of ``cfg`` alone."""
-    own = cfg.copy()
-    with open_dict(own):
+    task_cfg = cfg.copy()
+    with open_dict(task_cfg):
         if cfg.learn != "task":
-            if cfg.trainer.max_epochs == UNLIMITED:
-                own.trainer.pop("max_steps", None)  # the length of the sampler's training
-            own.trainer.max_epochs = cfg.epochs.task
-            own.optimizer = cfg.pretrain
-            own.weights = "auto"
-            for name in cfg.callbacks:
-                if name not in STANDARD:  # such as early stopping on a score
-                    del own.callbacks[name]
-        own.learn = "task"
-        own.trainer.devices = 1
-        own.trainer.strategy = "auto"
-        own.ckpt_path = None
-        own.evaluate = None
-    return own
+            _take_pretraining(task_cfg, cfg)
+        task_cfg.learn = "task"
+        task_cfg.trainer.devices = 1
+        task_cfg.trainer.strategy = "auto"
+        task_cfg.ckpt_path = None
+        task_cfg.evaluate = None
+    return task_cfg
+
+
+def _take_pretraining(task_cfg: DictConfig, cfg: DictConfig) -> None:
+    """Replace the settings of a sampler's training by those of the training before it."""
+    if cfg.trainer.max_epochs == UNLIMITED:
+        task_cfg.trainer.pop("max_steps", None)  # the length of the sampler's training
+    task_cfg.trainer.max_epochs = cfg.epochs.task
+    task_cfg.optimizer = cfg.pretrain
+    task_cfg.weights = "auto"
+    for name in cfg.callbacks:
+        if name not in DEFAULT_CALLBACKS:  # such as early stopping on a score
+            del task_cfg.callbacks[name]
 
 
 def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
     """Return the cache folder of the task net for these settings and data; it may not exist."""
-    own = _plain(task_config(cfg))
+    settings = _plain(task_config(cfg))
     for name in SHORTENS:  # the cached net is that of a whole training
-        own["trainer"].pop(name, None)
-    key = checkpoint_identity(own, dataset.fingerprint)
+        settings["trainer"].pop(name, None)
+    key = checkpoint_identity(settings, dataset.fingerprint)
     digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:12]
     name = f"{cfg.names.task}-{cfg.names.net}-{cfg.names.dataset}-{digest}"
     return Path(cfg.cache).expanduser() / "weights" / name

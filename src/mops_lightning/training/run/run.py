@@ -20,22 +20,20 @@ from mops_lightning.training.run import pretrain
 from mops_lightning.training.run.build import build_parts
 from mops_lightning.training.run.channels import scaled_as_trained
 from mops_lightning.training.run.ending import sigterm_as_ctrl_c
-from mops_lightning.training.run.whole import recorded, train_and_test
+from mops_lightning.training.run.recorded import recorded
+from mops_lightning.training.run.stages import train_and_test
 
 STARTED = ".started"
 """Empty file in the folder of a run that has begun."""
 
 
-def run(
-    cfg: DictConfig, folder: Path, overrides: list[str] | None = None, claimed: bool = False
-) -> RunRecord:
+def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> RunRecord:
     """Train and test as a configuration says, and write ``result.json`` into ``folder``.
 
     Args:
         cfg: a composed configuration.
         folder: the run's folder; must not hold a result yet.
         overrides: what the user changed, for the record.
-        claimed: whether the settings are ``checked`` and the folder is claimed (``claim``).
 
     Returns:
         The record, as written.
@@ -43,14 +41,19 @@ def run(
     Raises:
         UserError: a mistake in settings or files.
     """
+    given = overrides or []
+    cfg = checked(cfg, given)
+    if not distributed.is_worker_rank(cfg):
+        claim(folder)
+    return run_in(folder, cfg, given)
+
+
+def run_in(folder: Path, cfg: DictConfig, overrides: list[str]) -> RunRecord:
+    """Do the same with settings that are ``checked``, in a folder that is claimed (``claim``)."""
     trained = TrainedRun.read(cfg.evaluate) if cfg.evaluate else None
-    leads = not distributed.is_worker_rank(cfg)
-    if not claimed:
-        cfg = checked(cfg, overrides or [])
-        if leads:
-            claim(folder)
+    writes = not distributed.is_worker_rank(cfg)
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
-    with sigterm_as_ctrl_c(), recorded(settings, folder, overrides or [], writes=leads) as record:
+    with sigterm_as_ctrl_c(), recorded(settings, folder, overrides, writes) as record:
         with record.timed("data"):
             dataset = _load_data(cfg, trained)
         parts = build_parts(cfg, folder, dataset, record, trained)
@@ -60,13 +63,13 @@ def run(
                 task_weights = pretrain.task_weights(cfg, dataset, folder)
         train_and_test(parts, record, task_weights)
         pretrain.add_to_cache(parts, record)
-    if leads:
+    if writes:
         closing_lines(folder, record)
     return record
 
 
 def checked(cfg: DictConfig, overrides: list[str]) -> DictConfig:
-    """Return the checked settings of a run, which an evaluation takes from the trained run.
+    """Return the checked settings of a run; those of an evaluation are the trained run's.
 
     Raises:
         UserError: a mistake in the settings.

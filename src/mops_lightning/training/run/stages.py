@@ -8,35 +8,28 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import lightning as L
-from omegaconf import OmegaConf
 from torch import nn
 
-from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import Interrupted, UserError
-from mops_lightning.nets.by_run import BY_RUN
 from mops_lightning.records.collapse import collapsed
 from mops_lightning.records.metric_info import foreign_metrics
 from mops_lightning.records.readout_names import parse_metric_name
-from mops_lightning.records.run_record import Evaluated, RunRecord
+from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.checkpoint import Diverged, check_finite
-from mops_lightning.training.evaluation import KEY, OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.recipe.warm_start import warm_start_sampler
-from mops_lightning.training.run.build import Parts, has_weights
 from mops_lightning.training.run.callbacks import CPUTime
 from mops_lightning.training.run.ending import KeepsEnding
+from mops_lightning.training.run.load import load_weights
 from mops_lightning.training.run.partial import (
-    note_evaluated,
-    note_task_net,
     note_test,
     note_training,
 )
-from mops_lightning.training.run.trainer import PROFILE, log_test, show_profile
-from mops_lightning.tree import dotted
+from mops_lightning.training.run.parts import Parts
+from mops_lightning.training.run.trainer import PROFILE, finish_loggers, log_test, show_profile
 from mops_lightning.viz.figures import CLOUDS
 from mops_lightning.zoo import weights
-from mops_lightning.zoo.outputs import check_names
 
 Kind = TypeVar("Kind")
 OUTPUTS = {
@@ -49,102 +42,32 @@ OUTPUTS = {
 """Files and folders that callbacks and loggers may have written."""
 
 
-def load_weights(parts: Parts, record: RunRecord, task_weights: Path | None) -> None:
-    """Load the weights of the task net and of an evaluated run.
-
-    Raises:
-        UserError: they do not fit.
-    """
-    if task_weights is not None:
-        _load_task_net(parts, record, task_weights)
-    if parts.trained is not None:
-        of_run = parts.cfg.weights == OF_RUN
-        record.evaluated = load_trained(parts.trained, of_run, parts.experiment, parts.dataset)
-        note_evaluated(parts.trained.name, parts.trained.record, record)
-
-
-def _load_task_net(parts: Parts, record: RunRecord, path: Path) -> None:
-    """Load the task net from a file, and say in which settings its training differed."""
-    task = parts.experiment.task
-    cfg = parts.cfg
-    is_start = cfg.learn == "task" and cfg.weights == "auto"
-    setting = "pretrain_from" if is_start else "weights"
-    try:
-        content = weights.load_into(task, path)
-    except UserError as error:
-        raise UserError(f"{setting}: {error}") from None
-    record.weights_loaded = content["sha256"]
-    if content.get("classes"):
-        check_names(content["classes"], task, parts.dataset, f"{setting}: {path}")
-    net: Any = OmegaConf.to_container(cfg.task.net, resolve=True)
-    different = _different_net(content["config"], net)
-    if different and parts.trainer.is_global_zero:
-        print(f"{setting}: {path} was trained with {', '.join(different)}, not as here.")
-    note_task_net(content["config"], record)
-
-
-def _different_net(recorded: dict[str, Any], net: dict[str, Any]) -> list[str]:
-    """Return the recorded settings of a task net that differ from the present ones.
+def train_and_test(parts: Parts, record: RunRecord, task_weights: Path | None) -> None:
+    """Run all stages in their order.
 
     Args:
-        recorded: the configuration of the run that trained the net.
-        net: the present settings of the net.
+        parts: of the run.
+        record: of the run, to fill.
+        task_weights: a file for the task net; None leaves it as initialised.
     """
-    before = dotted(recorded)
-    different = []
-    for name, value in dotted(net).items():
-        path = f"task.net.{name}"
-        if name in BY_RUN or path not in before:
-            continue
-        if before[path] != value:
-            different.append(f"{path}={before[path]}")
-    return different
-
-
-def load_trained(
-    trained: TrainedRun, task_net: bool, experiment: Experiment, dataset: CloudDataset
-) -> Evaluated:
-    """Load the nets of a trained run into an experiment.
-
-    Args:
-        trained: the run.
-        task_net: whether the run's task net is loaded, if it has weights.
-        experiment: to fill.
-        dataset: that is tested.
-
-    Returns:
-        The run and how it was trained, for the record.
-
-    Raises:
-        UserError: settings, classes or files do not match the run.
-    """
-    record = trained.record
-    task = experiment.task
-    is_own_data = record.dataset_fingerprint == dataset.fingerprint
-    if task_net and not is_own_data:
-        outputs = getattr(record, str(task.output_names), None)
-        check_names(outputs, task, dataset, f"{KEY}: {trained.name}")
-    module = task if trained.trained_task_net else experiment.sampler
-    assert module is not None  # learn=nothing builds a sampler
-    needs_task_net = task_net and not trained.trained_task_net and has_weights(task)
+    load_weights(parts, record, task_weights)
     try:
-        content = weights.load_into(module, weights.of_run(trained.place))
-        if needs_task_net:
-            if "task_weights" not in record.files:
-                raise UserError("it comes without its task net. Give weights=FILE.")
-            weights.load_into(task, weights.of_run(trained.place, "task_weights"))
-    except UserError as error:
-        raise UserError(f"{KEY}: {trained.name} cannot be loaded: {error}") from None
-    return Evaluated(
-        run=trained.name,
-        commit=record.git["commit"],
-        max_epochs=record.config["trainer"]["max_epochs"],
-        learn=record.config["learn"],
-        recipe=record.recipe,
-        seed=record.seed,
-        dataset=record.config["names"]["dataset"],
-        weights_sha256=content["sha256"],
-    )
+        if parts.trains:
+            warm_start(parts, record)
+            with record.timed("fit"):
+                fit(parts, record)
+        with record.timed("test"):
+            test(parts, record)
+        if parts.trainer.is_global_zero:
+            save(parts, record)
+    except Diverged as error:
+        text = f"{error} No weights were saved."
+        if parts.last_checkpoint:
+            text += f" The last finite checkpoint is {parts.last_checkpoint}."
+        text += " Try a lower learning rate (optimizer.lr) or other weights of the losses."
+        raise UserError(text) from None
+    finally:
+        finish_loggers(parts.trainer)
 
 
 def warm_start(parts: Parts, record: RunRecord) -> None:
@@ -169,10 +92,12 @@ def fit(parts: Parts, record: RunRecord) -> None:
     trainer = parts.trainer
     experiment = parts.experiment
     resumed = parts.resumed
-    record.recipe = _recipe_in_force(parts)
+    record.recipe = _recorded_recipe(parts)
     _check_enough_clouds(parts)
     loader = parts.train_loader()
-    validation = parts.score_loader(parts.held_out) if len(parts.held_out.labels) else None
+    validation = None
+    if len(parts.held_out.labels) > 0:
+        validation = parts.score_loader(parts.held_out)
     checkpoint = None if resumed is None else resumed.path
     with _interruptible():
         trainer.fit(experiment, loader, validation, ckpt_path=checkpoint)
@@ -181,16 +106,14 @@ def fit(parts: Parts, record: RunRecord) -> None:
     note_training(trainer, len(loader), record)
     show_profile(parts.folder, "fit")
     record.validation = dict(callback_of(trainer, KeepsEnding).validation(trainer))
-    if resumed is None or resumed.steps != trainer.global_step:
-        return
-    if trainer.is_global_zero:
+    if resumed is not None and trainer.is_global_zero and resumed.steps == trainer.global_step:
         print(
             f"{resumed.path}: this training had ended after {resumed.done} epochs; "
             "nothing was added to it."
         )
 
 
-def _recipe_in_force(parts: Parts) -> dict[str, Any] | None:
+def _recorded_recipe(parts: Parts) -> dict[str, Any] | None:
     """Return the recipe of the training for the record; None for the paper's."""
     recipe = parts.experiment.recipe
     if recipe == Recipe():
@@ -259,57 +182,71 @@ def _interruptible() -> Iterator[None]:
         raise Interrupted("Resume with the same command and ckpt_path=last.") from None
 
 
-def _check_scores(parts: Parts, metrics: dict[str, float]) -> None:
-    """Refuse a test whose score or losses are not finite, though the weights are."""
-    for name, value in metrics.items():
-        is_loss = name.split("/")[-2] == "loss"
-        is_judged = is_loss or name == parts.experiment.score_name
-        if is_judged and not math.isfinite(value):
-            if parts.trains:
-                raise Diverged(f"training diverged: {name} is {value}.")
-            raise UserError(f"{name} is {value}. Check the data and the weights.")
-
-
 def save(parts: Parts, record: RunRecord) -> None:
-    """Record the files and scores of the run, and save the trained weights."""
-    experiment = parts.experiment
-    for kind, name in OUTPUTS.items():
-        if (parts.folder / name).exists():
-            record.files[kind] = name
-    record.score = record.metrics.get(experiment.score_name)
-    record.collapsed = {str(m): count for m, count in collapsed(record).items()}
-    record.score_name = experiment.score_name
-    record.metric_info = foreign_metrics(experiment.task.metrics().items())
-    record.processes = parts.trainer.world_size
-    record.parameters = {"task": _size(experiment.task)}
-    if experiment.sampler is not None:
-        record.parameters["sampler"] = _size(experiment.sampler)
+    """Record the scores and files of the run, and save the trained weights.
+
+    Raises:
+        Diverged: a score or a loss of the trained nets is not finite.
+        UserError: one of given nets is not finite.
+    """
+    _record_results(parts, record)
     _check_scores(parts, record.metrics)
     if parts.trains:
         _save_weights(parts, record)
 
 
-def _size(module: nn.Module) -> int:
-    """Return the number of parameters."""
+def _record_results(parts: Parts, record: RunRecord) -> None:
+    """Add the scores, the files of callbacks and loggers, and the nets' sizes to the record."""
+    experiment = parts.experiment
+    for kind, name in OUTPUTS.items():
+        if (parts.folder / name).exists():
+            record.files[kind] = name
+    record.score = record.metrics.get(experiment.score_name)
+    record.score_name = experiment.score_name
+    record.collapsed = {str(m): count for m, count in collapsed(record).items()}
+    record.metric_info = foreign_metrics(experiment.task.metrics().items())
+    record.processes = parts.trainer.world_size
+    record.parameters = {"task": _number_of_parameters(experiment.task)}
+    if experiment.sampler is not None:
+        record.parameters["sampler"] = _number_of_parameters(experiment.sampler)
+
+
+def _check_scores(parts: Parts, metrics: Mapping[str, float]) -> None:
+    """Refuse a test whose score or losses are not finite, though the weights are."""
+    for name, value in metrics.items():
+        is_loss = name.split("/")[-2] == "loss"
+        is_score = name == parts.experiment.score_name
+        if math.isfinite(value) or not (is_loss or is_score):
+            continue
+        if parts.trains:
+            raise Diverged(f"training diverged: {name} is {value}.")
+        raise UserError(f"{name} is {value}. Check the data and the weights.")
+
+
+def _number_of_parameters(module: nn.Module) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
 
 
 def _save_weights(parts: Parts, record: RunRecord) -> None:
-    """Save the weights of the trained net, and beside a sampler's those of its task net."""
+    """Save the weights of the trained net, and of the task net of a trained sampler."""
     task = parts.experiment.task
     sampler = parts.experiment.sampler
-    files: dict[str, nn.Module] = {}
+    classes: tuple[str, ...] = ()
+    if task.output_names:
+        classes = getattr(parts.dataset, task.output_names)
     if sampler is None:
-        files[weights.FILE] = task
-    else:
-        files[weights.FILE] = sampler
-        if parts.has_task_weights:
-            files[f"task_{weights.FILE}"] = task
-    for name, module in files.items():
-        classes: tuple[str, ...] = ()
-        if module is task and task.output_names:
-            classes = getattr(parts.dataset, task.output_names)
-        path = parts.folder / name
-        channels = parts.dataset.channels
-        weights.save(path, module, record.config, record.metrics, classes, channels)
-        record.files[Path(name).stem] = name
+        _save_net(task, weights.FILE, classes, parts, record)
+        return
+    _save_net(sampler, weights.FILE, (), parts, record)
+    if parts.has_task_weights:
+        _save_net(task, f"task_{weights.FILE}", classes, parts, record)
+
+
+def _save_net(
+    net: nn.Module, name: str, classes: tuple[str, ...], parts: Parts, record: RunRecord
+) -> None:
+    """Save a net in the run's folder under a name, with the names of its classes."""
+    path = parts.folder / name
+    channels = parts.dataset.channels
+    weights.save(path, net, record.config, record.metrics, classes, channels)
+    record.files[path.stem] = name

@@ -1,45 +1,13 @@
-"""What a run and the training of its task net have in common: a record, and all stages."""
+"""The record of a run or of its task net's training, written also when the run fails."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mops_lightning.errors import Interrupted, UserError, closed_outputs
+from mops_lightning.errors import Interrupted, closed_outputs
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import RunRecord
-from mops_lightning.training.checkpoint import Diverged
-from mops_lightning.training.run import stages
-from mops_lightning.training.run.build import Parts
-from mops_lightning.training.run.trainer import finish_loggers
-
-
-def train_and_test(parts: Parts, record: RunRecord, task_weights: Path | None) -> None:
-    """Load weights, train the learned parts, test and save them.
-
-    Args:
-        parts: of the run.
-        record: is filled.
-        task_weights: a file for the task net; None leaves it as initialised.
-    """
-    stages.load_weights(parts, record, task_weights)
-    try:
-        if parts.trains:
-            stages.warm_start(parts, record)
-            with record.timed("fit"):
-                stages.fit(parts, record)
-        with record.timed("test"):
-            stages.test(parts, record)
-        if parts.trainer.is_global_zero:
-            stages.save(parts, record)
-    except Diverged as error:
-        text = f"{error} No weights were saved."
-        if parts.last_checkpoint:
-            text += f" The last finite checkpoint is {parts.last_checkpoint}."
-        text += " Try a lower learning rate (optimizer.lr) or other weights of the losses."
-        raise UserError(text) from None
-    finally:
-        finish_loggers(parts.trainer)
 
 
 @contextmanager
