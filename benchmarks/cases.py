@@ -26,7 +26,7 @@ from mops_lightning.samplers.random import RandomSampler
 from mops_lightning.samplers.samplenet import SampleNet
 from mops_lightning.samplers.snet import SNet
 from mops_lightning.samplers.voxel import VoxelSampler
-from mops_lightning.training.run.trainer import keep_freed_memory
+from mops_lightning.training.run.memory import keep_freed_memory
 
 Row = dict[str, Any]
 SIZES = (512, 256, 128, 64, 32, 16, 8)

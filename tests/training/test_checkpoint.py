@@ -25,8 +25,8 @@ from mops_lightning.training.muon import MuonAdam
 from mops_lightning.training.recipe.moving_average import MovingAverage
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.run.callbacks import last_checkpoint
+from mops_lightning.training.run.checkpoint_io import AtomicCheckpointIO
 from mops_lightning.training.run.ending import StopWithCheckpoint
-from mops_lightning.training.run.trainer import AtomicCheckpointIO
 from mops_lightning.training.schedules import one_cycle
 from tests.support.training import quiet_trainer, small_dataset
 

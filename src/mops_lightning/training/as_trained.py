@@ -12,7 +12,13 @@ from mops_lightning.config.build import signature
 from mops_lightning.config.validate import check
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
-from mops_lightning.training.evaluation import KEY, NAME, TrainedRun, is_repeated, is_special
+from mops_lightning.training.evaluation import (
+    EVALUATE,
+    PLAIN_NAME,
+    TrainedRun,
+    is_repeated,
+    is_special,
+)
 from mops_lightning.tree import dotted
 
 
@@ -45,7 +51,7 @@ def as_trained(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -> Di
         is_about_change = text.startswith(tuple(changed))
         if is_about_change:
             raise
-        raise UserError(f"{KEY}: the record of {trained.name}: {text}") from None
+        raise UserError(f"{EVALUATE}: the record of {trained.name}: {text}") from None
     if not trained.trained_task_net:
         _check_sampler(sampler, _plain(merged.sampler), trained.name)
     return merged
@@ -63,23 +69,28 @@ def _check_special(trained: TrainedRun, changed: list[str]) -> None:
             raise trained.not_accepted(path)
 
 
-def _check_sampler(old: dict[str, Any], new: dict[str, Any], name: str) -> None:
+def _check_sampler(recorded: dict[str, Any], present: dict[str, Any], name: str) -> None:
     """Refuse settings of the sampler's training that differ from the run's.
+
+    Args:
+        recorded: the sampler's settings in the run.
+        present: those of the evaluation.
+        name: of the run.
 
     Raises:
         UserError: a setting differs.
     """
-    for key in sorted({*old, *new}):
+    for key in sorted({*recorded, *present}):
         path = f"sampler.{key}"
-        used = old.get(key)
-        given = new.get(key)
+        used = recorded.get(key)
+        given = present.get(key)
         if used == given or not settings.of(path).affects_training:
             continue
         hint = ""
         if key == "m":
             hint = " For other sizes of a flexible sampler give sizes=[...]."
         raise UserError(
-            f"{KEY}: {path} must be {used}, as in {name}, got {given}. "
+            f"{EVALUATE}: {path} must be {used}, as in {name}, got {given}. "
             f"Leave it out, or train a sampler with it.{hint}"
         )
 
@@ -95,25 +106,34 @@ def _recorded(cfg: DictConfig, trained: TrainedRun) -> DictConfig:
     """
     recorded = _leaves(trained.record.config)
     present = _leaves(OmegaConf.to_container(cfg, resolve=False))
-    values = {}
-    results = {}  # of interpolations
-    for path, value in recorded.items():
-        if "${" in str(present.get(path)):
-            results[path] = value
-        else:
-            values[path] = value
-    new = []
-    for path, value in present.items():
-        if path not in recorded and "${" not in str(value):
-            new.append(path)
     merged = deepcopy(cfg)
     with open_dict(merged):
         _drop_new_baselines(merged, trained.record)
         _check_trusted(recorded, trained)
+        values = {}
+        resolved = {}
+        for path, value in recorded.items():
+            if _is_interpolation(present.get(path)):
+                resolved[path] = value
+            else:
+                values[path] = value
         _take_values(merged, cfg, values, trained.record)
-        _take_defaults(merged, new)
-        _take_other_results(merged, results)
+        _take_defaults(merged, _newer_than_run(present, recorded))
+        _take_other_results(merged, resolved)
     return merged
+
+
+def _is_interpolation(value: Any) -> bool:
+    return "${" in str(value)
+
+
+def _newer_than_run(present: dict[str, Any], recorded: dict[str, Any]) -> list[str]:
+    """Return the settings with a value of their own that the run's version did not have."""
+    newer = []
+    for path, value in present.items():
+        if path not in recorded and not _is_interpolation(value):
+            newer.append(path)
+    return newer
 
 
 def _drop_new_baselines(merged: DictConfig, record: RunRecord) -> None:
@@ -131,7 +151,7 @@ def _check_trusted(recorded: dict[str, Any], trained: TrainedRun) -> None:
         UserError: there is one.
     """
     for path, value in recorded.items():
-        has_plain_names = all(NAME.fullmatch(part) for part in path.split("."))
+        has_plain_names = all(PLAIN_NAME.fullmatch(part) for part in path.split("."))
         if not has_plain_names or _names_code(value):
             raise trained.not_accepted(path)
 
@@ -147,9 +167,9 @@ def _take_values(
             OmegaConf.update(merged, path, value, merge=False)
 
 
-def _take_defaults(merged: DictConfig, new: list[str]) -> None:
-    """Set settings that the run's version did not have to the defaults of their classes."""
-    for path in new:
+def _take_defaults(merged: DictConfig, paths: list[str]) -> None:
+    """Set settings to the defaults of their classes."""
+    for path in paths:
         node, name = _node_of(merged, path)
         parameter = _parameters(node, path).get(name)
         if parameter is not None and parameter.default is not parameter.empty:
@@ -209,4 +229,4 @@ def _names_code(value: Any) -> bool:
         return has_special_key or any(_names_code(item) for item in value.values())
     if isinstance(value, list):
         return any(_names_code(item) for item in value)
-    return "${" in str(value)
+    return _is_interpolation(value)

@@ -5,6 +5,7 @@ that names code is taken from it, and no path in place of a choice.
 """
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,10 +18,10 @@ from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.zoo import model_file, names
 
-KEY = "evaluate"
+EVALUATE = "evaluate"
 OF_RUN = "run"
 """``weights=run``: the task net that the evaluated run was trained with."""
-NAME = re.compile(r"[A-Za-z0-9_-]+")
+PLAIN_NAME = re.compile(r"[A-Za-z0-9_-]+")
 """A choice of a group, or a part of a setting's name."""
 UNFINISHED = {
     "failed": "failed",
@@ -33,18 +34,23 @@ NOT_OF_TASK_NETS = ("m", "weights")
 """Settings of the test of a sampler that also count in other runs of ``learn=task``."""
 
 
+def names_a_net(weights: str | None) -> bool:
+    """Return whether a value of ``weights`` names a net: a model, a run or a file."""
+    return weights not in (None, "auto", OF_RUN)
+
+
 @dataclass(frozen=True)
 class TrainedRun:
     """A completed run that trained something, or a model.
 
     Attributes:
         name: as the user gave it.
-        place: the run's folder, or the model's file.
+        path: the run's folder, or the model's file.
         record: its record.
     """
 
     name: str
-    place: Path
+    path: Path
     record: RunRecord
 
     @classmethod
@@ -56,26 +62,17 @@ class TrainedRun:
         """
         name = name.removesuffix(f"/{run_record.FILE}")
         try:
-            place = names.resolve(name)
-            if place.is_file() and place.suffix == model_file.SUFFIX:
-                card = model_file.read_card(place)
-                return cls(name, place, run_record.from_plain(card["record"]))
-            if not place.is_dir():
-                raise UserError(f"no folder {place}. Give a model, or the folder of a run.")
-            record = run_record.read(place)
+            path = names.resolve(name)
+            if path.is_file() and path.suffix == model_file.SUFFIX:
+                card = model_file.read_card(path)
+                return cls(name, path, run_record.from_plain(card["record"]))
+            if not path.is_dir():
+                raise UserError(f"no folder {path}. Give a model, or the folder of a run.")
+            record = run_record.read(path)
         except UserError as error:
-            raise UserError(f"{KEY}: {error}") from None
-        if record.status != "completed":
-            hint = "Give a completed run."
-            if (place / "checkpoints" / CHECKPOINT).is_file():
-                hint = f"Finish it with its own command and ckpt_path={place}."
-            raise UserError(f"{KEY}: {place} {UNFINISHED[record.status]}. {hint}")
-        if "weights" not in record.files:
-            raise UserError(
-                f"{KEY}: {place} trained nothing, or its weights were not kept; "
-                "run its own command with other settings."
-            )
-        return cls(name, place, record)
+            raise UserError(f"{EVALUATE}: {error}") from None
+        _check_usable(record, path)
+        return cls(name, path, record)
 
     @property
     def trained_task_net(self) -> bool:
@@ -88,28 +85,52 @@ class TrainedRun:
         Raises:
             UserError: the record chooses a file by a path.
         """
-        used = self.record.config["names"]  # a sweep's file may choose them
-        chosen = []
+        choices = [*self._named_choices(), *self._choices_on_command_line()]
+        for argument in choices:
+            override = overrides.parse_override(argument)
+            if override is None or not PLAIN_NAME.fullmatch(str(override.value())):
+                raise self.not_accepted(argument)
+        return choices
+
+    def _named_choices(self) -> Iterator[str]:
+        """Yield the choices in ``names``, which a sweep's file may have made."""
+        chosen = self.record.config["names"]
         for name, group in NAMED.items():
             is_of_training = name == "recipe"
-            if used.get(name) and not is_of_training:
-                chosen.append(f"{group}={used[name]}")
+            if chosen.get(name) and not is_of_training:
+                yield f"{group}={chosen[name]}"
+
+    def _choices_on_command_line(self) -> Iterator[str]:
+        """Yield the choices that its user made in other groups, such as ``task/net``."""
         for argument in self.record.overrides:
             key = overrides.key(argument)
             is_choice = "/" in key or "@" in key
             if is_choice and is_repeated(overrides.path(argument)):
-                chosen.append(overrides.readable(argument))
-        for argument in chosen:
-            override = overrides.parse_override(argument)
-            if override is None or not NAME.fullmatch(str(override.value())):
-                raise self.not_accepted(argument)
-        return chosen
+                yield overrides.readable(argument)
 
     def not_accepted(self, setting: str) -> UserError:
         """Return the error about a setting that no record may choose."""
         return UserError(
-            f"{KEY}: the record of {self.name} sets {setting}, which is not accepted from a "
+            f"{EVALUATE}: the record of {self.name} sets {setting}, which is not accepted from a "
             "record. If you trust it, give it on the command line."
+        )
+
+
+def _check_usable(record: RunRecord, folder: Path) -> None:
+    """Refuse a run that is not completed, or that has no weights.
+
+    Raises:
+        UserError: the run is such a one.
+    """
+    if record.status != "completed":
+        hint = "Give a completed run."
+        if (folder / "checkpoints" / CHECKPOINT).is_file():
+            hint = f"Finish it with its own command and ckpt_path={folder}."
+        raise UserError(f"{EVALUATE}: {folder} {UNFINISHED[record.status]}. {hint}")
+    if "weights" not in record.files:
+        raise UserError(
+            f"{EVALUATE}: {folder} trained nothing, or its weights were not kept; "
+            "run its own command with other settings."
         )
 
 
@@ -133,28 +154,37 @@ def command_line(arguments: list[str]) -> list[str]:
     Raises:
         UserError: RUN is not a completed run that trained something.
     """
-    named = [argument for argument in arguments if overrides.key(argument) == KEY]
-    if not named:
+    namings = [argument for argument in arguments if overrides.key(argument) == EVALUATE]
+    if not namings:
         return arguments
-    name = _run_named(named[-1])
+    name = _run_named(namings[-1])
     if name is None:
         return arguments
     path = Path(name).expanduser()
     trained = TrainedRun.read(str(path) if path.exists() else name)
+    of_run = _settings_of_run(trained)
+    # A process that is started by another one of its run is given the settings of the run, too.
+    not_of_user = [*namings, *of_run]
+    of_user = [argument for argument in arguments if argument not in not_of_user]
+    _check_given(of_user, trained)
+    changed = [overrides.path(argument) for argument in of_user]
+    kept = []
+    for argument in of_run:
+        setting = overrides.path(argument)
+        if not any(covers(given, setting) for given in changed):
+            kept.append(argument)
+    return [*of_user, *kept]
+
+
+def _settings_of_run(trained: TrainedRun) -> list[str]:
+    """Return the overrides that make a command line an evaluation of a run."""
     learn = "task" if trained.trained_task_net else "nothing"
-    run = f"{KEY}={overrides.quote(trained.name)}"
-    of_evaluation = [*trained.choices(), f"learn={learn}", f"weights={OF_RUN}", run]
-    # The processes of one run are started with what has been added here.
-    added = [*named, *of_evaluation]
-    rest = [argument for argument in arguments if argument not in added]
-    _check_given(rest, trained)
-    paths = [overrides.path(argument) for argument in rest]
-    for argument in of_evaluation:
-        place = overrides.path(argument)
-        is_given = any(covers(given, place) for given in paths)
-        if not is_given:
-            rest.append(argument)
-    return rest
+    return [
+        *trained.choices(),
+        f"learn={learn}",
+        f"weights={OF_RUN}",
+        f"{EVALUATE}={overrides.quote(trained.name)}",
+    ]
 
 
 def _run_named(argument: str) -> str | None:
@@ -163,11 +193,13 @@ def _run_named(argument: str) -> str | None:
     if override is None or override.is_delete():
         return None
     if override.is_sweep_override():
-        raise UserError(f"{argument}: {KEY} takes one run. Start one evaluation for each.")
+        raise UserError(f"{argument}: {EVALUATE} takes one run. Start one evaluation for each.")
     value = override.value()
     if value == "":
         raise UserError(f"{argument}: no run is given. Give a run's folder or a model.")
-    return None if value is None else str(value)
+    if value is None:
+        return None
+    return str(value)
 
 
 def _check_given(arguments: list[str], trained: TrainedRun) -> None:
@@ -176,26 +208,27 @@ def _check_given(arguments: list[str], trained: TrainedRun) -> None:
     Raises:
         UserError: a setting does not apply.
     """
-    used = trained.record.config["names"]
+    chosen = trained.record.config["names"]
     has_new_net = "weights=auto" in arguments
     for argument in arguments:
         path = overrides.path(argument)
         if not _may_change(path, has_new_net):
             raise UserError(
-                f"{argument}: has no effect with {KEY}, which trains nothing. Leave it out, or "
-                f"train with the settings of {trained.name} and without {KEY}."
+                f"{argument}: has no effect with {EVALUATE}, which trains nothing. "
+                f"Leave it out, or train with the settings of {trained.name} "
+                f"and without {EVALUATE}."
             )
         is_of_sampler = path in NOT_OF_TASK_NETS or not settings.of(path).counts("task")
         if trained.trained_task_net and is_of_sampler:
             raise UserError(
-                f"{argument}: has no effect with {KEY}={trained.name}, which trained a task net "
-                "alone. To test a sampler with it, evaluate the sampler's run with "
-                f"weights={trained.name}."
+                f"{argument}: has no effect with {EVALUATE}={trained.name}, "
+                "which trained a task net alone. To test a sampler with it, evaluate the "
+                f"sampler's run with weights={trained.name}."
             )
-        if path in ("task", "sampler") and argument != f"{path}={used[path]}":
+        if path in ("task", "sampler") and argument != f"{path}={chosen[path]}":
             raise UserError(
-                f"{KEY}: {trained.name} was trained with {path}={used[path]}, got {argument}. "
-                f"Leave {path} out, or give another run."
+                f"{EVALUATE}: {trained.name} was trained with {path}={chosen[path]}, "
+                f"got {argument}. Leave {path} out, or give another run."
             )
 
 

@@ -29,8 +29,9 @@ from mops_lightning.training.scores import Scores
 from mops_lightning.types import Batch, SampleOutput
 
 TEST = "test/"
+"""Prefix of the metrics of the test."""
 VALIDATION = "val/"
-"""Prefixes of the metrics of a stage."""
+"""Prefix of the metrics of a validation."""
 
 ALL_POINTS = 0
 """The size of a step that trains the task net alone, without sampling."""
@@ -102,22 +103,26 @@ class Experiment(L.LightningModule):
         self.test_logger = test_logger
         for module in self._frozen():
             module.requires_grad_(False)
-        own_size = 0 if sampler is None else sampler.m
-        self.m: int = m or own_size
+        size_of_sampler = 0 if sampler is None else sampler.m
+        self.m: int = m or size_of_sampler
         self.sizes = tuple(sizes or (self.m,))
         self.prefixes = dict.fromkeys(self.sizes, "")
         if len(self.sizes) > 1:
             self.prefixes = {size: size_prefix(size) for size in self.sizes}
         self.main_readout, *others = names_of_readouts(sampler)
-        score = task.score
-        if sampler is None and task.full_score:
-            score = task.full_score
-        prefix = self.prefixes.get(self.m, "")
-        self.score_name = f"{TEST}{prefix}{self.main_readout}/{score}"
+        self.score_name = self._score_name()
         names = dict.fromkeys([self.main_readout, *others, *self.baselines, FULL])
         self.scores = Scores(task.metrics, names, self.prefixes.values())
         self.train_scores = task.metrics(training=True)
         self.train()
+
+    def _score_name(self) -> str:
+        """Return the log key of the run's score: of the main readout at the run's own size."""
+        score = self.task.score
+        if self.sampler is None and self.task.full_score:
+            score = self.task.full_score
+        prefix = self.prefixes.get(self.m, "")
+        return f"{TEST}{prefix}{self.main_readout}/{score}"
 
     def train(self, mode: bool = True) -> "Experiment":
         """Set the mode of what learns; frozen parts stay in evaluation mode.
@@ -245,8 +250,9 @@ class Experiment(L.LightningModule):
             losses = self._over_sizes(terms, len(sizes))
             total = torch.stack(list(losses.values())).sum()
         check_finite({"the loss": total}, self.global_step, self.trainer.strategy)
-        first = outputs[sizes[0]]
-        readout = self.main_readout if first.soft_projected is None else PROJECTED
+        readout = self.main_readout
+        if outputs[sizes[0]].soft_projected is not None:
+            readout = PROJECTED
         self._log_training({**losses, "total": total}, readout, len(batch.points))
         return total
 
@@ -259,7 +265,10 @@ class Experiment(L.LightningModule):
         """
         is_mean = self.sampler is not None and self.sampler.size_reduction == "mean"
         share = 1 / sizes if is_mean else 1.0
-        return {name: torch.stack(values).sum() * share for name, values in terms.items()}
+        losses = {}
+        for name, values in terms.items():
+            losses[name] = torch.stack(values).sum() * share
+        return losses
 
     def _losses(
         self, batch: Batch, seen: Tensor, sampled: SampleOutput, targets: Targets | None
@@ -306,7 +315,7 @@ class Experiment(L.LightningModule):
         over_epoch: dict[str, Any] = {"on_step": False, "on_epoch": True, "batch_size": clouds}
         self.log("loss", total, prog_bar=True, logger=False, batch_size=clouds)
         self.log("train/mean_loss", total, sync_dist=True, **over_epoch)
-        tau: Any = getattr(self.sampler, "tau", None)
+        tau: Any = getattr(self.sampler, "tau", None)  # not every sampler has a temperature
         if tau is not None:
             self.log("train/tau", tau, batch_size=clouds)
         for name, metric in self.train_scores.items(keep_base=True, copy_state=False):
@@ -362,7 +371,9 @@ class Experiment(L.LightningModule):
 
     def _logs(self, stage: str) -> bool | None:
         """Return whether the metrics of a stage go to the loggers; None: if there is one."""
-        return self.test_logger if stage == TEST else None
+        if stage == TEST:
+            return self.test_logger
+        return None
 
     def _score_sets(
         self,

@@ -10,8 +10,10 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from mops_lightning.errors import UserError
 
-START_FACTOR, END_FACTOR = 0.04, 1e-4
-"""First and last learning rate of one cycle over its peak."""
+START_FACTOR = 0.04
+"""First learning rate of one cycle over its peak."""
+END_FACTOR = 1e-4
+"""Last learning rate of one cycle over its peak."""
 
 
 def one_cycle(optimizer: Optimizer, total_steps: int, warmup: float = 0.3) -> LambdaLR:

@@ -9,8 +9,8 @@ from mops_lightning.config.compose import compose
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.checkpoint import CHECKPOINT
+from mops_lightning.training.run.checkpoint_io import AtomicCheckpointIO
 from mops_lightning.training.run.recorded import recorded
-from mops_lightning.training.run.trainer import AtomicCheckpointIO
 from tests.support.command_line import job
 
 

@@ -13,7 +13,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.seeding import generator
 from mops_lightning.training import checkpoint
-from mops_lightning.training.evaluation import OF_RUN, TrainedRun
+from mops_lightning.training.evaluation import TrainedRun, names_a_net
 from mops_lightning.training.run.cloud_sizes import check_processes
 from mops_lightning.training.run.make_experiment import make_experiment
 from mops_lightning.training.run.parts import Parts
@@ -76,7 +76,7 @@ def _check_weights(parts: Parts) -> None:
         UserError: such a setting is given.
     """
     cfg = parts.cfg
-    if not parts.has_task_weights and cfg.weights not in (None, "auto", OF_RUN):
+    if not parts.has_task_weights and names_a_net(cfg.weights):
         raise UserError(
             f"weights: {cfg.names.net} has no weights to load, got {cfg.weights}. "
             "Give weights=null."

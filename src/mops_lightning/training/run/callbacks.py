@@ -105,7 +105,9 @@ def progress(score: str) -> Callback:
     Args:
         score: see ``EpochLines``.
     """
-    return RichProgressBar(leave=False) if sys.stdout.isatty() else EpochLines(score)
+    if sys.stdout.isatty():
+        return RichProgressBar(leave=False)
+    return EpochLines(score)
 
 
 def build_callbacks(nodes: DictConfig, offered: dict[str, Any], logged: bool) -> list[Callback]:
@@ -119,15 +121,14 @@ def build_callbacks(nodes: DictConfig, offered: dict[str, Any], logged: bool) ->
     Raises:
         UserError: a node describes no callback.
     """
-    chosen = {str(name): node for name, node in nodes.items() if node is not None}
-    if not logged:
-        chosen.pop("learning_rate", None)
-    if "batch" not in offered:
-        chosen.pop("pictures", None)
-    built = []
-    for name, node in chosen.items():
+    callbacks = []
+    for name, node in nodes.items():
+        has_nothing_to_log = name == "learning_rate" and not logged
+        has_nothing_to_draw = name == "pictures" and "batch" not in offered
+        if node is None or has_nothing_to_log or has_nothing_to_draw:
+            continue
         where = f"callbacks.{name}"
         if "_target_" not in node:
             raise UserError(f"{where}: give its class as {where}._target_=MODULE.CLASS.")
-        built.append(build_as(Callback, node, where, offered))
-    return built
+        callbacks.append(build_as(Callback, node, where, offered))
+    return callbacks

@@ -1,6 +1,7 @@
 """Channels of the data: scaled as given nets were trained, and refused where nothing takes them."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,23 @@ from omegaconf import DictConfig
 from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.training.evaluation import KEY, OF_RUN, TrainedRun
+from mops_lightning.training.evaluation import EVALUATE, TrainedRun, names_a_net
 from mops_lightning.zoo import model_file, names, weights
+
+
+@dataclass(frozen=True)
+class GivenNet:
+    """A trained net that a run starts from or tests.
+
+    Attributes:
+        setting: the setting that names it.
+        reference: what the setting says.
+        find: returns the weights file of a reference.
+    """
+
+    setting: str
+    reference: Any
+    find: Callable[[Any], Path]
 
 
 def scaled_as_trained(
@@ -29,41 +45,35 @@ def scaled_as_trained(
         UserError: a net was trained with other features, or two nets with other statistics.
     """
     first = None
-    for setting, reference, find in _given(cfg, trained):
+    for net in _given_nets(cfg, trained):
         try:
-            path = find(reference)
+            path = net.find(net.reference)
             channels = weights.channels_in(model_file.read_header(path))
         except UserError:
-            continue  # whoever loads the net says what is wrong
+            continue  # loading the net will say what is wrong
         if first is not None and channels != first:
             raise UserError(
-                f"{setting}: {path} was trained with other statistics of the channels than the "
+                f"{net.setting}: {path} was trained with other statistics of the channels than the "
                 "net before it. Give nets that were trained on the same data."
             )
         first = channels
-        dataset = dataset.scaled_as(channels, f"{setting}: {path}")
+        dataset = dataset.scaled_as(channels, f"{net.setting}: {path}")
     return dataset
 
 
-def _given(
-    cfg: DictConfig, trained: TrainedRun | None
-) -> Iterator[tuple[str, Any, Callable[[Any], Path]]]:
-    """Yield the trained nets that a run starts from or tests.
-
-    Returns:
-        The setting, what it names, and the function that finds the weights file.
-    """
+def _given_nets(cfg: DictConfig, trained: TrainedRun | None) -> Iterator[GivenNet]:
+    """Yield the trained nets that a run starts from or tests."""
     if trained is not None:
-        yield KEY, trained.place, weights.of_run
-    if cfg.weights not in (None, "auto", OF_RUN):
-        yield "weights", cfg.weights, weights.of_task_net
+        yield GivenNet(EVALUATE, trained.path, weights.of_run)
+    if names_a_net(cfg.weights):
+        yield GivenNet("weights", cfg.weights, weights.of_task_net)
     if cfg.pretrain_from and cfg.weights == "auto":
-        yield "pretrain_from", cfg.pretrain_from, weights.of_task_net
+        yield GivenNet("pretrain_from", cfg.pretrain_from, weights.of_task_net)
     for name in cfg.other_nets or ():
-        yield "other_nets", name, weights.of_task_net
+        yield GivenNet("other_nets", name, weights.of_task_net)
     start = cfg.recipe.get("warm_start") if cfg.recipe else None
     if isinstance(start, str):
-        yield "recipe.warm_start", start, _of_sampler
+        yield GivenNet("recipe.warm_start", start, _of_sampler)
 
 
 def _of_sampler(reference: str) -> Path:

@@ -9,7 +9,7 @@ from mops_lightning.data.clouds import CloudDataset
 from mops_lightning.errors import UserError
 from mops_lightning.nets.by_run import BY_RUN
 from mops_lightning.records.run_record import Evaluated, RunRecord
-from mops_lightning.training.evaluation import KEY, OF_RUN, TrainedRun
+from mops_lightning.training.evaluation import EVALUATE, OF_RUN, TrainedRun
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.run.partial import note_evaluated, note_task_net
 from mops_lightning.training.run.parts import Parts, has_weights
@@ -95,18 +95,18 @@ def load_trained(
     is_on_same_data = record.dataset_fingerprint == dataset.fingerprint
     if with_task_net and not is_on_same_data:
         outputs = getattr(record, str(task.output_names), None)
-        check_names(outputs, task, dataset, f"{KEY}: {trained.name}")
+        check_names(outputs, task, dataset, f"{EVALUATE}: {trained.name}")
     module = task if trained.trained_task_net else experiment.sampler
     assert module is not None  # learn=nothing builds a sampler
     needs_task_net = with_task_net and not trained.trained_task_net and has_weights(task)
     try:
-        content = weights.load_into(module, weights.of_run(trained.place))
+        content = weights.load_into(module, weights.of_run(trained.path))
         if needs_task_net:
             if "task_weights" not in record.files:
                 raise UserError("it comes without its task net. Give weights=FILE.")
-            weights.load_into(task, weights.of_run(trained.place, "task_weights"))
+            weights.load_into(task, weights.of_run(trained.path, "task_weights"))
     except UserError as error:
-        raise UserError(f"{KEY}: {trained.name} cannot be loaded: {error}") from None
+        raise UserError(f"{EVALUATE}: {trained.name} cannot be loaded: {error}") from None
     return Evaluated(
         run=trained.name,
         commit=record.git["commit"],

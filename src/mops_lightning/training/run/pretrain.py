@@ -16,7 +16,7 @@ from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.filesystem import atomic_write, remove_temporary
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.training.checkpoint import CHECKPOINT, checkpoint_identity
-from mops_lightning.training.evaluation import OF_RUN
+from mops_lightning.training.evaluation import OF_RUN, names_a_net
 from mops_lightning.training.run.build import build_parts
 from mops_lightning.training.run.callbacks import DEFAULT_CALLBACKS
 from mops_lightning.training.run.parts import Parts
@@ -46,10 +46,10 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, run_folder: Path) -> Pa
     """
     if cfg.weights in (None, OF_RUN) or cfg.ckpt_path is not None:
         return None
-    if cfg.weights == "auto" and cfg.learn == "task":
-        return _start_weights(cfg.pretrain_from)
-    if cfg.weights != "auto":
+    if names_a_net(cfg.weights):
         return weights.of_task_net(cfg.weights)
+    if cfg.learn == "task":
+        return _start_weights(cfg.pretrain_from)
     folder = cache_folder(cfg, dataset)
     remove_temporary(folder)
     if (folder / FILE).is_file():

@@ -22,12 +22,13 @@ from mops_lightning.training.recipe.warm_start import warm_start_sampler
 from mops_lightning.training.run.callbacks import CPUTime
 from mops_lightning.training.run.ending import KeepsEnding
 from mops_lightning.training.run.load import load_weights
+from mops_lightning.training.run.loggers import finish_loggers, log_test
 from mops_lightning.training.run.partial import (
     note_test,
     note_training,
 )
 from mops_lightning.training.run.parts import Parts
-from mops_lightning.training.run.trainer import PROFILE, finish_loggers, log_test, show_profile
+from mops_lightning.training.run.trainer import PROFILE, show_profile
 from mops_lightning.viz.figures import CLOUDS
 from mops_lightning.zoo import weights
 
