@@ -69,4 +69,6 @@ def main() -> None:
 def program() -> str:
     """Return what the user typed to start this program."""
     name = Path(sys.argv[0]).name
-    return "python -m mops_lightning" if name == "__main__.py" else name
+    if name == "__main__.py":
+        return "python -m mops_lightning"
+    return name

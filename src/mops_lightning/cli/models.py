@@ -37,11 +37,11 @@ def main(arguments: list[str], prog: str) -> None:
         else:
             parser = Parser(prog, DESCRIPTION)
             parser.add_argument("name", nargs="?", metavar="NAME", help="see above")
-            chosen = parser.parse_args(arguments)
-            if chosen.name is None:
+            options = parser.parse_args(arguments)
+            if options.name is None:
                 lines = _table()
             else:
-                lines = _card(names.resolve(chosen.name))
+                lines = _card(names.resolve(options.name))
         print(printable("\n".join(lines)))
 
 
@@ -55,11 +55,11 @@ def _add(arguments: list[str], prog: str) -> list[str]:
     add("--task-net", metavar="NAME", help="model of the sampler's task net")
     add("--notes", default="", help="what a user must know besides")
     add("--overwrite", action="store_true", help="replace a model of this name")
-    chosen = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     from mops_lightning.zoo import publish
 
-    name = chosen.name
-    folder = chosen.folder
+    name = options.name
+    folder = options.folder
     if folder is None:
         if not os.environ.get(names.VARIABLE):
             raise UserError(
@@ -67,12 +67,12 @@ def _add(arguments: list[str], prog: str) -> list[str]:
             )
         folder = names.folders()[0]
     path = publish.add(
-        chosen.run,
+        options.run,
         name,
         folder,
-        task_net=chosen.task_net,
-        notes=chosen.notes,
-        overwrite=chosen.overwrite,
+        task_net=options.task_net,
+        notes=options.notes,
+        overwrite=options.overwrite,
     )
     card = model_file.read_card(path)
     record = card["record"]
@@ -112,15 +112,15 @@ def _card(path: Path) -> list[str]:
     card = model_file.read_card(path)
     record = card["record"]
     config = record["config"]
-    chosen = config["names"]
+    choices = config["names"]
     if config["learn"] == "task":
-        net = f"{chosen['net']} (task net)"
+        net = f"{choices['net']} (task net)"
     else:
-        net = f"{chosen['sampler']} (sampler)"
+        net = f"{choices['sampler']} (sampler)"
     lines = {
         "name": card["name"],
         "net": net,
-        "task": f"{chosen['task']} by {chosen['net']}",
+        "task": f"{choices['task']} by {choices['net']}",
         "sizes": _sizes(card),
         "input": "clouds in the unit sphere (centroid at the origin, largest distance from it 1)",
         "channels": ", ".join(name for name, _, _ in card.get("channels", [])),
@@ -158,8 +158,10 @@ def _data(config: dict[str, Any]) -> str:
 
 
 def _commit(record: dict[str, Any]) -> str:
-    text = record["git"]["commit"] or "unknown"
-    return f"{text} (changed)" if record["git"]["dirty"] else text
+    text = str(record["git"]["commit"] or "unknown")
+    if record["git"]["dirty"]:
+        text += " (changed)"
+    return text
 
 
 def _file(path: Path, card: dict[str, Any]) -> str:
@@ -174,16 +176,18 @@ def _sizes(card: dict[str, Any]) -> str:
     if config["learn"] == "task":
         return ""
     largest = config["sampler"].get("m_max")
-    return f"1-{largest}" if largest else str(config["m"])
+    if largest:
+        return f"1-{largest}"
+    return str(config["m"])
 
 
 def _figures(card: dict[str, Any]) -> str:
-    own = card["figures"]
-    values = own["values"]
-    if own["m"] is None:
-        return f"{own['metric']}: {values.get('full', 'unknown')} on all points"
+    figures = card["figures"]
+    values = figures["values"]
+    if figures["m"] is None:
+        return f"{figures['metric']}: {values.get('full', 'unknown')} on all points"
     listed = ", ".join(f"{value} {readout}" for readout, value in values.items())
-    return f"{own['metric']}, m={own['m']}: {listed}"
+    return f"{figures['metric']}, m={figures['m']}: {listed}"
 
 
 def _megabytes(path: Path) -> str:
@@ -204,12 +208,15 @@ def export(arguments: list[str], prog: str) -> None:
     add("--m", type=int, help="number of points; default: as the sampler was trained for")
     add("--overwrite", action="store_true", help="replace an existing file")
     with one_line_endings(prog):
-        chosen = parser.parse_args(arguments)
-        if chosen.target.exists() and not chosen.overwrite:
-            raise UserError(f"{chosen.target} exists. Give another OUT, or --overwrite.")
+        options = parser.parse_args(arguments)
+        target = options.target
+        if target.exists() and not options.overwrite:
+            raise UserError(f"{target} exists. Give another OUT, or --overwrite.")
         from mops_lightning.zoo import export as files
         from mops_lightning.zoo.load import load
 
-        difference = files.export(load(chosen.sampler), chosen.target, chosen.m)
-        told = f"largest difference from the sampler {difference:.1e}"
-        print(f"{chosen.target}: {_megabytes(chosen.target)} MB; {told}")
+        difference = files.export(load(options.sampler), target, options.m)
+        print(
+            f"{target}: {_megabytes(target)} MB; "
+            f"largest difference from the sampler {difference:.1e}"
+        )

@@ -48,15 +48,15 @@ class RunStart(Callback):
         from mops_lightning.training.run.run import checked, claim
 
         HydraConfig.instance().set_config(config)  # the folder's name is made from it
-        own = [str(key) for key in config if key != "hydra"]
-        cfg = OmegaConf.masked_copy(config, own)
+        own_keys = [str(key) for key in config if key != "hydra"]
+        cfg = OmegaConf.masked_copy(config, own_keys)
         try:
             given = overrides.as_typed(config.hydra.overrides.task)
-            complete = checked(cfg, given)
+            cfg_of_run = checked(cfg, given)
             if cfg.evaluate:  # the job gets the settings of the trained run
                 with open_dict(config):
-                    for name in complete:
-                        config[name] = complete[name]
+                    for name in cfg_of_run:
+                        config[name] = cfg_of_run[name]
             else:
                 check_effect(cfg, given)
             check_paths(cfg)
@@ -90,7 +90,7 @@ def _use_folder_of_its_own(config: DictConfig) -> None:
 
 
 def line_about_run(error: Exception, given: list[str]) -> str | None:
-    """Return one line about an error of a run that the user can mend; None for any other.
+    """Return one line about an error of a run that is the user's mistake; None for any other.
 
     Lightning refuses some of its settings only when it uses them, by errors of any kind.
 
@@ -136,18 +136,21 @@ def check_paths(cfg: DictConfig) -> None:
         except FileNotFoundError:
             _check_missing(name, value)
         except (OSError, RuntimeError, ValueError) as error:
-            # Python: no such user, a null byte.
-            reason = error.strerror if isinstance(error, OSError) else str(error)
-            raise UserError(f"{name}: {value[:100]}: {str(reason).rstrip('.')}.") from None
+            reason = str(error)  # Python's own: no such user, a null byte
+            if isinstance(error, OSError):
+                reason = str(error.strerror)
+            raise UserError(f"{name}: {value[:100]}: {reason.rstrip('.')}.") from None
 
 
 def _check_missing(name: str, value: str) -> None:
     """Refuse a path that does not exist where the setting needs one; weights may be of a model."""
     if name not in MISSING:
         return
-    try:
-        found = name != "ckpt_path" and names.resolve(value).exists()
-    except UserError as error:
-        raise UserError(f"{name}: {error}") from None
-    if not found:
+    is_model = False
+    if name != "ckpt_path":
+        try:
+            is_model = names.resolve(value).exists()
+        except UserError as error:
+            raise UserError(f"{name}: {error}") from None
+    if not is_model:
         raise UserError(f"{name}: {MISSING[name].format(value)}")

@@ -80,7 +80,9 @@ def _run_or_repeat(cfg: DictConfig, folder: Path, overrides: list[str]) -> float
         checkpoint = _checkpoint(cfg, folder)
         if checkpoint and cfg.ckpt_path is None:
             cfg.ckpt_path = str(checkpoint)
-        action = f"resuming from {cfg.ckpt_path}" if cfg.ckpt_path else "starting again"
+        action = "starting again"
+        if cfg.ckpt_path:
+            action = f"resuming from {cfg.ckpt_path}"
         log.info(f"{folder}: the last attempt was {status}; {action}")
     # A process that was killed before it wrote a record left this file.
     (folder / STARTED).unlink(missing_ok=True)
@@ -90,7 +92,9 @@ def _run_or_repeat(cfg: DictConfig, folder: Path, overrides: list[str]) -> float
 
 def _number(score: float | None) -> float:
     """Return a score, NaN for none."""
-    return math.nan if score is None else float(score)
+    if score is None:
+        return math.nan
+    return float(score)
 
 
 def _note_failure(error: Exception, folder: Path, overrides: list[str]) -> None:
@@ -142,10 +146,11 @@ def _differences(cfg: DictConfig, record: RunRecord) -> dict[str, tuple[Any, Any
     recorded = dotted(record.config)
     different = {}
     for key in {**present, **recorded}:
-        values = (present.get(key), recorded.get(key))
+        value = present.get(key)
+        earlier = recorded.get(key)
         affects_results = settings.of(key).affects is not Affects.NOTHING
-        if values[0] != values[1] and affects_results:
-            different[key] = values
+        if value != earlier and affects_results:
+            different[key] = (value, earlier)
     return different
 
 
@@ -177,6 +182,11 @@ def _attempt_number(path: Path) -> int:
     return int(path.name)
 
 
+def _order_of_moving(name: str) -> tuple[bool, str]:
+    """Return a key that sorts names of files, with the record at the end."""
+    return name == run_record.FILE, name
+
+
 def _move_aside(folder: Path) -> None:
     """Move an attempt into a numbered folder.
 
@@ -185,9 +195,8 @@ def _move_aside(folder: Path) -> None:
     """
     moving = folder / ASIDE / MOVING
     moving.mkdir(parents=True, exist_ok=True)
-    names = {path.name for path in folder.iterdir()} - {*STAYS}
-    record = names & {run_record.FILE}
-    for name in (*sorted(names - record), *record):
+    names = [path.name for path in folder.iterdir() if path.name not in STAYS]
+    for name in sorted(names, key=_order_of_moving):
         (folder / name).rename(moving / name)
     numbers = [_attempt_number(path) for path in _attempts(folder)]
     moving.rename(folder / ASIDE / str(max(numbers, default=0) + 1))

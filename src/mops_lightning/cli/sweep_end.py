@@ -42,11 +42,11 @@ def _add_models(cells: list[Path], folder: Path) -> None:
     """Write the nets that cells trained as models in ``models/`` of the sweep's folder."""
     from mops_lightning.zoo import publish
 
-    added = publish.add_all(cells, folder, folder / "models")
+    models = folder / "models"
+    added = publish.add_all(cells, folder, models)
     if added:
-        place = folder / "models"
-        print(f"{len(added)} models in {place}; to test one:")
-        print(f"MOPS_MODELS={place} python -m mops_lightning evaluate={added[-1].stem}")
+        print(f"{len(added)} models in {models}; to test one:")
+        print(f"MOPS_MODELS={models} python -m mops_lightning evaluate={added[-1].stem}")
 
 
 class SweepSummary(Callback):
@@ -91,8 +91,9 @@ class SweepSummary(Callback):
         except Exception:
             log.exception("the runs are done, but the end of the sweep failed")
             raise SystemExit(1) from None
-        found = set(states.values())
-        if found - {"completed", ELSEWHERE} or not found:
+        different_states = set(states.values())
+        has_unfinished = bool(different_states - {"completed", ELSEWHERE})
+        if has_unfinished or not states:
             print(f"To repeat the rest: the same command with hydra.sweep.dir={folder}")
             raise SystemExit(1)
 
@@ -126,7 +127,7 @@ def _let_search_go_on(config: DictConfig) -> None:
     """Let a search by Optuna survive failed trials, unless its user limits their share."""
     sweeper = config.hydra.sweeper
     limit = "hydra.sweeper.max_failure_rate"
-    given = any(str(one).startswith(limit) for one in config.hydra.overrides.hydra)
-    if "max_failure_rate" in sweeper and not given:
+    is_given = any(str(override).startswith(limit) for override in config.hydra.overrides.hydra)
+    if "max_failure_rate" in sweeper and not is_given:
         with open_dict(sweeper):
             sweeper.max_failure_rate = 1.0

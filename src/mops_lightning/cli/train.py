@@ -162,9 +162,14 @@ def _job(cfg: "DictConfig") -> float | None:
         except errors.Interrupted as stop:
             if distributed.is_worker_rank(cfg):
                 sys.exit(errors.INTERRUPTED)  # rank 0 prints the message
+            text = str(stop)
+            if swept:
+                sweep_folder = os.path.relpath(hydra_cfg.sweep.dir)
+                text = (
+                    f"Run the same command with hydra.sweep.dir={sweep_folder} "
+                    "to continue the sweep."
+                )
             # Hydra passes this on like any other error.
-            again = "Run the same command with hydra.sweep.dir={} to continue the sweep."
-            text = again.format(os.path.relpath(hydra_cfg.sweep.dir)) if swept else str(stop)
             raise KeyboardInterrupt(text) from None
         except Exception as error:
             line = line_about_run(error, overrides)

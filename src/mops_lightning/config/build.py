@@ -14,6 +14,8 @@ from mops_lightning.errors import UserError
 # It logs as an error what it also raises.
 logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
 
+Parameters = dict[str, inspect.Parameter]
+"""Parameters of a function by name."""
 
 REJECTIONS = (ValueError, TypeError, OverflowError, ZeroDivisionError)
 """Errors that constructors of other libraries raise for invalid settings."""
@@ -50,7 +52,7 @@ def build(node: Any, where: str = "", **extra: Any) -> Any:
 
     below = _built_below(node, where, extra)
     try:
-        made = instantiate(node, **below, **extra, _convert_="all")
+        built = instantiate(node, **below, **extra, _convert_="all")
     except (InstantiationException, *REJECTIONS) as error:
         if isinstance(error, UserError):
             raise
@@ -59,8 +61,8 @@ def build(node: Any, where: str = "", **extra: Any) -> Any:
             raise
         raise _with_path(known, _unresolved(node), where, tuple(extra)) from None
     if isinstance(node, DictConfig) and node.get("_partial_"):
-        return Deferred(made, _unresolved(node), where)
-    return made
+        return Deferred(built, _unresolved(node), where)
+    return built
 
 
 def _built_below(node: Any, where: str, extra: Mapping[str, Any]) -> dict[str, Any]:
@@ -105,8 +107,9 @@ class Deferred:
         try:
             return self._function(*args, **kwargs)
         except UserError as error:
-            named = list(signature(str(self._node["_target_"]), self._where))[: len(args)]
-            extra = (*named, *kwargs)
+            parameters = list(signature(str(self._node["_target_"]), self._where))
+            positional = parameters[: len(args)]
+            extra = (*positional, *kwargs)
             raise _with_path(error, self._node, self._where, extra) from error.__cause__
         except REJECTIONS as error:
             raise _rejected(error, self._node, self._where) from error
@@ -141,14 +144,16 @@ def build_as(
     taken = {}
     if offered:
         parameters = signature(str(node["_target_"]), where)
-        taken = {name: value for name, value in offered.items() if name in parameters}
-    made = build(node, where, **taken, **extra)
-    if not isinstance(made, kind):
+        for name, value in offered.items():
+            if name in parameters:
+                taken[name] = value
+    built = build(node, where, **taken, **extra)
+    if not isinstance(built, kind):
         raise UserError(
             f"{where}: {node.get('_target_')} must return a {kind.__name__}, got "
-            f"{type(made).__name__}."
+            f"{type(built).__name__}."
         )
-    return made
+    return built
 
 
 def _known_cause(error: BaseException, node: Any, where: str) -> UserError | None:
@@ -171,9 +176,10 @@ def _known_cause(error: BaseException, node: Any, where: str) -> UserError | Non
 def _refused_by_lightning(cause: BaseException, where: str) -> UserError:
     """Return Lightning's refusal in one line, such as of a trainer that this machine cannot run."""
     text = " ".join(str(cause).split())
-    of_machine = any(word in text.lower() for word in ("accelerator", "gpu", "device"))
-    hint = " Try trainer=auto or trainer=cpu." if of_machine else ""
-    return UserError(f"{where}: {text}{hint}")
+    is_about_machine = any(word in text.lower() for word in ("accelerator", "gpu", "device"))
+    if is_about_machine:
+        text += " Try trainer=auto or trainer=cpu."
+    return UserError(f"{where}: {text}")
 
 
 def _rejected(cause: Exception, node: Any, where: str) -> UserError:
@@ -220,7 +226,7 @@ def takes(node: DictConfig, name: str) -> bool:
     return name in signature(str(node["_target_"]), "")
 
 
-def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
+def signature(target: str, where: str) -> Parameters:
     """Return the parameters of a target, with those that a class passes on to its bases.
 
     Raises:
@@ -229,39 +235,56 @@ def signature(target: str, where: str) -> dict[str, inspect.Parameter]:
     from hydra.utils import get_object
 
     try:
-        found = get_object(target)
+        called = get_object(target)
     except Exception as error:
         # The last line says what failed; Hydra puts others before and after it.
         reason = str(error.__cause__ or error).strip().splitlines()[-1]
         raise UserError(f"{where}._target_: cannot import {target!r}: {reason}") from None
-    if not callable(found):
+    if not callable(called):
         raise UserError(f"{where}._target_: {target!r} is neither a class nor a function.")
-    if not inspect.isclass(found):
-        return _own_signature(found)
-    parameters: dict[str, inspect.Parameter] = {}
-    for cls in found.__mro__:
+    if not inspect.isclass(called):
+        return _own_signature(called)
+    parameters: Parameters = {}
+    for cls in called.__mro__:
         if "__init__" not in vars(cls):
             continue
-        own = _own_signature(vars(cls)["__init__"])
-        own.pop("self", None)
-        named = _without_keywords(own)
-        passes_on = len(named) < len(own)
+        taken = _own_signature(vars(cls)["__init__"])
+        taken.pop("self", None)
+        named = _without_keywords(taken)
         if parameters:  # what a base must be given, the class above gives it
-            named = {name: one for name, one in named.items() if one.default is not one.empty}
+            named = _optional(named)
         parameters = {**named, **parameters}
+        passes_on = any(takes_keywords(parameter) for parameter in taken.values())
         if not passes_on:
             return parameters
     if target in PASSED_ON:
         return {**signature(PASSED_ON[target], where), **parameters}
-    return {**parameters, **own}  # the target takes any further argument
+    return {**parameters, **taken}  # the target takes any further argument
 
 
-def _without_keywords(parameters: dict[str, inspect.Parameter]) -> dict[str, inspect.Parameter]:
-    """Return parameters without ``**kwargs``, by which a class passes arguments to its bases."""
-    return {name: one for name, one in parameters.items() if one.kind is not one.VAR_KEYWORD}
+def takes_keywords(parameter: inspect.Parameter) -> bool:
+    """Return whether a parameter is ``**kwargs``, such as a class passes on to its bases."""
+    return parameter.kind is parameter.VAR_KEYWORD
 
 
-def _own_signature(function: Any) -> dict[str, inspect.Parameter]:
+def _without_keywords(parameters: Parameters) -> Parameters:
+    kept = {}
+    for name, parameter in parameters.items():
+        if not takes_keywords(parameter):
+            kept[name] = parameter
+    return kept
+
+
+def _optional(parameters: Parameters) -> Parameters:
+    """Return the parameters that have a default."""
+    kept = {}
+    for name, parameter in parameters.items():
+        if parameter.default is not parameter.empty:
+            kept[name] = parameter
+    return kept
+
+
+def _own_signature(function: Any) -> Parameters:
     try:
         return dict(inspect.signature(function, eval_str=True).parameters)
     except NameError:  # an annotation that exists for type checkers only

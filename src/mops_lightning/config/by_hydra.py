@@ -18,7 +18,8 @@ def composed(overrides: list[str]) -> DictConfig:
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         cfg = compose_by_hydra("config", overrides=overrides, return_hydra_config=True)
     HydraConfig.instance().set_config(cfg)
-    plain = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
+    own_keys = [str(key) for key in cfg if key != "hydra"]
+    plain = OmegaConf.masked_copy(cfg, own_keys)
     # Names come from Hydra's choices; resolved here they outlive the global HydraConfig.
     plain.names = OmegaConf.to_container(cfg.names, resolve=True)
     return plain

@@ -94,16 +94,22 @@ class Setting:
     @property
     def repeated(self) -> bool:
         """Whether ``evaluate=RUN`` takes it from RUN."""
-        return bool(self.affects) if self.repeat is None else self.repeat
+        if self.repeat is not None:
+            return self.repeat
+        return bool(self.affects)
 
     @property
     def in_evaluation(self) -> InEvaluation:
         """Whether an evaluation may change it."""
         if self.evaluation is not None:
             return self.evaluation
-        return InEvaluation.STAYS if self.affects_training else InEvaluation.CHANGES
+        if self.affects_training:
+            return InEvaluation.STAYS
+        return InEvaluation.CHANGES
 
     @property
     def compared(self) -> bool:
         """Whether ``report`` compares it."""
-        return bool(self.affects) if self.compare is None else self.compare
+        if self.compare is not None:
+            return self.compare
+        return bool(self.affects)

@@ -18,7 +18,9 @@ RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "SLURM_PROCID")
 def is_distributed(cfg: DictConfig) -> bool:
     """Return whether the settings request more than one device."""
     devices = cfg.trainer.get("devices")
-    return devices != 1 and not (OmegaConf.is_list(devices) and len(devices) == 1)
+    if OmegaConf.is_list(devices):
+        return len(devices) != 1
+    return bool(devices != 1)
 
 
 def is_worker_rank(cfg: DictConfig) -> bool:
@@ -36,7 +38,8 @@ def check_start(cfg: DictConfig, hydra_overrides: Sequence[str]) -> None:
     Raises:
         UserError: the settings request one process, or every process would have its own folder.
     """
-    if (number := _number("WORLD_SIZE")) > 1 and not is_distributed(cfg):
+    number = _number("WORLD_SIZE")
+    if number > 1 and not is_distributed(cfg):
         raise UserError(
             f"{number} processes were started (WORLD_SIZE), but trainer.devices=1. Give "
             "trainer=ddp trainer.devices=N, as many as on this host, or start one process."
@@ -78,13 +81,17 @@ def check_shares(batch_size: int, test_clouds: int, held_out: int, processes: in
     Raises:
         UserError: a process would have no clouds, too few, or fewer than another one.
     """
-    for name, clouds in (("test", test_clouds), ("held-out", held_out or processes)):
+    splits = {"test": test_clouds}
+    if held_out:
+        splits["held-out"] = held_out
+    for name, clouds in splits.items():
         if clouds < processes:
             raise UserError(
                 f"trainer.devices: {processes} devices are too many for {clouds} {name} clouds. "
                 f"Try trainer.devices={clouds}."
             )
-    if processes > 1 and (batch_size % processes or batch_size < 2 * processes):
+    is_divisible = batch_size % processes == 0 and batch_size >= 2 * processes
+    if processes > 1 and not is_divisible:
         near = max(round(batch_size / processes), 2) * processes
         raise UserError(
             f"batch_size={batch_size} is the batch of all {processes} devices together: it must "
@@ -94,4 +101,6 @@ def check_shares(batch_size: int, test_clouds: int, held_out: int, processes: in
 
 def _number(name: str) -> int:
     value = os.environ.get(name, "")
-    return int(value) if value.isdigit() else 0
+    if not value.isdigit():
+        return 0
+    return int(value)

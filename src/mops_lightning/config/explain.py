@@ -44,11 +44,13 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
         return f"{mark.name}, line {mark.line + 1}: not valid YAML: {error.problem}."
     texts = []
     for cause in _causes(error):
-        if line := _from_kind(cause, arguments):
+        line = _from_kind(cause, arguments)
+        if line:
             return line
         texts.append(str(cause).strip())
     for text in texts:
-        if line := _from_words(text, texts, arguments):
+        line = _from_words(text, texts, arguments)
+        if line:
             return line
     return _without_notes(texts)
 
@@ -109,16 +111,20 @@ def _from_words(text: str, texts: Sequence[str], arguments: Sequence[str]) -> st
         texts: the messages of all its causes.
         arguments: the overrides.
     """
-    if refused := NO_OVERRIDE.search(text):
+    refused = NO_OVERRIDE.search(text)
+    if refused:
         inside = NOT_IN_STRUCT.search("\n".join(texts))
         named = inside or refused
         return _no_such_setting(named.group(1), arguments)
-    if unknown := UNKNOWN_IN_FILE.search(text):
+    unknown = UNKNOWN_IN_FILE.search(text)
+    if unknown:
         file, name = unknown.groups()
         return f"{file}.yaml: {name}: no such setting.{did_you_mean(name, settings.declared())}"
-    if unread := UNREAD.match(text):
+    unread = UNREAD.match(text)
+    if unread:
         return f"{unread.group(1).strip()!r} is not a setting. Settings are KEY=VALUE."
-    if removed := REMOVED.search(text):
+    removed = REMOVED.search(text)
+    if removed:
         return f"{removed.group(1)} cannot be removed."
     return None
 
@@ -153,12 +159,17 @@ def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
         offered = [group for group in groups if is_offered(group)]
         return f"{key}: no such group of choices.{did_you_mean(key, offered)}"
     cfg = _composed(groups, arguments)
-    if target := _taken_by(key, cfg):
+    target = _taken_by(key, cfg)
+    if target:
         return f"{key}: {target} accepts it, but no file sets it. Write +{key}=..."
-    if choices := _choices_with(key, groups):
+    choices = _choices_with(key, groups)
+    if choices:
         return f"{key}: no such setting here. It belongs to {' and '.join(choices)}."
-    leaves = dotted(OmegaConf.to_container(cfg, resolve=False))
-    known = {*settings.declared(), *(path for path in leaves if "._" not in path)} - {key}
+    known = set(settings.declared())
+    for path in dotted(OmegaConf.to_container(cfg, resolve=False)):
+        if "._" not in path:
+            known.add(path)
+    known.discard(key)
     return f"{key}: no such setting.{did_you_mean(key, known)} --cfg job shows all of them."
 
 
@@ -188,17 +199,23 @@ def _choices_with(key: str, groups: Sequence[str]) -> list[str]:
     group = node.rpartition(".")[2]  # of task.net.sampler, too
     if group not in groups:
         return []
-    place = f"@{node}" if "." in node else ""
+    package = f"@{node}" if "." in node else ""
     choices = []
     for file in sorted(conf_dir().joinpath(group).glob("*.yaml")):
-        if name in (OmegaConf.load(file) or {}):
-            choices.append(f"{group}{place}={file.stem}")
+        content = OmegaConf.load(file) or {}
+        if name in content:
+            choices.append(f"{group}{package}={file.stem}")
     return choices
 
 
 def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
     """Compose the groups that the command line chooses, without its other settings."""
+    choices = []
+    for argument in arguments:
+        group = key_of(argument).partition("@")[0]
+        if group in groups:
+            choices.append(argument)
     try:
-        return composed([part for part in arguments if key_of(part).partition("@")[0] in groups])
+        return composed(choices)
     except Exception:  # the mistake may be among them
         return composed([])

@@ -21,14 +21,17 @@ def sweeps_dir() -> Path:
 def _top() -> Path:
     """Return the folder of both: the package in the wheel, or the top of a checkout."""
     package = Path(__file__).resolve().parents[1]
-    return package if (package / "conf").is_dir() else package.parents[1]
+    if (package / "conf").is_dir():
+        return package
+    return package.parents[1]
 
 
 def choice_groups() -> list[str]:
     """List the groups of choices, such as ``task/net``."""
     root = conf_dir()
-    paths = [path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_dir()]
-    return [path for path in paths if not path.startswith("hydra")]
+    folders = [path for path in root.rglob("*") if path.is_dir()]
+    groups = [folder.relative_to(root).as_posix() for folder in folders]
+    return [group for group in groups if not group.startswith("hydra")]
 
 
 def is_offered(group: str) -> bool:

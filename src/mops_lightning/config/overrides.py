@@ -63,8 +63,8 @@ def with_own_classes(arguments: list[str]) -> list[str]:
             choice of the group, such as ``sampler=mops``, the settings of its file are kept.
     """
     keys = [key(argument) for argument in arguments]
-    places = [place for place in OWN if f"{place}._target_" in keys]
-    below = tuple(f"{place}." for place in places)
+    named = [setting for setting in OWN if f"{setting}._target_" in keys]
+    below = tuple(f"{setting}." for setting in named)
     result = []
     for argument, name in zip(arguments, keys, strict=True):
         is_removal = argument.startswith("~")
@@ -72,9 +72,9 @@ def with_own_classes(arguments: list[str]) -> list[str]:
             result.append(f"++{argument.lstrip('+')}")
         else:
             result.append(argument)
-    for place in places:
-        if OWN[place] not in keys:
-            result.append(f"{OWN[place]}=own")
+    for setting in named:
+        if OWN[setting] not in keys:
+            result.append(f"{OWN[setting]}=own")
     return result
 
 
@@ -91,13 +91,13 @@ def with_home(argument: str) -> str:
     if not folder.startswith("~"):
         return argument
     try:
-        path = str(Path(folder).expanduser())
+        expanded = str(Path(folder).expanduser())
     except RuntimeError:
         raise UserError(
             f"{argument}: no user has this name. For a folder, write ./{folder}"
         ) from None
     name = argument.partition("=")[0]
-    return f"{name}={quote(path)}"
+    return f"{name}={quote(expanded)}"
 
 
 def as_typed(arguments: Any) -> list[str]:

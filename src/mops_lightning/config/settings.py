@@ -29,6 +29,19 @@ def group(affects: Affects = Affects.RESULTS, **more: Any) -> Any:
     return setting(None, "", affects, group=True, **more)
 
 
+def _are_sizes(value: Any) -> bool:
+    """Return whether a value is ``auto`` or a list of sizes."""
+    if value == "auto":
+        return True
+    return type(value) is list and value != [] and all(map(whole(1).fits, value))
+
+
+def _are_words_or_null(value: Any) -> bool:
+    if value is None:
+        return True
+    return type(value) is list and all(type(word) is str for word in value)
+
+
 @dataclass
 class RunSettings:
     """The top level of the configuration."""
@@ -46,10 +59,7 @@ class RunSettings:
         "sizes tested in addition to m: auto (the usual sizes, for multi-size samplers) or "
         "[8,100,...]",
         Affects.SCORES,
-        limits=Limits(
-            "auto or a list of whole numbers of at least 1",
-            lambda x: x == "auto" or (type(x) is list and x != [] and all(map(whole(1).fits, x))),
-        ),
+        limits=Limits("auto or a list of whole numbers of at least 1", _are_sizes),
         learn=WITH_SAMPLER,
         compare=False,
     )
@@ -93,8 +103,7 @@ class RunSettings:
         "[NAME,...]: further frozen task nets that the sampler is trained under, models or runs",
         Affects.TRAINING,
         limits=Limits(
-            "null or a list of models or runs that trained a task net",
-            lambda x: x is None or (type(x) is list and all(type(one) is str for one in x)),
+            "null or a list of models or runs that trained a task net", _are_words_or_null
         ),
         learn=("sampler",),
         nullable=True,
@@ -153,10 +162,7 @@ class RunSettings:
         None,
         "[WORD,...]: words that describe the run, for report and TensorBoard",
         Affects.NOTHING,
-        limits=Limits(
-            "null or a list of words",
-            lambda x: x is None or (type(x) is list and all(type(one) is str for one in x)),
-        ),
+        limits=Limits("null or a list of words", _are_words_or_null),
         nullable=True,
     )
     pictures: int = setting(
@@ -299,7 +305,7 @@ INSIDE: dict[str, dict[str, Any]] = {
 
 def declared() -> dict[str, Setting]:
     """Return the settings of the top level by name."""
-    return {one.name: one.metadata["setting"] for one in fields(SCHEMA)}
+    return _declared(SCHEMA)
 
 
 def of(path: str) -> Setting:
@@ -310,18 +316,24 @@ def of(path: str) -> Setting:
 def limits(path: str) -> Limits | None:
     """Return the limits of a setting; None for one without, and for one that is not declared."""
     is_declared = path in declared() or path in INSIDE
-    return of(path).limits if is_declared else None
+    if not is_declared:
+        return None
+    return of(path).limits
+
+
+def _declared(schema: type) -> dict[str, Setting]:
+    return {entry.name: entry.metadata["setting"] for entry in fields(schema)}
 
 
 @cache
 def _of(schema: type, path: str) -> Setting:
-    tops = {declaration.name: declaration.metadata["setting"] for declaration in fields(schema)}
-    setting: Setting = tops.get(path.partition(".")[0], Setting())
+    top = path.partition(".")[0]
+    declaration = _declared(schema).get(top, Setting())
     for inner, changes in INSIDE.items():
         if path == inner or path.startswith(f"{inner}."):
             # A run is evaluated with its groups as they were.
-            setting = replace(setting, **{"repeat": setting.repeated, **changes})
-    return setting
+            declaration = replace(declaration, **{"repeat": declaration.repeated, **changes})
+    return declaration
 
 
 def register() -> None:

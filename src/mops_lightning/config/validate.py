@@ -13,7 +13,7 @@ import msgspec
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from mops_lightning.config import settings
-from mops_lightning.config.build import build, signature
+from mops_lightning.config.build import build, signature, takes_keywords
 from mops_lightning.config.shortened import UNLIMITED, has_step_limit
 from mops_lightning.errors import UserError, did_you_mean
 from mops_lightning.tree import dotted
@@ -174,8 +174,8 @@ def _check_limits(config: dict[str, Any]) -> None:
         if not limits.fits(value):
             raise limits.refusal(path, value)
     for path, value in values.items():
-        several = value if isinstance(value, list) else [value]
-        for number in several:
+        items = value if isinstance(value, list) else [value]
+        for number in items:
             if not _is_usable(number):
                 raise UserError(f"{path} must be finite and below 2**63, got {number!r:.30}.")
 
@@ -190,7 +190,8 @@ def _is_usable(value: Any) -> bool:
 
 
 def _check_evaluation(config: dict[str, Any]) -> None:
-    learn, evaluate = config["learn"], config["evaluate"]
+    learn = config["learn"]
+    evaluate = config["evaluate"]
     if evaluate and learn not in ("nothing", "task"):
         raise UserError(
             f"evaluate: trains nothing, got learn={learn}. Leave learn out, or train "
@@ -217,7 +218,7 @@ def _check_node(node: Any, where: str) -> None:
 def _check_arguments(node: dict[Any, Any], where: str) -> None:
     """Compare the settings of a node with the signature of its ``_target_``."""
     parameters = signature(str(node["_target_"]), where)
-    takes_any = any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+    takes_any = any(takes_keywords(parameter) for parameter in parameters.values())
     for key, value in node.items():
         name = str(key)
         path = f"{where}.{name}"
@@ -289,4 +290,6 @@ def _in_words(message: str) -> str | None:
     kinds = expected[1].split(" | ")
     words = " or ".join(WORDS.get(kind, kind) for kind in kinds)
     is_about_item = "`$[" in message
-    return f"a list, each of it {words}" if is_about_item else words
+    if is_about_item:
+        return f"a list, each of it {words}"
+    return words
